@@ -90,6 +90,10 @@ from clrecon.rendering.views.camera import Camera as Camera
 from clrecon.rendering.views.centre_line_files import read_curve_points as read_curve_points
 from clrecon.rendering.views.clip import Clip as Clip
 from clrecon.system.time_limit import time_limit as time_limit
+from clrecon.vertebrae.result import MiddlePlane as MiddlePlane
+from clrecon.vertebrae.result import Vertebra as Vertebra
+from clrecon.vertebrae.result import VertebraSplit as VertebraSplit
+from clrecon.vertebrae.split import split_vertebrae as split_vertebrae
 
 __all__: list[str]
 __version__: str

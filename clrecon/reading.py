@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from clrecon.sources.listing import SeriesListing
     from clrecon.system.progress import Progress
 
-__all__ = ["Selection", "list_series", "read_selected", "read_volume"]
+__all__ = ["Selection", "list_series", "read_selected", "read_volume", "tell_format"]
 
 _OTHER_FORMATS = ("NIfTI", "NRRD", "MetaImage")
 _NAMES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
@@ -102,7 +102,7 @@ def read_volume(
         `series` matches no series or several; the `phase` does not exist; an option for DICOM is given with another
         format; a package is missing; or `path` is empty.
     """
-    kind = _tell_format(path)
+    kind = tell_format(path)
     if kind is None:
         from clrecon.dicom import read_volume as read_dicom
 
@@ -143,7 +143,7 @@ def list_series(
         As `clrecon.dicom.list_series`; a file of another format is corrupt, its package is missing, or an option for
         DICOM is given with it.
     """
-    kind = _tell_format(path)
+    kind = tell_format(path)
     if kind is None:
         from clrecon.dicom import list_series as list_dicom
 
@@ -162,7 +162,7 @@ def _refuse_options(kind: str, **options: Any) -> None:
         raise UsageError(f"{' and '.join(given)}: only for DICOM, the input is a {kind} file")
 
 
-def _tell_format(path: str | os.PathLike[str]) -> str | None:
+def tell_format(path: str | os.PathLike[str]) -> str | None:
     """Return the format of a file other than DICOM; None leaves the input and its errors to the DICOM reader."""
     try:
         file = Path(path)

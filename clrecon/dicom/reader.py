@@ -28,7 +28,7 @@ from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text, join_names
 from clrecon.system.wording import name_parameter
 
-__all__ = ["list_series", "read_volume"]
+__all__ = ["list_series", "list_slices", "read_volume"]
 
 log = get_logger(__name__)
 
@@ -93,6 +93,39 @@ def read_volume(
     log.info("series %d of %d read: %s voxels %s", chosen.number, len(found), voxels.shape[::-1], voxels.dtype)
     log_warnings(log, report.warnings)
     return Volume(voxels, stack.affine, report, stack.slice_positions, hu_range=(facts.hu_min, facts.hu_max))
+
+
+def list_slices(
+    path: str | os.PathLike[str],
+    series: int | str | None = None,
+    *,
+    phase: int | None = None,
+    allow_gaps: bool = False,
+    force: bool = False,
+) -> list[tuple[Path, int, int]]:
+    """List the slices of which `read_volume` makes a volume, slice k at place k.
+
+    Parameters
+    ----------
+    path, series, phase, allow_gaps, force
+        As in `read_volume`.
+
+    Returns
+    -------
+    list of (Path, int, int)
+        File of the slice, its frame there from 0, and number of frames of the file.
+
+    Raises
+    ------
+    NoDicomError, RefusedInputError, UsageError
+        As `read_volume`, as far as headers tell.
+    """
+    with _quiet_warnings():
+        _, found = _scan_and_group(path, None, force)
+        chosen = choose_series(found, series).choose(_checked_phase(phase), allow_gaps)
+        if chosen.problems or chosen.stack is None:
+            raise RefusedInputError(_describe_refusal(chosen))
+        return [(header.file, header.frame, header.frames) for header in chosen.stack.slices]
 
 
 def _checked_phase(phase: int | None) -> int | None:

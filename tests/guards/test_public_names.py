@@ -25,7 +25,7 @@ TAKE_PROGRESS = {
     "extract_label_masks", "extract_labels", "filter_bilateral", "filter_volume",
     "find_cut_cells", "find_ghost_slices", "find_mesh_cells", "find_neighbours", "find_spine_line",
     "list_series", "mask_field_of_view", "measure_cells", "measure_slices", "measure_truth",
-    "read_labels", "read_volume", "reconstruct_surface", "reformat_curve",
+    "split_vertebrae", "read_labels", "read_volume", "reconstruct_surface", "reformat_curve",
     "remove_outliers", "remove_sparse_cells", "remove_table", "render", "smooth_mesh", "thin_points",
     "write_animation",
 }  # fmt: skip

@@ -29,7 +29,8 @@ _layer("sources", "errors", "system", "geometry")
 _layer("dicom", "errors", "system", "geometry", "sources")
 _layer("formats", "errors", "system", "geometry", "sources")
 _layer("reading", "errors", "system", "geometry", "sources", "dicom", "formats")
-_layer("labels", "errors", "system", "geometry", "dicom", "formats")
+_layer("labels", "errors", "version", "system", "geometry", "dicom", "formats")
+_layer("vertebrae", "errors", "system", "geometry", "anatomy", "labels")
 _layer("mesh", "errors", "system", "geometry", "anatomy", "exchange")
 _layer("points", "errors", "system", "geometry", "exchange")
 _layer("rendering", "errors", "version", "system", "geometry", "labels")
@@ -55,6 +56,7 @@ _layer(
     "phantom",
     "reference",
     "operators",
+    "vertebrae",
 )
 _layer("viewer", "errors", "rendering")
 _layer("cli", "errors", "version", "system", "jobs")
@@ -74,6 +76,7 @@ _layer(
     "points",
     "rendering",
     "operators",
+    "vertebrae",
 )
 
 # Third-party packages: at module level (paid by whoever imports the layer), or only inside functions.
@@ -85,6 +88,7 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "formats": frozenset({"numpy"}),
     "sources": frozenset({"numpy"}),
     "labels": frozenset({"numpy"}),
+    "vertebrae": frozenset({"numpy"}),
     "mesh": frozenset({"numpy"}),
     "points": frozenset({"numpy"}),
     "exchange": frozenset({"numpy"}),
@@ -102,6 +106,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "dicom": frozenset({"imagecodecs", "openjpeg", "rle", "jpeg_ls", "pylibjpeg"}),
     "formats": frozenset({"nibabel", "nrrd", "SimpleITK"}),
     "labels": frozenset({"pydicom", "scipy"}),
+    "vertebrae": frozenset({"scipy", "skimage"}),
     "exchange": frozenset({"vtk", "vtkmodules", "laspy"}),
     "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification"}),
     "points": frozenset({"pyvista", "open3d"}),
@@ -110,7 +115,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "phantom": frozenset({"scipy"}),
     "opencl": frozenset({"pyopencl"}),
     "operators": frozenset({"pyopencl", "SimpleITK", "skimage"}),
-    "jobs": frozenset({"pyvista", "skimage", "vtkmodules"}),  # vtkmodules: flying edges, the peer of the bench
+    "jobs": frozenset({"PIL", "pyvista", "skimage", "vtkmodules"}),  # vtkmodules: flying edges, the peer of the bench
     "viewer": frozenset({"pyvista", "vtk", "vtkmodules"}),
     "cli": frozenset({"rich"}),
 }

@@ -42,6 +42,7 @@ from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.clip import Clip
 from clrecon.sources.listing import SeriesEntry, SeriesListing
 from clrecon.system.gates import at_most
+from clrecon.vertebrae.result import MiddlePlane, Vertebra, VertebraSplit
 
 VOXELS = np.arange(4 * 5 * 6, dtype=np.int16).reshape(4, 5, 6)
 AFFINE = np.array([[0.7, 0.1, 0.0, -25.0], [-0.1, 0.7, 0.2, -30.0], [0.0, 0.05, 2.5, -84.0], [0, 0, 0, 1.0]])
@@ -53,6 +54,11 @@ CURVE = Curve([[0, 0, 0], [1, 2, 3], [2, 2, 7.0]])
 ENTRY = SeriesEntry(1, "ab", "thin", "CT", 4, [6, 5, 4], [1.0] * 3, None, 0.0, 0.0, {"min": 1.0}, False, [], [])
 EMPTY = np.zeros((2, 3), np.float32)
 CLOUD = PointCloud([[0, 0, 0], [1, 2, 3]], hu=[200, 300], labels=[0, -1], report={"iso_value_hu": 250.0})
+
+VERTEBRA = Vertebra(1, "vertebra_1", 0.4, False, ["shallow disc"], True, [0.0, 1.0, 2.0], 30.0, 40.0)
+PLANE = MiddlePlane(
+    EMPTY, EMPTY, EMPTY.astype(np.int32), EMPTY.astype(np.int32), 1, 2, [((0.0, 1.0), (2.0, 3.0))], [0.5]
+)
 
 MESSAGES = {
     "volume": Volume(VOXELS, AFFINE, {"warnings": ["doubtful"]}),
@@ -80,6 +86,9 @@ MESSAGES = {
     "phantom settings": PhantomSettings(),
     "iso choice": half_iso_value(1000.0, 40.0),
     "grid cells": GridCells([[0, -1, 2], [3, 4, 5]], "t-mc"),
+    "vertebra": VERTEBRA,
+    "middle plane": PLANE,
+    "vertebra split": VertebraSplit(LABELS, [VERTEBRA], CURVE.points, CURVE.points, 150.0, ["a sacrum"], PLANE),
     "gate": at_most("gap", 1.0, 2.0, "mm", "a gap"),
     "quality": TRIANGLE.quality(),
     "point cloud": CLOUD,

@@ -1,0 +1,131 @@
+"""``clrecon vertebrae``: a first guess of a label map of the vertebrae."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from clrecon.cli.common import add_keep_ids, add_no_clobber, megabytes, pick, table
+from clrecon.cli.console import Console, printable
+from clrecon.cli.mesh import describe_volume
+from clrecon.cli.points import parse_point
+from clrecon.cli.reading import add_reading
+
+__all__ = ["add_arguments", "run"]
+
+PARTLY = 8
+
+_EPILOG = """\
+A first guess for the chest and the loin of an adult: look at the picture, and correct the map before it is used, for
+example in 3D Slicer. A trained segmentation (TotalSegmentator, TotalSpineSeg) is better where there is one. Vertebrae
+of which the search is not sure are left out of the map, each with a warning, and the exit code is 8. No OpenCL device
+is needed.
+
+examples:
+  clrecon vertebrae CT_FOLDER -o spine.nii.gz
+  clrecon vertebrae CT_FOLDER -o spine.dcm --name-at 2,-110,-420=L3
+  clrecon vertebrae CT_FOLDER -o spine.nii.gz --seed 2,-110,-420 --seed 1,-112,-385 --keep-unsure
+  clrecon mesh CT_FOLDER -o l3.stl --labels spine.nii.gz --label L3"""
+
+
+def _parse_name(text: str) -> tuple[tuple[float, ...], str]:
+    """Read ``X,Y,Z=L3``.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        The text has another form.
+    """
+    point, equals, level = text.rpartition("=")
+    if not equals or not level.strip():
+        raise argparse.ArgumentTypeError(f"{text!r} is no named point: write it as X,Y,Z=L3")
+    return parse_point(point), level.strip()
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.epilog = _EPILOG
+    parser.add_argument("input", metavar="INPUT", help="DICOM folder or file, or a NIfTI, NRRD or MetaImage file")
+    parser.add_argument(
+        "-o", "--output", metavar="OUT", required=True, help="label map: .nii.gz, .nii, or .dcm (DICOM SEG)"
+    )
+    parser.add_argument(
+        "--picture", metavar="PNG", help="picture of discs and labels (default: beside the map, with its name)"
+    )
+    add_reading(parser)
+    group = parser.add_argument_group("vertebrae")
+    group.add_argument(
+        "--hu",
+        dest="level",
+        type=float,
+        metavar="N",
+        help="bone is N HU and more (default: half way between discs and marrow, 120 to 226)",
+    )
+    group.add_argument(
+        "--seed",
+        dest="seeds",
+        type=parse_point,
+        metavar="X,Y,Z",
+        action="append",
+        default=[],
+        help="a point in the body of a vertebra, LPS mm; one for each vertebra, in place of the search for discs",
+    )
+    group.add_argument(
+        "--name-at",
+        type=_parse_name,
+        metavar="X,Y,Z=L3",
+        help="the level of the vertebra at this point (LPS mm); without it they are numbered from the head",
+    )
+    group.add_argument(
+        "--keep-unsure", action="store_true", help="write vertebrae of which the search is not sure, too"
+    )
+    checks = parser.add_argument_group("checks")
+    add_no_clobber(checks)
+    add_keep_ids(checks)
+    checks.add_argument("--report", metavar="FILE", help="write vertebrae, sureness, discs and times as JSON")
+
+
+def run(options: argparse.Namespace, console: Console) -> int:
+    """Run the command; returns the exit code."""
+    from clrecon.jobs.vertebrae.files import picture_beside
+    from clrecon.jobs.vertebrae.job import make_vertebrae
+    from clrecon.jobs.vertebrae.settings import VertebraeSettings
+
+    names = ("series", "phase", "allow_gaps", "force", "level", "seeds", "name_at", "keep_unsure", "keep_ids")
+    settings = VertebraeSettings(**pick(options, names))
+    report = make_vertebrae(
+        options.input,
+        options.output,
+        settings,
+        picture_path=options.picture,
+        report_path=options.report,
+        no_clobber=options.no_clobber,
+        progress=console.progress,
+    )
+    console.result(report)
+    for line in _describe(report):
+        console.say(line)
+    console.say(f"wrote    {printable(options.output)}, {megabytes(report['output']['bytes'])}")
+    console.say(f"picture  {printable(options.picture or picture_beside(options.output))}: look at it")
+    if options.report:
+        console.say(f"report   {printable(options.report)}")
+    for warning in report["warnings"]:
+        console.warn(warning)
+    return PARTLY if report["unsure"] else 0
+
+
+def _describe(report: dict[str, Any]) -> list[str]:
+    rows = [("", "number", "sureness", "height mm", "ml", "")]
+    for one in report["vertebrae"]:
+        remarks = ("" if one["is_sure"] else "unsure ") + ("" if one["whole"] else "cut by the scan")
+        figures = f"{one['sureness']:.2f}", f"{one['height_mm']:.0f}", f"{one['volume_ml']:.1f}"
+        rows.append((one["name"], str(one["number"]), *figures, remarks.strip()))
+    found = len(report["vertebrae"])
+    return [
+        f"input    {describe_volume(report['volume'])}",
+        f"found    {found} vertebra{'e' * (found != 1)}, {report['unsure']} unsure, {len(report['discs'])} discs;"
+        f" bone is {report['level_hu']:.0f} HU and more",
+        *(f"         {line}" for line in table(rows, right=(1, 2, 3, 4))),
+        *(f"         {text}" for text in report["left_out"]),
+        f"time     {report['seconds']['total']:.2f} s",
+    ]

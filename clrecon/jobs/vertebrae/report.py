@@ -1,0 +1,95 @@
+"""`VertebraeReport`: what a vertebrae job found and wrote."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from clrecon.geometry.certificate import without_ids
+from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
+from clrecon.system.records import Record
+from clrecon.version import package_version
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+    from clrecon.jobs.vertebrae.settings import VertebraeSettings
+    from clrecon.vertebrae import VertebraSplit
+
+__all__ = ["VertebraeReport", "describe_split"]
+
+
+@dataclass(frozen=True, eq=False)
+class VertebraeReport(Record):
+    """Report of `make_vertebrae`.
+
+    Attributes
+    ----------
+    vertebrae : list of Vertebra
+        All that were found, from the head downwards, see `clrecon.vertebrae.result.Vertebra`.
+    unsure : int
+        How many of them are unsure.
+    written : int
+        How many the label map has.
+    discs : list of dict
+        ``centre_mm`` and ``normal`` (downwards) of each disc, LPS.
+    left_out : list of str
+    level_hu : float
+    output : dict
+        ``format`` and ``bytes`` of the label map.
+    version, platform : str
+    warnings : list of str
+    volume : mapping
+        The certificate of the volume without its warnings.
+    seconds : mapping
+    peak_memory_bytes : int or None
+    """
+
+    vertebrae: list[Any]
+    unsure: int
+    written: int
+    discs: list[dict[str, list[float]]]
+    left_out: list[str]
+    level_hu: float
+    output: Mapping[str, Any]
+    version: str
+    platform: str
+    warnings: list[str]
+    volume: Mapping[str, Any]
+    seconds: Mapping[str, float]
+    peak_memory_bytes: int | None
+
+
+def describe_split(
+    volume: Volume,
+    split: VertebraSplit,
+    settings: VertebraeSettings,
+    output: Mapping[str, Any],
+    seconds: Mapping[str, float],
+) -> VertebraeReport:
+    """Describe the result of a job."""
+    certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
+    told = [str(warning) for warning in certificate.pop("warnings", [])]
+    fate = "it is in the label map all the same" if settings.keep_unsure else "it is not in the label map"
+    told += [f"{one.name} is unsure ({one.sureness:.2f}), {fate}: {'; '.join(one.doubts)}" for one in split.unsure]
+    if settings.name_at is not None and split.unsure:
+        told.append("names are counted past vertebrae that are unsure: check them with the picture")
+    rounded = [
+        {"centre_mm": [round(float(v), 2) for v in centre], "normal": [round(float(v), 4) for v in normal]}
+        for centre, normal in zip(split.discs_mm, split.disc_normals, strict=True)
+    ]
+    return VertebraeReport(
+        vertebrae=split.vertebrae,
+        unsure=len(split.unsure),
+        written=len(split.labels.numbers),
+        discs=rounded,
+        left_out=split.left_out,
+        level_hu=split.level_hu,
+        output=output,
+        version=package_version(),
+        platform=platform_name(),
+        warnings=list(dict.fromkeys(told)),
+        volume=certificate,
+        seconds=seconds,
+        peak_memory_bytes=peak_memory_bytes(),
+    )

@@ -1,0 +1,58 @@
+"""Settings of the vertebrae job, validated on construction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from clrecon.errors import UsageError
+from clrecon.reading import Selection
+
+__all__ = ["VertebraeSettings"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class VertebraeSettings(Selection):
+    """Settings of the search for vertebrae.
+
+    Parameters
+    ----------
+    series, phase, allow_gaps, force
+        See `clrecon.reading.Selection`.
+    level : float, optional
+        HU from which on a voxel is bone, see `clrecon.split_vertebrae`.
+    seeds : sequence of (x, y, z)
+        Points in LPS mm, one in the body of each vertebra, in place of the search for discs.
+    name_at : ((x, y, z), str), optional
+        A point in LPS mm and the level of the vertebra there.
+    keep_unsure : bool
+        Write vertebrae of which the search is not sure, too.
+    keep_ids : bool
+        Write the hashes of the UIDs of series and frame of reference into the report.
+
+    Raises
+    ------
+    UsageError
+        A value is impossible.
+    """
+
+    level: float | None = None
+    seeds: Sequence[Sequence[float]] = ()
+    name_at: tuple[Sequence[float], str] | None = None
+    keep_unsure: bool = False
+    keep_ids: bool = False
+
+    def __post_init__(self) -> None:
+        from clrecon.vertebrae.naming import check_level
+
+        if self.level is not None and not math.isfinite(self.level):
+            raise UsageError(f"the level of bone is a number of HU, not {self.level!r}")
+        points = [*self.seeds, *([] if self.name_at is None else [self.name_at[0]])]
+        for point in points:
+            if len(point) != 3 or not all(math.isfinite(value) for value in point):
+                raise UsageError(f"a point is three numbers in mm, not {list(point)!r}")
+        if len(self.seeds) == 1:
+            raise UsageError("one seed is too few: give a point in each vertebra, two at least")
+        if self.name_at is not None:
+            check_level(self.name_at[1])

@@ -1,0 +1,76 @@
+"""Label maps as NIfTI-1 (.nii, .nii.gz), with the names of the labels in the header.
+
+nibabel writes the header.  The names are a label table as Caret and Connectome Workbench write it, which `read_labels`
+and other programs read.
+"""
+
+from __future__ import annotations
+
+import gzip
+from typing import Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+from clrecon.formats.extras import import_extra
+from clrecon.formats.grid_file import LABEL_MAP
+from clrecon.geometry.frames import lps_affine_from_ras
+from clrecon.labels.label_map import LabelMap
+
+__all__ = ["encode_nifti", "load_nibabel"]
+
+CARET_CODE = 30
+"""Code of the extension that holds Caret's XML."""
+MM = 2
+SCANNER = 1
+"""Codes of NIfTI: lengths in mm, positions as the scanner gave them."""
+
+
+def load_nibabel() -> Any:
+    """Import nibabel.
+
+    Raises
+    ------
+    UsageError
+        It is not installed.
+    """
+    return import_extra("nibabel", LABEL_MAP)
+
+
+def encode_nifti(labels: LabelMap, *, packed: bool) -> bytes:
+    """Return the bytes of the file; the same labels give the same bytes.
+
+    Parameters
+    ----------
+    labels : LabelMap
+    packed : bool
+        True: gzip, as in .nii.gz.
+
+    Raises
+    ------
+    UsageError
+        nibabel is not installed.
+    """
+    nibabel = load_nibabel()
+    image = nibabel.Nifti1Image(np.asarray(labels.voxels).transpose(2, 1, 0), None)
+    affine = lps_affine_from_ras(labels.affine)
+    image.header.set_xyzt_units(MM)
+    image.set_sform(affine, SCANNER)
+    if _is_rigid(affine):
+        image.set_qform(affine, SCANNER)  # cannot hold a shear
+    else:
+        image.header["pixdim"][1:4] = labels.spacing
+    table = "".join(
+        f'<Label Key="{number}" Red="1" Green="1" Blue="1" Alpha="1">{escape(name)}</Label>'
+        for number, name in labels.names.items()
+    )
+    text = f'<?xml version="1.0" encoding="UTF-8"?><CaretExtension><VolumeInformation Index="0"><LabelTable>{table}'
+    text += "</LabelTable></VolumeInformation></CaretExtension>"
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(CARET_CODE, text.encode("utf-8")))
+    content = bytes(image.to_bytes())
+    return gzip.compress(content, compresslevel=6, mtime=0) if packed else content
+
+
+def _is_rigid(affine: np.ndarray) -> bool:
+    axes = affine[:3, :3] / np.linalg.norm(affine[:3, :3], axis=0)
+    return bool(np.abs(axes.T @ axes - np.eye(3)).max() < 1e-6)

@@ -1,0 +1,275 @@
+"""Bone along the spine, and its division into vertebrae by watersheds from markers between the discs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.volume import Volume
+from clrecon.vertebrae.course import Course
+from clrecon.vertebrae.discs import TILTS_DEG, Bound, Looks
+
+__all__ = ["Part", "cut_part", "divide", "fill_bone", "planes_of"]
+
+Mask = NDArray[np.bool_]
+Planes = tuple[Float64Array, Float64Array]
+"""Centres and normals (m, 3) of planes in LPS mm, from the head downwards; normals point downwards."""
+
+FRONT_MM, BEHIND_MM, BESIDE_MM = 46.0, 58.0, 42.0
+"""Bone farther than this from the canal belongs to no vertebra."""
+BODY_MARGIN_MM = 5.0
+"""In front of the canal bone farther than this from the walls of the bodies is rib, vessel or pelvis."""
+PEDICLE_MM = 8.0
+"""The bodies' own bounds count from so far in front of the canal."""
+CLOSING_MM = 1.5
+CANAL_MM = 4.0
+"""Holes that come so near to the middle of the canal are the canal and stay open."""
+MARKER_AHEAD_MM, MARKER_OFF_MM = 6.0, 2.0
+"""A marker lies so far in front of the canal, within the walls of the body, and off the planes of the discs."""
+BRIGHT_HU = 600.0
+BRIGHT_MM = 0.7
+ARCH_ASIDE_MM, SPINE_ASIDE_MM = 26.0, 12.0
+OVER_MM, UNDER_MM, SPINE_MM = (16.0, 8.0), (20.0, 8.0), (80.0, 1.6, 22.0, 45.0)
+"""How far a vertebra reaches over the plane above it and under the one below it: its articular processes, and all else.
+Its spinous process reaches down by 80 mm less 1.6 heights of the vertebra, 22 to 45: those of the chest are steep."""
+RIDGE_WIDTH = 0.12
+"""Arches meet behind a disc over so much height, in gaps of the discs (standard deviation)."""
+RIDGE_AHEAD_MM = (-25.0, 4.0)
+RIDGE_MM, RIDGE_HU = 1.5, 125.0
+"""What a ridge between two arches adds to a landscape at its crest."""
+ARCH_DOWN = 0.3
+"""An arch lies so much lower than its body, in gaps of the discs."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """The part of a volume round the spine, and where each of its voxels lies from the canal.
+
+    Attributes
+    ----------
+    first : (k, j, i)
+        First voxel of the part in the volume.
+    values : ndarray, shape (nk, nj, ni), float32
+        HU.
+    ahead, aside : ndarray, shape (nk, nj, ni), float32
+        mm in front of the canal and to its left, in the plane across the canal.
+    place : ndarray, shape (nk, nj, ni), float32
+        Place along the course of that plane.
+    within : ndarray, shape (nk, nj, ni), bool
+        Near enough to the canal to be a vertebra.
+    body : ndarray, shape (nk, nj, ni), bool
+        Within the walls of the bodies.
+    spacing : (dk, dj, di)
+        mm.
+    """
+
+    first: tuple[int, int, int]
+    values: NDArray[np.float32]
+    ahead: NDArray[np.float32]
+    aside: NDArray[np.float32]
+    place: NDArray[np.float32]
+    within: Mask
+    body: Mask
+    spacing: tuple[float, float, float]
+
+    @property
+    def where(self) -> tuple[slice, slice, slice]:
+        """The part of the volume as slices of its voxels."""
+        k, j, i = (slice(n, n + size) for n, size in zip(self.first, self.values.shape, strict=True))
+        return k, j, i
+
+    def points(self, volume: Volume, k: int) -> Float64Array:
+        """Return the places of the voxels of slice k of the part, shape (nj, ni, 3), LPS mm."""
+        _, nj, ni = self.values.shape
+        j, i = np.mgrid[:nj, :ni]
+        ijk = np.stack([i + self.first[2], j + self.first[1], np.full_like(i, k + self.first[0])], axis=-1)
+        return volume.ijk_to_lps(ijk.reshape(-1, 3)).reshape(nj, ni, 3)
+
+
+def planes_of(bounds: list[Bound], course: Course, looks: Looks) -> Planes:
+    """Return the planes of bounds."""
+    at = np.array([bound.at for bound in bounds])
+    tilt = np.radians(TILTS_DEG[[bound.tilt for bound in bounds]])[:, None]
+    centres = course.canal[at] + looks.middle_mm[at, None] * course.ahead[at]
+    return centres, np.cos(tilt) * course.down[at] - np.sin(tilt) * course.ahead[at]
+
+
+def cut_part(volume: Volume, course: Course, looks: Looks) -> Part:
+    """Cut out the box of the volume that can hold the vertebrae."""
+    sides = [(x, y) for x in (-BESIDE_MM, BESIDE_MM) for y in (-FRONT_MM, BEHIND_MM)]
+    corners = np.concatenate([course.canal + np.array([x, y, 0.0]) for x, y in sides])
+    ijk = volume.lps_to_ijk(corners)
+    low = np.clip(np.floor(ijk.min(axis=0)).astype(int), 0, np.array(volume.shape_ijk) - 1)
+    high = np.clip(np.ceil(ijk.max(axis=0)).astype(int) + 1, low + 1, volume.shape_ijk)
+    box = volume.voxels[low[2] : high[2], low[1] : high[1], low[0] : high[0]]
+    values = np.nan_to_num(box.astype(np.float32), nan=-1024.0)
+    di, dj, dk = volume.spacing
+    part = Part(
+        first=(int(low[2]), int(low[1]), int(low[0])),
+        values=values,
+        ahead=np.empty(values.shape, np.float32),
+        aside=np.empty(values.shape, np.float32),
+        place=np.empty(values.shape, np.float32),
+        within=np.empty(values.shape, bool),
+        body=np.empty(values.shape, bool),
+        spacing=(dk, dj, di),
+    )
+    order = np.argsort(course.canal[:, 2], kind="stable")
+    heights, numbers = course.canal[order, 2], np.arange(len(course))
+    for k in range(len(values)):
+        places = part.points(volume, k)
+        at = np.interp(places[..., 2], heights, order.astype(np.float64))
+        for _ in range(2):  # from the canal at the same height to the plane across the canal, where it is bent
+            nearest = np.clip(np.rint(at), 0, len(course) - 1).astype(int)
+            off = places - course.canal[nearest]
+            at = nearest + (off * course.down[nearest]).sum(axis=-1)
+        ahead, aside = ((off * way[nearest]).sum(axis=-1) for way in (course.ahead, course.aside))
+        part.ahead[k], part.aside[k], part.place[k] = ahead, aside, np.clip(at, 0, len(course) - 1)
+        front, side = np.interp(at, numbers, looks.front_mm), np.interp(at, numbers, looks.side_mm)
+        near = (ahead <= FRONT_MM) & (ahead >= -BEHIND_MM) & (np.abs(aside) <= BESIDE_MM)
+        near &= (at >= -1.0) & (at <= len(course))
+        walls = (ahead <= front + BODY_MARGIN_MM) & (np.abs(aside) <= side + BODY_MARGIN_MM)
+        part.within[k] = near & (walls | (ahead < PEDICLE_MM))
+        part.body[k] = near & walls & (ahead >= MARKER_AHEAD_MM)
+    return part
+
+
+def _ball(spacing: tuple[float, float, float]) -> Mask:
+    """Return the voxels within `CLOSING_MM`, and along each axis the next one at least."""
+    radii = [max(CLOSING_MM, step) for step in spacing]
+    reach = [int(radius / step + 1e-6) for radius, step in zip(radii, spacing, strict=True)]
+    grid = np.meshgrid(
+        *[np.arange(-n, n + 1) * step / r for n, step, r in zip(reach, spacing, radii, strict=True)], indexing="ij"
+    )
+    return np.asarray(sum(axis**2 for axis in grid) <= 1.0 + 1e-6)
+
+
+def fill_bone(part: Part, level: float) -> Mask:
+    """Return the bone of a part as a solid: from the level on, closed, without holes in its slices but the canal."""
+    from scipy.ndimage import binary_closing, binary_fill_holes, label
+
+    raw = (part.values >= level) & part.within
+    ball = _ball(part.spacing)
+    margins = [(n // 2, n // 2) for n in ball.shape]
+    inner = tuple(slice(n, n + size) for (n, _), size in zip(margins, raw.shape, strict=True))
+    bone = np.asarray(binary_closing(np.pad(raw, margins, mode="edge"), ball)[inner]) | raw
+    canal = np.hypot(part.ahead, part.aside) <= CANAL_MM
+    for plane, tube in zip(bone, canal, strict=True):
+        holes, count = label(binary_fill_holes(plane) & ~plane)
+        fills = np.ones(count + 1, bool)
+        fills[0] = False
+        fills[np.unique(holes[tube])] = False
+        plane |= fills[holes]
+    return np.asarray(bone & part.within)
+
+
+def divide(
+    part: Part, bone: Mask, bounds: list[Bound], planes: Planes, volume: Volume
+) -> tuple[NDArray[np.uint8], Float64Array]:
+    """Divide bone into the pieces between planes.
+
+    Two watersheds from the same markers are compared.  That of the distance field keeps arches together that touch in
+    facet joints, that of the brightness follows the dark gap of a joint which the closing has filled.  In both there
+    are ridges between arches at the heights of the discs.  Where they differ, a group of voxels in front of the canal
+    goes to the vertebra at whose height it lies, and an arch to the one that is a little higher.
+
+    Returns
+    -------
+    pieces : ndarray, shape (nk, nj, ni), uint8
+        0 outside of bone; 1 above the first plane, and so on.
+    doubtful : ndarray, shape (pieces + 1,), float64
+        Share of each piece that the two watersheds give to different ones.
+    """
+    from scipy.ndimage import distance_transform_edt, gaussian_filter
+    from skimage.segmentation import watershed
+
+    markers = _mark(part, bone, planes, volume)
+    ridge = _ridges(part, bounds)
+    depth = distance_transform_edt(bone, sampling=part.spacing)
+    by_depth = watershed(RIDGE_MM * ridge - depth, markers, mask=bone)
+    bright = gaussian_filter(np.clip(part.values, 0.0, BRIGHT_HU), [BRIGHT_MM / step for step in part.spacing])
+    by_brightness = watershed(RIDGE_HU * ridge - bright, markers, mask=bone)
+    pieces = _bound(part, _settle(part, by_depth, by_brightness, bounds), bounds, planes, volume)
+    count = np.bincount(pieces.ravel(), minlength=len(bounds) + 2)
+    differ = np.bincount(pieces[by_depth != by_brightness], minlength=len(bounds) + 2)
+    return pieces, differ / np.maximum(count, 1)
+
+
+def _bound(
+    part: Part, pieces: NDArray[np.uint8], bounds: list[Bound], planes: Planes, volume: Volume
+) -> NDArray[np.uint8]:
+    """Take from each piece what lies too far beyond its planes: sacrum, pelvis, ribs of other levels."""
+    centres, normals = planes
+    last = len(centres)
+    at = np.array([bound.at for bound in bounds], np.float64)
+    gaps = np.diff(at) if last > 1 else np.array([30.0])
+    heights = np.r_[gaps[0], gaps[0], gaps, gaps[-1]]  # of piece n, the first is no piece
+    first, less, low, high = SPINE_MM
+    spine = np.clip(first - less * heights, low, high)
+    for k, plane in enumerate(pieces):
+        chosen = plane > 0
+        if not chosen.any():
+            continue
+        places, own = part.points(volume, k)[chosen], plane[chosen].astype(np.int64)
+        aside, ahead = np.abs(part.aside[k][chosen]), part.ahead[k][chosen]
+        near = (aside <= ARCH_ASIDE_MM) & (ahead < MARKER_AHEAD_MM)
+        above, below = np.minimum(own - 2, last - 1), np.minimum(own - 1, last - 1)
+        over = -((places - centres[above]) * normals[above]).sum(axis=1)
+        under = ((places - centres[below]) * normals[below]).sum(axis=1)
+        far = (own > 1) & (over > np.where(near, OVER_MM[0], OVER_MM[1]))
+        reach = np.where(near & (aside <= SPINE_ASIDE_MM), spine[own], np.where(near, UNDER_MM[0], UNDER_MM[1]))
+        far |= (own <= last) & (under > reach)
+        plane[chosen] = np.where(far, 0, own)
+    return pieces
+
+
+def _ridges(part: Part, bounds: list[Bound]) -> NDArray[np.float32]:
+    """Return ridges, 0 to 1, at the heights at which one arch ends and the next begins: those of the discs."""
+    at = np.array([bound.at for bound in bounds], np.float64)
+    gaps = np.gradient(at) if len(at) > 1 else np.array([30.0])
+    place = np.arange(int(part.place.max()) + 2)[:, None]
+    heights = np.exp(-0.5 * ((place - at) / (RIDGE_WIDTH * gaps)) ** 2).max(axis=1)
+    arch = (part.ahead < RIDGE_AHEAD_MM[1]) & (part.ahead > RIDGE_AHEAD_MM[0])
+    return np.where(arch, heights[np.rint(part.place).astype(int)], 0.0).astype(np.float32)
+
+
+def _mark(part: Part, bone: Mask, planes: Planes, volume: Volume) -> NDArray[np.int32]:
+    """Return the bone of the bodies with its piece's number, but for what is near to a plane."""
+    markers = np.zeros(bone.shape, np.int32)
+    for k, plane in enumerate(bone & part.body):
+        if plane.any():
+            places = part.points(volume, k)[plane]
+            sides = np.stack([(places - centre) @ normal for centre, normal in zip(*planes, strict=True)], axis=1)
+            off = np.abs(sides).min(axis=1) >= MARKER_OFF_MM
+            markers[k][plane] = np.where(off, 1 + (sides > 0.0).sum(axis=1), 0)
+    return markers
+
+
+def _settle(
+    part: Part, by_depth: NDArray[np.int32], by_brightness: NDArray[np.int32], bounds: list[Bound]
+) -> NDArray[np.uint8]:
+    """Choose one of two divisions for each group of voxels in which they differ."""
+    from skimage.measure import label
+
+    at = np.array([bound.at for bound in bounds], np.float64)
+    gaps = np.diff(at) if len(at) > 1 else np.array([30.0])
+    upper, lower = np.r_[at[0] - gaps[0], at], np.r_[at, at[-1] + gaps[-1]]
+    differ = by_depth != by_brightness
+    pairs = np.where(differ, by_depth * (len(bounds) + 2) + by_brightness, 0)
+    groups = label(pairs, connectivity=1)[differ]
+    if not len(groups):
+        return by_brightness.astype(np.uint8)
+    count = np.maximum(np.bincount(groups), 1)
+    place, ahead = (np.bincount(groups, field[differ]) / count for field in (part.place, part.ahead))
+    ours = np.zeros((2, len(count)), np.int64)
+    for n, division in enumerate((by_depth, by_brightness)):
+        ours[n, groups] = division[differ]
+    number = np.maximum(ours - 1, 0)
+    expected = 0.5 * (upper + lower)[number] + np.where(ahead < 0.0, ARCH_DOWN, 0.0) * (lower - upper)[number]
+    nearer = np.abs(place - expected).argmin(axis=0)
+    result = by_brightness.astype(np.uint8)
+    result[differ] = np.take_along_axis(ours, nearer[None], axis=0)[0][groups]
+    return result

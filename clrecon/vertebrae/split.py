@@ -1,0 +1,344 @@
+"""`split_vertebrae`: a first guess of where each vertebra is, from the scan alone."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.anatomy.spine_line import find_spine_line
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry.affine import Float64Array, checked_points
+from clrecon.geometry.volume import Volume
+from clrecon.labels import LabelMap
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.wording import name_parameter
+from clrecon.vertebrae.course import AHEAD_MM, ASIDE_MM, Course, Field, follow_canal, sample_course
+from clrecon.vertebrae.discs import (
+    BODY_BACK_MM,
+    TILTS_DEG,
+    Bound,
+    Looks,
+    choose_discs,
+    discs_between,
+    end_of_bone,
+    look_at_bodies,
+)  # fmt: skip
+from clrecon.vertebrae.judge import SURE, Piece, beside_share, judge, weigh
+from clrecon.vertebrae.naming import check_level, name_levels
+from clrecon.vertebrae.regions import cut_part, divide, fill_bone, planes_of
+from clrecon.vertebrae.result import MiddlePlane, Vertebra, VertebraSplit
+
+__all__ = ["split_vertebrae"]
+
+LEVELS_HU = (120.0, 226.0)
+"""The level of bone is taken from between these."""
+LEVEL_SHARE = 0.5
+"""The level lies so far between a disc and the marrow of a body."""
+CUT_MM = 8.0
+"""Least height of a vertebra that the scan cuts."""
+WINGS = 0.25
+"""Share of bone beside a body from which on it is the sacrum's."""
+SEED_TO_CANAL_MM = 24.0
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What was found along the canal."""
+
+    course: Course
+    scan: Field
+    looks: Looks
+    bounds: list[Bound]
+    usual: float
+
+
+def split_vertebrae(
+    volume: Volume,
+    *,
+    level: float | None = None,
+    seeds: ArrayLike | None = None,
+    name_at: tuple[Sequence[float], str] | None = None,
+    keep_unsure: bool = False,
+    progress: Progress | None = None,
+) -> VertebraSplit:
+    """Make a first guess of where each vertebra is, without a label map.
+
+    Meant for the thoracic and lumbar spine of an adult in CT.  It is a starting point for corrections by hand; a
+    trained segmentation is better.
+
+    Parameters
+    ----------
+    volume : Volume
+        A scan in HU.
+    level : float, optional
+        HU from which on a voxel is bone; by default half way between discs and marrow, but 120 to 226.
+    seeds : array_like, shape (n, 3), optional
+        Points in LPS mm, each in the body of a vertebra, in any order: there are these vertebrae and no others, with
+        one disc between each two.
+    name_at : ((x, y, z), str), optional
+        A point in LPS mm in a vertebra, and its level (``"L3"``): the others are named from there, and numbered as in
+        the VerSe data set (C1 is 1, T1 is 8, L1 is 20).  Without it they are numbered from the head.
+    keep_unsure : bool
+        True: the label map has vertebrae of which the search is not sure, too.
+    progress : callable, optional
+        Called as ``progress("canal" or "vertebrae", steps done, steps)``.
+
+    Returns
+    -------
+    VertebraSplit
+
+    Raises
+    ------
+    UsageError
+        A parameter is impossible, or `name_at` is in no vertebra.
+    RefusedInputError
+        No spine, fewer than two discs, or no vertebra of which the search is sure.
+    """
+    progress = progress or ignore_progress
+    _check(volume, level)
+    points = None if seeds is None else _checked_seeds(seeds)
+    named = None if name_at is None else (checked_points([name_at[0]])[0], check_level(name_at[1]))
+    progress("canal", 0, 1)
+    line = _canal_points(volume, points, progress)
+    progress("vertebrae", 0, 4)
+    found = _find_discs(volume, line, points)
+    progress("vertebrae", 1, 4)
+    hu = _choose_level(found) if level is None else float(level)
+    part = cut_part(volume, found.course, found.looks)
+    bone = fill_bone(part, hu)
+    progress("vertebrae", 2, 4)
+    planes = planes_of(found.bounds, found.course, found.looks)
+    pieces, doubtful = divide(part, bone, found.bounds, planes, volume)
+    progress("vertebrae", 3, 4)
+    voxel_ml = float(abs(np.linalg.det(volume.affine[:3, :3])) / 1000.0)
+    spans, left_out = _spans(found, pieces, doubtful, voxel_ml, hu)
+    place = None if named is None else _place_of(named[0], spans, found, volume, part.first, pieces)
+    names = name_levels(len(spans), None if named is None or place is None else (place, named[1]))
+    vertebrae = _judge_all(spans, names, found)
+    kept = {one.number: one.name for one in vertebrae if one.is_sure or keep_unsure}
+    if not kept:
+        raise RefusedInputError(_describe_refusal(vertebrae, left_out))
+    every = np.zeros(len(found.bounds) + 2, np.uint8)  # number of each piece
+    every[[piece_number for piece_number, _ in spans]] = [one.number for one in vertebrae]
+    plane = _middle_plane(volume, found, spans, _as_map(volume, part.where, every[pieces], {}))
+    labels = _as_map(volume, part.where, np.where(np.isin(every, list(kept)), every, 0)[pieces], kept)
+    centres, normals = planes_of([bound for bound in found.bounds if bound.is_disc], found.course, found.looks)
+    progress("vertebrae", 4, 4)
+    return VertebraSplit(labels, vertebrae, centres, normals, hu, left_out, plane)
+
+
+def _check(volume: Volume, level: float | None) -> None:
+    if level is not None and not math.isfinite(level):
+        raise UsageError(f"the level of bone is a number of HU, not {level!r}")
+    if volume.uneven:
+        raise RefusedInputError(
+            "the slices are unevenly spaced, and a label map cannot follow them: resample the scan first"
+        )
+
+
+def _checked_seeds(seeds: ArrayLike) -> Float64Array:
+    points = checked_points(seeds)
+    if len(points) < 2:
+        raise UsageError(
+            "seeds are points in the bodies of at least two vertebrae: with one there is no disc to look for"
+        )
+    return points[np.argsort(-points[:, 2])]
+
+
+def _canal_points(volume: Volume, seeds: Float64Array | None, progress: Progress) -> Float64Array:
+    """Return the middle of the canal; with seeds, where it is not found, it lies behind them."""
+    try:
+        return find_spine_line(volume, progress=lambda _, done, total: progress("canal", done, total)).points
+    except RefusedInputError as error:
+        if seeds is not None:
+            return np.asarray(seeds + np.array([0.0, SEED_TO_CANAL_MM, 0.0]))
+        what = str(error).partition(": give points")[0].partition("; give points")[0]
+        raise RefusedInputError(
+            f"{what}; no vertebrae without it: give a point in each of them ({name_parameter('seeds', 'X,Y,Z')})"
+        ) from error
+
+
+def _find_discs(volume: Volume, line: Float64Array, seeds: Float64Array | None) -> _Found:
+    course = follow_canal(line, volume)
+    scan = sample_course(volume, course)
+    looks = look_at_bodies(scan)
+    if seeds is None:
+        bounds, usual = choose_discs(looks)
+    else:
+        at = [course.nearest(seed) for seed in seeds]
+        if min(np.diff(sorted(at))) < 8:
+            raise UsageError("two seeds lie at the same height of the spine: one is needed in each vertebra")
+        bounds, usual = discs_between(looks, at)
+    if len(bounds) < 2 and seeds is None:
+        found = "one disc was" if bounds else "no disc was"
+        raise RefusedInputError(
+            f"{found} found along {len(course)} mm of the spine, and a vertebra is what lies between two:"
+            f" give a point in each vertebra ({name_parameter('seeds', 'X,Y,Z')})"
+        )
+    gaps = [float(b.at - a.at) for a, b in itertools.pairwise(bounds)] or [30.0]
+    first = end_of_bone(looks, bounds[0], gaps[0], -1, 0.5 * usual)
+    last = end_of_bone(looks, bounds[-1], gaps[-1], 1, 0.5 * usual)
+    bounds = [*([first] if first else []), *bounds, *([last] if last else [])]
+    return _Found(course, scan, looks, bounds, usual)
+
+
+def _choose_level(found: _Found) -> float:
+    """Return the level half way between the discs and the marrow of the bodies, HU."""
+    at = np.array([bound.at for bound in found.bounds if bound.is_disc])
+    middles = (at[:-1] + at[1:]) // 2 if len(at) > 1 else at + 15
+    columns = [found.looks.middle_mm.astype(int) + shift for shift in (-5, 0, 5)]
+    disc, marrow = (
+        float(np.nanmedian(np.stack([found.looks.core[rows, column[rows]] for column in columns])))
+        for rows in (at, np.clip(middles, 0, len(found.scan) - 1))
+    )
+    return float(np.clip(disc + LEVEL_SHARE * (marrow - disc), *LEVELS_HU))
+
+
+def _spans(
+    found: _Found, pieces: NDArray[np.uint8], doubtful: Float64Array, voxel_ml: float, level: float
+) -> tuple[list[tuple[int, Piece]], list[str]]:
+    """Return the number and span of each piece that is a vertebra, and what else was seen."""
+    from scipy.ndimage import find_objects, label
+
+    bounds, course = found.bounds, found.course
+    volumes = np.bincount(pieces.ravel(), minlength=len(bounds) + 2) * voxel_ml
+    boxes = find_objects(pieces, max_label=len(bounds) + 1)
+    spans, left_out = [], []
+    gaps = [float(b.at - a.at) for a, b in itertools.pairwise(bounds)] or [30.0]
+    for n in range(len(bounds) + 1):
+        upper = bounds[n - 1] if n else None
+        lower = bounds[n] if n < len(bounds) else None
+        begin, end = (upper.at if upper else 0), (lower.at if lower else len(course))
+        share = 0.0
+        if boxes[n] is not None:
+            parts = np.bincount(label(pieces[boxes[n]] == n + 1)[0].ravel())[1:]
+            share = float(parts.max() / parts.sum())
+        if end <= begin:
+            continue
+        piece = Piece(upper, lower, begin, end, float(volumes[n + 1]), share, float(doubtful[n + 1]))
+        reason = _no_vertebra(piece, found, gaps, level)
+        if reason is None:
+            spans.append((n + 1, piece))
+        elif reason:
+            where = "above the first vertebra" if n == 0 else "below the last vertebra"
+            left_out.append(f"{where} {reason}")
+    return spans, left_out
+
+
+def _no_vertebra(piece: Piece, found: _Found, gaps: list[float], level: float) -> str | None:
+    """Return why a piece is no vertebra, None where it may be one, "" where there is nothing to tell."""
+    height = piece.end - piece.begin
+    known = piece.upper or piece.lower
+    if known is None or (known is not None and not known.is_disc and not piece.whole):
+        return ""  # beyond the end of the bone
+    if piece.lower is None or not piece.lower.is_disc:
+        share = beside_share(found.scan, found.looks, piece, level)
+        if share >= WINGS:
+            return f"the bone has wings ({100 * share:.0f} % beside its body): it looks like the sacrum"
+    if piece.whole:
+        return None
+    reaches = found.course.reaches[0 if piece.upper is None else 1]
+    gap = gaps[0] if piece.upper is None else gaps[-1]
+    if not reaches or height > 1.3 * gap:
+        return f"{height} mm follow without a disc that was found"
+    return None if height >= CUT_MM else f"only {height} mm of a vertebra are in the scan"
+
+
+def _place_of(
+    point: Float64Array, spans: list[tuple[int, Piece]], found: _Found, volume: Volume, first: tuple[int, int, int],
+    pieces: NDArray[np.uint8],
+) -> int:  # fmt: skip
+    """Return the place of the vertebra at a point: by its bone, else by the height of the point along the spine."""
+    i, j, k = np.rint(volume.lps_to_ijk([point])[0]).astype(int) - np.array(first[::-1])
+    number = 0
+    if all(0 <= n < size for n, size in zip((k, j, i), pieces.shape, strict=True)):
+        number = int(pieces[k, j, i])
+    at = found.course.nearest(point)
+    far = float(np.linalg.norm(found.course.canal[at] - point)) > 80.0
+    for place, (own, piece) in enumerate(spans):
+        if own == number or (not number and not far and piece.begin <= at < piece.end):
+            return place
+    shown = ", ".join(f"{value:g}" for value in point)
+    raise UsageError(f"there is no vertebra at {shown} mm: give a point in the body of one that was found")
+
+
+def _judge_all(spans: list[tuple[int, Piece]], names: dict[int, str], found: _Found) -> list[Vertebra]:
+    vertebrae = []
+    for n, ((_, piece), (number, name)) in enumerate(zip(spans, names.items(), strict=True)):
+        beside = [spans[m][1] for m in (n - 1, n + 1) if 0 <= m < len(spans)]
+        gaps = [float(one.end - one.begin) for one in beside if one.whole and _between_discs(one)]
+        traits = judge(piece, gaps if _between_discs(piece) else [], found.scan, found.looks, found.course, found.usual)
+        sureness, doubts = weigh(traits)
+        middle = (piece.begin + piece.end) // 2
+        centre = found.course.canal[middle] + found.looks.middle_mm[middle] * found.course.ahead[middle]
+        vertebrae.append(
+            Vertebra(
+                number=number,
+                name=name,
+                sureness=round(sureness, 3),
+                is_sure=sureness >= SURE,
+                doubts=doubts,
+                whole=piece.whole,
+                centre_mm=[round(float(value), 2) for value in centre],
+                height_mm=float(piece.end - piece.begin),
+                volume_ml=round(piece.volume_ml, 3),
+            )
+        )
+    return vertebrae
+
+
+def _between_discs(piece: Piece) -> bool:
+    return all(bound is not None and bound.is_disc for bound in (piece.upper, piece.lower))
+
+
+def _describe_refusal(vertebrae: list[Vertebra], left_out: list[str]) -> str:
+    if not vertebrae:
+        return f"no vertebra was found: {'; '.join(left_out) or 'nothing lies between two discs'}"
+    first = vertebrae[0]
+    return (
+        f"of {len(vertebrae)} vertebra{'e' * (len(vertebrae) > 1)} that were found none is sure ({first.name}:"
+        f" {'; '.join(first.doubts)}): give a point in each ({name_parameter('seeds', 'X,Y,Z')}), or keep them"
+        f" ({name_parameter('keep_unsure', True)}) and look at the picture"
+    )
+
+
+def _as_map(
+    volume: Volume, where: tuple[slice, slice, slice], numbers: NDArray[Any], names: dict[int, str]
+) -> LabelMap:
+    voxels = np.zeros(volume.voxels.shape, np.uint8)
+    voxels[where] = numbers
+    return LabelMap(voxels, volume.affine, names)
+
+
+def _middle_plane(volume: Volume, found: _Found, spans: list[tuple[int, Piece]], labels: LabelMap) -> MiddlePlane:
+    """Sample the scan and all labels, unsure ones too, in the straightened middle plane and through the bodies."""
+    course, looks = found.course, found.looks
+    ahead = np.arange(-58.0, AHEAD_MM[-1])
+    sagittal = sample_course(volume, course, ahead, np.zeros(1))[:, ::-1, 0]
+    numbers = sample_course(labels, course, ahead, np.zeros(1), order=0)[:, ::-1, 0]
+    rows, columns = np.arange(len(course)), np.rint(looks.middle_mm).astype(int)
+    coronal = found.scan[rows, columns]
+    beside = sample_course(labels, course, AHEAD_MM, ASIDE_MM, order=0)[rows, columns]
+    canal = len(ahead) - 1 - int(-ahead[0])
+    lines = []
+    for bound in found.bounds:
+        slope, middle = math.tan(math.radians(TILTS_DEG[bound.tilt])), looks.middle_mm[bound.at]
+        ends = (looks.front_mm[bound.at], BODY_BACK_MM)
+        front, back = ((float(bound.at + slope * (end - middle)), float(canal - end)) for end in ends)
+        lines.append((front, back))
+    return MiddlePlane(
+        sagittal,
+        coronal,
+        np.nan_to_num(numbers).astype(np.int32),
+        np.nan_to_num(beside).astype(np.int32),
+        canal,
+        int(-ASIDE_MM[0]),
+        lines,
+        [0.5 * (piece.begin + piece.end) for _, piece in spans],
+    )

@@ -1,0 +1,207 @@
+"""Vertebrae of phantoms are found one by one; what is not sure is said."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+import clrecon
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry import Volume
+from clrecon.phantom import PhantomSettings, make_phantom, phantom_truth
+from clrecon.vertebrae.judge import SURE
+
+COARSE: dict[str, Any] = {"size": (112, 112), "spacing": (2.0, 2.0, 2.5)}
+LEAST_RIGHT = 0.95
+
+
+@cache
+def phantom(levels: str, **choice: Any) -> tuple[Volume, np.ndarray, dict[int, str]]:
+    """The scan, the true number of each voxel, and the names of the numbers."""
+    settings = PhantomSettings(levels=levels, facet_gap_mm=0.0, **COARSE, **choice)
+    voxels, affine, _ = make_phantom(settings)
+    volume, truth = Volume(voxels, affine), phantom_truth(settings)
+    numbers = np.zeros(volume.voxels.shape, np.uint8)
+    near = np.argwhere(volume.voxels > 100)
+    numbers[tuple(near.T)] = truth.label(volume.ijk_to_lps(near[:, ::-1]))
+    return volume, numbers, {n: name for n, name in truth.names.items() if (numbers == n).any()}
+
+
+@cache
+def split(levels: str, **choice: Any) -> clrecon.VertebraSplit:
+    return clrecon.split_vertebrae(phantom(levels, **choice)[0], keep_unsure=True)
+
+
+def shares(labels: np.ndarray, truth: np.ndarray, names: dict[int, str]) -> dict[str, tuple[int, float]]:
+    """For each level the number that most of its voxels have, and the share of them that have it."""
+    found = {}
+    for number, name in names.items():
+        own = np.bincount(labels[truth == number])
+        best = int(own[1:].argmax()) + 1 if len(own) > 1 else 0
+        found[name] = best, float(own[best] / own.sum())
+    return found
+
+
+CASES = [("T12-L3", {}), ("L1-L4", {"tilt": 12.0, "oblique": (5.0, -8.0, 4.0)}), ("T9-T12", {"scoliosis_deg": 20.0})]
+
+
+@pytest.mark.parametrize(("levels", "choice"), CASES, ids=["straight", "tilted", "scoliosis"])
+def test_all_levels_with_touching_facets_are_told_apart(levels: str, choice: dict[str, Any]) -> None:
+    _, truth, names = phantom(levels, **choice)
+    result = split(levels, **choice)
+    found = shares(result.labels.voxels, truth, names)
+    assert [number for number, _ in found.values()] == [1, 2, 3, 4]
+    assert min(share for _, share in found.values()) >= LEAST_RIGHT, found
+    assert [one.is_sure for one in result.vertebrae] == [True] * 4
+    assert [one.name for one in result.vertebrae] == ["vertebra_1", "vertebra_2", "vertebra_3", "vertebra_4"]
+    assert result.labels.names == {one.number: one.name for one in result.vertebrae}
+    assert len(result.discs_mm) == 3 and result.unsure == []
+
+
+def test_discs_lie_between_the_true_centres_and_normals_point_down() -> None:
+    settings = PhantomSettings(levels="T12-L3", facet_gap_mm=0.0, **COARSE)
+    _, _, truth = make_phantom(settings)
+    centres = np.array([level["center_lps_mm"] for level in truth["spine"]["vertebrae"] if "label" in level])
+    result = split("T12-L3")
+    middles = 0.5 * (centres[1:] + centres[:-1])
+    assert np.abs(result.discs_mm[:, 2] - middles[:, 2]).max() < 4.0
+    assert np.allclose(np.linalg.norm(result.disc_normals, axis=1), 1.0)
+    assert (result.disc_normals[:, 2] < -0.8).all()
+    heights = [one.centre_mm[2] for one in result.vertebrae]
+    assert np.abs(np.array(heights) - centres[:, 2]).max() < 6.0
+
+
+def test_a_named_point_names_all_and_numbers_them_as_verse_does() -> None:
+    volume, truth, _ = phantom("T12-L3")
+    point = volume.ijk_to_lps(np.argwhere(truth == 20)[:, ::-1]).mean(axis=0)  # L1; its middle may be in the canal
+    centre = split("T12-L3").vertebrae[1].centre_mm
+    named = clrecon.split_vertebrae(volume, name_at=(centre, "l1"))
+    assert named.labels.names == {19: "T12", 20: "L1", 21: "L2", 22: "L3"}
+    assert [one.name for one in named.vertebrae] == ["T12", "L1", "L2", "L3"]
+    assert clrecon.split_vertebrae(volume, name_at=(point, "L1")).labels.names == named.labels.names
+    same = np.array([0, 19, 20, 21, 22])[split("T12-L3").labels.voxels]
+    assert np.array_equal(named.labels.voxels, same)
+
+
+@pytest.mark.parametrize(
+    ("choice", "words"),
+    [
+        ({"name_at": ((0.0, -100.0, 5000.0), "L1")}, "no vertebra at"),
+        ({"name_at": ((0.0, -100.0, -400.0), "L9")}, "no vertebra 'L9'"),
+        ({"name_at": ("seed", "C1")}, "above it"),
+        ({"name_at": ("seed", "L6")}, "below it"),
+        ({"level": float("nan")}, "number of HU"),
+        ({"seeds": [(0.0, -150.0, -400.0)]}, "at least two"),
+        ({"seeds": [(0.0, -150.0, -400.0), (3.0, -150.0, -400.0)]}, "same height"),
+    ],
+)
+def test_impossible_parameters_are_refused(choice: dict[str, Any], words: str) -> None:
+    if choice.get("name_at", ("",))[0] == "seed":
+        choice = {"name_at": (split("T12-L3").vertebrae[1].centre_mm, choice["name_at"][1])}
+    with pytest.raises(UsageError, match=words):
+        clrecon.split_vertebrae(phantom("T12-L3")[0], **choice)
+
+
+def test_seeds_are_the_vertebrae_and_need_no_canal(monkeypatch: pytest.MonkeyPatch) -> None:
+    volume, truth, names = phantom("T12-L3")
+    seeds = [one.centre_mm for one in split("T12-L3").vertebrae]
+
+    def refuse(*_: object, **__: object) -> None:
+        raise RefusedInputError("no spine was found: give points of the centre line")
+
+    for canal_is_found in (True, False):
+        if not canal_is_found:
+            monkeypatch.setattr("clrecon.vertebrae.split.find_spine_line", refuse)
+            with pytest.raises(RefusedInputError, match="no spine was found; no vertebrae without it"):
+                clrecon.split_vertebrae(volume)
+        seeded = clrecon.split_vertebrae(volume, seeds=seeds[::-1], keep_unsure=True)
+        found = shares(seeded.labels.voxels, truth, names)
+        assert [number for number, _ in found.values()] == [1, 2, 3, 4]
+        assert min(share for _, share in found.values()) >= (LEAST_RIGHT if canal_is_found else 0.9), found
+
+
+def test_a_disc_that_bone_fills_makes_its_vertebra_unsure() -> None:
+    """The row then has a vertebra of twice the height, or a shallow disc: neither is sure."""
+    volume, truth, _ = phantom("T12-L3")
+    disc = split("T12-L3").discs_mm[1]
+    k, j, i = np.indices(volume.voxels.shape)
+    places = volume.ijk_to_lps(np.stack([i, j, k], axis=-1).reshape(-1, 3)).reshape(*k.shape, 3) - disc
+    filled = (np.abs(places[..., 2]) < 9.0) & (np.hypot(places[..., 0], places[..., 1]) < 24.0)
+    voxels = np.where(filled, 200 + 10 * ((i + j + k) % 3), volume.voxels)
+    result = clrecon.split_vertebrae(Volume(voxels, volume.affine), keep_unsure=True)
+    touched = [one for one in result.vertebrae if abs(one.centre_mm[2] - disc[2]) < 0.6 * one.height_mm]
+    assert touched and not any(one.is_sure for one in touched)
+    assert all(one.doubts and one.sureness < SURE for one in touched)
+    kept = clrecon.split_vertebrae(Volume(voxels, volume.affine))
+    assert set(kept.labels.numbers) == {one.number for one in kept.vertebrae if one.is_sure}
+    assert set(kept.labels.numbers) < set(result.labels.numbers)
+
+
+def test_a_kyphotic_upper_chest_is_never_wrong_without_a_word() -> None:
+    _, truth, names = phantom("C7-T6", kyphosis_deg=60.0)
+    result = split("C7-T6", kyphosis_deg=60.0)
+    for one in result.vertebrae:
+        own = np.bincount(truth[result.labels.voxels == one.number], minlength=30)
+        true = int(own[1:].argmax()) + 1
+        right = own[true] / max((truth == true).sum(), 1)
+        assert right >= 0.8 or not one.is_sure, (one, names.get(true), right)
+    assert any(one.is_sure for one in result.vertebrae)
+
+
+@pytest.mark.parametrize(("levels", "words"), [("L3", "none is sure|disc"), ("C1,L5", "no spine|disc|none is sure")])
+def test_one_vertebra_is_refused(levels: str, words: str) -> None:
+    with pytest.raises(RefusedInputError, match=words):
+        clrecon.split_vertebrae(phantom(levels)[0])
+
+
+@pytest.mark.parametrize("kind", ["head", "limb", "empty", "water"])
+def test_other_bodies_are_refused(kind: str) -> None:
+    settings = PhantomSettings(kind=kind, size=(64, 64), slices=48, spacing=(3.6, 3.6, 3.6))
+    voxels, affine, _ = make_phantom(settings)
+    with pytest.raises(RefusedInputError, match="no vertebrae without it"):
+        clrecon.split_vertebrae(Volume(voxels, affine))
+
+
+def test_uneven_slices_are_refused() -> None:
+    volume, _, _ = phantom("T12-L3")
+    places = volume.slice_origins()
+    places[20:, 2] += 1.0
+    uneven = Volume(volume.voxels, volume.affine, slice_positions=places)
+    with pytest.raises(RefusedInputError, match="unevenly spaced"):
+        clrecon.split_vertebrae(uneven)
+
+
+def test_the_order_of_the_axes_does_not_matter() -> None:
+    """A volume whose slices are sagittal, as in NIfTI files."""
+    volume, _, _ = phantom("T12-L3")
+    turn = np.eye(4)[[2, 0, 1, 3]]  # new (i, j, k) of old (k, i, j)
+    turned = Volume(volume.voxels.transpose(1, 2, 0), volume.affine @ turn.T)
+    places = np.array([[3.0, 4.0, 5.0]])
+    assert np.allclose(turned.ijk_to_lps(places[:, [2, 0, 1]]), volume.ijk_to_lps(places))
+    labels = clrecon.split_vertebrae(turned, keep_unsure=True).labels.voxels.transpose(2, 0, 1)
+    same = labels == split("T12-L3").labels.voxels
+    assert same[split("T12-L3").labels.voxels > 0].mean() > 0.97
+
+
+def test_the_middle_plane_shows_scan_labels_and_discs() -> None:
+    plane = split("T12-L3").plane
+    assert plane.sagittal.shape == plane.sagittal_labels.shape and len(plane.coronal) == len(plane.sagittal)
+    assert set(np.unique(plane.coronal_labels)) == {0, 1, 2, 3, 4}
+    assert len(plane.lines) >= 3 and len(plane.rows) == 4 and sorted(plane.rows) == plane.rows
+    for number, row in enumerate(plane.rows, start=1):
+        assert plane.coronal_labels[int(row), plane.middle_column] == number
+        assert plane.sagittal_labels[int(row), plane.canal_column] == 0
+        assert abs(plane.sagittal[int(row), plane.canal_column]) < 130
+
+
+def test_progress_and_level() -> None:
+    volume, _, _ = phantom("T12-L3")
+    told: list[tuple[str, int, int]] = []
+    dense = clrecon.split_vertebrae(volume, level=260.0, keep_unsure=True, progress=lambda *step: told.append(step))
+    assert dense.level_hu == 260.0 and 120.0 <= split("T12-L3").level_hu <= 226.0
+    ml = [sum(one.volume_ml for one in result.vertebrae) for result in (dense, split("T12-L3"))]
+    assert ml[0] < ml[1]
+    assert [stage for stage, _, _ in told][-1] == "vertebrae" and told[-1][1] == told[-1][2]
