@@ -61,6 +61,12 @@ class Edges:
         """Number of faces at each edge, shape (count,)."""
         return np.diff(self.first, append=len(self.half_edges))
 
+    def border(self, vertex_count: int) -> NDArray[np.bool_]:
+        """Mark the vertices at edges with one face, shape (vertex_count,)."""
+        found = np.zeros(vertex_count, dtype=bool)
+        found[self.ends[:, self.uses == 1].reshape(-1)] = True
+        return found
+
 
 def _index_type(size: int) -> type[np.integer]:
     return np.int32 if size < 2**31 else np.int64

@@ -8,46 +8,25 @@ from numpy.typing import NDArray
 from clrecon.exchange.coordinates import as_stored, find_coincident
 from clrecon.mesh.connectivity import Edges, find_edges, label_components
 from clrecon.mesh.intersections import find_beside, find_self_intersections
+from clrecon.mesh.refine.collapses import Collapses, Quadrics, last_of_collapses
 from clrecon.mesh.refine.deviation import WITNESSES, Deviation
 from clrecon.mesh.refine.faults import any_corner, find_faults_beside, find_sheets, find_torn
 from clrecon.mesh.refine.topology import TopologyChange, compare_topology, measure_topology
 from clrecon.mesh.triangles import cross_products
+from clrecon.system.pieces import side_by_side
 
-__all__ = ["Clusters", "last_of_collapses"]
+__all__ = ["Clusters"]
 
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]
-
-
-def last_of_collapses(collapses: NDArray[np.integer], count: int) -> NDArray[np.int64]:
-    """Return for each vertex the one that it was merged into in the end.
-
-    Parameters
-    ----------
-    collapses : ndarray, shape (c, 2), int
-        In each, the second vertex is merged into the first.
-    count : int
-        Number of vertices.
-
-    Returns
-    -------
-    ndarray, shape (count,), int64
-    """
-    into = np.arange(count)
-    into[collapses[:, 1]] = collapses[:, 0]
-    while True:
-        further = into[into]
-        if np.array_equal(further, into):
-            return into
-        into = further
 
 
 class Clusters:
     """A mesh with merged vertices: its surface is the given one with vertices renamed.
 
     Every edge collapse renames one vertex to another and drops the triangles that have both.  The result of many
-    collapses is a name for each vertex and a place for each name.  Collapses come in rounds; a cluster is undone by
-    giving its vertices the names and places that they had before the last round.
+    collapses is a name for each vertex and a place for each name.  The collapses are kept in their order: a cluster is
+    undone from the last one on, and what it comes apart into gets places of its own.
 
     Parameters
     ----------
@@ -59,20 +38,23 @@ class Clusters:
 
     def __init__(self, vertices: Float64Array, triangles: NDArray[np.uint32], origin: Float64Array):
         self._triangles, self._origin = triangles, origin
-        self._names, self._places = np.arange(len(vertices)), self._rounded(vertices)
-        self._before = self._names, self._places
+        self._names, self._original = np.arange(len(vertices)), self._rounded(vertices)
+        self._places = self._original.copy()
+        self._collapses = Collapses(len(vertices))
         self._named, self._is_face = triangles.copy(), _are_faces(triangles)
         self._faces: NDArray[np.uint32] | None = None
-        edges = find_edges(triangles, len(vertices))
+        self._quadrics, edges = side_by_side(
+            lambda: Quadrics(self._original, triangles), lambda: find_edges(triangles, len(vertices))
+        )
         self._components = label_components(triangles, len(vertices), edges)
         self._topology = measure_topology(triangles, self._components[1], self._components[0], edges)
+        self._is_border = edges.border(len(vertices))
         # For each original triangle, faces that show that it lies within the bound (witnesses); -1 where none is known.
         itself = np.where(self._is_face, np.arange(len(triangles), dtype=np.int32), np.int32(-1))
         self._witnesses = np.repeat(itself[None], WITNESSES, axis=0)
-        self._witnesses_before = self._witnesses
-        # Vertices whose name or place has changed since the surface was last examined for cuts and for distances.
-        self._new_to_cuts, self._new_to_distances, self._new_to_faults = (
-            np.zeros(len(vertices), dtype=bool) for _ in range(3)
+        # Vertices whose name or place has changed since the surface was last examined.
+        self._new_to_cuts, self._new_to_distances, self._new_to_faults, self._new_to_vertices = (
+            np.zeros(len(vertices), dtype=bool) for _ in range(4)
         )
         # Whether all of the surface has been examined for faults since the last collapses, and whether none were there.
         self._examined = self._sound = False
@@ -110,13 +92,13 @@ class Clusters:
             raise RuntimeError("the collapses that fast-simplification lists do not lead to its result")
         # A vertex that none was merged into keeps its place.
         gained = np.bincount(rename, minlength=len(names))[going_on] > 1
-        places[going_on[gained]] = self._rounded(points[gained])
-        self._before, self._witnesses_before = (self._names, self._places), self._witnesses.copy()
+        moved = going_on[gained]
+        places[moved] = self._rounded(points[gained])
+        self._collapses.add(standing[collapses])
         self._names, self._places = names, places
         self._named, self._is_face, self._faces = named, is_face, left
-        new = self._has_moved()
-        for fresh in (self._new_to_cuts, self._new_to_distances):
-            fresh[names[new]] = True
+        for fresh in (self._new_to_cuts, self._new_to_distances, self._new_to_vertices):
+            fresh[moved] = True
         self._examined = self._sound = False
 
     @property
@@ -154,30 +136,51 @@ class Clusters:
         return self._places[standing], number[faces]
 
     def undo(self, names: IntArray) -> int:
-        """Undo these clusters; return the number of vertices that moved or reappeared."""
+        """Undo the last collapses of these clusters; return the number of vertices in those that had collapses."""
         if len(names) == 0:
             return 0
         marked = np.zeros(len(self._names), dtype=bool)
         marked[names] = True
-        moved = marked[self._names] & self._has_moved()
-        names_before, places_before = self._before
-        self._names[moved] = names_before[moved]
-        back = self._names[moved]
-        self._places[back] = places_before[back]
-        for fresh in (self._new_to_cuts, self._new_to_distances, self._new_to_faults):
+        undone, left = self._collapses.undo(marked, self._names)
+        moved = undone[self._names]
+        members = np.flatnonzero(moved)
+        if len(members) == 0:
+            return 0
+        into = np.arange(len(self._names))
+        into[left[:, 1]] = left[:, 0]
+        while True:
+            back = into[members]
+            further = into[back]
+            if np.array_equal(further, back):
+                break
+            into[members] = further
+        self._names[members] = back
+        self._place(members)
+        for fresh in (self._new_to_cuts, self._new_to_distances, self._new_to_faults, self._new_to_vertices):
             fresh[back] = True
         rows = np.flatnonzero(any_corner(moved, self._triangles))
-        if len(rows):
-            self._named[rows] = self._names[self._triangles[rows]]
-            self._is_face[rows] = _are_faces(self._named[rows])
-            self._faces = None
-        return int(np.count_nonzero(moved))
+        self._named[rows] = self._names[self._triangles[rows]]
+        self._is_face[rows] = _are_faces(self._named[rows])
+        self._faces = None
+        return len(members)
+
+    def _place(self, members: IntArray) -> None:
+        """Place the clusters of these vertices, which are all of theirs."""
+        names = self._names[members]
+        size = np.bincount(names, minlength=len(self._names))
+        # The border of an open surface has no planes that would hold it.
+        alone = (size == 1) | self._is_border
+        at_home = names[alone[names]]
+        self._places[at_home] = self._original[at_home]
+        merged = members[~alone[names]]
+        heads, clusters = np.unique(self._names[merged], return_inverse=True)
+        if len(heads):
+            self._places[heads] = self._rounded(self._quadrics.best_places(clusters, merged, len(heads)))
 
     def _has_moved(self) -> NDArray[np.bool_]:
-        """Mark vertices whose name, or the place of it, changed in the last round."""
-        names_before, places_before = self._before
-        x, y, z = (self._places != places_before).T
-        return np.asarray((self._names != names_before) | (x | y | z)[self._names])
+        """Mark vertices that have another name than at first, or a name with another place."""
+        x, y, z = (self._places != self._original).T
+        return np.asarray((self._names != np.arange(len(self._names))) | (x | y | z)[self._names])
 
     def find_faults(self, everywhere: bool = False) -> IntArray:
         """Find the names of clusters that have spoilt the surface.
@@ -219,6 +222,10 @@ class Clusters:
             return np.zeros(0, dtype=np.int64)
         return find_torn(self._triangles[differ[labels[self._triangles[:, 0]]]], self._names)
 
+    def components(self) -> tuple[int, NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the number of components of the given surface, the one of each vertex, and its vertices at borders."""
+        return *self._components, self._is_border
+
     def compare_topology(self) -> TopologyChange:
         """Compare the topology of the present surface with that of the given one."""
         count, labels = self._components
@@ -256,7 +263,7 @@ class Clusters:
     def find_crossing(self) -> IntArray:
         """Find names of clusters at faces that cut each other after coordinates are rounded.
 
-        Only faces that changed since the last call, and differ from those before the round, are examined with their
+        Only faces that changed since the last call, and differ from those at first, are examined with their
         surroundings.
         """
         faces = self.faces()
@@ -272,8 +279,8 @@ class Clusters:
     def find_far(self, deviation: Deviation) -> IntArray:
         """Find names of clusters where either surface is too far from the other.
 
-        Only faces that changed since the last call and since before the round are examined: where a change is undone,
-        the surface is again within the bound.
+        Only faces that changed since the last call are examined.  Of the corners of a triangle that is too far away,
+        the one with the last collapse is named: collapses come in order of their error.
 
         Parameters
         ----------
@@ -285,26 +292,45 @@ class Clusters:
         named, is_face = self._named, self._is_face
         new = any_corner(self._new_to_distances, named)
         self._new_to_distances[:] = False
-        differs = any_corner(self._has_moved(), self._triangles)
+        has_moved = self._has_moved()
 
-        changed = _any_witness(new, self._witnesses)
-        as_before = changed & ~_any_witness(differs, self._witnesses_before)
-        self._witnesses[:, as_before] = self._witnesses_before[:, as_before]
-        rows = np.flatnonzero(changed & ~as_before)
+        rows = np.flatnonzero(_any_witness(new, self._witnesses))
         self._witnesses[:, rows] = rows
+        rows = rows[any_corner(has_moved, self._triangles[rows])]
         rows = rows[deviation.can_be_far(rows, self._names, self._places)]
-        is_left_behind, seen = deviation.is_far_from(rows, self._names, self._places, self.faces())
+        from_rows = np.flatnonzero(is_face & new)
+        from_rows = from_rows[any_corner(has_moved, self._triangles[from_rows])]
+        now, faces = named[from_rows], self.faces()
+        (is_left_behind, seen), is_away = side_by_side(
+            lambda: deviation.is_far_from(rows, self._names, self._places, faces),
+            lambda: deviation.are_far(self._places, now, from_rows),
+        )
         self._witnesses[:, rows] = np.append(np.flatnonzero(is_face), -1)[seen]
+        return self._pick(np.concatenate([named[rows[is_left_behind]], now[is_away]]))
 
-        from_rows = np.flatnonzero(is_face & new & differs)
-        now = named[from_rows]
-        away = now[deviation.are_far(self._places, now, from_rows)]
-        # A triangle that is again as before the round is within the bound again when its former neighbours are back
-        # too.
-        left_behind = rows[is_left_behind]
-        left_alone = self._witnesses_before[:, left_behind[~differs[left_behind]]]
-        found = named[left_behind], away, named[left_alone[left_alone >= 0]]
-        return np.unique(np.concatenate([names.reshape(-1) for names in found]))
+    def _pick(self, named: NDArray[np.uint32]) -> IntArray:
+        """Return the names with the last collapses in each row of names, shape (k, v)."""
+        if len(named) == 0:
+            return np.zeros(0, dtype=np.int64)
+        last = self._collapses.latest(self._names)[named].argmax(axis=1)
+        return np.unique(named[np.arange(len(named)), last])
+
+    def find_left_behind(self, deviation: Deviation) -> IntArray:
+        """Find names of clusters with vertices that are too far from the surface around the name.
+
+        Only vertices with changed faces around their name are examined, and no triangles: `find_far` is exact.
+
+        Parameters
+        ----------
+        deviation
+            As in `find_far`.
+        """
+        faces = self.faces()
+        beside = np.zeros(len(self._names), dtype=bool)
+        beside[faces[any_corner(self._new_to_vertices, faces)]] = True
+        self._new_to_vertices[:] = False
+        rows = np.flatnonzero(beside[self._names] & self._has_moved())
+        return np.unique(self._names[rows[deviation.are_left_behind(rows, self._names, self._places, faces)]])
 
 
 def _are_faces(named: IntArray) -> NDArray[np.bool_]:

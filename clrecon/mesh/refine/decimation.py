@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -35,17 +36,23 @@ _AGGRESSIVENESS = 3.0
 """How fast fast-simplification lets its error grow.  With the bound, 2 to 7 give the same surface, and 3 is fastest."""
 
 _LAST_ITERATION = 99
-_ERROR_OVER_BOUND = 4.0
-"""Largest quadric error of a round, in squares of the bound.  The error sums the squared distances to dozens of planes
-that meet in a vertex.  With 16 as many triangles disappear in the end, but three times as many collapses must be
-undone."""
+_FIRST_ERROR = 256.0
+"""Largest quadric error of the first round, in squares of the bound.  The error sums the squared distances to dozens of
+planes that meet in a vertex.  The last collapses are undone where they went too far: what matters is their order."""
+
+_ERROR = 4.0
+"""The same for later rounds, which start from a surface that is nearly as it can be.  With 2 or 16 more is left."""
+
+_ROUGH_TURNS = 3
+"""Repairs after the first round: faults and vertices only, as the next round changes nearly all of the surface."""
 
 _TRIES = 200
-"""Most attempts to repair a round; each undoes some clusters, and CT needs 3 to 8."""
+"""Most attempts to repair a round; each undoes some collapses, and CT needs 30 to 50."""
 
 _ROUNDS = 12
 _LEAST_GAIN = 0.15
-"""Rounds of collapses continue while each removes more than this share of the triangles."""
+"""Rounds of collapses continue while each removes more than this share of the triangles.  Where less than it would do,
+there is one more: it costs little, as little changes."""
 
 _SHARE_SLACK = 0.005
 """The wanted number of triangles counts as reached when it is exceeded by this share or less."""
@@ -111,11 +118,11 @@ def decimate_mesh(
 ) -> Mesh:
     """Remove triangles by collapsing edges in order of their quadric error (Garland and Heckbert 1997).
 
-    fast-simplification chooses the collapses and stops where the error reaches the bound.  Collapses are then undone
-    where the result exceeds the bound, is not manifold, has faces without area, cuts itself, or has lost a component or
-    a tunnel.  So a closed and manifold surface stays closed and manifold, keeps all its components and, as far as a
-    collapse of the last round is the cause, their Euler numbers.  Further rounds follow until the share is reached or
-    hardly any more triangles can be removed within the bound.
+    fast-simplification chooses the collapses and stops where the error reaches the bound.  The last collapses are
+    then undone where the result exceeds the bound, is not manifold, has faces without area, cuts itself, or has lost a
+    component or a tunnel.  So a closed and manifold surface stays closed and manifold, keeps all its components and, as
+    far as a collapse is the cause, their Euler numbers.  Further rounds follow until the share is reached or hardly any
+    more triangles can be removed within the bound.
 
     Parameters
     ----------
@@ -150,30 +157,18 @@ def decimate_mesh(
     longest = max(_SHARE_FOR_VOLUME * bound - rounding_step(mesh.vertices), 0.0)
     deviation = Deviation(mesh.vertices - origin, mesh.triangles, (1.0 - _SHARE_FOR_VOLUME) * bound)
     wanted = (1.0 - fraction) * mesh.triangle_count
-    nearly = wanted * (1.0 + _SHARE_SLACK) + 2
-    left, rounds, taken_back = mesh.triangle_count, 0, 0
 
-    def tell() -> None:
+    def tell(left: int) -> None:
         if progress is not None:
             to_go = math.ceil(mesh.triangle_count - wanted)
             progress("decimate", min(mesh.triangle_count - left, to_go), to_go)
 
-    while left > nearly and rounds < _ROUNDS:
-        tell()
-        _collapse(clusters, wanted / left, bound)
-        collapsed = clusters.collapsed_count
-        _mend(clusters, deviation, tell)
-        taken_back += collapsed - clusters.collapsed_count
-        rounds += 1
-        before, left = left, len(clusters.faces())
-        if left > (1.0 - _LEAST_GAIN) * before:
-            break
-    tell()
+    rounds, taken_back = _collapse_in_rounds(clusters, deviation, wanted, bound, tell)
     vertices, triangles = _with_volumes(clusters, mesh, origin, longest)
     said = {
         "fraction": fraction,
         "reached": 1.0 - len(triangles) / mesh.triangle_count,
-        "ended_by": "share" if left <= nearly else "bound",
+        "ended_by": "share" if len(triangles) <= _nearly(wanted) else "bound",
         "rounds": rounds,
         "max_deviation_mm": bound,
         "triangles_before": mesh.triangle_count,
@@ -183,19 +178,59 @@ def decimate_mesh(
     return Mesh(vertices, triangles, vertex_normals(vertices, triangles), carry_on(mesh, "decimate", said))
 
 
+def _nearly(wanted: float) -> float:
+    """Return the largest number of triangles that counts as the wanted one."""
+    return wanted * (1.0 + _SHARE_SLACK) + 2
+
+
+def _collapse_in_rounds(
+    clusters: Clusters, deviation: Deviation, wanted: float, bound: float, tell: Callable[[int], None]
+) -> tuple[int, int]:
+    """Collapse edges and repair until few triangles are left, or hardly any more can be removed.
+
+    Returns
+    -------
+    rounds : int
+    taken_back : int
+        Number of collapses that were undone.
+    """
+    left, rounds, taken_back, is_last = len(clusters.faces()), 0, 0, False
+    while left > _nearly(wanted) and rounds < _ROUNDS:
+        tell(left)
+        if rounds == 0:
+            _collapse(clusters, wanted / left, bound, _FIRST_ERROR)
+            collapsed = clusters.collapsed_count
+            _mend_roughly(clusters, deviation)
+            taken_back += collapsed - clusters.collapsed_count
+            left, rounds = len(clusters.faces()), 1
+        if left > wanted:
+            _collapse(clusters, wanted / left, bound)
+            rounds += 1
+        collapsed, before = clusters.collapsed_count, left
+        _mend(clusters, deviation, partial(tell, left))
+        taken_back += collapsed - clusters.collapsed_count
+        left = len(clusters.faces())
+        is_near = wanted >= (1.0 - _LEAST_GAIN) * left
+        if left > (1.0 - _LEAST_GAIN) * before and (is_last or not is_near):
+            break
+        is_last = is_near
+    tell(left)
+    return rounds, taken_back
+
+
 def _with_volumes(
     clusters: Clusters, mesh: Mesh, origin: NDArray[np.float64], longest: float
 ) -> tuple[NDArray[np.floating], NDArray[np.uint32]]:
     """Return the surface of clusters as it is stored, each closed component with its original volume."""
     places, triangles = clusters.surface()
-    wanted = measure_volumes(mesh.vertices - origin, mesh.triangles)
+    wanted = measure_volumes(mesh.vertices - origin, mesh.triangles, *clusters.components())
     step = np.zeros_like(places)
     restore_volumes(places, step, triangles, wanted.labels[clusters.standing()], wanted, longest)
     return move_vertices(as_stored(places + origin), triangles, step)[0], triangles
 
 
 def _mend(clusters: Clusters, deviation: Deviation, tell: Callable[[], None] = lambda: None) -> None:
-    """Undo clusters until the surface is sound and within the bound; cheap checks with large effect come first."""
+    """Undo collapses until the surface is sound and within the bound; cheap checks with large effect come first."""
     for _ in range(_TRIES):
         tell()
         if clusters.undo(clusters.find_faults()):
@@ -208,14 +243,25 @@ def _mend(clusters: Clusters, deviation: Deviation, tell: Callable[[], None] = l
             break
 
 
-def _collapse(clusters: Clusters, left_share: float, bound: float) -> None:
-    """Make one round of fast-simplification on the present surface, leaving `left_share` of its triangles."""
+def _mend_roughly(clusters: Clusters, deviation: Deviation) -> None:
+    """Undo collapses where there are faults or vertices beyond the bound; the rest is left to the next round."""
+    for _ in range(_ROUGH_TURNS):
+        clusters.undo(clusters.find_faults())
+        if not clusters.undo(clusters.find_left_behind(deviation)):
+            break
+
+
+def _collapse(clusters: Clusters, left_share: float, bound: float, error: float = _ERROR) -> None:
+    """Make one round of fast-simplification on the present surface.
+
+    It leaves `left_share` of the triangles, or more where the quadric error reaches `error` squares of the bound.
+    """
     from fast_simplification import simplify
 
     # In iteration i it collapses edges of an error up to 1e-9 * (i + 3)**agg.  Coordinates are scaled so that the last
     # iteration reaches the bound's error.
     largest_error = 1e-9 * (_LAST_ITERATION + 3) ** _AGGRESSIVENESS
-    scale = math.sqrt(largest_error / _ERROR_OVER_BOUND) / bound
+    scale = math.sqrt(largest_error / error) / bound
     vertices, triangles = clusters.surface()
     points, faces, collapses = simplify(
         vertices * scale,

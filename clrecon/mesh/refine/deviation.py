@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +26,9 @@ _PIECE = 1 << 13
 
 _NEAREST = 6
 """Most vertices near a point around which the original surface is looked for by upper bounds."""
+
+_WALKS = 2
+"""Steps from triangle to triangle towards a point before the nearest vertex is looked for in the tree."""
 
 _MIDDLES = np.array([[1, 1, 1], [1, 1, 0], [0, 1, 1], [1, 0, 1]]) / [[3], [2], [2], [2]]
 """Barycentric coordinates of the middle of a triangle and of its edges."""
@@ -49,7 +54,10 @@ class Deviation:
         from scipy.spatial import cKDTree
 
         self._vertices, self._triangles, self._bound = vertices, triangles, bound
-        self._tree = cKDTree(vertices, balanced_tree=False, compact_nodes=False)
+        # scipy builds the tree without Python's lock: this goes on while the first edges are collapsed.
+        pool = ThreadPoolExecutor(1)
+        self._tree = pool.submit(cKDTree, vertices, balanced_tree=False, compact_nodes=False)
+        pool.shutdown(wait=False)
         self._columns = np.ascontiguousarray(vertices.T, dtype=np.float32)
         self._distance = NearDistance(vertices, triangles)
         self._exact: SurfaceDistance | None = None
@@ -73,10 +81,13 @@ class Deviation:
         triangles = self._triangles[rows]
         a, b, c = names[triangles].T
         changed = (a == b) | (b == c) | (c == a)
-        step = places[names] - self._vertices
-        has_moved = np.einsum("na,na->n", step, step) > self._bound * self._bound
-        one, two, three = triangles.T
-        return np.asarray(changed | has_moved[one] | has_moved[two] | has_moved[three])
+        used = np.zeros(len(names), dtype=bool)
+        used[triangles] = True
+        used = np.flatnonzero(used)
+        step = places[names[used]] - self._vertices[used]
+        has_moved = np.zeros(len(names), dtype=bool)
+        has_moved[used] = np.einsum("na,na->n", step, step) > self._bound * self._bound
+        return changed | any_corner(has_moved, triangles)
 
     def is_far_from(
         self, rows: IntArray, names: IntArray, places: Float64Array, faces: NDArray[np.uint32]
@@ -105,8 +116,8 @@ class Deviation:
             Rows of `faces` that show that a triangle is within the bound; it is so as long as these faces stay.  -1
             where it is not.
         """
-        now = NearDistance(places, faces)
         triangles = self._triangles[rows]
+        around, now = _surface_around(np.unique(names[triangles]), places, faces)
         used = np.zeros(len(names), dtype=bool)
         used[triangles] = True
         used = np.flatnonzero(used)
@@ -135,8 +146,29 @@ class Deviation:
             length, row = now.find_around(points, names[triangles[of]])
             witnesses[3 + middle, of] = row
             far[of[length > self._bound]] = True
-        witnesses[:, far] = -1
-        return far, witnesses
+        found = around[witnesses]
+        found[:, far] = -1
+        return far, found
+
+    def are_left_behind(
+        self, vertices: IntArray, names: IntArray, places: Float64Array, faces: NDArray[np.uint32]
+    ) -> NDArray[np.bool_]:
+        """Mark vertices of the original surface for which no upper bound shows that they lie within the bound.
+
+        Parameters
+        ----------
+        vertices : ndarray, shape (k,), int
+            Vertices to examine.
+        names, places, faces : ndarray
+            As in `is_far_from`.
+
+        Returns
+        -------
+        ndarray, shape (k,), bool
+        """
+        _, now = _surface_around(np.unique(names[vertices]), places, faces)
+        length, _ = now.find_surely_within(self._vertices[vertices], names[vertices], self._bound)
+        return np.asarray(length > self._bound)
 
     def _leave_middles(
         self, now: NearDistance, corners: Corners, near: IntArray, rest: IntArray, names: IntArray, witnesses: IntArray
@@ -255,25 +287,38 @@ class Deviation:
             far[these] = self._find_far(points, hints).reshape(len(weights), len(these)).any(axis=0)
         return far
 
+    def _nearest_corner(self, columns: NDArray[np.float32], rows: IntArray) -> IntArray:
+        """Return the nearest corner of a triangle of the original surface for each point, shape (3, k)."""
+        corners = self._triangles[rows]
+        squares = np.empty((len(rows), 3), dtype=np.float32)
+        for number, corner in enumerate(corners.T):
+            away = columns - self._columns.take(corner, axis=1)
+            squares[:, number] = np.einsum("ak,ak->k", away, away)
+        return np.asarray(corners[np.arange(len(rows)), squares.argmin(axis=1)].astype(np.int64))
+
     def _find_far(self, points: Float64Array, hints: IntArray) -> NDArray[np.bool_]:
         """Mark points that are farther than the bound from the original surface.
 
-        Around vertices that may be near them, shape (k, v), it is looked for first, then around the nearest ones; what
-        upper bounds do not decide is measured.
+        Around vertices that may be near them, shape (k, v), it is looked for first, then around the nearest corner of
+        the nearest triangle there, and around the nearest vertices; what upper bounds do not decide is measured.
         """
-        is_left = np.zeros(len(points), dtype=bool)
+        is_left, tree = np.zeros(len(points), dtype=bool), self._tree.result()
         self._distance.prepare()
 
         def work(where: slice) -> None:
             columns = points[where].T.astype(np.float32)
             rest = np.arange(columns.shape[1])
             for near in hints[where].T:
-                rest = rest[~(self._distance.upper_bounds(columns[:, rest], near[rest])[0] <= self._bound)]
-            near = self._tree.query(points[where][rest])[1]
+                length, row = self._distance.upper_bounds(columns[:, rest], near[rest])
+                rest, row = rest[~(length <= self._bound)], row[~(length <= self._bound)]
+            for _ in range(_WALKS):
+                length, row = self._distance.upper_bounds(columns[:, rest], self._nearest_corner(columns[:, rest], row))
+                rest, row = rest[~(length <= self._bound)], row[~(length <= self._bound)]
+            near = tree.query(points[where][rest])[1]
             rest = rest[~(self._distance.upper_bounds(columns[:, rest], near)[0] <= self._bound)]
             for turn in range(1, _NEAREST if len(rest) else 0):
                 if turn == 1:
-                    several = self._tree.query(points[where][rest], k=_NEAREST)[1]
+                    several = tree.query(points[where][rest], k=_NEAREST)[1]
                 near = np.minimum(several[:, turn], len(self._vertices) - 1)  # as many as there are
                 within = self._distance.upper_bounds(columns[:, rest], near)[0] <= self._bound
                 rest, several = rest[~within], several[~within]
@@ -285,6 +330,14 @@ class Deviation:
             self._exact = self._exact or SurfaceDistance(self._vertices, self._triangles)
             is_left[left] = self._exact(points[left]) > self._bound
         return is_left
+
+
+def _surface_around(names: IntArray, places: Float64Array, faces: NDArray[np.uint32]) -> tuple[IntArray, NearDistance]:
+    """Return the rows of the faces around these vertices, int32, and distances to these faces."""
+    is_near = np.zeros(len(places), dtype=bool)
+    is_near[names] = True
+    rows = np.flatnonzero(any_corner(is_near, faces)).astype(np.int32)
+    return rows, NearDistance(places, faces[rows])
 
 
 def _inner_weights(steps: int, corners: int) -> Float64Array:

@@ -18,7 +18,7 @@ from clrecon.mesh.compare.near_distances import NearDistance
 from clrecon.mesh.connectivity import find_edges, label_components
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
-from clrecon.mesh.refine.clusters import last_of_collapses
+from clrecon.mesh.refine.collapses import last_of_collapses
 from clrecon.mesh.refine.decimation import carry_on, check_share, check_triangles
 from clrecon.mesh.refine.topology import TopologyChange, compare_topology, measure_topology
 from clrecon.system.gates import Gate, none_of

@@ -48,12 +48,28 @@ class Volumes:
     is_open: NDArray[np.bool_]
 
 
-def measure_volumes(vertices: Float64Array, triangles: NDArray[np.uint32]) -> Volumes:
-    """Measure the components of a surface; `vertices` have shape (n, 3), in mm from a point near them."""
-    edges = find_edges(triangles, len(vertices))
-    count, labels = label_components(triangles, len(vertices), edges)
+def measure_volumes(
+    vertices: Float64Array,
+    triangles: NDArray[np.uint32],
+    count: int | None = None,
+    labels: NDArray[np.int64] | None = None,
+    border: NDArray[np.bool_] | None = None,
+) -> Volumes:
+    """Measure the components of a surface.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (n, 3), float64, mm from a point near them
+    triangles : ndarray, shape (m, 3), uint32
+    count, labels, border : int, ndarray, shape (n,), int64, and ndarray, shape (n,), bool, optional
+        Number of components, component of each vertex, and vertices at edges of one triangle, if they are known.
+    """
+    if count is None or labels is None or border is None:
+        edges = find_edges(triangles, len(vertices))
+        count, labels = label_components(triangles, len(vertices), edges)
+        border = edges.border(len(vertices))
     is_open = np.zeros(count, dtype=bool)
-    is_open[labels[edges.ends[:, edges.uses == 1].reshape(-1)]] = True
+    is_open[labels[border]] = True
     return Volumes(labels, _volumes(vertices, triangles, labels, count)[0], is_open)
 
 

@@ -16,6 +16,7 @@ from clrecon.mesh import Mesh, split_components
 from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.intersections import count_self_intersections
 from clrecon.mesh.refine.clusters import Clusters
+from clrecon.mesh.refine.collapses import Quadrics
 from clrecon.mesh.refine.decimation import _collapse, _mend, check_refinement, decimate_mesh
 from clrecon.mesh.refine.deviation import Deviation
 from clrecon.mesh.refine.smoothing import smooth_mesh
@@ -169,7 +170,7 @@ def test_collapses_that_do_not_lead_to_the_result_are_found():
         clusters.collapse(triangles[:1, :2], vertices, triangles)
 
 
-def test_clusters_are_undone_as_a_whole_and_by_rounds():
+def test_clusters_are_undone_from_the_last_collapse_on():
     vertices, triangles = samples.sphere(rounds=1)
     a, b, c = (int(corner) for corner in triangles[0])
     faces = triangles.astype(np.uint32)
@@ -192,9 +193,52 @@ def test_clusters_are_undone_as_a_whole_and_by_rounds():
     clusters.collapse(np.array([[one, other]]), *after([b, c]))
     assert (clusters.collapsed_count, len(clusters.faces())) == (2, len(triangles) - 4)
     assert clusters.undo(np.array([c])) == 0  # it stands for nothing any more
-    assert clusters.undo(np.array([a])) == 1  # only what the last round has moved: c
+    assert clusters.undo(np.array([a])) == 3  # all of the cluster gets new names and places
     assert (clusters.collapsed_count, len(clusters.faces())) == (1, len(triangles) - 2)
-    np.testing.assert_allclose(clusters.places[a], places[a], atol=1e-6)
+    assert clusters.names[[a, b, c]].tolist() == [a, a, c]
+    best = Quadrics(vertices, faces).best_places(np.zeros(2, int), np.array([a, b]), 1)[0]
+    np.testing.assert_allclose(clusters.places[a], best, atol=1e-5)
+    np.testing.assert_allclose(clusters.places[c], vertices[c], atol=1e-6)
+    assert clusters.undo(np.array([a])) == 2
+    np.testing.assert_array_equal(clusters.faces(), faces)
+    np.testing.assert_allclose(clusters.places, vertices, atol=1e-6)
+    assert clusters.undo(np.array([a])) == 0
+
+
+def test_the_cluster_of_a_vertex_that_is_left_behind_is_found_once():
+    """A corner of a box goes into its neighbour; what has not changed since is not looked at again."""
+    vertices, triangles = samples.box()
+    faces = triangles.astype(np.uint32)
+    one, other = (int(corner) for corner in triangles[0, :2])
+    names = np.where(np.arange(8) == other, one, np.arange(8))
+    left = names[triangles]
+    left = left[(left != left[:, (1, 2, 0)]).all(axis=1)]
+    standing = np.unique(left)
+    found = []
+    for bound in (0.1, 9.0):
+        clusters, deviation = Clusters(vertices, faces, np.zeros(3)), Deviation(vertices, faces, bound)
+        assert clusters.find_left_behind(deviation).tolist() == []
+        clusters.collapse(np.array([[one, other]]), vertices[standing], np.searchsorted(standing, left))
+        found += [clusters.find_left_behind(deviation).tolist(), clusters.find_left_behind(deviation).tolist()]
+    assert found == [[one], [], [], []]
+
+
+def test_what_is_left_of_a_cluster_at_a_border_stays_there():
+    """Two vertices of the border of a sheet that is bent, and one collapse of the two undone."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(4), np.arange(3)))
+    vertices = np.column_stack([x, y, 0.25 * y**2]).astype(float)
+    corner = (x + 4 * y)[(x < 3) & (y < 2)]
+    lower, upper = (np.column_stack([corner, corner + one, corner + other]) for one, other in ((1, 5), (5, 4)))
+    faces = np.concatenate([lower, upper]).astype(np.uint32)
+    clusters = Clusters(vertices, faces, np.zeros(3))
+    names = np.array([0, 1, 1, 1, 4, 5, 6, 7, 8, 9, 10, 11])
+    left = names[faces]
+    left = left[(left != left[:, (1, 2, 0)]).all(axis=1)]
+    standing = np.unique(left)
+    clusters.collapse(np.array([[1, 2], [1, 3]]), vertices[standing], np.searchsorted(standing, left))
+    clusters.undo(np.array([1]))
+    assert clusters.names[[1, 2, 3]].tolist() == [1, 1, 3]
+    np.testing.assert_array_equal(clusters.places[[1, 3]], vertices[[1, 3]])
 
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0, -0.1, 90.0, float("nan")])
@@ -213,7 +257,7 @@ def test_the_public_names():
 def test_rounds_end_where_one_takes_hardly_any_triangle():
     sphere = Mesh(*samples.sphere(rounds=1))
     said = decimate_mesh(sphere, 0.5, 1e-3).report["refinement"]["decimate"]
-    assert (said["rounds"], said["reached"], said["ended_by"], said["vertices_taken_back"]) == (1, 0.0, "bound", 0)
+    assert (said["rounds"], said["reached"], said["ended_by"], said["vertices_taken_back"]) == (2, 0.0, "bound", 0)
 
 
 def test_a_mesh_of_2_to_the_31_corners_is_too_large():

@@ -83,6 +83,17 @@ def test_points_between_the_middle_and_the_corners_are_tested():
     assert Deviation(flat, triangles, BOUND).are_far(flat, np.zeros((0, 3), np.uint32), np.zeros(0, int)).tolist() == []
 
 
+def test_vertices_are_left_behind_beyond_the_bound_from_the_faces_around_their_name():
+    vertices, triangles = samples.box()
+    deviation = Deviation(vertices, triangles.astype(np.uint32), BOUND)
+    top = vertices[:, 2] == 1.0
+    for down, is_far in ((BOUND - 1e-3, False), (BOUND + 1e-3, True)):
+        places = vertices - np.where(top, down, 0.0)[:, None] * [0.0, 0.0, 1.0]
+        some = np.flatnonzero(top)[:3]
+        found = deviation.are_left_behind(some, np.arange(8), places, triangles.astype(np.uint32))
+        assert found.tolist() == [is_far] * 3
+
+
 def test_one_flag_of_three_corners_is_enough():
     flags = np.array([False, True, False, False])
     triangles = np.array([[1, 0, 2], [0, 1, 2], [0, 2, 1], [0, 2, 3], [1, 1, 1]])

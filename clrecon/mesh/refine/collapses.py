@@ -1,0 +1,173 @@
+"""Collapses of edges in their order, the last of which can be undone, and the places of what is left of a cluster."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.mesh.connectivity import order_by_number
+from clrecon.mesh.triangles import cross_product
+
+__all__ = ["Collapses", "Quadrics", "last_of_collapses"]
+
+Float64Array = NDArray[np.float64]
+IntArray = NDArray[np.integer]
+
+_PATIENCE = 3
+"""After so many turns of undoing a cluster, each turn undoes twice as many of its collapses as before."""
+
+_MOST_TURNS = 60
+
+_PULL = 1e-3
+"""Weight of the mean of the vertices, in sums of the planes: it decides where planes leave a direction open."""
+
+
+def last_of_collapses(collapses: NDArray[np.integer], count: int) -> NDArray[np.int64]:
+    """Return for each vertex the one that it was merged into in the end.
+
+    Parameters
+    ----------
+    collapses : ndarray, shape (c, 2), int
+        In each, the second vertex is merged into the first.
+    count : int
+        Number of vertices.
+
+    Returns
+    -------
+    ndarray, shape (count,), int64
+    """
+    into = np.arange(count)
+    into[collapses[:, 1]] = collapses[:, 0]
+    while True:
+        further = into[into]
+        if np.array_equal(further, into):
+            return into
+        into = further
+
+
+class Collapses:
+    """Collapses that stand, in the order in which they were made.
+
+    Every collapse joins two clusters, so those of a cluster form a tree: without the last of them it is two clusters
+    again, each as it was before.
+
+    Parameters
+    ----------
+    count : int
+        Number of vertices.
+    """
+
+    def __init__(self, count: int):
+        self._pairs = np.zeros((0, 2), dtype=np.int64)
+        self._turns = np.zeros(count, dtype=np.int8)
+
+    def add(self, pairs: IntArray) -> None:
+        """Append collapses, shape (c, 2): in each, the second vertex is merged into the first."""
+        self._pairs = np.concatenate([self._pairs, pairs])
+        self._turns[:] = 0
+
+    def latest(self, names: IntArray) -> IntArray:
+        """Return for each cluster the number of its last collapse, shape (n,); -1 where there is none.
+
+        Parameters
+        ----------
+        names : ndarray, shape (n,), int
+            Cluster of each vertex.
+        """
+        found = np.full(len(names), -1)
+        found[names[self._pairs[:, 0]]] = np.arange(len(self._pairs))  # the last of equals stays
+        return found
+
+    def undo(self, marked: NDArray[np.bool_], names: IntArray) -> tuple[NDArray[np.bool_], IntArray]:
+        """Undo the last collapses of clusters: one of each, and more where a cluster of this round is undone often.
+
+        Parameters
+        ----------
+        marked : ndarray, shape (n,), bool
+            Clusters by their names.
+        names : ndarray, shape (n,), int
+            Cluster of each vertex.
+
+        Returns
+        -------
+        undone : ndarray, shape (n,), bool
+            Clusters that had collapses.
+        left : ndarray, shape (k, 2), int
+            Collapses of these clusters that stay.
+        """
+        undone = np.zeros(len(marked), dtype=bool)
+        rows = np.flatnonzero(marked[names[self._pairs[:, 0]]])
+        if len(rows) == 0:
+            return undone, self._pairs[:0]
+        name = names[self._pairs[rows, 0]]
+        order = order_by_number(name, len(names))
+        rows, name = rows[order], name[order]
+        first = np.flatnonzero(np.append(True, name[1:] != name[:-1]))
+        count = np.diff(np.append(first, len(name)))
+        back = np.repeat(first + count, count) - np.arange(len(name))  # the last has 1
+        heads = name[first]
+        undone[heads] = True
+        gone = back <= np.repeat(1 << self._turns[heads].astype(np.int64) // _PATIENCE, count)
+        # What comes apart takes over how often it was undone.
+        turns = np.minimum(self._turns[heads] + 1, _MOST_TURNS)
+        self._turns[heads] = turns
+        self._turns[self._pairs[rows[gone], 1]] = np.repeat(turns, count)[gone]
+        left = self._pairs[np.sort(rows[~gone])]
+        self._pairs = np.delete(self._pairs, rows[gone], axis=0)
+        return undone, left
+
+
+class Quadrics:
+    """Squared distances to the planes of the triangles around each vertex (Garland and Heckbert 1997).
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (n, 3), float64, mm, near zero
+    triangles : ndarray, shape (m, 3), uint32
+    """
+
+    def __init__(self, vertices: Float64Array, triangles: NDArray[np.uint32]):
+        from scipy.sparse import csr_array
+
+        columns = np.ascontiguousarray(vertices.T)
+        one, two, three = (columns.take(corner, axis=1) for corner in triangles.T.astype(np.intp))
+        two -= one
+        three -= one
+        normal = cross_product(two, three)
+        length = np.sqrt(np.einsum("ij,ij->j", normal, normal))
+        normal /= np.where(length > 0.0, length, 1.0)
+        x, y, z = normal
+        along = np.einsum("ij,ij->j", normal, one)
+        planes = np.stack([x * x, x * y, x * z, y * y, y * z, z * z, x * along, y * along, z * along], axis=1)
+        ones = np.ones(triangles.size)
+        begin = np.arange(0, triangles.size + 1, 3, dtype=np.int32)
+        around = csr_array((ones, triangles.reshape(-1).astype(np.int32), begin), shape=(len(triangles), len(vertices)))
+        self._vertices, self._sums = vertices, around.T @ planes
+
+    def best_places(self, clusters: IntArray, members: IntArray, count: int) -> Float64Array:
+        """Return the places with the least sum of squares for clusters of vertices.
+
+        Parameters
+        ----------
+        clusters : ndarray, shape (k,), int
+            Cluster of each member, from 0 to ``count - 1``; each cluster has members.
+        members : ndarray, shape (k,), int
+            Vertices.
+        count : int
+            Number of clusters.
+
+        Returns
+        -------
+        ndarray, shape (count, 3), float64, mm
+        """
+        from scipy.sparse import csr_array
+
+        shape = (count, len(self._vertices))
+        which = csr_array((np.ones(len(members)), (clusters, members)), shape=shape)
+        sums, size = which @ self._sums, np.bincount(clusters, minlength=count)
+        mean = which @ self._vertices / size[:, None]
+        matrix = sums[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+        right = sums[:, 6:] - np.einsum("nij,nj->ni", matrix, mean)
+        pull = _PULL * (sums[:, 0] + sums[:, 3] + sums[:, 5])
+        matrix = matrix + np.where(pull > 0.0, pull, 1.0)[:, None, None] * np.eye(3)
+        return mean + np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
