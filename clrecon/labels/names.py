@@ -17,6 +17,10 @@ __all__ = ["check_name", "file_suffixes", "find_number", "label_suffix", "list_l
 SUFFIX_LENGTH = 40
 LABELS_LISTED = 60
 
+_LEVEL = re.compile(r"(c|th?|l|s)(0?[1-9]|1[0-9])")
+_VERTEBRA = ("vertebra", "vertebrae", "vert", "level")
+"""Words beside the level in names of vertebrae: TotalSegmentator's ``vertebrae_L3``, 3D Slicer's ``L3 vertebra``."""
+
 
 def check_name(name: str) -> str:
     """Return a name as one printable line of limited length.
@@ -42,9 +46,22 @@ def _parts(name: str) -> list[str]:
     return [part for part in re.split(r"[^a-z0-9]+", name.casefold()) if part]
 
 
+def _level(text: str) -> str | None:
+    """Return the level of the spine that a name says, ``l3`` of ``L3``, ``vertebrae_L3``, ``Vertebra L03``, ``Th12``.
+
+    None where it says no level or several.
+    """
+    levels = {(match[1][0], int(match[2])) for part in _parts(text) if (match := _LEVEL.fullmatch(part))}
+    others = [part for part in _parts(text) if not _LEVEL.fullmatch(part) and part not in _VERTEBRA]
+    if len(levels) != 1 or others:
+        return None
+    letter, number = levels.pop()
+    return f"{letter}{number}"
+
+
 def find_number(label: str | int, names: Mapping[int, str], present: Collection[int]) -> int:
-    """Return the number of `label`: a number itself, else the exact name, else the only name that contains it as a
-    part.
+    """Return the number of `label`: a number itself, else the exact name, else the only name that says the same
+    level of the spine, else the only one that contains it as a part.
 
     Parameters
     ----------
@@ -63,6 +80,8 @@ def find_number(label: str | int, names: Mapping[int, str], present: Collection[
     named = [number for number, name in names.items() if name.casefold() == wanted]
     if not named and re.fullmatch(r"[0-9]{1,9}", text):
         named = [int(text)]
+    if not named and (level := _level(text)) is not None:
+        named = [number for number, name in names.items() if _level(name) == level]
     if not named:
         parts = _parts(text)
         named = [number for number, name in names.items() if len(parts) == 1 and parts[0] in _parts(name)]

@@ -37,6 +37,18 @@ def test_labels_are_found_by_number_name_and_part_of_a_name(label, number):
     assert label_map().find(label) == number
 
 
+@pytest.mark.parametrize("named", ["L3", "vertebrae_L3", "L3 vertebra", "Vertebra L03", "level l3"])
+@pytest.mark.parametrize("label", ["L3", "l3", "vertebrae_L3", "Vertebra L3", "vert L03"])
+def test_a_level_is_found_however_it_is_spelled(named, label):
+    assert label_map({2: named, 5: "L3 body", 7: "rib_L3", 8: "vertebrae_L1", 11: "Th12"}).find(label) == 2
+    assert label_map({2: "Th12", 5: "C7"}).find("vertebrae_T12") == 2
+
+
+def test_a_part_of_a_vertebra_is_not_the_vertebra():
+    with pytest.raises(UsageError, match="vertebrae_L3' is not in the label map"):
+        label_map({5: "L3 body"}).find("vertebrae_L3")
+
+
 @pytest.mark.parametrize(
     ("label", "message"),
     [
