@@ -14,7 +14,7 @@ DOCUMENTS = [
     "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/contract.md", "docs/iso_value.md", "docs/geometry.md",
     "docs/certificate.md", "docs/formats.md", "docs/labels.md", "docs/calibration.md", "docs/transfer_functions.md",
     "docs/slices.md", "docs/rendering.md", "docs/clouds.md", "docs/filters.md", "docs/masks.md",
-    "docs/inside.md",
+    "docs/inside.md", "docs/measures.md",
 ]  # fmt: skip
 LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)")
 QUOTED = re.compile(r"`((?:\.ci|cl|clrecon|docs|scripts|tests)/[\w./-]*|(?:setup\.cfg|\w+\.(?:md|toml)))`")

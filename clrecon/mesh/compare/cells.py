@@ -34,8 +34,8 @@ _BITS, _FARTHEST = 21, 1 << 20
 _MOST_CANDIDATES = 64
 """Triangles whose box meets more cells are divided into four, until none does."""
 
-_PIECE = 1 << 17
-"""Pairs of a triangle and a cell that are tested at once: about 100 MB."""
+_PIECE = 1 << 16
+"""Triangles at a time; the pairs of a triangle and a cell that are tested at once take at most about 100 MB."""
 
 IntArray = NDArray[np.int64]
 Triangles = NDArray[np.float64]
@@ -241,7 +241,7 @@ def _tested(
     corners: Triangles, low: IntArray, size: IntArray, rows: IntArray, margin: float
 ) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield the cells of some rows that pass the test, and their rows."""
-    step = _PIECE // _MOST_CANDIDATES * 8
+    step = _PIECE // _MOST_CANDIDATES * 4
     for start in range(0, len(rows), step):
         part = rows[start : start + step]
         extent = size[part]

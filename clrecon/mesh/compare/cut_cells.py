@@ -17,11 +17,8 @@ __all__ = ["SignedSurface", "find_cut_cells"]
 _BLOCK = 16
 """Cells along the edges of the first blocks, a power of two; those that the surface may meet are halved."""
 
-_SPREAD = 0.25
-"""Share by which a distance may be wrong for a block to be left out, and mm beside it: that of a spine is too large by
-at most 0.1 mm, but for one point in 500."""
-
 _SLACK_MM = 0.3
+"""Mm by which a distance may be too large for a block to be left out: those of a spine are, by up to 0.2 mm."""
 
 
 class SignedSurface(Protocol):
@@ -42,7 +39,7 @@ def find_cut_cells(
     Parameters
     ----------
     truth : SignedSurface
-        Such as `clrecon.phantom_truth` gives.
+        Such as `clrecon.phantom_truth` gives; if it has a method ``label``, a point is inside where that is above 0.
     grid : Volume or LabelMap
         Its cells and those of a border of one voxel around it are searched.
     name : str
@@ -71,7 +68,7 @@ def find_cut_cells(
         reach = _half_diagonals(grid, low, edge)
         distance = np.abs(truth.signed_distance(grid.ijk_to_lps(low + 0.5 * edge)))
         asked += len(low)
-        low = low[distance <= reach * (1.0 + _SPREAD) + _SLACK_MM]
+        low = low[distance <= reach + _SLACK_MM]
         if edge == 1:
             break
         edge //= 2
@@ -98,9 +95,16 @@ def _is_cut(truth: SignedSurface, grid: Grid, low: NDArray[np.int64]) -> NDArray
     """Mark cells with points of a lattice of half voxels on both sides; each point is asked once."""
     if len(low) == 0:
         return np.zeros(0, dtype=bool)
-    inside = np.zeros(len(low), dtype=np.int64)
     places = 2 * low[:, None] + _corners(3)
     unique, number = np.unique(places.reshape(-1, 3), axis=0, return_inverse=True)
-    within = truth.signed_distance(grid.ijk_to_lps(0.5 * unique)) < 0.0
+    within = _holds(truth, grid.ijk_to_lps(0.5 * unique))
     inside = within[number.reshape(len(low), -1)].sum(axis=1)
     return np.asarray((inside > 0) & (inside < 27))
+
+
+def _holds(truth: SignedSurface, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Mark the points inside; the label of a phantom tells it in an eighth of the time of a distance."""
+    label = getattr(truth, "label", None)
+    if label is None:
+        return np.asarray(truth.signed_distance(points) < 0.0)
+    return np.asarray(label(points) > 0)

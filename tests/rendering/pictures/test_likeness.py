@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from clrecon.errors import UsageError
+from clrecon.reading import read_volume
 from clrecon.rendering.pictures.likeness import make_control_pictures, measure_pictures
 
 pytestmark = pytest.mark.unit
@@ -87,3 +88,15 @@ def test_what_cannot_be_compared_is_refused(one, other, said):
 def test_a_background_that_is_no_colour_is_refused():
     with pytest.raises(UsageError, match="0 to 255"):
         measure_pictures(picture(), picture(), background=300)
+
+
+def test_controls_of_a_real_slice_are_those_of_the_documents(real_data):
+    voxels = read_volume(real_data / "thoracic_0p8mm").voxels.astype(np.float64)
+    one, after = (np.rint(np.clip((voxels[k] + 200.0) / 1000.0, 0.0, 1.0) * 255.0).astype(np.uint8) for k in (47, 48))
+    found = {
+        name: measure_pictures(control, one, whole=True) for name, control in make_control_pictures(one, after).items()
+    }
+    assert {name: round(figures.ssim, 3) for name, figures in found.items()} == {
+        "black": 0.548, "white": 0.087, "noise": 0.003, "shifted": 0.711, "next": 0.93
+    }  # fmt: skip
+    assert [round(figures.mse) for figures in found.values()] == [2141, 53847, 17207, 488, 43]
