@@ -18,6 +18,9 @@ pytestmark = pytest.mark.unit
 
 SHEARED = np.array([[0.7, 0.1, 0.2, -25.0], [-0.1, 0.9, 0.4, -30.0], [0.0, 0.05, 2.5, -84.0], [0, 0, 0, 1.0]])
 
+FAR = SHEARED + np.array([[0.0, 0, 0, 1250.0], [0, 0, 0, -1071.0], [0, 0, 0, 846.0], [0, 0, 0, 0]])
+"""Where float32 rounds millimetres to 1e-4."""
+
 
 def grid(shape=(12, 12, 12), affine=None) -> Volume:
     return Volume(np.zeros(shape, np.int16), np.eye(4) if affine is None else affine)
@@ -44,7 +47,8 @@ def test_a_box_passes_through_the_shell_of_its_cells(affine):
     assert cells_of(samples.box((2.25,) * 3, (0.5,) * 3), on) == {(2, 2, 2)}
 
 
-def test_faces_between_cells_belong_to_the_upper_ones():
+@pytest.mark.parametrize("affine", [np.eye(4), SHEARED, FAR], ids=["even", "sheared", "far"])
+def test_faces_between_cells_belong_to_the_upper_ones(affine):
     low, high = 2, 7
     wanted = set()
     for axis, plane in itertools.product(range(3), (low, high)):
@@ -52,7 +56,7 @@ def test_faces_between_cells_belong_to_the_upper_ones():
             cell = [u, v]
             cell.insert(axis, plane)
             wanted.add(tuple(cell))
-    assert cells_of(samples.box((2.0,) * 3, (5.0,) * 3), grid()) == wanted
+    assert cells_of(samples.box((2.0,) * 3, (5.0,) * 3), grid(affine=affine)) == wanted
 
 
 def test_a_diagonal_plane_passes_beside_the_corners_it_touches():

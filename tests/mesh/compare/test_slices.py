@@ -58,6 +58,20 @@ def test_an_open_mesh_is_refused():
         measure_slices(placed((vertices, np.delete(triangles, faced[0], axis=0)), on), on, 50.0)
 
 
+def test_the_rows_through_a_small_hole_are_left_out():
+    on = block(size=20, low=5, high=14)
+    vertices, triangles = samples.sphere((9.5, 9.5, 9.5), 6.0, 3)
+    # The triangle nearest to the pole of the rows: they leave the ball through the hole.
+    hole = int(np.argmin(np.linalg.norm(vertices[triangles].mean(axis=1) - [15.5, 9.5, 9.5], axis=1)))
+    whole = measure_slices(placed((vertices, triangles), on), on, 50.0, finer=5)
+    holed = measure_slices(placed((vertices, np.delete(triangles, hole, axis=0)), on), on, 50.0, finer=5)
+    assert whole.rows_odd == 0
+    assert 1 <= holed.rows_odd < 20
+    # each of these rows is as long as the ball is thick, or as the block
+    assert (whole.points_mesh - holed.points_mesh) / holed.rows_odd == pytest.approx(5 * 12.0, abs=2.0)
+    assert (whole.points_hu - holed.points_hu) / holed.rows_odd == pytest.approx(5 * 10.0, abs=1.0)
+
+
 def test_what_cannot_be_sliced_is_refused():
     on, empty = block(), Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.uint32))
     box = placed(samples.box((2.6,) * 3, (5.8,) * 3), on)
