@@ -1,10 +1,10 @@
 /* The bilateral filter of a volume: each voxel becomes the mean of its neighbours, weighted by distance in mm and by
  * difference in HU.
  *
- *     v'(p) = v(p) + sum_t w_t d_t / sum_t w_t,   d_t = v(p + t) - v(p),   w_t = exp2(s_t - c d_t^2)
+ *     v'(p) = v(p) + sum_t w_t d_t / (1 + sum_t w_t),   d_t = v(p + t) - v(p),   w_t = exp2(s_t - c d_t^2)
  *
  * s_t is the exponent of the distance, -|t|^2 log2(e) / (2 sigma_mm^2), and c = log2(e) / (2 sigma_hu^2).  The taps t
- * of the window stand in rows: those with the same steps along j and k are neighbours along i.  Voxels beyond the
+ * of the window, all but the voxel itself, stand in rows: those with the same steps along j and k are neighbours along i.  Voxels beyond the
  * volume have the value of the nearest voxel in it.  NaN and infinite voxels stay, and count nowhere.
  *
  * A work-item with LANES = 8 makes a group of 16 voxels along i, with LANES = 1 a voxel.  So that no group has to ask
@@ -169,11 +169,11 @@ __kernel void filter_bilateral(
 
     const floats centre = to_floats(load_lanes(own));
     const floats scaled = centre * range;
-    tap_sums sums = {0.0f, 0.0f, centre, centre};
+    tap_sums sums = {1.0f, 0.0f, centre, centre}; /* the voxel itself, which is no tap */
 #if LANES == 8
     const floats next_centre = to_floats(load_lanes(own + LANES));
     const floats next_scaled = next_centre * range;
-    tap_sums next = {0.0f, 0.0f, next_centre, next_centre};
+    tap_sums next = {1.0f, 0.0f, next_centre, next_centre};
 #endif
     const int tap_count = in_row && j >= inner_j && j + inner_j < nj && k >= inner_k && k + inner_k < nk ? steps : 0;
     for (int t = 0; t < tap_count; ++t)

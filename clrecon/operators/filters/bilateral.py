@@ -210,7 +210,8 @@ class _Run:
         self.warnings: list[str] = []
         ni, self.nj, self.nk = resident.volume.shape_ijk
         self.ni, self.dtype = ni, resident.dtype
-        reach = settings.window.reach
+        self.window = settings.window.without_middle()
+        reach = self.window.reach
         self.reach = reach[0]
         rings = 0 if settings.near is None else settings.rings
         # A window without neighbours along an axis says nothing of them: the box has them all the same.
@@ -243,7 +244,7 @@ class _Run:
             self.program = prepare_bilateral(device, self.dtype)
             if self.settings.near is not None:
                 prepare_near_level(device, self.dtype)
-        window = self.settings.window
+        window = self.window
         self.tap_rows = window.rows()
         self.tap_rows_d = upload(device, self.tap_rows)
         steps, self.inner_jk = self._tap_steps()
@@ -275,7 +276,7 @@ class _Run:
 
     def _tap_steps(self) -> tuple[NDArray[np.int32], tuple[int, int]]:
         """Return the steps to the taps in memory, and how far from the borders along j and k they are used."""
-        steps = self.settings.window.offsets.astype(np.int64) @ np.array([1, self.ni, self.ni * self.nj])
+        steps = self.window.offsets.astype(np.int64) @ np.array([1, self.ni, self.ni * self.nj])
         reach = self.settings.window.reach
         if steps.max() > np.iinfo(np.int32).max:  # of slices beyond 100 million voxels: nowhere
             return np.zeros(1, np.int32), (self.nj, self.nk)
@@ -321,7 +322,7 @@ class _Run:
         sides: dict[str, int],
     ) -> None:
         """Filter all groups, or those of a list, in launches of about a second."""
-        device, window = self.resident.device, self.settings.window
+        device, window = self.resident.device, self.window
         range_factor = math.sqrt(0.5 / math.log(2.0)) / self.settings.sigma_hu
         items = 1 if device.kernel_variants["LANES"] == "8" else GROUP
         slice_groups = self.row_groups * there.nj

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,9 +57,15 @@ class Window:
 
     def rows(self) -> NDArray[np.int32]:
         """Return the rows of taps, (m, 4) int32: steps along j and k, first step along i, number of taps."""
-        _, starts, counts = np.unique(self.offsets[:, :0:-1], axis=0, return_index=True, return_counts=True)
-        first = self.offsets[starts]
+        goes_on = (np.diff(self.offsets, axis=0) == (1, 0, 0)).all(axis=1)
+        starts = np.flatnonzero(np.append(True, ~goes_on))
+        first, counts = self.offsets[starts], np.diff(np.append(starts, self.taps))
         return np.column_stack([first[:, 1], first[:, 2], first[:, 0], counts]).astype(np.int32)
+
+    def without_middle(self) -> Window:
+        """Return the window without the voxel itself, whose weight is 1."""
+        others = self.offsets.any(axis=1)
+        return replace(self, offsets=self.offsets[others], exponents=np.ascontiguousarray(self.exponents[:, others]))
 
 
 def choose_window(volume: Volume, sigma_mm: float, dimensions: int, most_taps: int) -> Window:
