@@ -45,8 +45,9 @@ static inline uint word_at(__global const uint *mask, const int at, const int to
     return at >= 0 && at < total ? mask[at] : 0;
 }
 
-/* Words from `at` on; zeros beyond the ends of the mask of `total` words. */
-static inline words_of_piece load_vector(__global const uint *mask, const int at, const int total)
+/* Words from `at` on; zeros beyond the ends of the mask of `total` words.  Part of the kernels by order: PoCL 3.0 would
+ * make a call of it, which takes as long as the rest of a ball. */
+static inline __attribute__((always_inline)) words_of_piece load_vector(__global const uint *mask, const int at, const int total)
 {
     if (at >= 0 && at + VECTOR_WORDS <= total)
         return LOAD_VECTOR(mask + at);
