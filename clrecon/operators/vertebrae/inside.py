@@ -229,7 +229,7 @@ def vertebra_inside(
     RefusedInputError
         The map names another frame of reference, lies outside of the volume, or this label does.
     NoSurfaceError
-        No voxel of the label has the iso value, or none of its solid bone lies in the band.
+        No voxel of the label has the iso value, every voxel around it has, or none of its solid bone lies in the band.
     DeviceError
         The device has no room, or it fails.
     """

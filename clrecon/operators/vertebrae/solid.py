@@ -75,7 +75,7 @@ def vertebra_solid(
     RefusedInputError
         The map names another frame of reference, lies outside of the volume, or this label does.
     NoSurfaceError
-        No voxel of the label has the iso value.
+        No voxel of the label has the iso value, or every voxel around it has.
     DeviceError
         The device has no room, or it fails.
     """
@@ -129,6 +129,11 @@ def _inside(resident: DeviceVolume, crop: LabelCrop, iso_value: float, grow_mm: 
     growth = Growth.of(volume, grow_mm)
     boxes = find_boxes(taken.voxels, (crop.number,), growth.reach)
     inside = np.zeros(taken.voxels.shape, taken.voxels.dtype)
+    if rule.mark_inside(volume.voxels).all():
+        raise NoSurfaceError(
+            f"every voxel around label {crop.number} {crop.name} has {iso_value:g} HU and more, from"
+            f" {float(volume.voxels.min()):g} HU on: a level lies between bone and what is beside it"
+        )
     if not boxes or not ((taken.voxels == crop.number) & rule.mark_inside(volume.voxels)).any():
         return inside != 0
 

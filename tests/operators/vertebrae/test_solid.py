@@ -113,6 +113,8 @@ def test_what_cannot_be_is_refused_in_words(device):
         vertebra_solid(volume, labels, 1, grow_mm=2.0, device=device)
     with pytest.raises(NoSurfaceError, match=r"no voxel of label 1 ring has 2000 HU: they run from 1000 to 1000 HU"):
         vertebra_solid(Volume(np.where(ring, voxels, 3000), affine), labels, 1, 2000, device=device)
+    with pytest.raises(NoSurfaceError, match="every voxel around label 1 ring has -2000 HU and more, from 0 HU on"):
+        vertebra_solid(volume, labels, 1, -2000, device=device)
     two = LabelMap(np.concatenate([ring.astype(np.uint8), 2 * ring.astype(np.uint8)]), affine, {1: "ring", 2: "away"})
     with pytest.raises(RefusedInputError, match=r"label 2 away has no voxel in the CT: it lies outside"):
         vertebra_solid(volume, two, "away", device=device)
