@@ -33,6 +33,9 @@ _STAGES = {
     "blur": "blurring the phantom",
     "selftest": "testing",
     "bench": "timing",
+    "compare methods": "running methods, one after another",
+    "measure methods": "measuring what they made",
+    "report": "drawing and writing the report",
 }
 _HIDDEN = {*range(0x202A, 0x202F), *range(0x2066, 0x206A), 0x200E, 0x200F, 0x061C}
 _BAR_WIDTH = 24

@@ -40,6 +40,7 @@ COMMANDS = {
     "phantom": _Command("clrecon.cli.phantom", "write a made-up CT series with a known surface"),
     "selftest": _Command("clrecon.cli.selftest", "check that a device computes rightly"),
     "bench": _Command("clrecon.cli.bench", "time every stage on this computer, beside VTK's flying edges"),
+    "compare": _Command("clrecon.cli.compare", "compare methods of surfaces and clouds on your own scan, as a page"),
     "demo": _Command("clrecon.cli.demo", "phantom, mesh, picture and report in one go: what clrecon does, in seconds"),
 }
 

@@ -26,6 +26,7 @@ INPUTS = {
     "phantom": ("{nowhere}/phantom",),
     "bench": ("{there}/scan", "--report", "{nowhere}/bench.json"),
     "demo": ("{nowhere}/demo",),
+    "compare": ("{there}/scan", "-o", "{nowhere}/report"),
 }
 """Arguments that end a command after its options were checked, before a device is opened: a folder that is missing."""
 

@@ -115,7 +115,8 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "phantom": frozenset({"scipy"}),
     "opencl": frozenset({"pyopencl"}),
     "operators": frozenset({"pyopencl", "SimpleITK", "skimage"}),
-    "jobs": frozenset({"PIL", "pyvista", "skimage", "vtkmodules"}),  # vtkmodules: flying edges, the peer of the bench
+    # vtkmodules: peers of the bench and of the comparison, whose page has plots and pictures.
+    "jobs": frozenset({"pyvista", "skimage", "vtkmodules", "matplotlib", "PIL"}),
     "viewer": frozenset({"pyvista", "vtk", "vtkmodules"}),
     "cli": frozenset({"rich"}),
 }

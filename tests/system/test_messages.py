@@ -15,6 +15,7 @@ from clrecon.anatomy.iso_choice import half_iso_value
 from clrecon.anatomy.noise import Noise
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
+from clrecon.jobs.compare.settings import CompareSettings
 from clrecon.jobs.mesh.label_choice import LabelChoice
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.render.settings import RenderSettings
@@ -77,6 +78,7 @@ MESSAGES = {
     "mesh settings": MeshSettings(iso_value=(200.0, (300.0, 400.0)), labels=None, device=0),
     "label choice": LabelChoice("labels.nii", ("bone",)),
     "render settings": RenderSettings(),
+    "compare settings": CompareSettings(methods=("t-mc", "vtk-fe"), iso_value=226.0),
     "volume look": VolumeLook("skin", labels=LABELS, label_opacity={"bone": 0.5}),
     "projection": Projection("drr", clip=Clip.plane((0, 0, 0), (0, 0, 1))),
     "surface look": SurfaceLook(300, color=(1, 0, 0), shadows=True, lighting=Lighting(direction=(1, 0, 0))),

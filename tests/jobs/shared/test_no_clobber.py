@@ -32,6 +32,7 @@ COMMANDS = {
     "frames": ("render scan --turntable {old}", "old/frame_0000.png"),
     "phantom": ("phantom {old} --kind sphere --size 16 --slices 8", "old/truth.json"),
     "demo": ("demo {old}", "old/report.json"),
+    "comparison": ("compare scan -o {old}", "old/report.json"),
     "report of a bench": ("bench --report {old}.json", ".json"),
 }
 

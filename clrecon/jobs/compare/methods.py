@@ -1,0 +1,89 @@
+"""The methods that are compared: one table, in the order of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from clrecon.errors import UsageError
+from clrecon.system.wording import name_parameter
+
+__all__ = ["COMPARED", "MESH", "Compared", "choose_methods"]
+
+MESH, CLOUD, PICTURE = "mesh", "cloud", "picture"
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A method that is compared.
+
+    Attributes
+    ----------
+    name : str
+        As the user names it.
+    title : str
+        In tables and plots.
+    what : str
+        In words.
+    makes : {"mesh", "cloud", "picture"}
+    on_device : bool
+        True: its kernels run on the OpenCL device; False: on the CPU alone.
+    peer : str
+        The library of somebody else that does the work; empty for clrecon's own.
+    """
+
+    name: str
+    title: str
+    what: str
+    makes: str = MESH
+    on_device: bool = True
+    peer: str = ""
+
+
+COMPARED = {
+    method.name: method
+    for method in (
+        Compared("t-mc", "T-MC", "marching cubes, every cell, shared vertices"),
+        Compared("t-mc-soup", "T-MC, soup", "every cell, triangles welded afterwards (numpy)", on_device=False),
+        Compared("skimage", "scikit-image", "its marching cubes", on_device=False, peer="scikit-image"),
+        Compared("vtk-mc", "VTK MC", "vtkMarchingCubes", on_device=False, peer="vtk"),
+        Compared("vtk-fe", "VTK FE", "vtkFlyingEdges3D", on_device=False, peer="vtk"),
+        Compared("i-mc", "I-MC", "cells grown from the large parts, linear vertices"),
+        Compared("i-mc-golden", "I-MC, golden", "the same, vertices at the golden section of their edge"),
+        Compared("g-mc", "G-MC", "T-MC, then quadric collapse without a bound"),
+        Compared("s-mc", "S-MC", "T-MC, then decimation within a bound, topology kept"),
+        Compared("cloud-surface", "Cloud surface", "closed surface around that cloud"),
+        Compared("cloud", "Cloud", "voxels at the border of what is at the level and above, by the affine", CLOUD),
+        Compared("rays", "Ray casting", "samples along rays, preset bone, with light", PICTURE),
+        Compared("rays-cpu", "Ray casting, CPU", "the same in plain numpy", PICTURE, on_device=False),
+    )
+}
+
+
+def choose_methods(names: Sequence[str], reference: str) -> tuple[Compared, ...]:
+    """Return the methods that run, in the order of the table, the reference among them.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Empty: all.
+    reference : str
+
+    Raises
+    ------
+    UsageError
+        There is no such method, one is named twice, or the reference makes no mesh.
+    """
+    for name in (*names, reference):
+        if name not in COMPARED:
+            raise UsageError(f"there is no method {name!r:.60} to compare: they are {', '.join(COMPARED)}")
+    doubled = sorted({name for name in names if names.count(name) > 1})
+    if doubled:
+        raise UsageError(f"a method is named twice: {', '.join(doubled)}")
+    if COMPARED[reference].makes != MESH:
+        meshes = ", ".join(name for name, method in COMPARED.items() if method.makes == MESH)
+        raise UsageError(
+            f"{name_parameter('reference', reference)} makes no mesh to compare with: take one of {meshes}"
+        )
+    wanted = {*(names or COMPARED), reference}
+    return tuple(method for name, method in COMPARED.items() if name in wanted)
