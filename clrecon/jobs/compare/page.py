@@ -12,7 +12,7 @@ from clrecon.jobs.compare.pictures import embed
 from clrecon.jobs.compare.plots import PART_COLORS, PART_WORDS, plot_accuracy, plot_times
 from clrecon.jobs.compare.report import CompareReport
 from clrecon.jobs.compare.table import main_table, paper_table, shown_columns, small_table
-from clrecon.jobs.compare.template import PAGE_TEMPLATE, STYLE
+from clrecon.jobs.compare.template import PAGE_TEMPLATE, read_style
 from clrecon.jobs.compare.words import join, share
 
 __all__ = ["make_page"]
@@ -41,7 +41,7 @@ def make_page(report: CompareReport, figures: Figures) -> str:
     return PAGE_TEMPLATE.substitute(
         version=escape(report.version),
         title="Surfaces and clouds of one scan, compared",
-        style=STYLE,
+        style=read_style(),
         lead=escape(_lead(report)),
         facts="\n".join(f"<div><dt>{escape(name)}</dt><dd>{escape(said)}</dd></div>" for name, said in _facts(report)),
         body="\n".join(filter(None, parts)),

@@ -86,7 +86,7 @@ def test_every_method_has_its_row_and_its_picture(device: Any, whole: Path) -> N
     assert rows["t-mc"]["cells"]["dice"] == rows["vtk-mc"]["cells"]["dice"] == 1.0
     assert rows["i-mc"]["cells_visited"] < rows["i-mc"]["cells_all"] == rows["t-mc"]["cells_visited"]
     assert rows["i-mc-golden"]["slices"]["dice"] < rows["i-mc"]["slices"]["dice"] - 0.01
-    assert rows["t-mc-soup"]["pictures"] == {"mse": 0.0, "ssim": 1.0}
+    assert rows["t-mc-soup"]["pictures"]["mse"] < 1e-3 and rows["t-mc-soup"]["pictures"]["ssim"] > 0.9999
     assert rows["cloud"]["points"] and rows["cloud"]["points_mm"]["to_reference_mm"]["mean"] > 0.0
     assert all(m["memory_bytes"] > 3e7 and m["first_s"] > 0 and m["warm_s"] > 0 for m in report["methods"])
     for method in report["methods"]:
