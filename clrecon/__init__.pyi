@@ -25,6 +25,7 @@ from clrecon.mesh.compare.cut_cells import find_cut_cells as find_cut_cells
 from clrecon.mesh.compare.distances import compare_meshes as compare_meshes
 from clrecon.mesh.compare.slices import measure_slices as measure_slices
 from clrecon.mesh.compare.truth import measure_truth as measure_truth
+from clrecon.mesh.reader import read_mesh as read_mesh
 from clrecon.mesh.refine.decimation import decimate_mesh as decimate_mesh
 from clrecon.mesh.refine.quadric import collapse_quadric as collapse_quadric
 from clrecon.mesh.refine.smoothing import smooth_mesh as smooth_mesh

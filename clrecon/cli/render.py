@@ -15,12 +15,13 @@ from clrecon.cli.render_options import (
     add_curve,
     add_labels,
     add_looks,
+    add_meshes,
     add_motion,
     add_region,
     render_settings,
 )
 from clrecon.jobs.render.settings import describe_modes, describe_presets
-from clrecon.jobs.shared.clouds import CLOUD_INPUTS, is_cloud_file
+from clrecon.jobs.shared.clouds import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file, is_mesh_file
 
 __all__ = ["add_arguments", "run"]
 
@@ -34,7 +35,9 @@ examples:
   clrecon render CT_FOLDER -o slice.png --mode slice --view axial,coronal,sagittal --window -450,1050
   clrecon render CT_FOLDER -o spine.png --curve auto
   clrecon render CT_FOLDER --turntable bone.mp4
-  clrecon render cloud.ply -o cloud.png --color label --point-radius 0.5"""
+  clrecon render cloud.ply -o cloud.png --color label --point-radius 0.5
+  clrecon render bone.stl -o bone.png --color orange --view left
+  clrecon render CT_FOLDER -o both.png --preset muscle --mesh l3.stl=orange --mesh l4.stl=,0.4"""
 
 
 def _epilog() -> str:
@@ -61,8 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "input",
         metavar="INPUT",
-        help="DICOM folder (subfolders and any file names are fine) or file; a NIfTI, NRRD or MetaImage file; or a"
-        f" cloud of points ({', '.join(CLOUD_INPUTS)})",
+        help="DICOM folder (subfolders and any file names are fine) or file; a NIfTI, NRRD or MetaImage file; a"
+        f" cloud of points ({', '.join(CLOUD_INPUTS)}); or a mesh ({', '.join(MESH_INPUTS)}; of .ply say --mode mesh)",
     )
     parser.add_argument(
         "-o", "--output", metavar="OUT", help="picture: .png, .jpg or .tif; may be left out with --turntable"
@@ -72,6 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_region(parser)
     add_curve(parser)
     add_labels(parser)
+    add_meshes(parser)
     add_motion(parser)
     add_reading(parser)
     add_masking(parser)
@@ -91,6 +95,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
     files = PictureFiles(options.output, options.depth, options.values, options.turntable, options.report)
     if options.mode is None and is_cloud_file(options.input):
         options.mode = "points"
+    if options.mode is None and is_mesh_file(options.input):
+        options.mode = "mesh"
     report = make_pictures(
         options.input, files, render_settings(options), no_clobber=options.no_clobber, progress=console.progress
     )
@@ -111,6 +117,7 @@ def describe_report(report: dict[str, Any]) -> list[str]:
         f"picture  {_describe_look(report)}",
         *(f"         {line}" for line in map(_describe_picture, report["pictures"])),
         *(f"         {line}" for line in _describe_legend(report["pictures"])),
+        *(f"mesh     {line}" for line in map(_describe_mesh, report["meshes"][report["mode"] == "mesh" :])),
         f"device   {printable(report['device'])}",
         f"time     {_describe_times(report['seconds'])}",
     ]
@@ -118,10 +125,17 @@ def describe_report(report: dict[str, Any]) -> list[str]:
 
 def _describe_input(report: dict[str, Any]) -> str:
     cloud = report["cloud"]
+    if report["mode"] == "mesh":
+        return f"mesh of {report['meshes'][0]['triangles']:,} triangles"
     if cloud is None:
         return describe_volume(report["volume"])
     known = [name for name in ("normals", "hu", "labels") if cloud[name]]
     return f"{cloud['points']:,} points" + (f" with {', '.join(known)}" if known else "")
+
+
+def _describe_mesh(mesh: dict[str, Any]) -> str:
+    color = "#" + "".join(f"{round(255 * share):02x}" for share in mesh["color"])
+    return f"{mesh['triangles']:,} triangles, {color}, opacity {mesh['opacity']:g}, {mesh['file']['space']}"
 
 
 def _describe_legend(pictures: list[dict[str, Any]]) -> list[str]:

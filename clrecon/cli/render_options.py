@@ -14,19 +14,30 @@ from clrecon.cli.render_values import (
     parse_label_color,
     parse_label_opacity,
     parse_light,
+    parse_mesh,
     parse_picture_size,
     parse_slices,
     parse_views,
     parse_window,
 )
 from clrecon.errors import UsageError
-from clrecon.jobs.render.settings import POINT_COLORS, VIEWS, LabelLook, RenderSettings, Turntable, describe_modes
+from clrecon.jobs.render.settings import (
+    POINT_COLORS,
+    VIEWS,
+    LabelLook,
+    MeshFile,
+    RenderSettings,
+    Turntable,
+    describe_modes,
+)
+from clrecon.jobs.shared.clouds import MESH_INPUTS
 
 __all__ = [
     "add_camera",
     "add_curve",
     "add_labels",
     "add_looks",
+    "add_meshes",
     "add_motion",
     "add_region",
     "label_look",
@@ -85,6 +96,8 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
         metavar="MM",
         help="of points, which are discs (default: their mean spacing)",
     )
+    group.add_argument("--opacity", type=float, metavar="SHARE", help="of the mesh in mode mesh (default: 1)")
+    group.add_argument("--flat", action="store_true", help="light each triangle of a mesh by its own normal")
     group.add_argument(
         "--window",
         type=parse_window,
@@ -192,6 +205,20 @@ def add_labels(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_meshes(parser: argparse.ArgumentParser) -> None:
+    """Add the options for meshes that are shown with the input."""
+    group = parser.add_argument_group("meshes with the input")
+    _add_repeated(
+        group, "--mesh", parse_mesh, "FILE[=COLOUR[,OPACITY]]",
+        f"show a mesh too ({', '.join(MESH_INPUTS)}), in modes dvr, surface, slices, points and mesh", dest="meshes",
+    )  # fmt: skip
+    group.add_argument(
+        "--mesh-space",
+        metavar="lps|ras",
+        help="patient frame of meshes whose files do not name theirs (default: lps, with a warning)",
+    )
+
+
 def add_motion(parser: argparse.ArgumentParser) -> None:
     """Add the options of the turntable."""
     group = parser.add_argument_group("motion")
@@ -219,6 +246,7 @@ def render_settings(options: argparse.Namespace) -> RenderSettings:
         "thickness": options.thickness or None,  # 0 is the same as no thickness
         "offset_mm": options.offset_mm or None,
         "labels": label_look(options),
+        "meshes": tuple(MeshFile(*given) for given in options.meshes),
         "turntable": turntable(options),
     }
     return RenderSettings.of(**given)

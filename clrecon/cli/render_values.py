@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 
 from clrecon.jobs.render.settings import VIEWS
 
@@ -14,6 +15,7 @@ __all__ = [
     "parse_label_color",
     "parse_label_opacity",
     "parse_light",
+    "parse_mesh",
     "parse_picture_size",
     "parse_slices",
     "parse_views",
@@ -122,3 +124,20 @@ def parse_label_opacity(text: str) -> tuple[str, float]:
     if not label or math.isnan(opacity):
         raise argparse.ArgumentTypeError(f"{text!r} is not LABEL=OPACITY, such as L2=0.2")
     return label, opacity
+
+
+def parse_mesh(text: str) -> tuple[str, str | None, float]:
+    """Read ``FILE``, ``FILE=COLOUR`` or ``FILE=COLOUR,OPACITY``; a colour left empty is the default."""
+    if "=" not in text or os.path.exists(text):
+        return text, None, 1.0
+    path, _, look = text.rpartition("=")
+    color, comma, share = look.partition(",")
+    try:
+        opacity = float(share) if comma else 1.0
+    except ValueError:
+        opacity = math.nan
+    if not path or not (color or comma) or math.isnan(opacity):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not FILE[=COLOUR[,OPACITY]], such as l3.stl=orange,0.4 or l3.stl=,0.4"
+        )
+    return path, color or None, opacity

@@ -123,7 +123,7 @@ def test_the_command_line_says_all_that_pictures_may_be_told() -> None:
     speak = speaker_of(parser_of("render"))
     of_python = {name for name in RenderSettings.keywords() if speak(name, None) == name}
     # Fields that other options make (--light, --clip-box and --clip), and those that only Python has.
-    of_meshes = {"opacity", "flat", "vertex_colors"}
+    of_meshes = {"vertex_colors"}
     assert of_python == {"style", "lighting", "clip", "views", "angle", "width_mm", "pixel_mm", "lowest_hu"} | of_meshes
 
 

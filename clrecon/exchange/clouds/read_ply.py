@@ -21,7 +21,7 @@ from clrecon.exchange.clouds.raw_cloud import RawCloud, read_remarks, say_cut
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["read"]
+__all__ = ["Element", "Header", "read", "read_binary", "read_header", "read_text", "skip_to_vertices"]
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -37,17 +37,26 @@ _PIECE = 1 << 16
 
 
 @dataclass
-class _Element:
+class Element:
+    """An element of a file: its rows, their numbers by name, and their lists by name (types of count and entries)."""
+
     name: str
     count: int
     types: dict[str, str] = field(default_factory=dict)
-    has_list: bool = False
+    lists: dict[str, tuple[str, str]] = field(default_factory=dict)
+
+    @property
+    def has_list(self) -> bool:
+        """True where rows have no fixed length."""
+        return bool(self.lists)
 
 
 @dataclass
-class _Header:
+class Header:
+    """What a header says; `order` is that of the bytes, "" in text files."""
+
     order: str
-    elements: list[_Element]
+    elements: list[Element]
     comments: list[str]
 
 
@@ -62,12 +71,12 @@ def read(path: Path) -> RawCloud:
     name = escape_text(path.name)
     try:
         with open_regular(path) as stream:
-            header = _read_header(stream, name)
-            vertex = _skip_to_vertices(stream, header, name)
+            header = read_header(stream, name)
+            vertex = skip_to_vertices(stream, header, name)
             if header.order:
-                found = _read_binary(stream, header, vertex, name, path.stat().st_size)
+                found = read_binary(stream, header, vertex, name, path.stat().st_size)
             else:
-                found = _read_text(stream, vertex, name, path.stat().st_size)
+                found = read_text(stream, vertex, name, path.stat().st_size)
     except (OSError, ValueError, OverflowError, MemoryError) as error:
         raise say_cut(name, error) from error
     others = [f"{each.count:,} of '{escape_text(each.name)}'" for each in header.elements if each.name != "vertex"]
@@ -80,14 +89,15 @@ def read(path: Path) -> RawCloud:
     )
 
 
-def _read_header(stream: BinaryIO, name: str) -> _Header:
+def read_header(stream: BinaryIO, name: str) -> Header:
+    """Read the header; the stream then stands behind it."""
     start = stream.read(_LONGEST_HEAD)
     end = re.search(rb"(?:^|\n)end_header[ \t]*(?:\r\n|\n|\r)", start)
     if end is None:
         raise RefusedInputError(f"{name} is cut or corrupt: its first {len(start):,} bytes have no line 'end_header'")
     stream.seek(end.end())
     lines = start[: end.start()].decode("latin-1").replace("\r", "").split("\n")
-    header = _Header("?", [], [])
+    header = Header("?", [], [])
     for number, line in enumerate(lines[1:], 2):
         word, _, rest = line.strip().partition(" ")
         if word == "comment":
@@ -95,7 +105,7 @@ def _read_header(stream: BinaryIO, name: str) -> _Header:
         elif word == "format" and rest.split()[:1] and rest.split()[0] in _FORMATS:
             header.order = _FORMATS[rest.split()[0]]
         elif word == "element" and re.fullmatch(r"\S+ +\d{1,18}", rest.strip()):
-            header.elements.append(_Element(rest.split()[0], int(rest.split()[1])))
+            header.elements.append(Element(rest.split()[0], int(rest.split()[1])))
         elif word == "property" and header.elements:
             _add_property(header.elements[-1], rest.split(), number, name)
         elif word not in ("", "obj_info"):
@@ -105,9 +115,9 @@ def _read_header(stream: BinaryIO, name: str) -> _Header:
     return header
 
 
-def _add_property(element: _Element, words: list[str], number: int, name: str) -> None:
-    if words[:1] == ["list"]:
-        element.has_list = True
+def _add_property(element: Element, words: list[str], number: int, name: str) -> None:
+    if len(words) == 4 and words[0] == "list" and words[1] in _TYPES and words[2] in _TYPES:
+        element.lists[words[3]] = _TYPES[words[1]], _TYPES[words[2]]
         return
     if len(words) != 2 or words[0] not in _TYPES or words[1] in element.types:
         raise RefusedInputError(
@@ -118,7 +128,7 @@ def _add_property(element: _Element, words: list[str], number: int, name: str) -
     element.types[words[1]] = _TYPES[words[0]]
 
 
-def _skip_to_vertices(stream: BinaryIO, header: _Header, name: str) -> _Element:
+def skip_to_vertices(stream: BinaryIO, header: Header, name: str) -> Element:
     """Move the stream to the first vertex and return the element."""
     for element in header.elements:
         if element.name == "vertex":
@@ -138,7 +148,7 @@ def _skip_to_vertices(stream: BinaryIO, header: _Header, name: str) -> _Element:
     raise RefusedInputError(f"{name} has no element 'vertex' in its header")
 
 
-def _check_room(vertex: _Element, row_bytes: int, left: int, name: str) -> None:
+def _check_room(vertex: Element, row_bytes: int, left: int, name: str) -> None:
     if vertex.count * row_bytes > left:
         raise RefusedInputError(
             f"{name} is cut or corrupt: {vertex.count:,} vertices of {row_bytes} bytes or more cannot come from"
@@ -146,9 +156,10 @@ def _check_room(vertex: _Element, row_bytes: int, left: int, name: str) -> None:
         )
 
 
-def _read_binary(
-    stream: BinaryIO, header: _Header, vertex: _Element, name: str, file_bytes: int
+def read_binary(
+    stream: BinaryIO, header: Header, vertex: Element, name: str, file_bytes: int
 ) -> dict[str, NDArray[Any]]:
+    """Read the columns of vertices from a binary file."""
     row = np.dtype([(own, header.order + kind) for own, kind in vertex.types.items()])
     _check_room(vertex, row.itemsize, file_bytes - stream.tell(), name)
     columns = {own: np.empty(vertex.count, kind) for own, kind in vertex.types.items()}
@@ -159,7 +170,8 @@ def _read_binary(
     return columns
 
 
-def _read_text(stream: BinaryIO, vertex: _Element, name: str, file_bytes: int) -> dict[str, NDArray[Any]]:
+def read_text(stream: BinaryIO, vertex: Element, name: str, file_bytes: int) -> dict[str, NDArray[Any]]:
+    """Read the columns of vertices from a text file."""
     _check_room(vertex, 2 * len(vertex.types), file_bytes - stream.tell() + 1, name)
     if vertex.count == 0:
         return {own: np.zeros(0) for own in vertex.types}

@@ -20,7 +20,7 @@ from clrecon.jobs.render.report import (
 )
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.jobs.render.studio import Studio, read_curve, read_function, read_look
-from clrecon.jobs.shared.clouds import is_cloud_file, refuse_scan_settings
+from clrecon.jobs.shared.clouds import is_cloud_file, is_mesh_file, refuse_scan_settings
 from clrecon.jobs.shared.labelled import read_with_labels
 from clrecon.jobs.shared.laps import Laps
 from clrecon.jobs.shared.masking import mask_volume
@@ -29,6 +29,8 @@ from clrecon.jobs.shared.outputs import check_kept, commit_all
 from clrecon.jobs.shared.preprocess import preprocess_volume
 from clrecon.jobs.shared.region import Band, restrict_volume
 from clrecon.jobs.shared.report import stage_report
+from clrecon.mesh import Mesh
+from clrecon.mesh.reader import read_mesh
 from clrecon.reading import read_selected
 from clrecon.rendering.pictures.styles import SurfaceLook
 from clrecon.system.files import allow_open_files
@@ -59,7 +61,7 @@ def make_pictures(
 ) -> PictureReport:
     """Read a CT series or a cloud and take the pictures that are asked for.
 
-    Checks come in this order: the outputs, the settings files (transfer function, centre line), the device, the input.
+    Checks come in this order: the outputs, the settings files (transfer function, centre line, meshes), the device, the input.
     Pictures and turntable are written under temporary names and renamed when all are done.  The report is renamed
     last: it marks that everything is complete.
 
@@ -67,7 +69,7 @@ def make_pictures(
     ----------
     source : path
         DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`; for mode points a file of
-        points, see `clrecon.read_points`.
+        points, see `clrecon.read_points`, and for mode mesh one of a mesh, see `clrecon.read_mesh`.
     files : PictureFiles
     settings : RenderSettings, optional
     no_clobber : bool
@@ -95,9 +97,12 @@ def make_pictures(
     allow_open_files(3 * len(settings.views_used) + 2)  # 3 for each view, turntable and report
     function = read_function(settings.transfer_function)
     curve = read_curve(settings.curve)
+    meshes = [read_mesh(mesh.path, space=settings.mesh_space) for mesh in settings.meshes]
 
     subject, labels, device = _open(source, settings, progress, watch)
-    studio = Studio(subject, device, settings, function=function, curve=curve, labels=labels, progress=progress)
+    studio = Studio(
+        subject, device, settings, function=function, curve=curve, labels=labels, meshes=meshes, progress=progress
+    )
     with (
         keep_existing(no_clobber),
         studio,
@@ -118,16 +123,21 @@ def make_pictures(
 
 def _open(
     source: str | Path, settings: RenderSettings, progress: Progress, watch: Laps
-) -> tuple[Volume | PointCloud, LabelMap | None, Device]:
-    """Read the scan and its labels, or the cloud, while the device opens and builds its kernels.
+) -> tuple[Volume | PointCloud | Mesh, LabelMap | None, Device]:
+    """Read the scan and its labels, the cloud or the mesh, while the device opens and builds its kernels.
 
     Raises
     ------
     UsageError
         The mode shows a cloud and the input is a scan, or the other way round.
     """
-    is_cloud = is_cloud_file(source)
-    if is_cloud != (settings.mode == "points"):
+    is_mesh = settings.mode == "mesh"
+    is_cloud = is_cloud_file(source) and not is_mesh
+    if is_mesh:
+        refuse_scan_settings(settings, noun="a mesh")
+    elif is_mesh_file(source):
+        raise UsageError(f"the input is a mesh, which mode mesh shows, and not mode {settings.mode}")
+    elif is_cloud != (settings.mode == "points"):
         raise UsageError(
             f"the input is a cloud of points, which mode points shows, and not mode {settings.mode}"
             if is_cloud
@@ -137,9 +147,12 @@ def _open(
         refuse_scan_settings(settings)
     progress("device", 0, 0)
     with DeviceOpening(settings.device, partial(_prepare, settings=settings)) as opening:
-        subject: Volume | PointCloud
+        subject: Volume | PointCloud | Mesh
         labels = None
-        if is_cloud:
+        if is_mesh:
+            progress("read", 0, 0)
+            subject = read_mesh(source, space=settings.mesh_space)
+        elif is_cloud:
             from clrecon.points.reader import read_points
 
             progress("read", 0, 0)
@@ -153,7 +166,7 @@ def _open(
         watch.lap("read")
         device = opening.wait()
         watch.lap("device")
-    if not is_cloud:
+    if not (is_cloud or is_mesh):
         subject = _narrow(subject, settings, device, progress)  # type: ignore[arg-type]
         watch.lap("mask")
     return subject, labels, device
@@ -175,6 +188,11 @@ def _prepare(device: Device, settings: RenderSettings) -> None:
     from clrecon.geometry import Volume
     from clrecon.points import PointCloud
 
+    if settings.mode == "mesh":
+        small = RenderSettings.of("mesh", size=(8, 8))
+        with Studio(Mesh(np.eye(3), [(0, 1, 2)]), device, small, progress=ignore_progress) as studio:
+            studio.take_view("anterior")
+        return
     if settings.mode == "points":
         small = RenderSettings.of("points", size=(8, 8))
         with Studio(PointCloud([(0.0, 0.0, 0.0)]), device, small, progress=ignore_progress) as studio:

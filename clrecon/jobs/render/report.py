@@ -12,6 +12,7 @@ from clrecon.jobs.render.settings import LabelLook, RenderSettings
 from clrecon.jobs.shared.clouds import describe_cloud
 from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
 from clrecon.jobs.shared.run_report import RunReport
+from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, PointLook, Style, SurfaceLook, VolumeLook
 from clrecon.system.wording import name_parameter
 from clrecon.version import package_version
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.jobs.render.studio import Studio
     from clrecon.labels import LabelMap
+    from clrecon.mesh import Mesh
     from clrecon.opencl import Device
     from clrecon.points import PointCloud
     from clrecon.rendering import Rendering, TransferFunction
@@ -85,6 +87,9 @@ def _describe_points(made: Mapping[str, Any]) -> dict[str, Any] | None:
     return {name: made[name] for name in ("points", "radius_mm", "color_by", "shading", "legend", "legend_left_out")}
 
 
+_NOUNS = {"points": "cloud", "mesh": "mesh"}
+
+
 def find_emptiness(picture: Rendering) -> str | None:
     """Say why a picture is empty; None if it is not."""
     import numpy as np
@@ -94,7 +99,7 @@ def find_emptiness(picture: Rendering) -> str | None:
         if np.isfinite(picture.depth).any():
             return None
         return (
-            f"nothing of the {'cloud' if picture.mode == 'points' else 'volume'} shows in mode {picture.mode}:"
+            f"nothing of the {_NOUNS.get(picture.mode, 'volume')} shows in mode {picture.mode}:"
             " look at view and zoom, at what is clipped, and at the iso value or the transfer function"
         )
     is_water = picture.mode == "drr"
@@ -140,6 +145,8 @@ class PictureReport(RunReport):
         Settings of slices and reformations; None in other modes.
     labels : list of mapping or None
         The labels with a look of their own.
+    meshes : list of mapping
+        Each mesh: ``triangles``, ``color``, ``opacity``; ``file``: what its file says.
     cloud : mapping or None
         Of a cloud: ``points``, and whether it has ``normals``, ``hu``, ``labels``; ``file``: what its file says.
     pictures : list of mapping
@@ -163,6 +170,7 @@ class PictureReport(RunReport):
     combine: str | None
     offset_mm: float | None
     labels: list[dict[str, Any]] | None
+    meshes: list[dict[str, Any]]
     cloud: Mapping[str, Any] | None
     pictures: list[dict[str, Any]]
     turntable: Mapping[str, Any] | None
@@ -178,7 +186,7 @@ class PictureReport(RunReport):
 
 
 def describe_pictures(
-    subject: Volume | PointCloud,
+    subject: Volume | PointCloud | Mesh,
     settings: RenderSettings,
     studio: Studio,
     device: Device,
@@ -190,7 +198,7 @@ def describe_pictures(
 
     Parameters
     ----------
-    subject : Volume or PointCloud
+    subject : Volume, PointCloud or Mesh
     settings : RenderSettings
     studio : Studio
         The studio of the pictures: it knows their transfer function, light and warnings.
@@ -201,6 +209,7 @@ def describe_pictures(
     seconds : mapping
     """
     from clrecon.geometry import Volume
+    from clrecon.points import PointCloud
 
     volume = subject if isinstance(subject, Volume) else None
     certificate: dict[str, Any] = {}
@@ -209,12 +218,14 @@ def describe_pictures(
     warnings = [str(text) for text in certificate.pop("warnings", [])] + device.warnings + studio.warnings
     if volume is not None:
         warnings += warn_of_face(volume, _skin_shown(studio.style), "picture")
-    cloud = describe_cloud(subject) if not isinstance(subject, Volume) else None
-    warnings = [*((cloud or {}).get("file") or {}).get("warnings", ()), *warnings]
+    cloud = describe_cloud(subject) if isinstance(subject, PointCloud) else None
+    meshes = _describe_meshes(subject, settings, studio)
+    files = [(each or {}).get("file") or {} for each in (cloud, *meshes)]
+    warnings = [*(text for file in files for text in file.get("warnings", ())), *warnings]
     style, lighting = studio.style, studio.lighting
     clip = getattr(style, "clip", None)
     surface = style if isinstance(style, SurfaceLook) else None
-    colored = style if isinstance(style, SurfaceLook | PointLook) else None
+    colored = style if isinstance(style, SurfaceLook | PointLook | MeshLook) else None
     return PictureReport(
         affine_ijk_to_lps_mm=subject.report.get("affine_ijk_to_lps_mm") if volume is None else volume.affine.tolist(),
         mode=style.mode,
@@ -232,6 +243,7 @@ def describe_pictures(
         combine=style.combine if isinstance(style, PlaneCut | CurveCut) and style.thickness else None,
         offset_mm=style.offset_mm if isinstance(style, PlaneCut) else None,
         labels=_describe_labels(settings.labels, studio.labels),
+        meshes=meshes,
         cloud=cloud,
         pictures=list(pictures),
         turntable=turntable,
@@ -245,6 +257,27 @@ def describe_pictures(
         seconds=seconds,
         peak_memory_bytes=peak_memory_bytes(),
     )
+
+
+def _describe_meshes(
+    subject: Volume | PointCloud | Mesh, settings: RenderSettings, studio: Studio
+) -> list[dict[str, Any]]:
+    """Describe the mesh that is the input, and those that are shown with it."""
+    from clrecon.mesh import Mesh
+
+    shown = [(subject, studio.style)] if isinstance(subject, Mesh) else []
+    described = []
+    for mesh, look in [*shown, *zip(studio.meshes, settings.mesh_looks(), strict=True)]:
+        assert isinstance(look, MeshLook)
+        described.append(
+            {
+                "triangles": mesh.triangle_count,
+                "color": [round(float(share), 4) for share in look.rgb],
+                "opacity": look.opacity,
+                "file": mesh.report.get("file"),
+            }
+        )
+    return described
 
 
 def _describe_function(function: TransferFunction | None) -> dict[str, Any] | None:

@@ -9,16 +9,19 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import UsageError
+from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import Grid
 from clrecon.jobs.shared.settings import InputSettings
 from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import find_color
+from clrecon.rendering.looks.label_style import distinct_colors
 from clrecon.rendering.looks.lighting import UNSHADED, Lighting
 from clrecon.rendering.looks.presets import DEFAULT_PRESET, PRESETS, find_preset
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.movies.movie import turntable_cameras
 from clrecon.rendering.pictures.annotations import SMALLEST_SIDE
+from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.modes import MODES, check_known, choose_mode, keywords_of, make_style
 from clrecon.rendering.pictures.styles import (
     POINT_COLORS,
@@ -35,9 +38,11 @@ from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import DEFAULT_SIZE, DIRECTIONS, checked_size
 from clrecon.rendering.views.plane import find_plane
+from clrecon.system.wording import name_parameter
 
 __all__ = [
     "LabelLook",
+    "MeshFile",
     "POINT_COLORS",
     "RenderSettings",
     "Turntable",
@@ -102,6 +107,32 @@ class LabelLook:
 
 
 @dataclass(frozen=True)
+class MeshFile:
+    """A mesh that is shown with the input.
+
+    Parameters
+    ----------
+    path : path
+        See `clrecon.read_mesh`.
+    color : str, optional
+        See `clrecon.rendering.looks.colors.find_color`; default: "bone" for one mesh, a colour for each of several.
+    opacity : float
+    """
+
+    path: str
+    color: str | None = None
+    opacity: float = 1.0
+
+    def __post_init__(self) -> None:
+        _ = self.look
+
+    @property
+    def look(self) -> MeshLook:
+        """The style that it is shown in."""
+        return MeshLook(self.color, opacity=self.opacity)
+
+
+@dataclass(frozen=True)
 class RenderSettings(InputSettings):
     """Settings of the render job, which makes pictures from a CT series.
 
@@ -116,6 +147,10 @@ class RenderSettings(InputSettings):
     curve : str, optional
         File with the centre line; "spine" (or "auto") and None mean the curve of the style.
     labels : LabelLook, optional
+    meshes : sequence of MeshFile
+        Shown with the input.
+    mesh_space : {"lps", "ras"}, optional
+        Patient frame of meshes that do not name theirs; default: LPS, with a warning.
     light : "head", "none", side of the patient or (x, y, z), optional
         Origin of the light: the camera, nowhere (no shading), or a direction in LPS as seen from the patient.  Default:
         that of the style and its transfer function.
@@ -144,6 +179,8 @@ class RenderSettings(InputSettings):
     transfer_function: str | None = None
     curve: str | None = None
     labels: LabelLook | None = None
+    meshes: Sequence[MeshFile] = ()
+    mesh_space: str | None = None
     light: str | Sequence[float] | None = None
     views: Sequence[str] = ()
     up: str | Sequence[float] | None = None
@@ -211,7 +248,12 @@ class RenderSettings(InputSettings):
             find_color(self.background)
         if self.light is not None:
             _turn_light(self.light, Lighting())
-        for name in ("letters", "zoom", "view_angle", "turntable"):
+        if self.mesh_space is not None:
+            frame_from_lps(self.mesh_space)
+            if not self.meshes and self.mode != "mesh":
+                what = name_parameter("mesh_space")
+                raise UsageError(f"{what} says how meshes lie in the patient: name one with {name_parameter('meshes')}")
+        for name in ("letters", "zoom", "view_angle", "turntable", "meshes"):
             if getattr(self, name) != _DEFAULTS[name]:
                 check_known(self.mode, name)
         self._check_place()
@@ -266,7 +308,7 @@ class RenderSettings(InputSettings):
         style = self.style
         if function is not None and isinstance(style, VolumeLook | SlicesInSpace):
             style = replace(style, transfer_function=function)
-        if self.light is not None and isinstance(style, VolumeLook | SurfaceLook | PointLook):
+        if self.light is not None and isinstance(style, VolumeLook | SurfaceLook | PointLook | MeshLook):
             made_for = style.function.lighting if isinstance(style, VolumeLook) else None
             style = replace(style, lighting=_turn_light(self.light, made_for or Lighting()))
         if curve is not None and isinstance(style, CurveCut):
@@ -293,7 +335,19 @@ class RenderSettings(InputSettings):
         function = self.transfer_function or ""
         curve = "" if self.curve in (None, *SPINES) else self.curve
         look = "" if self.labels is None else self.labels.path
-        return tuple(path for path in (function, function.rpartition(":")[0], curve, look) if path)
+        meshes = (mesh.path for mesh in self.meshes)
+        return tuple(path for path in (function, function.rpartition(":")[0], curve, look, *meshes) if path)
+
+    def mesh_looks(self) -> list[MeshLook]:
+        """Return the styles of the meshes: with the light, and a colour for each of several that have none."""
+        colors = distinct_colors(len(self.meshes)) if len(self.meshes) > 1 else [None]
+        looks = []
+        for mesh, own in zip(self.meshes, colors, strict=False):
+            look = mesh.look
+            if mesh.color is None and own is not None:
+                look = replace(look, color=tuple(own.tolist()))
+            looks.append(look if self.light is None else replace(look, lighting=_turn_light(self.light, Lighting())))
+        return looks
 
     def camera(self, volume: Grid, view: str, turning: bool = False) -> Camera:
         """Place the camera of one view; with `turning` the whole volume stays in the picture while the camera orbits.

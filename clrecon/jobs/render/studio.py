@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, cast
 
 from clrecon.jobs.render.settings import SPINES, LabelLook, RenderSettings
 from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.looks.presets import find_preset
+from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.styles import (
     SPINE,
     CurveCut,
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from clrecon.geometry.affine import Float64Array
     from clrecon.geometry.grid import Grid
     from clrecon.labels import LabelMap
+    from clrecon.mesh import Mesh
     from clrecon.opencl import Device
     from clrecon.points import PointCloud
     from clrecon.rendering import Lighting, Rendering, TransferFunction
@@ -90,7 +93,7 @@ class Studio(Closing):
 
     Parameters
     ----------
-    subject : Volume or PointCloud
+    subject : Volume, PointCloud or Mesh
     device : Device
     settings : RenderSettings
     function : TransferFunction, optional
@@ -98,20 +101,24 @@ class Studio(Closing):
     curve : ndarray, shape (n, 3), optional
         Centre line of curved reformations in LPS mm; None means that of the style.
     labels : LabelMap, optional
+    meshes : sequence of Mesh
+        Those of the settings.
     progress : callable
     """
 
     def __init__(
         self,
-        subject: Volume | PointCloud,
+        subject: Volume | PointCloud | Mesh,
         device: Device,
         settings: RenderSettings,
         *,
         function: TransferFunction | None = None,
         curve: Float64Array | None = None,
         labels: LabelMap | None = None,
+        meshes: Sequence[Mesh] = (),
         progress: Progress,
     ):
+        self.meshes = list(meshes)
         self._subject, self.device, self._settings = subject, device, settings
         self.labels, self._progress = labels, progress
         self.style = settings.style_with(function, curve, labels)
@@ -131,15 +138,19 @@ class Studio(Closing):
         from clrecon.geometry.grid import Grid
         from clrecon.operators.rays.point_pictures import cloud_box
 
+        if self._is_scene:
+            box: Grid = self._open_scene().box
+            return box
         if not isinstance(self._subject, Grid):
-            self._box = self._box or cloud_box(self._subject)
+            self._box = self._box or cloud_box(cast("PointCloud", self._subject))
             return self._box
         return self._subject
 
     @property
     def lighting(self) -> Lighting | None:
         """The light of shaded pictures, None in modes without shading."""
-        return self.style.light if isinstance(self.style, VolumeLook | SurfaceLook | PointLook) else None
+        shaded = VolumeLook | SurfaceLook | PointLook | MeshLook
+        return self.style.light if isinstance(self.style, shaded) else None
 
     def take_view(self, view: str) -> Rendering:
         """Take the picture of one view, with its annotations."""
@@ -156,7 +167,9 @@ class Studio(Closing):
 
     def _render(self, **place: Any) -> Rendering:
         settings = self._settings
-        if isinstance(self.style, PointLook):
+        if self._is_scene:
+            picture = self._open_scene().take(place["camera"], place["size"], self._ground)
+        elif isinstance(self.style, PointLook):
             picture = self._take_points(self.style, place["camera"], place["size"])
         else:
             picture = self._open_volume().render(self.style, background=settings.background, **place)
@@ -176,11 +189,27 @@ class Studio(Closing):
         if self._renderer is None:
             opened = PointPictures(cast("PointCloud", self._subject), device=self.device, memory=self._settings.memory)
             self._renderer = self._stack.enter_context(opened)
-        background = self._settings.background
-        picture: Rendering = self._renderer.take(
-            style, camera, size, None if is_transparent(background) else background
-        )
+        picture: Rendering = self._renderer.take(style, camera, size, self._ground)
         return picture
+
+    @property
+    def _ground(self) -> str | None:
+        background = self._settings.background
+        return None if is_transparent(background) else background
+
+    @property
+    def _is_scene(self) -> bool:
+        return bool(self.meshes) or isinstance(self.style, MeshLook)
+
+    def _open_scene(self) -> Any:
+        from clrecon.operators.rays.scene import ScenePictures
+
+        if self._renderer is None:
+            looks = self._settings.mesh_looks()
+            objects = [(self._subject, self.style), *zip(self.meshes, looks, strict=True)]
+            opened = ScenePictures(objects, device=self.device, memory=self._settings.memory)
+            self._renderer = self._stack.enter_context(opened)
+        return self._renderer
 
 
 def _shown_function(settings: RenderSettings, style: Style) -> TransferFunction | None:

@@ -15,10 +15,24 @@ from clrecon.system.wording import name_parameter
 if TYPE_CHECKING:
     from clrecon.points import PointCloud
 
-__all__ = ["CLOUD_INPUTS", "describe_cloud", "is_cloud_file", "refuse_other_clouds", "refuse_scan_settings"]
+__all__ = [
+    "CLOUD_INPUTS",
+    "MESH_INPUTS",
+    "describe_cloud",
+    "is_cloud_file",
+    "is_mesh_file",
+    "refuse_other_clouds",
+    "refuse_scan_settings",
+]
 
 CLOUD_INPUTS = (".ply", ".vtp", ".npz", ".xyz", ".las", ".csv", ".txt")
 """Extensions of files that are read as clouds, see `clrecon.read_points`."""
+
+MESH_INPUTS = (".stl", ".ply")
+"""Extensions of files that are read as meshes, see `clrecon.read_mesh`."""
+
+MESH_ONLY = tuple(extension for extension in MESH_INPUTS if extension not in CLOUD_INPUTS)
+"""Those of them that are not read as clouds."""
 
 OTHER_CLOUDS = (".pcd", ".e57", ".laz", ".pts", ".ptx")
 """Extensions of clouds that are not read."""
@@ -30,6 +44,11 @@ _OF_BOTH = ("keep_ids", "device", "memory")
 def is_cloud_file(source: str | Path) -> bool:
     """True for a file, or the name of one, whose extension is that of a cloud; folders are scans."""
     return os.path.splitext(os.fspath(source))[1].lower() in CLOUD_INPUTS and not os.path.isdir(source)
+
+
+def is_mesh_file(source: str | Path) -> bool:
+    """True for a file, or the name of one, whose extension only meshes have; that of PLY is one of clouds too."""
+    return os.path.splitext(os.fspath(source))[1].lower() in MESH_ONLY and not os.path.isdir(source)
 
 
 def refuse_other_clouds(source: str | Path) -> None:
@@ -47,14 +66,16 @@ def refuse_other_clouds(source: str | Path) -> None:
         )
 
 
-def refuse_scan_settings(settings: InputSettings, also: Sequence[str] = ()) -> None:
-    """Refuse settings that have no meaning where the input is a cloud.
+def refuse_scan_settings(settings: InputSettings, also: Sequence[str] = (), noun: str = "a cloud of points") -> None:
+    """Refuse settings that have no meaning where the input is a cloud or a mesh.
 
     Parameters
     ----------
     settings : InputSettings
     also : sequence of str
         Further settings that are about a scan.
+    noun : str
+        What the input is.
 
     Raises
     ------
@@ -65,9 +86,7 @@ def refuse_scan_settings(settings: InputSettings, also: Sequence[str] = ()) -> N
     of_scans = [own.name for own in fields(InputSettings) if own.name not in _OF_BOTH]
     for name in (*of_scans, *also):
         if getattr(settings, name) != defaults[name]:
-            raise UsageError(
-                f"the input is a cloud of points, and {name_parameter(name)} is about a scan: leave it out"
-            )
+            raise UsageError(f"the input is {noun}, and {name_parameter(name)} is about a scan: leave it out")
 
 
 def describe_cloud(cloud: PointCloud) -> dict[str, Any]:

@@ -58,6 +58,7 @@ _BESIDE = {
     "depth": ("dvr", "mip", "minip", "surface", "slices", "slice", "points", "mesh"),
     "values": ("mip", "minip", "mean", "drr", "slice", "cpr"),
     "turntable": _CAMERAS,
+    "meshes": ("dvr", "surface", "slices", "points", "mesh"),
 }
 """Keywords that are not fields of a style, and the modes in which each is allowed.
 

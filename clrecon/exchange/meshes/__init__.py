@@ -1,0 +1,1 @@
+"""Readers of mesh files: binary and text STL, PLY of any program."""

@@ -1,0 +1,42 @@
+"""What a reader found in a file of a mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["RawMesh"]
+
+
+@dataclass
+class RawMesh:
+    """A file's triangles, in the file's own frame.
+
+    Attributes
+    ----------
+    kind : str
+        "STL" or "PLY".
+    vertices : ndarray, shape (n, 3), of any real type
+        mm; perhaps not finite.
+    triangles : ndarray, shape (m, 3), integer
+        Perhaps of vertices that are not there.
+    normals : ndarray, shape (n, 3), float32, or None
+    space : str or None
+        Frame that the file names.
+    iso_value_hu : float or None
+    certificate : sequence of str
+    warnings : list of str
+    """
+
+    kind: str
+    vertices: NDArray[Any]
+    triangles: NDArray[Any]
+    normals: NDArray[np.float32] | None = None
+    space: str | None = None
+    iso_value_hu: float | None = None
+    certificate: Sequence[str] = ()
+    warnings: list[str] = field(default_factory=list)

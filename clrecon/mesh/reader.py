@@ -1,0 +1,96 @@
+"""`read_mesh`: a mesh from a file, our own or that of another program."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.exchange.meshes import read_ply_mesh, read_stl
+from clrecon.geometry import SPACES, frame_from_lps
+from clrecon.mesh.mesh import Mesh
+from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.text import escape_text
+
+__all__ = ["MESH_INPUTS", "read_mesh"]
+
+log = get_logger(__name__)
+
+_READERS = {".stl": read_stl.read, ".ply": read_ply_mesh.read}
+
+MESH_INPUTS = tuple(_READERS)
+"""Extensions of files that are read as meshes."""
+
+
+def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh:
+    """Read a mesh from a file.
+
+    Parameters
+    ----------
+    path : str or path
+        STL (binary or text; corners that coincide are joined) or PLY with triangles, by the extension.  Units are mm.
+    space : {"lps", "ras"}, optional
+        Patient frame of coordinates that do not name theirs; None: LPS, which the report then calls assumed.
+
+    Returns
+    -------
+    Mesh
+        In LPS mm.  Entries of ``report["file"]``: ``kind``, ``space``, ``space_from`` ("file", "argument" or
+        "assumed"), ``triangles`` and ``warnings``.
+
+    Raises
+    ------
+    UsageError
+        The extension or `space` is unknown, or the file names another frame.
+    RefusedInputError
+        The file cannot be read, is cut or corrupt, or has numbers that a mesh cannot have.
+    """
+    asked = None if space is None else space.upper()
+    if asked is not None:
+        frame_from_lps(asked)
+    file = Path(path)
+    name = escape_text(file.name)
+    reader = _READERS.get(file.suffix.lower())
+    if reader is None:
+        raise UsageError(f"{name}: meshes are read from files {', '.join(MESH_INPUTS)}")
+    raw = reader(file)
+    warnings = raw.warnings
+    named = None if raw.space is None else raw.space.upper()
+    if named is not None and named.lower() not in SPACES:
+        warnings.append(f"{name} names the frame '{escape_text(named)}', which is not known")
+        named = None
+    if asked is not None and named is not None and asked != named:
+        raise UsageError(f"{name} says that its coordinates are {named}, {asked} was asked for: leave the space out")
+    used = named or asked or "LPS"
+    vertices, normals = raw.vertices, raw.normals
+    if vertices.dtype.kind not in "fiu":
+        raise RefusedInputError(f"{name} is corrupt: its vertices are no numbers")
+    if used != "LPS":
+        signs = np.diag(frame_from_lps(used))
+        vertices = vertices * signs.astype(vertices.dtype if vertices.dtype.kind == "f" else np.float64)
+        normals = None if normals is None else normals * signs.astype(np.float32) + np.float32(0)
+    if named is None and asked is None:
+        warnings.append(f"{name} names no patient frame: its coordinates are taken as LPS")
+    facts: dict[str, Any] = {
+        "kind": raw.kind,
+        "space": used,
+        "space_from": "file" if named else "argument" if asked else "assumed",
+        "triangles": len(raw.triangles),
+        "warnings": warnings,
+    }
+    report: dict[str, Any] = {"file": facts}
+    if raw.iso_value_hu is not None and np.isfinite(raw.iso_value_hu):
+        report["iso_value_hu"] = raw.iso_value_hu
+    if raw.certificate:
+        report["certificate_lines"] = list(raw.certificate)
+    try:
+        mesh = Mesh(vertices, raw.triangles, normals, report)
+        mesh.check()
+    except UsageError as error:
+        raise RefusedInputError(f"{name} is corrupt: {error}") from error
+    log.info("%s file read: %d triangles", raw.kind, mesh.triangle_count)
+    log_warnings(log, warnings)
+    return mesh

@@ -1,0 +1,98 @@
+"""Meshes from files in pictures: as the input, and with a scan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sample_meshes import ball
+
+import clrecon
+from clrecon.cli.main import main
+from clrecon.errors import UsageError
+from clrecon.jobs.render.files import PictureFiles
+from clrecon.jobs.render.job import make_pictures
+from clrecon.jobs.render.settings import MeshFile, RenderSettings
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, Path]:
+    """Return a ball in LPS, one in RAS 12 mm to the left, one without a frame, and a scan around them."""
+    vertices, triangles = ball(5.0, 12)
+    found = {name: tmp_path / name for name in ("lps.stl", "ras.ply", "plain.stl", "scan.nii")}
+    clrecon.Mesh(vertices, triangles).save(found["lps.stl"])
+    clrecon.Mesh(vertices + (12.0, 0.0, 0.0), triangles).save(found["ras.ply"], "ras")
+    content = found["lps.stl"].read_bytes()
+    found["plain.stl"].write_bytes(content[:80].replace(b"SPACE=LPS", b"         ") + content[80:])
+    import nibabel
+
+    affine = np.diag([-2.0, -2.0, 2.0, 1.0])
+    affine[:3, 3] = 19.0, 19.0, -19.0
+    image = nibabel.Nifti1Image(np.arange(8000, dtype=np.int16).reshape(20, 20, 20) % 500, affine)
+    image.header.set_xyzt_units("mm")
+    nibabel.save(image, found["scan.nii"])
+    return found
+
+
+def test_a_mesh_is_an_input(device: Any, files: dict[str, Path], tmp_path: Path, capsys: Any) -> None:
+    out = tmp_path / "out.png"
+    code = main(
+        ["render", str(files["ras.ply"]), "--mode", "mesh", "-o", str(out), "--size", "64x48", "--color", "orange"]
+    )
+    said = capsys.readouterr()
+    assert code == 0 and out.exists() and not said.err, said.err
+    assert "mode mesh" in said.out and "triangles" in said.out
+    depth = tmp_path / "depth.npy"
+    pictures = PictureFiles(str(out), str(depth), None, None, None)
+    settings = RenderSettings.of("mesh", size=(64, 48), meshes=(MeshFile(str(files["lps.stl"]), "red"),))
+    report = make_pictures(files["ras.ply"], pictures, settings)
+    camera = report.pictures[0]["camera"]
+    assert np.allclose(camera["focal_point_lps_mm"], (6.0, 0.0, 0.0), atol=0.2)  # the RAS ball is at the left
+    assert [mesh["file"]["space"] for mesh in report.meshes] == ["RAS", "LPS"]
+    assert [mesh["color"] for mesh in report.meshes][1] == [1.0, 0.0, 0.0]
+    assert report.cloud is None and report.mode == "mesh"
+
+
+@pytest.mark.parametrize("mode", ["dvr", "slices", "surface"])
+def test_meshes_lie_in_a_scan(device: Any, files: dict[str, Path], tmp_path: Path, mode: str) -> None:
+    out = tmp_path / "out.png"
+    meshes = (MeshFile(str(files["lps.stl"])), MeshFile(str(files["plain.stl"]), opacity=0.5))
+    extra = {"iso_value": 300.0} if mode == "surface" else {}
+    settings = RenderSettings.of(mode, size=(64, 48), meshes=meshes, **extra)
+    report = make_pictures(files["scan.nii"], PictureFiles(str(out), None, None, None, None), settings)
+    assert out.exists() and report.mode == mode
+    assert any("plain.stl names no patient frame" in text for text in report.warnings)
+    assert report.meshes[0]["color"] != report.meshes[1]["color"]
+    assert report.pictures[0]["hit_share"] > 0.02
+
+
+def test_a_turntable_of_a_mesh(device: Any, files: dict[str, Path], tmp_path: Path) -> None:
+    out = tmp_path / "frames"
+    words = ["--turntable", str(out), "--frames", "3", "--size", "32"]
+    assert main(["render", str(files["lps.stl"]), *words]) == 0
+    assert len(list(out.iterdir())) == 3
+
+
+def test_what_has_no_meaning_is_refused(files: dict[str, Path], tmp_path: Path, capsys: Any) -> None:
+    out, ball_file = str(tmp_path / "out.png"), str(files["lps.stl"])
+    for words, text in (
+        ([str(files["scan.nii"]), "--mode", "mip", "--mesh", ball_file], "--mesh means nothing in mode mip"),
+        ([str(files["scan.nii"]), "--mesh-space", "ras"], "name one with --mesh"),
+        ([str(files["scan.nii"]), "--mesh", ball_file + "=octarine"], "unknown colour 'octarine'"),
+        ([str(files["scan.nii"]), "--mesh", ball_file + "=red,2"], "opacity of a mesh"),
+        ([str(files["scan.nii"]), "--mesh", ball_file + "=red,x"], "FILE[=COLOUR[,OPACITY]]"),
+        ([str(files["scan.nii"]), "--mesh", str(tmp_path / "a.obj")], ".stl, .ply"),
+        ([ball_file, "--mode", "dvr"], "mode mesh shows, and not mode dvr"),
+        ([ball_file, "--fov"], "the input is a mesh"),
+        ([ball_file, "--mesh-space", "ras"], "leave the space out"),
+        ([str(files["scan.nii"]), "--mode", "mesh"], ".stl, .ply"),
+        ([str(files["scan.nii"]), "--opacity", "0.5"], "--opacity means nothing in mode dvr"),
+    ):
+        assert main(["render", *words, "-o", out]) != 0
+        error = capsys.readouterr().err
+        assert text in error and error.strip().count("\n") == 0, error
+        assert not Path(out).exists()
+    with pytest.raises(UsageError, match="unknown colour"):
+        MeshFile("a.stl", "octarine")
