@@ -62,8 +62,8 @@ def make_pictures(
     """Read a CT series or a cloud and take the pictures that are asked for.
 
     Checks come in this order: the outputs, the settings files (transfer function, centre line, meshes), the device, the
-    input.  Pictures and turntable are written under temporary names and renamed when all are done.  The report is renamed
-    last: it marks that everything is complete.
+    input.  Pictures and turntable are written under temporary names and renamed when all are done.  The report is
+    renamed last: it marks that everything is complete.
 
     Parameters
     ----------
