@@ -86,8 +86,8 @@ static inline void unite(volatile __global uint *parents, uint a, uint b)
 
 /* Join the runs of a row of cells with those of the next one, row `other`, in word w.  `mixed` are the
  * faces, `joined` those whose cells others join; `mixed_before` says whether the last face of the word before is mixed,
- * and is then told that of this word. */
-static inline void join_word(
+ * and is then told that of this word.  Part of the kernel by order: compilers for CPUs would make a call of it. */
+static inline __attribute__((always_inline)) void join_word(
     volatile __global uint *parents, __global const uint *run_starts, __global const ushort *word_runs,
     __global const uint *row_offsets, uint row, uint other, uint w, uint words, uint mixed, uint joined,
     uint *mixed_before)
