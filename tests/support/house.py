@@ -31,6 +31,7 @@ _layer("formats", "errors", "system", "geometry", "sources")
 _layer("reading", "errors", "system", "geometry", "sources", "dicom", "formats")
 _layer("labels", "errors", "version", "system", "geometry", "dicom", "formats")
 _layer("vertebrae", "errors", "system", "geometry", "anatomy", "labels")
+_layer("corridors", "errors", "geometry", "labels")
 _layer("mesh", "errors", "system", "geometry", "anatomy", "exchange")
 _layer("points", "errors", "system", "geometry", "exchange")
 _layer("rendering", "errors", "version", "system", "geometry", "labels")
@@ -57,6 +58,7 @@ _layer(
     "reference",
     "operators",
     "vertebrae",
+    "corridors",
 )
 _layer("viewer", "errors", "rendering")
 _layer("cli", "errors", "version", "system", "jobs")
@@ -89,6 +91,7 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "sources": frozenset({"numpy"}),
     "labels": frozenset({"numpy"}),
     "vertebrae": frozenset({"numpy"}),
+    "corridors": frozenset({"numpy"}),
     "mesh": frozenset({"numpy"}),
     "points": frozenset({"numpy"}),
     "exchange": frozenset({"numpy"}),
@@ -108,6 +111,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "labels": frozenset({"pydicom", "scipy"}),
     "vertebrae": frozenset({"scipy", "skimage"}),
     "exchange": frozenset({"vtk", "vtkmodules", "laspy"}),
+    "corridors": frozenset({"scipy"}),
     "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification"}),
     "points": frozenset({"pyvista", "open3d"}),
     "reference": frozenset({"scipy"}),

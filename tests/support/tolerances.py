@@ -220,3 +220,18 @@ TWIN_FILTER_MM = 1e-5  # the bar: exp and normals in float32 at coordinates up t
 MEAN_DISTANCE_SHARE = 1e-5  # sums of 16 distances in float32
 TWIN_FIELD_MM = 2e-5  # float32 sums of some 30 heights of up to 2 mm, places up to 30 mm: measured 3e-6
 FAR_FIELD_MM = 1e-3  # a cloud that moved by steps of float32 at 1e5 mm has its nodes elsewhere in it: measured 2e-4
+
+CORRIDOR_RADIUS_MM = 0.15
+"""Corridors of a cylinder with partial volume: a trilinear surface of 0.8 to 1 mm voxels, and the last step of the
+search."""
+
+CORRIDOR_FRAME_DEG = 2.5
+CORRIDOR_ANGLE_DEG = 4.0
+"""A line of 0.1 mm less radius may turn by some degrees within a short cylinder."""
+
+SEGMENT_DISTANCE_MM = 2e-3
+"""float32 coordinates of some centimetres, and the steps of the expected values along a segment."""
+
+CORRIDOR_HALF_MM = 0.5
+CORRIDOR_226_MM = 1.0
+"""Bars for a corridor's radius against the truth along its line, at the half level and at 226 HU."""

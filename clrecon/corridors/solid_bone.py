@@ -1,0 +1,338 @@
+"""The solid bone of one labelled vertebra on a lattice in LPS mm, and the points of its surface.
+
+HU and label are resampled (trilinear) on a regular lattice first, so that tilted, sheared and uneven stacks are right.
+Where HU cross the level between two points of the lattice, the surface lies at the crossing; elsewhere half way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import RefusedInputError
+from clrecon.geometry import AIR_HU, Volume
+from clrecon.labels.growth import Growth
+from clrecon.labels.solid import fill_solid
+
+__all__ = ["LATTICE_STEP_MM", "Lattice", "SolidBone", "fill_vertebra", "label_box", "sample_volume"]
+
+Float64Array = NDArray[np.float64]
+Box = tuple[slice, slice, slice]
+
+LATTICE_STEP_MM = 0.5
+"""Step of the lattice: half of a fine voxel, a quarter of a coarse one."""
+
+QUICK_STRIDE = 2
+"""Points of the lattice in one step of the quick distances."""
+
+MARGIN_MM = 3.0
+"""What is sampled beyond the label on each side; the walls' profiles of HU need it."""
+
+LARGEST_MM = 250.0
+"""Longest side of a label that can be one vertebra, with its transverse and spinous processes."""
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Points in even steps along the axes of LPS.
+
+    Attributes
+    ----------
+    origin : ndarray, shape (3,)
+        LPS mm of the first point.
+    step : float
+        mm.
+    shape : (int, int, int)
+        Points along z, y, x, as of an array.
+    """
+
+    origin: Float64Array
+    step: float
+    shape: tuple[int, int, int]
+
+    def points(self, kji: NDArray[Any]) -> Float64Array:
+        """Return LPS mm (n, 3) of array indices (n, 3) in the order z, y, x."""
+        return self.origin + self.step * np.asarray(kji, dtype=np.float64)[:, ::-1]
+
+    def indices(self, points: Float64Array) -> Float64Array:
+        """Return array coordinates, shape (3, n), in the order z, y, x, of LPS mm (n, 3)."""
+        return np.ascontiguousarray(((points - self.origin) / self.step).T[::-1])
+
+
+def sample_volume(volume: Volume, points: Float64Array) -> NDArray[np.float32]:
+    """Return HU (trilinear) at LPS mm (n, 3), `AIR_HU` beyond the scan; only the part around the points is read."""
+    from scipy.ndimage import map_coordinates
+
+    places = volume.lps_to_ijk(points)[:, ::-1].T
+    low = np.maximum(np.floor(places.min(axis=1)).astype(int), 0)
+    high = np.minimum(np.ceil(places.max(axis=1)).astype(int) + 1, volume.voxels.shape)
+    if (high <= low).any():
+        return np.full(len(points), AIR_HU, np.float32)
+    box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+    part = np.asarray(volume.voxels[box], dtype=np.float32)
+    found = map_coordinates(part, places - low[:, None], order=1, mode="constant", cval=AIR_HU)
+    return np.asarray(found, dtype=np.float32)
+
+
+def label_box(labels: NDArray[Any], number: int, margin: tuple[int, int, int]) -> Box | None:
+    """Return the box (k, j, i) of a label in an array, `margin` (k, j, i) larger and within it; None without one."""
+    from scipy.ndimage import find_objects
+
+    found = find_objects((labels == number).view(np.uint8))
+    if not found:
+        return None
+    return tuple(  # type: ignore[return-value]
+        slice(max(0, part.start - more), min(size, part.stop + more))
+        for part, more, size in zip(found[0], margin, labels.shape, strict=True)
+    )
+
+
+def _own(labels: NDArray[Any], number: int, volume: Volume) -> NDArray[np.bool_]:
+    """Mark the voxels of a label, grown by one voxel each way into voxels of no label that no other label is nearer
+    to.
+    """
+    grown = labels.copy()
+    for di, dj, dk in Growth.of(volume, None).offsets:
+        shifted = np.zeros_like(labels)
+        source, target = [], []
+        for step, size in zip((dk, dj, di), labels.shape, strict=True):
+            source.append(slice(max(0, step), size + min(0, step)))
+            target.append(slice(max(0, -step), size - max(0, step)))
+        shifted[tuple(target)] = labels[tuple(source)]
+        np.copyto(grown, shifted, where=grown == 0)
+    return np.asarray(grown == number)
+
+
+@dataclass(frozen=True)
+class SolidBone:
+    """The solid bone of one vertebra.
+
+    Attributes
+    ----------
+    lattice : Lattice
+    hu : ndarray, shape of the lattice, float32
+        HU at the points of the lattice within `MARGIN_MM` of the label; elsewhere `AIR_HU`.
+    solid : ndarray, shape of the lattice, bool
+        True inside.
+    mask : ndarray, shape of the lattice, bool
+        True in the label itself, whatever the HU.
+    surface : ndarray, shape (n, 3)
+        Points of the surface, LPS mm, about one step apart.
+    by_hu : ndarray, shape (n,), bool
+        True where HU cross the level there; False where the label alone ends or fills the bone.
+    level : float
+        HU.
+    steps : ndarray, shape (3, 3)
+        Columns: the steps of the scan's voxels along i, j, k, mm.
+    cut : ndarray, shape (m, 3)
+        Voxels of the label in the outermost layer of the scan, LPS mm: beyond them the vertebra may go on.
+    """
+
+    lattice: Lattice
+    hu: NDArray[np.float32]
+    solid: NDArray[np.bool_]
+    mask: NDArray[np.bool_]
+    surface: Float64Array
+    by_hu: NDArray[np.bool_]
+    level: float
+    steps: Float64Array
+    cut: Float64Array
+
+    @cached_property
+    def _tree(self) -> Any:
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.surface)
+
+    @cached_property
+    def _quick(self) -> NDArray[np.float32]:
+        from scipy.ndimage import distance_transform_edt
+
+        # from a point to the nearest one outside; the surface lies half a step before it on average
+        step = QUICK_STRIDE * self.lattice.step
+        thin = self.solid[(slice(None, None, QUICK_STRIDE),) * 3]
+        far = distance_transform_edt(np.pad(thin, 1), sampling=step)[1:-1, 1:-1, 1:-1]
+        return np.asarray(far - step / 2.0, dtype=np.float32)
+
+    def quick_depth(self, points: Float64Array) -> Float64Array:
+        """Return the distance from the surface, mm, below 0 outside, of LPS mm (n, 3), right to about half a mm."""
+        from scipy.ndimage import map_coordinates
+
+        places = self.lattice.indices(points) / QUICK_STRIDE
+        return np.asarray(map_coordinates(self._quick, places, order=1, mode="nearest"), dtype=np.float64)
+
+    def nearest(self, points: Float64Array) -> tuple[Float64Array, NDArray[np.intp]]:
+        """Return distances (n,) to the nearest points of the surface, and their places in `surface`."""
+        distance, place = self._tree.query(points)
+        return np.asarray(distance, dtype=np.float64), np.asarray(place, dtype=np.intp)
+
+    def is_solid(self, points: Float64Array) -> NDArray[np.bool_]:
+        """Tell of LPS mm (n, 3) whether the nearest point of the lattice is solid; False beyond the lattice."""
+        return self._look_up(self.solid, points)
+
+    def is_labelled(self, points: Float64Array) -> NDArray[np.bool_]:
+        """Tell of LPS mm (n, 3) whether the nearest point of the lattice has the label; False beyond the lattice."""
+        return self._look_up(self.mask, points)
+
+    def _look_up(self, marked: NDArray[np.bool_], points: Float64Array) -> NDArray[np.bool_]:
+        index = np.rint(self.lattice.indices(points)).astype(np.intp)
+        limits = np.array(self.lattice.shape)[:, None]
+        within = ((index >= 0) & (index < limits)).all(axis=0)
+        found = np.zeros(len(points), dtype=bool)
+        found[within] = marked[tuple(index[:, within])]
+        return found
+
+    def depth(self, points: Float64Array) -> Float64Array:
+        """Return the distance from the surface, mm, positive inside, of LPS mm (n, 3)."""
+        distance, _ = self.nearest(points)
+        return np.where(self.is_solid(points), distance, -distance)
+
+    def sample_hu(self, points: Float64Array) -> Float64Array:
+        """Return HU (trilinear) at LPS mm (n, 3); beyond the lattice those of its end."""
+        from scipy.ndimage import map_coordinates
+
+        found = map_coordinates(self.hu, self.lattice.indices(points), order=1, mode="nearest")
+        return np.asarray(found, dtype=np.float64)
+
+
+def fill_vertebra(volume: Volume, labels: NDArray[Any], number: int, level: float, what: str) -> SolidBone:
+    """Make the solid bone of one label.
+
+    Inside is what has the level or more and is the label's own (within the label, or one voxel beyond it), and what it
+    encloses: see `clrecon.labels.solid.fill_solid`.  The vertebral canal is open above and below, and so stays outside.
+
+    Parameters
+    ----------
+    volume : Volume
+    labels : ndarray, shape (nk, nj, ni)
+        Labels on the grid of the volume.
+    number : int
+    level : float
+        HU.
+    what : str
+        Name of the label, for messages.
+
+    Raises
+    ------
+    RefusedInputError
+        No voxel has the label, or it is too large for a vertebra, or nothing of it is as dense as the level.
+    """
+    spacing = np.array(volume.spacing)
+    margin = tuple(int(np.ceil(MARGIN_MM / step)) + 1 for step in spacing[::-1])
+    box = label_box(labels, number, margin)  # type: ignore[arg-type]
+    if box is None:
+        raise RefusedInputError(f"no voxel of {what} lies in the scan")
+    mask = labels[box]
+    start = np.array([part.start for part in box])
+    own = _own(mask, number, volume)
+    voxels = np.asarray(volume.voxels[box], dtype=np.float32)
+    dense = np.where(own & (voxels >= level), mask.dtype.type(number), mask.dtype.type(0))
+    if not dense.any():
+        raise RefusedInputError(
+            f"no voxel of {what} has {level:g} HU or more: they run to {float(voxels[mask == number].max()):g} HU"
+        )
+    found = np.argwhere(mask == number)
+    ends = ((found + start == 0) | (found + start == np.array(volume.voxels.shape) - 1)).any(axis=1)
+    places = volume.ijk_to_lps((found + start)[:, ::-1].astype(np.float64))
+    low, high = places.min(axis=0) - MARGIN_MM, places.max(axis=0) + MARGIN_MM
+    if (high - low).max() > LARGEST_MM:
+        raise RefusedInputError(
+            f"{what} is {(high - low).max() - 2 * MARGIN_MM:.0f} mm long: that is no vertebra, give the label of one"
+        )
+    solid_voxels = dense.copy()
+    fill_solid(solid_voxels, mask, number, (slice(None),) * 3, True)
+    counts = np.ceil((high - low) / LATTICE_STEP_MM).astype(int) + 1
+    lattice = Lattice(low, LATTICE_STEP_MM, (int(counts[2]), int(counts[1]), int(counts[0])))
+    filled = (solid_voxels != 0) & (dense == 0)
+    parts = (mask == number, own, solid_voxels != 0, filled)
+    hu, label, solid = _sample(volume, start, voxels, parts, lattice, level)
+    solid = _largest(solid)
+    surface, by_hu = _cross(lattice, hu, solid, level)
+    if not len(surface):
+        raise RefusedInputError(f"nothing of {what} is left at {level:g} HU")
+    return SolidBone(lattice, hu, solid, label, surface, by_hu, level, np.array(volume.affine[:3, :3]), places[ends])
+
+
+def _sample(
+    volume: Volume,
+    start: NDArray[Any],
+    voxels: NDArray[np.float32],
+    parts: tuple[NDArray[np.bool_], ...],
+    lattice: Lattice,
+    level: float,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Resample HU and label, and decide which points of the lattice are solid, plane by plane.
+
+    `parts` are the voxels of the label, those that are its own, those that are solid, and those of them that are filled
+    and not dense.
+    """
+    from scipy.ndimage import map_coordinates
+
+    nz, ny, nx = lattice.shape
+    hu = np.full(lattice.shape, AIR_HU, np.float32)
+    mask, solid = np.zeros(lattice.shape, bool), np.zeros(lattice.shape, bool)
+    shares = [part.astype(np.float32) for part in parts]
+    near = _widen(parts[1], volume.spacing)
+    y, x = (part.ravel() for part in np.indices((ny, nx)))
+    last = np.array(voxels.shape)[:, None] - 0.5
+    for z in range(nz):
+        points = lattice.points(np.stack((np.full(len(x), z), y, x), axis=1))
+        places = volume.lps_to_ijk(points)[:, ::-1].T - start[:, None]
+        within = ((places >= -0.5) & (places < last)).all(axis=0)
+        within[within] = near[tuple(np.floor(places[:, within] + 0.5).astype(np.intp))]
+        places = places[:, within]
+        sampled = [map_coordinates(part, places, order=1, mode="nearest") for part in (voxels, *shares)]
+        values, label, own, whole, filled = sampled
+        # a cell whose corners are all solid is so throughout; in others HU decide, and half a filled voxel
+        inside = ((values >= level) & (own >= 0.5)) | (filled >= 0.5) | (whole >= 1.0 - 1e-4)
+        at = within.reshape(ny, nx)
+        hu[z][at], mask[z][at], solid[z][at] = values, label >= 0.5, inside
+    return hu, mask, solid
+
+
+def _widen(own: NDArray[np.bool_], spacing: tuple[float, float, float]) -> NDArray[np.bool_]:
+    """Mark the voxels within `MARGIN_MM` of some, and one voxel more."""
+    from scipy.ndimage import maximum_filter
+
+    size = tuple(2 * (int(np.ceil(MARGIN_MM / step)) + 1) + 1 for step in spacing[::-1])
+    return np.asarray(maximum_filter(own.view(np.uint8), size), dtype=bool)
+
+
+def _largest(solid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the largest piece of a solid, without the cavities in it."""
+    from scipy.ndimage import binary_fill_holes, label
+
+    pieces, count = label(solid)
+    if count > 1:
+        sizes = np.bincount(pieces.ravel())
+        sizes[0] = 0
+        solid = pieces == int(sizes.argmax())
+    return np.asarray(binary_fill_holes(solid), dtype=bool)
+
+
+def _cross(
+    lattice: Lattice, hu: NDArray[np.float32], solid: NDArray[np.bool_], level: float
+) -> tuple[Float64Array, NDArray[np.bool_]]:
+    """Return the points where the steps of the lattice leave the solid, and whether HU place them."""
+    points, placed = [], []
+    for axis in range(3):
+        size = solid.shape[axis]
+        first = np.take(solid, range(size - 1), axis=axis)
+        second = np.take(solid, range(1, size), axis=axis)
+        at = np.argwhere(first != second)
+        ends = at.copy()
+        ends[:, axis] += 1
+        one, other = hu[tuple(at.T)].astype(np.float64), hu[tuple(ends.T)].astype(np.float64)
+        outward = first[tuple(at.T)]
+        inner, outer = np.where(outward, one, other), np.where(outward, other, one)
+        by_hu = (inner >= level) & (outer < level)
+        share = np.where(by_hu, (one - level) / np.where(one == other, 1.0, one - other), 0.5)
+        where = at.astype(np.float64)
+        where[:, axis] += share
+        points.append(lattice.points(where))
+        placed.append(by_hu)
+    return np.concatenate(points), np.concatenate(placed)

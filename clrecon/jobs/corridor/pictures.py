@@ -1,0 +1,141 @@
+"""The sheet of a vertebra: for each side three slices through its corridor, with line and circles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.corridors.corridor import Corridor, VertebraCorridors, screw_diameter
+from clrecon.corridors.grades import Screw
+from clrecon.corridors.search import SIDES
+from clrecon.corridors.solid_bone import sample_volume
+from clrecon.geometry import Volume
+from clrecon.rendering.pictures.annotations import orientation_letters
+from clrecon.rendering.pictures.picture_data import PictureData
+from clrecon.rendering.pictures.sheets import Panel, Stroke, draw_sheet
+
+__all__ = ["draw_corridors"]
+
+Float64Array = NDArray[np.float64]
+
+WIDTH_MM = 96.0
+PIXELS = 400
+CORRIDOR, LIMIT, GIVEN = (90, 230, 120), (255, 190, 60), (255, 90, 90)
+"""Colours of corridor, largest screw and given screws."""
+
+
+def _slice(volume: Volume, centre: Float64Array, right: Float64Array, down: Float64Array) -> NDArray[np.float32]:
+    """Return HU (trilinear) of a plane of `WIDTH_MM`, shape (`PIXELS`, `PIXELS`); air beyond the scan."""
+    way = (np.arange(PIXELS) - (PIXELS - 1) / 2.0) * (WIDTH_MM / PIXELS)
+    points = centre + way[:, None, None] * down + way[None, :, None] * right
+    return sample_volume(volume, points.reshape(-1, 3)).reshape(PIXELS, PIXELS)
+
+
+def _flat(points: Float64Array, centre: Float64Array, right: Float64Array, down: Float64Array) -> Float64Array:
+    return np.stack(((points - centre) @ right, (points - centre) @ down), axis=1)
+
+
+def _along(
+    centre: Float64Array, right: Float64Array, down: Float64Array, ends: Float64Array, radius: float, color: Any
+) -> list[Stroke]:
+    """Return the two sides of a cylinder that lies in the plane, and its axis."""
+    flat = _flat(ends, centre, right, down)
+    way = (flat[1] - flat[0]) / max(float(np.linalg.norm(flat[1] - flat[0])), 1e-9)
+    across = radius * np.array((-way[1], way[0]))
+    frame = np.stack((flat[0] + across, flat[1] + across, flat[1] - across, flat[0] - across, flat[0] + across))
+    return [Stroke(frame, color), Stroke(flat, color)]
+
+
+def draw_corridors(
+    volume: Volume, found: VertebraCorridors, screws: Sequence[Screw], margin: float, footer: Sequence[str]
+) -> PictureData:
+    """Draw the corridors of a vertebra.
+
+    Each side has a row: the slice through line and left-right direction, the one through line and cranial direction,
+    and the one square to the line at the narrowest section of the pedicle.  A side without corridor shows the slices
+    through the vertebra's middle.
+
+    Parameters
+    ----------
+    volume : Volume
+    found : VertebraCorridors
+    screws : sequence of Screw
+        Given screws of this vertebra.
+    margin : float
+        mm.
+    footer : sequence of str
+        Lines of text below.
+    """
+    rows = [
+        _row(volume, found, corridor, [screw for screw in screws if _side_of(found, screw) == corridor.side], margin)
+        for corridor in found.corridors
+    ]
+    return draw_sheet(rows, footer)
+
+
+def _side_of(found: VertebraCorridors, screw: Screw) -> str:
+    first, last = found.frame.to_frame(np.stack((screw.entry, screw.tip)))
+    share = np.clip((found.frame.body_y[1] - first[1]) / min(last[1] - first[1], -1e-9), 0.0, 1.0)
+    return "left" if (first + share * (last - first))[0] > found.frame.canal[0] else "right"
+
+
+def _row(
+    volume: Volume, found: VertebraCorridors, corridor: Corridor, screws: Sequence[Screw], margin: float
+) -> list[Panel]:
+    axes, name = found.frame.axes, f"{found.name}, {corridor.side}"
+    ends: Float64Array
+    if corridor.tip is not None and corridor.entry is not None and corridor.pass_point is not None:
+        ends, centre = np.stack((corridor.entry, corridor.tip)), corridor.pass_point
+        told = [
+            f"{name}: radius {corridor.radius:.1f} mm",
+            f"screw to {screw_diameter(corridor.radius or 0.0, margin):.1f} mm, margin {margin:g} mm",
+        ]
+    else:
+        side = SIDES[corridor.side]
+        centre = found.frame.to_lps(np.array([[found.frame.canal[0] + 14.0 * side, found.frame.body_y[1], 0.0]]))[0]
+        ends, told = np.stack((centre + 20.0 * axes[1], centre - 25.0 * axes[1])), [name, "no corridor"]
+    back = ends[0] - ends[1]
+    back /= np.linalg.norm(back)
+    left = axes[0] - (axes[0] @ back) * back
+    left /= np.linalg.norm(left)
+    up = np.cross(back, left)
+    up = up if up @ axes[2] > 0.0 else -up
+    # seen from the patient's feet, from the patient's left, and from behind
+    planes = ((left, back, "in the plane of line and left"), (back, -up, "of line and cranial"), (-left, -up, "across"))
+    panels = []
+    for number, (right, down, caption) in enumerate(planes):
+        strokes: list[Stroke] = []
+        for radius, pair, color in _cylinders(corridor, ends, screws, margin):
+            if number < 2:
+                strokes += _along(centre, right, down, pair, radius, color)
+            else:
+                way = pair[1] - pair[0]
+                share = ((centre - pair[0]) @ back) / (way @ back)
+                strokes.append(Stroke(_flat((pair[0] + share * way)[None], centre, right, down), color, radius))
+        edges = tuple(orientation_letters(way)[:1] for way in (-right, right, -down, down))
+        panels.append(
+            Panel(
+                _slice(volume, centre, right, down),
+                WIDTH_MM / PIXELS,
+                [*told, caption] if number == 0 else [caption],
+                strokes,
+                edges,  # type: ignore[arg-type]
+            )
+        )
+    return panels
+
+
+def _cylinders(
+    corridor: Corridor, ends: Float64Array, screws: Sequence[Screw], margin: float
+) -> list[tuple[float, Float64Array, tuple[int, int, int]]]:
+    """Return radius, ends and colour of what is drawn: corridor, largest screw, given screws."""
+    drawn = []
+    if corridor.radius is not None:
+        drawn.append((corridor.radius, ends, CORRIDOR))
+        if corridor.radius > margin:
+            drawn.append((corridor.radius - margin, ends, LIMIT))
+    drawn += [(screw.diameter / 2.0, np.stack((screw.entry, screw.tip)), GIVEN) for screw in screws]
+    return drawn
