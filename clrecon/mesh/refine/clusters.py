@@ -343,5 +343,5 @@ def _any_witness(flags: NDArray[np.bool_], witnesses: IntArray) -> NDArray[np.bo
     """Mark triangles with a witness, shape (7, m), whose flag is set, or without witness."""
     found = witnesses[0] < 0
     for rows in witnesses:
-        found |= flags[rows]
+        found |= flags.take(rows, mode="clip")
     return found

@@ -20,8 +20,9 @@ IntArray = NDArray[np.integer]
 
 def any_corner(flags: NDArray[np.bool_], triangles: IntArray) -> NDArray[np.bool_]:
     """Mark triangles, shape (m, 3), that have a corner whose flag is set."""
-    a, b, c = triangles.T
-    return np.asarray(flags[a] | flags[b] | flags[c])
+    # "clip" avoids checking each index, which takes longer than the look-up.
+    one, two, three = flags.take(triangles, mode="clip").T
+    return np.asarray(one | two | three)
 
 
 def find_sheets(faces: NDArray[np.uint32], size: int, edges: Edges) -> list[IntArray]:
