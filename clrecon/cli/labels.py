@@ -13,6 +13,13 @@ if TYPE_CHECKING:
 __all__ = ["add_label_arguments", "describe_labels", "label_choice"]
 
 
+def _parse_color(text: str) -> tuple[str, str]:
+    """Read ``LABEL=COLOUR``."""
+    from clrecon.cli.render_values import parse_label_color  # numpy: not loaded for a help text
+
+    return parse_label_color(text)
+
+
 def add_label_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options for label maps."""
     group = parser.add_argument_group("labels", "one mesh a label: the label picks the cells, HU place the vertices")
@@ -21,6 +28,19 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--label", metavar="NAME|N", action="append", help="this label only; may be given again (default: all)"
+    )
+    group.add_argument("--hide-label", metavar="NAME|N", action="append", help="not this label; may be given again")
+    group.add_argument(
+        "--label-color",
+        metavar="LABEL=COLOUR",
+        type=_parse_color,
+        action="append",
+        help="colour of a label in .ply, .glb and .3mf, such as L3=orange; may be given again",
+    )
+    group.add_argument(
+        "--one-file",
+        action="store_true",
+        help="all labels in one file (.3mf or .glb), each an object with its name and a colour of its own",
     )
     group.add_argument(
         "--surface",
@@ -49,9 +69,21 @@ def label_choice(options: argparse.Namespace) -> LabelChoice | None:
         from clrecon.jobs.mesh.label_choice import LabelChoice
 
         surface = "hu" if options.surface is None else options.surface.lower()
-        return LabelChoice(options.labels, tuple(options.label or ()), options.grow, options.solid, surface)
+        return LabelChoice(
+            options.labels,
+            tuple(options.label or ()),
+            options.grow,
+            options.solid,
+            surface,
+            hidden=tuple(options.hide_label or ()),
+            colors=tuple(options.label_color or ()),
+            one_file=options.one_file,
+        )
     given = {
         "--label": options.label,
+        "--hide-label": options.hide_label,
+        "--label-color": options.label_color,
+        "--one-file": options.one_file,
         "--solid": options.solid,
         "--grow": options.grow is not None,
         "--surface": options.surface,

@@ -171,7 +171,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     console.result(report)
     for line in describe_mesh(report):
         console.say(line)
-    console.say(f"wrote    {_describe_files(options.output, report)}")
+    console.say(f"wrote    {_describe_files(options.output, report, together=options.one_file)}")
     if options.report:
         console.say(f"report   {printable(options.report)}")
     return finish_with_gates(report, console, settings.strict)
@@ -257,10 +257,10 @@ def _describe_parts(meshes: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def _describe_files(output: str, report: dict[str, Any]) -> str:
+def _describe_files(output: str, report: dict[str, Any], *, together: bool) -> str:
     from clrecon.jobs.shared.outputs import name_outputs
 
-    paths = name_outputs(output, [mesh["name"] or "" for mesh in report["meshes"]])
+    paths = [output] if together else name_outputs(output, [mesh["name"] or "" for mesh in report["meshes"]])
     names = [printable(str(path)) for path in (paths[0], paths[-1])]
     files = {1: names[0], 2: " and ".join(names)}.get(len(paths), f"{names[0]} to {names[1]}, {len(paths):,} files")
     return f"{files}, {megabytes(report['output']['bytes'])}, {report['space'].upper()} mm"

@@ -13,7 +13,7 @@ from clrecon.errors import OutputError
 from clrecon.exchange.certificate import certificate_lines, plain_lines
 from clrecon.geometry import frame_from_lps
 
-__all__ = ["Content", "PointContent", "Writable", "describe_facts", "refuse_file"]
+__all__ = ["Assembly", "Content", "PointContent", "Writable", "describe_facts", "parts_of", "refuse_file"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,9 +81,33 @@ class Content(PointContent):
     Attributes
     ----------
     triangles : ndarray, shape (m, 3), uint32
+    name : str or None
+        Name of the object, for formats that have names.
+    color : (float, float, float) or None
+        Red, green and blue, 0 to 1, for formats that have colours; None: the colour of the format's writer.
     """
 
     triangles: NDArray[np.uint32]
+    name: str | None = None
+    color: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """Several meshes as they go into one file, each an object with a name and a colour of its own.
+
+    Attributes
+    ----------
+    parts : tuple of Content
+        All in the same space.
+    """
+
+    parts: tuple[Content, ...]
+
+
+def parts_of(content: Content | Assembly) -> tuple[Content, ...]:
+    """Return the meshes of a file."""
+    return content.parts if isinstance(content, Assembly) else (content,)
 
 
 def describe_facts(report: Mapping[str, Any], space: str, *, keep_ids: bool = False) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.exchange.content import PointContent
+from clrecon.exchange.content import Assembly, PointContent
 from clrecon.system.files import StagedFile, stage_file
 
 __all__ = ["FOUR_GIB", "NO_LIMIT", "FileFormat", "find_extension", "stage_content"]
@@ -18,7 +18,7 @@ __all__ = ["FOUR_GIB", "NO_LIMIT", "FileFormat", "find_extension", "stage_conten
 FOUR_GIB = 2**32 - 1
 NO_LIMIT = 2**62
 
-Contents = TypeVar("Contents", bound=PointContent)
+Contents = TypeVar("Contents", bound=PointContent | Assembly)
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def stage_content(
 
     Parameters
     ----------
-    content : PointContent
+    content : PointContent or Assembly
     path : str or path
     chosen : FileFormat
     counted : str

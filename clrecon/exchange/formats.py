@@ -11,18 +11,22 @@ The same mesh gives the same bytes every time.  No file holds patient data, a da
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 
 import numpy as np
 
-from clrecon.errors import NoSurfaceError
+from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange import glb, obj, ply, stl, threemf, vtp
-from clrecon.exchange.content import Content, Writable
+from clrecon.exchange.content import Assembly, Content, Writable
 from clrecon.exchange.file_format import FOUR_GIB, NO_LIMIT, FileFormat, find_extension, stage_content
 from clrecon.geometry.precision import float32_step
 from clrecon.system.files import StagedFile
 
-__all__ = ["FORMATS", "check_format", "describe_rounding", "stage_mesh", "write_mesh"]
+__all__ = [
+    "ASSEMBLIES", "FORMATS", "check_assembly", "check_format", "describe_rounding", "stage_assembly",
+    "stage_mesh", "write_mesh",
+]  # fmt: skip
 
 # STL: the format could hold more, but many programs keep offsets in 32 bits.  GLB: its length field has 32 bits.
 FORMATS: dict[str, FileFormat[Content]] = {
@@ -33,6 +37,39 @@ FORMATS: dict[str, FileFormat[Content]] = {
     ".vtp": FileFormat(vtp.estimate, vtp.write, vtp.verify, NO_LIMIT),
     ".3mf": FileFormat(threemf.estimate, threemf.write, threemf.verify, NO_LIMIT),
 }
+
+
+ASSEMBLIES: dict[str, FileFormat[Assembly]] = {
+    ".glb": FileFormat(glb.estimate, glb.write, glb.verify, FOUR_GIB),
+    ".3mf": FileFormat(threemf.estimate, threemf.write, threemf.verify, NO_LIMIT),
+}
+"""Formats that hold several named objects in a file."""
+
+
+def check_assembly(path: str | os.PathLike[str]) -> None:
+    """Refuse a file whose format holds one object only.
+
+    Raises
+    ------
+    UsageError
+    """
+    extension = check_format(path)
+    if extension not in ASSEMBLIES:
+        raise UsageError(f"{extension} holds one mesh: several with their names in one file are .3mf or .glb")
+
+
+def stage_assembly(
+    meshes: Sequence[Writable], path: str | os.PathLike[str], space: str = "lps", *, keep_ids: bool = False
+) -> AbstractContextManager[StagedFile]:
+    """Write several meshes as the objects of one file, as `stage_mesh` does one."""
+    check_assembly(path)
+    for mesh in meshes:
+        mesh.check()
+    content = Assembly(tuple(mesh.describe(space, keep_ids=keep_ids) for mesh in meshes if mesh.triangle_count))
+    if not content.parts:
+        raise NoSurfaceError("the surfaces are empty: no file is written")
+    count = sum(mesh.triangle_count for mesh in meshes)
+    return stage_content(content, path, ASSEMBLIES[check_format(path)], f"{count} triangles", "fewer labels")
 
 
 def check_format(path: str | os.PathLike[str]) -> str:

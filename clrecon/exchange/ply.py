@@ -37,10 +37,18 @@ def _header(content: PointContent) -> bytes:
         *(f"property float {name}" for name in ("nx", "ny", "nz") if content.normals is not None),
         *(["property float scalar_HU"] if content.hu is not None else []),
         *(["property int label"] if content.labels is not None else []),
+        *(f"property uchar {name}" for name in ("red", "green", "blue") if _color(content) is not None),
     ]
     if isinstance(content, Content):
         lines += [f"element face {len(content.triangles)}", "property list uchar int vertex_indices"]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+
+
+def _color(content: PointContent) -> NDArray[np.uint8] | None:
+    """Return red, green and blue of a mesh that has a colour."""
+    if not isinstance(content, Content) or content.color is None:
+        return None
+    return np.rint(255.0 * np.array(content.color)).astype(np.uint8)
 
 
 def _columns(content: PointContent) -> dict[str, tuple[NDArray[Any], str, tuple[int, ...]]]:
@@ -54,6 +62,8 @@ def _columns(content: PointContent) -> dict[str, tuple[NDArray[Any], str, tuple[
         columns["hu"] = (content.hu, "<f4", ())
     if content.labels is not None:
         columns["label"] = (content.labels, "<i4", ())
+    if (color := _color(content)) is not None:
+        columns["color"] = (np.broadcast_to(color, (len(content.vertices), 3)), "u1", (3,))
     return columns
 
 

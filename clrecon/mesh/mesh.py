@@ -197,7 +197,15 @@ class Mesh(Message):
         """
         vertices, normals = self.in_space(space)
         facts = describe_facts(self.report, space, keep_ids=keep_ids)
-        return Content(vertices=vertices, triangles=self.triangles, normals=normals, **facts)
+        name, color = self.report.get("part_name"), self.report.get("color")
+        return Content(
+            vertices=vertices,
+            triangles=self.triangles,
+            normals=normals,
+            name=None if name is None else str(name),
+            color=None if color is None else (float(color[0]), float(color[1]), float(color[2])),
+            **facts,
+        )
 
     def quality(self) -> MeshQuality:
         """Measure the mesh: closedness, size and faults."""

@@ -29,6 +29,7 @@ from clrecon.jobs.shared.outputs import (
     refuse_files,
     refuse_numbered,
     stage_meshes,
+    stage_together,
 )
 from clrecon.jobs.shared.report import stage_report
 from clrecon.reading import read_selected
@@ -111,7 +112,7 @@ def make_mesh(
     watch.lap("surface")
     parts = _select(volume, surfaces, extracted, device.current, settings, progress)
     del extracted
-    paths = name_outputs(output, [part.name for part in parts], report_path)
+    paths = _name_files(output, parts, report_path, settings)
     judge_surfaces(parts, volume, settings)
     watch.lap("select")
     gates = _refine_and_measure(parts, volume, settings, measure or settings.strict, progress, watch)
@@ -140,10 +141,23 @@ def _check_files(
     settings: MeshSettings,
 ) -> None:
     """Refuse outputs that cannot be written or would replace an input."""
-    outputs = check_outputs(output, report_path, first_names(surfaces, settings.split))
-    if settings.split:
+    if settings.one_file:
+        from clrecon.exchange.formats import check_assembly
+
+        check_assembly(output)
+    outputs = check_outputs(output, report_path, [""] if settings.one_file else first_names(surfaces, settings.split))
+    if settings.split and not settings.one_file:
         refuse_numbered(output)
     check_kept(outputs, source, None if settings.labels is None else settings.labels.path)
+
+
+def _name_files(
+    output: str | Path, parts: Sequence[Part], report_path: str | Path | None, settings: MeshSettings
+) -> list[str | Path]:
+    """Return the file of each part."""
+    if settings.one_file:
+        return [output] * len(parts)
+    return name_outputs(output, [part.name for part in parts], report_path)
 
 
 def _log(report: MeshReport, volume: Volume) -> None:
@@ -163,12 +177,18 @@ def _write(
     watch: Laps,
     progress: Progress,
 ) -> MeshReport:
-    """Write all files, with the report of all meshes as the last one, and return the report."""
+    """Write all files, with `one_file` all meshes into one, and the report of all as the last; return the report."""
     with ExitStack() as staged:  # all files are on the disk before the first replaces an older one
         meshes = [part.mesh for part in parts]
-        files = stage_meshes(staged, meshes, paths, settings.space, progress, keep_ids=settings.keep_ids)
+        if settings.one_file:
+            files = [stage_together(staged, meshes, paths[0], settings.space, progress, keep_ids=settings.keep_ids)]
+        else:
+            files = stage_meshes(staged, meshes, paths, settings.space, progress, keep_ids=settings.keep_ids)
         watch.lap("write")
-        report = compose([describe_part(*each, settings.space) for each in zip(parts, files, paths, strict=True)])
+        of_parts = files * len(parts) if settings.one_file else files
+        report = compose([describe_part(*each, settings.space) for each in zip(parts, of_parts, paths, strict=True)])
+        if settings.one_file:
+            report = report.changed(output={**report["output"], "bytes": files[0].size})
         if report_path is not None:
             files.append(staged.enter_context(stage_report(report_path, report)))
         commit_all(files)
@@ -189,7 +209,8 @@ def _open(
 
     def read_map(volume: Volume | None) -> LabelMap | None:
         labels = open_labels(settings.labels, volume)
-        if labels is not None and settings.labels is not None and settings.labels_pick and no_clobber:
+        several = settings.labels_pick and not settings.one_file
+        if labels is not None and settings.labels is not None and several and no_clobber:
             refuse_files(name_outputs(output, name_label_files(labels, settings.labels, surfaces)))
         return labels
 

@@ -50,7 +50,7 @@ def name_label_files(labels: LabelMap, choice: LabelChoice, surfaces: Sequence[S
     """Name the files of all wanted labels, each of which may turn out to have no surface; empty for one file."""
     from clrecon.labels import file_suffixes
 
-    numbers = [labels.find(label) for label in choice.wanted] or labels.numbers
+    numbers = choice.numbers_of(labels)
     suffixes = file_suffixes({number: labels.name(number) for number in numbers})
     names = ["_".join(filter(None, (suffix, each.name))) for suffix in suffixes.values() for each in surfaces]
     return names if len(names) > 1 else []
@@ -87,17 +87,19 @@ def extract_label_surfaces(
     from clrecon.operators.surface.labels import extract_labels
 
     found: list[tuple[Surface, int, Mesh]] = []
-    numbers = [labels.find(label) for label in choice.wanted] or labels.numbers
+    numbers = choice.numbers_of(labels)
+    colors = choice.colors_of(labels, numbers)
+    asked = numbers if choice.wanted or choice.hidden else None
     suffixes = file_suffixes({number: labels.name(number) for number in numbers})  # reports contain no other names
     for surface in surfaces:
         if surface.iso_value is None:
-            masks = _extract_masks(volume, labels, choice, device, settings, progress)
+            masks = _extract_masks(volume, labels, asked, device, settings, progress)
             found += [(surface, number, mesh) for number, mesh in masks.items()]
             continue
         if isinstance(surface.iso_value, tuple):  # refused with the settings
             raise UsageError(f"labels take one iso value, not {surface.describe()}")
         meshes = extract_labels(
-            volume, labels, surface.iso_value, device=device, numbers=choice.wanted or None, grow_mm=choice.grow_mm,
+            volume, labels, surface.iso_value, device=device, numbers=asked, grow_mm=choice.grow_mm,
             closed=settings.closed, solid=choice.solid, memory=settings.memory, progress=progress,
         )  # fmt: skip
         found += [(surface, number, mesh) for number, mesh in meshes.items()]
@@ -109,14 +111,21 @@ def extract_label_surfaces(
                 f" or more in the CT and no mesh: {', '.join(left_out[:NAMES_SHOWN])}{more}"
             )
     named = []
-    for surface, number, _ in found:
+    for surface, number, mesh in found:
+        if number in colors:
+            mesh.report |= {"part_name": suffixes[number], "color": colors[number]}
         name = "_".join(part for part in (suffixes[number], surface.name) if part) if len(found) > 1 else ""
         named.append(replace(surface, name=name, label=suffixes[number]))
     return named, [mesh for _, _, mesh in found]
 
 
 def _extract_masks(
-    volume: Volume, labels: LabelMap, choice: LabelChoice, device: Device, settings: MeshSettings, progress: Progress
+    volume: Volume,
+    labels: LabelMap,
+    numbers: Sequence[int] | None,
+    device: Device,
+    settings: MeshSettings,
+    progress: Progress,
 ) -> dict[int, Mesh]:
     """Extract each label's own surface, on the map's own grid; the map must still lie on the scan."""
     from clrecon.anatomy.head import warn_of_skin
@@ -127,7 +136,7 @@ def _extract_masks(
     meshes = extract_label_masks(
         labels,
         device=device,
-        numbers=choice.wanted or None,
+        numbers=numbers,
         closed=settings.closed,
         memory=settings.memory,
         progress=progress,

@@ -258,6 +258,11 @@ class MeshSettings(InputSettings):
         return self.labels is None or self.labels.surface == "hu"
 
     @property
+    def one_file(self) -> bool:
+        """True where all meshes are objects of one file."""
+        return self.labels is not None and self.labels.one_file
+
+    @property
     def labels_pick(self) -> bool:
         """True where the label map makes the meshes; False without one, and where it only has seeds."""
         return self.labels is not None and not self.seed_labels

@@ -27,6 +27,7 @@ __all__ = [
     "count_leftovers",
     "name_outputs",
     "stage_meshes",
+    "stage_together",
 ]
 
 MOST_FILES = 1000
@@ -235,6 +236,22 @@ def stage_meshes(
         progress("write", len(staged), len(meshes) if len(meshes) > 1 else 0)
         staged.append(stack.enter_context(stage_mesh(mesh, path, space, keep_ids=keep_ids)))
     return staged
+
+
+def stage_together(
+    stack: ExitStack,
+    meshes: Sequence[Mesh],
+    path: str | Path,
+    space: str,
+    progress: Progress,
+    *,
+    keep_ids: bool = False,
+) -> StagedFile:
+    """Write all meshes as named objects of one file under a temporary name, as `stage_meshes` does several files."""
+    from clrecon.exchange.formats import stage_assembly
+
+    progress("write", 0, 0)
+    return stack.enter_context(stage_assembly(meshes, path, space, keep_ids=keep_ids))
 
 
 def commit_all(files: Sequence[Staged]) -> None:

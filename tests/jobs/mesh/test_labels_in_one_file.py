@@ -1,0 +1,118 @@
+"""Labels as named, coloured objects of one file; labels that are hidden; colours of single files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clrecon.cli.main import main
+from clrecon.errors import UsageError
+from clrecon.jobs.mesh.label_choice import LabelChoice
+from clrecon.labels import LabelMap
+from clrecon.labels.write_nifti import encode_nifti
+
+pytest.importorskip("nibabel")
+trimesh = pytest.importorskip("trimesh")
+
+NAMES = {2: "vertebrae_L2", 3: "vertebrae_L3", 9: "left & right"}
+AFFINE = np.diag((1.5, 1.5, 2.0, 1.0))
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a CT of three cubes, ct.nii, and their labels."""
+    nibabel = pytest.importorskip("nibabel")
+    folder = tmp_path_factory.mktemp("cubes")
+    voxels, numbers = np.full((30, 20, 20), -50, np.int16), np.zeros((30, 20, 20), np.uint8)
+    for place, number in enumerate(NAMES):
+        where = (slice(3 + 9 * place, 9 + 9 * place), slice(5, 12), slice(4, 13))
+        voxels[where], numbers[where] = 700, number
+    image = nibabel.Nifti1Image(voxels.transpose(2, 1, 0), np.diag((-1.5, -1.5, 2.0, 1.0)))
+    nibabel.save(image, folder / "ct.nii")
+    (folder / "labels.nii.gz").write_bytes(encode_nifti(LabelMap(numbers, AFFINE, NAMES), packed=True))
+    return folder
+
+
+def run(scan: Path, device: Any, output: Path, *extra: str) -> int:
+    given = ["mesh", str(scan / "ct.nii"), "-o", str(output), "--labels", str(scan / "labels.nii.gz"), "--hu", "300"]
+    return main([*given, "--device", str(device.index), "-q", *extra])
+
+
+@pytest.mark.parametrize("kind", ["glb", "3mf"])
+def test_all_labels_are_objects_of_one_file(kind: str, scan: Path, device: Any, tmp_path: Path) -> None:
+    assert run(scan, device, tmp_path / f"a.{kind}", "--one-file", "--label-color", "L3 vertebra=#ff0000") == 0
+    assert [path.name for path in tmp_path.iterdir()] == [f"a.{kind}"]
+    assert run(scan, device, tmp_path / "one.stl") == 0
+    scene = trimesh.load(tmp_path / f"a.{kind}")
+    names = ["left_right", "vertebrae_L2", "vertebrae_L3"]
+    assert sorted(scene.geometry) == names
+    for name in names:
+        alone = trimesh.load(tmp_path / f"one_{name}.stl")
+        assert scene.geometry[name].volume == pytest.approx(alone.volume, rel=1e-4)  # in the buffer's mm
+    if kind == "glb":
+        colors = {name: tuple(scene.geometry[name].visual.material.baseColorFactor[:3]) for name in names}
+        assert colors["vertebrae_L3"] == (255, 0, 0) and len(set(colors.values())) == 3
+    else:
+        import zipfile
+
+        with zipfile.ZipFile(tmp_path / "a.3mf") as package:
+            model = package.read("3D/3dmodel.model").decode()
+        assert '<base name="vertebrae_L3" displaycolor="#FF0000"/>' in model
+        assert model.count("<object ") == model.count("<item ") == model.count("<base ") == 3
+
+
+def test_a_hidden_label_has_no_mesh(scan: Path, device: Any, tmp_path: Path) -> None:
+    assert run(scan, device, tmp_path / "a.glb", "--one-file", "--hide-label", "L3") == 0
+    assert sorted(trimesh.load(tmp_path / "a.glb").geometry) == ["left_right", "vertebrae_L2"]
+    assert run(scan, device, tmp_path / "b.stl", "--hide-label", "l2", "--hide-label", "9") == 0
+    assert [path.name for path in tmp_path.glob("*.stl")] == ["b.stl"]
+
+
+def test_components_of_labels_are_objects_too(scan: Path, device: Any, tmp_path: Path) -> None:
+    assert run(scan, device, tmp_path / "a.glb", "--one-file", "--split") == 0
+    assert len(trimesh.load(tmp_path / "a.glb").geometry) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["a.glb"]
+
+
+def test_a_ply_has_the_colour_at_its_vertices(scan: Path, device: Any, tmp_path: Path) -> None:
+    assert run(scan, device, tmp_path / "a.ply", "--label", "L2", "--label-color", "vertebrae_L2=orange") == 0
+    colors = trimesh.load(tmp_path / "a.ply").visual.vertex_colors
+    assert (colors == [255, 165, 0, 255]).all()
+    assert run(scan, device, tmp_path / "b.ply", "--label", "L2") == 0
+    assert b"red" not in (tmp_path / "b.ply").read_bytes()[:2000]
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        (["-o", "a.stl", "--one-file"], ".3mf or .glb"),
+        (["-o", "a.glb", "--one-file", "--hide-label", "L4"], "L4"),
+        (["-o", "a.glb", "--hide-label", "2", "--hide-label", "3", "--hide-label", "9"], "all labels are hidden"),
+        (["-o", "a.glb", "--label-color", "L3=nocolour"], "nocolour"),
+        (["-o", "a.glb", "--label-color", "L3"], "LABEL=COLOUR"),
+        (["-o", "a.glb", "--label-color", "L3=red", "--label-color", "3=blue"], "two colours"),
+    ],
+)
+def test_wrong_choices_are_one_line(
+    extra: list[str], words: str, scan: Path, device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    output = Path(extra[1])
+    assert run(scan, device, output, *extra[2:]) == 3
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line and list(tmp_path.iterdir()) == []
+
+
+def test_colours_are_looked_at_when_they_are_chosen() -> None:
+    with pytest.raises(UsageError, match="unknown colour"):
+        LabelChoice("a.nii", colors=(("L3", "no"),))
+
+
+@pytest.mark.parametrize("option", ["--one-file", "--hide-label=L3", "--label-color=L3=red"])
+def test_they_need_labels(option: str, scan: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["mesh", str(scan / "ct.nii"), "-o", "a.glb", option]) == 3
+    assert "--labels FILE" in capsys.readouterr().err
