@@ -93,13 +93,19 @@ static inline void draw_box(const corners *c, const pixel_box *b, const float4 p
     __global const float4 *planes, const uint plane_count, __global uint *keys, __global uint *numbers,
     __global const uint *floor_keys, __global const uint *floor_numbers, const int finds_numbers, const int width)
 {
+    const uint nearest = key_of(min(min(c->depth[0], c->depth[1]), c->depth[2]));
+    const uint farthest = key_of(max(max(c->depth[0], c->depth[1]), c->depth[2]));
     for (int row = b->top; row < b->bottom; ++row)
         for (int column = b->left; column < b->right; ++column) {
+            /* Keys are known where numbers are found: most of what is hidden needs no further look. */
+            const size_t at = (size_t)row * (size_t)width + (size_t)column;
+            const uint below = floor_keys[at];
+            if (farthest < below || (finds_numbers && (keys[at] < nearest || keys[at] > farthest)))
+                continue;
             meeting m;
             if (!meet_triangle(c, pixel, column, row, &m))
                 continue;
-            const size_t at = (size_t)row * (size_t)width + (size_t)column;
-            const uint key = key_of(m.depth), below = floor_keys[at];
+            const uint key = key_of(m.depth);
             if (key < below || (key == below && number <= floor_numbers[at]))
                 continue;
             if (plane_count > 0 && !is_kept(planes, plane_count, pixel, column, row, m.depth))
