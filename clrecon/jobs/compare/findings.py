@@ -112,10 +112,15 @@ def _of_growing(done: Rows, reference: str) -> Iterator[str]:
     if not (grown and grown.cells_visited and grown.cells_all and grown.growing):
         return
     left = grown.growing["cells_left_out_share"]
+    said = (
+        f" and leaves out {100.0 * left:.1f} % of those that the surface passes through: the parts that are too small"
+        " to be grown from."
+        if left > 0.0
+        else " and leaves nothing out."
+    )
     yield (
         f"I-MC visits {count(grown.cells_visited)} of {count(grown.cells_all)} cells, 1 in"
-        f" {ratio(grown.cells_all / grown.cells_visited)}, and leaves out {100.0 * left:.1f} % of those that the"
-        " surface passes through: the parts that are too small to be grown from."
+        f" {ratio(grown.cells_all / grown.cells_visited)},{said}"
     )
     if whole and whole.name == "t-mc" and whole.warm_s and grown.warm_s:
         times = grown.warm_s / whole.warm_s

@@ -196,6 +196,10 @@ def test_findings_say_the_numbers() -> None:
         "Ray casting on the device is 30 times as fast as in numpy at 128 x 128 pixels (0.20 and 6.0 s).",
     ]
     assert find_findings([rows[0]], "t-mc", with_truth=True) == []
+    grown = rows[3].changed(growing={"cells_left_out_share": 0.0}, warm_s=None)
+    assert find_findings([grown], "t-mc", with_truth=False) == [
+        "I-MC visits 50 of 2,000 cells, 1 in 40, and leaves nothing out."
+    ]
     assert find_worse(rows[5], rows[0]) == ["80 times slower", "Dice lower by 0.0150"]
     assert find_worse(rows[0], rows[0]) == find_worse(rows[5], None) == []
     broken = rows[5].changed(quality={"closed": False}, memory_bytes=5e8, truth={"scatter_mm": 0.3})
