@@ -148,9 +148,8 @@ def _compare_ways(ways: list[Any], layers: list[Float64Array], found: LayeredPic
     nearest = np.full(SIZE[::-1], -np.inf)
     for number, ((begin, end), farthest) in enumerate(zip(ways, ends, strict=False)):
         for what, own, expected in (("begin", begin, nearest), ("end", end, farthest)):
-            require_equal(
-                np.isinf(own), np.isinf(expected), f"pixels without a {what} of the way before layer {number}"
-            )
+            one, other = (np.sign(depths) * np.isinf(depths) for depths in (own, expected))  # before or behind all
+            require_equal(one, other, f"pixels without a {what} of the way before layer {number}")
             finite, wanted = (np.where(np.isinf(depths), 0.0, depths) for depths in (own, expected))
             require_close(finite, wanted, DEPTH_MM, f"{what}s of the way before layer {number}, in mm")
         nearest = farthest
