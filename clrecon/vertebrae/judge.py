@@ -41,6 +41,8 @@ class Piece:
         Share of its voxels in its largest connected part.
     doubtful_share : float
         Share of its voxels that two ways of dividing the bone give to different vertebrae.
+    arch_ml : float
+        Volume of its spinous process.
     """
 
     upper: Bound | None
@@ -50,6 +52,7 @@ class Piece:
     volume_ml: float
     largest_share: float
     doubtful_share: float
+    arch_ml: float
 
     @property
     def whole(self) -> bool:
@@ -120,6 +123,9 @@ def judge(piece: Piece, gaps: Sequence[float], scan: Field, looks: Looks, course
     traits["volume"] = fits, f"its volume is {piece.volume_ml:.3g} ml, not {low:g} to {high:g}"
     torn = piece.doubtful_share
     traits["border"] = _ramp(torn, 0.6, 0.15), f"{100 * torn:.0f} % of it may be a neighbour's: their joints are closed"
+    if piece.whole:
+        arch = piece.arch_ml
+        traits["arch"] = _ramp(arch, 0.1, 0.7), f"it has only {arch:.1f} ml of a spinous process"
     traits["one part"] = _ramp(piece.largest_share, 0.6, 0.95), f"{100 * piece.largest_share:.0f} % of it hang together"
     return traits
 

@@ -45,6 +45,8 @@ CUT_MM = 8.0
 WINGS = 0.25
 """Share of bone beside a body from which on it is the sacrum's."""
 SEED_TO_CANAL_MM = 24.0
+ARCH_BEHIND_MM, ARCH_ASIDE_MM = 16.0, 8.0
+"""The spinous process lies so far behind the canal, within so much to either side."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,9 @@ def split_vertebrae(
     pieces, doubtful = divide(part, bone, found.bounds, planes, volume)
     progress("vertebrae", 3, 4)
     voxel_ml = float(abs(np.linalg.det(volume.affine[:3, :3])) / 1000.0)
-    spans, left_out = _spans(found, pieces, doubtful, voxel_ml, hu)
+    behind = pieces[(part.ahead < -ARCH_BEHIND_MM) & (np.abs(part.aside) < ARCH_ASIDE_MM)]
+    arches = np.asarray(voxel_ml * np.bincount(behind, minlength=len(found.bounds) + 2), dtype=np.float64)
+    spans, left_out = _spans(found, pieces, doubtful, arches, voxel_ml, hu)
     place = None if named is None else _place_of(named[0], spans, found, volume, part.first, pieces)
     names = name_levels(len(spans), None if named is None or place is None else (place, named[1]))
     vertebrae = _judge_all(spans, names, found)
@@ -201,7 +205,12 @@ def _choose_level(found: _Found) -> float:
 
 
 def _spans(
-    found: _Found, pieces: NDArray[np.uint8], doubtful: Float64Array, voxel_ml: float, level: float
+    found: _Found,
+    pieces: NDArray[np.uint8],
+    doubtful: Float64Array,
+    arches: Float64Array,
+    voxel_ml: float,
+    level: float,
 ) -> tuple[list[tuple[int, Piece]], list[str]]:
     """Return the number and span of each piece that is a vertebra, and what else was seen."""
     from scipy.ndimage import find_objects, label
@@ -221,7 +230,9 @@ def _spans(
             share = float(parts.max() / parts.sum())
         if end <= begin:
             continue
-        piece = Piece(upper, lower, begin, end, float(volumes[n + 1]), share, float(doubtful[n + 1]))
+        piece = Piece(
+            upper, lower, begin, end, float(volumes[n + 1]), share, float(doubtful[n + 1]), float(arches[n + 1])
+        )
         reason = _no_vertebra(piece, found, gaps, level)
         if reason is None:
             spans.append((n + 1, piece))

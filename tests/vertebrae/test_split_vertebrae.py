@@ -165,6 +165,19 @@ def test_other_bodies_are_refused(kind: str) -> None:
         clrecon.split_vertebrae(Volume(voxels, affine))
 
 
+def test_a_vertebra_without_an_arch_is_unsure() -> None:
+    volume, _, _ = phantom("T12-L3")
+    k, j, i = np.indices(volume.voxels.shape)
+    places = volume.ijk_to_lps(np.stack([i, j, k], axis=-1).reshape(-1, 3)).reshape(*k.shape, 3)
+    third = split("T12-L3").vertebrae[2]
+    behind = places[..., 1] > third.centre_mm[1] + 30.0
+    near = np.abs(places[..., 2] - third.centre_mm[2] + 12.0) < 24.0
+    cut = np.where(behind & near & (volume.voxels > 60), 40, volume.voxels)
+    result = clrecon.split_vertebrae(Volume(cut, volume.affine), keep_unsure=True)
+    one = min(result.vertebrae, key=lambda found: abs(found.centre_mm[2] - third.centre_mm[2]))
+    assert not one.is_sure and any("spinous" in doubt for doubt in one.doubts)
+
+
 def test_uneven_slices_are_refused() -> None:
     volume, _, _ = phantom("T12-L3")
     places = volume.slice_origins()
