@@ -6,6 +6,7 @@ from clrecon.anatomy.iso_choice import choose_iso_value as choose_iso_value
 from clrecon.anatomy.noise import Noise as Noise
 from clrecon.anatomy.noise import measure_noise as measure_noise
 from clrecon.anatomy.spine_line import find_spine_line as find_spine_line
+from clrecon.corridors.corridor import find_corridors as find_corridors
 from clrecon.errors import Cancelled as Cancelled
 from clrecon.errors import ClreconError as ClreconError
 from clrecon.errors import DeviceError as DeviceError

@@ -15,8 +15,10 @@ from clrecon.corridors.search import SIDES, Line, Span, find_line, line_points
 from clrecon.corridors.solid_bone import SolidBone, fill_vertebra
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
+from clrecon.labels import LabelMap
+from clrecon.labels.resample import resample_labels
 
-__all__ = ["Corridor", "VertebraCorridors", "find_corridors", "screw_diameter"]
+__all__ = ["Corridor", "VertebraCorridors", "find_corridors", "measure_corridors", "screw_diameter"]
 
 Float64Array = NDArray[np.float64]
 
@@ -121,8 +123,41 @@ def screw_diameter(radius: float, margin: float) -> float:
     return max(0.0, math.floor(20.0 * (radius - margin) + 1e-9) / 10.0)
 
 
-def find_corridors(volume: Volume, labels: NDArray[Any], number: int, level: float, name: str) -> VertebraCorridors:
-    """Find the corridors through the pedicles of a labelled vertebra.
+def find_corridors(volume: Volume, labels: LabelMap, label: int | str, iso_value: float) -> VertebraCorridors:
+    """Find the widest straight corridors through the pedicles of a labelled vertebra.
+
+    It measures one surface at one level of HU and is not for planning an operation; see docs/corridor.md.
+
+    Parameters
+    ----------
+    volume : Volume
+        HU.
+    labels : LabelMap
+        On any grid; each label is one vertebra.
+    label : int or str
+        Number or name, as `LabelMap.find` takes it.
+    iso_value : float
+        HU at which the bone's surface lies.
+
+    Returns
+    -------
+    VertebraCorridors
+        Points in LPS mm.  A side without a corridor says why.
+
+    Raises
+    ------
+    UsageError
+        There is no such label.
+    RefusedInputError
+        The label is not that of a whole vertebra, or it is cut off at the end of the scan.
+    """
+    number = labels.find(label)
+    taken = resample_labels(labels, volume)
+    return measure_corridors(volume, taken.voxels, number, float(iso_value), labels.name(number))
+
+
+def measure_corridors(volume: Volume, labels: NDArray[Any], number: int, level: float, name: str) -> VertebraCorridors:
+    """Find the corridors through the pedicles of a vertebra whose labels lie on the grid of the volume.
 
     Parameters
     ----------

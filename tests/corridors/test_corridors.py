@@ -7,9 +7,10 @@ import pytest
 import tolerances
 from box_vertebra import BODY_HALF, CANAL_Y, HALF_HU, PLATE_HALF, PLATE_Y, BoxVertebra, grid_around, turned
 
-from clrecon.corridors.corridor import find_corridors, screw_diameter
+from clrecon.corridors.corridor import find_corridors, measure_corridors, screw_diameter
 from clrecon.corridors.search import BODY_SHARE, segment_distances
-from clrecon.errors import RefusedInputError
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.labels import LabelMap
 
 pytestmark = pytest.mark.untraced
 
@@ -28,7 +29,7 @@ def test_the_cylinder_is_the_corridor(name: str) -> None:
     off_mm = tolerances.CORRIDOR_RADIUS_MM * (2.0 if name == "thick slices" else 1.0)
     affine, shape = grid_around(vertebra, **options)  # type: ignore[arg-type]
     volume, labels = vertebra.scan(affine, shape)
-    found = find_corridors(volume, labels, 3, HALF_HU, "L3")
+    found = measure_corridors(volume, labels, 3, HALF_HU, "L3")
     assert found.warnings == ()
     angles = np.degrees(np.arccos(np.clip((found.frame.axes * vertebra.axes).sum(axis=1), -1.0, 1.0)))
     assert angles.max() < tolerances.CORRIDOR_FRAME_DEG
@@ -64,7 +65,7 @@ def test_the_cylinder_is_the_corridor(name: str) -> None:
 def test_angles_of_the_patient_follow_the_pose() -> None:
     vertebra = BoxVertebra(rotation=turned(0.0, 0.0, 15.0))
     affine, shape = grid_around(vertebra)
-    found = find_corridors(*vertebra.scan(affine, shape), 3, HALF_HU, "L3")
+    found = measure_corridors(*vertebra.scan(affine, shape), 3, HALF_HU, "L3")
     left, right = found.corridors
     # its left points backwards: a line of the left side runs more to the left, and less towards the midline
     turn = np.degrees(np.arctan2(vertebra.axes[0, 1], vertebra.axes[0, 0]))
@@ -76,7 +77,7 @@ def test_a_level_farther_out_is_told() -> None:
     """Partial volume reaches half a voxel to both sides: a tenth of the contrast lies 0.4 voxel outside of the half."""
     vertebra = BoxVertebra()
     affine, shape = grid_around(vertebra, spacing=(1.0, 1.0, 1.0))
-    found = find_corridors(*vertebra.scan(affine, shape), 3, 100.0, "L3")
+    found = measure_corridors(*vertebra.scan(affine, shape), 3, 100.0, "L3")
     for corridor, radius in zip(found.corridors, (4.0, 3.0), strict=True):
         assert corridor.radius == pytest.approx(radius + 0.4, abs=2.0 * tolerances.CORRIDOR_RADIUS_MM)
         assert corridor.bias.median_mm == pytest.approx(0.4, abs=0.25)
@@ -86,7 +87,7 @@ def test_a_level_farther_out_is_told() -> None:
 def test_a_pedicle_below_two_voxels_is_refused() -> None:
     vertebra = BoxVertebra(left_radius=4.5, right_radius=2.0)
     affine, shape = grid_around(vertebra, spacing=(2.5, 2.5, 2.5))
-    left, right = find_corridors(*vertebra.scan(affine, shape), 3, HALF_HU, "L3").corridors
+    left, right = measure_corridors(*vertebra.scan(affine, shape), 3, HALF_HU, "L3").corridors
     assert left.refused is None and left.radius == pytest.approx(4.5, abs=0.6)
     assert right.radius is None and right.refused is not None
     assert "not resolved" in right.refused
@@ -97,16 +98,16 @@ def test_what_is_no_vertebra_is_refused() -> None:
     affine, shape = grid_around(vertebra)
     volume, labels = vertebra.scan(affine, shape)
     with pytest.raises(RefusedInputError, match="liver is not the label of a whole vertebra: no vertebral canal"):
-        find_corridors(volume, labels, 3, HALF_HU, "liver")
+        measure_corridors(volume, labels, 3, HALF_HU, "liver")
     with pytest.raises(RefusedInputError, match="no voxel of L9 lies in the scan"):
-        find_corridors(volume, labels, 9, HALF_HU, "L9")
+        measure_corridors(volume, labels, 9, HALF_HU, "L9")
     with pytest.raises(RefusedInputError, match="no voxel of L3 has 2000 HU or more: they run to 1000 HU"):
-        find_corridors(volume, labels, 3, 2000.0, "L3")
+        measure_corridors(volume, labels, 3, 2000.0, "L3")
     few = np.zeros_like(labels)
     few[20:30, 40:50, 40:50] = 3
     volume = volume.with_voxels(np.where(few > 0, 900, 0).astype(np.int16))
     with pytest.raises(RefusedInputError, match="volume of 0.* ml: no vertebra"):
-        find_corridors(volume, few, 3, HALF_HU, "L3")
+        measure_corridors(volume, few, 3, HALF_HU, "L3")
 
 
 def test_a_cut_body_is_refused_and_a_cut_process_is_told() -> None:
@@ -117,14 +118,14 @@ def test_a_cut_body_is_refused_and_a_cut_process_is_told() -> None:
     first, last = marked[:, 1].min(), marked[:, 1].max()
     cut = slice(0, last - 3)  # through the plate behind the canal
     shorter = type(volume)(volume.voxels[:, cut], affine)
-    found = find_corridors(shorter, labels[:, cut], 3, HALF_HU, "L3")
+    found = measure_corridors(shorter, labels[:, cut], 3, HALF_HU, "L3")
     assert found.warnings == ("L3 touches the end of the scan with its processes; body and pedicles are whole",)
     assert found.corridors[0].radius == pytest.approx(4.0, abs=tolerances.CORRIDOR_RADIUS_MM)
     front = affine.copy()
     front[:3, 3] += affine[:3, 1] * (first + 4)
     shorter = type(volume)(volume.voxels[:, first + 4 :], front)
     with pytest.raises(RefusedInputError, match="L3 is cut off: .* voxels of its body and pedicles"):
-        find_corridors(shorter, labels[:, first + 4 :], 3, HALF_HU, "L3")
+        measure_corridors(shorter, labels[:, first + 4 :], 3, HALF_HU, "L3")
 
 
 def test_distances_of_segments_are_those_of_their_nearest_points() -> None:
@@ -155,3 +156,14 @@ def test_distances_of_segments_are_those_of_their_nearest_points() -> None:
 )
 def test_the_largest_screw_keeps_the_margin(radius: float, margin: float, diameter: float) -> None:
     assert screw_diameter(radius, margin) == pytest.approx(diameter)
+
+
+def test_a_label_map_by_name_gives_the_same() -> None:
+    vertebra = BoxVertebra()
+    volume, labels = vertebra.scan(*grid_around(vertebra))
+    found = find_corridors(volume, LabelMap(labels, volume.affine, {3: "L3"}), "L3", HALF_HU)
+    wanted = measure_corridors(volume, labels, 3, HALF_HU, "L3")
+    assert [each.radius for each in found.corridors] == [each.radius for each in wanted.corridors]
+    assert found.name == "L3"
+    with pytest.raises(UsageError, match="L4"):
+        find_corridors(volume, LabelMap(labels, volume.affine, {3: "L3"}), "L4", HALF_HU)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 import shlex
-from importlib import import_module
 from pathlib import Path
 
 import pytest
+from command_lines import parse_command
 from house import ROOT
 
 DOCUMENTS = [
@@ -31,28 +31,6 @@ def find_missing_files(text: str, folder: Path) -> list[str]:
 def find_commands(text: str) -> list[list[str]]:
     """Arguments of every clrecon command in an indented block of `text`."""
     return [shlex.split(arguments) for arguments in COMMAND.findall(text)]
-
-
-def parse_command(arguments: list[str]) -> None:
-    """Parse `arguments` as clrecon would.
-
-    Raises
-    ------
-    UsageError
-        They are not understood.
-    """
-    from clrecon.cli.common import Parser, add_common
-    from clrecon.cli.main import COMMANDS
-    from clrecon.errors import UsageError
-
-    if arguments == ["--help"]:
-        return
-    if arguments[0] not in COMMANDS:
-        raise UsageError(f"no command {arguments[0]}")
-    parser = Parser(prog=arguments[0])
-    import_module(COMMANDS[arguments[0]].module).add_arguments(parser)
-    add_common(parser)
-    parser.parse_args(arguments[1:])
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)

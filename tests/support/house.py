@@ -71,6 +71,7 @@ _layer(
     "opencl",
     "geometry",
     "anatomy",
+    "corridors",
     "reading",
     "labels",
     "mesh",

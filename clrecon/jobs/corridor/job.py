@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from clrecon.corridors.corridor import VertebraCorridors, find_corridors
+from clrecon.corridors.corridor import VertebraCorridors, measure_corridors
 from clrecon.corridors.grades import SCALE, Screw, ScrewGrade, grade_screw
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.certificate import without_ids
@@ -88,7 +88,7 @@ def make_corridors(
     for done, number in enumerate(numbers):
         progress("corridors", done, len(numbers))
         _check_inside(taken.inside[number], names[number])
-        found.append(find_corridors(volume, taken.voxels, number, level, names[number]))
+        found.append(measure_corridors(volume, taken.voxels, number, level, names[number]))
     graded = _grade(found, labels, numbers, settings.screws)
     watch.lap("corridors")
     with keep_existing(no_clobber), ExitStack() as stack:
