@@ -18,7 +18,7 @@ from clrecon.system.time_limit import time_limit
 
 __all__ = ["main", "run_method"]
 
-LONG_SECONDS = 4.0
+LONG_SECONDS = 2.0
 """No further warm run begins after so many seconds of them."""
 
 

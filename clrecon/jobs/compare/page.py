@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from html import escape
 from typing import Any
 
+from clrecon.jobs.compare.child import LONG_SECONDS
 from clrecon.jobs.compare.figures import COLORS, Figures
 from clrecon.jobs.compare.paper import PAPER
 from clrecon.jobs.compare.pictures import embed
@@ -224,7 +225,7 @@ def _settings(report: CompareReport) -> str:
         ("level", f"{report.iso_value_hu:g} HU; the surface lies at {report.iso_level_hu:g} HU"),
         ("border", "closed with air" if report.closed_at_border else "open"),
         ("reference", _title_of(report, report.reference)),
-        ("warm runs", f"{report.repeat} at most, fewer of methods that take more than 4 s"),
+        ("warm runs", f"{report.repeat} at most, none begins after {LONG_SECONDS:g} s of them"),
         ("memory on the device", memory),
         ("truth", "that of the phantom" if report.with_truth else "not known"),
         ("read the input", f"{report.read_s['first']:.2f} s first, {report.read_s['warm']:.2f} s again"),
