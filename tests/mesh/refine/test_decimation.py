@@ -313,3 +313,15 @@ def test_the_corners_of_faces_without_area_are_faults():
     clusters = Clusters(vertices, np.concatenate([triangles, [[0, 8, 1]]]).astype(np.uint32), np.zeros(3))
     found = np.concatenate(clusters._find_flat(clusters.faces()))
     assert found.tolist() == [0, 8, 1]
+
+
+def test_less_is_taken_where_the_shift_that_restores_a_volume_is_too_short():
+    large, (vertices, triangles) = samples.sphere((20.0, 0.0, 0.0), 10.0, 3), samples.sphere((0.0, 0.0, 0.0), 1.4, 2)
+    mesh = Mesh(*samples.join(large, (vertices, triangles)))
+    coarse = decimate_mesh(mesh, 0.7, 0.2)
+    small = coarse.vertices[coarse.triangles][:, :, 0].max(axis=1) < 5.0
+    assert 0 < small.sum() < len(triangles)
+    part = Mesh(coarse.vertices, coarse.triangles[small])
+    wanted = Mesh(vertices, triangles).quality()["volume_ml"]
+    assert part.quality()["volume_ml"] == pytest.approx(wanted, rel=0.004)
+    assert coarse.report["refinement"]["decimate"]["vertices_taken_back"] > 0
