@@ -171,6 +171,14 @@ def device(request: pytest.FixtureRequest) -> Any:
     return request.param
 
 
+@pytest.fixture(autouse=True)
+def own_remarks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a test makes the device remark is forgotten after it: others would find it among their warnings."""
+    if "device" in request.fixturenames:
+        device = request.getfixturevalue("device")
+        monkeypatch.setattr(device, "_remarks", list(device._remarks))
+
+
 @pytest.fixture
 def users_kernels(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """The variant of the kernels that users of this device get: that of the tests is another one on llvmpipe."""

@@ -111,6 +111,9 @@ OWN = {
     "__init__.py": "its own list of names",
     "opencl/unknown_cpu.py": "the system",
     "jobs/bench/machine.py": "the system",
+    "jobs/compare/folder.py": "what it has just written",
+    "jobs/compare/template.py": "its own style",
+    "jobs/shared/report.py": "the system",
     "rendering/movies/frame_folder.py": "new frames",
     "rendering/movies/video.py": "its own temporary files",
 }

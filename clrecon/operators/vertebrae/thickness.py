@@ -15,7 +15,7 @@ MOST_RADIUS_MM = 8.0
 """Bone in which larger balls fit is no shell any more."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ShellThickness(Record):
     """How thick a shell of bone is.
 
