@@ -24,6 +24,7 @@ from clrecon.errors import UsageError
 from clrecon.jobs.render.settings import (
     POINT_COLORS,
     VIEWS,
+    WINDOWS,
     LabelLook,
     MeshFile,
     RenderSettings,
@@ -101,8 +102,9 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--window",
         type=parse_window,
-        metavar="LOW,HIGH",
-        help="HU that are black and white, of modes that show HU; mm of water in mode drr",
+        metavar="LOW,HIGH|NAME",
+        help=f"HU that are black and white, of modes that show HU, or one of {', '.join(WINDOWS)}; mm of water in mode"
+        " drr",
     )
     group.add_argument(
         "--ray-step", type=float, metavar="MM", help="way between samples (default: half the smallest spacing)"

@@ -69,8 +69,10 @@ def parse_light(text: str) -> str | tuple[float, ...]:
     return parse_direction(text)
 
 
-def parse_window(text: str) -> tuple[float, ...]:
-    """Read ``LOW,HIGH`` in HU."""
+def parse_window(text: str) -> str | tuple[float, ...]:
+    """Read ``LOW,HIGH`` in HU, or the name of a window."""
+    if text[:1].isalpha() and "," not in text:
+        return text
     return _numbers(text, 2, "a window: the HU that are black and white, LOW,HIGH, such as -450,1050")
 
 

@@ -12,6 +12,7 @@ from clrecon.jobs.render.settings import LabelLook, RenderSettings
 from clrecon.jobs.shared.clouds import describe_cloud
 from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
 from clrecon.jobs.shared.run_report import RunReport
+from clrecon.rendering.pictures.annotations import edge_letters
 from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, PointLook, Style, SurfaceLook, VolumeLook
 from clrecon.system.wording import name_parameter
@@ -74,6 +75,7 @@ def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]
         "slices": made.get("slices"),
         "plane": made.get("plane"),
         "curve": made.get("curve"),
+        "edges": made.get("edges") if picture.camera is None else edge_letters(picture.camera),
         "points": _describe_points(made),
         "slabs": made.get("slabs", 1),
         "seconds": made.get("seconds"),

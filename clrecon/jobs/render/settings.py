@@ -19,6 +19,7 @@ from clrecon.rendering.looks.label_style import distinct_colors
 from clrecon.rendering.looks.lighting import UNSHADED, Lighting
 from clrecon.rendering.looks.presets import DEFAULT_PRESET, PRESETS, find_preset
 from clrecon.rendering.looks.transfer_function import TransferFunction
+from clrecon.rendering.looks.window import WINDOWS
 from clrecon.rendering.movies.movie import turntable_cameras
 from clrecon.rendering.pictures.annotations import SMALLEST_SIDE
 from clrecon.rendering.pictures.mesh_look import MeshLook
@@ -47,6 +48,7 @@ __all__ = [
     "RenderSettings",
     "Turntable",
     "VIEWS",
+    "WINDOWS",
     "describe_modes",
     "describe_presets",
 ]

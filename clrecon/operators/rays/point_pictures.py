@@ -18,7 +18,7 @@ from clrecon.points.spacing import mean_spacing
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.looks.label_style import distinct_colors
-from clrecon.rendering.looks.window import choose_window
+from clrecon.rendering.looks.window import checked_window, choose_window
 from clrecon.rendering.pictures.styles import PointLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.closing import Closing
@@ -221,7 +221,7 @@ def _color_points(cloud: PointCloud, style: PointLook) -> _Colors:
     if by == "hu":
         if cloud.hu is None:
             raise UsageError("the cloud has no HU to colour it by")
-        window = _choose_window(cloud.hu) if style.window is None else (float(style.window[0]), float(style.window[1]))
+        window = _choose_window(cloud.hu) if style.window is None else checked_window(style.window)
         share = np.clip((cloud.hu - np.float32(window[0])) * np.float32(255.0 / (window[1] - window[0])), 0, 255)
         grey = np.rint(share).astype(np.uint8)
         return _Colors(_rows(grey, grey, grey), by, [], 0, window)

@@ -20,7 +20,7 @@ from clrecon.operators.rays.slabs import RAYS, RaySlab, entry_slice, plan_ray_sl
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.frame import volume_box
 from clrecon.rendering import Lighting, Rendering
-from clrecon.rendering.looks.window import choose_water_window, choose_window, grey_image
+from clrecon.rendering.looks.window import checked_window, choose_water_window, choose_window, grey_image
 from clrecon.rendering.pictures.styles import Projection, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.progress import Progress, ignore_progress
@@ -198,7 +198,8 @@ class _Job:
         self, style: Projection, values: NDArray[np.float32], depths: NDArray[np.float32], report: dict[str, Any]
     ) -> Rendering:
         is_water = style.kind == "drr"
-        window = style.window or (choose_water_window if is_water else choose_window)(values)
+        choose = choose_water_window if is_water else choose_window
+        window = choose(values) if style.window is None else checked_window(style.window)
         report["window_mm_water" if is_water else "window_hu"] = list(window)
         image = grey_image(values, window)
         if is_water:

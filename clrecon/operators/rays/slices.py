@@ -19,6 +19,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.frame import FieldFrame, volume_box
 from clrecon.operators.resident.voxel_types import voxel_variants
 from clrecon.rendering import Rendering
+from clrecon.rendering.looks.window import checked_window
 from clrecon.rendering.pictures.styles import SlicesInSpace
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.progress import Progress, ignore_progress
@@ -163,7 +164,7 @@ class _Colors(NamedTuple):
             low, high = style.transfer_function.range_hu
             colors = style.transfer_function.table(low, high, NODES)
         else:
-            low, high = DEFAULT_WINDOW if style.window is None else style.window
+            low, high = DEFAULT_WINDOW if style.window is None else checked_window(style.window)
             colors = np.repeat(np.linspace(0.0, 1.0, NODES)[:, None], 4, axis=1).astype(np.float32)
         return cls(colors, low, (NODES - 1) / (high - low))
 

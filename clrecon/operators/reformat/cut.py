@@ -17,7 +17,8 @@ from clrecon.operators.reformat.sample import Reformation, sample_sheet
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
-from clrecon.rendering.looks.window import BONE_WINDOW, grey_image
+from clrecon.rendering.looks.window import BONE_WINDOW, checked_window, grey_image
+from clrecon.rendering.pictures.annotations import sheet_letters
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.centre_line import Curve
@@ -36,6 +37,11 @@ DEFAULT_WIDTH_MM = 120.0
 """Default width of a curved reformation without a size: a vertebra with its surroundings."""
 
 
+LEAST_PIXELS = 768
+"""Least pixels along the longer side of a curved reformation without a size, so that short curves are large enough to
+look at."""
+
+
 class _Job:
     """The common part of both kinds of pictures: the device, how samples are combined, the picture and its report."""
 
@@ -47,7 +53,7 @@ class _Job:
     ):
         self.resident, self.style, self.progress = resident, style, progress
         self.samples = slab_samples(resident.volume, style.thickness)
-        self.window = BONE_WINDOW if style.window is None else style.window
+        self.window = BONE_WINDOW if style.window is None else checked_window(style.window)
         self.stopwatch = Stopwatch()
         self.warnings: list[str] = []
 
@@ -101,7 +107,7 @@ def cut_slice(
     offset_mm: float = 0.0,
     thickness: float = 0.0,
     combine: str = "mean",
-    window: Sequence[float] | None = None,
+    window: Sequence[float] | str | None = None,
     background: str | Sequence[float] = "black",
     memory: int | None = None,
     progress: Progress | None = None,
@@ -132,8 +138,9 @@ def cut_slice(
         `clrecon.rendering.views.plane.SlabSamples`.
     combine : {"mean", "max", "min"}
         How the samples within the volume are combined.
-    window : (low, high), optional
-        HU that are black and white; default -450 to 1050, a window for bone.
+    window : (low, high) or str, optional
+        HU that are black and white, or a name such as "lung", see `clrecon.rendering.looks.window.WINDOWS`; default
+        "bone", -450 to 1050.
     background : str or colour
         Colour outside the volume; "transparent" gives opacity 0 there.
     memory : int, optional
@@ -209,7 +216,7 @@ def reformat_curve(
     width_mm: float | None = None,
     thickness: float = 0.0,
     combine: str = "mean",
-    window: Sequence[float] | None = None,
+    window: Sequence[float] | str | None = None,
     background: str | Sequence[float] = "black",
     memory: int | None = None,
     progress: Progress | None = None,
@@ -227,7 +234,7 @@ def reformat_curve(
         have one direction in the patient and form a surface, which the picture shows unrolled; all lengths within that
         surface are kept.  See `clrecon.rendering.views.curved`.
     size : (int, int), optional
-        Width and height of the picture; default: as many pixels as the curve is long, and `width_mm`.
+        Width and height of the picture; default: the whole curve, and `width_mm`.
     device : Device, str or int, optional
         See `clrecon.device`.
     view, up : str or direction
@@ -237,7 +244,8 @@ def reformat_curve(
     angle : float
         Degrees by which the rows of a straightened picture are turned about the centre line.
     pixel_mm : float, optional
-        Side of a pixel; default: the curve fills the height of `size`, else the smallest distance of voxels.
+        Side of a pixel; default: the curve fills the height of `size`, else the smallest distance of voxels,
+        or a whole part of it so that the longer side has at least 768 pixels.
     width_mm : float, optional
         Width of the picture where no `size` is given; default 120 mm.
     thickness, combine, window, background, memory, progress
@@ -271,7 +279,8 @@ def reformat_curve(
         made = job.sample(curved.sheet)
     made.values[np.isnan(curved.arc)] = np.nan
     said = _describe_curve(line, curved, kind, across, turned) | {"angle_deg": style.angle, "found": found}
-    report = job.describe(made, pixel) | {"curve": said}
+    edges = sheet_letters(curved.sheet, ~np.isnan(curved.arc))
+    report = job.describe(made, pixel) | {"curve": said, "edges": edges}
     report["warnings"] += _warn_of_part(found)
     return job.picture(made, np.full(made.values.shape, np.nan, np.float32), None, "cpr", report, background)
 
@@ -325,6 +334,8 @@ def _fit_picture(
         pixel = length / checked_size(size)[1]
     else:
         pixel = finest_step(volume)
+        longest = max(length, DEFAULT_WIDTH_MM if style.width_mm is None else style.width_mm) / pixel
+        pixel /= max(1.0, np.ceil(LEAST_PIXELS / longest))  # a whole number of pixels a voxel
     if size is not None:
         if style.width_mm is not None:
             raise UsageError("the width of a picture is given by its size or in mm, not by both")

@@ -10,23 +10,55 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 
-__all__ = ["BODY_SHARE", "BONE_WINDOW", "checked_window", "choose_water_window", "choose_window", "grey_image"]
+__all__ = [
+    "BODY_SHARE",
+    "BONE_WINDOW",
+    "WINDOWS",
+    "checked_window",
+    "choose_water_window",
+    "choose_window",
+    "grey_image",
+]
 
 BONE_WINDOW = (-450.0, 1050.0)
 """Level 300, width 1500 HU: distinguishes marrow, cortex and soft tissue."""
+
+WINDOWS = {
+    "bone": BONE_WINDOW,
+    "soft": (-150.0, 250.0),
+    "lung": (-1350.0, 150.0),
+    "abdomen": (-150.0, 250.0),
+    "mediastinum": (-125.0, 225.0),
+    "brain": (0.0, 80.0),
+}
+"""Windows by name, HU.  All but bone: the typical widths and levels of Radiopaedia, "Windowing (CT)": lungs
+1500 about -600, soft tissue of the abdomen 400 about 50, mediastinum 350 about 50, brain 80 about 40."""
 
 BODY_SHARE = 0.05
 """Least share of the most water along a ray; rays with less meet air, a table or the fold of a blanket, but no body."""
 
 
-def checked_window(window: Sequence[float]) -> tuple[float, float]:
+def checked_window(window: Sequence[float] | str) -> tuple[float, float]:
     """Check a window and return its low and high end.
+
+    Parameters
+    ----------
+    window : (low, high) or str
+        HU that are black and white, or a name of `WINDOWS`, in upper or lower case.
 
     Raises
     ------
     UsageError
-        The window is not two finite numbers with the lower one first.
+        There is no window of this name, or it is not two finite numbers with the lower one first.
     """
+    if isinstance(window, str):
+        named = WINDOWS.get(window.strip().lower())
+        if named is None:
+            raise UsageError(
+                f"no window is called {window!r:.60}: use one of {', '.join(WINDOWS)}, or the HU that are black and"
+                " white, such as (-450, 1050)"
+            )
+        return named
     try:
         low, high = (float(end) for end in window)
     except (TypeError, ValueError):

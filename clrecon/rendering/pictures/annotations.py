@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -12,11 +13,20 @@ from clrecon.rendering.pictures.picture_data import PictureData
 from clrecon.rendering.pictures.pillow import load_font, load_pillow
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import DIRECTIONS
+from clrecon.rendering.views.plane import Sheet
 
 if TYPE_CHECKING:
     from PIL import Image
 
-__all__ = ["SMALLEST_SIDE", "annotate", "bar_length", "check_caption", "edge_letters", "orientation_letters"]
+__all__ = [
+    "SMALLEST_SIDE",
+    "annotate",
+    "bar_length",
+    "check_caption",
+    "edge_letters",
+    "orientation_letters",
+    "sheet_letters",
+]
 
 SMALLEST_SIDE = 64
 """Smallest width and height in pixels; letters in smaller pictures cannot be read."""
@@ -70,6 +80,31 @@ def edge_letters(camera: Camera) -> dict[str, str]:
     return {edge: orientation_letters(direction) for edge, direction in edges.items()}
 
 
+def sheet_letters(sheet: Sheet, rows: NDArray[np.bool_]) -> dict[str, str]:
+    """Letters of the edges of a picture whose rows turn along a curve; empty where no letter is true for all of it.
+
+    Parameters
+    ----------
+    sheet : Sheet
+    rows : ndarray, shape (h,), bool
+        Rows that show something.
+
+    Returns
+    -------
+    dict of str to str
+        As `edge_letters`: the letters with which the directions of all rows begin, so that the first is everywhere the
+        side to which the edge looks most.
+    """
+    right = sheet.steps[rows]
+    up = np.cross(right, sheet.normals[rows])
+    edges = {"left": -right, "right": right, "top": up, "bottom": -up}
+    return {edge: _shared_letters(directions) for edge, directions in edges.items()}
+
+
+def _shared_letters(directions: NDArray[np.float64]) -> str:
+    return os.path.commonprefix([orientation_letters(direction) for direction in directions])
+
+
 def bar_length(width_mm: float) -> float:
     """Longest length of the form 1, 2 or 5 x 10^n mm within 35 % of a picture's width in mm."""
     longest = LONGEST_BAR_SHARE * width_mm * (1.0 + 1e-12)
@@ -87,7 +122,8 @@ def annotate(
     rendering : PictureData
         Not changed.
     letters : bool
-        Mark each edge with the side of the patient in its direction, see `orientation_letters`.
+        Mark each edge with the side of the patient in its direction, see `orientation_letters`; along a curve only
+        those that are true for all of the picture, see `sheet_letters`.
     scale_bar : bool
         Draw a bar of a round length at the bottom left.  In a perspective picture the bar is valid in the focal plane
         only, and its text says so.
@@ -103,7 +139,7 @@ def annotate(
     ------
     UsageError
         The picture is smaller than 64 x 64 pixels or too narrow for the text; its directions or its pixel size
-        are not known (curved reformations); or the font lacks a character of the caption.
+        are not known; or the font lacks a character of the caption.
     """
     check_caption(caption)
     if not (letters or scale_bar or caption):
@@ -116,10 +152,14 @@ def annotate(
         )
     page = _Page(rendering)
     if letters:
-        if rendering.camera is None:
-            raise UsageError("a curved picture has no sides of the patient at its edges: leave the letters out")
-        for edge, text in edge_letters(rendering.camera).items():
-            page.draw_edge(edge, text)
+        edges = rendering.report.get("edges") if rendering.camera is None else edge_letters(rendering.camera)
+        if edges is None:
+            raise UsageError(
+                "the sides of the patient at the edges of this picture are not known: leave the letters out"
+            )
+        for edge, text in edges.items():
+            if text:
+                page.draw_edge(edge, text)
     if scale_bar:
         page.draw_bar(*_bar_of(rendering))
     if caption:

@@ -186,8 +186,9 @@ class Projection(Style):
     ----------
     kind : {"mip", "minip", "mean", "drr"}
         The highest, lowest or mean HU; "drr" is a radiograph: the thickness of water in mm with the same attenuation.
-    window : (float, float), optional
-        Values shown as black and white, in HU or (drr) mm of water; default: the 1st and the 99th percentile of the
+    window : (float, float) or str, optional
+        Values shown as black and white, in HU or (drr) mm of water, or a name of
+        `clrecon.rendering.looks.window.WINDOWS` such as "lung"; default: the 1st and the 99th percentile of the
         picture, in "drr" of the rays that meet the body.
     ray_step : float, optional
         mm between samples; default: half the smallest spacing of the volume.
@@ -199,9 +200,18 @@ class Projection(Style):
         "mip", checks.one_of(PROJECTIONS, f"a projection is one of {', '.join(PROJECTIONS)}"), "mode"
     )
     _: KW_ONLY
-    window: Sequence[float] | None = style_field(None, checked_window)
+    window: Sequence[float] | str | None = style_field(None, checked_window)
     ray_step: float | None = style_field(None, checks.ray_step)
     clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
+
+    def __post_init__(self) -> None:
+        named = self.window
+        super().__post_init__()
+        if self.kind == "drr" and isinstance(named, str):
+            raise UsageError(
+                f"the window {named!r:.60} is in HU, and mode drr shows mm of water: give the mm that are black"
+                " and white"
+            )
 
     @property
     def mode(self) -> str:
@@ -268,7 +278,7 @@ class SlicesInSpace(Style):
         An int n: every n-th slice from the first.  A list: those slices.  Default: about twelve, evenly spaced.
     opacity : float
         Opacity of each slice, above 0 and at most 1.
-    window : (float, float), optional
+    window : (float, float) or str, optional
         HU shown as black and white; default: -300 to 400.
     transfer_function : TransferFunction, optional
         Colours to use in place of grey; its opacity is ignored.
@@ -287,7 +297,7 @@ class SlicesInSpace(Style):
         checks.number("the opacity of a slice lies above 0 and up to 1, not at", lambda share: 0.0 < share <= 1.0),
         "slice_opacity",
     )
-    window: Sequence[float] | None = style_field(None, checked_window)
+    window: Sequence[float] | str | None = style_field(None, checked_window)
     transfer_function: TransferFunction | None = style_field(
         None, checks.instance_of("transfer function", TransferFunction)
     )
@@ -320,7 +330,7 @@ class PointLook(Style):
         Default: by label where there are labels, else by HU where they differ, else `color`.
     color : str or (float, float, float), optional
         One colour for all, see `clrecon.rendering.looks.colors.find_color`; default: "bone".
-    window : (float, float), optional
+    window : (float, float) or str, optional
         HU shown as black and white; default: the 99th percentile of the points is white, the 1st dark grey.
     lighting : Lighting, optional
         Default: ``Lighting()``.
@@ -335,7 +345,7 @@ class PointLook(Style):
         None, checks.one_of(POINT_COLORS, f"points are coloured by one of {', '.join(POINT_COLORS)}")
     )
     color: _Color | None = style_field(None, checks.color)
-    window: Sequence[float] | None = style_field(None, checked_window)
+    window: Sequence[float] | str | None = style_field(None, checked_window)
     lighting: Lighting | None = style_field(None, checks.instance_of("lighting", Lighting))
     clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
 
@@ -361,7 +371,7 @@ class _Cut(Style):
     combine: str = style_field(
         "mean", checks.one_of(COMBINATIONS, f"samples of a thick slice are combined by {', '.join(COMBINATIONS)}")
     )
-    window: Sequence[float] | None = style_field(None, checked_window)
+    window: Sequence[float] | str | None = style_field(None, checked_window)
     pixel_mm: float | None = style_field(None, partial(positive_mm, "the size of a pixel"))
 
 
@@ -377,7 +387,7 @@ class PlaneCut(_Cut):
         Thickness in mm of the thick slice around the plane; its samples are combined.  0: the plane alone.
     combine : {"mean", "max", "min"}
         Which value of the samples is shown.
-    window : (float, float), optional
+    window : (float, float) or str, optional
         HU shown as black and white; default: -450 to 1050, a window for bone.
     pixel_mm : float, optional
         Side of a pixel; by default the volume fits the picture.
@@ -406,7 +416,8 @@ class CurveCut(_Cut):
     thickness, combine, window
         As of `PlaneCut`; the thick slice lies across the picture.
     pixel_mm : float, optional
-        Side of a pixel; by default the curve fills the height of the size; without a size it is the smallest spacing.
+        Side of a pixel; by default the curve fills the height of the size; without a size it is the smallest spacing,
+        or a whole part of it so that the longer side has at least 768 pixels.
     """
 
     _mode: ClassVar[str] = "cpr"

@@ -15,8 +15,11 @@ from clrecon.rendering.pictures.annotations import (
     check_caption,
     edge_letters,
     orientation_letters,
+    sheet_letters,
 )
 from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.centre_line import Curve
+from clrecon.rendering.views.curved import straightened_sheet, stretched_sheet
 
 BLACK, WHITE, CLEAR = (0, 0, 0, 255), (255, 255, 255, 255), (0, 0, 0, 0)
 
@@ -54,6 +57,32 @@ def test_letters_of_an_oblique_view():
 )
 def test_letters_come_from_the_largest_component_to_the_smallest(direction, letters):
     assert orientation_letters(direction) == letters
+
+
+def _arc(degrees: float) -> Curve:
+    """Return a curve downwards that bends to the front by an angle, seen from the left."""
+    turns = np.radians(np.linspace(0.0, degrees, 40))
+    return Curve(np.column_stack([0.0 * turns, 80.0 * (np.cos(turns) - 1.0), -80.0 * np.sin(turns)]))
+
+
+@pytest.mark.parametrize(
+    ("degrees", "letters"),
+    [
+        (5.0, {"left": "A", "right": "P", "top": "S", "bottom": "I"}),
+        (40.0, {"left": "A", "right": "P", "top": "S", "bottom": "I"}),  # from A to AI: both begin with A
+        (80.0, {"left": "", "right": "", "top": "", "bottom": ""}),  # from A to IA: nothing is true everywhere
+    ],
+)
+def test_letters_along_a_curve_are_true_for_every_row_or_left_out(degrees, letters):
+    made = straightened_sheet(_arc(degrees), np.array([0.0, 1.0, 0.0]), (40, 60), 2.0)
+    shown = ~np.isnan(made.arc)
+    assert sheet_letters(made.sheet, shown) == letters
+
+
+def test_the_rows_of_a_stretched_picture_have_one_direction():
+    made = stretched_sheet(_arc(60.0), np.array([1.0, 0.0, 0.0]), (40, 60), 2.0)
+    letters = sheet_letters(made.sheet, ~np.isnan(made.arc))
+    assert (letters["left"], letters["right"]) == ("R", "L") and letters["top"] == letters["bottom"] == ""
 
 
 def test_bars_are_round_and_as_long_as_they_may_be():
@@ -161,7 +190,7 @@ def test_nothing_asked_is_nothing_done():
     [
         (make_picture((63, 200)), {"letters": True}, "at least 64 x 64"),
         (make_picture((64, 64), camera=PERSPECTIVE), {"scale_bar": True}, "no room for '50 mm \\(focal plane\\)'"),
-        (make_picture(camera=None), {"letters": True}, "no sides of the patient"),
+        (make_picture(camera=None), {"letters": True}, "sides of the patient at the edges"),
         (make_picture(camera=None), {"scale_bar": True}, "size of this picture's pixels is not known"),
     ],
 )

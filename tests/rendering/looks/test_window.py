@@ -1,0 +1,35 @@
+"""Windows by numbers and by name."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.errors import UsageError
+from clrecon.rendering.looks.window import BONE_WINDOW, WINDOWS, checked_window, grey_image
+from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, Projection, SlicesInSpace
+
+
+@pytest.mark.parametrize(
+    ("name", "level", "width"),
+    [("lung", -600, 1500), ("soft", 50, 400), ("abdomen", 50, 400), ("mediastinum", 50, 350), ("brain", 40, 80),
+     ("bone", 300, 1500)],
+)  # fmt: skip
+def test_names_stand_for_levels_and_widths(name, level, width):
+    assert checked_window(name) == (level - width / 2, level + width / 2) == WINDOWS[name]
+    assert checked_window(f" {name.upper()} ") == WINDOWS[name]
+
+
+def test_every_style_with_a_window_takes_names():
+    for style in (Projection("mip", window="Lung"), PlaneCut(window="lung"), SlicesInSpace(window="LUNG")):
+        assert style.window == WINDOWS["lung"]
+    assert CurveCut(window="bone").window == BONE_WINDOW
+    grey = grey_image(np.array([[-1350.0, -600.0, 150.0]]), "lung")
+    assert grey[0, :, 0].tolist() == [0, 128, 255]
+
+
+def test_names_that_are_none_are_listed():
+    with pytest.raises(UsageError, match="no window is called 'liver': use one of bone, soft, lung"):
+        checked_window("liver")
+    with pytest.raises(UsageError, match="mm of water"):
+        Projection("drr", window="lung")
