@@ -18,6 +18,7 @@ from clrecon.errors import UsageError as UsageError
 from clrecon.geometry import Volume as Volume
 from clrecon.labels import LabelMap as LabelMap
 from clrecon.labels import read_labels as read_labels
+from clrecon.labels.statistics import measure_labels as measure_labels
 from clrecon.mesh import Mesh as Mesh
 from clrecon.mesh.compare.cells import GridCells as GridCells
 from clrecon.mesh.compare.cells import find_mesh_cells as find_mesh_cells

@@ -29,6 +29,7 @@ _STAGES = {
     "compare": "comparing with the surface before",
     "write": "writing",
     "measure": "measuring the mesh",
+    "measure labels": "measuring labels",
     "draw": "drawing the phantom",
     "blur": "blurring the phantom",
     "selftest": "testing",

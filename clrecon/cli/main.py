@@ -36,6 +36,7 @@ COMMANDS = {
     "render": _Command("clrecon.cli.render", "make pictures of a CT series, still or moving"),
     "vertebrae": _Command("clrecon.cli.vertebrae", "make a first guess of a label map of the vertebrae"),
     "corridor": _Command("clrecon.cli.corridor", "find the widest straight line through each pedicle of a vertebra"),
+    "stats": _Command("clrecon.cli.stats", "measure each label of a label map: ml, and HU with percentiles"),
     "info": _Command("clrecon.cli.info", "show which series a folder holds and whether they can be used"),
     "devices": _Command("clrecon.cli.devices", "show the OpenCL devices and which one would be used"),
     "phantom": _Command("clrecon.cli.phantom", "write a made-up CT series with a known surface"),

@@ -24,7 +24,7 @@ TAKE_PROGRESS = {
     "cut_slice", "decimate_mesh", "denoise_points", "estimate_normals", "extract_isosurface", "extract_isosurfaces",
     "extract_label_masks", "extract_labels", "filter_bilateral", "filter_volume",
     "find_cut_cells", "find_ghost_slices", "find_mesh_cells", "find_neighbours", "find_spine_line",
-    "list_series", "mask_field_of_view", "measure_cells", "measure_slices", "measure_truth",
+    "list_series", "mask_field_of_view", "measure_cells", "measure_labels", "measure_slices", "measure_truth",
     "split_vertebrae", "read_labels", "read_volume", "reconstruct_surface", "reformat_curve",
     "remove_outliers", "remove_sparse_cells", "remove_table", "render", "smooth_mesh", "thin_points",
     "write_animation",

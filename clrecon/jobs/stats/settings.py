@@ -1,0 +1,44 @@
+"""Settings of the job of statistics, validated on construction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from clrecon.labels.statistics import PERCENTILES, check_percentiles
+from clrecon.reading import Selection
+
+__all__ = ["StatsSettings"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatsSettings(Selection):
+    """Settings of the job.
+
+    Parameters
+    ----------
+    series, phase, allow_gaps, force
+        See `clrecon.reading.Selection`.
+    labels : path
+        Label map: NIfTI, NRRD, MetaImage or DICOM SEG.
+    only : sequence of str or int
+        Labels that are measured; none: all.
+    percentiles : sequence of float
+        From 0 to 100.
+    keep_ids : bool
+        Write the hashes of the UIDs of series and frame of reference into the report.
+
+    Raises
+    ------
+    UsageError
+        A percentile is not one.
+    """
+
+    labels: str | Path
+    only: Sequence[str | int] = ()
+    percentiles: Sequence[float] = PERCENTILES
+    keep_ids: bool = False
+
+    def __post_init__(self) -> None:
+        check_percentiles(self.percentiles)

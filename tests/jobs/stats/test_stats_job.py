@@ -1,0 +1,108 @@
+"""``clrecon stats``: table, JSON and CSV, wide and narrow, and wrong usage."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from label_files import write_nifti
+
+from clrecon.cli.main import main
+from clrecon.cli.stats import _lay_out
+
+pytest.importorskip("nibabel")
+
+AFFINE = np.array([[2.0, 0, 0, -10.0], [0, 2.0, 0, -12.0], [0, 0, 2.5, -84.0], [0, 0, 0, 1.0]])
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, str]:
+    voxels = np.zeros((6, 8, 8), np.int16)
+    voxels[2:4] = 100
+    voxels[3:5, 2:4] += 7
+    labels = np.zeros(voxels.shape, np.uint8)
+    labels[2:4, 1:5, 1:5] = 2
+    labels[4:5] = 5
+    scan = write_nifti(tmp_path / "ct.nii", voxels, AFFINE)
+    own = (
+        b'<?xml version="1.0"?> <CaretExtension><VolumeInformation Index="0"><LabelTable>'
+        b'<Label Key="2"><![CDATA[a very long name of a structure in the belly]]></Label>'
+        b"</LabelTable></VolumeInformation>"
+    )
+    return {"ct": str(scan), "labels": str(write_nifti(tmp_path / "l.nii", labels, AFFINE, extension=own))}
+
+
+def test_table_json_and_csv_say_the_same(files: dict[str, str], tmp_path: Path, capsys: Any) -> None:
+    out, table = tmp_path / "out.json", tmp_path / "out.csv"
+    given = ["stats", files["ct"], "--labels", files["labels"], "--percentiles", "50,2.5"]
+    assert main([*given, "--report", str(out), "--csv", str(table)]) == 0
+    shown = capsys.readouterr().out
+    report = json.loads(out.read_text())
+    one, other = report["labels"]
+    assert report["percentiles"] == [2.5, 50.0] and report["resampled"] is False
+    assert (one["number"], one["voxels"], other["name"]) == (2, 32, "label_5")
+    assert one["ml"] == pytest.approx(32 * 0.01) and one["mean_hu"] == pytest.approx((24 * 100 + 8 * 107) / 32)
+    assert one["percentiles_hu"] == {"2.5": 100.0, "50": 100.0}
+    with table.open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["name"] for row in rows] == [one["name"], "label_5"]
+    assert float(rows[0]["mean_hu"]) == pytest.approx(one["mean_hu"])
+    assert float(rows[1]["p50_hu"]) == other["percentiles_hu"]["50"]
+    (line,) = (line for line in shown.splitlines() if line.startswith("a very long"))
+    assert line.split()[-7:] == ["0.32", "101.8", "3.0", "100", "100", "100", "107"]
+    assert "peak_memory_bytes" in report and report["volume"]["series"]["uid_hash"] is None
+
+
+def test_json_on_stdout_and_one_label(files: dict[str, str], capsys: Any) -> None:
+    assert main(["stats", files["ct"], "--labels", files["labels"], "--label", "5", "--json"]) == 0
+    (one,) = json.loads(capsys.readouterr().out)["labels"]
+    assert one["number"] == 5
+
+
+def test_a_narrow_window_gets_two_tables(files: dict[str, str], capsys: Any) -> None:
+    assert main(["stats", files["ct"], "--labels", files["labels"], "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    wide, narrow = _lay_out(report, None), _lay_out(report, 60)
+    assert len(wide) == 3 and max(map(len, wide)) > 60
+    assert len(narrow) == 7 and max(map(len, narrow)) <= 60
+    assert narrow[1].startswith("a very long name") and "..." in narrow[5] and narrow[5].split()[-1] == "107"
+    assert _lay_out(report, 200) == wide
+
+
+@pytest.mark.parametrize(
+    ("extra", "code", "words"),
+    [
+        ([], 3, "--labels"),
+        (["--labels", "LABELS", "--label", "spleen"], 3, "spleen"),
+        (["--labels", "no.nii"], 3, "no label map"),
+        (["--labels", "LABELS", "--percentiles", "5;50"], 3, "5,50,95"),
+        (["--labels", "LABELS", "--percentiles", "500"], 3, "from 0 to 100"),
+        (["--labels", "LABELS", "--csv", "a.json", "--report", "a.json"], 3, "same file"),
+        (["--labels", "LABELS", "--csv", "no/a.csv"], 6, "no"),
+        (["--labels", "LABELS", "--report", "LABELS"], 3, "would replace"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_writes_nothing(
+    extra: list[str], code: int, words: str, files: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    given = [files["labels"] if word == "LABELS" else word for word in extra]
+    assert main(["stats", files["ct"], *given, "-q"]) == code
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_what_exists_stays_with_no_clobber(files: dict[str, str], tmp_path: Path, capsys: Any) -> None:
+    (tmp_path / "a.csv").write_text("mine")
+    given = ["stats", files["ct"], "--labels", files["labels"], "--csv", str(tmp_path / "a.csv")]
+    assert main([*given, "--no-clobber"]) == 6
+    assert "a.csv" in capsys.readouterr().err and (tmp_path / "a.csv").read_text() == "mine"
+    assert main(given) == 0
+    assert (tmp_path / "a.csv").read_text().startswith("number,name,voxels,ml")
