@@ -15,6 +15,7 @@ from clrecon.errors import NoSurfaceError as NoSurfaceError
 from clrecon.errors import OutputError as OutputError
 from clrecon.errors import RefusedInputError as RefusedInputError
 from clrecon.errors import UsageError as UsageError
+from clrecon.formats.write_volume import write_volume as write_volume
 from clrecon.geometry import Volume as Volume
 from clrecon.labels import LabelMap as LabelMap
 from clrecon.labels import read_labels as read_labels

@@ -11,7 +11,18 @@ from numpy.typing import NDArray
 from clrecon.geometry.affine import Float64Array, apply_affine
 from clrecon.geometry.grid import Grid
 
-__all__ = ["RegularGrid", "regular_grid", "resample_grid", "shear_degrees"]
+__all__ = [
+    "LARGEST_SHEAR_DEGREES",
+    "RegularGrid",
+    "describe_unevenness",
+    "regular_grid",
+    "resample_grid",
+    "shear_degrees",
+]
+
+LARGEST_SHEAR_DEGREES = 0.01
+"""Axes this near to right angles count as rectangular, because directions in headers are rounded.  A file or an image
+gets the affine's own axes, so its points are those of the volume."""
 
 ON_GRID = 1e-6
 """Tolerance in steps: a volume that ends this near to a point of the regular grid needs no further point."""
@@ -38,11 +49,26 @@ def shear_degrees(affine: Float64Array) -> float:
     return float(np.degrees(np.arcsin(np.clip(np.abs(cosines - np.diag(np.diag(cosines))).max(), 0.0, 1.0))))
 
 
-def regular_grid(grid: Grid, origins: Float64Array) -> RegularGrid:
+def describe_unevenness(origins: Float64Array) -> str:
+    """Describe slices that lie at positions (n, 3) in uneven steps."""
+    gaps = np.linalg.norm(np.diff(origins, axis=0), axis=1)
+    return f"the slices of this volume are uneven ({gaps.min():.4g} to {gaps.max():.4g} mm apart)"
+
+
+def regular_grid(grid: Grid, origins: Float64Array, step_mm: float | None = None) -> RegularGrid:
     """Return the smallest regular grid that encloses all voxel centres of a grid.
 
-    i runs as in the grid, j within the plane of the slices, k along their normal; the step of k is the mean distance
-    of the slices along it.  Where a volume is sheared but even, the planes of the grid are those of its slices.
+    i runs as in the grid, j within the plane of the slices, k along their normal.  Without `step_mm`, i and j have the
+    steps of the grid and k the mean distance of the slices along the normal: where a volume is sheared but even, the
+    planes are those of its slices.
+
+    Parameters
+    ----------
+    grid : Grid
+    origins : ndarray, shape (nk, 3)
+        LPS mm of voxel (0, 0, k) of each slice.
+    step_mm : float, optional
+        Step along all three axes.
     """
     di, dj, _ = grid.spacing
     first = grid.affine[:3, 0] / di
@@ -54,7 +80,7 @@ def regular_grid(grid: Grid, origins: Float64Array) -> RegularGrid:
     places = (origins[:, None, :] + in_plane).reshape(-1, 3) @ axes
     heights = origins @ axes[:, 2]
     dk = abs(heights[-1] - heights[0]) / (nk - 1) if nk > 1 else abs(grid.affine[:3, 2] @ axes[:, 2])
-    spacing = np.array([di, dj, dk])
+    spacing = np.array([di, dj, dk]) if step_mm is None else np.full(3, step_mm)
     low, high = places.min(axis=0), places.max(axis=0)
     counts = np.ceil((high - low) / spacing - ON_GRID).astype(int) + 1
     affine = np.eye(4)

@@ -16,7 +16,47 @@ from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, checked_points, slice_normal
 from clrecon.system.messages import Message
 
-__all__ = ["UnevenStack"]
+__all__ = [
+    "POSITION_TOLERANCE_GAPS",
+    "POSITION_TOLERANCE_MM",
+    "UnevenStack",
+    "fit_even",
+    "fit_line",
+    "position_tolerance",
+]
+
+POSITION_TOLERANCE_MM = 0.01
+POSITION_TOLERANCE_GAPS = 0.01
+"""A residual up to 1 % of the gap (or 0.01 mm if larger) is due to rounding and does not make a stack uneven."""
+
+
+def position_tolerance(gap_mm: float) -> float:
+    """Return the largest distance in mm of a slice from even places that is taken as rounding."""
+    return max(POSITION_TOLERANCE_MM, POSITION_TOLERANCE_GAPS * gap_mm)
+
+
+def fit_line(positions: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Fit step and origin (LPS mm) by least squares to positions (n, 3) that are numbered 0 to n - 1, n >= 2."""
+    k = np.arange(len(positions), dtype=np.float64)
+    centre, mean = k.mean(), positions.mean(axis=0)
+    step = (k - centre) @ (positions - mean) / np.sum((k - centre) ** 2)
+    return step, mean - centre * step
+
+
+def fit_even(positions: Float64Array, normal: Float64Array) -> tuple[Float64Array, Float64Array, bool]:
+    """Fit even places to slices at positions (n, 3), n >= 2.
+
+    Returns
+    -------
+    step, origin : ndarray, shape (3,)
+        LPS mm.
+    is_even : bool
+        No position is further off than `position_tolerance` of the median gap along the normal.
+    """
+    step, origin = fit_line(positions)
+    off = np.linalg.norm(positions - (origin + np.arange(len(positions))[:, None] * step), axis=1)
+    usual = float(np.median(np.abs(np.diff(positions @ normal))))
+    return step, origin, bool(off.max() <= position_tolerance(usual))
 
 
 @dataclass(frozen=True)

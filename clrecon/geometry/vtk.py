@@ -20,13 +20,15 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, is_left_handed
 from clrecon.geometry.grid import Grid
-from clrecon.geometry.regular import regular_grid, resample_grid, shear_degrees
+from clrecon.geometry.regular import (
+    LARGEST_SHEAR_DEGREES,
+    describe_unevenness,
+    regular_grid,
+    resample_grid,
+    shear_degrees,
+)
 
 __all__ = ["make_image_data"]
-
-LARGEST_SHEAR_DEGREES = 0.01
-"""Axes this near to right angles count as rectangular, because directions in headers are rounded.  The image gets the
-affine's own axes, so its points are those of the volume."""
 
 
 def make_image_data(grid: Grid, origins: Float64Array, uneven: bool, resample: bool, air: float) -> Any:
@@ -74,8 +76,7 @@ def make_image_data(grid: Grid, origins: Float64Array, uneven: bool, resample: b
 def _fault_of(grid: Grid, origins: Float64Array, uneven: bool) -> str | None:
     """Return why an image cannot hold this volume as it is; None where it can."""
     if uneven:
-        gaps = np.linalg.norm(np.diff(origins, axis=0), axis=1)
-        return f"the slices of this volume are uneven ({gaps.min():.4g} to {gaps.max():.4g} mm apart)"
+        return describe_unevenness(origins)
     shear = shear_degrees(grid.affine)
     return f"the axes of this volume are sheared by {shear:.2f} degrees" if shear > LARGEST_SHEAR_DEGREES else None
 

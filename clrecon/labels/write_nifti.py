@@ -14,16 +14,13 @@ import numpy as np
 
 from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import LABEL_MAP
-from clrecon.geometry.frames import lps_affine_from_ras
+from clrecon.formats.write_nifti import place_in_header
 from clrecon.labels.label_map import LabelMap
 
 __all__ = ["encode_nifti", "load_nibabel"]
 
 CARET_CODE = 30
 """Code of the extension that holds Caret's XML."""
-MM = 2
-SCANNER = 1
-"""Codes of NIfTI: lengths in mm, positions as the scanner gave them."""
 
 
 def load_nibabel() -> Any:
@@ -53,13 +50,7 @@ def encode_nifti(labels: LabelMap, *, packed: bool) -> bytes:
     """
     nibabel = load_nibabel()
     image = nibabel.Nifti1Image(np.asarray(labels.voxels).transpose(2, 1, 0), None)
-    affine = lps_affine_from_ras(labels.affine)
-    image.header.set_xyzt_units(MM)
-    image.set_sform(affine, SCANNER)
-    if _is_rigid(affine):
-        image.set_qform(affine, SCANNER)  # cannot hold a shear
-    else:
-        image.header["pixdim"][1:4] = labels.spacing
+    place_in_header(image.header, labels.affine)
     table = "".join(
         f'<Label Key="{number}" Red="1" Green="1" Blue="1" Alpha="1">{escape(name)}</Label>'
         for number, name in labels.names.items()
@@ -69,8 +60,3 @@ def encode_nifti(labels: LabelMap, *, packed: bool) -> bytes:
     image.header.extensions.append(nibabel.nifti1.Nifti1Extension(CARET_CODE, text.encode("utf-8")))
     content = bytes(image.to_bytes())
     return gzip.compress(content, compresslevel=6, mtime=0) if packed else content
-
-
-def _is_rigid(affine: np.ndarray) -> bool:
-    axes = affine[:3, :3] / np.linalg.norm(affine[:3, :3], axis=0)
-    return bool(np.abs(axes.T @ axes - np.eye(3)).max() < 1e-6)

@@ -23,18 +23,13 @@ from clrecon.dicom.series.phases import SAME_POSITION_MM, Phase, _are_passes, _s
 from clrecon.dicom.series.remains import DAMAGED_START, _Slices, describe_start
 from clrecon.dicom.stack import attributes
 from clrecon.dicom.stack.attributes import Alternation, _is_compared, _shorten, find_alternation
-from clrecon.dicom.stack.fit import (
-    POSITION_TOLERANCE_GAPS,
-    POSITION_TOLERANCE_MM,
-    _cross,
-    measure_line,
-    measure_stated_gap,
-)
+from clrecon.dicom.stack.fit import _cross, measure_line, measure_stated_gap
 from clrecon.dicom.stack.holes import RUN_LENGTH, _find_runs
 from clrecon.dicom.stack.layout import describe_thickness, summarise_gaps
 from clrecon.dicom.stack.mixture import describe_differences
 from clrecon.dicom.stack.numbers import median
 from clrecon.errors import RefusedInputError
+from clrecon.geometry.uneven import POSITION_TOLERANCE_GAPS, POSITION_TOLERANCE_MM
 
 pytestmark = pytest.mark.unit
 

@@ -18,6 +18,7 @@ KEYWORDS = ("device", "memory", "progress")
 """What a call is computed with, not what it computes: never by position."""
 
 TAKE_PROGRESS = {
+    "write_volume",
     "Mask.from_band", "SurfaceExtractor.extract_vertices", "extract_points",
     "SurfaceExtractor.extract", "VolumeRenderer.render", "choose_iso_value", "cluster_points", "collapse_quadric",
     "compare_meshes", "extract_by_method",

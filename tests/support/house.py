@@ -27,7 +27,7 @@ _layer("anatomy", "errors", "system", "geometry")
 _layer("exchange", "errors", "system", "geometry")
 _layer("sources", "errors", "system", "geometry")
 _layer("dicom", "errors", "system", "geometry", "sources")
-_layer("formats", "errors", "system", "geometry", "sources")
+_layer("formats", "errors", "system", "geometry", "exchange", "sources")
 _layer("reading", "errors", "system", "geometry", "sources", "dicom", "formats")
 _layer("labels", "errors", "version", "system", "geometry", "dicom", "formats")
 _layer("vertebrae", "errors", "system", "geometry", "anatomy", "labels")
@@ -72,6 +72,7 @@ _layer(
     "geometry",
     "anatomy",
     "corridors",
+    "formats",
     "reading",
     "labels",
     "mesh",

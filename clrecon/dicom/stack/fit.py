@@ -24,6 +24,7 @@ from clrecon.dicom.stack.holes import Holes, find_holes
 from clrecon.dicom.stack.numbers import median
 from clrecon.geometry import compose_affine, tilt_degrees
 from clrecon.geometry.affine import TILT_REPORT_DEG
+from clrecon.geometry.uneven import fit_line, position_tolerance
 from clrecon.system.text import join_names
 from clrecon.system.wording import name_parameter
 
@@ -31,9 +32,6 @@ __all__ = ["Line", "Stack", "group_places", "measure_stack", "measure_stated_gap
 
 Float64Array = NDArray[np.float64]
 
-POSITION_TOLERANCE_MM = 0.01
-POSITION_TOLERANCE_GAPS = 0.01
-"""A residual up to 1 % of the gap (or 0.01 mm if larger) is due to rounding and does not make a stack uneven."""
 DUPLICATE_MM = 1e-3
 STATED_GAP_TOLERANCE = 0.01
 PIXEL_SPACING_TOLERANCE = 1e-5
@@ -163,7 +161,7 @@ def measure_line(positions: Float64Array, distances: Float64Array) -> Line:
     usual = median(gaps)
     step, origin = fit_line(positions)
     residuals = np.linalg.norm(positions - (origin + np.arange(len(positions))[:, None] * step), axis=1)
-    tolerance = max(POSITION_TOLERANCE_MM, POSITION_TOLERANCE_GAPS * usual)
+    tolerance = position_tolerance(usual)
     return Line(
         step=step,
         origin=origin,
@@ -203,14 +201,6 @@ def sort_slices(
     distances = positions @ normal
     order = sorted(range(len(headers)), key=lambda index: (distances[index], str(headers[index].file)))
     return tuple(headers[index] for index in order), positions[order], distances[order]
-
-
-def fit_line(positions: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Fit step and origin (LPS mm) by least squares to positions (n, 3) that are numbered 0 to n - 1, n >= 2."""
-    k = np.arange(len(positions), dtype=np.float64)
-    centre, mean = k.mean(), positions.mean(axis=0)
-    step = (k - centre) @ (positions - mean) / np.sum((k - centre) ** 2)
-    return step, mean - centre * step
 
 
 def find_mixed_values(headers: Sequence[SliceHeader]) -> list[str]:

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.dicom.headers.slice_header import SliceHeader
-from clrecon.dicom.stack.fit import POSITION_TOLERANCE_GAPS, POSITION_TOLERANCE_MM, Stack
+from clrecon.dicom.stack.fit import Stack
 from clrecon.dicom.stack.numbers import median
+from clrecon.geometry.uneven import position_tolerance
 
 __all__ = [
     "describe_thickness",
@@ -42,7 +43,7 @@ def summarise_gaps(distances: Float64Array) -> list[dict[str, Any]]:
     """
     runs: list[list[float]] = []
     for gap in np.diff(distances).tolist():
-        if runs and abs(gap - runs[-1][0]) <= max(POSITION_TOLERANCE_MM, POSITION_TOLERANCE_GAPS * runs[-1][0]):
+        if runs and abs(gap - runs[-1][0]) <= position_tolerance(runs[-1][0]):
             runs[-1].append(gap)
         else:
             runs.append([gap])

@@ -1,0 +1,53 @@
+"""MetaImage (.mha), with SimpleITK: the certificate as fields of its own, the voxels as they are, not packed."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from clrecon.errors import OutputError
+from clrecon.formats.content import VolumeContent
+from clrecon.formats.extras import import_extra
+from clrecon.formats.grid_file import VOLUME
+from clrecon.geometry.affine import column_spacing
+from clrecon.system.foreign_words import hush
+
+__all__ = ["write_metaimage"]
+
+_NAME = "volume.mha"
+
+
+def write_metaimage(stream: BinaryIO, content: VolumeContent) -> None:
+    """Write the file.  SimpleITK writes to a name alone: a temporary file, whose bytes go to the stream.
+
+    Raises
+    ------
+    UsageError
+        SimpleITK is not installed.
+    OutputError
+        SimpleITK cannot write the temporary file.
+    """
+    sitk = import_extra("SimpleITK", VOLUME)
+    content.progress("write", 0, 0)
+    spacing = column_spacing(content.affine)
+    image = sitk.GetImageFromArray(content.voxels)
+    image.SetSpacing(spacing)
+    image.SetOrigin(content.affine[:3, 3].tolist())
+    image.SetDirection((content.affine[:3, :3] / np.array(spacing)).ravel().tolist())
+    for n, line in enumerate(("HU", *content.lines)):
+        image.SetMetaData(f"clrecon_{n:02}", line)
+    with tempfile.TemporaryDirectory(prefix="clrecon-") as folder:
+        path = Path(folder, _NAME)
+        try:
+            with hush():
+                sitk.WriteImage(image, str(path), useCompression=False, imageIO="MetaImageIO")
+        except RuntimeError as error:
+            raise OutputError(f"SimpleITK cannot write a temporary file of {content.voxels.nbytes} bytes") from error
+        if path.stat().st_size < content.voxels.nbytes:
+            raise OutputError("SimpleITK could not write the whole volume: is the disk of temporary files full?")
+        with path.open("rb") as written:
+            shutil.copyfileobj(written, stream, 2**20)

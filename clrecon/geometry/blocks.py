@@ -1,0 +1,143 @@
+"""Blocks of a grid: the voxels in a box of millimetres, the affine of the block, and what a certificate says of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from clrecon.geometry.affine import Float64Array, slice_normal, tilt_degrees
+from clrecon.geometry.grid import Grid
+from clrecon.geometry.uneven import fit_even
+
+__all__ = ["Block", "describe_place", "find_block", "place_block"]
+
+ON_EDGE_MM = 1e-6
+"""A voxel centre this near to the side of a box lies in the box."""
+
+
+class Block(NamedTuple):
+    """Voxels first to end - 1 along each axis.
+
+    Attributes
+    ----------
+    first, end : (int, int, int)
+        Indices (i, j, k).
+    """
+
+    first: tuple[int, int, int]
+    end: tuple[int, int, int]
+
+    @property
+    def shape_ijk(self) -> tuple[int, int, int]:
+        """(ni, nj, nk) of the block."""
+        ni, nj, nk = (end - first for first, end in zip(self.first, self.end, strict=True))
+        return ni, nj, nk
+
+
+def find_block(grid: Grid, origins: Float64Array, low: ArrayLike, high: ArrayLike, margin: int = 0) -> Block | None:
+    """Return the smallest block that holds every voxel whose centre lies in a box; None where no centre does.
+
+    Parameters
+    ----------
+    grid : Grid
+    origins : ndarray, shape (nk, 3)
+        LPS mm of voxel (0, 0, k) of each slice.
+    low, high : array_like, shape (3,)
+        Corners of the box along the axes of the patient, LPS mm; infinite numbers leave a side open.
+    margin : int
+        Voxels more on each side, as far as the grid goes.
+    """
+    ni, nj, nk = grid.shape_ijk
+    low, high = np.asarray(low, np.float64) - ON_EDGE_MM, np.asarray(high, np.float64) + ON_EDGE_MM
+    along_i, along_j = np.arange(ni)[:, None] * grid.affine[:3, 0], np.arange(nj)[:, None] * grid.affine[:3, 1]
+    columns, rows = np.zeros(ni, dtype=bool), np.zeros(nj, dtype=bool)
+    slices = np.zeros(nk, dtype=bool)
+    for k, origin in enumerate(origins):
+        inside = np.ones((nj, ni), dtype=bool)
+        for a in range(3):
+            place = origin[a] + _one_if_constant(along_i[:, a])[None, :] + _one_if_constant(along_j[:, a])[:, None]
+            inside &= (place >= low[a]) & (place <= high[a])
+        if inside.any():
+            slices[k] = True
+            columns |= inside.any(axis=0)
+            rows |= inside.any(axis=1)
+    if not slices.any():
+        return None
+    ends = [np.flatnonzero(axis)[[0, -1]] for axis in (columns, rows, slices)]
+    first = tuple(max(0, int(one[0]) - margin) for one in ends)
+    end = tuple(min(n, int(one[1]) + 1 + margin) for one, n in zip(ends, (ni, nj, nk), strict=True))
+    return Block(first, end)  # type: ignore[arg-type]
+
+
+def _one_if_constant(places: Float64Array) -> Float64Array:
+    """Return one place for all where an axis does not move along a coordinate: less to add up."""
+    return places if places.any() else places[:1]
+
+
+def place_block(affine: Float64Array, origins: Float64Array, uneven: bool, block: Block) -> tuple[Any, Any]:
+    """Return the affine of a block, and the positions (n, 3) of its slices where they are uneven, else None.
+
+    A block of uneven slices that are even among themselves, by the rule of the reader, has an affine alone: that which
+    these slices have when they are read without the others.
+
+    Parameters
+    ----------
+    affine : ndarray, shape (4, 4)
+        Of the whole grid.
+    origins : ndarray, shape (nk, 3)
+        LPS mm of voxel (0, 0, k) of each slice of the whole grid.
+    uneven : bool
+        The slices of the whole grid lie elsewhere than its affine says.
+    block : Block
+    """
+    placed = np.array(affine)
+    aside = affine[:3, 0] * block.first[0] + affine[:3, 1] * block.first[1]
+    positions = origins[block.first[2] : block.end[2]] + aside
+    placed[:3, 3] = positions[0]
+    if not uneven or len(positions) < 2:
+        return placed, None
+    step, origin, is_even = fit_even(positions, slice_normal(affine))
+    if is_even:
+        placed[:3, 2], placed[:3, 3] = step, origin
+        return placed, None
+    placed[:3, 2] = (positions[-1] - positions[0]) / (len(positions) - 1)
+    return placed, positions
+
+
+def describe_place(report: Mapping[str, Any], volume: Any) -> dict[str, Any]:
+    """Return the entries of a report that change with the shape and the place of a volume, as far as it has them.
+
+    Parameters
+    ----------
+    report : mapping
+        Of the volume that `volume` was made of.
+    volume : Volume
+    """
+    ni, nj, nk = volume.shape_ijk
+    di, dj, dk = volume.spacing
+    origins, normal = volume.slice_origins(), slice_normal(volume.affine)
+    gaps = np.abs(np.diff(origins, axis=0) @ normal) if nk > 1 else np.array([abs(volume.affine[:3, 2] @ normal)])
+    usual = float(np.median(gaps))
+    even = volume.affine[:3, 3] + np.arange(nk)[:, None] * volume.affine[:3, 2]
+    off = np.linalg.norm(origins - even, axis=1)
+    hu = volume.hu_range
+    entries = {
+        "slices": nk,
+        "shape_ijk": [ni, nj, nk],
+        "spacing_mm": [di, dj, dk],
+        "extent_mm": [ni * di, nj * dj, float(gaps.sum()) + usual if nk > 1 else usual],
+        "affine_ijk_to_lps_mm": volume.affine.tolist(),
+        "tilt_deg": tilt_degrees(volume.affine),
+        "gap_mm": {"min": float(gaps.min()), "max": float(gaps.max()), "median": usual},
+        "uneven": volume.uneven,
+        "gap_runs": None,
+        "slice_positions_mm": origins.tolist() if volume.uneven else None,
+        "hu_range": None if hu is None else [float(hu[0]), float(hu[1])],
+    }
+    if report.get("uneven"):  # of even slices the residual is that of reading
+        entries["grid_residual_max_mm"] = float(off.max()) if volume.uneven else None
+        entries["grid_residual_rms_mm"] = float(np.sqrt(np.mean(off**2))) if volume.uneven else None
+    return {name: value for name, value in entries.items() if name in report}
