@@ -26,6 +26,8 @@ from clrecon.mesh.compare.cells import find_mesh_cells as find_mesh_cells
 from clrecon.mesh.compare.cells import measure_cells as measure_cells
 from clrecon.mesh.compare.cut_cells import find_cut_cells as find_cut_cells
 from clrecon.mesh.compare.distances import compare_meshes as compare_meshes
+from clrecon.mesh.compare.signed import measure_distance as measure_distance
+from clrecon.mesh.compare.signed import measure_vertex_distances as measure_vertex_distances
 from clrecon.mesh.compare.slices import measure_slices as measure_slices
 from clrecon.mesh.compare.truth import measure_truth as measure_truth
 from clrecon.mesh.reader import read_mesh as read_mesh

@@ -34,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "that fails, or whose library is not installed, is a row that says so (exit code 8). The folder appears as"
             " a",
             "whole or not at all; that of an earlier comparison is replaced. No name, ID or path of the scan is in it.",
+            "How far two meshes lie apart is what clrecon distance measures.",
             "",
             "examples:",
             "  clrecon compare CT_FOLDER -o report",

@@ -37,6 +37,7 @@ COMMANDS = {
     "vertebrae": _Command("clrecon.cli.vertebrae", "make a first guess of a label map of the vertebrae"),
     "corridor": _Command("clrecon.cli.corridor", "find the widest straight line through each pedicle of a vertebra"),
     "stats": _Command("clrecon.cli.stats", "measure each label of a label map: ml, and HU with percentiles"),
+    "distance": _Command("clrecon.cli.distance", "measure how far two meshes lie apart, in mm and in colours"),
     "info": _Command("clrecon.cli.info", "show which series a folder holds and whether they can be used"),
     "devices": _Command("clrecon.cli.devices", "show the OpenCL devices and which one would be used"),
     "phantom": _Command("clrecon.cli.phantom", "write a made-up CT series with a known surface"),

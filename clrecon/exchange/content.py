@@ -85,11 +85,17 @@ class Content(PointContent):
         Name of the object, for formats that have names.
     color : (float, float, float) or None
         Red, green and blue, 0 to 1, for formats that have colours; None: the colour of the format's writer.
+    vertex_colors : ndarray, shape (n, 3), uint8, or None
+        A colour for each vertex, in PLY, in place of `color`.
+    distances : ndarray, shape (n,), float32, or None
+        mm from another surface at each vertex, in PLY.
     """
 
     triangles: NDArray[np.uint32]
     name: str | None = None
     color: tuple[float, float, float] | None = None
+    vertex_colors: NDArray[np.uint8] | None = None
+    distances: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,21 @@ class CellLocator:
             squares[row] = square.get()
         return np.sqrt(squares)
 
+    def nearest(self, points: Points) -> tuple[Points, NDArray[np.int64]]:
+        """Return the nearest points of the surface, shape (k, 3), and the rows of their triangles, shape (k,)."""
+        from vtkmodules.vtkCommonCore import reference
+        from vtkmodules.vtkCommonDataModel import vtkGenericCell
+
+        closest = [0.0, 0.0, 0.0]
+        triangle: Any = reference(0)
+        others: tuple[Any, ...] = (vtkGenericCell(), triangle, reference(0), reference(0.0))
+        places, rows = np.empty((len(points), 3)), np.empty(len(points), dtype=np.int64)
+        find: Any = self._locator.FindClosestPoint
+        for row, point in enumerate(points.tolist()):
+            find(point, closest, *others)
+            places[row], rows[row] = closest, triangle.get()
+        return places, rows
+
     def first_hits(self, starts: Points, ends: Points) -> Points:
         """Return where lines from `starts` to `ends`, shape (k, 3), first meet the surface; NaN where they do not."""
         from vtkmodules.vtkCommonCore import reference

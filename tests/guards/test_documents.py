@@ -14,7 +14,8 @@ DOCUMENTS = [
     "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/contract.md", "docs/iso_value.md", "docs/geometry.md",
     "docs/certificate.md", "docs/formats.md", "docs/labels.md", "docs/calibration.md", "docs/transfer_functions.md",
     "docs/slices.md", "docs/rendering.md", "docs/clouds.md", "docs/filters.md", "docs/masks.md",
-    "docs/inside.md", "docs/measures.md", "docs/compare.md", "docs/corridor.md", "docs/statistics.md",
+    "docs/inside.md", "docs/measures.md", "docs/compare.md", "docs/corridor.md",
+    "docs/statistics.md", "docs/distance.md",
 ]  # fmt: skip
 LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)")
 QUOTED = re.compile(r"`((?:\.ci|cl|clrecon|docs|scripts|tests)/[\w./-]*|(?:setup\.cfg|\w+\.(?:md|toml)))`")
@@ -51,7 +52,17 @@ def test_the_commands_of_documents_are_understood() -> None:
     assert {command[0] for command in commands} >= {"demo", "mesh", "render", "info", "devices", "phantom", "selftest"}
     more = find_commands((ROOT / "docs" / "certificate.md").read_text(encoding="utf-8"))
     assert [command[0] for command in more] == ["phantom", "info"]
-    for name in ("compare", "corridor", "formats", "inside", "iso_value", "labels", "rendering", "statistics"):
+    for name in (
+        "compare",
+        "corridor",
+        "distance",
+        "formats",
+        "inside",
+        "iso_value",
+        "labels",
+        "rendering",
+        "statistics",
+    ):
         found = find_commands((ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8"))
         assert found
         more += found

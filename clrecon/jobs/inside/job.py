@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clrecon.jobs.inside.pictures import check_pictures, describe_picture, draw_parts, stage_picture
+from clrecon.jobs.inside.pictures import check_pictures, describe_picture, draw_parts
 from clrecon.jobs.inside.report import InsideReport, describe_job, describe_mesh_file
 from clrecon.jobs.inside.settings import InsideSettings
 from clrecon.jobs.shared.labelled import read_with_labels
@@ -23,6 +23,7 @@ from clrecon.jobs.shared.outputs import (
     refuse_files,
     stage_meshes,
 )
+from clrecon.jobs.shared.pictures import stage_picture
 from clrecon.jobs.shared.report import stage_report
 from clrecon.reading import read_selected
 from clrecon.system.log import get_logger, log_warnings

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
     from clrecon.rendering import Rendering
-    from clrecon.system.files import StagedFile
 
-__all__ = ["DEFAULT_VIEW", "check_pictures", "describe_picture", "draw_parts", "stage_picture"]
+__all__ = ["DEFAULT_VIEW", "check_pictures", "describe_picture", "draw_parts"]
 
 DEFAULT_VIEW = "130,20"
 """From the left, behind and above: body, arch and canal are seen."""
@@ -85,25 +83,6 @@ def draw_parts(
         with ScenePictures(shown, device=device, memory=memory) as scene:
             pictures[part] = scene.take(camera, DEFAULT_SIZE, "white")
     return pictures
-
-
-def stage_picture(stack: ExitStack, picture: Rendering, path: str | Path) -> StagedFile:
-    """Write a picture under a temporary name that `stack` removes unless it is committed.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written; an older one is intact.
-    """
-    from clrecon.rendering.pictures.image_files import encode_image
-    from clrecon.system.files import stage_file
-
-    content = encode_image(picture, os.path.splitext(os.fspath(path))[1].lower())
-
-    def write(stream: BinaryIO) -> None:
-        stream.write(content)
-
-    return stack.enter_context(stage_file(path, write, expected_bytes=len(content)))
 
 
 def describe_picture(part: str, picture: Rendering, path: str | Path, size: int) -> dict[str, Any]:

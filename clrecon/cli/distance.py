@@ -1,0 +1,142 @@
+"""``clrecon distance``: how far two meshes lie apart."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from clrecon.cli.common import add_device, add_memory, add_no_clobber, megabytes, table
+from clrecon.cli.console import Console, printable
+
+__all__ = ["add_arguments", "run"]
+
+_EPILOG = """\
+From points that cover each mesh evenly by area to the
+nearest triangle of the other, in mm. Where the other mesh
+is closed, distances have a sign: + is outside of it.
+See docs/distance.md. To compare methods on a scan, use
+clrecon compare.
+
+examples:
+  clrecon distance printed.stl bone.stl
+  clrecon distance a.ply b.ply -o a_to_b.ply \\
+    --picture a_to_b.png --range 2 --report a_to_b.json"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.epilog = _EPILOG
+    parser.add_argument("mesh", metavar="A", help="mesh: .stl or .ply")
+    parser.add_argument("reference", metavar="B", help="mesh that it is measured against: .stl or .ply")
+    parser.add_argument(
+        "--mesh-space",
+        type=str.lower,
+        metavar="lps|ras",
+        help="patient frame of files that do not name theirs (default: lps, with a warning)",
+    )
+    parser.add_argument("--samples", type=int, metavar="N", help="points on each mesh, evenly by area (default: 50000)")
+    output = parser.add_argument_group("files")
+    output.add_argument("-o", "--output", metavar="PLY", help="write A coloured by its distance from B: .ply")
+    output.add_argument("--picture", metavar="FILE", help="picture of it with its scale: .png, .jpg or .tif")
+    output.add_argument(
+        "--range",
+        dest="range_mm",
+        type=float,
+        metavar="MM",
+        help="distance at which the colours end (default: 1, 2 or 5 x 10^n mm that hold 95 %% of the distances)",
+    )
+    output.add_argument(
+        "--view", default="anterior", metavar="V", help="view of the picture: anterior (default), left, AZ,EL ..."
+    )
+    output.add_argument(
+        "--space",
+        type=str.lower,
+        default="lps",
+        metavar="lps|ras",
+        help="patient frame of the coloured mesh (default: lps)",
+    )
+    output.add_argument("--report", metavar="FILE", help="write all figures as JSON")
+    add_no_clobber(output)
+    device = parser.add_argument_group("device, for the picture alone")
+    add_device(device)
+    add_memory(device)
+
+
+def run(options: argparse.Namespace, console: Console) -> int:
+    """Run the command; returns the exit code."""
+    from clrecon.jobs.distance.job import DistanceFiles, measure_meshes
+    from clrecon.jobs.distance.settings import DistanceSettings
+
+    given = {} if options.samples is None else {"samples": options.samples}
+    settings = DistanceSettings(
+        mesh_space=options.mesh_space,
+        range_mm=options.range_mm,
+        view=options.view,
+        space=options.space,
+        device=options.device,
+        memory=options.memory,
+        **given,
+    )
+    report = measure_meshes(
+        options.mesh,
+        options.reference,
+        DistanceFiles(options.output, options.picture, options.report),
+        settings,
+        no_clobber=options.no_clobber,
+        progress=console.progress,
+    )
+    console.result(report)
+    for line in _describe(report):
+        console.say(line)
+    if options.report:
+        console.say(f"report   {printable(options.report)}")
+    for warning in report["warnings"]:
+        console.warn(warning)
+    return 0
+
+
+def _describe(report: dict[str, Any]) -> list[str]:
+    lines = []
+    for name in ("a", "b"):
+        lines += _describe_mesh(name.upper(), report[name])
+    sides = {"A to B": "a_to_b", "B to A": "b_to_a"}
+    figures = [["mm", "mean", "rms", "95 %", "largest"]]
+    for words, side in sides.items():
+        figures.append([words, *(_mm(report[f"{side}_mm"][name]) for name in ("mean", "rms", "p95", "max"))])
+    figures.append(["both", _mm(report["assd_mm"]), "", _mm(report["hd95_mm"]), _mm(report["hausdorff_mm"])])
+    lines += ["", *table(figures, right=range(1, 5))]
+    signed = {words: report[f"{side}_signed_mm"] for words, side in sides.items()}
+    if any(signed.values()):
+        figures = [["signed mm", "mean", "5 %", "50 %", "95 %", "outside"]]
+        for words, own in signed.items():
+            if own is not None:
+                cells = [_mm(own[name], "+") for name in ("mean", "p5", "median", "p95")]
+                figures.append([words, *cells, f"{100.0 * own['outside_share']:.0f} %"])
+        lines += ["", *table(figures, right=range(1, 6))]
+    lines.append("")
+    if report["colors"] is not None:
+        end = f"{report['colors']['range_mm']:g}"
+        span = f"-{end} to +{end}" if report["colors"]["signed"] else f"0 to {end}"
+        lines.append(
+            f"colours  {span} mm, beyond them {100.0 * report['colors']['beyond_share']:.1f} % of A's vertices"
+        )
+    lines += [
+        f"wrote    {each['kind']} {printable(each['name'])}, {megabytes(each['bytes'])}" for each in report["outputs"]
+    ]
+    return [*lines, f"time     {report['seconds']['total']:.2f} s"]
+
+
+def _describe_mesh(letter: str, entry: dict[str, Any]) -> list[str]:
+    size = f"{entry['triangles']:,} triangles, "
+    size += "not closed" if entry["volume_ml"] is None else f"closed, {entry['volume_ml']:,.2f} ml"
+    turned = ", turned to LPS" if entry["space"] != "LPS" else ""
+    source = {"file": "named by the file", "argument": "as you say", "assumed": "assumed"}[entry["space_from"]]
+    return [
+        f"{letter:<9}{printable(entry['name'])}",
+        f"         {size}",
+        f"         {entry['space']}, {source}{turned}",
+    ]
+
+
+def _mm(value: float, sign: str = "") -> str:
+    return f"{round(value, 3) + 0.0:{sign}.3f}"

@@ -1,0 +1,255 @@
+"""The job of distances: two meshes in, figures, a mesh coloured by distance and a picture of it out."""
+
+from __future__ import annotations
+
+import os
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.jobs.distance.inputs import describe_mesh, doubt_frames, read_side
+from clrecon.jobs.distance.report import DistanceReport
+from clrecon.jobs.distance.settings import DistanceSettings
+from clrecon.jobs.shared.laps import Laps
+from clrecon.jobs.shared.outputs import check_distinct, check_kept, commit_all
+from clrecon.jobs.shared.pictures import stage_picture
+from clrecon.jobs.shared.report import peak_memory_bytes, platform_name, stage_report
+from clrecon.mesh import Mesh
+from clrecon.mesh.compare.signed import MeshDeviation, measure_distance, measure_vertex_distances
+from clrecon.system.files import Staged, check_writable
+from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.targets import keep_existing
+from clrecon.version import package_version
+
+if TYPE_CHECKING:
+    from clrecon.opencl import Device
+    from clrecon.rendering import Rendering
+    from clrecon.rendering.looks.color_scale import ColorScale
+
+__all__ = ["DistanceFiles", "measure_meshes"]
+
+log = get_logger(__name__)
+
+_LEAST_RANGE_MM = 1e-3
+"""Least distance at which colours end where it is chosen; float32 is as exact 8 m from the origin."""
+
+
+@dataclass(frozen=True)
+class DistanceFiles:
+    """Files that a job writes.
+
+    Attributes
+    ----------
+    output : path or None
+        A coloured by its distance from B, ``.ply``.
+    picture : path or None
+        A picture of it with the scale of its colours.
+    report : path or None
+        JSON.
+    """
+
+    output: str | Path | None = None
+    picture: str | Path | None = None
+    report: str | Path | None = None
+
+
+def measure_meshes(
+    mesh: str | Path,
+    reference: str | Path,
+    files: DistanceFiles | None = None,
+    settings: DistanceSettings | None = None,
+    *,
+    no_clobber: bool = False,
+    progress: Progress | None = None,
+) -> DistanceReport:
+    """Measure how far two meshes lie apart.
+
+    Parameters
+    ----------
+    mesh, reference : path
+        Files A and B, see `clrecon.read_mesh`.
+    files : DistanceFiles, optional
+    settings : DistanceSettings, optional
+    no_clobber : bool
+        True: files that exist stay and are an `OutputError`, before any work.
+    progress : callable, optional
+        ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    DistanceReport
+
+    Raises
+    ------
+    UsageError, OutputError, RefusedInputError, NoSurfaceError, DeviceError
+        After an error nothing is written, and older files are intact.
+    """
+    files, settings = files or DistanceFiles(), settings or DistanceSettings()
+    progress = progress or ignore_progress
+    watch = Laps()
+    with keep_existing(no_clobber):
+        _check_files(files, (mesh, reference))
+    device = None if files.picture is None else _open_device(settings.device)
+    progress("read", 0, 0)
+    meshes = [read_side(path, settings.mesh_space) for path in (mesh, reference)]
+    entries = [describe_mesh(own, path) for own, path in zip(meshes, (mesh, reference), strict=True)]
+    for entry in entries:
+        if not entry["area_mm2"]:
+            raise NoSurfaceError(f"{entry['name']} has no triangle with an area: there is nothing to measure")
+    watch.lap("read")
+    names = (entries[0]["name"], entries[1]["name"])
+    found = measure_distance(meshes[0], meshes[1], settings.samples, names=names, progress=progress)
+    colored = None
+    if files.output is not None or files.picture is not None:
+        colored = _color(meshes[0], meshes[1], found, settings, progress)
+    watch.lap("measure")
+    drawn = None
+    if device is not None and colored is not None:
+        progress("render", 0, 0)
+        drawn = _draw(meshes[0], colored, names[1], settings, device)
+        watch.lap("render")
+    warnings = [text for own in meshes for text in own.report["file"]["warnings"]]
+    warnings += [*doubt_frames(meshes, entries), *found.warnings]
+    with keep_existing(no_clobber), ExitStack() as staged:
+        written = _stage(staged, meshes[0], colored, drawn, files, settings)
+        outputs = [
+            {"kind": what, "name": os.path.basename(os.fspath(path)), "bytes": file.size}
+            for what, path, file in written
+        ]
+        watch.lap("write")
+        report = _describe(found, entries, colored, outputs, device, warnings, watch)
+        own: list[Staged] = [file for _, _, file in written]
+        if files.report is not None:
+            own.append(staged.enter_context(stage_report(files.report, report)))
+        commit_all(own)
+    log_warnings(log, report.warnings)
+    return report
+
+
+def _check_files(files: DistanceFiles, sources: tuple[str | Path, str | Path]) -> None:
+    from clrecon.rendering.pictures.image_files import check_image_path
+    from clrecon.rendering.pictures.pillow import load_pillow
+
+    if files.output is not None and not os.fspath(files.output).lower().endswith(".ply"):
+        raise UsageError(
+            f"a mesh coloured by distance is a .ply file, not {os.path.basename(os.fspath(files.output))[-40:]!r}"
+        )
+    if files.picture is not None:
+        load_pillow()
+        check_image_path(files.picture)
+    named = [("the coloured mesh", files.output), ("the picture", files.picture), ("the report", files.report)]
+    outputs: list[tuple[str, str | Path]] = [(what, path) for what, path in named if path is not None]
+    check_distinct(outputs)
+    for _, path in outputs:
+        check_writable(path)
+    check_kept(outputs, *sources)
+
+
+def _open_device(name: str | None) -> Device:
+    from clrecon.operators import take_device
+
+    return take_device(name)
+
+
+@dataclass(frozen=True)
+class _Colored:
+    """Distances of the vertices of A, and their colours."""
+
+    distances: NDArray[np.float64]
+    scale: ColorScale
+
+    @property
+    def colors(self) -> NDArray[np.uint8]:
+        return self.scale.colors(self.distances)
+
+
+def _color(
+    mesh: Mesh, reference: Mesh, found: MeshDeviation, settings: DistanceSettings, progress: Progress
+) -> _Colored:
+    from clrecon.rendering.looks.color_scale import ColorScale, round_up
+
+    distances, signed = measure_vertex_distances(mesh, reference, progress=progress)
+    limit = settings.range_mm or round_up(max(found.to_reference_mm.p95, _LEAST_RANGE_MM))
+    return _Colored(distances, ColorScale(limit, signed))
+
+
+def _draw(mesh: Mesh, colored: _Colored, other: str, settings: DistanceSettings, device: Device) -> Rendering:
+    from clrecon.operators.rays.mesh_pictures import box_around, mesh_corners
+    from clrecon.operators.rays.scene import ScenePictures
+    from clrecon.rendering.pictures.mesh_look import MeshLook
+    from clrecon.rendering.pictures.scale_strip import add_scale
+    from clrecon.rendering.views.camera import Camera
+    from clrecon.rendering.views.directions import DEFAULT_SIZE
+
+    camera = Camera.fit(box_around([mesh_corners(mesh)]), settings.view)
+    look = MeshLook(vertex_colors=colored.colors)
+    with ScenePictures([(mesh, look)], device=device, memory=settings.memory) as scene:
+        picture: Rendering = scene.take(camera, DEFAULT_SIZE, "white")
+    title = "mm, + is\noutside of B" if colored.scale.signed else "mm from B"
+    return add_scale(picture.annotated(letters=True, scale_bar=True), colored.scale, title)
+
+
+def _stage(
+    staged: ExitStack,
+    mesh: Mesh,
+    colored: _Colored | None,
+    drawn: Rendering | None,
+    files: DistanceFiles,
+    settings: DistanceSettings,
+) -> list[tuple[str, str | Path, Any]]:
+    from clrecon.exchange.file_format import stage_content
+    from clrecon.exchange.formats import FORMATS
+
+    written: list[tuple[str, str | Path, Any]] = []
+    if files.output is not None and colored is not None:
+        content = replace(
+            mesh.describe(settings.space), vertex_colors=colored.colors, distances=colored.distances.astype(np.float32)
+        )
+        counted = f"{mesh.triangle_count} triangles"
+        file = staged.enter_context(stage_content(content, files.output, FORMATS[".ply"], counted, "fewer triangles"))
+        written.append(("mesh", files.output, file))
+    if files.picture is not None and drawn is not None:
+        written.append(("picture", files.picture, stage_picture(staged, drawn, files.picture)))
+    return written
+
+
+def _describe(
+    found: MeshDeviation,
+    entries: list[dict[str, Any]],
+    colored: _Colored | None,
+    outputs: list[dict[str, Any]],
+    device: Device | None,
+    warnings: list[str],
+    watch: Laps,
+) -> DistanceReport:
+    colors = None
+    if colored is not None:
+        limit = colored.scale.limit
+        beyond = float(np.mean(np.abs(colored.distances) > limit))
+        colors = {"range_mm": limit, "signed": colored.scale.signed, "beyond_share": beyond}
+    return DistanceReport(
+        a=entries[0],
+        b=entries[1],
+        hausdorff_mm=found.hausdorff_mm,
+        hd95_mm=found.hd95_mm,
+        assd_mm=found.assd_mm,
+        a_to_b_mm=found.to_reference_mm,  # type: ignore[arg-type]
+        b_to_a_mm=found.from_reference_mm,  # type: ignore[arg-type]
+        a_to_b_signed_mm=found.to_reference_signed_mm,
+        b_to_a_signed_mm=found.from_reference_signed_mm,
+        samples=found.samples,
+        colors=colors,
+        outputs=outputs,
+        device=None if device is None else device.current.label,
+        version=package_version(),
+        platform=platform_name(),
+        warnings=list(dict.fromkeys(warnings)),
+        seconds={part: round(value, 4) for part, value in {**watch.seconds, "total": watch.total()}.items()},
+        peak_memory_bytes=peak_memory_bytes(),
+    )

@@ -1,0 +1,302 @@
+"""Signed distances between two surfaces: as `compare_meshes` measures them, with a sign where a surface is closed.
+
+The sign is that of the angle-weighted pseudonormal at the nearest point of the surface, which is right for every
+closed surface whose triangles face outward (Baerentzen and Aanaes 2005): on a face its normal, on an edge the sum of
+the normals of both faces, at a vertex the sum of those around it weighted by their angles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.mesh.compare.distances import (
+    SAMPLES,
+    DistanceSummary,
+    Points,
+    SurfaceDistance,
+    sample_surface,
+    summarise_distances,
+)
+from clrecon.mesh.connectivity import find_edges, opposite_half_edges
+from clrecon.mesh.mesh import Mesh
+from clrecon.mesh.normals import vertex_normals
+from clrecon.mesh.quality import MeshQuality, measure_quality
+from clrecon.mesh.triangles import cross_products
+from clrecon.mesh.vtk import CellLocator
+from clrecon.system.pieces import chunks, local_origin
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.records import Record
+
+__all__ = [
+    "MeshDeviation", "SideDistance", "SignedDistance", "measure_distance", "measure_vertex_distances",
+    "why_unsigned",
+]  # fmt: skip
+
+_AT_CORNER = 1e-6
+"""Share of a triangle within which the nearest point counts as on its edge or at its corner."""
+
+_PIECE = 1 << 14
+"""Points between two calls of `progress`."""
+
+
+class SignedDistance:
+    """Exact distances from points to the nearest triangle of a closed surface, below zero inside.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (n, 3), mm
+    triangles : ndarray, shape (m, 3), uint32
+        Every edge in two triangles, which run along it in opposite directions.
+    outward : bool
+        False: the triangles face inward, and the sign is turned.
+
+    Raises
+    ------
+    UsageError
+        The surface is open, or its triangles do not agree which side is outside.
+    """
+
+    def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], *, outward: bool = True):
+        opposite = opposite_half_edges(triangles, find_edges(triangles, len(vertices)))
+        if opposite is None:
+            raise UsageError("distances have a sign where the surface is closed and its triangles agree on the outside")
+        self._origin = local_origin(vertices)
+        self._vertices = (vertices - self._origin).astype(np.float64)
+        self._triangles = triangles
+        self._locator = CellLocator(vertices - self._origin, triangles)
+        self._sign = 1.0 if outward else -1.0
+        faces = np.zeros((len(triangles), 3))
+        for where, _, cross in cross_products(vertices, triangles, np.zeros(3)):
+            length = np.sqrt(np.einsum("ij,ij->j", cross, cross))
+            faces[where] = np.divide(cross, length, out=np.zeros_like(cross), where=length > 0.0).T
+        self._faces = faces
+        self._edges = faces[np.arange(len(opposite)) // 3] + faces[opposite // 3]
+        self._corners = vertex_normals(vertices, triangles).astype(np.float64)
+
+    def __call__(self, points: Points) -> NDArray[np.float64]:
+        """Distances in mm, shape (k,), from `points`, shape (k, 3), mm; positive outside."""
+        local = points - self._origin
+        nearest, rows = self._locator.nearest(local)
+        away = local - nearest
+        distance = np.sqrt(np.einsum("ij,ij->i", away, away))
+        side = np.einsum("ij,ij->i", away, self._normals_at(nearest, rows))
+        return np.where(side < 0.0, -self._sign, self._sign) * distance + 0.0
+
+    def _normals_at(self, places: Points, rows: NDArray[np.int64]) -> Points:
+        """Return pseudonormals at places on triangles, shape (k, 3)."""
+        a, b, c = (self._vertices[corner] for corner in self._triangles[rows].T)
+        p, q, there = b - a, c - a, places - a
+        cross = np.cross(p, q)
+        square = np.einsum("ij,ij->i", cross, cross)
+        safe = np.where(square > 0.0, square, 1.0)
+        shares = np.empty((len(rows), 3))
+        shares[:, 1] = np.einsum("ij,ij->i", np.cross(there, q), cross) / safe
+        shares[:, 2] = np.einsum("ij,ij->i", np.cross(p, there), cross) / safe
+        shares[:, 0] = 1.0 - shares[:, 1] - shares[:, 2]
+        near = np.stack([np.linalg.norm(places - corner, axis=1) for corner in (a, b, c)], axis=1)
+        absent = shares <= _AT_CORNER
+        absent[square == 0.0] = True  # a triangle without area: the nearest of its corners
+        count = absent.sum(axis=1)
+        normals = self._faces[rows]
+        on_edge = np.flatnonzero(count == 1)
+        # Half-edge i runs from corner i to the next one: the corner that is absent is the one before.
+        half = (absent[on_edge].argmax(axis=1) + 1) % 3
+        normals[on_edge] = self._edges[3 * rows[on_edge] + half]
+        at_corner = np.flatnonzero(count >= 2)
+        corner = self._triangles[rows[at_corner], near[at_corner].argmin(axis=1)]
+        normals[at_corner] = self._corners[corner]
+        return np.asarray(normals)
+
+
+@dataclass(frozen=True, eq=False)
+class SideDistance(Record):
+    """Signed distances of points of one surface from another, mm; positive outside of the other.
+
+    Attributes
+    ----------
+    mean, sd, p5, median, p95, min, max : float
+    outside_share : float
+        Share of the points at a distance above 0.
+    """
+
+    mean: float
+    sd: float
+    p5: float
+    median: float
+    p95: float
+    min: float
+    max: float
+    outside_share: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MeshDeviation(Record):
+    """How far two surfaces lie apart, and on which side.
+
+    Attributes
+    ----------
+    hausdorff_mm : float
+        Largest distance found, of both sides; what lies between the points can be a little further.
+    hd95_mm : float
+        The larger of the two 95th percentiles (robust Hausdorff distance).
+    assd_mm : float
+        Mean of both sides (average symmetric surface distance).
+    to_reference_mm, from_reference_mm : DistanceSummary
+        Of each side, without sign: from points of the mesh to the reference, and back.
+    to_reference_signed_mm : SideDistance or None
+        Positive where the mesh lies outside the reference; None where the reference is not closed.
+    from_reference_signed_mm : SideDistance or None
+        Positive where the reference lies outside the mesh; None where the mesh is not closed.
+    warnings : list of str
+        Why a side has no sign, or that one was turned.
+    samples : int
+        Number of points on each surface.
+    """
+
+    hausdorff_mm: float
+    hd95_mm: float
+    assd_mm: float
+    to_reference_mm: DistanceSummary
+    from_reference_mm: DistanceSummary
+    to_reference_signed_mm: SideDistance | None
+    from_reference_signed_mm: SideDistance | None
+    warnings: list[str]
+    samples: int
+
+
+def why_unsigned(quality: MeshQuality, name: str) -> str | None:
+    """Say why distances from a surface have no sign; None where they have one."""
+    if quality.boundary_edges or quality.nonmanifold_edges:
+        edges = quality.boundary_edges + quality.nonmanifold_edges
+        loose = f"{edges:,} edge{'s' * (edges != 1)} not in two triangles"
+        return f"{name} is not closed ({loose}): distances from it have no sign"
+    if not quality.oriented:
+        return f"the triangles of {name} do not agree which side is outside: distances from it have no sign"
+    return None
+
+
+def measure_distance(
+    mesh: Mesh,
+    reference: Mesh,
+    samples: int = SAMPLES,
+    *,
+    names: tuple[str, str] = ("the mesh", "the reference"),
+    progress: Progress | None = None,
+) -> MeshDeviation:
+    """Measure how far two surfaces lie apart, and on which side.
+
+    As `compare_meshes`, from points that cover each surface evenly by area to the nearest triangle of the other; where
+    the other is closed, the distances have a sign.
+
+    Parameters
+    ----------
+    mesh, reference : Mesh
+    samples : int
+        Number of points on each surface.
+    names : (str, str)
+        Words for both, in warnings.
+    progress : callable, optional
+        Called as ``progress("compare", points done, all points)``.
+
+    Returns
+    -------
+    MeshDeviation
+
+    Raises
+    ------
+    NoSurfaceError
+        A mesh is empty or has no area.
+    UsageError
+        `samples` is below 1.
+    """
+    if samples < 1:
+        raise UsageError(f"distances need at least 1 sample, not {samples}")
+    told, done = progress or ignore_progress, 0
+    sides, signed, warnings = [], [], []
+    for one, other, name in ((mesh, reference, names[1]), (reference, mesh, names[0])):
+        points = sample_surface(one.vertices, one.triangles, samples)
+        measure, has_sign, remark = _open(other, name)
+        distances = np.empty(samples)
+        for where in chunks(samples, _PIECE):
+            told("compare", done + where.start, 2 * samples)
+            distances[where] = measure(points[where])
+        done += samples
+        sides.append(summarise_distances(np.abs(distances)))
+        signed.append(_summarise(distances) if has_sign else None)
+        warnings += remark
+    told("compare", done, 2 * samples)
+    return MeshDeviation(
+        hausdorff_mm=max(side.max for side in sides),
+        hd95_mm=max(side.p95 for side in sides),
+        assd_mm=0.5 * (sides[0].mean + sides[1].mean),
+        to_reference_mm=sides[0],
+        from_reference_mm=sides[1],
+        to_reference_signed_mm=signed[0],
+        from_reference_signed_mm=signed[1],
+        warnings=warnings,
+        samples=samples,
+    )
+
+
+def measure_vertex_distances(
+    mesh: Mesh, reference: Mesh, *, progress: Progress | None = None
+) -> tuple[NDArray[np.float64], bool]:
+    """Measure the distance of each vertex of a mesh from another surface.
+
+    Parameters
+    ----------
+    mesh, reference : Mesh
+    progress : callable, optional
+        Called as ``progress("compare", vertices done, all vertices)``.
+
+    Returns
+    -------
+    distances : ndarray, shape (n,), float64
+        mm; positive outside of the reference where that is closed.
+    signed : bool
+        False: the reference is not closed, and the distances have no sign.
+
+    Raises
+    ------
+    NoSurfaceError
+        The reference is empty.
+    """
+    told = progress or ignore_progress
+    measure, has_sign, _ = _open(reference, "the reference")
+    distances = np.empty(mesh.vertex_count)
+    for where in chunks(mesh.vertex_count, _PIECE):
+        told("compare", where.start, mesh.vertex_count)
+        distances[where] = measure(mesh.vertices[where].astype(np.float64))
+    told("compare", mesh.vertex_count, mesh.vertex_count)
+    return distances, has_sign
+
+
+def _open(mesh: Mesh, name: str) -> tuple[SignedDistance | SurfaceDistance, bool, list[str]]:
+    """Return what measures distances from a mesh, whether they have a sign, and what is to be said of it."""
+    mesh.check()
+    if not mesh.triangle_count:
+        raise NoSurfaceError(f"{name} has no triangles: there is nothing to measure from")
+    quality = measure_quality(mesh.vertices, mesh.triangles)
+    remark = why_unsigned(quality, name)
+    if remark is not None:
+        return SurfaceDistance(mesh.vertices, mesh.triangles), False, [remark]
+    turned = [] if quality.outward else [f"{name} is turned inside out: the sign of distances from it is turned back"]
+    return SignedDistance(mesh.vertices, mesh.triangles, outward=quality.outward), True, turned
+
+
+def _summarise(distances: NDArray[np.float64]) -> SideDistance:
+    p5, median, p95 = np.percentile(distances, (5, 50, 95)).tolist()
+    return SideDistance(
+        mean=float(distances.mean()),
+        sd=float(distances.std()),
+        p5=p5,
+        median=median,
+        p95=p95,
+        min=float(distances.min()),
+        max=float(distances.max()),
+        outside_share=float(np.mean(distances > 0.0)),
+    )
