@@ -8,6 +8,7 @@ from typing import Any
 
 from clrecon.cli.common import pick
 from clrecon.cli.render_values import (
+    parse_center,
     parse_clip_box,
     parse_clip_plane,
     parse_direction,
@@ -137,6 +138,12 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
         "--up", type=parse_direction, metavar="SIDE|X,Y,Z", help="what is at the top (default: superior, else anterior)"
     )
     group.add_argument("--zoom", type=float, default=1.0, metavar="F", help="2 shows everything twice as large")
+    group.add_argument(
+        "--center",
+        type=parse_center,
+        metavar="X,Y,Z",
+        help="LPS mm in the middle of the picture, of a slice too (default: the middle of what is shown)",
+    )
     group.add_argument(
         "--size", type=parse_picture_size, metavar="W[xH]", help="pixels of the picture (default: 1024x1024)"
     )

@@ -9,6 +9,7 @@ import os
 from clrecon.jobs.render.settings import VIEWS
 
 __all__ = [
+    "parse_center",
     "parse_clip_box",
     "parse_clip_plane",
     "parse_direction",
@@ -32,6 +33,11 @@ def _numbers(text: str, count: int, form: str) -> tuple[float, ...]:
     if len(values) != count:
         raise argparse.ArgumentTypeError(f"{text!r} is not {form}")
     return values
+
+
+def parse_center(text: str) -> tuple[float, ...]:
+    """Read ``X,Y,Z`` in LPS mm."""
+    return _numbers(text, 3, "a place X,Y,Z in LPS mm, such as -12,40,310")
 
 
 def parse_picture_size(text: str) -> tuple[int, int]:

@@ -63,6 +63,10 @@ def lit(image: np.ndarray) -> np.ndarray:
     return np.asarray(image[..., :3].max(axis=-1) > 20)
 
 
+def lit_mm2(image: np.ndarray, report: dict[str, Any]) -> float:
+    return float(lit(image).sum() * report["pictures"][0]["pixel_mm"] ** 2)
+
+
 def side_of(mask: np.ndarray) -> tuple[str, str]:
     """Where the middle of what is marked lies: left or right, top or bottom."""
     rows, columns = np.nonzero(mask)
@@ -144,12 +148,12 @@ def test_background(render: Renders) -> None:
 
 def test_clipping_leaves_out(render: Renders) -> None:
     low, high = lps((21.5, -0.5, -0.5)), lps((24.5, 25, 17))
-    whole = lit(render()[0]).sum()
+    whole = lit_mm2(*render())
     half, report = render("--clip-box", f",{high[0]},,,,")
-    assert 0.4 < lit(half).sum() / whole < 0.65
+    assert 0.4 < lit_mm2(half, report) / whole < 0.65
     assert report["clip_planes_lps_mm"] == [[-1.0, 0.0, 0.0, pytest.approx(-high[0])]]
-    other = render("--clip", f"{high[0]},0,0,1,0,0")[0]
-    assert lit(half).sum() + lit(other).sum() == pytest.approx(whole, abs=0.15 * whole)
+    other = lit_mm2(*render("--clip", f"{high[0]},0,0,1,0,0"))
+    assert lit_mm2(half, report) + other == pytest.approx(whole, abs=0.15 * whole)
     nothing = render("--clip", f"{low[0]},0,0,-1,0,0", "--clip", f"{low[0]},0,0,-2,0,0")[1]
     assert nothing["pictures"][0]["hit_share"] == 0.0 and nothing["pictures"][0]["depth_mm"] is None
 
@@ -436,16 +440,3 @@ def test_nothing_to_write_is_wrong_usage(ct: Path, tmp_path: Path, capsys: pytes
     assert "name a picture (-o out.png) or a turntable" in capsys.readouterr().err
     assert main(["render", str(ct), "--turntable", str(tmp_path / "a.gif"), "--depth", str(tmp_path / "d.npy")]) == 3
     assert "belong to a picture" in capsys.readouterr().err
-
-
-def test_no_encoder_is_said_before_anything_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from clrecon.rendering.movies import video
-
-    video.find_encoder.cache_clear()
-    monkeypatch.setattr(video, "_find_ffmpeg", lambda: None)
-    assert main(["render", str(tmp_path / "no CT"), "--turntable", str(tmp_path / "a.mp4")]) == 3
-    assert "no encoder for MP4" in capsys.readouterr().err
-    video.find_encoder.cache_clear()
-    assert list(tmp_path.iterdir()) == []

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 import pytest
 
+from clrecon.cli.main import main
 from clrecon.cli.render_options import add_camera, add_labels, add_region
 
 GIVEN_TWICE = {
@@ -33,3 +35,16 @@ def test_what_may_be_given_again_makes_a_list(name: str, parser: argparse.Argume
     assert getattr(options, action.dest) == values
     assert getattr(parser.parse_args([]), action.dest) == []  # a parser keeps nothing from the last time
     assert str(action.help).endswith("; may be given again")
+
+
+def test_no_encoder_is_said_before_anything_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from clrecon.rendering.movies import video
+
+    video.find_encoder.cache_clear()
+    monkeypatch.setattr(video, "_find_ffmpeg", lambda: None)
+    assert main(["render", str(tmp_path / "no CT"), "--turntable", str(tmp_path / "a.mp4")]) == 3
+    assert "no encoder for MP4" in capsys.readouterr().err
+    video.find_encoder.cache_clear()
+    assert list(tmp_path.iterdir()) == []

@@ -159,7 +159,7 @@ class RenderSettings(InputSettings):
     views : sequence of str
         One picture is taken per view, see `clrecon.rendering.views.camera.Camera.fit`.  Slices also know axial, coronal
         and sagittal.
-    up, zoom, size, view_angle
+    up, zoom, size, view_angle, center
         As in `Camera.fit`.  The default size is 1024 x 1024; for a curved reformation it depends on the curve.
     background : str
         Colour, or "transparent".
@@ -189,6 +189,7 @@ class RenderSettings(InputSettings):
     zoom: float = 1.0
     size: tuple[int, int] | None = None
     view_angle: float | None = None
+    center: Sequence[float] | None = None
     background: str = "black"
     letters: bool = False
     scale_bar: bool = False
@@ -255,7 +256,7 @@ class RenderSettings(InputSettings):
             if not self.meshes and self.mode != "mesh":
                 what = name_parameter("mesh_space")
                 raise UsageError(f"{what} says how meshes lie in the patient: name one with {name_parameter('meshes')}")
-        for name in ("letters", "zoom", "view_angle", "turntable", "meshes"):
+        for name in ("letters", "zoom", "view_angle", "center", "turntable", "meshes"):
             if getattr(self, name) != _DEFAULTS[name]:
                 check_known(self.mode, name)
         self._check_place()
@@ -360,10 +361,11 @@ class RenderSettings(InputSettings):
             `Camera.fit` refuses a value.
         """
         if isinstance(self.style, PlaneCut):
-            return find_plane(volume, view, self.size_used, zoom=self.zoom, up=self.up)  # type: ignore[arg-type]
+            return find_plane(volume, view, self.size_used, zoom=self.zoom, up=self.up, center=self.center)
         return Camera.fit(
-            volume, view, self.zoom, up=self.up, view_angle=self.view_angle, size=self.size_used, turning=turning
-        )
+            volume, view, self.zoom,
+            up=self.up, view_angle=self.view_angle, size=self.size_used, turning=turning, center=self.center,
+        )  # fmt: skip
 
 
 _DEFAULTS = {own.name: own.default for own in fields(RenderSettings)}

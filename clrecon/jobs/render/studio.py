@@ -20,6 +20,7 @@ from clrecon.rendering.pictures.styles import (
     SurfaceLook,
     VolumeLook,
 )
+from clrecon.rendering.views.seen import check_center
 from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
 
@@ -134,17 +135,28 @@ class Studio(Closing):
 
     @property
     def box(self) -> Grid:
-        """The grid that cameras look at: the volume, or the box of the cloud."""
+        """The grid that cameras fit: the volume or the box of what is left of it, or the box of the cloud.
+
+        Raises
+        ------
+        UsageError
+            The centre of the pictures lies outside of it.
+        """
+        if self._box is None:
+            self._box = self._find_box()
+            if self._settings.center is not None:
+                check_center(self._settings.center, self._box)
+        return self._box
+
+    def _find_box(self) -> Grid:
         from clrecon.geometry.grid import Grid
         from clrecon.operators.rays.point_pictures import cloud_box
 
         if self._is_scene:
-            box: Grid = self._open_scene().box
-            return box
+            return cast("Grid", self._open_scene().box)
         if not isinstance(self._subject, Grid):
-            self._box = self._box or cloud_box(cast("PointCloud", self._subject))
-            return self._box
-        return self._subject
+            return cloud_box(cast("PointCloud", self._subject))
+        return cast("Grid", self._open_volume().frame(self.style))
 
     @property
     def lighting(self) -> Lighting | None:

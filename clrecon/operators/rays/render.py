@@ -35,6 +35,7 @@ def render(
     up: str | Sequence[float] | None = None,
     zoom: float | None = None,
     view_angle: float | None = None,
+    center: Sequence[float] | None = None,
     size: Sequence[int] | None = None,
     background: str | Sequence[float] = "black",
     device: Device | str | int | None = None,
@@ -45,10 +46,7 @@ def render(
     """Make a picture of a volume, of a point cloud, of a mesh, or of several of them in one place.
 
     >>> render(volume, SurfaceLook(300, color="orange"), view="left", size=(800, 600))
-    >>> render(volume, preset="spine", view=(30, 15))
     >>> render(volume, "mip", window=(0, 1000))
-    >>> render(cloud, color_by="label", view="left")
-    >>> render(mesh, MeshLook("orange", opacity=0.5), view="left")
     >>> render([(scan, VolumeLook("muscle")), (vertebra, MeshLook("orange")), (implant, MeshLook(opacity=0.4))])
 
     Parameters
@@ -62,10 +60,11 @@ def render(
         `clrecon.rendering.pictures.modes.MODES`.  Default: volume rendering of bone, of a cloud its points, and of a
         mesh its triangles.
     camera : Camera, optional
-        In place of `view`, `up`, `zoom` and `view_angle`, which are refused beside it.
+        In place of `view`, `up`, `zoom`, `view_angle` and `center`, which are refused beside it.
     view : str or (azimuth, elevation), optional
-        Where the camera stands, default "anterior"; `up`, `zoom` and `view_angle` go with it, see `Camera.fit`.  A
-        plane knows axial, coronal and sagittal too.
+        Where the camera stands, default "anterior"; `up`, `zoom`, `view_angle` and `center` (LPS mm) go with it, see
+        `Camera.fit`.  A plane knows axial, coronal and sagittal too.  It fits the volume; where a part of that was
+        turned into air or is clipped or hidden, the box of what is left.
     size : (width, height), optional
         Pixels; default 1024 x 1024, and for a `CurveCut` what the curve needs.
     background : str or (float, float, float)
@@ -93,7 +92,8 @@ def render(
     DeviceError
         No device, not enough memory, or the device fails.
     """
-    placing: dict[str, Any] = {"camera": camera, "view": view, "up": up, "zoom": zoom, "view_angle": view_angle}
+    placing: dict[str, Any] = {"camera": camera, "view": view, "up": up, "zoom": zoom}
+    placing |= {"view_angle": view_angle, "center": center}
     if isinstance(shown, Volume | DeviceVolume) or not isinstance(shown, PointCloud | Mesh | Sequence):
         with VolumeRenderer(shown, device=device, memory=memory) as renderer:
             return renderer.render(style, size=size, background=background, progress=progress, **{**placing, **look})

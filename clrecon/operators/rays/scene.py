@@ -16,6 +16,7 @@ from clrecon.geometry.grid import Grid
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, Stopwatch, check_memory, take_device, work_on
 from clrecon.operators.rays.buffers import DrawnVolume
+from clrecon.operators.rays.framing import shown_box
 from clrecon.operators.rays.layers import PIXEL_BYTES, Still, draw_layers
 from clrecon.operators.rays.mesh_pictures import box_around, make_part, mesh_corners
 from clrecon.operators.rays.point_pictures import PointPictures, cloud_box
@@ -106,7 +107,7 @@ class ScenePictures(Closing):
         check_memory(memory)
         check_objects(objects)
         self.memory = memory
-        self.box = _box_of([subject for subject, _ in objects])
+        self.box = _box_of(objects)
         self._parts: list[MeshPart] = []
         self._objects = list(objects)
         for subject, style in objects:
@@ -252,24 +253,23 @@ class ScenePictures(Closing):
         return Rendering(found.image, found.depth, found.expected_depth, camera, None, modes[0], report)
 
 
-def _box_of(subjects: Sequence[Subject]) -> Grid:
+def _box_of(objects: Sequence[tuple[Subject, Style]]) -> Grid:
     """Return what cameras fit: a volume that all others lie in, else the box around all."""
     corners: list[Float64Array] = []
-    for subject in subjects:
-        if isinstance(subject, Mesh):
-            corners.append(mesh_corners(subject))
-        else:
-            grid = cloud_box(subject) if isinstance(subject, PointCloud) else _grid_of(subject)
-            corners.append(box_corners(grid))
+    grids: list[Grid | None] = []
+    for subject, style in objects:
+        grid = None
+        if isinstance(subject, PointCloud):
+            grid = cloud_box(subject)
+        elif not isinstance(subject, Mesh):
+            grid = shown_box(subject, style)
+        grids.append(grid if isinstance(grid, Volume) else None)
+        corners.append(mesh_corners(subject) if isinstance(subject, Mesh) else box_corners(grid))  # type: ignore[arg-type]
     every = box_around(corners)
-    for subject, own in zip(subjects, corners, strict=True):
-        if isinstance(subject, Volume | DeviceVolume) and np.allclose(box_around([own]).affine, every.affine):
-            return _grid_of(subject)
+    for volume, own in zip(grids, corners, strict=True):
+        if volume is not None and np.allclose(box_around([own]).affine, every.affine):
+            return volume
     return every
-
-
-def _grid_of(volume: Volume | DeviceVolume) -> Volume:
-    return volume.volume if isinstance(volume, DeviceVolume) else volume
 
 
 def _join_stills(drawn: Sequence[Rendering]) -> Still | None:

@@ -13,6 +13,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.grid import Grid
 from clrecon.opencl import Device
 from clrecon.operators.rays.buffers import DrawnVolume
+from clrecon.operators.rays.framing import shown_box
 from clrecon.operators.rays.ray_pictures import take_picture, take_with_layers
 from clrecon.operators.rays.slices import overlay_slices, overlay_with_layers
 from clrecon.operators.rays.surface import cast_surface
@@ -34,6 +35,8 @@ from clrecon.rendering.pictures.styles import (
 )
 from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size
+from clrecon.rendering.views.plane import find_plane
+from clrecon.rendering.views.seen import check_center
 from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
 
@@ -78,6 +81,7 @@ class VolumeRenderer(Closing):
     ):
         self._resident, self._is_own = take_volume(volume, device, memory, "a picture")
         self.volume = self._resident.volume
+        self._framed: tuple[Style, Grid] | None = None
         voxels = self.volume.voxels
         if voxels.dtype.kind == "f" and not np.isfinite(voxels).all():
             raise UsageError("the voxels hold NaN or infinite values: fill them first, for CT with -1024")
@@ -101,6 +105,7 @@ class VolumeRenderer(Closing):
         up: str | Sequence[float] | None = None,
         zoom: float | None = None,
         view_angle: float | None = None,
+        center: Sequence[float] | None = None,
         size: Sequence[int] | None = None,
         background: str | Sequence[float] = "black",
         progress: Progress | None = None,
@@ -112,13 +117,13 @@ class VolumeRenderer(Closing):
             raise UsageError("mode points shows a point cloud, and this is a volume: make a cloud of it first")
         if isinstance(style, MeshLook):
             raise UsageError("mode mesh shows a mesh, and this is a volume: extract a surface first")
-        place = Place.checked(style, camera, view, up, zoom, view_angle)
+        place = Place.checked(style, camera, view, up, zoom, view_angle, center)
         if isinstance(style, CurveCut):
             return self._reformat(style, place, size, background, progress)
         size = checked_size(DEFAULT_SIZE if size is None else size)
         if isinstance(style, PlaneCut):
             return self._cut(style, place, size, background, progress)
-        camera = place.camera_for(self.volume, size)
+        camera = place.camera or place.camera_for(self.frame(style), size)
         ground = None if is_transparent(background) else background
         if isinstance(style, SurfaceLook):
             step = self._checked_step(style.ray_step)
@@ -128,6 +133,15 @@ class VolumeRenderer(Closing):
         assert isinstance(style, VolumeLook | Projection)
         step = self._checked_step(style.ray_step)
         return take_picture(self._resident, style, camera, size, step, ground, progress)
+
+    def frame(self, style: Style) -> Grid:
+        """Return what cameras fit: the volume, or the box of what is left of it where a part is masked, cut or hidden.
+
+        See `clrecon.operators.rays.framing`; that of the last style is kept.
+        """
+        if self._framed is None or self._framed[0] is not style:
+            self._framed = style, shown_box(self._resident, style)
+        return self._framed[1]
 
     def render_with_layers(
         self,
@@ -159,11 +173,14 @@ class VolumeRenderer(Closing):
         background: str | Sequence[float],
         progress: Progress | None,
     ) -> Rendering:
-        own: dict[str, Any] = {} if place.camera is not None else {"zoom": place.zoom, "up": place.up}
-        return cut_slice(
-            self._resident, place.camera or place.view, size,
-            background=background, progress=progress, **own, **style.parameters(),
-        )  # fmt: skip
+        look = style.parameters()
+        plane = place.camera
+        if plane is None:
+            plane = find_plane(
+                place.checked_box(self.frame(style)), place.view, size,
+                zoom=place.zoom, up=place.up, pixel_mm=look.pop("pixel_mm"), center=place.center,
+            )  # fmt: skip
+        return cut_slice(self._resident, plane, size, background=background, progress=progress, **look)
 
     def _reformat(
         self,
@@ -204,6 +221,7 @@ class Place(NamedTuple):
     up: str | Sequence[float] | None
     zoom: float
     view_angle: float | None
+    center: Sequence[float] | None = None
 
     @classmethod
     def checked(
@@ -214,24 +232,36 @@ class Place(NamedTuple):
         up: str | Sequence[float] | None,
         zoom: float | None,
         view_angle: float | None,
+        center: Sequence[float] | None = None,
     ) -> Place:
         """Refuse what has no meaning in the style's mode or beside a camera."""
         if not (camera is None or isinstance(camera, Camera)):
             raise UsageError(f"the camera of a picture is a Camera or None, not {type(camera).__name__}")
-        for keyword, value in (("zoom", zoom), ("view_angle", view_angle)):
+        for keyword, value in (("zoom", zoom), ("view_angle", view_angle), ("center", center)):
             if value is not None:
                 check_known(style.mode, keyword)
         if camera is not None:
             if isinstance(style, CurveCut):
                 raise UsageError("a curved reformation has no camera: view and up say which way one looks at it")
-            _check_alone(view=view, up=up, zoom=zoom, view_angle=view_angle)
-        return cls(camera, DEFAULT_VIEW if view is None else view, up, 1.0 if zoom is None else zoom, view_angle)
+            _check_alone(view=view, up=up, zoom=zoom, view_angle=view_angle, center=center)
+        return cls(
+            camera, DEFAULT_VIEW if view is None else view, up, 1.0 if zoom is None else zoom, view_angle, center
+        )
+
+    def checked_box(self, shown: Grid) -> Grid:
+        """Return the box that cameras fit; refuse a centre outside of it."""
+        if self.center is not None:
+            check_center(self.center, shown)
+        return shown
 
     def camera_for(self, volume: Grid, size: tuple[int, int]) -> Camera:
         """Return the given camera, or one made from the other parameters."""
         if self.camera is not None:
             return self.camera
-        return Camera.fit(volume, self.view, self.zoom, up=self.up, view_angle=self.view_angle, size=size)
+        return Camera.fit(
+            self.checked_box(volume), self.view, self.zoom,
+            up=self.up, view_angle=self.view_angle, size=size, center=self.center,
+        )  # fmt: skip
 
 
 def _check_alone(**placing: Any) -> None:

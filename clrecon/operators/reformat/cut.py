@@ -139,8 +139,7 @@ def cut_slice(
     combine : {"mean", "max", "min"}
         How the samples within the volume are combined.
     window : (low, high) or str, optional
-        HU that are black and white, or a name such as "lung", see `clrecon.rendering.looks.window.WINDOWS`; default
-        "bone", -450 to 1050.
+        HU that are black and white, or a name of `clrecon.rendering.looks.window.WINDOWS`; default "bone".
     background : str or colour
         Colour outside the volume; "transparent" gives opacity 0 there.
     memory : int, optional
@@ -260,8 +259,7 @@ def reformat_curve(
     Raises
     ------
     UsageError
-        Points are not numbers, too few or outside the volume; the kind or view is unknown; numbers are impossible; or
-        the curve is parallel to the rows.
+        The points, the kind, the view or a number cannot be; or the curve is parallel to the rows.
     RefusedInputError
         No part of the volume surely shows a spine.
     DeviceError

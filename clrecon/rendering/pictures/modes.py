@@ -54,6 +54,7 @@ _BESIDE = {
     "lighting": ("mip", "minip", "mean", "drr", "slices"),
     "zoom": (*_CAMERAS, "slice"),
     "view_angle": _CAMERAS,
+    "center": (*_CAMERAS, "slice"),
     "letters": (*_CAMERAS, "slice", "cpr"),
     "depth": ("dvr", "mip", "minip", "surface", "slices", "slice", "points", "mesh"),
     "values": ("mip", "minip", "mean", "drr", "slice", "cpr"),

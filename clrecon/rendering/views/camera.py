@@ -130,6 +130,7 @@ class Camera:
         view_angle: float | None = None,
         size: Sequence[int] = DEFAULT_SIZE,
         turning: bool = False,
+        center: ArrayLike | None = None,
     ) -> Camera:
         """Return a camera that looks at the middle of a volume from a side of the patient, so that the volume just
         fits.
@@ -153,6 +154,8 @@ class Camera:
         turning : bool
             True: leave enough room that the volume stays inside the picture while the camera orbits about the axis of
             the body.
+        center : array_like, shape (3,), optional
+            LPS mm, in the middle of the picture in place of the middle of the volume; the scale stays the same.
 
         Raises
         ------
@@ -171,6 +174,11 @@ class Camera:
         needs = [near.orbit(turn)._room_for(corners - middle, width / height) for turn in turns]
         position = middle + (RADII_AWAY * radius if parallel else max(needs)) * towards
         scale = max(needs) if parallel else None
+        if center is not None:
+            moved = checked_vector("the centre of a picture", center) - middle
+            # A parallel camera stays outside of the volume, and a perspective one at its distance.
+            away = max(0.0, float(moved @ -towards)) * towards if parallel else 0.0
+            middle, position = middle + moved, position + moved + away
         return cls(_triple(position), _triple(middle), _triple(up_lps), view_angle, scale).zoomed(zoom)
 
     def _room_for(self, points: Float64Array, aspect: float) -> float:

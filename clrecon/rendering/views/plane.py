@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.grid import Grid
 from clrecon.geometry.volume import Volume
 from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.rendering.views.directions import DIRECTIONS, checked_size
@@ -136,19 +137,20 @@ and coronal slices, the front at the left of sagittal ones."""
 
 
 def find_plane(
-    volume: Volume,
+    volume: Grid,
     view: str | Sequence[float],
     size: Sequence[int],
     *,
     zoom: float = 1.0,
     up: str | ArrayLike | None = None,
     pixel_mm: float | None = None,
+    center: ArrayLike | None = None,
 ) -> Camera:
     """Return a parallel camera for a slice through the middle of a volume.
 
     Parameters
     ----------
-    volume : Volume
+    volume : Volume or Grid
     view : str or (float, float)
         axial, coronal, sagittal, or a view as in `Camera.fit`.
     size : (int, int)
@@ -160,6 +162,8 @@ def find_plane(
         As in `Camera.fit`.
     pixel_mm : float, optional
         Side of a pixel; default: so that the box fits.
+    center : array_like, shape (3,), optional
+        A point of the plane, LPS mm, in the middle of the picture; default: the middle of the volume.
 
     Raises
     ------
@@ -181,6 +185,8 @@ def find_plane(
     half = max(float(np.abs(seen @ top).max()), float(np.abs(seen @ right).max()) * height / width)
     if pixel_mm is not None:
         half = 0.5 * height * positive_mm("the size of a pixel", pixel_mm)
+    if center is not None:
+        camera = Camera.fit(volume, view, up=up, size=size, center=center)
     return replace(camera, parallel_scale=half).zoomed(zoom)
 
 
