@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.anatomy.body_cells import Cells, Mask, grow, measure_cells
+from clrecon.anatomy.body_cells import PIECE, Cells, Mask, count_cells, grow, measure_cells
 from clrecon.anatomy.dense_pieces import BONE_KEPT, DensePieces, find_dense_pieces, judge_bone, judge_circle
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.volume import AIR_HU, Volume
-from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.pieces import in_threads
+from clrecon.system.progress import Progress, Steps
 
 __all__ = ["find_body", "find_unmeasured", "mask_field_of_view", "remove_table"]
 
@@ -48,6 +49,8 @@ FEWEST_UNMEASURED = 16
 """Least number of connected cells of one value that count as unmeasured; smaller groups occur by chance."""
 MARGIN_MM = 3.0
 """Width of the untouched margin around the body: it contains the blurred edge of the skin."""
+BODY_STEPS = 5
+"""Steps of the search for the body, as progress counts them."""
 AIR_RANGE_HU = (-1100.0, -900.0)
 
 
@@ -65,7 +68,7 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Pro
     allow_bone_loss : bool
         Go on where less than 98 % of the bone stays; the gate ``bone_kept`` has failed then.
     progress : callable, optional
-        Called as ``progress("mask", slices done, all slices)``.
+        Called as ``progress("mask", steps done, steps)``.
 
     Returns
     -------
@@ -79,11 +82,10 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Pro
     RefusedInputError
         Nothing is thick and dense enough to be a body, and there is no bone; or the gate fails.
     """
-    progress = progress or ignore_progress
-    progress("mask", 0, len(volume.voxels))
-    cells = measure_cells(volume)
-    progress("mask", 0, len(volume.voxels))
-    body, pieces = _find_body(cells)
+    slices = count_cells(volume)[0]
+    steps = Steps(progress, "mask", slices + BODY_STEPS + len(volume.voxels))
+    cells = measure_cells(volume, steps.take_slice)
+    body, pieces = _find_body(cells, steps)
     bone, gate = judge_bone(cells, pieces, body)
     if gate["ok"] is False and not allow_bone_loss:
         raise RefusedInputError(
@@ -98,7 +100,7 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Pro
         return np.asarray(~np.repeat(np.repeat(body[k // step[2]], step[1], 0), step[0], 1)[:nj, :ni])
 
     said = {"body_share": round(float(body.mean()), 4), **bone}
-    masked = _turn_into_air(volume, outside, "remove_table", said, progress)
+    masked = _turn_into_air(volume, outside, "remove_table", said, steps)
     masked.report = amend(masked.report, gates=[*masked.report.get("gates", []), gate])
     return masked
 
@@ -113,7 +115,7 @@ def mask_field_of_view(volume: Volume, radius_mm: float | None = None, *, progre
     radius_mm : float, optional
         Default: the largest circle that fits the slice, which is what scanners reconstruct.
     progress : callable, optional
-        Called as ``progress("mask", slices done, all slices)``.
+        Called as ``progress("mask", steps done, steps)``.
 
     Returns
     -------
@@ -135,26 +137,25 @@ def mask_field_of_view(volume: Volume, radius_mm: float | None = None, *, progre
     if not (math.isfinite(radius) and radius > 0.0):
         raise UsageError(f"the radius of the field of view is a length in mm above 0, not {radius:g}")
     j, i = np.ogrid[:nj, :ni]
-    steps = np.stack(np.broadcast_arrays(i - (ni - 1) / 2.0, j - (nj - 1) / 2.0), axis=-1)
-    mask = np.linalg.norm(steps @ volume.affine[:3, :2].T, axis=-1) > radius
+    offsets = np.stack(np.broadcast_arrays(i - (ni - 1) / 2.0, j - (nj - 1) / 2.0), axis=-1)
+    mask = np.linalg.norm(offsets @ volume.affine[:3, :2].T, axis=-1) > radius
     if mask.all():
         raise UsageError(f"a field of view of {radius:g} mm holds no voxel: they are {di:.3g} x {dj:.3g} mm")
-    progress = progress or ignore_progress
-    progress("mask", 0, len(volume.voxels))
-    cells = measure_cells(volume)
+    steps = Steps(progress, "mask", count_cells(volume)[0] + len(volume.voxels))
+    cells = measure_cells(volume, steps.take_slice)
     si, sj, _ = cells.step
     _, cj, ci = cells.mean.shape
     middle = np.ix_(np.minimum(np.arange(cj) * sj + sj // 2, nj - 1), np.minimum(np.arange(ci) * si + si // 2, ni - 1))
     bone, gate = judge_circle(cells, ~mask[middle])
     said = {"radius_mm": round(radius, 3), **bone}
-    masked = _turn_into_air(volume, lambda k: mask, "field_of_view", said, progress)
+    masked = _turn_into_air(volume, lambda k: mask, "field_of_view", said, steps)
     if radius_mm is None:
         masked.report = amend(masked.report, gates=[*masked.report.get("gates", []), gate])
     return masked
 
 
 def _turn_into_air(
-    volume: Volume, outside: Callable[[int], Mask], name: str, said: dict[str, Any], progress: Progress
+    volume: Volume, outside: Callable[[int], Mask], name: str, said: dict[str, Any], steps: Steps
 ) -> Volume:
     """Give the voxels outside the value of the air there; `outside` returns the mask of a slice."""
     voxels = np.array(volume.voxels)
@@ -163,10 +164,10 @@ def _turn_into_air(
     for k, layer in enumerate(voxels):
         mask = outside(k)
         removed += int(np.count_nonzero(mask))
-        dense += int(np.count_nonzero(layer[mask] > TISSUE_HU))
-        layer[mask] = air
+        dense += int(np.count_nonzero(mask & (layer > TISSUE_HU)))
+        np.copyto(layer, air, where=mask)
         volume.release_slices(k, k + 1)
-        progress("mask", k + 1, len(voxels))
+        steps.take()
     share = removed / voxels.size
     facts = {"voxels_removed": removed, "dense_voxels_removed": dense, "removed_share": round(share, 4), **said}
     facts["air_hu"] = float(air)
@@ -207,18 +208,19 @@ def find_body(volume: Volume) -> tuple[Mask, tuple[int, int, int]]:
         Nothing is thick and dense enough, and there is no bone.
     """
     cells = measure_cells(volume)
-    return _find_body(cells)[0], cells.step
+    return _find_body(cells, Steps(None, "mask", BODY_STEPS))[0], cells.step
 
 
-def _find_body(cells: Cells) -> tuple[Mask, DensePieces]:
-    """Find the body with its margin, and decide on all pieces as dense as bone."""
-    from scipy import ndimage
-
+def _find_body(cells: Cells, steps: Steps) -> tuple[Mask, DensePieces]:
+    """Find the body with its margin, in `BODY_STEPS` steps, and decide on all pieces as dense as bone."""
     across = cells.across
     dense_enough = cells.mean > TISSUE_HU
     thick = grow(grow(dense_enough, -OPENING_MM / across), OPENING_MM / across) & dense_enough
+    steps.take()
     tissue = dense_enough | _find_cavities(cells.mean, dense_enough, thick, across)
+    steps.take()
     body = _thick_parts(tissue, across)
+    steps.take()
     pieces = find_dense_pieces(cells, dense_enough, thick, body)
     if not (body.any() or pieces.added.any()):
         raise RefusedInputError(
@@ -227,9 +229,29 @@ def _find_body(cells: Cells) -> tuple[Mask, DensePieces]:
         )
     body |= _thin_parts(tissue, body, cells.size_mm)
     body |= pieces.added
-    for layer in body:
-        layer |= ndimage.binary_fill_holes(layer)
-    return grow(body, MARGIN_MM / across), pieces
+    steps.take()
+    _fill_holes(body)
+    body = grow(body, MARGIN_MM / across)
+    steps.take()
+    return body, pieces
+
+
+def _fill_holes(mask: Mask) -> None:
+    """Fill what a mask encloses in each slice, in place."""
+    from scipy import ndimage
+
+    rows, columns = (np.flatnonzero(mask.any(axis=axes)) for axes in ((0, 2), (0, 1)))
+    if not len(rows):
+        return
+    box = mask[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+
+    def fill(where: slice) -> None:
+        for layer in box[where]:
+            # All that is outside is one region with its frame, and the first.
+            regions, _ = ndimage.label(np.pad(~layer, 1, constant_values=True))
+            layer |= regions[1:-1, 1:-1] > 1
+
+    in_threads(fill, len(box), PIECE)
 
 
 def _thick_parts(tissue: Mask, across: float) -> Mask:
@@ -262,7 +284,7 @@ def _find_cavities(cells: NDArray[np.float32], tissue: Mask, thick: Mask, across
     regions, count = ndimage.label(~tissue & ~unmeasured, np.pad(in_plane, ((1, 1), (0, 0), (0, 0))))
 
     def cells_beside(mask: Mask) -> NDArray[np.int64]:
-        return np.bincount(regions[ndimage.binary_dilation(mask, in_plane)], minlength=count + 1)
+        return np.bincount(regions[grow(mask, 1)], minlength=count + 1)
 
     thick_wall = cells_beside(thick) / np.maximum(cells_beside(tissue), 1)
     at_border = unmeasured
@@ -289,16 +311,23 @@ def find_unmeasured(cells: NDArray[Any]) -> Mask:
     from scipy import ndimage
 
     found = np.zeros(cells.shape, dtype=bool)
-    for layer, out in zip(cells, found, strict=True):
-        for corner in (layer[0, 0], layer[0, -1], layer[-1, 0], layer[-1, -1]):
-            out |= layer == corner
-        pieces, count = ndimage.label(out)
-        if count:
+
+    def mark(where: slice) -> None:
+        for layer, out in zip(cells[where], found[where], strict=True):
+            for corner in {layer[j, i].item() for j in (0, -1) for i in (0, -1)}:
+                out |= layer == corner
+            if np.count_nonzero(out) < FEWEST_UNMEASURED:
+                out[...] = False
+                continue
+            pieces, count = ndimage.label(out)
             outer = np.zeros(count + 1, dtype=bool)
-            outer[np.unique(np.concatenate([pieces[[0, -1]].ravel(), pieces[:, [0, -1]].ravel()]))] = True
-            outer &= np.bincount(pieces.ravel()) >= FEWEST_UNMEASURED
+            for side in (pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]):
+                outer[side] = True
+            outer &= np.bincount(pieces.ravel(), minlength=count + 1) >= FEWEST_UNMEASURED
             outer[0] = False
-            out[...] = outer[pieces]
+            np.take(outer, pieces, out=out)
+
+    in_threads(mark, len(cells), PIECE)
     return found
 
 

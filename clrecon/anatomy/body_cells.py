@@ -5,14 +5,17 @@ voxels.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry.volume import Volume
+from clrecon.system.pieces import in_threads
 
-__all__ = ["DENSE_HU", "HARD_HU", "Cells", "Mask", "grow", "measure_cells"]
+__all__ = ["DENSE_HU", "HARD_HU", "PIECE", "Cells", "Mask", "count_cells", "grow", "measure_cells"]
 
 Mask = NDArray[np.bool_]
 
@@ -22,6 +25,9 @@ DENSE_HU = 300.0
 """Bone has voxels above this; plastic and carbon fibre may have them too."""
 HARD_HU = 600.0
 """Compact bone, teeth and metal have voxels above this; plastic and carbon fibre have none (560 HU at most)."""
+
+PIECE = 4
+"""Slices that a thread works out together."""
 
 
 @dataclass(frozen=True)
@@ -57,32 +63,79 @@ class Cells:
         return math.sqrt(self.size_mm[0] * self.size_mm[1])
 
 
-def measure_cells(volume: Volume) -> Cells:
-    """Compute the cells, reading the voxels once, slab by slab."""
-    nk, nj, ni = volume.voxels.shape
+def _voxels_of_a_cell(volume: Volume) -> tuple[int, int, int]:
+    """Return the number of voxels of a cell along i, j, k."""
     si, sj, sk = (max(1, round(CELL_MM / length)) for length in volume.spacing)
-    rows, columns = np.arange(0, nj, sj), np.arange(0, ni, si)
-    shape = (-(-nk // sk), len(rows), len(columns))
+    return si, sj, sk
+
+
+def count_cells(volume: Volume) -> tuple[int, int, int]:
+    """Return the number of cells along k, j, i."""
+    sizes = zip(volume.shape_ijk, _voxels_of_a_cell(volume), strict=True)
+    ci, cj, ck = (-(-size // step) for size, step in sizes)
+    return ck, cj, ci
+
+
+def measure_cells(volume: Volume, done: Callable[[slice], None] | None = None) -> Cells:
+    """Compute the cells, reading the voxels once, slab by slab.
+
+    Parameters
+    ----------
+    volume : Volume
+        A scan in HU.
+    done : callable, optional
+        Called in the thread of the caller with the slices of cells that are finished.
+    """
+    nk, nj, ni = volume.voxels.shape
+    si, sj, sk = _voxels_of_a_cell(volume)
+    shape = count_cells(volume)
     mean = np.empty(shape, dtype=np.float32)
     dense, hard = np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.uint16)
-    for place in range(shape[0]):
-        first, end = place * sk, min((place + 1) * sk, nk)
-        slab = volume.voxels[first:end]
-        total = slab.sum(axis=0, dtype=np.float32)
-        mean[place] = np.add.reduceat(np.add.reduceat(total, rows, axis=0), columns, axis=1) / (end - first)
-        # Few voxels are dense: counting them one by one costs less than sums over all voxels.
-        _, j, i = np.nonzero(slab > DENSE_HU)
-        if len(i):
-            cell = (j // sj) * shape[2] + i // si
-            is_hard = slab[slab > DENSE_HU] > HARD_HU
-            for counts, chosen in ((dense, cell), (hard, cell[is_hard])):
-                counts[place] = np.bincount(chosen, minlength=shape[1] * shape[2]).reshape(shape[1:])
-        volume.release_slices(first, end)
-    for axis, (size, begin) in enumerate(((nj, rows), (ni, columns)), start=1):
-        widths = np.diff(np.append(begin, size)).astype(np.float32)
+
+    def measure(where: slice) -> None:
+        for place in range(where.start, where.stop):
+            first, end = place * sk, min((place + 1) * sk, nk)
+            slab = volume.voxels[first:end]
+            mean[place] = _sum_blocks(slab, sj, si) / (end - first)
+            _count_dense(slab, dense[place], hard[place], sj, si)
+            volume.release_slices(first, end)
+
+    in_threads(measure, shape[0], PIECE, done)
+    for axis, (size, step) in enumerate(((nj, sj), (ni, si)), start=1):
+        widths = np.diff(np.append(np.arange(0, size, step), size)).astype(np.float32)
         mean /= widths.reshape([-1 if place == axis else 1 for place in range(3)])
     di, dj, dk = volume.spacing
     return Cells(mean, dense, hard, (si, sj, sk), (si * di, sj * dj, sk * dk))
+
+
+def _sum_blocks(slab: NDArray[Any], sj: int, si: int) -> NDArray[np.float32]:
+    """Sum a slab over all its slices and over blocks of sj x si voxels; those at the far ends may hold fewer."""
+    total = slab[0].astype(np.float32)
+    for layer in slab[1:]:
+        total += layer
+    # Sums of long rows: numpy is slow where it adds a few values at a time.
+    rows = total[::sj].copy()
+    for n in range(1, sj):
+        part = total[n::sj]
+        rows[: len(part)] += part
+    blocks = rows[:, ::si].copy()
+    for n in range(1, si):
+        part = rows[:, n::si]
+        blocks[:, : part.shape[1]] += part
+    return blocks
+
+
+def _count_dense(slab: NDArray[Any], dense: NDArray[np.uint16], hard: NDArray[np.uint16], sj: int, si: int) -> None:
+    """Count the voxels of a slab above `DENSE_HU` and `HARD_HU` in each cell, into zeros."""
+    # Few voxels are dense: counting them one by one costs less than sums over all voxels.
+    _, nj, ni = slab.shape
+    place = np.flatnonzero(slab > DENSE_HU)
+    if not len(place):
+        return
+    cell = (place // ni % nj // sj) * dense.shape[1] + place % ni // si
+    is_hard = slab.reshape(-1)[place] > HARD_HU
+    for counts, chosen in ((dense, cell), (hard, cell[is_hard])):
+        counts[...] = np.bincount(chosen, minlength=counts.size).reshape(counts.shape)
 
 
 def grow(mask: Mask, cells: float) -> Mask:
@@ -90,10 +143,28 @@ def grow(mask: Mask, cells: float) -> Mask:
 
     Cross and square alternate, so a point grows to an octagon.
     """
-    from scipy import ndimage
+    turns = max(1, round(abs(cells)))
+    # The border erodes nothing: an eroded mask is what is left of the grown rest.
+    changed = mask.copy() if cells > 0 else ~mask
 
-    change = ndimage.binary_dilation if cells > 0 else ndimage.binary_erosion
-    for turn in range(max(1, round(abs(cells)))):
-        shape = ndimage.generate_binary_structure(2, 1 + turn % 2)[None]
-        mask = change(mask, shape, border_value=cells < 0)  # the border erodes nothing
-    return mask
+    def work(where: slice) -> None:
+        for layer in changed[where]:
+            _grow_layer(layer, turns)
+            if cells <= 0:
+                np.logical_not(layer, out=layer)
+
+    in_threads(work, len(changed), PIECE)
+    return changed
+
+
+def _grow_layer(layer: Mask, turns: int) -> None:
+    """Dilate a slice in place: cross and square alternate.  Whole rows are shifted, which stay in the cache."""
+    for turn in range(turns):
+        square = turn % 2 == 1
+        rows = layer.copy()
+        layer[:, 1:] |= rows[:, :-1]
+        layer[:, :-1] |= rows[:, 1:]
+        if square:
+            rows = layer.copy()
+        layer[1:] |= rows[:-1]
+        layer[:-1] |= rows[1:]

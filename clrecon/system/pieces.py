@@ -30,20 +30,37 @@ _FEWEST_PIECES = 4
 """Fewer pieces are not worth starting threads."""
 
 
-def in_threads(work: Callable[[slice], None], count: int, size: int = CHUNK) -> None:
+def in_threads(
+    work: Callable[[slice], None], count: int, size: int = CHUNK, done: Callable[[slice], None] | None = None
+) -> None:
     """Call a function with slices that cover ``range(count)``, several at a time; numpy runs side by side in threads.
 
-    What the function raises is raised here.
+    Parameters
+    ----------
+    work : callable
+        What it raises is raised here.
+    count, size : int
+        Length of the range, and of the slices.
+    done : callable, optional
+        Called in the thread of the caller with each slice that is finished, in order.  What it raises ends the work.
     """
     pieces = list(chunks(count, size))
     threads = count_readers(len(pieces), _MOST_THREADS)
     if threads == 1 or len(pieces) < _FEWEST_PIECES:
         for piece in pieces:
             work(piece)
+            if done is not None:
+                done(piece)
         return
     with ThreadPoolExecutor(threads) as pool:
-        for _ in pool.map(work, pieces):
-            pass
+        finished = pool.map(work, pieces)
+        try:
+            for piece, _ in zip(pieces, finished, strict=True):
+                if done is not None:
+                    done(piece)
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
 
 
 _One = TypeVar("_One")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-__all__ = ["Progress", "ignore_progress"]
+__all__ = ["Progress", "Steps", "ignore_progress"]
 
 Progress = Callable[[str, int, int], None]
 """Called as ``progress(stage, done, total)``; ``total`` is 0 where the end is not known.
@@ -16,3 +16,30 @@ and reaches the caller as it is; `clrecon.errors.Cancelled` is there for that.
 
 def ignore_progress(stage: str, done: int = 0, total: int = 0) -> None:
     """A progress function that does nothing."""
+
+
+class Steps:
+    """Counts the steps of work that several functions share, and reports each.
+
+    Parameters
+    ----------
+    progress : callable or None
+        None reports nothing.
+    stage : str
+    total : int
+        All steps.
+    """
+
+    def __init__(self, progress: Progress | None, stage: str, total: int) -> None:
+        self.done, self.total = 0, total
+        self._progress, self._stage = progress or ignore_progress, stage
+        self._progress(stage, 0, total)
+
+    def take(self, count: int = 1) -> None:
+        """Report that so many more steps are done."""
+        self.done += count
+        self._progress(self._stage, self.done, self.total)
+
+    def take_slice(self, piece: slice) -> None:
+        """Report the steps of a slice of a range, for `clrecon.system.pieces.in_threads`."""
+        self.take(piece.stop - piece.start)

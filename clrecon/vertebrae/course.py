@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import Grid
+from clrecon.system.pieces import in_threads
 
 __all__ = ["AHEAD_MM", "ASIDE_MM", "Course", "follow_canal", "sample_course"]
 
@@ -124,15 +125,22 @@ def sample_course(
     offsets = ahead_mm[:, None, None], aside_mm[None, :, None]
     found = np.empty((len(course), len(ahead_mm), len(aside_mm)), np.float32)
     size = np.array(grid.shape_ijk)
-    for n in range(len(course)):
+
+    def sample(n: int) -> None:
         plane = course.canal[n] + offsets[0] * course.ahead[n] + offsets[1] * course.aside[n]
         ijk = grid.lps_to_ijk(plane.reshape(-1, 3))
         inside = ((ijk >= -0.5) & (ijk <= size - 0.5)).all(axis=1)
         low, high = np.maximum(np.floor(ijk.min(axis=0)).astype(int) - 1, 0), np.ceil(ijk.max(axis=0)).astype(int) + 2
         if not inside.any():
             found[n] = np.nan
-            continue
+            return
         part = grid.voxels[low[2] : high[2], low[1] : high[1], low[0] : high[0]].astype(np.float32)
         values = map_coordinates(part, (ijk - low).T[::-1], order=order, mode="nearest")
         found[n] = np.where(inside, values, np.nan).reshape(found[n].shape)
+
+    def sample_places(where: slice) -> None:
+        for n in range(where.start, where.stop):
+            sample(n)
+
+    in_threads(sample_places, len(course), 16)
     return found
