@@ -9,6 +9,7 @@ from typing import Any
 from clrecon.cli.cloud_values import parse_clusters, parse_denoisers, parse_level
 from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes, pick
 from clrecon.cli.console import Console, printable
+from clrecon.cli.cropping import add_cropping
 from clrecon.cli.masking import add_masking
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.points import parse_point
@@ -70,6 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_reading(parser)
     add_masking(parser)
+    add_cropping(parser)
     _add_points(parser)
     _add_steps(parser)
     device = parser.add_argument_group("device")

@@ -8,6 +8,7 @@ from typing import Any
 
 from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes, pick
 from clrecon.cli.console import Console, printable
+from clrecon.cli.cropping import add_cropping
 from clrecon.cli.growing import add_methods, describe_cells
 from clrecon.cli.labels import add_label_arguments, describe_labels, label_choice
 from clrecon.cli.levels import LEVELS_HELP, parse_hu, parse_levels
@@ -75,6 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_purpose(parser)
     add_reading(parser)
     add_masking(parser)
+    add_cropping(parser)
     surface = parser.add_argument_group("surface")
     level = surface.add_mutually_exclusive_group()
     level.add_argument("--hu", type=parse_hu, default={}, metavar="N[,N...]|A:B|auto|half:B,T", help=LEVELS_HELP)
@@ -180,9 +182,10 @@ def run(options: argparse.Namespace, console: Console) -> int:
 def describe_mesh(report: dict[str, Any]) -> list[str]:
     """Describe a report for people: the input, the meshes, the device, the time."""
     border = "closed" if report["closed_at_border"] else "open"
+    end = "crop" if report["volume"].get("crop") else "volume"
     return [
         f"input    {describe_volume(report['volume'])}",
-        f"surface  {_describe_surfaces(report)}, {border} at the border of the volume",
+        f"surface  {_describe_surfaces(report)}, {border} at the border of the {end}",
         f"mesh     {report['vertices']:,} vertices, {report['triangles']:,} triangles",
         *_describe_quality(report),
         *describe_cells(report),

@@ -7,17 +7,18 @@ from typing import Any
 
 from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes
 from clrecon.cli.console import Console, printable
+from clrecon.cli.cropping import add_cropping
 from clrecon.cli.masking import add_masking
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.reading import add_reading
 from clrecon.cli.render_options import (
     add_camera,
+    add_clipping,
     add_curve,
     add_labels,
     add_looks,
     add_meshes,
     add_motion,
-    add_region,
     render_settings,
 )
 from clrecon.jobs.render.settings import describe_modes, describe_presets
@@ -72,7 +73,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_looks(parser)
     add_camera(parser)
-    add_region(parser)
+    add_cropping(parser, "of the patient (LPS); where rays are cast they end exactly at the box")
+    add_clipping(parser)
     add_curve(parser)
     add_labels(parser)
     add_meshes(parser)

@@ -9,7 +9,6 @@ from typing import Any
 from clrecon.cli.common import pick
 from clrecon.cli.render_values import (
     parse_center,
-    parse_clip_box,
     parse_clip_plane,
     parse_direction,
     parse_label_color,
@@ -36,12 +35,12 @@ from clrecon.jobs.shared.clouds import MESH_INPUTS
 
 __all__ = [
     "add_camera",
+    "add_clipping",
     "add_curve",
     "add_labels",
     "add_looks",
     "add_meshes",
     "add_motion",
-    "add_region",
     "label_look",
     "render_settings",
     "turntable",
@@ -166,12 +165,9 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--values", metavar="FILE", help="write the HU of modes that show HU: .npy or .tif, float32")
 
 
-def add_region(parser: argparse.ArgumentParser) -> None:
-    """Add the options for the part of space that is shown."""
+def add_clipping(parser: argparse.ArgumentParser) -> None:
+    """Add the planes that limit the part of space that is shown."""
     group = parser.add_argument_group("clipping, in mm of the patient (LPS)")
-    group.add_argument(
-        "--clip-box", type=parse_clip_box, metavar="X0,X1,Y0,Y1,Z0,Z1", help="keep a box; a side left empty is open"
-    )
     _add_repeated(
         group, "--clip", parse_clip_plane, "PX,PY,PZ,NX,NY,NZ",
         "keep the side of a plane through a point that a normal points to", dest="clip_planes",

@@ -10,7 +10,6 @@ from clrecon.jobs.render.settings import VIEWS
 
 __all__ = [
     "parse_center",
-    "parse_clip_box",
     "parse_clip_plane",
     "parse_direction",
     "parse_label_color",
@@ -80,22 +79,6 @@ def parse_window(text: str) -> str | tuple[float, ...]:
     if text[:1].isalpha() and "," not in text:
         return text
     return _numbers(text, 2, "a window: the HU that are black and white, LOW,HIGH, such as -450,1050")
-
-
-def parse_clip_box(text: str) -> tuple[float, ...]:
-    """Read ``X0,X1,Y0,Y1,Z0,Z1`` in LPS mm; an empty number leaves that side open."""
-    parts = text.split(",")
-    try:
-        values = tuple(
-            float(part) if part.strip() else (math.inf if place % 2 else -math.inf) for place, part in enumerate(parts)
-        )
-    except ValueError:
-        values = ()
-    if len(values) != 6:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is no box: X0,X1,Y0,Y1,Z0,Z1 in LPS mm, a side that stays open empty, such as ,,-50,20,,"
-        )
-    return values
 
 
 def parse_clip_plane(text: str) -> tuple[float, ...]:

@@ -31,10 +31,17 @@ from clrecon.geometry.resample import resample_volume
 from clrecon.geometry.volume import Volume
 from clrecon.system.files import StagedFile, stage_file
 from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.wording import name_parameter
 
-__all__ = ["FORMATS", "VolumeFormat", "check_volume_format", "describe_shear", "stage_volume", "write_volume"]
-
-_RESAMPLE = "resample=MM"
+__all__ = [
+    "FORMATS",
+    "VolumeFormat",
+    "check_holds",
+    "check_volume_format",
+    "describe_shear",
+    "stage_volume",
+    "write_volume",
+]
 
 SAME_PLACE_MM = 1e-3
 """Largest distance of a voxel from its place when the header is read back; NIfTI keeps its affine in float32."""
@@ -127,7 +134,7 @@ def write_volume(
     """
     check_volume_format(path)
     if resample is not None and isinstance(volume, Volume):
-        volume = resample_volume(volume, resample)
+        volume = resample_volume(volume, resample, progress=progress)
     with stage_volume(volume, path, keep_ids=keep_ids, progress=progress) as staged:
         staged.commit()
     return staged.size
@@ -144,7 +151,7 @@ def stage_volume(
         raise UsageError(f"a volume is written, not {type(volume).__name__}")
     extension = check_volume_format(path)
     chosen = FORMATS[extension]
-    _check_holds(volume, extension)
+    check_holds(volume, extension)
     content = VolumeContent(
         stored_values(volume.voxels, volume.hu_range),
         volume.affine,
@@ -177,11 +184,11 @@ def describe_shear(volume: Volume) -> str | None:
     return (
         f"the axes are sheared by {shear:.2f} degrees (gantry tilt) and written so: each voxel is at its place, but"
         " programs that use ITK refuse a sheared NIfTI, and others may leave the shear out;"
-        f" {_RESAMPLE} makes right angles"
+        f" {name_parameter('resample', 'MM')} makes right angles"
     )
 
 
-def _check_holds(volume: Volume, extension: str) -> None:
+def check_holds(volume: Volume, extension: str) -> None:
     """Refuse a volume that the format cannot hold.
 
     Raises
@@ -196,7 +203,7 @@ def _check_holds(volume: Volume, extension: str) -> None:
         fault += " (.nii.gz and .nrrd hold that)"
     else:
         return
-    raise UsageError(f"{fault}; resample it to a regular grid ({_RESAMPLE})")
+    raise UsageError(f"{fault}; resample it to a regular grid ({name_parameter('resample', 'MM')})")
 
 
 def _verify(path: Path, kind: str, content: VolumeContent) -> None:

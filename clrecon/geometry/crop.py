@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
+from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.blocks import Block, describe_place, find_block, place_block
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.frames import frame_from_lps
 from clrecon.geometry.volume import Volume
 
-__all__ = ["crop_volume", "cut_block", "describe_extent"]
+__all__ = ["crop_volume", "cut_block", "describe_extent", "find_extent"]
 
 
 def crop_volume(volume: Volume, low: ArrayLike, high: ArrayLike, *, margin: int = 0, space: str = "lps") -> Volume:
@@ -91,12 +92,16 @@ def _certify(volume: Volume, cropped: Volume, block: Block, box: np.ndarray, spa
     return cropped
 
 
-def describe_extent(volume: Volume, space: str) -> str:
-    """Describe the box of the voxels' centres, mm of the frame `space`, and their HU."""
+def find_extent(volume: Volume) -> tuple[Float64Array, Float64Array]:
+    """Return the lowest and highest (x, y, z) of the box of the voxels' centres, LPS mm."""
     ni, nj, nk = volume.shape_ijk
     corners = volume.ijk_to_lps([(i, j, k) for i in (0, ni - 1) for j in (0, nj - 1) for k in (0, nk - 1)])
-    corners = corners * np.diag(frame_from_lps(space))
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    return corners.min(axis=0), corners.max(axis=0)
+
+
+def describe_extent(volume: Volume, space: str) -> str:
+    """Describe the box of the voxels' centres, mm of the frame `space`, and their HU."""
+    low, high = np.sort(np.array(find_extent(volume)) * np.diag(frame_from_lps(space)), axis=0)
     box = ", ".join(f"{name} {a:.1f} to {b:.1f}" for name, a, b in zip("xyz", low, high, strict=True))
     hu = volume.hu_range
     values = "" if hu is None else f" and from {hu[0]:g} to {hu[1]:g} HU"

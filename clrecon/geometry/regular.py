@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry.affine import Float64Array, apply_affine
 from clrecon.geometry.grid import Grid
+from clrecon.system.progress import Progress, ignore_progress
 
 __all__ = [
     "LARGEST_SHEAR_DEGREES",
@@ -89,7 +90,7 @@ def regular_grid(grid: Grid, origins: Float64Array, step_mm: float | None = None
     return RegularGrid(affine, (int(counts[0]), int(counts[1]), int(counts[2])))
 
 
-def resample_grid(grid: Grid, regular: RegularGrid, air: float) -> NDArray[Any]:
+def resample_grid(grid: Grid, regular: RegularGrid, air: float, progress: Progress = ignore_progress) -> NDArray[Any]:
     """Resample a grid (trilinear) at the points of a regular one, plane by plane; `air` beyond its voxels.
 
     Returns
@@ -101,6 +102,7 @@ def resample_grid(grid: Grid, regular: RegularGrid, air: float) -> NDArray[Any]:
     dtype = grid.voxels.dtype
     values = np.full((nk, nj, ni), air, dtype)
     for k, plane in enumerate(values):
+        progress("resample", k, nk)
         # The plane is parallel to the slices: one k for all of it, and i and j run linearly along its rows and columns.
         corners = grid.lps_to_ijk(apply_affine(regular.affine, [[0.0, 0.0, k], [1.0, 0.0, k], [0.0, 1.0, k]]))
         first, columns, rows = corners[0], corners[1] - corners[0], corners[2] - corners[0]

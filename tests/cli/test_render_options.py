@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from clrecon.cli.main import main
-from clrecon.cli.render_options import add_camera, add_labels, add_region
+from clrecon.cli.render_options import add_camera, add_clipping, add_labels
 
 GIVEN_TWICE = {
     "view": (["anterior,left", "30,15"], [("anterior", "left"), ("30,15",)]),
@@ -21,7 +21,7 @@ GIVEN_TWICE = {
 @pytest.fixture
 def parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser()
-    for add in (add_camera, add_region, add_labels):
+    for add in (add_camera, add_clipping, add_labels):
         add(parser)
     return parser
 

@@ -23,7 +23,7 @@ GHOSTS = ("keep", "drop")
 STEPS = {
     "read": "the scan, or a cloud from a file",
     "ghost slices": "foreign slices inside the stack are told by their neighbours; with drop the points in them go",
-    "masks": "the field of view, the body and the region: what is outside becomes air",
+    "masks": "the field of view, the body and the region: what is outside becomes air; a crop takes it away",
     "preprocessing": "filters of HU, and morphology of what is in the band",
     "points": "the surface, the shell or the voxels of the HU band or the label",
     "clusters": "density clusters (DBSCAN), each point with the number of its own",
@@ -188,7 +188,7 @@ class CloudSettings(InputSettings):
     @property
     def masks(self) -> bool:
         """True where something of the scan is turned into air, or preprocessed."""
-        given = (self.field_of_view, self.region, self.preprocess)
+        given = (self.field_of_view, self.region, self.preprocess, self.crop)
         return self.remove_table or any(each is not None for each in given)
 
     @property

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
+from clrecon.jobs.shared.cropping import crop_labels
 from clrecon.system.progress import Progress
 from clrecon.system.wording import name_parameter
 
@@ -133,6 +134,9 @@ def _extract_masks(
     from clrecon.operators.surface.label_masks import extract_label_masks
 
     shares = check_together(labels, volume)
+    if settings.crop is not None:
+        labels = crop_labels(labels, settings.crop, settings.space)
+        numbers = None if numbers is None else [number for number in numbers if number in labels.counts]
     meshes = extract_label_masks(
         labels,
         device=device,

@@ -12,6 +12,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import Grid
+from clrecon.jobs.shared.cropping import CROPS, Box, crop_box
 from clrecon.jobs.shared.settings import InputSettings
 from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import find_color
@@ -60,7 +61,7 @@ SPINES = (SPINE, "auto")
 VIEWS = tuple(DIRECTIONS)
 LIGHTS = ("head", "none")
 
-_CALLED = {"light": "lighting", "labels": "labels", "clip_box": "clip", "clip_planes": "clip"}
+_CALLED = {"light": "lighting", "labels": "labels", "clip_planes": "clip"}
 """Settings that make a field of the style under another name: the name of the setting, and that of the field."""
 
 
@@ -202,7 +203,6 @@ class RenderSettings(InputSettings):
         mode: str | None = None,
         preset: str | None = None,
         *,
-        clip_box: Sequence[float] | None = None,
         clip_planes: Sequence[Sequence[float]] = (),
         **given: Any,
     ) -> RenderSettings:
@@ -211,12 +211,11 @@ class RenderSettings(InputSettings):
         Parameters
         ----------
         mode, preset : str, optional
-        clip_box : (x0, x1, y0, y1, z0, z1), optional
-            Box that is kept, LPS mm; infinite numbers leave a side open.
         clip_planes : sequence of (px, py, pz, nx, ny, nz)
             Planes by point and normal; the side to which the normal points is kept.
         **given
-            Fields of `RenderSettings`, and of the mode's style.
+            Fields of `RenderSettings`, and of the mode's style.  The box of `clip_box`, `between` and `around` crops a
+            scan, and where the style can be clipped it ends exactly at the box; clouds and meshes are clipped alone.
 
         Raises
         ------
@@ -227,14 +226,17 @@ class RenderSettings(InputSettings):
         curve = None if own.get("curve") is None else SPINE  # files are read later: placeholders until then
         function = None if own.get("transfer_function") is None else find_preset(DEFAULT_PRESET).transfer_function
         mode = choose_mode(mode, preset, curve=curve, **given)
-        said = own | {"clip_box": clip_box, "clip_planes": tuple(clip_planes) or None}
+        box = crop_box(*(own.get(name) for name in CROPS))
+        if mode in ("points", "mesh"):
+            own = {name: value for name, value in own.items() if name not in CROPS}
+        said = own | {"clip_planes": tuple(clip_planes) or None}
         for called, keyword in _CALLED.items():
             if said.get(called) is not None:
                 check_known(mode, keyword, called)
         light = own.get("light")
         look = {
             "lighting": None if light is None else _turn_light(light, Lighting()),
-            "clip": _find_clip(clip_box, clip_planes),
+            "clip": _find_clip(box if "clip" in keywords_of(mode) else None, clip_planes),
             "transfer_function": function,
             "curve": curve,
         }
@@ -244,7 +246,7 @@ class RenderSettings(InputSettings):
     def keywords(cls) -> set[str]:
         """The keywords that `of` accepts; the looks of labels are part of `labels`."""
         look = {keyword for mode in MODES for keyword in keywords_of(mode)} - {"label_colors", "label_opacity"}
-        return {own.name for own in fields(cls)} | look | {"preset", "clip_box", "clip_planes"}
+        return {own.name for own in fields(cls)} | look | {"preset", "clip_planes"}
 
     def __post_init__(self) -> None:
         if self.background != "transparent":
@@ -286,6 +288,11 @@ class RenderSettings(InputSettings):
     def mode(self) -> str:
         """The mode of the style."""
         return self.style.mode
+
+    @property
+    def crop_margin(self) -> int:
+        """Voxels that stay beyond the box: where rays end exactly at it, they sample up to the next voxel."""
+        return 0 if getattr(self.style, "clip", None) is None else 1
 
     @property
     def preset_used(self) -> str | None:
@@ -390,13 +397,11 @@ def _turn_light(light: str | Sequence[float], lighting: Lighting) -> Lighting:
     return replace(lighting if lighting.shades else Lighting(), direction=direction)
 
 
-def _find_clip(box: Sequence[float] | None, planes: Sequence[Sequence[float]]) -> Clip | None:
+def _find_clip(box: Box | None, planes: Sequence[Sequence[float]]) -> Clip | None:
     """Return the part of space that a box and planes leave, None for all of it."""
     clip = Clip()
     if box is not None:
-        if len(box) != 6:
-            raise UsageError(f"a clip box has six numbers, x0,x1,y0,y1,z0,z1, not {len(box)}")
-        clip = Clip.box(box[0::2], box[1::2])
+        clip = Clip.box(*box)
     for plane in planes:
         if len(plane) != 6:
             raise UsageError(f"a clip plane is a point and a normal, six numbers, not {len(plane)}")

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.certificate import amend
+from clrecon.geometry.crop import describe_extent
 from clrecon.geometry.volume import AIR_HU
+from clrecon.jobs.shared.cropping import crop_scan
 from clrecon.jobs.shared.region_rules import RegionRule, parse_region_rules
 from clrecon.jobs.shared.settings import InputSettings
 from clrecon.system.progress import Progress
@@ -32,7 +34,7 @@ Band = tuple[float, float]
 def restrict_volume(
     volume: Volume, settings: InputSettings, device: Device, bands: Sequence[Band], progress: Progress
 ) -> Volume:
-    """Turn what lies outside of the region of interest into air, where the settings ask for it at this place.
+    """Crop the volume, and turn what lies outside of the region of interest into air where that is asked for here.
 
     Parameters
     ----------
@@ -48,6 +50,7 @@ def restrict_volume(
     UsageError, RefusedInputError, NoSurfaceError
         As `apply_region`.
     """
+    volume = crop_scan(volume, settings.crop, settings.space_of_points, margin=settings.crop_margin)
     if not settings.region or settings.region_later:
         return volume
     from clrecon.operators.resident.device_volume import DeviceVolume
@@ -132,12 +135,12 @@ def _find_region(resident: DeviceVolume, rules: Sequence[RegionRule], space: str
             continue
         own = _mask_of(resident, rule, space, facts)
         if not own.count:
-            raise UsageError(f"the region {rule} holds no voxel: {_describe_extent(resident.volume, space)}")
+            raise UsageError(f"the region {rule} holds no voxel: {describe_extent(resident.volume, space)}")
         by_kind[rule.kind] = by_kind[rule.kind] | own if rule.kind in by_kind else own
     mask = reduce(lambda one, other: one & other, by_kind.values())
     if not mask.count:
         kinds = " and ".join(str(rule) for rule in rules if rule.kind != "seed")
-        raise UsageError(f"the region is empty: no voxel lies in {kinds}; {_describe_extent(resident.volume, space)}")
+        raise UsageError(f"the region is empty: no voxel lies in {kinds}; {describe_extent(resident.volume, space)}")
     seeds = [rule.numbers for rule in rules if rule.kind == "seed"]
     return (mask.grow(_to_lps(seeds, space)) if seeds else mask), facts
 
@@ -187,15 +190,3 @@ def _to_lps(points: Any, space: str) -> Any:
     from clrecon.geometry import frame_from_lps
 
     return np.asarray(points, dtype=np.float64) * np.diag(frame_from_lps(space))
-
-
-def _describe_extent(volume: Volume, space: str) -> str:
-    """Describe the box of the voxels' centres, and their HU."""
-    ni, nj, nk = volume.shape_ijk
-    corners = volume.ijk_to_lps([(i, j, k) for i in (0, ni - 1) for j in (0, nj - 1) for k in (0, nk - 1)])
-    corners = _to_lps(corners, space)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    box = ", ".join(f"{name} {a:.1f} to {b:.1f}" for name, a, b in zip("xyz", low, high, strict=True))
-    hu = volume.hu_range
-    values = "" if hu is None else f" and from {hu[0]:g} to {hu[1]:g} HU"
-    return f"the scan runs from {box} mm ({space.upper()}){values}"

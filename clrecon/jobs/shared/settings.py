@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from clrecon.errors import UsageError
+from clrecon.jobs.shared.cropping import Box, crop_box
 from clrecon.reading import Selection
 
 __all__ = ["InputSettings"]
@@ -27,6 +28,13 @@ class InputSettings(Selection):
         and above.
     field_of_view : float or "auto", optional
         First turn everything farther from the centre of the slices (mm) into air; "auto": the circle that fits them.
+    clip_box : (x0, x1, y0, y1, z0, z1), optional
+        Crop the scan to a box by whole voxels, see `clrecon.geometry.crop.crop_volume`; infinite numbers leave a side
+        open.  mm of the frame `space` where the job has one, else LPS; so are the next two.
+    between : (z0, z1), optional
+        Crop it to these heights.
+    around : (x, y, z, r), optional
+        Crop it to a cube around a point; `r` is half of its side.
     region : sequence of str, optional
         Rules of the region of interest, outside of which everything becomes air, see
         `clrecon.jobs.shared.region_rules.parse_region_rules`; mm of the frame `space` where the job has one, else LPS.
@@ -49,6 +57,9 @@ class InputSettings(Selection):
     remove_table: bool = False
     allow_bone_loss: bool = False
     field_of_view: float | str | None = None
+    clip_box: Sequence[float] | None = None
+    between: Sequence[float] | None = None
+    around: Sequence[float] | None = None
     region: Sequence[str] | None = None
     preprocess: str | Sequence[str] | None = None
     keep_ids: bool = False
@@ -68,6 +79,7 @@ class InputSettings(Selection):
                 "a loss of bone is allowed, but nothing takes any: ask for the removal of the table or for"
                 " preprocessing too"
             )
+        _ = self.crop
         self._check_region()
 
     def _check_region(self) -> None:
@@ -77,6 +89,16 @@ class InputSettings(Selection):
             parse_region_rules(self.region)
         if self.region_later and not self.region:
             raise UsageError("a step of preprocessing is the region of interest, and there is none: give its rules")
+
+    @property
+    def crop(self) -> Box | None:
+        """The box that the scan is cropped to; None without a crop."""
+        return crop_box(self.clip_box, self.between, self.around)
+
+    @property
+    def crop_margin(self) -> int:
+        """Voxels that stay beyond the box on each side."""
+        return 0
 
     @property
     def region_later(self) -> bool:

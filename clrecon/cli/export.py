@@ -1,0 +1,104 @@
+"""``clrecon export``: the volume of a CT series as NIfTI, NRRD or MetaImage."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import fields
+from typing import Any
+
+from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes, pick
+from clrecon.cli.console import Console, printable
+from clrecon.cli.cropping import add_cropping
+from clrecon.cli.masking import add_masking
+from clrecon.cli.mesh import describe_volume
+from clrecon.cli.reading import add_reading
+
+__all__ = ["add_arguments", "run"]
+
+_PARTS = ("read", "mask", "resample", "write")
+_EPILOG = """\
+Values are HU, as they were measured: int16 where they fit, else int32, and float32 for fractions. Each voxel lies where
+the scan has it: NIfTI in RAS mm, NRRD and MetaImage in LPS mm, as these formats have it. Uneven slices fit into no such
+file and are refused without --resample; so is gantry tilt in .mha. The file has the certificate of the scan, see
+docs/export.md.
+
+examples:
+  clrecon export CT_FOLDER -o ct.nii.gz
+  clrecon export CT_FOLDER -o loin.nrrd --between -320,-80 --remove-table
+  clrecon export CT_FOLDER -o l3.mha --around 12,-80,-140,40 --resample 0.5 --report l3.json
+  clrecon export CT_FOLDER -o bone.nii.gz --region hu:200,"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.epilog = _EPILOG
+    parser.add_argument("input", metavar="INPUT", help="DICOM folder or file; or a NIfTI, NRRD or MetaImage file")
+    parser.add_argument(
+        "-o", "--output", metavar="OUT", required=True, help="volume file: .nii.gz, .nii, .nrrd or .mha"
+    )
+    parser.add_argument(
+        "--resample",
+        type=float,
+        metavar="MM",
+        help="resample (trilinear) to a regular grid with this step along all axes; without it voxels stay as they are",
+    )
+    parser.add_argument(
+        "--space",
+        type=str.lower,
+        default="lps",
+        metavar="lps|ras",
+        help="patient frame of the numbers of crop and region (default: lps); that of the file is its format's",
+    )
+    add_reading(parser)
+    add_masking(parser)
+    add_cropping(parser)
+    device = parser.add_argument_group("device", "for --region and --preprocess only")
+    add_device(device)
+    add_memory(device)
+    checks = parser.add_argument_group("checks")
+    add_no_clobber(checks)
+    add_keep_ids(checks)
+    checks.add_argument("--report", metavar="FILE", help="write affine, crop, certificate, values and times as JSON")
+
+
+def run(options: argparse.Namespace, console: Console) -> int:
+    """Run the command; returns the exit code."""
+    from clrecon.jobs.export.job import export_volume
+    from clrecon.jobs.export.settings import ExportSettings
+
+    settings = ExportSettings(**pick(options, {own.name for own in fields(ExportSettings)}))
+    report = export_volume(
+        options.input,
+        options.output,
+        settings,
+        report_path=options.report,
+        no_clobber=options.no_clobber,
+        progress=console.progress,
+    )
+    console.result(report)
+    for line in _describe(report):
+        console.say(line)
+    output = report["output"]
+    console.say(
+        f"wrote    {printable(options.output)}, {megabytes(output['bytes'])}, HU as {output['type']},"
+        f" {output['space'].upper()} mm"
+    )
+    if options.report:
+        console.say(f"report   {printable(options.report)}")
+    for warning in report["warnings"]:
+        console.warn(warning)
+    return 0
+
+
+def _describe(report: dict[str, Any]) -> list[str]:
+    output = report["output"]
+    low, high = output["corners_lps_mm"]
+    box = ", ".join(f"{name} {a:.1f} to {b:.1f}" for name, a, b in zip("xyz", low, high, strict=True))
+    lines = [f"volume   {describe_volume(report['volume'])}", f"place    {box} mm (LPS)"]
+    if output["outside_hu"] is not None:
+        lines.append(f"region   what lies outside has {output['outside_hu']:g} HU")
+    if report["device"] is not None:
+        lines.append(f"device   {printable(report['device'])}")
+    seconds = report["seconds"]
+    parts = ", ".join(f"{part} {seconds[part]:.2f}" for part in _PARTS if part in seconds)
+    return [*lines, f"time     {seconds['total']:.2f} s ({parts})"]

@@ -1,0 +1,150 @@
+"""The export job: a CT series in, its volume out with affine and certificate."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from clrecon.formats.write_volume import (
+    FORMATS,
+    check_holds,
+    check_volume_format,
+    describe_shear,
+    stage_volume,
+    stored_values,
+)
+from clrecon.geometry.crop import find_extent
+from clrecon.geometry.resample import resample_volume
+from clrecon.jobs.export.report import ExportReport, describe_export
+from clrecon.jobs.export.settings import ExportSettings
+from clrecon.jobs.shared.cropping import crop_scan
+from clrecon.jobs.shared.laps import Laps
+from clrecon.jobs.shared.masking import mask_volume
+from clrecon.jobs.shared.outputs import check_distinct, check_kept, commit_all
+from clrecon.jobs.shared.preprocess import preprocess_volume
+from clrecon.jobs.shared.region import restrict_volume
+from clrecon.jobs.shared.report import stage_report
+from clrecon.reading import read_selected
+from clrecon.system.files import Staged, check_writable
+from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.targets import keep_existing, refuse_existing, resolve_target
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+
+__all__ = ["export_volume"]
+
+log = get_logger(__name__)
+
+
+def export_volume(
+    source: str | Path,
+    output: str | Path,
+    settings: ExportSettings | None = None,
+    *,
+    report_path: str | Path | None = None,
+    no_clobber: bool = False,
+    progress: Progress | None = None,
+) -> ExportReport:
+    """Read a CT series and write its volume: masked, cropped, preprocessed and resampled as the settings ask for it.
+
+    A device is opened for a region and for preprocessing only.  Where the format cannot hold the volume and it is not
+    resampled, that is refused before the device works.
+
+    Parameters
+    ----------
+    source : path
+        DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
+    output : path
+        .nii.gz, .nii, .nrrd or .mha, see `clrecon.write_volume`.
+    settings : ExportSettings, optional
+    report_path : path, optional
+        File for the report as JSON.
+    no_clobber : bool
+        True: files that exist stay and are an `OutputError`, before any work.
+    progress : callable, optional
+        ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    ExportReport
+
+    Raises
+    ------
+    UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError
+        After an error nothing is written, and older files are intact.
+    """
+    settings = settings or ExportSettings()
+    progress = progress or ignore_progress
+    watch = Laps()
+    with keep_existing(no_clobber):
+        extension = _check_files(source, output, report_path)
+    volume = read_selected(source, settings, progress=progress)
+    watch.lap("read")
+    if settings.resample is None:  # no device works for what cannot be written
+        check_holds(crop_scan(volume, settings.crop, settings.space), extension)
+    volume, device = _narrow(volume, settings, progress)
+    watch.lap("mask")
+    if settings.resample is not None:
+        progress("resample", 0, 0)
+        volume = resample_volume(volume, settings.resample, progress=progress)
+        watch.lap("resample")
+    shear = describe_shear(volume)
+    with keep_existing(no_clobber), ExitStack() as staged:
+        files: list[Staged] = [
+            staged.enter_context(stage_volume(volume, output, keep_ids=settings.keep_ids, progress=progress))
+        ]
+        watch.lap("write")
+        region = volume.report.get("region")
+        facts = {
+            "format": extension[1:],
+            "bytes": files[0].size,
+            "type": stored_values(volume.voxels[:1], volume.hu_range).dtype.name,
+            "shape_ijk": list(volume.shape_ijk),
+            "affine_ijk_to_lps_mm": volume.affine.tolist(),
+            "space": "ras" if FORMATS[extension].kind == "NIfTI" else "lps",
+            "corners_lps_mm": [corner.tolist() for corner in find_extent(volume)],
+            "outside_hu": None if region is None else region["outside_hu"],
+        }
+        seconds = {part: round(value, 4) for part, value in {**watch.seconds, "total": watch.total()}.items()}
+        report = describe_export(volume, settings, facts, device, [] if shear is None else [shear], seconds)
+        if report_path is not None:
+            files.append(staged.enter_context(stage_report(report_path, report)))
+        commit_all(files)
+    log_warnings(log, report.warnings, volume.report.get("warnings", ()))
+    return report
+
+
+def _check_files(source: str | Path, output: str | Path, report_path: str | Path | None) -> str:
+    """Refuse outputs that cannot be written, before any work; return the extension of the volume file.
+
+    Raises
+    ------
+    UsageError, OutputError
+    """
+    extension = check_volume_format(output)
+    outputs: list[tuple[str, str | Path]] = [("the volume", output)]
+    if report_path is not None:
+        outputs.append(("the report", report_path))
+    check_distinct(outputs)
+    for _, path in outputs:
+        check_writable(path)
+        refuse_existing(path, resolve_target(path))
+    check_kept(outputs, source)
+    return extension
+
+
+def _narrow(volume: Volume, settings: ExportSettings, progress: Progress) -> tuple[Volume, str | None]:
+    """Mask, crop and preprocess the volume; return it and the device that was needed for it."""
+    volume = mask_volume(volume, settings, progress)
+    if not settings.needs_device:
+        return crop_scan(volume, settings.crop, settings.space), None
+    from clrecon.operators import take_device
+
+    progress("device", 0, 0)
+    device = take_device(settings.device)
+    volume = restrict_volume(volume, settings, device, [], progress)
+    volume = preprocess_volume(volume, settings, device, [], progress)
+    return volume, device.current.label
