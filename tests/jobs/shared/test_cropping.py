@@ -149,4 +149,4 @@ def test_boxes() -> None:
     assert RenderSettings.of(clip_box=(0, 1, 0, 1, 0, 1)).crop_margin == 1
     assert RenderSettings.of("slice", clip_box=(0, 1, 0, 1, 0, 1)).crop_margin == 0
     points = RenderSettings.of("points", between=(0, 1))
-    assert points.crop is None and len(points.style.clip.planes) == 2
+    assert points.crop is None and len(getattr(points.style, "clip").planes) == 2
