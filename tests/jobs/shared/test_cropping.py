@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from label_files import write_nrrd
 
-from clrecon import read_mesh, read_points
+from clrecon import PointLook, read_mesh, read_points
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.settings import MeshSettings
@@ -149,4 +149,5 @@ def test_boxes() -> None:
     assert RenderSettings.of(clip_box=(0, 1, 0, 1, 0, 1)).crop_margin == 1
     assert RenderSettings.of("slice", clip_box=(0, 1, 0, 1, 0, 1)).crop_margin == 0
     points = RenderSettings.of("points", between=(0, 1))
-    assert points.crop is None and len(getattr(points.style, "clip").planes) == 2
+    assert isinstance(points.style, PointLook) and points.style.clip is not None
+    assert points.crop is None and len(points.style.clip.planes) == 2
