@@ -111,7 +111,7 @@ def _add_points(parser: argparse.ArgumentParser) -> None:
         help="iso value, inside is N and above; or a band, both ends included (default: that of bone)",
     )
     group.add_argument(
-        "--labels", metavar="FILE", help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage or DICOM SEG"
+        "--labels", metavar="FILE", help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG or RTSTRUCT"
     )
     group.add_argument("--label", metavar="NAME|N", help="points of this label only (default: of all)")
     group.add_argument(

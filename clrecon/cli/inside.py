@@ -37,7 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o", "--output", metavar="OUT", required=True, help="mesh files: .stl .ply .obj .glb .vtp or .3mf"
     )
     parser.add_argument(
-        "--labels", metavar="FILE", required=True, help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage or DICOM SEG"
+        "--labels",
+        metavar="FILE",
+        required=True,
+        help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG or RTSTRUCT",
     )
     parser.add_argument(
         "--label",

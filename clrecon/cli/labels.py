@@ -24,7 +24,7 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options for label maps."""
     group = parser.add_argument_group("labels", "one mesh a label: the label picks the cells, HU place the vertices")
     group.add_argument(
-        "--labels", metavar="FILE", help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage or DICOM SEG"
+        "--labels", metavar="FILE", help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG or RTSTRUCT"
     )
     group.add_argument(
         "--label", metavar="NAME|N", action="append", help="this label only; may be given again (default: all)"

@@ -46,7 +46,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("input", metavar="INPUT", help="DICOM folder or file; or a NIfTI, NRRD or MetaImage file")
     parser.add_argument(
-        "--labels", metavar="FILE", required=True, help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage or DICOM SEG"
+        "--labels",
+        metavar="FILE",
+        required=True,
+        help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG or RTSTRUCT",
     )
     parser.add_argument(
         "--label", metavar="NAME|N", action="append", default=[], help="this label only; may be given again"

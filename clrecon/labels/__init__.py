@@ -1,4 +1,4 @@
-"""Label maps: which voxel belongs to which structure, read from NIfTI, NRRD and DICOM SEG."""
+"""Label maps: which voxel belongs to which structure, read from NIfTI, NRRD, DICOM SEG and RTSTRUCT."""
 
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.names import file_suffixes, label_suffix

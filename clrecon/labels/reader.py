@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from functools import partial
 from math import prod
@@ -11,14 +12,24 @@ from clrecon.errors import ClreconError, RefusedInputError, UsageError
 from clrecon.formats.grid_file import LABEL_MAP, GridFile
 from clrecon.formats.kinds import open_grid, tell_kind
 from clrecon.geometry.grid import Grid
+from clrecon.geometry.volume import Volume
 from clrecon.labels.grids import read_grid_labels
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.overlap import check_wanted
 from clrecon.labels.segmentation import read_segmentation, tell_pixel_bytes
+from clrecon.labels.structures import STRUCTURE_SET, read_structures
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
 
 __all__ = ["is_large_map", "read_labels"]
+
+OTHER_OBJECTS = {
+    "1.2.840.10008.5.1.4.1.1.481.2": "an RT dose",
+    "1.2.840.10008.5.1.4.1.1.481.5": "an RT plan",
+    "1.2.840.10008.5.1.4.1.1.481.1": "an RT image",
+    "1.2.840.10008.5.1.4.1.1.66.1": "a spatial registration",
+}
+"""SOP classes that lie beside a scan and its labels, in words."""
 
 LARGE_BYTES = 2**29
 """Stored bytes that take a second to unpack.  Zeros pack to a thousandth: a file of 33 MB can hold 34 GB."""
@@ -34,7 +45,8 @@ def read_labels(
     volume: Grid | None = None,
     progress: Progress | None = None,
 ) -> LabelMap:
-    """Read a label map: NIfTI (.nii, .nii.gz), NRRD and 3D Slicer's .seg.nrrd, MetaImage, or DICOM SEG.
+    """Read a label map: NIfTI (.nii, .nii.gz), NRRD and 3D Slicer's .seg.nrrd, MetaImage, DICOM SEG,
+    or RTSTRUCT.
 
     The kind is told from the content.  NIfTI and NRRD need the extra ``clrecon[labels]``, MetaImage
     ``clrecon[volumes]``.
@@ -47,7 +59,8 @@ def read_labels(
         wanted segments may not overlap each other, and voxels that they share with other segments go to the wanted
         ones.
     volume : Volume, optional
-        The scan of the labels: a map that takes long to unpack is refused if it has many times as many voxels.
+        The scan of the labels.  An RTSTRUCT needs it: its contours become labels on the slices of the scan.  A map that
+        takes long to unpack is refused if it has many times as many voxels.
     progress : callable, optional
         Called as ``progress("read", done, total)``: slices, in DICOM SEG frames.
 
@@ -76,10 +89,16 @@ def read_labels(
         name, kind = escape_text(path.name), tell_kind(path)
         if kind is None:
             raise RefusedInputError(
-                f"{name} is no label map that can be read: NIfTI, NRRD, MetaImage and DICOM SEG are"
+                f"{name} is no label map that can be read: NIfTI, NRRD, MetaImage, DICOM SEG and RTSTRUCT are"
             )
         check = None if volume is None else partial(_check_proportion, name, volume)
-        if kind == "DICOM":
+        if kind == "DICOM" and (sop_class := _tell_class(path)) in OTHER_OBJECTS:
+            raise RefusedInputError(f"{name} is {OTHER_OBJECTS[sop_class]}, no label map: give a SEG or an RTSTRUCT")
+        if kind == "DICOM" and sop_class == STRUCTURE_SET:
+            labels = read_structures(
+                path, volume if isinstance(volume, Volume) else None, wanted, progress or ignore_progress
+            )
+        elif kind == "DICOM":
             labels = read_segmentation(path, wanted, progress or ignore_progress, check)
         else:
             grid = open_grid(path, kind, LABEL_MAP)
@@ -96,14 +115,30 @@ def read_labels(
 
 
 def is_large_map(path: str | Path) -> bool:
-    """Tell from its header whether a label map takes long to unpack, and is better held against its scan first."""
+    """Tell from its header whether a label map is read after its scan: contours of an RTSTRUCT need its slices, and one
+    that takes long to unpack is better held against its grid first.
+    """
     try:
         kind = tell_kind(Path(path))
+        if kind == "DICOM" and _tell_class(Path(path)) == STRUCTURE_SET:
+            return True
         if kind == "DICOM":
             return tell_pixel_bytes(Path(path)) > LARGE_BYTES
         return kind is not None and _stored_bytes(open_grid(Path(path), kind, LABEL_MAP)) > LARGE_BYTES
     except (ClreconError, OSError):  # told by `read_labels`
         return False
+
+
+def _tell_class(path: Path) -> str:
+    """Return the SOP class of a DICOM file as its meta header says it, "" where it does not."""
+    from pydicom.filereader import read_file_meta_info
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # pydicom's messages quote the file unescaped
+            return str(read_file_meta_info(path).get("MediaStorageSOPClassUID", ""))
+    except Exception:  # pydicom raises many error types; told by the readers
+        return ""
 
 
 def _stored_bytes(grid: GridFile) -> int:

@@ -23,7 +23,7 @@ class InsideSettings(Selection):
     series, phase, allow_gaps, force
         See `clrecon.reading.Selection`.
     labels : path
-        Label map: NIfTI, NRRD, MetaImage or DICOM SEG.
+        Label map: NIfTI, NRRD, MetaImage, DICOM SEG or RTSTRUCT.
     only : sequence of str or int
         The vertebrae, by numbers or names of their labels.
     iso_value : float, optional

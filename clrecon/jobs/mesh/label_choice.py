@@ -23,7 +23,7 @@ class LabelChoice:
     Parameters
     ----------
     path : path
-        NIfTI, NRRD or DICOM SEG.
+        NIfTI, NRRD, DICOM SEG or RTSTRUCT.
     wanted : tuple of str or int
         Numbers or names; empty means all that have a surface.
     grow_mm : float, optional

@@ -90,7 +90,7 @@ class LabelLook:
     Parameters
     ----------
     path : path
-        NIfTI, NRRD, MetaImage or DICOM SEG.
+        NIfTI, NRRD, MetaImage, DICOM SEG or RTSTRUCT.
     colors : mapping of str to str
         Colour by number or name of the label, see `clrecon.rendering.looks.colors.find_color`.
     opacities : mapping of str to float

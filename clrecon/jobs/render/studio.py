@@ -83,8 +83,9 @@ def read_look(look: LabelLook | None, volume: Volume | None = None) -> LabelMap 
         return None
     from clrecon.labels import read_labels
 
-    labels = read_labels(look.path, volume=volume)
-    for label in (*look.colors, *look.opacities):
+    named = [*look.colors, *look.opacities]  # they get the voxels that they share with others
+    labels = read_labels(look.path, named or None, volume=volume)
+    for label in named:
         labels.find(label)
     return labels
 

@@ -21,7 +21,7 @@ class StatsSettings(Selection):
     series, phase, allow_gaps, force
         See `clrecon.reading.Selection`.
     labels : path
-        Label map: NIfTI, NRRD, MetaImage or DICOM SEG.
+        Label map: NIfTI, NRRD, MetaImage, DICOM SEG or RTSTRUCT.
     only : sequence of str or int
         Labels that are measured; none: all.
     percentiles : sequence of float

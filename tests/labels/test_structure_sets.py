@@ -1,0 +1,213 @@
+"""RT structure sets: contours in mm become labels on the slices of their scan, by the even-odd rule of centres."""
+
+from __future__ import annotations
+
+import json
+
+import dicom_series
+import numpy as np
+import pytest
+from structure_sets import write_structures
+from uneven_volume import uneven
+
+from clrecon import Volume, read_labels
+from clrecon.cli.main import main
+from clrecon.dicom import read_volume
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.labels.contours import fill_contours
+from clrecon.labels.resample import resample_labels
+
+pytestmark = pytest.mark.unit
+
+CLOSED = "CLOSED_PLANAR"
+PLANS = {
+    "straight": dicom_series.Plan(shape=(7, 20, 24), gap=1.25),
+    "oblique": dicom_series.Plan(shape=(7, 20, 24), angles=(10, -20, 35), gap=1.25),
+    "tilted": dicom_series.Plan(shape=(7, 20, 24), tilt_deg=12.0, gap=1.25),
+}
+
+
+@pytest.fixture(params=PLANS)
+def volume(request, tmp_path):
+    dicom_series.write_series(tmp_path / "ct", PLANS[request.param])
+    return read_volume(tmp_path / "ct")
+
+
+def rectangle(volume, k, low, high):
+    """A contour around the pixels from `low` to `high` (i, j), both included."""
+    (i0, j0), (i1, j1) = np.subtract(low, 0.5), np.add(high, 0.5)
+    return CLOSED, volume.ijk_to_lps([(i0, j0, k), (i1, j0, k), (i1, j1, k), (i0, j1, k)])
+
+
+def ring(volume, k, centre, radius, count=720):
+    turn = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    ijk = np.column_stack([centre[0] + radius * np.cos(turn), centre[1] + radius * np.sin(turn), np.full(count, k)])
+    return CLOSED, volume.ijk_to_lps(ijk)
+
+
+def test_rectangles_have_their_pixels(volume, tmp_path):
+    rois = {"L3": [rectangle(volume, k, (3, 4), (9, 12)) for k in (2, 3, 4)], "Leber & Milz ä": [
+        rectangle(volume, 3, (15, 2), (15, 2))]}  # fmt: skip
+    labels = read_labels(write_structures(tmp_path / "rt.dcm", rois), volume=volume)
+    expected = np.zeros(volume.voxels.shape, int)
+    expected[2:5, 4:13, 3:10] = 1
+    expected[3, 2, 15] = 2
+    assert np.array_equal(labels.voxels, expected)
+    assert labels.names == {1: "L3", 2: "Leber & Milz ä"} and labels.warnings == ()
+    assert np.array_equal(labels.affine, volume.affine)
+    assert resample_labels(labels, volume).exact
+
+
+def test_a_contour_within_another_is_a_hole(volume, tmp_path):
+    nested = [rectangle(volume, 1, (2, 2), (16, 16)), rectangle(volume, 1, (5, 5), (13, 13)),
+              rectangle(volume, 1, (8, 8), (10, 10))]  # fmt: skip
+    labels = read_labels(write_structures(tmp_path / "rt.dcm", {"x": nested}), volume=volume)
+    assert labels.counts == {1: 15 * 15 - 9 * 9 + 3 * 3}
+
+
+def test_a_keyhole_is_a_ring(volume, tmp_path):
+    outer = [(1.5, 1.5), (10.5, 1.5), (10.5, 10.5), (1.5, 10.5), (1.5, 1.5)]
+    inner = [(4.5, 4.5), (4.5, 7.5), (7.5, 7.5), (7.5, 4.5), (4.5, 4.5)]
+    ijk = [(i, j, 2) for i, j in (*outer, *inner)]
+    rois = {"x": [(CLOSED, volume.ijk_to_lps(ijk))]}
+    labels = read_labels(write_structures(tmp_path / "rt.dcm", rois), volume=volume)
+    assert labels.counts == {1: 9 * 9 - 3 * 3}
+
+
+def test_circles_have_their_area():
+    turn = np.linspace(0, 2 * np.pi, 3600, endpoint=False)
+    for radius, centre in ((20.3, (30.2, 31.7)), (3.7, (30.5, 30.5))):
+        circle = np.column_stack([centre[0] + radius * np.cos(turn), centre[1] + radius * np.sin(turn)])
+        found = fill_contours([circle], (64, 60))
+        j, i = np.indices((64, 60))
+        assert np.array_equal(found, np.hypot(i - centre[0], j - centre[1]) < radius)
+
+
+def test_neighbours_share_no_pixel_and_leave_none_out():
+    middle = [(5.0, -1.0), (5.0, 20.0)]
+    left = np.array([(-1.0, -1.0), *middle, (-1.0, 20.0)])
+    right = np.array([middle[0], (30.0, -1.0), (30.0, 20.0), middle[1]])
+    one, other = fill_contours([left], (10, 12)), fill_contours([right], (10, 12))
+    assert not (one & other).any() and (one | other).all()
+    assert one[:, :5].all() and other[:, 5:].all()  # centres on the common side belong to the right one
+
+
+def test_what_lies_beyond_the_slices_is_cut_off(volume, tmp_path):
+    rois = {"x": [rectangle(volume, 1, (-30, -30), (5, 90)), *(rectangle(volume, k, (2, 2), (4, 4)) for k in (-3, 9))]}
+    labels = read_labels(write_structures(tmp_path / "rt.dcm", rois), volume=volume)
+    assert labels.counts == {1: 20 * 6}
+    assert labels.warnings == ("ROI x: 2 contours lie beyond the slices of the scan and were left out",)
+
+
+def test_what_is_left_out_is_said(volume, tmp_path):
+    point = ("POINT", volume.ijk_to_lps([(4, 4, 4)]))
+    rois = {
+        "x": [rectangle(volume, 1, (2, 2), (4, 4)), rectangle(volume, 5, (2, 2), (4, 4)), point],
+        "iso": [point],
+    }
+    labels = read_labels(write_structures(tmp_path / "rt.dcm", rois), volume=volume)
+    assert labels.counts == {1: 18}
+    assert labels.warnings == (
+        "ROI x: 1 POINT left out, only closed planar contours enclose voxels",
+        "ROI x: 3 of 5 slices from its first to its last have no contour and stay empty",
+        "ROI iso: 1 POINT left out, only closed planar contours enclose voxels",
+        "ROI iso has no closed contour and no voxel",
+    )
+
+
+@pytest.mark.parametrize("off", [0.4, 0.2])
+def test_contours_between_slices_are_refused(volume, tmp_path, off):
+    rois = {"x": [rectangle(volume, 2, (2, 2), (4, 4)), rectangle(volume, 3 + off, (2, 2), (4, 4))]}
+    path = write_structures(tmp_path / "rt.dcm", {**rois, "fine": [rectangle(volume, 1, (2, 2), (4, 4))]})
+    with pytest.raises(RefusedInputError, match=rf"1 of 2 contours of ROI x lie between.*{1.25 * off:.2f} mm off"):
+        read_labels(path, volume=volume)
+    assert read_labels(path, ["fine"], volume=volume).counts[3 - 1] == 9
+
+
+def test_contours_across_slices_are_refused(volume, tmp_path):
+    rois = {"x": [(CLOSED, volume.ijk_to_lps([(2, 2, 1), (6, 2, 1), (6, 6, 3), (2, 6, 3)]))]}
+    with pytest.raises(RefusedInputError, match="not parallel"):
+        read_labels(write_structures(tmp_path / "rt.dcm", rois), volume=volume)
+
+
+def test_points_are_rounded_by_writers(volume, tmp_path):
+    kind, points = rectangle(volume, 2, (2, 2), (4, 4))
+    rois = {"x": [(kind, np.round(points, 2))]}
+    assert read_labels(write_structures(tmp_path / "rt.dcm", rois), volume=volume).counts == {1: 9}
+
+
+def test_another_frame_of_reference_is_refused(volume, tmp_path):
+    rois = {"x": [rectangle(volume, 2, (2, 2), (4, 4))]}
+    path = write_structures(tmp_path / "rt.dcm", rois, frame="1.2.3.4.5.6")
+    assert volume.report["frame_of_reference_hash"] is not None
+    with pytest.raises(RefusedInputError, match="1 of 1 ROIs of rt.dcm belong to frame of reference"):
+        read_labels(path, volume=volume)
+
+
+def test_overlapping_structures_are_chosen_by_name(volume, tmp_path):
+    rois = {
+        "BODY": [rectangle(volume, k, (0, 0), (23, 19)) for k in range(7)],
+        "L3": [rectangle(volume, 3, (2, 2), (4, 4))],
+    }
+    path = write_structures(tmp_path / "rt.dcm", rois)
+    with pytest.raises(RefusedInputError, match="1 BODY and 2 L3 share 9 voxels.*choose labels"):
+        read_labels(path, volume=volume)
+    assert read_labels(path, ["L3"], volume=volume).counts == {1: 7 * 480 - 9, 2: 9}
+
+
+def test_numbers_from_0_are_moved(volume, tmp_path):
+    rois = {name: [rectangle(volume, k, (2, 2), (4, 4))] for name, k in (("a", 1), ("b", 2))}
+    labels = read_labels(write_structures(tmp_path / "rt.dcm", rois, numbers=[0, 1]), volume=volume)
+    assert labels.names == {1: "a", 2: "b"} and labels.counts == {1: 9, 2: 9}
+
+
+def test_scans_that_cannot_have_contours(tmp_path):
+    stack = uneven()
+    plain = Volume(stack.voxels, stack.affine)
+    path = write_structures(tmp_path / "rt.dcm", {"x": [rectangle(plain, 2, (1, 1), (2, 2))]})
+    with pytest.raises(UsageError, match="its contours need the scan"):
+        read_labels(path)
+    with pytest.raises(UsageError, match="slices of the scan are uneven"):
+        read_labels(path, volume=stack)
+
+
+def test_other_objects_are_no_label_maps(volume, tmp_path):
+    path = write_structures(tmp_path / "dose.dcm", {}, sop_class="1.2.840.10008.5.1.4.1.1.481.2")
+    with pytest.raises(RefusedInputError, match=r"^dose.dcm is an RT dose, no label map: give a SEG or an RTSTRUCT$"):
+        read_labels(path, volume=volume)
+
+
+@pytest.mark.parametrize("harm", ["two points", "nan", "cut", "none", "words", "twice"])
+def test_corrupt_files_are_one_line(volume, tmp_path, harm):
+    kind, points = rectangle(volume, 2, (2, 2), (4, 4))
+    rois = {"x": [(kind, points[:2] if harm == "two points" else points)]}
+    path = write_structures(tmp_path / "rt.dcm", {} if harm == "none" else rois)
+    data = path.read_bytes()
+    number = f"{points[1, 0]:.6f}"[:16].encode()
+    if harm == "nan":
+        path.write_bytes(data.replace(number, b"nan".ljust(len(number))))
+    elif harm == "words":
+        path.write_bytes(data.replace(number, b"x" * len(number)))
+    elif harm == "cut":
+        path.write_bytes(data[:-20])
+    elif harm == "twice":
+        write_structures(path, {"x": rois["x"], "y": rois["x"]}, numbers=[4, 4])
+    with pytest.raises(RefusedInputError) as found:
+        read_labels(path, volume=volume)
+    assert "rt.dcm" in str(found.value) and "\n" not in str(found.value)
+
+
+@pytest.mark.first_device
+def test_commands_take_them(tmp_path, capsys):
+    dicom_series.write_series(tmp_path / "ct", PLANS["straight"])
+    volume = read_volume(tmp_path / "ct")
+    rois = {"L3": [rectangle(volume, k, (3, 4), (9, 12)) for k in (2, 3, 4)]}
+    path = write_structures(tmp_path / "rt.dcm", rois, frame="")
+    words = ["--labels", str(path), "-q"]
+    mesh = ["mesh", str(tmp_path / "ct"), "-o", str(tmp_path / "a.stl"), "--surface", "mask", *words]
+    assert main(mesh) == 0, capsys.readouterr()
+    assert main(["stats", str(tmp_path / "ct"), "--report", str(tmp_path / "s.json"), *words]) == 0
+    (one,) = json.loads((tmp_path / "s.json").read_text())["labels"]
+    assert one["name"] == "L3" and one["ml"] == pytest.approx(3 * 9 * 7 * 0.7 * 0.5 * 1.25 / 1000)
+    picture = ["render", str(tmp_path / "ct"), "-o", str(tmp_path / "p.png"), "--size", "64", *words]
+    assert main(picture) == 0, capsys.readouterr()
