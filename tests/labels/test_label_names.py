@@ -121,7 +121,9 @@ def test_a_mask_is_a_label_map():
 
 def test_files_that_are_no_label_maps_are_refused(tmp_path):
     (tmp_path / "a.nii").write_text("hello")
-    with pytest.raises(RefusedInputError, match="is no label map that can be read: NIfTI, NRRD, MetaImage and"):
+    with pytest.raises(
+        RefusedInputError, match="is no label map that can be read: NIfTI, NRRD, MetaImage, DICOM SEG and RTSTRUCT are"
+    ):
         read_labels(tmp_path / "a.nii")
     (tmp_path / "b.gz").write_bytes(b"\x1f\x8b nonsense")
     with pytest.raises(RefusedInputError, match="is no label map"):
