@@ -31,7 +31,6 @@ from clrecon.mesh.compare.signed import measure_vertex_distances as measure_vert
 from clrecon.mesh.compare.slices import measure_slices as measure_slices
 from clrecon.mesh.compare.truth import measure_truth as measure_truth
 from clrecon.mesh.reader import read_mesh as read_mesh
-from clrecon.mesh.refine.decimation import decimate_mesh as decimate_mesh
 from clrecon.mesh.refine.quadric import collapse_quadric as collapse_quadric
 from clrecon.mesh.refine.smoothing import smooth_mesh as smooth_mesh
 from clrecon.opencl import list_devices
@@ -56,6 +55,7 @@ from clrecon.operators.rays.render import render as render
 from clrecon.operators.reformat.cut import cut_slice as cut_slice
 from clrecon.operators.reformat.cut import reformat_curve as reformat_curve
 from clrecon.operators.resident.device_volume import DeviceVolume as DeviceVolume
+from clrecon.operators.surface.decimation import decimate_mesh as decimate_mesh
 from clrecon.operators.surface.extract import SurfaceExtractor as SurfaceExtractor
 from clrecon.operators.surface.extract import extract_isosurface as extract_isosurface
 from clrecon.operators.surface.extract import extract_isosurfaces as extract_isosurfaces

@@ -147,6 +147,16 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "image": (("= finish_color((float4)(color", "= (uchar4)(255) - finish_color((float4)(color"),),
         "depths": (("? depth * length_of_ray : depth;", "? -depth * length_of_ray : -depth;"),),
     },
+    "find_near_faces": {
+        "squares": (("squares[number] = least;", "squares[number] = -least;"),),
+        "rows": (("rows[number] = nearest;", "rows[number] = ~nearest;"),),
+    },
+    "find_witnesses": {
+        "witnesses": (
+            ("witnesses[(uint)i * count + number] = row[i];", "witnesses[(uint)i * count + number] = ~row[i];"),
+        ),
+        "left": (("left[number] = (uchar)undecided;", "left[number] = (uchar)~undecided;"),),
+    },
     "place_vertices": {"placed": (("placed[3 * vertex + axis] = (", "placed[3 * vertex + axis] = -("),)},
     "count_pieces": {"pieces": (("? 0 : count_across(b.left", "? 0 : ~count_across(b.left"),)},
     "draw_triangles": {

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 __all__ = [
     "Edges",
+    "Fans",
     "count_duplicate_faces",
     "find_edges",
     "find_faces_back_to_back",
@@ -86,6 +87,41 @@ def order_by_number(numbers: IntArray, size: int) -> IntArray:
     kind = _index_type(max(count, size) + 1)
     here = np.arange(count + 1, dtype=kind)
     return csr_array((here[:-1], numbers.astype(kind), here), shape=(count, size)).tocsc().data
+
+
+class Fans:
+    """The triangles around each vertex.
+
+    Parameters
+    ----------
+    triangles : ndarray, shape (m, 3), uint32
+    vertex_count : int
+
+    Attributes
+    ----------
+    rows : ndarray, shape (3 * m,), int
+        Triangles, those around vertex v from ``begin[v]`` to ``begin[v + 1]``, in their order.
+    begin : ndarray, shape (vertex_count + 1,), int64
+    """
+
+    def __init__(self, triangles: NDArray[np.uint32], vertex_count: int):
+        corners = triangles.reshape(-1)
+        self.rows: IntArray = order_by_number(corners, vertex_count) // 3
+        self.begin = np.zeros(vertex_count + 1, dtype=np.int64)
+        np.cumsum(np.bincount(corners, minlength=vertex_count), out=self.begin[1:])
+
+    def around(self, vertices: IntArray) -> tuple[IntArray, IntArray]:
+        """Return the triangles around some vertices one after the other, and how many each vertex has."""
+        first = self.begin[vertices]
+        count = self.begin[vertices + 1] - first
+        start = np.cumsum(count) - count
+        return self.rows[np.arange(int(count.sum())) + np.repeat(first - start, count)], count
+
+    def touching(self, vertices: IntArray) -> IntArray:
+        """Return the triangles that have one of some vertices, each once, in their order."""
+        found = np.zeros(len(self.rows) // 3, dtype=bool)
+        found[self.around(vertices)[0]] = True
+        return np.flatnonzero(found)
 
 
 def find_edges(triangles: NDArray[np.uint32], vertex_count: int) -> Edges:

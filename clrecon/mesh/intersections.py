@@ -20,6 +20,9 @@ _PIECE = 1 << 16
 _FEW = 0.05
 """Share of changed triangles up to which it is faster to search only around them."""
 
+_CELLS_A_SIDE = 128
+"""Coarse cells along the longest side of a surface."""
+
 Float64Array = NDArray[np.float64]
 
 
@@ -76,7 +79,7 @@ def find_self_intersections(
 def find_beside(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], changed: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Find the changed triangles and those that can touch one of them.
+    """Find the changed triangles and those that can touch one of them: whose box shares a coarse cell with one.
 
     Parameters
     ----------
@@ -92,12 +95,25 @@ def find_beside(
         return np.ones(len(triangles), dtype=bool)
     if not changed.any():
         return changed
-    from scipy.spatial import cKDTree
-
-    corners = vertices[triangles]
-    centres = corners.mean(axis=1, dtype=np.float64)
-    reach = 2.0 * float(np.linalg.norm(corners - centres[:, None], axis=2).max())
-    return np.isfinite(cKDTree(centres[changed]).query(centres, distance_upper_bound=reach, workers=-1)[0])
+    columns = vertices.T
+    one, two, three = (columns.take(corner, axis=1) for corner in triangles.T.astype(np.intp))
+    low, high = np.minimum(np.minimum(one, two), three), np.maximum(np.maximum(one, two), three)
+    start = low.min(axis=1)[:, None]
+    size = float((high.max(axis=1)[:, None] - start).max()) / _CELLS_A_SIDE or 1.0
+    first, last = (((corner - start) / size).astype(np.int32) for corner in (low, high))
+    # Of each box the number of cells with a changed triangle, from sums over all cells below and before (Crow 1984).
+    _, cell = _enter_into_cells(first[:, changed], last[:, changed])
+    sums = np.zeros(last.max(axis=1) + 2, dtype=np.int32)
+    sums[tuple(cell + 1)] = 1
+    for axis in range(3):
+        np.cumsum(sums, axis=axis, out=sums)
+    last += 1
+    x, y, z = zip(first, last, strict=True)
+    count = np.zeros(len(triangles), dtype=np.int32)
+    for corner in np.ndindex(2, 2, 2):
+        here = sums[x[corner[0]], y[corner[1]], z[corner[2]]]
+        count += here if sum(corner) % 2 else -here
+    return np.asarray(count > 0)
 
 
 @dataclass(frozen=True)

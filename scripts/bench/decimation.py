@@ -28,7 +28,7 @@ def measure_decimation(job: Job) -> dict[str, Any]:
     import clrecon
 
     mesh = clrecon.extract_isosurface(job.input.volume(), job.hu, device=job.device)
-    small = clrecon.decimate_mesh(mesh, SHARE)
+    small = clrecon.decimate_mesh(mesh, SHARE, device=job.device)
     reached = small.report["refinement"]["decimate"]["reached"]
     peers: dict[str, Callable[[], Any]] = {
         "collapse_quadric": lambda: clrecon.collapse_quadric(mesh, reached),
@@ -37,7 +37,10 @@ def measure_decimation(job: Job) -> dict[str, Any]:
     }
     if find_spec("meshlib") is not None:
         peers["meshlib"] = lambda: _meshlib(mesh, reached)
-    times = {name: _in_turns(lambda: clrecon.decimate_mesh(mesh, SHARE), peer, job) for name, peer in peers.items()}
+    times = {
+        name: _in_turns(lambda: clrecon.decimate_mesh(mesh, SHARE, device=job.device), peer, job)
+        for name, peer in peers.items()
+    }
     results = {"decimate_mesh": small, **{name: peer() for name, peer in peers.items()}}
     return {
         "ratios": {name: found["ratio"] for name, found in times.items()},
@@ -45,7 +48,7 @@ def measure_decimation(job: Job) -> dict[str, Any]:
         "euler_number": mesh.quality()["euler_number"],
         "bound_mm": small.report["refinement"]["decimate"]["max_deviation_mm"],
         **times,
-        "busy_s": {"decimate_mesh": _busy(lambda: clrecon.decimate_mesh(mesh, SHARE))}
+        "busy_s": {"decimate_mesh": _busy(lambda: clrecon.decimate_mesh(mesh, SHARE, device=job.device))}
         | {name: _busy(peer) for name, peer in peers.items()},
         "results": {name: _judge(result, mesh) for name, result in results.items()},
     }

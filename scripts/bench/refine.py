@@ -25,12 +25,14 @@ def measure_refinement(job: Job) -> dict[str, Any]:
     import clrecon
 
     mesh = clrecon.extract_isosurface(job.input.volume(), job.hu, device=job.device)
-    small = clrecon.decimate_mesh(mesh, SHARE)
+    small = clrecon.decimate_mesh(mesh, SHARE, device=job.device)
     reached = small.report["refinement"]["decimate"]["reached"]
     peer_small = _decimate(mesh, reached)
     times = {
         "smooth": _in_turns(lambda: clrecon.smooth_mesh(mesh), lambda: _smooth(mesh), job),
-        "decimate": _in_turns(lambda: clrecon.decimate_mesh(mesh, SHARE), lambda: _decimate(mesh, reached), job),
+        "decimate": _in_turns(
+            lambda: clrecon.decimate_mesh(mesh, SHARE, device=job.device), lambda: _decimate(mesh, reached), job
+        ),
         "quality": _in_turns(mesh.quality, lambda: _measure(mesh), job),
     }
     return {

@@ -7,7 +7,7 @@ import pytest
 import sample_meshes as samples
 
 from clrecon.mesh import Mesh, intersections
-from clrecon.mesh.intersections import count_self_intersections, find_beside
+from clrecon.mesh.intersections import count_self_intersections, find_beside, find_self_intersections
 
 pytestmark = pytest.mark.unit
 
@@ -94,18 +94,39 @@ def test_triangles_that_are_points_cut_nothing():
     assert count((np.ones((1, 3)), [[0, 0, 0]] * 3)) == 0
 
 
-def test_only_triangles_that_can_touch_a_changed_one_lie_beside_it():
-    """Equal triangles in a row: two can touch if their centres are no farther apart than twice the longest way from
-    a centre to a corner.
-    """
-    face = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 2.0, 0.0]])  # its corners lie within 2 of its centre
+@pytest.mark.parametrize("axis", range(3))
+def test_only_triangles_that_can_touch_a_changed_one_lie_beside_it(axis):
+    """Triangles in a row, in boxes of 2 with steps of 2.5: 40 of them are cut into 128 cells of 99.5 / 128 = 0.777."""
+    face = np.roll([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.5]], axis, axis=1)
+    along = np.roll([2.5, 0.0, 0.0], axis)
+    vertices = (face + np.arange(40)[:, None, None] * along).reshape(-1, 3)
+    triangles = np.arange(120, dtype=np.uint32).reshape(-1, 3)
+    # The 20th reaches from 50 to 52, cells 64 to 66; its neighbours from 47.5 to 49.5, cells 61 to 63, and from 52.5
+    # on, cell 67.  From 49.8 on the one before would meet cell 64.
     changed = np.arange(40) == 20
-    for step, beside in ((3.9, [19, 20, 21]), (4.1, [20])):
-        vertices = (face + step * np.arange(40)[:, None, None] * [1, 0, 0]).reshape(-1, 3)
-        triangles = np.arange(120, dtype=np.uint32).reshape(-1, 3)
-        assert np.flatnonzero(find_beside(vertices, triangles, changed)).tolist() == beside
-        assert not find_beside(vertices, triangles, np.zeros(40, bool)).any()
-        assert find_beside(vertices, triangles, np.arange(40) < 3).all()  # more than one of twenty: all are looked at
+    assert np.flatnonzero(find_beside(vertices, triangles, changed)).tolist() == [20]
+    longer = vertices.copy()
+    longer[58] += np.roll([0.4, 0.0, 0.0], axis)
+    assert np.flatnonzero(find_beside(longer, triangles, changed)).tolist() == [19, 20]
+    for number in (0, 39):
+        assert np.flatnonzero(find_beside(vertices, triangles, np.arange(40) == number)).tolist() == [number]
+    assert not find_beside(vertices, triangles, np.zeros(40, bool)).any()
+    assert find_beside(vertices, triangles, np.arange(40) < 3).all()  # more than one of twenty: all are looked at
+
+
+def test_what_touches_a_changed_triangle_lies_beside_it():
+    rng = np.random.default_rng(4)
+    vertices = rng.uniform(-40.0, 60.0, (600, 3))
+    vertices = (vertices[:, None] + rng.normal(0.0, 6.0, (600, 3, 3))).reshape(-1, 3)
+    triangles = np.arange(1800, dtype=np.uint32).reshape(-1, 3)
+    changed = np.arange(600) % 30 == 7
+    pairs = find_self_intersections(vertices, triangles)
+    touched = pairs[changed[pairs].any(axis=1)]
+    beside = find_beside(vertices, triangles, changed)
+    assert len(touched) > 5 and beside[touched].all() and beside[changed].all() and 20 < beside.sum() < 400
+    numbers = np.flatnonzero(beside)
+    found = numbers[find_self_intersections(vertices, triangles[beside], changed[beside])]
+    assert sorted(map(sorted, found.tolist())) == sorted(map(sorted, touched.tolist()))
 
 
 @pytest.mark.parametrize("axis", range(3))

@@ -115,7 +115,7 @@ def make_mesh(
     paths = _name_files(output, parts, report_path, settings)
     judge_surfaces(parts, volume, settings)
     watch.lap("select")
-    gates = _refine_and_measure(parts, volume, settings, measure or settings.strict, progress, watch)
+    gates = _refine_and_measure(parts, volume, settings, device, measure or settings.strict, progress, watch)
     purpose_warnings = describe_purposes(parts)
     watch.lap("measure")
 
@@ -217,6 +217,7 @@ def _open(
     prepare = partial(
         prepare_surfaces, components=settings.selects, topology=settings.topology, inside=settings.inside,
         vertex_rule=settings.vertex_rule, grows=settings.method_used == "i-mc",
+        decimates=settings.decimate_used is not None and settings.method != "g-mc" and settings.memory is None,
     )  # fmt: skip
     with DeviceOpening(settings.device, prepare) as opening:
         volume, labels = read_with_labels(
@@ -277,12 +278,18 @@ def _select(
 
 
 def _refine_and_measure(
-    parts: Sequence[Part], volume: Volume, settings: MeshSettings, measure: bool, progress: Progress, watch: Laps
+    parts: Sequence[Part],
+    volume: Volume,
+    settings: MeshSettings,
+    device: Device,
+    measure: bool,
+    progress: Progress,
+    watch: Laps,
 ) -> list[dict[str, Any]]:
     """Refine and measure each part as far as wanted; return the gates."""
     if settings.refines:
         for part in parts:
-            part.mesh = refine_surface(part.mesh, settings, progress)
+            part.mesh = refine_surface(part.mesh, settings, device, progress)
         watch.lap("refine")
     if measure:
         for place, part in enumerate(parts):

@@ -28,8 +28,9 @@ def prepare_surfaces(
     inside: str = "above",
     vertex_rule: str = "linear",
     grows: bool = False,
+    decimates: bool = False,
 ) -> None:
-    """Build the kernels for surfaces of this topology and, if wanted, for components and for growing."""
+    """Build the kernels for surfaces of this topology and, if wanted, for components, growing and decimation."""
     from clrecon.operators.primitives.union_find import prepare_components
     from clrecon.operators.surface.extract import prepare_isosurface
 
@@ -38,6 +39,10 @@ def prepare_surfaces(
         from clrecon.operators.surface.growing import prepare_growing
 
         prepare_growing(device)
+    if decimates:
+        from clrecon.operators.surface.near_faces import prepare_near_faces
+
+        prepare_near_faces(device)
     if components:
         prepare_components(device)
 

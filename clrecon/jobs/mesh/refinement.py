@@ -12,12 +12,15 @@ from clrecon.system.progress import Progress, ignore_progress
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.mesh import Mesh
+    from clrecon.opencl import Device
 
 __all__ = ["describe_purposes", "judge_parts", "refine_surface", "warn_of_gates"]
 
 
-def refine_surface(mesh: Mesh, settings: MeshSettings, progress: Progress = ignore_progress) -> Mesh:
+def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress: Progress = ignore_progress) -> Mesh:
     """Smooth and decimate as the settings say; return the mesh itself if they ask for neither.
+
+    Distances are bounded on the device, unless the settings limit its memory: what they allow is for the surface.
 
     Returns
     -------
@@ -28,9 +31,10 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, progress: Progress = igno
     if not settings.refines:
         return mesh
     from clrecon.mesh.compare.distances import compare_meshes
-    from clrecon.mesh.refine.decimation import BOUND_VOXEL, decimate_mesh, default_deviation
+    from clrecon.mesh.refine.decimation import BOUND_VOXEL, default_deviation
     from clrecon.mesh.refine.quadric import collapse_quadric
     from clrecon.mesh.refine.smoothing import smooth_mesh
+    from clrecon.operators.surface.decimation import decimate_mesh
 
     raw = mesh
     if settings.smooth is not None:
@@ -39,7 +43,8 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, progress: Progress = igno
     if share is not None and settings.method == "g-mc":
         mesh = collapse_quadric(mesh, share, progress=progress)
     elif share is not None:
-        mesh = decimate_mesh(mesh, share, settings.max_deviation_mm, progress=progress)
+        where = device if settings.memory is None else None
+        mesh = decimate_mesh(mesh, share, settings.max_deviation_mm, device=where, progress=progress)
     mesh.report["refinement"] |= {
         "deviation": compare_meshes(mesh, raw, progress=progress),
         "voxel_mm": default_deviation(raw) / BOUND_VOXEL,

@@ -7,11 +7,16 @@ from numpy.typing import NDArray
 
 from clrecon.mesh.triangles import cross_product
 
-__all__ = ["FaceFrames"]
+__all__ = ["FaceFrames", "rounding_of_bounds"]
 
 _ROUNDINGS = 16.0
 """Units of the last place of the largest coordinate by which a bound may be too small; each of 16 steps rounds by half
 a unit of a number that is no larger."""
+
+
+def rounding_of_bounds(largest: float) -> float:
+    """Return by how many mm a distance in float32 may be too short, from the largest coordinate in mm."""
+    return _ROUNDINGS * float(np.spacing(np.float32(largest)))
 
 
 class FaceFrames:
@@ -36,8 +41,7 @@ class FaceFrames:
         self._rows = np.zeros((len(triangles), 16), dtype=np.float32)
         for place, part in enumerate((corner, *along, one, two)):
             self._rows[:, 3 * place : 3 * place + 3] = part.T
-        largest = float(np.abs(columns).max(initial=0.0))
-        self.slack = _ROUNDINGS * float(np.spacing(np.float32(largest)))
+        self.slack = rounding_of_bounds(float(np.abs(columns).max(initial=0.0)))
 
     def squares(self, points: NDArray[np.float32], rows: NDArray[np.integer]) -> NDArray[np.float32]:
         """Return squares of distances from points to a point of the triangle, the nearest one or one near it.

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.compare.frames import FaceFrames
-from clrecon.mesh.connectivity import order_by_number
+from clrecon.mesh.connectivity import Fans
 from clrecon.mesh.triangles import cross_product
 from clrecon.system.pieces import in_threads
 
@@ -37,15 +37,15 @@ class NearDistance:
     ----------
     vertices : ndarray, shape (n, 3), mm
     triangles : ndarray, shape (m, 3), uint32
+    fans : Fans, optional
+        Fans of the triangles if they are known.
     """
 
-    def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
+    def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], fans: Fans | None = None):
         self._vertices, self._triangles = vertices, triangles
-        corners = triangles.reshape(-1)
-        self._face_of = order_by_number(corners, len(vertices)) // 3
-        self._begin = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=len(vertices)))])
-        self._columns = np.ascontiguousarray(vertices.T, dtype=np.float64)
+        self._fans = fans or Fans(triangles, len(vertices))
         self._exact: SurfaceDistance | None = None
+        self._all_columns: Columns | None = None
         self._frames: FaceFrames | None = None
 
     def __call__(self, points: Points, near: NDArray[np.integer], limit: float) -> NDArray[np.float64]:
@@ -132,12 +132,17 @@ class NearDistance:
         best = np.flatnonzero(square == least[pair])[::-1]  # backwards: the first of equals wins
         rows[pair[best]] = row[best]
         np.sqrt(least, out=least)
-        least += np.float32(self.frames.slack)
+        least += np.float32(self.slack)
         return least, rows
+
+    @property
+    def slack(self) -> float:
+        """mm by which rounding may make the root of a square too short for an upper bound."""
+        return self.frames.slack
 
     def prepare(self) -> None:
         """Make what upper bounds need, before threads use it."""
-        assert self.frames is not None
+        assert self.frames is not None and len(self._columns) == 3
 
     @property
     def frames(self) -> FaceFrames:
@@ -163,6 +168,13 @@ class NearDistance:
             found = np.minimum(found, length)
         return found, rows
 
+    @property
+    def _columns(self) -> Columns:
+        """Vertices in columns, made when they are first asked for."""
+        if self._all_columns is None:
+            self._all_columns = np.ascontiguousarray(self._vertices.T, dtype=np.float64)
+        return self._all_columns
+
     def _corners(self, rows: NDArray[np.integer]) -> tuple[Columns, Columns, Columns]:
         a, b, c = self._triangles[rows].T.astype(np.intp)
         # "clip" avoids checking each index, which takes longer than the look-up; the triangles have been checked.
@@ -174,6 +186,7 @@ class NearDistance:
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return the smallest value of a measure among the triangles around the vertices, and the rows of these."""
         found, rows = np.full(len(points), np.inf), np.full(len(points), -1)
+        assert len(self._columns) == 3  # before threads use them
 
         def work(where: slice) -> None:
             pair, row, start, some = self._pairs(near[where])
@@ -191,12 +204,8 @@ class NearDistance:
         """List the triangles around vertices: number of the vertex in `near`, and the triangle; for each vertex where
         its pairs begin, and whether it has any.
         """
-        first = self._begin[near]
-        count = self._begin[near + 1] - first
-        start = np.cumsum(count) - count
-        pair = np.repeat(np.arange(len(count)), count)
-        row = self._face_of[np.arange(len(pair)) + (first - start)[pair]]
-        return pair, row, start, count > 0
+        row, count = self._fans.around(near)
+        return np.repeat(np.arange(len(count)), count), row, np.cumsum(count) - count, count > 0
 
 
 def _perpendicular(points: Columns, a: Columns, b: Columns, c: Columns) -> NDArray[np.float64]:

@@ -6,16 +6,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.exchange.coordinates import as_stored, find_coincident
-from clrecon.mesh.connectivity import Edges, find_edges, label_components
+from clrecon.mesh.connectivity import Edges, Fans, find_edges, label_components
 from clrecon.mesh.intersections import find_beside, find_self_intersections
+from clrecon.mesh.refine.bounds import WITNESSES
 from clrecon.mesh.refine.collapses import Collapses, Quadrics, last_of_collapses
-from clrecon.mesh.refine.deviation import WITNESSES, Deviation
+from clrecon.mesh.refine.deviation import Deviation
 from clrecon.mesh.refine.faults import any_corner, find_faults_beside, find_sheets, find_torn
 from clrecon.mesh.refine.topology import TopologyChange, compare_topology, measure_topology
 from clrecon.mesh.triangles import cross_products
 from clrecon.system.pieces import side_by_side
 
 __all__ = ["Clusters"]
+
+_FEW = 0.05
+"""Share of the vertices or triangles up to which it is faster to look at the triangles around each than at all."""
 
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]
@@ -46,6 +50,8 @@ class Clusters:
         self._quadrics, edges = side_by_side(
             lambda: Quadrics(self._original, triangles), lambda: find_edges(triangles, len(vertices))
         )
+        self.fans = Fans(triangles, len(vertices))
+        """Fans of the given surface."""
         self._components = label_components(triangles, len(vertices), edges)
         self._topology = measure_topology(triangles, self._components[1], self._components[0], edges)
         self._is_border = edges.border(len(vertices))
@@ -119,7 +125,7 @@ class Clusters:
     def faces(self) -> NDArray[np.uint32]:
         """Triangles with three different names, shape (k, 3)."""
         if self._faces is None:
-            self._faces = self._named[self._is_face]
+            self._faces = self._named.take(np.flatnonzero(self._is_face), axis=0)
         return self._faces
 
     def standing(self) -> IntArray:
@@ -158,7 +164,7 @@ class Clusters:
         self._place(members)
         for fresh in (self._new_to_cuts, self._new_to_distances, self._new_to_faults, self._new_to_vertices):
             fresh[back] = True
-        rows = np.flatnonzero(any_corner(moved, self._triangles))
+        rows = self._touching(members)
         self._named[rows] = self._names[self._triangles[rows]]
         self._is_face[rows] = _are_faces(self._named[rows])
         self._faces = None
@@ -177,10 +183,36 @@ class Clusters:
         if len(heads):
             self._places[heads] = self._rounded(self._quadrics.best_places(clusters, merged, len(heads)))
 
+    def _touching(self, vertices: IntArray) -> IntArray:
+        """Return the given triangles that have one of these vertices."""
+        if len(vertices) <= _FEW * len(self._names):
+            return self.fans.touching(vertices)
+        flags = np.zeros(len(self._names), dtype=bool)
+        flags[vertices] = True
+        return np.flatnonzero(any_corner(flags, self._triangles))
+
+    def _named_rows(self, flags: NDArray[np.bool_]) -> IntArray:
+        """Return the given triangles that have a corner with a flagged name."""
+        return self._touching(np.flatnonzero(flags[self._names]))
+
+    def _face_rows(self, flags: NDArray[np.bool_]) -> IntArray:
+        """Return those of them that are faces."""
+        rows = self._named_rows(flags)
+        return rows[self._is_face[rows]]
+
     def _has_moved(self) -> NDArray[np.bool_]:
         """Mark vertices that have another name than at first, or a name with another place."""
         x, y, z = (self._places != self._original).T
         return np.asarray((self._names != np.arange(len(self._names))) | (x | y | z)[self._names])
+
+    def _have_moved(self, rows: IntArray) -> NDArray[np.bool_]:
+        """Mark those of some given triangles that have a corner that has moved."""
+        corners = self._triangles[rows]
+        if len(rows) > _FEW * len(self._triangles):
+            return any_corner(self._has_moved(), corners)
+        names = self._names[corners]
+        is_elsewhere = (self._places[names] != self._original[names]).any(axis=2)
+        return np.asarray(((names != corners) | is_elsewhere).any(axis=1))
 
     def find_faults(self, everywhere: bool = False) -> IntArray:
         """Find the names of clusters that have spoilt the surface.
@@ -196,7 +228,9 @@ class Clusters:
         """
         found: IntArray = np.zeros(0, dtype=np.int64)
         if self._examined and self._new_to_faults.any():
-            found = find_faults_beside(self.faces(), self._new_to_faults)
+            touched = np.zeros(len(self._names), dtype=bool)
+            touched[self._named[self._face_rows(self._new_to_faults)]] = True
+            found = find_faults_beside(self._named[self._face_rows(touched)], self._new_to_faults)
         self._new_to_faults[:] = False
         if len(found) or (self._sound and not everywhere):
             return found
@@ -289,23 +323,26 @@ class Clusters:
         """
         if not self._new_to_distances.any():
             return np.zeros(0, dtype=np.int64)
-        named, is_face = self._named, self._is_face
-        new = any_corner(self._new_to_distances, named)
+        named, changed = self._named, self._named_rows(self._new_to_distances)
         self._new_to_distances[:] = False
-        has_moved = self._has_moved()
+        new = np.zeros(len(named), dtype=bool)
+        new[changed] = True
 
         rows = np.flatnonzero(_any_witness(new, self._witnesses))
         self._witnesses[:, rows] = rows
-        rows = rows[any_corner(has_moved, self._triangles[rows])]
+        rows = rows[self._have_moved(rows)]
         rows = rows[deviation.can_be_far(rows, self._names, self._places)]
-        from_rows = np.flatnonzero(is_face & new)
-        from_rows = from_rows[any_corner(has_moved, self._triangles[from_rows])]
-        now, faces = named[from_rows], self.faces()
+        near = np.zeros(len(self._names), dtype=bool)
+        near[named[rows]] = True
+        around = self._face_rows(near)
+        from_rows = changed[self._is_face[changed]]
+        from_rows = from_rows[self._have_moved(from_rows)]
+        now = named[from_rows]
         (is_left_behind, seen), is_away = side_by_side(
-            lambda: deviation.is_far_from(rows, self._names, self._places, faces),
+            lambda: deviation.is_far_from(rows, self._names, self._places, named[around]),
             lambda: deviation.are_far(self._places, now, from_rows),
         )
-        self._witnesses[:, rows] = np.append(np.flatnonzero(is_face), -1)[seen]
+        self._witnesses[:, rows] = np.append(around, -1)[seen]
         return self._pick(np.concatenate([named[rows[is_left_behind]], now[is_away]]))
 
     def _pick(self, named: NDArray[np.uint32]) -> IntArray:
@@ -325,11 +362,12 @@ class Clusters:
         deviation
             As in `find_far`.
         """
-        faces = self.faces()
-        beside = np.zeros(len(self._names), dtype=bool)
-        beside[faces[any_corner(self._new_to_vertices, faces)]] = True
+        beside, near = (np.zeros(len(self._names), dtype=bool) for _ in range(2))
+        beside[self._named[self._face_rows(self._new_to_vertices)]] = True
         self._new_to_vertices[:] = False
         rows = np.flatnonzero(beside[self._names] & self._has_moved())
+        near[self._names[rows]] = True
+        faces = self._named[self._face_rows(near)]
         return np.unique(self._names[rows[deviation.are_left_behind(rows, self._names, self._places, faces)]])
 
 

@@ -113,7 +113,9 @@ class Collapses:
         self._turns[heads] = turns
         self._turns[self._pairs[rows[gone], 1]] = np.repeat(turns, count)[gone]
         left = self._pairs[np.sort(rows[~gone])]
-        self._pairs = np.delete(self._pairs, rows[gone], axis=0)
+        stays = np.ones(len(self._pairs), dtype=bool)
+        stays[rows[gone]] = False
+        self._pairs = self._pairs.take(np.flatnonzero(stays), axis=0)
         return undone, left
 
 

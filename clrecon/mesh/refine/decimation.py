@@ -18,8 +18,9 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange.coordinates import as_stored, rounding_step
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
+from clrecon.mesh.refine.bounds import SurfaceBounds
 from clrecon.mesh.refine.clusters import Clusters
-from clrecon.mesh.refine.deviation import Deviation
+from clrecon.mesh.refine.deviation import Deviation, MakeBounds
 from clrecon.mesh.refine.shifts import measure_volumes, move_vertices, restore_volumes
 from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress
@@ -118,7 +119,12 @@ def carry_on(mesh: Mesh, name: str, said: dict[str, Any]) -> dict[str, Any]:
 
 
 def decimate_mesh(
-    mesh: Mesh, fraction: float, max_deviation_mm: float | None = None, *, progress: Progress | None = None
+    mesh: Mesh,
+    fraction: float,
+    max_deviation_mm: float | None = None,
+    *,
+    progress: Progress | None = None,
+    make_bounds: MakeBounds = SurfaceBounds,
 ) -> Mesh:
     """Remove triangles by collapsing edges in order of their quadric error (Garland and Heckbert 1997).
 
@@ -138,6 +144,8 @@ def decimate_mesh(
         Default: `default_deviation`.
     progress : callable, optional
         Called as ``progress("decimate", triangles removed, triangles to remove)``, several times in a round.
+    make_bounds : callable
+        `SurfaceBounds`, or what does the same elsewhere.
 
     Returns
     -------
@@ -159,7 +167,8 @@ def decimate_mesh(
     clusters = Clusters(mesh.vertices - origin, mesh.triangles, origin)
     # Both surfaces are stored rounded, each coordinate by at most half a step.
     longest = max(_SHARE_FOR_VOLUME * bound - rounding_step(mesh.vertices), 0.0)
-    deviation = Deviation(mesh.vertices - origin, mesh.triangles, (1.0 - _SHARE_FOR_VOLUME) * bound)
+    deviation_bound = (1.0 - _SHARE_FOR_VOLUME) * bound
+    deviation = Deviation(mesh.vertices - origin, mesh.triangles, deviation_bound, make_bounds, clusters.fans)
     wanted = (1.0 - fraction) * mesh.triangle_count
 
     def tell(left: int) -> None:

@@ -168,12 +168,14 @@ def extract_by_method(
                 grow_from=(AUTO if grow_from is None else grow_from) if chosen.grows else None,
             )  # fmt: skip
     if chosen.decimates:
-        from clrecon.mesh.refine.decimation import decimate_mesh
         from clrecon.mesh.refine.quadric import collapse_quadric
+        from clrecon.operators.surface.decimation import decimate_mesh
 
         share = DECIMATED_SHARE if decimate is None else decimate
-        collapse = collapse_quadric if chosen.decimates == "quadric" else decimate_mesh
-        mesh = collapse(mesh, share, progress=progress)
+        if chosen.decimates == "quadric":
+            mesh = collapse_quadric(mesh, share, progress=progress)
+        else:  # what may be taken on the device is for the surface
+            mesh = decimate_mesh(mesh, share, device=extractor.device if memory is None else None, progress=progress)
     mesh.report["method"] = method
     return mesh
 

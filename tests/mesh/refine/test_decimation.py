@@ -250,7 +250,6 @@ def test_impossible_shares(fraction):
 def test_the_public_names():
     import clrecon
 
-    assert clrecon.decimate_mesh is decimate_mesh
     assert {"smooth_mesh", "decimate_mesh", "compare_meshes"} <= set(clrecon.__all__)
 
 

@@ -1,0 +1,63 @@
+"""Decimation within a bound, with distances on a device if one is named."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from clrecon.mesh import Mesh
+from clrecon.mesh.refine import decimation
+from clrecon.opencl import Device, take_device, work_on
+from clrecon.operators.surface.near_faces import DeviceBounds
+from clrecon.system.progress import Progress
+
+__all__ = ["decimate_mesh"]
+
+
+def decimate_mesh(
+    mesh: Mesh,
+    fraction: float,
+    max_deviation_mm: float | None = None,
+    *,
+    device: Device | str | int | None = None,
+    progress: Progress | None = None,
+) -> Mesh:
+    """Remove triangles by collapsing edges in order of their quadric error, see `clrecon.mesh.refine.decimation`.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    fraction : float
+        Share of the triangles to remove, above 0 and below 1. The bound may allow only less.
+    max_deviation_mm : float, optional
+        No vertex and no middle of an edge or a triangle of either surface lies farther than this from the other.
+        Default: a quarter of the shortest voxel step.
+    device : Device, str or int, optional
+        Bounds distances, see `clrecon.device`.  None: numpy does it, which takes longer and needs no device.  The
+        result is the same but for rounding: another triangle may have been found to be near enough first.
+    progress : callable, optional
+        Called as ``progress("decimate", triangles removed, triangles to remove)``, several times in a round.
+
+    Returns
+    -------
+    Mesh
+        As that of `clrecon.mesh.refine.decimation.decimate_mesh`.
+
+    Raises
+    ------
+    UsageError
+        A value cannot be used, or there is neither a bound nor a voxel size in the report of the mesh.
+    NoSurfaceError
+        The mesh is empty.
+    DeviceError
+        The device does not exist, has no room for both surfaces, or fails.
+    """
+    decimation.check_share(fraction)
+    decimation.check_refinement(mesh, max_deviation_mm)
+    if device is None:
+        return decimation.decimate_mesh(mesh, fraction, max_deviation_mm, progress=progress)
+    return work_on(
+        take_device(device),
+        lambda device, told: decimation.decimate_mesh(
+            mesh, fraction, max_deviation_mm, progress=progress, make_bounds=partial(DeviceBounds, device)
+        ),
+    )
