@@ -29,6 +29,10 @@ _STAGES = {
     "compare": "comparing with the surface before",
     "write": "writing",
     "measure": "measuring the mesh",
+    "crossings": "looking for crossing triangles",
+    "distance": "measuring its distance from the scan",
+    "canal": "looking for the spinal canal",
+    "vertebrae": "looking for vertebrae",
     "measure labels": "measuring labels",
     "draw": "drawing the phantom",
     "blur": "blurring the phantom",
@@ -39,7 +43,7 @@ _STAGES = {
     "report": "drawing and writing the report",
 }
 _HIDDEN = {*range(0x202A, 0x202F), *range(0x2066, 0x206A), 0x200E, 0x200F, 0x061C}
-_BAR_WIDTH = 24
+_BAR_WIDTH, _LEAST_BAR = 24, 6
 _REDRAW_SECONDS = 0.1
 
 
@@ -135,11 +139,15 @@ class Console:
         self._guard_stdout(lambda: sys.stdout.flush())
 
     def _draw(self, stage: str, done: int, total: int) -> None:
-        line = f"clrecon: {_STAGES.get(stage, printable(stage))}"
+        line, room = f"clrecon: {_STAGES.get(stage, printable(stage))}", max(20, _columns() - 1)
         if total > 0:
-            filled = _BAR_WIDTH * min(done, total) // total
-            line += f" [{'#' * filled}{'.' * (_BAR_WIDTH - filled)}] {done}/{total}"
-        line = line[: max(20, _columns() - 1)]
+            count = f" {done}/{total}"
+            width = min(_BAR_WIDTH, room - len(line) - len(count) - 3)  # the count is worth more than a long bar
+            if width >= _LEAST_BAR:
+                filled = width * min(done, total) // total
+                line += f" [{'#' * filled}{'.' * (width - filled)}]"
+            line = line[: room - len(count)].rstrip() + count
+        line = line[:room]
         if sys.stderr is not None:
             _write(sys.stderr, "\r" + line + " " * max(0, self._drawn - len(line)))
             self._drawn = len(line)

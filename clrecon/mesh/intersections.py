@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.system.pieces import in_threads, local_origin
+from clrecon.system.progress import Steps
 
 __all__ = ["count_self_intersections", "find_beside", "find_self_intersections"]
 
@@ -32,7 +33,11 @@ def count_self_intersections(vertices: NDArray[np.floating], triangles: NDArray[
 
 
 def find_self_intersections(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], changed: NDArray[np.bool_] | None = None
+    vertices: NDArray[np.floating],
+    triangles: NDArray[np.uint32],
+    changed: NDArray[np.bool_] | None = None,
+    *,
+    steps: Steps | None = None,
 ) -> NDArray[np.int64]:
     """Find the pairs of triangles that cut each other.
 
@@ -45,6 +50,8 @@ def find_self_intersections(
     triangles : ndarray, shape (m, 3), uint32
     changed : ndarray, shape (m,), bool, optional
         Only pairs with one of these are examined.
+    steps : Steps, optional
+        Counts the triangles.
 
     Returns
     -------
@@ -72,7 +79,12 @@ def find_self_intersections(
         cut = _cut(points[:, one], points[:, other])
         found[where.start] = np.column_stack([one[cut], other[cut]])
 
-    in_threads(work, len(found), 1)
+    def count(piece: slice) -> None:
+        if steps is not None:
+            first, end = (len(triangles) * n // len(found) for n in (piece.start, piece.stop))
+            steps.take(end - first)
+
+    in_threads(work, len(found), 1, count)
     return np.concatenate(found) if found else np.zeros((0, 2), dtype=np.int64)
 
 

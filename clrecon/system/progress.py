@@ -37,7 +37,7 @@ class Steps:
 
     def take(self, count: int = 1) -> None:
         """Report that so many more steps are done."""
-        self.done += count
+        self.done = min(self.done + count, self.total)  # work that another device takes over is counted again
         self._progress(self._stage, self.done, self.total)
 
     def take_slice(self, piece: slice) -> None:

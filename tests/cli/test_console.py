@@ -163,6 +163,23 @@ def test_progress_moves_on_a_terminal_and_is_removed(monkeypatch: pytest.MonkeyP
     assert "\n" not in terminal.getvalue()
 
 
+@pytest.mark.parametrize(
+    ("columns", "expected"),
+    [
+        (60, "clrecon: looking through the files [####............] 25/95"),  # the bar is shorter
+        (48, "clrecon: looking through the files 25/95"),  # there is no room for one
+        (36, "clrecon: looking through the 25/95"),  # what is done stays in sight
+    ],
+)
+def test_the_count_stays_on_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch, columns: int, expected: str) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr("clrecon.cli.console._columns", lambda: columns)
+    Console().progress("scan", 25, 95)
+    assert terminal.getvalue().strip() == expected and len(expected) < columns
+
+
 def test_quiet_shows_no_progress_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)

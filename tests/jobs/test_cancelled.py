@@ -123,7 +123,8 @@ def test_a_mesh(scan: Path, device: Any, tmp_path: Path) -> None:
     found = moments(work)
     stages = {stage for stage, _, _ in found}
     assert stages == {
-        "device", "scan", "read", "mask", "build", "select", "smooth", "decimate", "compare", "measure", "write"
+        "device", "scan", "read", "mask", "build", "select", "smooth", "decimate", "compare", "measure", "distance",
+        "write",
     }  # fmt: skip
     assert ("write", 1, 2) in found  # between the files
     before = old_files(tmp_path, "a.stl", "a_100hu_001.stl", "a.json")

@@ -34,7 +34,7 @@ from clrecon.jobs.shared.outputs import (
 from clrecon.jobs.shared.report import stage_report
 from clrecon.reading import read_selected
 from clrecon.system.log import get_logger, log_warnings
-from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.progress import Progress, Steps, ignore_progress
 from clrecon.system.targets import keep_existing
 
 if TYPE_CHECKING:
@@ -292,10 +292,11 @@ def _refine_and_measure(
             part.mesh = refine_surface(part.mesh, settings, device, progress)
         watch.lap("refine")
     if measure:
-        for place, part in enumerate(parts):
-            progress("measure", place, len(parts) if len(parts) > 1 else 0)
+        steps = Steps(progress, "measure", len(parts))
+        for part in parts:
             part.quality = part.mesh.quality()
-    return judge_parts(parts, volume, settings) + judge_label_volumes(parts, settings.closed)
+            steps.take()
+    return judge_parts(parts, volume, settings, device, progress) + judge_label_volumes(parts, settings.closed)
 
 
 def _warn_of_leftovers(output: str | Path, paths: Sequence[str | Path]) -> list[str]:

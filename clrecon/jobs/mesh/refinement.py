@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part
-from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.progress import Progress, Steps, ignore_progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -52,7 +55,13 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress:
     return mesh
 
 
-def judge_parts(parts: Sequence[Part], volume: Volume, settings: MeshSettings) -> list[dict[str, Any]]:
+def judge_parts(
+    parts: Sequence[Part],
+    volume: Volume,
+    settings: MeshSettings,
+    device: Device | None = None,
+    progress: Progress = ignore_progress,
+) -> list[dict[str, Any]]:
     """Judge the parts of a job by the gates; the measures are stored in the `facts` of each.
 
     Parameters
@@ -63,7 +72,11 @@ def judge_parts(parts: Sequence[Part], volume: Volume, settings: MeshSettings) -
     volume : Volume
         The volume that they were made from.
     settings : MeshSettings
-        With `strict`, triangles that cut each other are searched, which takes longer than everything else.
+        With `strict`, triangles that cut each other are searched.
+    device : Device, optional
+        Helps with the search; without one the host finds the same.
+    progress : callable, optional
+        Called as ``progress("distance", parts done, parts)`` and ``progress("crossings", triangles done, triangles)``.
 
     Returns
     -------
@@ -76,18 +89,17 @@ def judge_parts(parts: Sequence[Part], volume: Volume, settings: MeshSettings) -
         return []
     from clrecon.mesh.compare.gates import judge_mesh
     from clrecon.mesh.compare.iso_distance import measure_iso_distance, rule_of_report
-    from clrecon.mesh.intersections import count_self_intersections
 
     gates = []
+    if settings.strict:
+        _count_crossings([part for part in parts if part.quality is not None], device, progress)
+    steps = Steps(progress, "distance", len(parts))
     for part in parts:
         mesh, refinement = part.mesh, part.mesh.report.get("refinement")
         iso_distance = None
         if part.quality is not None:
             rule = None if part.surface.label is not None else rule_of_report(mesh.report)
             iso_distance = None if rule is None else measure_iso_distance(mesh, volume, rule)
-            if settings.strict:
-                crossing = count_self_intersections(mesh.vertices, mesh.triangles)
-                part.quality = part.quality.changed(self_intersections=crossing)
         found = judge_mesh(
             part.quality,
             closed=settings.closed,
@@ -98,7 +110,34 @@ def judge_parts(parts: Sequence[Part], volume: Volume, settings: MeshSettings) -
         )
         part.facts |= {"iso_distance": iso_distance, "refinement": refinement}
         gates += [{"mesh": part.name or None, **gate} for gate in found]
+        steps.take()
     return gates
+
+
+def _count_crossings(parts: Sequence[Part], device: Device | None, progress: Progress) -> None:
+    """Store in the quality of each part how many pairs of its triangles cut each other."""
+    from clrecon.mesh.intersections import find_self_intersections
+    from clrecon.opencl import work_on
+    from clrecon.operators.surface.crossings import find_crossings
+
+    steps = Steps(progress, "crossings", sum(part.mesh.triangle_count for part in parts))
+    for part in parts:
+        vertices, triangles = part.mesh.vertices, part.mesh.triangles
+
+        def look(
+            current: Device,
+            _: list[str],
+            vertices: NDArray[np.floating] = vertices,
+            triangles: NDArray[np.uint32] = triangles,
+        ) -> NDArray[np.int64]:
+            return find_crossings(current, vertices, triangles, steps=steps)
+
+        if device is None:
+            found = find_self_intersections(vertices, triangles, steps=steps)
+        else:
+            found = work_on(device, look)
+        assert part.quality is not None
+        part.quality = part.quality.changed(self_intersections=len(found))
 
 
 def describe_purposes(parts: Sequence[Part]) -> list[str]:
