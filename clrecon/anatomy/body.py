@@ -24,7 +24,7 @@ from clrecon.geometry.volume import AIR_HU, Volume
 from clrecon.system.pieces import in_threads
 from clrecon.system.progress import Progress, Steps
 
-__all__ = ["find_body", "find_unmeasured", "mask_field_of_view", "remove_table"]
+__all__ = ["BODY_STEPS", "find_body", "find_unmeasured", "mask_field_of_view", "remove_table"]
 
 TISSUE_HU = -300.0
 """Cells above this are tissue: the value lies between that of blankets or foam and that of fat."""
@@ -192,8 +192,15 @@ def _air_level(volume: Volume, outside: Callable[[int], Mask]) -> Any:
     return dtype.type(AIR_HU if dtype.kind == "f" else max(AIR_HU, np.iinfo(dtype).min))
 
 
-def find_body(volume: Volume) -> tuple[Mask, tuple[int, int, int]]:
+def find_body(volume: Volume, *, steps: Steps | None = None) -> tuple[Mask, tuple[int, int, int]]:
     """Find the cells of the patient's body, with its margin.
+
+    Parameters
+    ----------
+    volume : Volume
+        A scan in HU.
+    steps : Steps, optional
+        Counts the slices of `count_cells` and `BODY_STEPS`.
 
     Returns
     -------
@@ -207,8 +214,9 @@ def find_body(volume: Volume) -> tuple[Mask, tuple[int, int, int]]:
     RefusedInputError
         Nothing is thick and dense enough, and there is no bone.
     """
-    cells = measure_cells(volume)
-    return _find_body(cells, Steps(None, "mask", BODY_STEPS))[0], cells.step
+    steps = steps or Steps(None, "mask", count_cells(volume)[0] + BODY_STEPS)
+    cells = measure_cells(volume, steps.take_slice)
+    return _find_body(cells, steps)[0], cells.step
 
 
 def _find_body(cells: Cells, steps: Steps) -> tuple[Mask, DensePieces]:
@@ -263,9 +271,9 @@ def _thick_parts(tissue: Mask, across: float) -> Mask:
     if count == 0:
         return np.zeros_like(tissue)
     sizes = np.bincount(pieces.ravel(), minlength=count + 1)[1:]
-    thick = np.unique(pieces[grow(core, -(THICK_MM - OPENING_MM) / across)])
     kept = np.zeros(count + 1, dtype=bool)
-    kept[thick] = kept[1 + int(sizes.argmax())] = True
+    kept[pieces[grow(core, -(THICK_MM - OPENING_MM) / across)]] = True
+    kept[1 + int(sizes.argmax())] = True
     kept[0] = False
     return grow(kept[pieces], OPENING_MM / across) & tissue
 
@@ -297,7 +305,7 @@ def _find_cavities(cells: NDArray[np.float32], tissue: Mask, thick: Mask, across
     foam &= np.bincount(regions[cells < FOAM_HU], minlength=count + 1) > 0.5 * size
     foam[0] = False
     if foam.any():
-        foam[np.unique(regions[grow(foam[regions], -FOAM_MM / across)])] = False
+        foam[regions[grow(foam[regions], -FOAM_MM / across)]] = False
     kept = np.where(is_lung, thick_wall > LUNG_WALL, ~is_open & (small | (thick_wall > AIR_WALL)))
     kept &= ~foam
     kept[0] = False
@@ -340,7 +348,7 @@ def _thin_parts(tissue: Mask, body: Mask, cell_mm: tuple[float, float, float]) -
     if count == 0:
         return np.zeros_like(body)
     hangs = np.zeros(count + 1, dtype=bool)
-    hangs[np.unique(pieces[near])] = True
+    hangs[pieces[near]] = True
     for number, box in enumerate(ndimage.find_objects(pieces), start=1):
         extent = [(part.stop - part.start) * length for part, length in zip(box, cell_mm[::-1], strict=True)]
         hangs[number] &= math.hypot(*extent) < LONG_MM

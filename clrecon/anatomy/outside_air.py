@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.anatomy.body import MARGIN_MM, TISSUE_HU, find_body, find_unmeasured
+from clrecon.anatomy.body import BODY_STEPS, MARGIN_MM, TISSUE_HU, find_body, find_unmeasured
+from clrecon.anatomy.body_cells import count_cells
 from clrecon.errors import NoSurfaceError, RefusedInputError
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.volume import AIR_HU, Volume
+from clrecon.system.progress import Progress, Steps
 from clrecon.system.wording import name_parameter
 
 __all__ = ["leave_outside_air"]
@@ -30,8 +32,11 @@ DEEP_MM = 5.0
 OPEN_MM = 12.0
 """Slices in which an airway is open (parted lips) get the outline of the slices above and below, up to this height."""
 
+OWN_STEPS = 6
+"""Steps after the search for the body, as progress counts them."""
 
-def leave_outside_air(volume: Volume, levels: Sequence[float]) -> Volume:
+
+def leave_outside_air(volume: Volume, levels: Sequence[float], *, progress: Progress | None = None) -> Volume:
     """Raise the air around the patient above the iso values, so that no surface of air includes it.
 
     Parameters
@@ -40,6 +45,8 @@ def leave_outside_air(volume: Volume, levels: Sequence[float]) -> Volume:
         A scan in HU.
     levels : sequence of float
         Iso values, HU.  What is denser than -300 HU is never left out.
+    progress : callable, optional
+        Called as ``progress("mask", steps done, steps)``.
 
     Returns
     -------
@@ -57,27 +64,33 @@ def leave_outside_air(volume: Volume, levels: Sequence[float]) -> Volume:
         All voxels below the levels are outside.
     """
     level = min(max(levels), TISSUE_HU)
+    steps = Steps(progress, "mask", count_cells(volume)[0] + BODY_STEPS + OWN_STEPS)
     try:
-        body, step = find_body(volume)
+        body, step = find_body(volume, steps=steps)
     except RefusedInputError as error:
         way_out = f"{name_parameter('keep_outside', True)} takes all"
         raise RefusedInputError(f"{error}: what is outside of it is not known ({way_out})") from None
     body = _close_along_k(body, int(OPEN_MM / (2.0 * step[2] * volume.spacing[2])))
     across = math.sqrt(step[0] * volume.spacing[0] * step[1] * volume.spacing[1])
     unmeasured = find_unmeasured(volume.voxels)
+    steps.take()
     # A lung that is cut by the circle of the reconstruction reaches up to it: unmeasured voxels must not shrink the
     # body.
     inner = _shrink(body | unmeasured[:: step[2], :: step[1], :: step[0]], (MARGIN_MM + SKIN_MM) / across)
     deep = _to_voxels(_shrink(body, (MARGIN_MM + SKIN_MM + DEEP_MM) / across, border=False), step, volume)
     within = _to_voxels(inner, step, volume)
+    steps.take()
 
     air = np.empty(volume.voxels.shape, dtype=bool)
     for k, layer in enumerate(volume.voxels):
         np.less(layer, level, out=air[k])
         volume.release_slices(k, k + 1)
+    steps.take()
     kept = _find_cavities(air, within & ~unmeasured, deep)
+    steps.take()
     outside = air & ~kept
     opening = _touching_mm2(kept, outside & ~unmeasured, volume)
+    steps.take()
 
     filled = _value_above(max(levels), volume.voxels.dtype)
     voxels = np.array(volume.voxels)
@@ -89,6 +102,7 @@ def leave_outside_air(volume: Volume, levels: Sequence[float]) -> Volume:
             f" ({name_parameter('keep_outside', True)} takes them)"
         )
     changed = volume.with_voxels(voxels)
+    steps.take()
     facts = {
         "left_out_ml": round(left_out_ml, 3),
         "kept_ml": round(kept_ml, 3),
@@ -105,12 +119,12 @@ def _find_cavities(air: Mask, within: Mask, deep: Mask) -> Mask:
 
     pieces, count = ndimage.label(air & within)
     keep = np.zeros(count + 1, dtype=bool)
-    keep[np.unique(pieces[deep])] = True
+    keep[pieces[deep]] = True
     joined = np.zeros(count + 1, dtype=bool)
     outside = air & ~within
     for low, high in _neighbours():
-        joined[np.unique(pieces[low][outside[high]])] = True
-        joined[np.unique(pieces[high][outside[low]])] = True
+        joined[pieces[low][outside[high]]] = True
+        joined[pieces[high][outside[low]]] = True
     keep |= ~joined
     keep[0] = False
     return np.asarray(keep[pieces])

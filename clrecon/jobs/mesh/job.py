@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import extract_label_surfaces, judge_label_volumes, name_label_files, open_labels
 from clrecon.jobs.mesh.levels import choose_level
-from clrecon.jobs.mesh.parts import check_levels, extract_surfaces, first_names, select_parts
+from clrecon.jobs.mesh.parts import SELECT_STEPS, check_levels, extract_surfaces, first_names, select_parts
 from clrecon.jobs.mesh.prepare import mask_parts, narrow_volume, prepare_surfaces
 from clrecon.jobs.mesh.refinement import describe_purposes, judge_parts, refine_surface, warn_of_gates
 from clrecon.jobs.mesh.report import MeshReport, describe_job, describe_part
@@ -268,13 +268,12 @@ def _select(
     progress: Progress,
 ) -> list[Part]:
     """Select the components of each surface that are written."""
-    if settings.selects:
-        progress("select", 0, 0)
-    return [
-        part
-        for surface, mesh in zip(surfaces, extracted, strict=True)
-        for part in select_parts(surface, mesh, settings, device, volume)
-    ]
+    steps = Steps(progress if settings.selects else None, "select", SELECT_STEPS * len(surfaces))
+    parts: list[Part] = []
+    for place, (surface, mesh) in enumerate(zip(surfaces, extracted, strict=True), start=1):
+        parts += select_parts(surface, mesh, settings, device, volume, steps)
+        steps.take(SELECT_STEPS * place - steps.done)
+    return parts
 
 
 def _refine_and_measure(

@@ -12,7 +12,7 @@ from clrecon.jobs.mesh.methods import extract_one
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface
 from clrecon.jobs.shared.outputs import MOST_FILES
-from clrecon.system.progress import Progress
+from clrecon.system.progress import Progress, Steps
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
@@ -22,11 +22,15 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
 
 __all__ = [
+    "SELECT_STEPS",
     "check_levels",
     "extract_surfaces",
     "first_names",
     "select_parts",
 ]
+
+SELECT_STEPS = 4
+"""Steps of the selection from a surface, as progress counts them: pieces, components, bone, and what is kept."""
 
 
 def check_levels(volume: Volume, surfaces: Sequence[Surface]) -> None:
@@ -84,8 +88,12 @@ def extract_surfaces(
     )
 
 
-def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device, volume: Volume) -> list[Part]:
+def select_parts(
+    surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device, volume: Volume, steps: Steps
+) -> list[Part]:
     """Keep the components that the settings ask for, and measure what the purpose of the mesh needs.
+
+    `steps` counts `SELECT_STEPS`, or fewer.
 
     Raises
     ------
@@ -93,18 +101,21 @@ def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: D
         As `_select_parts`.
     """
     if not settings.is_for_print:
-        return _select_parts(surface, mesh, settings, device, volume)
+        return _select_parts(surface, mesh, settings, device, volume, steps)
     from clrecon.jobs.mesh.print_facts import measure_pieces
 
     found = measure_pieces(mesh.vertices, mesh.triangles)
-    parts = _select_parts(surface, mesh, settings, device, volume)
+    steps.take()
+    parts = _select_parts(surface, mesh, settings, device, volume, steps)
     each = [measure_pieces(part.mesh.vertices, part.mesh.triangles) for part in parts]
     for part in parts:
         part.pieces = found, {name: sum(kept[name] for kept in each) for name in found}
     return parts
 
 
-def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device, volume: Volume) -> list[Part]:
+def _select_parts(
+    surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device, volume: Volume, steps: Steps
+) -> list[Part]:
     """Keep the components that the settings ask for, together or one by one.
 
     Raises
@@ -128,6 +139,7 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
         labelled = label_components(device, mesh.triangles, mesh.vertex_count, memory=settings.memory)
     except DeviceFailedError as error:  # the result is the same, it only takes longer
         mesh.report.setdefault("warnings", []).append(f"{error}: they were found without it")
+    steps.take()
     among = None
     if settings.keep == "bone":
         labelled = labelled or find_labels(mesh.triangles, mesh.vertex_count)
@@ -140,6 +152,7 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
             other = mesh.triangles[~among[labelled[1][mesh.triangles[:, 0]]]]
             no_bone = measure_pieces(mesh.vertices, other)
             mesh.report.update(not_bone=no_bone["pieces"], not_bone_ml=no_bone["pieces_ml"])
+    steps.take()
     try:
         if not settings.split:
             kept = select_components(mesh, *limits, seeds=seeds, labelled=labelled, among=among)

@@ -110,9 +110,9 @@ def leave_outside(volume: Volume, settings: MeshSettings, progress: Progress) ->
     from clrecon.anatomy.outside_air import leave_outside_air
     from clrecon.geometry.certificate import amend
 
-    progress("mask", 0, 0)
     warnings = list(volume.report.get("warnings", ()))
-    volume = leave_outside_air(volume, [level for level in settings.levels if not isinstance(level, tuple)])
+    levels = [level for level in settings.levels if not isinstance(level, tuple)]
+    volume = leave_outside_air(volume, levels, progress=progress)
     facts = volume.report["outside_air"]
     warnings.append(
         f"air outside of the body was left out: {facts['left_out_ml']:,.0f} ml, {facts['kept_ml']:,.1f} ml within it"

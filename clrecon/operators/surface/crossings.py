@@ -96,7 +96,8 @@ def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> Cro
     """
     scaled = np.ldexp(vertices, 11 - int(np.frexp(np.abs(vertices).max())[1]))
     low, high = _find_boxes(scaled, triangles)
-    longest = LONGEST * (high - low).max(axis=1).astype(np.float64)
+    box = (high - low).T
+    longest = LONGEST * np.maximum(np.maximum(box[0], box[1]), box[2]).astype(np.float64)
     origin, beyond = low.min(axis=0).astype(np.float64), low.max(axis=0).astype(np.float64)
     edge = max(1.0, float(np.median(longest[:: max(1, len(longest) // 10_000)])))
     while np.prod(np.floor((beyond - origin)[1:] / edge) + 1.0) > MOST_ROWS:
@@ -106,15 +107,17 @@ def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> Cro
     # An edge rounded to float32 is far nearer to the edge than the longest box.
     size = (np.floor((beyond - origin)[1:] / edges[:, None].astype(np.float64)) + 1.0).astype(np.int64)  # y, z
     first_row = np.concatenate([[0], np.cumsum(size.prod(axis=1))])
-    row = first_row[level]
-    for axis, step in ((1, np.ones_like(level)), (2, size[level, 0])):
-        row += step * ((low[:, axis] - origin[axis]) / edges[level].astype(np.float64)).astype(np.int64)
+    row = first_row.take(level)
+    width = edges.astype(np.float64).take(level)
+    row += ((low[:, 1] - origin[1]) / width).astype(np.int64)
+    row += size[:, 0].take(level) * ((low[:, 2] - origin[2]) / width).astype(np.int64)
     bits = np.ascontiguousarray(low[:, 0]).view(np.int32)
     along = np.where(bits < 0, bits ^ 0x7FFFFFFF, bits).astype(np.int64) + (1 << 31)  # in the order of the numbers
-    order = np.argsort(row << 32 | along, kind="stable")
+    order = np.argsort(row << 32 | along)
     starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=first_row[-1]))]).astype(np.uint32)
     levels = np.column_stack([first_row[:-1], size, starts[first_row[1:]]]).astype(np.uint32)
-    return CrossingPlan(scaled, order, triangles[order], low[order], high[order], starts, levels, edges)
+    low, high = low.take(order, axis=0), high.take(order, axis=0)
+    return CrossingPlan(scaled, order, triangles.take(order, axis=0), low, high, starts, levels, edges)
 
 
 def _find_boxes(vertices: Float32Array, triangles: NDArray[np.uint32]) -> tuple[Float32Array, Float32Array]:
