@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from clrecon.mesh.connectivity import (
     Edges,
+    count_duplicate_faces,
     find_edges,
     find_faces_back_to_back,
     find_split_vertices,
@@ -71,15 +72,20 @@ def find_faults_beside(faces: NDArray[np.uint32], new: NDArray[np.bool_]) -> Int
     touched = np.zeros(len(new), dtype=bool)
     touched[faces[any_corner(new, faces)]] = True
     # With their neighbours: the fans around the touched vertices and the faces along their edges are complete.
-    numbers, number = np.unique(faces[any_corner(touched, faces)], return_inverse=True)
-    local: NDArray[np.uint32] = number.reshape(-1, 3).astype(np.uint32)
+    around = faces[any_corner(touched, faces)]
+    used = np.zeros(len(new), dtype=bool)
+    used[around] = True
+    numbers = np.flatnonzero(used)
+    number = np.empty(len(new), dtype=np.uint32)
+    number[numbers] = np.arange(len(numbers), dtype=np.uint32)
+    local = number[around]
     if len(local) == 0:
         return np.zeros(0, dtype=np.int64)
     edges = find_edges(local, len(numbers))
     faults = _find_ridges(local, edges)
-    ordered = np.sort(local, axis=1)
-    _, first, uses = np.unique(ordered, axis=0, return_index=True, return_counts=True)
-    faults.append(local[first[uses > 1]].reshape(-1))
+    if count_duplicate_faces(local, len(numbers)):
+        _, first, uses = np.unique(np.sort(local, axis=1), axis=0, return_index=True, return_counts=True)
+        faults.append(local[first[uses > 1]].reshape(-1))
     split = find_split_vertices(local, len(numbers), edges)
     split = split[touched[numbers[split]]]
     faults += [split, local[np.isin(local, split).any(axis=1)].reshape(-1) if len(split) else split]
