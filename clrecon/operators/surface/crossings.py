@@ -36,6 +36,10 @@ FEWEST = 20_000
 MOST_ROWS = 1 << 22
 """Rows of the finest level; its edge is made longer until there are no more."""
 
+FINEST = 0.97
+"""Share of the triangles that belong to the finest level.  With a half, extracted and decimated surfaces took 1.2 to
+1.5 times the time: each level is looked through by itself."""
+
 LONGEST = 1.0 / 0.998
 """Edge of a level for the longest box in it: what the kernel needs for the rounding of rows."""
 
@@ -99,7 +103,7 @@ def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> Cro
     box = (high - low).T
     longest = LONGEST * np.maximum(np.maximum(box[0], box[1]), box[2]).astype(np.float64)
     origin, beyond = low.min(axis=0).astype(np.float64), low.max(axis=0).astype(np.float64)
-    edge = max(1.0, float(np.median(longest[:: max(1, len(longest) // 10_000)])))
+    edge = max(1.0, float(np.quantile(longest[:: max(1, len(longest) // 10_000)], FINEST)))
     while np.prod(np.floor((beyond - origin)[1:] / edge) + 1.0) > MOST_ROWS:
         edge *= 1.25
     level = np.ceil(np.log2(np.maximum(longest / edge, 1.0))).astype(np.int64)
