@@ -8,6 +8,13 @@ import math
 __all__ = ["add_cropping", "parse_clip_box"]
 
 
+_RULES = """\
+Whole voxels outside of the box are left out, after
+--remove-table and --fov and before --region. Surfaces end
+there as at the ends of a scan. Of several boxes, what is in
+all of them stays."""
+
+
 def add_cropping(parser: argparse.ArgumentParser, frame: str = "of the frame of --space") -> None:
     """Declare ``--clip-box``, ``--between`` and ``--around``.
 
@@ -17,11 +24,7 @@ def add_cropping(parser: argparse.ArgumentParser, frame: str = "of the frame of 
     frame : str
         The frame of the numbers, for the help.
     """
-    group = parser.add_argument_group(
-        "crop",
-        f"what lies outside is left out, by whole voxels, in mm {frame}; after --remove-table and --fov, before"
-        " --region. Surfaces end at the crop as they do at the ends of a scan. Of several, what is in all of them.",
-    )
+    group = parser.add_argument_group(f"crop, in mm {frame}", _RULES)
     group.add_argument(
         "--clip-box",
         type=parse_clip_box,

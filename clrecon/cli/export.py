@@ -17,15 +17,18 @@ __all__ = ["add_arguments", "run"]
 
 _PARTS = ("read", "mask", "resample", "write")
 _EPILOG = """\
-Values are HU, as they were measured: int16 where they fit, else int32, and float32 for fractions. Each voxel lies where
-the scan has it: NIfTI in RAS mm, NRRD and MetaImage in LPS mm, as these formats have it. Uneven slices fit into no such
-file and are refused without --resample; so is gantry tilt in .mha. The file has the certificate of the scan, see
+Values are HU, as they were measured: int16 where they fit,
+else int32, and float32 for fractions. Each voxel lies where
+the scan has it: NIfTI in RAS mm, NRRD and MetaImage in LPS
+mm, as these formats have it. Uneven slices fit into no such
+file and are refused without --resample; so is gantry tilt
+in .mha. The file has the certificate of the scan, see
 docs/export.md.
 
 examples:
   clrecon export CT_FOLDER -o ct.nii.gz
-  clrecon export CT_FOLDER -o loin.nrrd --between -320,-80 --remove-table
-  clrecon export CT_FOLDER -o l3.mha --around 12,-80,-140,40 --resample 0.5 --report l3.json
+  clrecon export CT_FOLDER -o loin.nrrd --between -320,-80
+  clrecon export CT_FOLDER -o l3.mha --around 12,-80,-140,40 --resample 0.5
   clrecon export CT_FOLDER -o bone.nii.gz --region hu:200,"""
 
 

@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_looks(parser)
     add_camera(parser)
-    add_cropping(parser, "of the patient (LPS); where rays are cast they end exactly at the box")
+    add_cropping(parser, "of the patient (LPS)")
     add_clipping(parser)
     add_curve(parser)
     add_labels(parser)

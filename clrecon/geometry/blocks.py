@@ -52,29 +52,26 @@ def find_block(grid: Grid, origins: Float64Array, low: ArrayLike, high: ArrayLik
     """
     ni, nj, nk = grid.shape_ijk
     low, high = np.asarray(low, np.float64) - ON_EDGE_MM, np.asarray(high, np.float64) + ON_EDGE_MM
-    along_i, along_j = np.arange(ni)[:, None] * grid.affine[:3, 0], np.arange(nj)[:, None] * grid.affine[:3, 1]
-    columns, rows = np.zeros(ni, dtype=bool), np.zeros(nj, dtype=bool)
-    slices = np.zeros(nk, dtype=bool)
-    for k, origin in enumerate(origins):
-        inside = np.ones((nj, ni), dtype=bool)
-        for a in range(3):
-            place = origin[a] + _one_if_constant(along_i[:, a])[None, :] + _one_if_constant(along_j[:, a])[:, None]
-            inside &= (place >= low[a]) & (place <= high[a])
-        if inside.any():
-            slices[k] = True
-            columns |= inside.any(axis=0)
-            rows |= inside.any(axis=1)
-    if not slices.any():
+    # In each row (k, j) the voxels in the box are an interval of i: that which lies within all three pairs of sides.
+    first, last = np.zeros((nk, nj)), np.full((nk, nj), ni - 1.0)
+    for a in range(3):
+        start = origins[:, a, None] + np.arange(nj) * grid.affine[a, 1]
+        step = grid.affine[a, 0]
+        if step == 0.0:
+            last[(start < low[a]) | (start > high[a])] = -1.0
+            continue
+        ends = (low[a] - start) / step, (high[a] - start) / step
+        first = np.maximum(first, np.ceil(np.minimum(*ends)))
+        last = np.minimum(last, np.floor(np.maximum(*ends)))
+    held = first <= last
+    if not held.any():
         return None
-    ends = [np.flatnonzero(axis)[[0, -1]] for axis in (columns, rows, slices)]
-    first = tuple(max(0, int(one[0]) - margin) for one in ends)
-    end = tuple(min(n, int(one[1]) + 1 + margin) for one, n in zip(ends, (ni, nj, nk), strict=True))
-    return Block(first, end)  # type: ignore[arg-type]
-
-
-def _one_if_constant(places: Float64Array) -> Float64Array:
-    """Return one place for all where an axis does not move along a coordinate: less to add up."""
-    return places if places.any() else places[:1]
+    slices, rows = np.flatnonzero(held.any(axis=1)), np.flatnonzero(held.any(axis=0))
+    begins = first[held].min(), rows[0], slices[0]
+    ends_at = last[held].max(), rows[-1], slices[-1]
+    i0, j0, k0 = (max(0, int(one) - margin) for one in begins)
+    i1, j1, k1 = (min(n, int(one) + 1 + margin) for one, n in zip(ends_at, (ni, nj, nk), strict=True))
+    return Block((i0, j0, k0), (i1, j1, k1))
 
 
 def place_block(affine: Float64Array, origins: Float64Array, uneven: bool, block: Block) -> tuple[Any, Any]:
