@@ -16,8 +16,10 @@ from clrecon.dicom.headers.multiframe import find_data_set
 from clrecon.dicom.parse.sequences import Item, Schema, read_sequences
 from clrecon.dicom.parse.values import ValueProblem
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
+from clrecon.geometry.affine import slice_normal
 from clrecon.geometry.volume import Volume
 from clrecon.labels.contours import fill_contours
+from clrecon.labels.fine_slices import label_slices
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.names import find_number
 from clrecon.labels.overlap import Painter
@@ -70,7 +72,8 @@ def read_structures(
     """Read the ROIs of an RTSTRUCT as labels on the slices of its scan.
 
     A voxel has the label of an ROI where its centre is inside of the closed contours of its slice (even-odd: a contour
-    within another is a hole).  The label's number is the ROI's.
+    within another is a hole).  The label's number is the ROI's.  Of an uneven scan the map has thinner slices, see
+    `clrecon.labels.fine_slices`.
 
     Parameters
     ----------
@@ -85,7 +88,7 @@ def read_structures(
     Raises
     ------
     UsageError
-        There is no scan, its slices are uneven, or a wanted ROI does not exist.
+        There is no scan, its slices are too uneven, or a wanted ROI does not exist.
     RefusedInputError
         The file is corrupt, a contour lies between the slices or is not parallel to them, the ROI has another frame of
         reference than the scan, or ROIs overlap.
@@ -93,18 +96,15 @@ def read_structures(
     name = escape_text(path.name)
     if volume is None:
         raise UsageError(f"{name} is an RTSTRUCT: its contours need the scan they were drawn on, give its volume too")
-    if volume.uneven:
-        raise UsageError(
-            f"{name} is an RTSTRUCT, and the slices of the scan are uneven: contours become labels on even slices only"
-        )
+    grid = label_slices(volume)
     structures = _parse(path, name)
     names = {number: one.name for number, one in structures.items()}
     shown = {number: text or f"label_{number}" for number, text in names.items()}
     wanted = set(structures) if only is None else {find_number(label, shown, structures) for label in only}
     warnings: list[str] = []
     _check_frames(name, {number: structures[number] for number in wanted}, volume)
-    ni, nj, nk = volume.shape_ijk
-    voxels = empty_labels(name, (nk, nj, ni))
+    ni, nj, _ = volume.shape_ijk
+    voxels = empty_labels(name, (len(grid.nearest), nj, ni))
     painter = Painter(name, voxels, names, only)
     for done, number in enumerate(painter.order):
         found = _Raster(name, structures[number], shown[number], volume)
@@ -112,10 +112,12 @@ def read_structures(
             found.refuse_misplaced()
             warnings += found.describe()
         for k, contours in sorted(found.slices.items()):
-            painter.paint(k, number, fill_contours(contours, (nj, ni)))
+            mask = fill_contours(contours, (nj, ni))
+            for place in np.flatnonzero(grid.nearest == k):
+                painter.paint(int(place), number, mask)
         progress("read", done + 1, len(painter.order))
     frame = volume.report.get("frame_of_reference_hash")
-    return painter.finish(volume.affine, frame_of_reference_hash=frame, warnings=warnings)
+    return painter.finish(grid.affine, frame_of_reference_hash=frame, warnings=warnings)
 
 
 def _check_frames(name: str, structures: dict[int, _Structure], volume: Volume) -> None:
@@ -150,20 +152,20 @@ class _Raster:
         self.slices: dict[int, list[NDArray[np.float64]]] = {}
         self._beyond = self._misplaced = 0
         self._off_mm = 0.0
-        normal_mm = abs(float(np.linalg.det(volume.affine[:3, :3]))) / float(
-            np.linalg.norm(np.cross(volume.affine[:3, 0], volume.affine[:3, 1]))
-        )
+        normal = slice_normal(volume.affine)
+        heights = volume.slice_origins() @ normal
         for value, count in zip(structure.contours, structure.counts, strict=True):
-            ijk = volume.lps_to_ijk(_points_of(value, count, file, self._shown))
-            k = float(np.rint(ijk[:, 2].mean()))
-            if not 0 <= k < volume.shape_ijk[2]:
+            points = _points_of(value, count, file, self._shown)
+            ijk = volume.lps_to_ijk(points)
+            k = int(np.rint(ijk[:, 2].mean()))
+            if not 0 <= k < len(heights):
                 self._beyond += 1
                 continue
-            off = float(np.abs(ijk[:, 2] - k).max()) * normal_mm
+            off = float(np.abs(points @ normal - heights[k]).max())
             if off > ON_SLICE_MM:
                 self._misplaced += 1
                 self._off_mm = max(self._off_mm, off)
-            self.slices.setdefault(int(k), []).append(ijk[:, :2])
+            self.slices.setdefault(k, []).append(ijk[:, :2])
 
     def refuse_misplaced(self) -> None:
         """Refuse an ROI whose contours do not lie on the slices.

@@ -16,6 +16,7 @@ from clrecon.dicom import read_volume
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.labels.contours import fill_contours
 from clrecon.labels.resample import resample_labels
+from clrecon.labels.volumes import label_ml, slice_voxel_ml
 
 pytestmark = pytest.mark.unit
 
@@ -163,12 +164,32 @@ def test_numbers_from_0_are_moved(volume, tmp_path):
 
 def test_scans_that_cannot_have_contours(tmp_path):
     stack = uneven()
-    plain = Volume(stack.voxels, stack.affine)
-    path = write_structures(tmp_path / "rt.dcm", {"x": [rectangle(plain, 2, (1, 1), (2, 2))]})
+    path = write_structures(tmp_path / "rt.dcm", {"x": [rectangle(stack, 2, (1, 1), (2, 2))]})
     with pytest.raises(UsageError, match="its contours need the scan"):
         read_labels(path)
-    with pytest.raises(UsageError, match="slices of the scan are uneven"):
+    with pytest.raises(UsageError, match="too uneven for contours: .* pixels off a line"):
         read_labels(path, volume=stack)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 18.0])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_each_slice_of_an_uneven_stack_has_its_own_contours(tmp_path, tilt, sign):
+    heights = np.array([0.0, 4.0, 8.0, 9.08, 16.0, 23.0])
+    affine = np.diag((0.5, 0.5, sign, 1.0))
+    table = np.column_stack([0 * heights, heights * np.tan(np.radians(tilt)), sign * heights])
+    volume = Volume(np.zeros((6, 20, 24), np.int16), affine, slice_positions=table)
+    areas = {1: ((3, 4), (9, 12)), 2: ((2, 2), (2, 2)), 3: ((5, 5), (8, 8)), 5: ((0, 0), (23, 19))}
+    rois = {"x": [rectangle(volume, k, *corners) for k, corners in areas.items()]}
+    labels = read_labels(write_structures(tmp_path / "rt.dcm", rois), volume=volume)
+    expected = np.zeros(volume.voxels.shape, int)
+    for k, ((i0, j0), (i1, j1)) in areas.items():
+        expected[k, j0 : j1 + 1, i0 : i1 + 1] = 1
+    assert np.array_equal(resample_labels(labels, volume).voxels, expected)
+    ml = float(np.count_nonzero(expected, axis=(1, 2)) @ slice_voxel_ml(volume))
+    assert label_ml(labels, 1) == pytest.approx(ml, rel=0.03)
+    between = {"x": [(CLOSED, rectangle(volume, 4, (1, 1), (3, 3))[1] + (0, 0, 2 * sign))]}
+    with pytest.raises(RefusedInputError, match=r"1 of 1 contours .* 2.00 mm off"):
+        read_labels(write_structures(tmp_path / "off.dcm", between), volume=volume)
 
 
 def test_other_objects_are_no_label_maps(volume, tmp_path):
