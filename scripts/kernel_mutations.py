@@ -245,6 +245,7 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     },
     "find_largest": {"largest": (("atomic_max(sums + LARGEST, run_cells[run])", "atomic_max(sums + LARGEST, 1u)"),)},
     "choose_largest": {"chosen": (("* parts >= sums[LARGEST])", "* parts < sums[LARGEST])"),)},
+    "choose_cells": {"run": (("popcount(run_starts[at] & upto) - 1", "popcount(run_starts[at] & upto)"),)},
     "choose_seeded": {"marks": (("seeds_here = active & (uint)(corners", "seeds_here = active & ~(uint)(corners"),)},
     "sum_components": {
         "components": (("atomic_inc(sums + COMPONENTS);", "atomic_add(sums + COMPONENTS, 2u);"),),

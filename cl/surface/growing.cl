@@ -16,11 +16,9 @@
  *   2. begin_cell_runs     each run by itself, without cells and not chosen
  *   3. join_cell_runs      runs of neighbouring rows with a mixed face between them
  *   4. find_run_roots      the smallest run of each component, and there the component's cells
- *   5. find_largest, choose_largest, choose_seeded   the components that are grown: the largest ones; those whose cells
- *                          have a corner in a mask; the host chooses others by their roots
- *   6. sum_components      how many there are, and their cells
- *   7. mark_grown          bits of the samples whose edges belong to chosen components
- *   8. count_visited       grown cells and their neighbours
+ *      (the components that are grown are chosen: cl/surface/choosing.cl)
+ *   5. mark_grown          bits of the samples whose edges belong to chosen components
+ *   6. count_visited       grown cells and their neighbours
  *
  * The grown samples.  All cells around a crossed edge are active and belong to one component, so an edge is grown or it
  * is not, and one of its cells says which: that of the sample that owns the edge, or at the far ends of the grid, where
@@ -36,6 +34,7 @@
  * count. */
 #include "include/mask_rows.h"
 #include "surface/cell_runs.h"
+#include "surface/component_sums.h"
 
 /* Parameters  mask         in   (gk, gj, words) inside mask of the whole grid
  *             row_extents  in   (gk, gj) first word of the row with a bit set, and the one after the last
@@ -100,16 +99,6 @@ __kernel void find_cell_runs(
     }
     row_runs[row] = runs;
 }
-
-/* What is summed up over all components: places in `sums`.  Of numbers of cells, which may be large, the lower 32 bits come
- * first. */
-#define COMPONENTS 0
-#define CHOSEN 1
-#define ACTIVE_CELLS 2
-#define CHOSEN_CELLS 4
-#define LARGEST 6
-#define LARGEST_LEFT_OUT 7
-#define SUMS 8
 
 /* Parameters  parents    out  (runs,) each run's own number
  *             run_cells  out  (runs,) 0
@@ -225,110 +214,6 @@ __kernel void find_run_roots(
     }
     if (cells != 0)
         atomic_add(run_cells + root, cells);
-}
-
-/* Parameters  roots      in      (runs,)
- *             run_cells  in      (runs,) at each root the cells of its component
- *             sums       in/out  (SUMS,) LARGEST: 0; then the cells of the largest component
- *             runs
- * Launch      global = runs rounded up by the host, any local */
-__kernel void find_largest(
-    __global const uint *restrict roots, __global const uint *restrict run_cells, volatile __global uint *sums,
-    const uint runs)
-{
-    const uint run = get_global_id(0);
-    if (run < runs && roots[run] == run)
-        atomic_max(sums + LARGEST, run_cells[run]);
-}
-
-/* Parameters  roots, run_cells, runs   in   as above
- *             sums       in      (SUMS,) of find_largest
- *             parts      the components with at least one of so many parts of the largest are chosen
- *             chosen     in/out  (runs,) 1 at the roots of chosen components
- * Launch      as find_largest */
-__kernel void choose_largest(
-    __global const uint *restrict roots, __global const uint *restrict run_cells, __global const uint *restrict sums,
-    __global uint *restrict chosen, const uint parts, const uint runs)
-{
-    const uint run = get_global_id(0);
-    if (run < runs && roots[run] == run && (ulong)run_cells[run] * parts >= sums[LARGEST])
-        chosen[run] = 1;
-}
-
-/* Parameters  roots, run_cells, chosen, runs   in   as above
- *             sums       in/out  (SUMS,) 0; then components, those chosen, their cells, and the most cells of one that is
- *                        not chosen
- * Launch      as find_largest */
-__kernel void sum_components(
-    __global const uint *restrict roots, __global const uint *restrict run_cells, __global const uint *restrict chosen,
-    volatile __global uint *sums, const uint runs)
-{
-    const uint run = get_global_id(0);
-    if (run >= runs || roots[run] != run)
-        return;
-    const uint cells = run_cells[run];
-    atomic_inc(sums + COMPONENTS);
-    if (atomic_add(sums + ACTIVE_CELLS, cells) > ~0u - cells)
-        atomic_inc(sums + ACTIVE_CELLS + 1);
-    if (chosen[run] == 0) {
-        atomic_max(sums + LARGEST_LEFT_OUT, cells);
-        return;
-    }
-    atomic_inc(sums + CHOSEN);
-    if (atomic_add(sums + CHOSEN_CELLS, cells) > ~0u - cells)
-        atomic_inc(sums + CHOSEN_CELLS + 1);
-}
-
-/* Parameters  mask, run_starts, word_runs, run_extents, row_offsets, roots   in   as above
- *             seeds        in   (nk, nj, voxel_words) voxels that are seeds, without a border
- *             chosen       in/out  (runs,) 1 at the roots of components, a cell of which has an enclosed corner that is a
- *                          seed
- *             enclosed_set   1 where set bits of the mask are enclosed by the surface, 0 where the others are
- *             border       layers of samples around the volume, 0 or 1
- *             voxel_words  words of a row of `seeds`
- *             gi gj gk, words   as above
- * Launch      as find_cell_runs
- * Guarantees  every component with a seed is chosen */
-__kernel void choose_seeded(
-    __global const uint *restrict mask, __global const uint *restrict run_starts,
-    __global const ushort *restrict word_runs, __global const ushort2 *restrict run_extents,
-    __global const uint *restrict row_offsets, __global const uint *restrict seeds,
-    __global const uint *restrict roots, volatile __global uint *chosen,
-    const int enclosed_set, const uint border, const uint voxel_words,
-    const uint gi, const uint gj, const uint gk, const uint words)
-{
-    const uint row = get_global_id(0);
-    if (row >= gj * gk)
-        return;
-    const uint j = row % gj, k = row / gj;
-    const ushort2 extent = run_extents[row];
-    uint run = row_offsets[row], found = 0;
-    for (uint w = extent.x; w < extent.y; ++w) {
-        cell_rows rows;
-        load_cell_rows(&rows, mask, j, k, w, gj, words);
-        const uint active = find_active_cells(rows, w, gi);
-        ulong corners = 0;
-#define CORNERS(bits, j, k) \
-        ((load_seeds(seeds, j, k, w, gj, gk, border, voxel_words) \
-            | (ulong)(w + 1 < words ? load_seeds(seeds, j, k, w + 1, gj, gk, border, voxel_words) : 0) << 32) \
-            & (enclosed_set ? (bits) : ~(bits)))
-        if (active != 0)
-            corners = CORNERS(rows.y0z0, j, k) | CORNERS(rows.y1z0, j + 1, k) | CORNERS(rows.y0z1, j, k + 1)
-                | CORNERS(rows.y1z1, j + 1, k + 1);
-#undef CORNERS
-        uint seeds_here = active & (uint)(corners | corners >> 1);
-        for (uint starts = run_starts[(size_t)row * words + w]; starts != 0; starts &= starts - 1) {
-            const uint before = (1u << lowest_bit(starts)) - 1;
-            if (found | ((seeds_here & before) != 0))
-                atomic_or(chosen + roots[run - 1], 1u);
-            seeds_here &= ~before;
-            found = 0;
-            ++run;
-        }
-        found |= seeds_here != 0;
-    }
-    if (found)
-        atomic_or(chosen + roots[run - 1], 1u);
 }
 
 /* Parameters  active_cells, run_starts, run_extents, row_offsets, roots   in   as above

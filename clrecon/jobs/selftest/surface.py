@@ -143,21 +143,30 @@ def _check_growing(device: Device) -> str:
     """Compare parts of surfaces that grow from the largest components, and from the voxels of a label."""
     worst = 0.0
     grains, at_edge = _grains()
-    for voxels, closed, marked in (
-        (noise(WIDE, "int16", 8), True, None),
-        (noise(LONG_THIN, "float32", 8), False, noise(LONG_THIN, "uint8", 40) == 38),  # whose HU are 7
-        (grains, False, None),
-        (grains, False, at_edge),
+    many = np.zeros((14, 12, 160), np.int16)
+    many[2::3, 2:9:3, 2:156:3] = 100
+    most = many > 0
+    most.reshape(-1)[np.flatnonzero(most)[::10]] = False
+    for voxels, closed, marked, by_point in (
+        (noise(WIDE, "int16", 8), True, None, False),
+        (noise(LONG_THIN, "float32", 8), False, noise(LONG_THIN, "uint8", 40) == 38, False),  # whose HU are 7
+        (grains, False, None, False),
+        (grains, False, at_edge, False),
+        (many, False, most, True),
     ):
         volume = stack(voxels, OBLIQUE)
         twin = _GrownTwin(marked)
         expected = extract_twin(volume, 6.5, closed=closed, grown=twin)
-        seeds = AUTO if marked is None else (LabelMap(marked.astype(np.uint8), volume.affine), 1)
+        seeds: Any = AUTO
+        if marked is not None:
+            seeds = LabelMap(marked.astype(np.uint8), volume.affine), 1
+        if by_point:
+            seeds = volume.ijk_to_lps(np.argwhere(most)[:, ::-1])
         mesh = extract_isosurface(volume, 6.5, device=device, closed=closed, grow_from=seeds)
         worst = max(worst, compare_mesh(volume, mesh, expected, f"a part in {voxels.dtype} voxels"))
         require_equal([mesh.report["cells"][name] for name in twin.counts], list(twin.counts.values()), "cells")
         require_equal(mesh.report["growing"]["components"], twin.components, "components")
-    return f"4 parts of surfaces: triangles and counts of cells equal, vertices within {worst:.1e} voxel"
+    return f"5 parts of surfaces: triangles and counts of cells equal, vertices within {worst:.1e} voxel"
 
 
 TRILINEAR = ("count_cells", "make_room", "emit_cell_triangles", "emit_cell_vertices")
@@ -189,7 +198,7 @@ CHECKS = (
     ),
     Check(
         "growing",
-        (*MARCHING, *GROWING, "find_largest", "choose_largest", "choose_seeded"),
+        (*MARCHING, *GROWING, "find_largest", "choose_largest", "choose_cells", "choose_seeded"),
         _check_growing,
         {"surface/cells.cl": ("GROWN",), "surface/marching_cubes.cl": ("GROWN",)},
     ),

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
+from clrecon.errors import DeviceMemoryError, NoSurfaceError
 from clrecon.opencl import (
     Device,
     Program,
@@ -22,27 +21,27 @@ from clrecon.opencl import (
     allocate,
     copy_buffer,
     download,
-    kernel_constant,
     launch,
     load_program,
-    upload,
 )
 from clrecon.operators.primitives.scan import enqueue_scan, exclusive_scan, prepare_scan
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.cells import Classified, load_cells
-from clrecon.operators.surface.nearest_cell import find_cell_near
-from clrecon.operators.surface.seeds import AUTO_SHARE, Seeds
+from clrecon.operators.surface.choosing import (
+    SUMS,
+    Components,
+    Runs,
+    Sums,
+    choose_components,
+    prepare_choosing,
+    sum_components,
+)
+from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import SampleGrid, Slab
 
 __all__ = ["Grown", "find_components", "grow", "growing_needs", "join_slabs", "prepare_growing"]
 
 MOST_RUNS = 2**31
-
-SUMS = {
-    name: kernel_constant("surface/growing.cl", name)
-    for name in ("COMPONENTS", "CHOSEN", "ACTIVE_CELLS", "CHOSEN_CELLS", "LARGEST_LEFT_OUT", "SUMS")
-}
-"""Places of what is summed up over components, and their number."""
 
 
 def prepare_growing(device: Device) -> Program:
@@ -55,6 +54,7 @@ def prepare_growing(device: Device) -> Program:
     """
     prepare_scan(device)
     load_cells(device, grown=True)
+    prepare_choosing(device)
     return load_program(device, "surface/growing.cl", {"ATOMIC_LOADS": "1"} if device.is_simulator else {})
 
 
@@ -91,7 +91,7 @@ class Grown:
 
     def report(self, device: Device, grid: SampleGrid) -> tuple[dict[str, int], dict[str, Any]]:
         """Return the numbers of cells, and what was grown and left out; the device may have to be waited for."""
-        sums = _Sums.read(device, self.sums_d)
+        sums = Sums.read(device, self.sums_d)
         visited = int(download(device, np.empty(1, np.uint64), self.visited_d)[0])
         cells = {
             "visited": visited, "grown": sums.chosen_cells, "active": sums.active_cells,
@@ -105,63 +105,6 @@ class Grown:
             "largest_left_out_cells": sums.largest_left_out,
         }
         return cells, growing
-
-
-@dataclass(frozen=True)
-class _Sums:
-    """Sums over all components, see cl/surface/growing.cl."""
-
-    components: int
-    chosen: int
-    active_cells: int
-    chosen_cells: int
-    largest_left_out: int
-
-    @classmethod
-    def read(cls, device: Device, sums_d: Any) -> _Sums:
-        sums = download(device, np.empty(SUMS["SUMS"], np.uint32), sums_d)
-
-        def cells(which: str) -> int:
-            return int(sums[SUMS[which]]) + (int(sums[SUMS[which] + 1]) << 32)
-
-        return cls(
-            int(sums[SUMS["COMPONENTS"]]), int(sums[SUMS["CHOSEN"]]), cells("ACTIVE_CELLS"), cells("CHOSEN_CELLS"),
-            int(sums[SUMS["LARGEST_LEFT_OUT"]]),
-        )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _Runs:
-    """Runs of active cells on the device."""
-
-    active_d: Any
-    starts_d: Any
-    words_d: Any
-    extents_d: Any
-    offsets_d: Any
-    total: int
-
-    @property
-    def places(self) -> dict[str, Any]:
-        """Arguments of kernels that walk along the runs of a row."""
-        return {"run_starts": self.starts_d, "run_extents": self.extents_d, "row_offsets": self.offsets_d}
-
-
-@dataclass(frozen=True)
-class _Components:
-    """Components of runs on the device: the root of each run; at roots the cells of the component, and 1 where it is
-    chosen; and sums over all of them.
-    """
-
-    roots_d: Any
-    cells_d: Any
-    chosen_d: Any
-    sums_d: Any
-
-    @property
-    def places(self) -> dict[str, Any]:
-        """Arguments of kernels that look up the components of runs."""
-        return {"roots": self.roots_d, "chosen": self.chosen_d}
 
 
 class _Search:
@@ -179,28 +122,30 @@ class _Search:
     def run(self, kernel: str, items: int, **arguments: Any) -> None:
         launch(self.device, self.program[kernel], items, stopwatch=self.stopwatch, **arguments)
 
-    def find_runs(self) -> _Runs:
+    def find_runs(self) -> Runs:
         """Find the runs of all rows."""
         bits = 4 * self.rows * self.grid.words
         active_d, starts_d, words_d = (allocate(self.device, size) for size in (bits, bits, bits // 2))
         counts_d, extents_d = allocate(self.device, 4 * self.rows), allocate(self.device, 4 * self.rows)
         self.run(
-            "find_cell_runs", self.rows, mask=self.classified.mask_d, row_extents=self.classified.row_extents_d,
-            active_cells=active_d, run_starts=starts_d, word_runs=words_d, row_runs=counts_d, run_extents=extents_d,
+            "find_cell_runs", self.rows, mask=self.classified.mask_d,
+            row_extents=self.classified.row_extents_d, active_cells=active_d, run_starts=starts_d,
+            word_runs=words_d, row_runs=counts_d, run_extents=extents_d,
             **self.sizes,
         )  # fmt: skip
         scanned = exclusive_scan(self.device, counts_d, self.rows, in_place=True, stopwatch=self.stopwatch)
         if scanned.total >= MOST_RUNS:
             raise DeviceMemoryError(f"the surface has {scanned.total:,} runs of cells: {MOST_RUNS:,} can be numbered")
-        return _Runs(active_d, starts_d, words_d, extents_d, scanned.offsets_d, scanned.total)
+        return Runs(active_d, starts_d, words_d, extents_d, scanned.offsets_d, scanned.total)
 
-    def join(self, runs: _Runs) -> _Components:
+    def join(self, runs: Runs) -> Components:
         """Join runs to components, none of which is chosen."""
         device, n = self.device, runs.total
         parents_d, cells_d, chosen_d, roots_d = (allocate(device, 4 * n) for _ in range(4))
         sums_d = allocate(device, 4 * SUMS["SUMS"])
         self.run(
-            "begin_cell_runs", n, parents=parents_d, run_cells=cells_d, chosen=chosen_d, sums=sums_d, runs=n
+            "begin_cell_runs", n, parents=parents_d, run_cells=cells_d, chosen=chosen_d, sums=sums_d,
+            runs=n,
         )  # fmt: skip
         self.run(
             "join_cell_runs", self.rows, mask=self.classified.mask_d, active_cells=runs.active_d,
@@ -210,61 +155,9 @@ class _Search:
             "find_run_roots", self.rows, active_cells=runs.active_d, parents=parents_d, roots=roots_d,
             run_cells=cells_d, **runs.places, **self.row_sizes,
         )  # fmt: skip
-        return _Components(roots_d, cells_d, chosen_d, sums_d)
+        return Components(roots_d, cells_d, chosen_d, sums_d)
 
-    def choose(self, runs: _Runs, components: _Components, seeds: Seeds) -> None:
-        """Choose the components that hold a seed."""
-        n = runs.total
-        if seeds.auto:
-            sized = {"roots": components.roots_d, "run_cells": components.cells_d, "sums": components.sums_d}
-            self.run("find_largest", n, runs=n, **sized)
-            self.run("choose_largest", n, chosen=components.chosen_d, parts=round(1 / AUTO_SHARE), runs=n, **sized)
-        one_d = upload(self.device, np.ones(1, np.uint32))
-        for point in seeds.points:
-            run = self.find_run_near(runs, point)
-            root = download(self.device, np.empty(1, np.uint32), components.roots_d, 4 * run)
-            copy_buffer(self.device, one_d, components.chosen_d, 4, 4 * int(root[0]))
-        if seeds.voxels is not None:
-            self.run(
-                "choose_seeded", self.rows, mask=self.classified.mask_d, word_runs=runs.words_d,
-                seeds=upload(self.device, seeds.voxels), enclosed_set=self.grid.rule.inside != "below",
-                border=self.grid.rule.border, voxel_words=seeds.voxels.shape[2], **runs.places, **components.places,
-                **self.sizes,
-            )  # fmt: skip
-        self.sum_up(runs, components)
-        if seeds.auto or len(seeds.points):
-            return
-        sums = _Sums.read(self.device, components.sums_d)
-        if not sums.chosen:
-            raise UsageError(
-                f"no part of the surface {self.grid.rule.describe_place()} touches {', '.join(seeds.names)}:"
-                f" {sums.components:,} components, none of them has a seed"
-            )
-
-    def sum_up(self, runs: _Runs, components: _Components) -> None:
-        """Sum up the components."""
-        self.run(
-            "sum_components", runs.total, run_cells=components.cells_d, sums=components.sums_d, runs=runs.total,
-            **components.places,
-        )  # fmt: skip
-
-    def find_run_near(self, runs: _Runs, point: NDArray[np.float64]) -> int:
-        """Return the run of the active cell nearest to a point.
-
-        Raises
-        ------
-        UsageError
-            None is within `SEED_REACH_MM`.
-        """
-        k, j, i = find_cell_near(self.device, self.grid, self.classified, point)
-        row, words = k * self.grid.shape[1] + j, self.grid.words
-        starts = download(self.device, np.empty(words, np.uint32), runs.starts_d, 4 * row * words)
-        begin, _ = download(self.device, np.empty(2, np.uint16), runs.extents_d, 4 * row)
-        offset = download(self.device, np.empty(1, np.uint32), runs.offsets_d, 4 * row)
-        bits = np.unpackbits(starts.view(np.uint8), bitorder="little")
-        return int(offset[0]) + int(bits[32 * int(begin) : i + 1].sum()) - 1
-
-    def mark(self, runs: _Runs, components: _Components) -> tuple[Any, Any, Any]:
+    def mark(self, runs: Runs, components: Components) -> tuple[Any, Any, Any]:
         """Return the grown samples of chosen components, their extents, and how many cells growing visits."""
         device = self.device
         grown_d = allocate(device, 4 * self.rows * self.grid.words)
@@ -274,7 +167,8 @@ class _Search:
             **runs.places, **components.places, **self.sizes,
         )  # fmt: skip
         self.run(
-            "count_visited", self.rows, grown=grown_d, grown_extents=extents_d, counts=counts_d, **self.sizes
+            "count_visited", self.rows, grown=grown_d, grown_extents=extents_d, counts=counts_d,
+            **self.sizes,
         )  # fmt: skip
         return grown_d, extents_d, enqueue_scan(device, counts_d, counts_d, self.rows, stopwatch=self.stopwatch)
 
@@ -328,7 +222,7 @@ def grow(resident: DeviceVolume, grid: SampleGrid, classified: Classified, seeds
     if runs.total == 0:
         raise NoSurfaceError(f"no surface {grid.rule.describe_place()} to grow")
     components = search.join(runs)
-    search.choose(runs, components, seeds)
+    choose_components(resident.device, grid, classified, runs, components, seeds, stopwatch)
     grown_d, extents_d, visited_d = search.mark(runs, components)
     return Grown(grown_d, extents_d, classified, components.sums_d, visited_d, seeds.names)
 
@@ -359,6 +253,6 @@ def find_components(
         if runs.total == 0:
             return 0, 0
         components = search.join(runs)
-        search.sum_up(runs, components)
-    sums = _Sums.read(resident.device, components.sums_d)
+        sum_components(resident.device, runs, components, stopwatch)
+    sums = Sums.read(resident.device, components.sums_d)
     return sums.components, sums.active_cells

@@ -16,6 +16,9 @@ __all__ = ["find_cell_near"]
 FARTHEST_TOLD_MM = 50.0
 """Of a seed in air the nearest cell is looked for up to here, for the message."""
 
+_NEAR_MM = 2.0
+"""Most seeds lie on the surface: it is looked for as near as this first, among few cells."""
+
 
 def find_cell_near(
     device: Device, grid: SampleGrid, classified: Classified, point: NDArray[np.float64]
@@ -35,11 +38,12 @@ def find_cell_near(
     DeviceError
         The device fails.
     """
-    found = _look(device, grid, classified, point, SEED_REACH_MM)
-    if found is None or found[1] > SEED_REACH_MM:
-        farther = _look(device, grid, classified, point, FARTHEST_TOLD_MM)
-        raise UsageError(_describe_lone(grid, point, None if farther is None else farther[1]))
-    return found[0]
+    for reach in (_NEAR_MM, SEED_REACH_MM):
+        found = _look(device, grid, classified, point, reach)
+        if found is not None and found[1] <= reach:
+            return found[0]
+    farther = _look(device, grid, classified, point, FARTHEST_TOLD_MM)
+    raise UsageError(_describe_lone(grid, point, None if farther is None else farther[1]))
 
 
 def _look(
