@@ -5,20 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange.coordinates import rounding_step
+from clrecon.mesh.base import BaseMesh
 from clrecon.mesh.connectivity import label_components
-from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.nearest import find_nearest_triangle
 from clrecon.mesh.triangles import cross_products
 from clrecon.system.pieces import CHUNK, local_origin
 from clrecon.system.wording import name_parameter
 
 __all__ = ["Labelled", "select_components", "split_components"]
+
+Own = TypeVar("Own", bound=BaseMesh)
 
 Labelled = tuple[int, NDArray[np.int64]]
 """The result of `label_components`: the number of components, and the component of each vertex."""
@@ -58,14 +61,14 @@ class _Chosen:
 
 
 def select_components(
-    mesh: Mesh,
+    mesh: Own,
     keep_largest: int | None = None,
     min_volume_ml: float | None = None,
     *,
     seeds: Sequence[Sequence[float]] = (),
     labelled: Labelled | None = None,
     among: NDArray[np.bool_] | None = None,
-) -> Mesh:
+) -> Own:
     """Keep the largest components of a surface, or those at given points.
 
     First, small components (`min_volume_ml`) are dropped, then those that are not nearest to a seed, then all but the
@@ -112,7 +115,7 @@ def select_components(
 
 
 def split_components(
-    mesh: Mesh,
+    mesh: Own,
     keep_largest: int | None = None,
     min_volume_ml: float | None = None,
     *,
@@ -120,7 +123,7 @@ def split_components(
     labelled: Labelled | None = None,
     among: NDArray[np.bool_] | None = None,
     most: int | None = None,
-) -> list[Mesh]:
+) -> list[Own]:
     """Split a surface into its components.
 
     Parameters
@@ -163,7 +166,7 @@ def split_components(
         faces = mesh.triangles[triangle_order[triangle_ends[part] : triangle_ends[part + 1]]]
         triangles = (number[faces] - vertex_ends[part]).astype(np.uint32)
         normals = None if mesh.normals is None else mesh.normals[own]
-        parts.append(Mesh(mesh.vertices[own], triangles, normals, {**mesh.report, **chosen.facts}))
+        parts.append(type(mesh)(mesh.vertices[own], triangles, normals, {**mesh.report, **chosen.facts}))
     return parts
 
 
@@ -174,7 +177,7 @@ def _group(ranks: NDArray[np.int64], count: int) -> tuple[NDArray[np.intp], NDAr
 
 
 def _choose(
-    mesh: Mesh,
+    mesh: BaseMesh,
     keep_largest: int | None,
     min_volume_ml: float | None,
     seeds: Sequence[Sequence[float]],
@@ -252,7 +255,7 @@ def _rank(areas: NDArray[np.float64], step: float) -> NDArray[np.int64]:
 
 
 def _find_at_seeds(
-    mesh: Mesh, label_of_triangle: NDArray[np.int64], keep: NDArray[np.bool_], seeds: Sequence[Sequence[float]]
+    mesh: BaseMesh, label_of_triangle: NDArray[np.int64], keep: NDArray[np.bool_], seeds: Sequence[Sequence[float]]
 ) -> tuple[NDArray[np.bool_], list[float]]:
     """Find the components of `keep` that are nearest to a seed, and the distance of each seed from its component."""
     rows = np.flatnonzero(keep[label_of_triangle])
@@ -276,7 +279,7 @@ def _find_at_seeds(
 
 
 def _measure_components(
-    mesh: Mesh, label_of_triangle: NDArray[np.int64], count: int, *, areas: bool, volumes: bool
+    mesh: BaseMesh, label_of_triangle: NDArray[np.int64], count: int, *, areas: bool, volumes: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Measure area in mm2 and enclosed volume in ml, without sign, of each component; zeros where not wanted."""
     twice_area = np.zeros(count)
@@ -303,10 +306,10 @@ def _measure_components(
     return twice_area / 2.0, np.abs(six_volumes) / 6000.0
 
 
-def _take(mesh: Mesh, keep_triangle: NDArray[np.bool_], report: dict[str, object]) -> Mesh:
+def _take(mesh: Own, keep_triangle: NDArray[np.bool_], report: dict[str, object]) -> Own:
     triangles = mesh.triangles[keep_triangle]
     keep_vertex = np.zeros(mesh.vertex_count, dtype=bool)
     keep_vertex[triangles.reshape(-1)] = True
     number = np.cumsum(keep_vertex, dtype=np.int64) - 1
     normals = None if mesh.normals is None else mesh.normals[keep_vertex]
-    return Mesh(mesh.vertices[keep_vertex], number[triangles].astype(np.uint32), normals, report)
+    return type(mesh)(mesh.vertices[keep_vertex], number[triangles].astype(np.uint32), normals, report)

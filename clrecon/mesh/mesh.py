@@ -2,56 +2,23 @@
 
 from __future__ import annotations
 
-import os
+import copy
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.exchange.content import Content, describe_facts
-from clrecon.exchange.coordinates import as_stored
-from clrecon.exchange.formats import write_mesh
-from clrecon.geometry import frame_from_lps
-from clrecon.geometry.affine import apply_affine, checked_affine, normal_matrix
-from clrecon.mesh.quality import MeshQuality, measure_quality
-from clrecon.system.messages import Message
-from clrecon.system.targets import keep_existing
+from clrecon.geometry import SPACES, frame_from_lps
+from clrecon.mesh.base import BaseMesh
+from clrecon.mesh.components import select_components, split_components
+from clrecon.mesh.quality import MeshQuality, measure_quality, measure_triangles
 
 __all__ = ["Mesh"]
 
-_MOST_VERTICES = 2**32
 
-
-def _rows_of_three(values: ArrayLike, name: str) -> NDArray[Any]:
-    array = np.asarray(values)
-    if array.size == 0 and array.ndim < 2:
-        return array.reshape(0, 3)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise UsageError(f"{name} have shape (n, 3), these have {array.shape}")
-    return array
-
-
-def _numbers(values: ArrayLike, name: str) -> NDArray[Any]:
-    array = _rows_of_three(values, name)
-    if array.dtype.kind not in "fiu":
-        raise UsageError(f"{name} are numbers, these are {array.dtype}")
-    return array
-
-
-def _as_indices(values: ArrayLike) -> NDArray[np.uint32]:
-    array = _rows_of_three(values, "triangles")
-    if array.size and array.dtype.kind not in "iu":
-        raise UsageError(f"triangles hold indices of vertices (integers), these are {array.dtype}")
-    # Only other types can hold values that uint32 cannot; arrays from a device are uint32 and need no check.
-    if array.size and array.dtype != np.uint32:
-        low, high = int(array.min()), int(array.max())
-        if low < 0 or high >= _MOST_VERTICES:
-            raise UsageError(f"triangles hold indices from {low} to {high}: they must fit 32 bits without a sign")
-    return np.ascontiguousarray(array, dtype=np.uint32)
-
-
-class Mesh(Message):
+class Mesh(BaseMesh):
     """An indexed triangle surface in the patient frame LPS, millimetres.
 
     Parameters
@@ -60,193 +27,91 @@ class Mesh(Message):
         LPS mm; kept as float32, without a copy when they are C-contiguous float32.  Others that reach 4096 mm from
         the origin, where float32 would round them by more than 2e-4 mm, are kept as float64.
     triangles : array_like, shape (m, 3)
-        Indices of vertices, counter-clockwise when seen from outside; kept as uint32.
+        Indices of vertices, from 0, counter-clockwise when seen from outside; kept as uint32.
     normals : array_like, shape (n, 3), optional
         Unit vectors at the vertices that point outward, LPS; kept as float32.
     report : dict, optional
         Facts about the origin of this mesh, without patient data: ``iso_value_hu``, ``affine_ijk_to_lps_mm``,
         ``certificate`` (the report of the volume), device, times.  The first three are written to the formats that have
         a place for them.
+    trusted : bool
+        True: indices and coordinates come from a computation that makes no wrong ones, and are not looked at.
 
     Raises
     ------
     UsageError
-        A shape or type cannot be used, or the number of normals is not that of the vertices.  Whether every index has a
-        vertex is checked by `check`, not here.
+        A shape or type cannot be used, the number of normals is not that of the vertices, a triangle refers to a vertex
+        that does not exist, or a coordinate is not finite.
     """
 
-    def __init__(
-        self,
-        vertices: ArrayLike,
-        triangles: ArrayLike,
-        normals: ArrayLike | None = None,
-        report: dict[str, Any] | None = None,
-    ):
-        self._vertices = as_stored(_numbers(vertices, "vertices"))
-        self._triangles = _as_indices(triangles)
-        self._normals = (
-            None if normals is None else np.ascontiguousarray(_numbers(normals, "normals"), dtype=np.float32)
-        )
-        if len(self._vertices) > _MOST_VERTICES:
-            raise UsageError(f"a mesh has at most {_MOST_VERTICES} vertices, this one has {len(self._vertices)}")
-        if self._normals is not None and len(self._normals) != len(self._vertices):
-            raise UsageError(f"{len(self._normals)} normals for {len(self._vertices)} vertices: one a vertex is needed")
-        self.report: dict[str, Any] = {} if report is None else report
+    @property
+    def bounds(self) -> NDArray[np.float64] | None:
+        """Lowest and highest corner of the box round the vertices, shape (2, 3), LPS mm; None without vertices."""
+        if not self.vertex_count:
+            return None
+        return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)], dtype=np.float64)
 
     @property
-    def vertices(self) -> NDArray[np.floating]:
-        """Positions in LPS mm, shape (n, 3), float32; float64 where they lie far from the origin."""
-        return self._vertices
+    def area(self) -> float:
+        """Area in mm2."""
+        return measure_triangles(self.vertices, self.triangles)[0]
 
     @property
-    def triangles(self) -> NDArray[np.uint32]:
-        """Indices of vertices, shape (m, 3), counter-clockwise when seen from outside."""
-        return self._triangles
+    def volume(self) -> float:
+        """Enclosed volume in mm3 (1000 mm3 are 1 ml), signed: cavities count negative, as does a mesh inside out.
 
-    @property
-    def normals(self) -> NDArray[np.float32] | None:
-        """Outward unit vectors at the vertices, shape (n, 3), or None."""
-        return self._normals
-
-    @property
-    def vertex_count(self) -> int:
-        """Number of vertices, n."""
-        return len(self._vertices)
-
-    @property
-    def triangle_count(self) -> int:
-        """Number of triangles, m."""
-        return len(self._triangles)
-
-    def check(self) -> None:
-        """Check every number: indices have a vertex, coordinates and normals are finite.
-
-        Raises
-        ------
-        UsageError
-            A number is wrong; the message names the first one.
+        It means nothing where the mesh is open: see `quality`.
         """
-        if self.triangle_count and int(self._triangles.max()) >= self.vertex_count:
-            raise UsageError(
-                f"a triangle refers to vertex {int(self._triangles.max())}, the mesh has {self.vertex_count} vertices"
-            )
-        for name, values in (("vertex", self._vertices), ("normal", self._normals)):
-            if values is not None and not np.isfinite(values).all():
-                row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
-                raise UsageError(f"{name} {row} is not finite: {values[row].tolist()}")
-
-    def in_space(self, space: str) -> tuple[NDArray[np.floating], NDArray[np.float32] | None]:
-        """Return vertices and normals in another patient frame; the mesh itself is always LPS.
-
-        Parameters
-        ----------
-        space : {"lps", "ras"}
-            RAS negates x and y, which is a half turn: the winding of the triangles stays.
-
-        Returns
-        -------
-        vertices : ndarray, shape (n, 3), mm, of the type of `vertices`
-        normals : ndarray, shape (n, 3), float32, or None
-        """
-        signs = np.diag(frame_from_lps(space)).astype(np.float32)
-        if space.lower() == "lps":
-            return self._vertices, self._normals
-        # Adding 0 turns -0 into 0; text formats would show -0.
-        vertices = self._vertices * signs + np.float32(0)
-        return vertices, None if self._normals is None else self._normals * signs + np.float32(0)
-
-    def transformed(self, matrix: ArrayLike) -> Mesh:
-        """Return the mesh moved, turned or scaled by an affine; this one stays as it is.
-
-        Parameters
-        ----------
-        matrix : array_like, shape (4, 4)
-            LPS mm to LPS mm; the last row is (0, 0, 0, 1).  A mirror is allowed: triangles are turned round, so that
-            they stay counter-clockwise when seen from outside.
-
-        Returns
-        -------
-        Mesh
-            Normals go through the inverse transpose.  The report has ``moved_by``, the matrix from the place where the
-            scan put the mesh, and no longer the affine and the certificate of the scan: they say nothing of its new
-            place.
-
-        Raises
-        ------
-        UsageError
-            `matrix` is no affine, or singular.
-        """
-        checked = checked_affine(matrix)
-        normals = self._normals
-        if normals is not None and len(normals):
-            directions = normals @ normal_matrix(checked).T
-            lengths = np.linalg.norm(directions, axis=1, keepdims=True)
-            normals = np.divide(directions, lengths, out=directions, where=lengths > 0)
-        mirrored = np.linalg.det(checked[:3, :3]) < 0
-        scan = ("affine_ijk_to_lps_mm", "certificate", "certificate_lines")
-        report = {name: value for name, value in self.report.items() if name not in scan}
-        before = self.report.get("moved_by")
-        report["moved_by"] = (checked if before is None else checked @ np.array(before)).tolist()
-        triangles = self._triangles[:, ::-1] if mirrored else self._triangles
-        return Mesh(apply_affine(checked, self._vertices), triangles, normals, report)
-
-    def describe(self, space: str, *, keep_ids: bool = False) -> Content:
-        """Return the contents of a file of the mesh in `space`; nothing else of `report` is ever written.
-
-        Only with `keep_ids` they have the hash of the frame of reference.
-        """
-        vertices, normals = self.in_space(space)
-        facts = describe_facts(self.report, space, keep_ids=keep_ids)
-        name, color = self.report.get("part_name"), self.report.get("color")
-        return Content(
-            vertices=vertices,
-            triangles=self.triangles,
-            normals=normals,
-            name=None if name is None else str(name),
-            color=None if color is None else (float(color[0]), float(color[1]), float(color[2])),
-            **facts,
-        )
+        return measure_triangles(self.vertices, self.triangles)[1]
 
     def quality(self) -> MeshQuality:
         """Measure the mesh: closedness, size and faults."""
-        return measure_quality(self._vertices, self._triangles)
+        return measure_quality(self.vertices, self.triangles)
 
-    def save(
-        self, path: str | os.PathLike[str], space: str = "lps", *, no_clobber: bool = False, keep_ids: bool = False
-    ) -> int:
-        """Write the mesh to a file; its extension gives the format.
+    def components(self) -> list[Mesh]:
+        """Return the parts that share no vertex, each a mesh, the largest area first."""
+        return self.split()
 
-        STL (binary), PLY (binary), OBJ, GLB, VTP and 3MF.  The file is either complete or absent, and an older file of
-        that name is replaced in one step.  It holds no patient data, date or path.
+    def split(
+        self,
+        keep_largest: int | None = None,
+        min_volume_ml: float | None = None,
+        *,
+        seeds: Sequence[Sequence[float]] = (),
+    ) -> list[Mesh]:
+        """Return the parts that share no vertex as meshes, the largest area first, or some of them.
 
         Parameters
         ----------
-        path : str or path
-            ``.stl``, ``.ply``, ``.obj``, ``.glb``, ``.vtp`` or ``.3mf``, upper or lower case.
-        space : {"lps", "ras"}
-            Patient frame of the coordinates; the file names it.  Units are mm; a node matrix in GLB maps them to the
-            metres, Y up, of glTF.  STL holds only float32, the other formats keep float64 vertices.
-        no_clobber : bool
-            True: a file of that name stays and is an `OutputError`.
-        keep_ids : bool
-            True: the comments hold the hash of the frame of reference, by which files of one scan are told.
+        keep_largest : int, optional
+            This number of parts, those of largest area.
+        min_volume_ml : float, optional
+            Parts that enclose at least this volume, regardless of sign: the wall of a cavity is a part of its own.
+        seeds : sequence of (x, y, z)
+            Parts whose surface lies nearest to one of these points, LPS mm.
 
-        Returns
-        -------
-        int
-            Size of the file in bytes.
+        Raises
+        ------
+        UsageError, NoSurfaceError
+            See `clrecon.mesh.select_components`.
+        """
+        return split_components(self, keep_largest, min_volume_ml, seeds=seeds)
+
+    def keep_largest(self, count: int = 1) -> Mesh:
+        """Return the mesh with its `count` parts of largest area alone.
+
+        The walls of cavities are parts of their own, so with one part cavities are filled.
 
         Raises
         ------
         UsageError
-            Unknown extension or space, or the mesh fails `check`.
+            `count` is below 1.
         NoSurfaceError
-            The mesh has no triangle.
-        OutputError
-            The file cannot be written; an older one of that name is intact.
+            The mesh is empty.
         """
-        with keep_existing(no_clobber):
-            return write_mesh(self, path, space, keep_ids=keep_ids)
+        own = copy.copy(self)
+        own.report = dict(self.report)
+        return select_components(own, count)
 
     def to_pyvista(self) -> Any:
         """Return the mesh as ``pyvista.PolyData`` in LPS mm, sharing the memory of vertices and normals.
@@ -264,6 +129,112 @@ class Mesh(Message):
         self.check()
         return wrap_polydata(self._vertices, self._triangles, self._normals)
 
+    @classmethod
+    def from_pyvista(cls, polydata: Any, space: str | None = None) -> Mesh:
+        """Make a mesh of a ``pyvista.PolyData``; polygons and strips become triangles.
+
+        Parameters
+        ----------
+        polydata : pyvista.PolyData or vtkPolyData
+            In mm.  Its point normals, if it has any that are named ``Normals``, are taken over.
+        space : {"lps", "ras"}, optional
+            Patient frame of the points; None: that of the field array ``SPACE``, which `to_pyvista` and 3D Slicer
+            write, else LPS.
+
+        Raises
+        ------
+        UsageError
+            It is no PolyData, has no faces, or a number that a mesh cannot have; or `space` is not that of the array.
+        """
+        from clrecon.mesh.vtk import unwrap_polydata
+
+        vertices, triangles, normals, named = unwrap_polydata(polydata)
+        return cls._of_others(vertices, triangles, normals, _choose_space(space, named, "the PolyData"))
+
+    def to_trimesh(self) -> Any:
+        """Return the mesh as ``trimesh.Trimesh`` in LPS mm, its ``units`` "mm" and ``metadata["SPACE"]`` "LPS".
+
+        Vertices and triangles keep their order and number (``process=False``).
+
+        Raises
+        ------
+        UsageError
+            trimesh is not installed, or the mesh fails `check`.
+        """
+        try:
+            import trimesh
+        except ImportError as error:
+            raise UsageError("trimesh is not installed: pip install trimesh") from error
+        self.check()
+        made = trimesh.Trimesh(
+            np.array(self.vertices, dtype=np.float64),
+            self.triangles.astype(np.int64),
+            vertex_normals=None if self.normals is None else self.normals.astype(np.float64),
+            metadata={"SPACE": "LPS", "UNIT": "mm"},
+            process=False,
+        )
+        made.units = "mm"
+        return made
+
+    @classmethod
+    def from_trimesh(cls, mesh: Any, space: str | None = None) -> Mesh:
+        """Make a mesh of a ``trimesh.Trimesh``.
+
+        Parameters
+        ----------
+        mesh : trimesh.Trimesh
+            In mm.  Its normals are not taken over: trimesh makes them of the triangles when they are asked for.
+        space : {"lps", "ras"}, optional
+            Patient frame of the vertices; None: that of ``metadata["SPACE"]``, which `to_trimesh` sets, else LPS.
+
+        Raises
+        ------
+        UsageError
+            It is no Trimesh, its ``units`` are not mm, or it has a number that a mesh cannot have; or `space` is not
+            that of the metadata.
+        """
+        vertices, faces = getattr(mesh, "vertices", None), getattr(mesh, "faces", None)
+        if vertices is None or faces is None or hasattr(mesh, "n_points"):
+            raise UsageError(
+                f"a {type(mesh).__name__} is no trimesh.Trimesh: of a Scene take scene.to_geometry() first"
+            )
+        units = getattr(mesh, "units", None)
+        if units not in (None, "mm", "millimeter", "millimeters"):
+            raise UsageError(f"the mesh is in {units}, clrecon's are in mm: call its convert_units('mm') first")
+        named = (getattr(mesh, "metadata", None) or {}).get("SPACE")
+        return cls._of_others(np.asarray(vertices), np.asarray(faces), None, _choose_space(space, named, "the Trimesh"))
+
+    @classmethod
+    def _of_others(
+        cls, vertices: NDArray[Any], triangles: NDArray[Any], normals: NDArray[Any] | None, space: str
+    ) -> Mesh:
+        """Make a mesh of arrays in `space`."""
+        if space != "LPS":
+            signs = np.diag(frame_from_lps(space))
+            vertices = vertices * signs.astype(vertices.dtype)
+            normals = None if normals is None else normals * signs.astype(normals.dtype)
+        return cls(vertices, triangles, normals)
+
     def __repr__(self) -> str:
-        normals = "" if self._normals is None else ", with normals"
+        normals = "" if self.normals is None else ", with normals"
         return f"Mesh({self.vertex_count} vertices, {self.triangle_count} triangles{normals}, LPS mm)"
+
+
+def _choose_space(asked: str | None, named: object, what: str) -> str:
+    """Return ``LPS`` or ``RAS``.
+
+    Raises
+    ------
+    UsageError
+        The frame that was asked for is unknown, or another than that which the mesh names; or that is unknown.
+    """
+    if asked is not None:
+        frame_from_lps(asked)
+    if named is None:
+        return "LPS" if asked is None else asked.upper()
+    told = str(named).upper()
+    if told.lower() not in SPACES:
+        raise UsageError(f"{what} names the frame {str(named)[:40]!r}: {' or '.join(SPACES)} are known")
+    if asked is not None and asked.upper() != told:
+        raise UsageError(f"{what} says that its coordinates are {told}, {asked.upper()} was asked for: leave space out")
+    return told

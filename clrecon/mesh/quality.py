@@ -21,7 +21,7 @@ from clrecon.mesh.triangles import corner_edges, cross_product
 from clrecon.system.pieces import local_origin
 from clrecon.system.records import Record
 
-__all__ = ["MeshQuality", "measure_quality"]
+__all__ = ["MeshQuality", "measure_quality", "measure_triangles"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -125,7 +125,7 @@ def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32
     coincident, open_by_place = _count_by_place(vertices, triangles, labels >= 0, edges)
     closed = triangle_count > 0 and edges.boundary == 0 and edges.nonmanifold == 0 and open_by_place == 0
     manifold = triangle_count > 0 and edges.nonmanifold == 0 and edges.oriented and split_vertices == 0 and loops == 0
-    area, volume, zero_area, shortest = _measure_triangles(vertices, triangles)
+    area, volume, zero_area, shortest = measure_triangles(vertices, triangles)
     return MeshQuality(
         vertices=vertex_count,
         triangles=triangle_count,
@@ -168,7 +168,7 @@ def _count_by_place(
     return len(coincident), by_place.boundary + by_place.nonmanifold
 
 
-def _measure_triangles(
+def measure_triangles(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
 ) -> tuple[float, float, int, float | None]:
     """Measure area in mm2, signed volume in mm3, number of triangles without area, shortest edge in mm."""

@@ -88,7 +88,6 @@ def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh
         report["certificate_lines"] = list(raw.certificate)
     try:
         mesh = Mesh(vertices, raw.triangles, normals, report)
-        mesh.check()
     except UsageError as error:
         raise RefusedInputError(f"{name} is corrupt: {error}") from error
     log.info("%s file read: %d triangles", raw.kind, mesh.triangle_count)

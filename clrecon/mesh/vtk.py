@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.errors import UsageError
 from clrecon.exchange.vtk import make_polydata
 from clrecon.system.foreign_words import hush
 
-__all__ = ["CellLocator", "smooth_windowed_sinc", "wrap_polydata"]
+__all__ = ["CellLocator", "smooth_windowed_sinc", "unwrap_polydata", "wrap_polydata"]
 
 Points = NDArray[np.float64]
 
@@ -109,3 +110,28 @@ def wrap_polydata(
     polydata.field_data["SPACE"] = ["LPS"]
     polydata.field_data["UNIT"] = ["mm"]
     return polydata
+
+
+def unwrap_polydata(polydata: Any) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None, str | None]:
+    """Points, triangles, normals and the frame that a ``pyvista.PolyData`` names; see `Mesh.from_pyvista`.
+
+    Raises
+    ------
+    UsageError
+        It is no PolyData, or has no faces.
+    """
+    import pyvista
+
+    found = pyvista.wrap(polydata) if hasattr(polydata, "GetPolys") else polydata
+    if not isinstance(found, pyvista.PolyData):
+        raise UsageError(
+            f"a {type(polydata).__name__} is no pyvista.PolyData: of a volume or grid take extract_surface() first"
+        )
+    if not found.is_all_triangles:
+        found = found.triangulate()
+    faces = np.asarray(found.faces)
+    if not len(faces):
+        raise UsageError(f"the PolyData has {found.n_points:,} points and no faces: it is no surface")
+    normals = found.point_data["Normals"] if "Normals" in found.point_data else None
+    named = found.field_data["SPACE"][0] if "SPACE" in found.field_data else None
+    return np.array(found.points), faces.reshape(-1, 4)[:, 1:], normals, None if named is None else str(named)

@@ -114,7 +114,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "vertebrae": frozenset({"scipy", "skimage"}),
     "exchange": frozenset({"vtk", "vtkmodules", "laspy"}),
     "corridors": frozenset({"scipy"}),
-    "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification"}),
+    "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification", "trimesh"}),
     "points": frozenset({"pyvista", "open3d"}),
     "reference": frozenset({"scipy"}),
     "rendering": frozenset({"scipy", "PIL", "skimage", "imageio_ffmpeg", "pyvista", "vtk", "vtkmodules"}),

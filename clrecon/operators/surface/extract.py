@@ -168,7 +168,7 @@ class SurfaceExtractor(Closing):
         run = Extraction(self._resident, grid, self._placement(grid), seeds=seeds)
         positions, normals, triangles = self._run(run, told, progress)
         report = run.describe(len(positions), len(triangles))
-        return Mesh(run.placement.to_lps(positions), triangles, normals, report)
+        return Mesh(run.placement.to_lps(positions), triangles, normals, report, trusted=True)
 
     def _extract_vertices(self, grid: SampleGrid, told: list[str], progress: Progress | None) -> PointCloud:
         run = Extraction(self._resident, grid, self._placement(grid), vertices_only=True)

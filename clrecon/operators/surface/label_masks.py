@@ -115,6 +115,6 @@ def _make_meshes(run: MaskExtraction, chosen: Sequence[int], progress: Progress 
     for number, ((positions, normals, triangles), level) in each_label(groups, run.hold, extract, run.warnings):
         own = {"label": number, "label_name": labels.name(number), "label_ml": label_ml(labels, number)}
         report = {**run.describe(), **own, "mask_level": level / FULL}
-        meshes[number] = Mesh(run.placement.to_lps(positions), triangles, normals, report)
+        meshes[number] = Mesh(run.placement.to_lps(positions), triangles, normals, report, trusted=True)
         run.stopwatch = Stopwatch()  # the time of common work counts for the first label
     return meshes

@@ -188,7 +188,7 @@ def _as_mesh(run: LabelExtraction, taken: ResampledLabels, report: dict[str, Any
     report["vertices_by_hu_share"] = run.share_by_hu
     report["warnings"] += _warn(taken, report)
     positions, normals, triangles = part
-    mesh = Mesh(run.placement.to_lps(positions), triangles, normals, report)
+    mesh = Mesh(run.placement.to_lps(positions), triangles, normals, report, trusted=True)
     if SKIN_HU[0] <= run.rule.iso_value <= SKIN_HU[1]:
         report["warnings"] += warn_of_skin(run.volume, mesh.vertices, mesh.triangles)
     run.stopwatch = Stopwatch()  # the time of common work counts for the first label

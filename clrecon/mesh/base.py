@@ -1,0 +1,236 @@
+"""`BaseMesh`: the arrays of an indexed triangle surface in LPS mm, checked, moved and written.
+
+What makes other meshes of one, or goes to other libraries, is in `clrecon.mesh.mesh`.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import UsageError
+from clrecon.exchange.content import Content, describe_facts
+from clrecon.exchange.coordinates import as_stored
+from clrecon.exchange.formats import write_mesh
+from clrecon.geometry import frame_from_lps
+from clrecon.geometry.affine import apply_affine, checked_affine, normal_matrix
+from clrecon.system.messages import Message
+from clrecon.system.targets import keep_existing
+
+__all__ = ["BaseMesh"]
+
+_MOST_VERTICES = 2**32
+
+Own = TypeVar("Own", bound="BaseMesh")
+
+
+def _rows_of_three(values: ArrayLike, name: str) -> NDArray[Any]:
+    array = np.asarray(values)
+    if array.size == 0 and array.ndim < 2:
+        return array.reshape(0, 3)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise UsageError(f"{name} have shape (n, 3), these have {array.shape}")
+    return array
+
+
+def _numbers(values: ArrayLike, name: str) -> NDArray[Any]:
+    array = _rows_of_three(values, name)
+    if array.dtype.kind not in "fiu":
+        raise UsageError(f"{name} are numbers, these are {array.dtype}")
+    return array
+
+
+def _as_indices(values: ArrayLike) -> NDArray[np.uint32]:
+    array = _rows_of_three(values, "triangles")
+    if array.size and array.dtype.kind not in "iu":
+        raise UsageError(f"triangles hold indices of vertices (integers), these are {array.dtype}")
+    # Only other types can hold values that uint32 cannot; arrays from a device are uint32 and need no check.
+    if array.size and array.dtype != np.uint32:
+        low, high = int(array.min()), int(array.max())
+        if low < 0 or high >= _MOST_VERTICES:
+            raise UsageError(f"triangles hold indices from {low} to {high}: they must fit 32 bits without a sign")
+    return np.ascontiguousarray(array, dtype=np.uint32)
+
+
+class BaseMesh(Message):
+    """An indexed triangle surface; `clrecon.mesh.mesh.Mesh` says what its arguments are."""
+
+    def __init__(
+        self,
+        vertices: ArrayLike,
+        triangles: ArrayLike,
+        normals: ArrayLike | None = None,
+        report: dict[str, Any] | None = None,
+        *,
+        trusted: bool = False,
+    ):
+        self._vertices = as_stored(_numbers(vertices, "vertices"))
+        self._triangles = _as_indices(triangles)
+        self._normals = (
+            None if normals is None else np.ascontiguousarray(_numbers(normals, "normals"), dtype=np.float32)
+        )
+        if len(self._vertices) > _MOST_VERTICES:
+            raise UsageError(f"a mesh has at most {_MOST_VERTICES} vertices, this one has {len(self._vertices)}")
+        if self._normals is not None and len(self._normals) != len(self._vertices):
+            raise UsageError(f"{len(self._normals)} normals for {len(self._vertices)} vertices: one a vertex is needed")
+        self.report: dict[str, Any] = {} if report is None else report
+        if not trusted:
+            self.check()
+
+    @property
+    def vertices(self) -> NDArray[np.floating]:
+        """Positions in LPS mm, shape (n, 3), float32; float64 where they lie far from the origin."""
+        return self._vertices
+
+    @property
+    def triangles(self) -> NDArray[np.uint32]:
+        """Indices of vertices, shape (m, 3), counter-clockwise when seen from outside."""
+        return self._triangles
+
+    @property
+    def normals(self) -> NDArray[np.float32] | None:
+        """Outward unit vectors at the vertices, shape (n, 3), or None."""
+        return self._normals
+
+    @property
+    def vertex_count(self) -> int:
+        """Number of vertices, n."""
+        return len(self._vertices)
+
+    @property
+    def triangle_count(self) -> int:
+        """Number of triangles, m."""
+        return len(self._triangles)
+
+    def check(self) -> None:
+        """Check every number: indices have a vertex, coordinates and normals are finite.
+
+        A mesh is checked when it is made; this is for arrays that were changed since.
+
+        Raises
+        ------
+        UsageError
+            A number is wrong; the message names the first one.
+        """
+        if self.triangle_count and int(self._triangles.max()) >= self.vertex_count:
+            row = int(np.flatnonzero((self._triangles >= self.vertex_count).any(axis=1))[0])
+            raise UsageError(
+                f"triangle {row:,} refers to vertex {int(self._triangles[row].max()):,}, the mesh has"
+                f" {self.vertex_count:,} vertices, which are numbered from 0"
+            )
+        for name, values in (("vertex", self._vertices), ("normal", self._normals)):
+            if values is not None and not np.isfinite(values).all():
+                row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
+                raise UsageError(f"{name} {row:,} is not finite: {values[row].tolist()}")
+
+    def in_space(self, space: str) -> tuple[NDArray[np.floating], NDArray[np.float32] | None]:
+        """Return vertices and normals in another patient frame; the mesh itself is always LPS.
+
+        Parameters
+        ----------
+        space : {"lps", "ras"}
+            RAS negates x and y, which is a half turn: the winding of the triangles stays.
+
+        Returns
+        -------
+        vertices : ndarray, shape (n, 3), mm, of the type of `vertices`
+        normals : ndarray, shape (n, 3), float32, or None
+        """
+        signs = np.diag(frame_from_lps(space)).astype(np.float32)
+        if space.lower() == "lps":
+            return self._vertices, self._normals
+        # Adding 0 turns -0 into 0; text formats would show -0.
+        vertices = self._vertices * signs + np.float32(0)
+        return vertices, None if self._normals is None else self._normals * signs + np.float32(0)
+
+    def transformed(self: Own, matrix: ArrayLike) -> Own:
+        """Return the mesh moved, turned or scaled by an affine; this one stays as it is.
+
+        Parameters
+        ----------
+        matrix : array_like, shape (4, 4)
+            LPS mm to LPS mm; the last row is (0, 0, 0, 1).  A mirror is allowed: triangles are turned round, so that
+            they stay counter-clockwise when seen from outside.
+
+        Returns
+        -------
+        Mesh
+            Normals go through the inverse transpose.  The report has ``moved_by``, the matrix from the place where the
+            scan put the mesh, and no longer the affine and the certificate of the scan: they say nothing of its new
+            place.
+
+        Raises
+        ------
+        UsageError
+            `matrix` is no affine, or singular.
+        """
+        checked = checked_affine(matrix)
+        normals = self._normals
+        if normals is not None and len(normals):
+            directions = normals @ normal_matrix(checked).T
+            lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+            normals = np.divide(directions, lengths, out=directions, where=lengths > 0)
+        mirrored = np.linalg.det(checked[:3, :3]) < 0
+        scan = ("affine_ijk_to_lps_mm", "certificate", "certificate_lines")
+        report = {name: value for name, value in self.report.items() if name not in scan}
+        before = self.report.get("moved_by")
+        report["moved_by"] = (checked if before is None else checked @ np.array(before)).tolist()
+        triangles = self._triangles[:, ::-1] if mirrored else self._triangles
+        return type(self)(apply_affine(checked, self._vertices), triangles, normals, report)
+
+    def describe(self, space: str, *, keep_ids: bool = False) -> Content:
+        """Return the contents of a file of the mesh in `space`; nothing else of `report` is ever written.
+
+        Only with `keep_ids` they have the hash of the frame of reference.
+        """
+        vertices, normals = self.in_space(space)
+        facts = describe_facts(self.report, space, keep_ids=keep_ids)
+        name, color = self.report.get("part_name"), self.report.get("color")
+        return Content(
+            vertices=vertices,
+            triangles=self.triangles,
+            normals=normals,
+            name=None if name is None else str(name),
+            color=None if color is None else (float(color[0]), float(color[1]), float(color[2])),
+            **facts,
+        )
+
+    def save(
+        self, path: str | os.PathLike[str], space: str = "lps", *, no_clobber: bool = False, keep_ids: bool = False
+    ) -> int:
+        """Write the mesh to a file; its extension gives the format.
+
+        STL (binary), PLY (binary), OBJ, GLB, VTP and 3MF.  The file is either complete or absent, and an older file of
+        that name is replaced in one step.  It holds no patient data, date or path.
+
+        Parameters
+        ----------
+        path : str or path
+            ``.stl``, ``.ply``, ``.obj``, ``.glb``, ``.vtp`` or ``.3mf``, upper or lower case.
+        space : {"lps", "ras"}
+            Patient frame of the coordinates; the file names it.  Units are mm; a node matrix in GLB maps them to the
+            metres, Y up, of glTF.  STL holds only float32, the other formats keep float64 vertices.
+        no_clobber : bool
+            True: a file of that name stays and is an `OutputError`.
+        keep_ids : bool
+            True: the comments hold the hash of the frame of reference, by which files of one scan are told.
+
+        Returns
+        -------
+        int
+            Size of the file in bytes.
+
+        Raises
+        ------
+        UsageError
+            Unknown extension or space, or the mesh fails `check`.
+        NoSurfaceError
+            The mesh has no triangle.
+        OutputError
+            The file cannot be written; an older one of that name is intact.
+        """
+        with keep_existing(no_clobber):
+            return write_mesh(self, path, space, keep_ids=keep_ids)
