@@ -110,6 +110,7 @@ OWN = {
     "exchange/vtp.py": "what it has just written",
     "__init__.py": "its own list of names",
     "opencl/unknown_cpu.py": "the system",
+    "formats/write_metaimage.py": "what it has just written",
     "jobs/bench/machine.py": "the system",
     "jobs/compare/folder.py": "what it has just written",
     "jobs/compare/template.py": "its own style",
