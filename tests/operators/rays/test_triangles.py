@@ -247,12 +247,15 @@ def test_layers_beyond_the_most_are_left_out_and_said(device: Any) -> None:
 
 def test_what_cannot_be_shown_is_refused(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = quad(-9.0, 9.0, 3.0)
-    broken = Mesh([(0, 0, 0), (1, 0, 0), (np.nan, 1, 0)], [(0, 1, 2)])
+    broken = Mesh([(0, 0, 0), (1, 0, 0), (2, 1, 0)], [(0, 1, 2)])
+    broken.vertices[2, 0] = np.nan  # what is given is checked; arrays can be changed afterwards
+    lost = Mesh(np.eye(3), [(0, 1, 2)])
+    lost.triangles[0, 2] = 7
     away = Mesh([(0, 0, 0), (1, 0, 0), (3e9, 1, 0)], [(0, 1, 2)])
     for bad, text in (
         (Mesh(np.zeros((0, 3)), np.zeros((0, 3), int)), "no triangles"),
         (broken, "vertex 2 is not finite"),
-        (Mesh(np.zeros((2, 3)), [(0, 1, 2)]), "refers to vertex 2"),
+        (lost, "refers to vertex 7"),
         (away, "3e\\+09 mm"),
     ):
         with pytest.raises(UsageError, match=text):
