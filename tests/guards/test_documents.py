@@ -14,7 +14,7 @@ DOCUMENTS = [
     "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/contract.md", "docs/iso_value.md", "docs/geometry.md",
     "docs/certificate.md", "docs/formats.md", "docs/labels.md", "docs/calibration.md", "docs/transfer_functions.md",
     "docs/slices.md", "docs/rendering.md", "docs/clouds.md", "docs/filters.md", "docs/masks.md",
-    "docs/inside.md", "docs/measures.md", "docs/compare.md", "docs/corridor.md",
+    "docs/papers.md", "docs/vertebrae.md", "docs/inside.md", "docs/measures.md", "docs/compare.md", "docs/corridor.md",
     "docs/statistics.md", "docs/distance.md",
 ]  # fmt: skip
 LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)")
