@@ -178,6 +178,10 @@ def _describe_picture(picture: dict[str, Any]) -> str:
     if picture["window_mm_water"]:
         low, high = picture["window_mm_water"]
         shown = f", {low:.4g} to {high:.4g} mm of water"
+    left_out = picture["left_out"]
+    if left_out and left_out["voxels"]:
+        where = "the body or the region" if left_out["region"] else "the body"
+        shown += f", without {100.0 * left_out['share']:.3g} % of the voxels, outside of {where}"
     return f"{picture['view']}: {width} x {height}, {scale}{shown}"
 
 

@@ -107,6 +107,9 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
         " drr",
     )
     group.add_argument(
+        "--keep-air", action="store_true", help="of mode minip: count what lies outside of the body and of masks too"
+    )
+    group.add_argument(
         "--ray-step", type=float, metavar="MM", help="way between samples (default: half the smallest spacing)"
     )
     group.add_argument(
@@ -131,7 +134,8 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
     _add_repeated(
         group, "--view", parse_views, "V[,V...]|AZ,EL",
         f"where the camera stands: {', '.join(VIEWS)}; or degrees from anterior to the patient's left and to the head;"
-        " of slices also axial, coronal, sagittal (default: anterior); several make a picture each: out_left.png",
+        " of slices also axial, coronal, sagittal (default: anterior; of mode slice axial, of slices 30,30, of cpr"
+        " left); several make a picture each: out_left.png",
     )  # fmt: skip
     group.add_argument(
         "--up", type=parse_direction, metavar="SIDE|X,Y,Z", help="what is at the top (default: superior, else anterior)"
@@ -206,7 +210,11 @@ def add_labels(parser: argparse.ArgumentParser) -> None:
     )
     _add_repeated(group, "--label-color", parse_label_color, "LABEL=COLOUR", "colour of a label, by name or number")
     _add_repeated(
-        group, "--label-opacity", parse_label_opacity, "LABEL=SHARE", "factor on the opacity of a label, 0 to 1"
+        group,
+        "--label-opacity",
+        parse_label_opacity,
+        "LABEL=SHARE",
+        "factor on the opacity of a label, 0 to 1; label 0 is all without a label",
     )
 
 

@@ -32,7 +32,7 @@ from clrecon.jobs.shared.report import stage_report
 from clrecon.mesh import Mesh
 from clrecon.mesh.reader import read_mesh
 from clrecon.reading import read_selected
-from clrecon.rendering.pictures.styles import SurfaceLook
+from clrecon.rendering.pictures.styles import Projection, SurfaceLook
 from clrecon.system.files import allow_open_files
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, ignore_progress
@@ -177,8 +177,24 @@ def _narrow(volume: Volume, settings: RenderSettings, device: Device, progress: 
     style = settings.style
     bands: list[Band] = [(style.iso_value, math.inf)] if isinstance(style, SurfaceLook) else []
     volume = mask_volume(volume, settings, progress)
+    if isinstance(style, Projection) and style.leaves_out:
+        return _leave_out(volume, settings, device, progress)
     volume = restrict_volume(volume, settings, device, bands, progress)
     return preprocess_volume(volume, settings, device, bands, progress)
+
+
+def _leave_out(volume: Volume, settings: RenderSettings, device: Device, progress: Progress) -> Volume:
+    """Leave out what lies outside of the body and of the region, whose voxels get a value above those that count."""
+    from clrecon.anatomy.surroundings import LEFT_OUT, leave_out_surroundings
+    from clrecon.geometry.certificate import amend
+
+    measured = volume.report.get("hu_range")
+    volume = leave_out_surroundings(volume, progress=progress)
+    bands: list[Band] = [(-math.inf, volume.report[LEFT_OUT]["value_hu"] - 1.0)]
+    volume = restrict_volume(volume, settings, device, bands, progress)
+    volume = preprocess_volume(volume, settings, device, bands, progress)
+    volume.report = amend(volume.report, hu_range=measured)
+    return volume
 
 
 def _prepare(device: Device, settings: RenderSettings) -> None:
@@ -218,7 +234,7 @@ def _take_views(
     written: list[Staged] = []
     if files.picture is None:
         return pictures, written
-    views = settings.views_used
+    views = studio.views
     for place, view in enumerate(views):
         progress("render", place, len(views) if len(views) > 1 else 0)
         picture = studio.take_view(view)
@@ -247,7 +263,7 @@ def _turn(
         return None, []
     from clrecon.rendering.movies.movie import animation_kind, stage_animation, turntable_cameras
 
-    first = settings.camera(studio.box, settings.views_used[0], turning=True)
+    first = settings.camera(studio.box, studio.views[0], turning=True)
     cameras = turntable_cameras(first, turn.frames, turn.degrees)
 
     empty: list[str] | None = []

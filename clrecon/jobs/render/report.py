@@ -12,6 +12,7 @@ from clrecon.jobs.render.settings import LabelLook, RenderSettings
 from clrecon.jobs.shared.clouds import describe_cloud
 from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
 from clrecon.jobs.shared.run_report import RunReport
+from clrecon.rendering.looks.label_style import NO_LABEL, find_shown
 from clrecon.rendering.pictures.annotations import edge_letters
 from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, PointLook, Style, SurfaceLook, VolumeLook
@@ -77,6 +78,7 @@ def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]
         "curve": made.get("curve"),
         "edges": made.get("edges") if picture.camera is None else edge_letters(picture.camera),
         "points": _describe_points(made),
+        "left_out": made.get("left_out"),
         "slabs": made.get("slabs", 1),
         "seconds": made.get("seconds"),
     }
@@ -110,8 +112,8 @@ def find_emptiness(picture: Rendering) -> str | None:
     if shade is None:
         return None
     shown, unit = f"{values.min():g} to {values.max():g}", "mm of water" if is_water else "HU"
-    clip = f": the air round the body is the lowest, clip it away ({name_parameter('clip_box')})"
-    air = clip if picture.mode == "minip" else ""
+    kept = picture.mode == "minip" and "left_out" not in picture.report
+    air = f": the air round the body is the lowest, do not keep it ({name_parameter('keep_air')})" if kept else ""
     return f"all of the picture is {shade}: its {shown} {unit} lie beyond the window from {low:g} to {high:g}{air}"
 
 
@@ -302,8 +304,9 @@ def _describe_labels(look: LabelLook | None, labels: LabelMap | None) -> list[di
     looks: dict[int, dict[str, Any]] = {}
     for what, chosen in (("color", look.colors), ("opacity", look.opacities)):
         for label, value in chosen.items():
-            looks.setdefault(labels.find(label), {})[what] = value
-    names = file_suffixes({number: labels.name(number) for number in looks})
+            looks.setdefault(find_shown(labels, label), {})[what] = value
+    names = file_suffixes({number: labels.name(number) for number in looks if number != NO_LABEL})
+    names[NO_LABEL] = "none"
     return [
         {"label_number": number, "label": names[number], "color": own.get("color"), "opacity": own.get("opacity")}
         for number, own in sorted(looks.items())

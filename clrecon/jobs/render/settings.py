@@ -16,7 +16,7 @@ from clrecon.jobs.shared.cropping import CROPS, Box, crop_box
 from clrecon.jobs.shared.settings import InputSettings
 from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import find_color
-from clrecon.rendering.looks.label_style import distinct_colors
+from clrecon.rendering.looks.label_style import NO_LABEL, distinct_colors
 from clrecon.rendering.looks.lighting import UNSHADED, Lighting
 from clrecon.rendering.looks.presets import DEFAULT_PRESET, PRESETS, find_preset
 from clrecon.rendering.looks.transfer_function import TransferFunction
@@ -38,6 +38,7 @@ from clrecon.rendering.pictures.styles import (
 )
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
+from clrecon.rendering.views.default_view import ANTERIOR, SLICES_VIEWS
 from clrecon.rendering.views.directions import DEFAULT_SIZE, DIRECTIONS, checked_size
 from clrecon.rendering.views.plane import find_plane
 from clrecon.system.wording import name_parameter
@@ -54,8 +55,8 @@ __all__ = [
     "describe_presets",
 ]
 
-DEFAULT_VIEWS = {"slice": "axial", "cpr": "left"}
-"""Default view of the modes whose default is not the view from the front."""
+DEFAULT_VIEWS = {"slice": "axial", "cpr": "left", "slices": SLICES_VIEWS[0]}
+"""Default view of the modes whose default is not the view from the front; that of slices suits the scan."""
 SPINES = (SPINE, "auto")
 """Values of a curve that stand for the spinal canal, which is found in the scan."""
 VIEWS = tuple(DIRECTIONS)
@@ -94,7 +95,7 @@ class LabelLook:
     colors : mapping of str to str
         Colour by number or name of the label, see `clrecon.rendering.looks.colors.find_color`.
     opacities : mapping of str to float
-        Factor on the opacity, by number or name of the label.
+        Factor on the opacity, by number or name of the label; "0" stands for all that has no label.
     """
 
     path: str
@@ -102,8 +103,10 @@ class LabelLook:
     opacities: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for color in self.colors.values():
+        for label, color in self.colors.items():
             find_color(color)
+            if label.strip() == str(NO_LABEL):
+                raise UsageError("what has no label (0) keeps the colours of the picture: give it an opacity alone")
         for label, opacity in self.opacities.items():
             if not 0.0 <= opacity <= 1.0:
                 raise UsageError(f"the opacity of a label lies between 0 and 1, that of {label} is {opacity:g}")
@@ -324,15 +327,14 @@ class RenderSettings(InputSettings):
         if curve is not None and isinstance(style, CurveCut):
             style = replace(style, curve=curve)
         if labels is not None and self.labels is not None and isinstance(style, VolumeLook | SurfaceLook):
-            plain = not (self.labels.colors or self.labels.opacities)  # every label then has its own colour
-            colors = None if plain else dict(self.labels.colors)
+            colors = dict(self.labels.colors) or None  # without any, every label has its own colour
             style = replace(style, labels=labels, label_colors=colors, label_opacity=dict(self.labels.opacities))
         return style
 
     @property
     def views_used(self) -> tuple[str, ...]:
         """The views of the pictures, defaults included."""
-        return tuple(self.views) or (DEFAULT_VIEWS.get(self.mode, "anterior"),)
+        return tuple(self.views) or (DEFAULT_VIEWS.get(self.mode, ANTERIOR),)
 
     @property
     def size_used(self) -> tuple[int, int]:

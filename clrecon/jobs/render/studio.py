@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from clrecon.jobs.render.settings import SPINES, LabelLook, RenderSettings
 from clrecon.rendering.looks.colors import is_transparent
+from clrecon.rendering.looks.label_style import NO_LABEL
 from clrecon.rendering.looks.presets import find_preset
 from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.styles import (
@@ -20,6 +21,7 @@ from clrecon.rendering.pictures.styles import (
     SurfaceLook,
     VolumeLook,
 )
+from clrecon.rendering.views.default_view import default_view
 from clrecon.rendering.views.seen import check_center
 from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
@@ -83,7 +85,8 @@ def read_look(look: LabelLook | None, volume: Volume | None = None) -> LabelMap 
         return None
     from clrecon.labels import read_labels
 
-    named = [*look.colors, *look.opacities]  # they get the voxels that they share with others
+    opacities = [label for label in look.opacities if label.strip() != str(NO_LABEL)]
+    named = [*look.colors, *opacities]  # they get the voxels that they share with others
     labels = read_labels(look.path, named or None, volume=volume)
     for label in named:
         labels.find(label)
@@ -133,6 +136,13 @@ class Studio(Closing):
     def close(self) -> None:
         """Free the memory of the device."""
         self._stack.close()
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """The views of the pictures; without any, that from which the slices of this scan show."""
+        if self._settings.views or not isinstance(self.style, SlicesInSpace):
+            return self._settings.views_used
+        return (default_view(self.style.mode, cast("Volume", self._subject)),)
 
     @property
     def box(self) -> Grid:

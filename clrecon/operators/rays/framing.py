@@ -6,19 +6,20 @@ import math
 
 import numpy as np
 
+from clrecon.anatomy.surroundings import LEFT_OUT
 from clrecon.geometry.grid import Grid
 from clrecon.geometry.volume import AIR_HU, Volume
 from clrecon.labels import resample_labels
 from clrecon.operators.rays.slices import choose_slices
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.rendering.looks.transfer_function import TransferFunction
-from clrecon.rendering.pictures.styles import SlicesInSpace, Style, SurfaceLook, VolumeLook
+from clrecon.rendering.pictures.styles import Projection, SlicesInSpace, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.seen import ShownLabels, find_seen_box
 
 __all__ = ["shown_box"]
 
-MASKED_BY = ("field_of_view", "remove_table", "region")
-"""Entries of the report of a volume of which a part was turned into air."""
+MASKED_BY = ("field_of_view", "remove_table", "region", LEFT_OUT)
+"""Entries of the report of a volume of which a part was turned into air, or left out."""
 
 AIR_ROOM_HU = 100.0
 """Projections and slices show nothing of interest less than this above the air that a mask leaves."""
@@ -44,7 +45,7 @@ def shown_box(shown: Volume | DeviceVolume, style: Style) -> Grid:
     if clip is None and labels is None and not any(name in volume.report for name in MASKED_BY):
         return volume
     slices = choose_slices(volume, style.slices) if isinstance(style, SlicesInSpace) else None
-    box = find_seen_box(volume, _band(style), clip=clip, labels=labels, slices=slices)
+    box = find_seen_box(volume, _band(style, volume), clip=clip, labels=labels, slices=slices)
     return volume if box is None else box
 
 
@@ -57,8 +58,10 @@ def _shown_labels(volume: Volume | DeviceVolume, style: Style) -> ShownLabels | 
     return ShownLabels(taken.voxels, look.table[:, 3] > 0.0)
 
 
-def _band(style: Style) -> tuple[float, float]:
-    """Return the HU that a style shows, infinite where they have no end."""
+def _band(style: Style, volume: Volume) -> tuple[float, float]:
+    """Return the HU that a style shows of a volume, infinite where they have no end."""
+    if isinstance(style, Projection) and style.leaves_out and LEFT_OUT in volume.report:
+        return -math.inf, volume.report[LEFT_OUT]["highest_hu"]
     if isinstance(style, SurfaceLook):
         return style.iso_value, math.inf
     if isinstance(style, SlicesInSpace):

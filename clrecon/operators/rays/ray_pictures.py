@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.anatomy.surroundings import LEFT_OUT, count_left_out
 from clrecon.geometry.affine import Float64Array
 from clrecon.opencl import Stopwatch
 from clrecon.operators.rays.buffers import Between, DrawnVolume, PictureBuffers
@@ -26,6 +27,8 @@ from clrecon.rendering.views.camera import Camera
 from clrecon.system.progress import Progress, ignore_progress
 
 __all__ = ["take_picture", "take_with_layers"]
+
+_NO_BODY = "no body was found in the scan: the lowest values are those of all of it, the air around included"
 
 
 def take_picture(
@@ -198,6 +201,15 @@ class _Job:
         self, style: Projection, values: NDArray[np.float32], depths: NDArray[np.float32], report: dict[str, Any]
     ) -> Rendering:
         is_water = style.kind == "drr"
+        volume = self.resident.volume
+        if style.leaves_out and LEFT_OUT in volume.report:
+            left_out = self.resident.keep("left out", None, 0, lambda: count_left_out(volume))
+            assert left_out is not None
+            empty = ~(values <= volume.report[LEFT_OUT]["highest_hu"])
+            values[empty] = depths[empty] = np.nan
+            report["left_out"] = left_out
+            if not left_out["body"]:
+                report["warnings"].append(_NO_BODY)
         choose = choose_water_window if is_water else choose_window
         window = choose(values) if style.window is None else checked_window(style.window)
         report["window_mm_water" if is_water else "window_hu"] = list(window)

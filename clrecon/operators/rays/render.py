@@ -18,8 +18,9 @@ from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.modes import find_style
-from clrecon.rendering.pictures.styles import PointLook, Style, VolumeLook
+from clrecon.rendering.pictures.styles import PointLook, SlicesInSpace, Style, VolumeLook
 from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.default_view import ANTERIOR, default_view
 from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size
 from clrecon.system.progress import Progress
 
@@ -62,9 +63,9 @@ def render(
     camera : Camera, optional
         In place of `view`, `up`, `zoom`, `view_angle` and `center`, which are refused beside it.
     view : str or (azimuth, elevation), optional
-        Where the camera stands, default "anterior"; `up`, `zoom`, `view_angle` and `center` (LPS mm) go with it, see
-        `Camera.fit`.  A plane knows axial, coronal and sagittal too.  It fits the volume; where a part of that was
-        turned into air or is clipped or hidden, the box of what is left.
+        Where the camera stands, default "anterior", of slices in space (30, 30); `up`, `zoom`, `view_angle` and
+        `center` (LPS mm) go with it, see `Camera.fit`.  A plane knows axial, coronal and sagittal too.  It fits the
+        volume; where a part of that was turned into air or is clipped or hidden, the box of what is left.
     size : (width, height), optional
         Pixels; default 1024 x 1024, and for a `CurveCut` what the curve needs.
     background : str or (float, float, float)
@@ -98,6 +99,8 @@ def render(
         with VolumeRenderer(shown, device=device, memory=memory) as renderer:
             return renderer.render(style, size=size, background=background, progress=progress, **{**placing, **look})
     objects = _name_objects(shown, style, look)
+    if view is None and camera is None:
+        placing["view"] = _default_view(objects)
     place = Place.checked(objects[0][1], **placing)
     size = checked_size(DEFAULT_SIZE if size is None else size)
     ground = None if is_transparent(background) else background
@@ -130,6 +133,14 @@ def _name_objects(
         named = "a point cloud" if isinstance(shown, PointCloud) else "a mesh"
         raise UsageError(f"{named} is shown in mode {mode}, not in mode {chosen.mode}")
     return [(shown, chosen)]
+
+
+def _default_view(objects: Sequence[tuple[Any, Style]]) -> str:
+    """Return the view from which slices in space show, where there are any."""
+    for subject, style in objects:
+        if isinstance(style, SlicesInSpace):
+            return default_view(style.mode, subject.volume if isinstance(subject, DeviceVolume) else subject)
+    return ANTERIOR
 
 
 def _styled(given: Any) -> tuple[Any, Style]:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from clrecon.anatomy.surroundings import LEFT_OUT, leave_out_surroundings
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.grid import Grid
@@ -34,15 +35,14 @@ from clrecon.rendering.pictures.styles import (
     VolumeLook,
 )
 from clrecon.rendering.views.camera import Camera, box_corners
+from clrecon.rendering.views.default_view import ANTERIOR, default_view
 from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size
 from clrecon.rendering.views.plane import find_plane
 from clrecon.rendering.views.seen import check_center
 from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
 
-__all__ = ["DEFAULT_VIEW", "Place", "VolumeRenderer"]
-
-DEFAULT_VIEW = "anterior"
+__all__ = ["Place", "VolumeRenderer"]
 
 SMALLEST_STEP = 0.01
 """Smallest ray step as a share of the smallest spacing; shorter steps only add time."""
@@ -82,6 +82,7 @@ class VolumeRenderer(Closing):
         self._resident, self._is_own = take_volume(volume, device, memory, "a picture")
         self.volume = self._resident.volume
         self._framed: tuple[Style, Grid] | None = None
+        self._inner: VolumeRenderer | None = None
         voxels = self.volume.voxels
         if voxels.dtype.kind == "f" and not np.isfinite(voxels).all():
             raise UsageError("the voxels hold NaN or infinite values: fill them first, for CT with -1024")
@@ -93,6 +94,8 @@ class VolumeRenderer(Closing):
 
     def close(self) -> None:
         """Free the volume on the device; a `DeviceVolume` that was given stays as it is."""
+        if self._inner is not None:
+            self._inner.close()
         if self._is_own:
             self._resident.close()
 
@@ -117,10 +120,16 @@ class VolumeRenderer(Closing):
             raise UsageError("mode points shows a point cloud, and this is a volume: make a cloud of it first")
         if isinstance(style, MeshLook):
             raise UsageError("mode mesh shows a mesh, and this is a volume: extract a surface first")
-        place = Place.checked(style, camera, view, up, zoom, view_angle, center)
+        seen_from = default_view(style.mode, self.volume) if view is None and camera is None else view
+        place = Place.checked(style, camera, seen_from, up, zoom, view_angle, center)
         if isinstance(style, CurveCut):
             return self._reformat(style, place, size, background, progress)
         size = checked_size(DEFAULT_SIZE if size is None else size)
+        if isinstance(style, Projection) and style.leaves_out and LEFT_OUT not in self.volume.report:
+            return self._within(progress).render(
+                style, camera=camera, view=view, up=up, zoom=zoom, view_angle=view_angle, center=center,
+                size=size, background=background, progress=progress,
+            )  # fmt: skip
         if isinstance(style, PlaneCut):
             return self._cut(style, place, size, background, progress)
         camera = place.camera or place.camera_for(self.frame(style), size)
@@ -134,11 +143,21 @@ class VolumeRenderer(Closing):
         step = self._checked_step(style.ray_step)
         return take_picture(self._resident, style, camera, size, step, ground, progress)
 
+    def _within(self, progress: Progress | None) -> VolumeRenderer:
+        """Return the renderer of the volume without what lies outside of the body, which is kept."""
+        if self._inner is None:
+            self._resident.make_way()
+            volume = leave_out_surroundings(self.volume, progress=progress)
+            self._inner = VolumeRenderer(volume, device=self._resident.device, memory=self._resident.memory)
+        return self._inner
+
     def frame(self, style: Style) -> Grid:
         """Return what cameras fit: the volume, or the box of what is left of it where a part is masked, cut or hidden.
 
         See `clrecon.operators.rays.framing`; that of the last style is kept.
         """
+        if isinstance(style, Projection) and style.leaves_out and LEFT_OUT not in self.volume.report:
+            return self._within(None).frame(style)
         if self._framed is None or self._framed[0] is not style:
             self._framed = style, shown_box(self._resident, style)
         return self._framed[1]
@@ -244,9 +263,7 @@ class Place(NamedTuple):
             if isinstance(style, CurveCut):
                 raise UsageError("a curved reformation has no camera: view and up say which way one looks at it")
             _check_alone(view=view, up=up, zoom=zoom, view_angle=view_angle, center=center)
-        return cls(
-            camera, DEFAULT_VIEW if view is None else view, up, 1.0 if zoom is None else zoom, view_angle, center
-        )
+        return cls(camera, ANTERIOR if view is None else view, up, 1.0 if zoom is None else zoom, view_angle, center)
 
     def checked_box(self, shown: Grid) -> Grid:
         """Return the box that cameras fit; refuse a centre outside of it."""

@@ -14,10 +14,13 @@ from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import find_color
 from clrecon.system.messages import Message
 
-__all__ = ["LabelStyle", "distinct_colors"]
+__all__ = ["NO_LABEL", "LabelStyle", "distinct_colors", "find_shown"]
 
 NO_COLOR = (-1.0, -1.0, -1.0)
 """Colour in the table that means: keep the colour of the picture without labels."""
+
+NO_LABEL = 0
+"""Number of the voxels without a label: they can be made translucent or hidden, as labels can."""
 
 GOLDEN_SHARE = 0.618034
 """Step from one hue to the next, as a share of the circle: any number of colours made with it stay distinct."""
@@ -25,7 +28,7 @@ GOLDEN_SHARE = 0.618034
 
 @dataclass(frozen=True)
 class LabelStyle(Message):
-    """The look of the labels of a map; voxels without a label, and labels that are not named, keep their look.
+    """The look of the labels of a map; what is not named keeps its look, voxels without a label (0) too.
 
     Attributes
     ----------
@@ -56,7 +59,7 @@ class LabelStyle(Message):
             named keep the colour of the picture; without a mapping every label gets its own colour, see
             `distinct_colors`.
         opacity : mapping of label to float, optional
-            0 to 1: a factor on the opacity; labels that are not named keep theirs.
+            0 to 1: a factor on the opacity; labels that are not named keep theirs.  0 stands for all that has no label.
 
         Raises
         ------
@@ -70,10 +73,10 @@ class LabelStyle(Message):
         if colors is None:
             numbers = labels.numbers
             table[list(numbers), :3] = distinct_colors(len(numbers))
-        for number, color in _by_number(labels, "colours", colors).items():
+        for number, color in _by_number(labels, _COLORS, colors).items():
             table[number, :3] = find_color(color)
         for number, factor in _by_number(labels, "opacities", opacity).items():
-            table[number, 3] = _check_opacity(labels.name(number), factor)
+            table[number, 3] = _check_opacity(_name(labels, number), factor)
         table.flags.writeable = False
         return cls(labels, table)
 
@@ -83,6 +86,28 @@ class LabelStyle(Message):
         return bool((self.table[:, 3] >= 1.0).all())
 
 
+_COLORS = "colours"
+
+
+def find_shown(labels: LabelMap, label: int | str) -> int:
+    """Return the number of a label, or 0 for what has no label.
+
+    Raises
+    ------
+    UsageError
+        `LabelMap.find` does not know it.
+    """
+    return NO_LABEL if str(label).strip() == "0" else labels.find(label)
+
+
+def _name(labels: LabelMap, number: int) -> str:
+    return "0" if number == NO_LABEL else labels.name(number)
+
+
+def _named(labels: LabelMap, number: int) -> str:
+    return "0" if number == NO_LABEL else f"{number} {labels.name(number)}"
+
+
 def _by_number(labels: LabelMap, what: str, mapping: Mapping | None) -> dict:
     if mapping is None:
         return {}
@@ -90,9 +115,11 @@ def _by_number(labels: LabelMap, what: str, mapping: Mapping | None) -> dict:
         raise UsageError(f"{what} of labels are a mapping such as {{'L2': ...}}, not {type(mapping).__name__}")
     found: dict = {}
     for label, value in mapping.items():
-        number = labels.find(label)
+        number = find_shown(labels, label)
+        if number == NO_LABEL and what == _COLORS:
+            raise UsageError("what has no label (0) keeps the colours of the picture: it gets an opacity alone")
         if number in found:
-            raise UsageError(f"{what} of labels: label {number} {labels.name(number)} is named twice")
+            raise UsageError(f"{what} of labels: label {_named(labels, number)} is named twice")
         found[number] = value
     return found
 

@@ -219,7 +219,7 @@ PRESETS: dict[str, Preset] = {
         ),
         _preset(
             "minip",
-            "the lowest value along the ray: airways, emphysema, gas (mode minip; clip the air round the body away)",
+            "the lowest value along the ray: airways, emphysema, gas in the body (mode minip)",
             [(-1000.0, _BLACK, 0.5), (-500.0, _WHITE, 0.0)],
             "air has -1000 HU, emphysema less than -950 HU, aerated lung -950 to -500 HU",
             lighting=UNSHADED,

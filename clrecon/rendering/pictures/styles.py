@@ -158,7 +158,7 @@ class VolumeLook(_Labelled):
     label_colors : mapping of label to colour, optional
         Labels by number or name, see `clrecon.rendering.looks.label_style.LabelStyle.of`; default: a colour for each.
     label_opacity : mapping of label to float, optional
-        Factors on the opacity, 0 to 1.
+        Factors on the opacity, 0 to 1; label 0 is all that has no label.
     """
 
     _mode: ClassVar[str] = "dvr"
@@ -192,6 +192,9 @@ class Projection(Style):
         picture, in "drr" of the rays that meet the body.
     ray_step : float, optional
         mm between samples; default: half the smallest spacing of the volume.
+    keep_air : bool
+        Of "minip": count what lies outside of the body, and what a mask took, too; else it is left out, see
+        `clrecon.anatomy.surroundings`.
     clip : Clip, optional
         The part of space that is shown.
     """
@@ -202,11 +205,17 @@ class Projection(Style):
     _: KW_ONLY
     window: Sequence[float] | str | None = style_field(None, checked_window)
     ray_step: float | None = style_field(None, checks.ray_step)
+    keep_air: bool = style_field(False, partial(checks.flag, "keep_air"))
     clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
 
     def __post_init__(self) -> None:
         named = self.window
         super().__post_init__()
+        if self.keep_air and self.kind != "minip":
+            raise UsageError(
+                f"{name_parameter('keep_air')} belongs to mode minip: no other projection leaves air out, not"
+                f" {self.kind}"
+            )
         if self.kind == "drr" and isinstance(named, str):
             raise UsageError(
                 f"the window {named!r:.60} is in HU, and mode drr shows mm of water: give the mm that are black"
@@ -216,6 +225,11 @@ class Projection(Style):
     @property
     def mode(self) -> str:
         return self.kind
+
+    @property
+    def leaves_out(self) -> bool:
+        """True where a picture leaves out what lies outside of the body."""
+        return self.kind == "minip" and not self.keep_air
 
 
 @dataclass(frozen=True)

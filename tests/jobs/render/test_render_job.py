@@ -242,7 +242,7 @@ FAR = (5000, 0, 0, 1, 0, 0)
         ({"iso_value": 30000.0}, "mode surface"),
         ({"clip_planes": [FAR]}, "mode dvr"),
         ({"clip_planes": [FAR], "mode": "mip"}, "mode mip"),
-        ({"preset": "minip"}, "picture is black.*clip it away"),
+        ({"preset": "minip", "keep_air": True}, "picture is black.*do not keep it"),
         ({"mode": "slice", "window": (20000, 30000)}, "picture is black"),
         ({"mode": "slice", "window": (-30000, -20000)}, "picture is white"),
     ],
@@ -324,3 +324,33 @@ def test_functions_are_named_by_file_and_name(tmp_path: Path) -> None:
     with pytest.raises(RefusedInputError, match="bad.json"):
         read_function(str(tmp_path / "bad.json"))
     assert read_function(None) is None
+
+
+def test_slices_show_by_default_and_the_report_names_their_view(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    settings = RenderSettings.of("slices", size=SIZE, device=str(device.index))
+    report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), settings)
+    assert report["pictures"][0]["hit_share"] > 0.1 and not [text for text in report["warnings"] if "edge-on" in text]
+    assert report["pictures"][0]["view"] == "30,30"
+
+
+def test_a_minimum_says_what_it_leaves_out_and_regions_go_too(device: Any, tmp_path: Path) -> None:
+    """A ball of tissue in air; a region leaves a part of it, and no air round that."""
+    folder = tmp_path / "ct"
+    truth = write_phantom(
+        folder, PhantomSettings(kind="sphere", size=(60, 60), slices=40, spacing=(2.0, 2.0, 2.0), noise=0, seed=1)
+    )
+    x, y, z = truth["surface"]["center_lps_mm"]
+    box = f"box:{x - 20},{x + 20},{y - 20},{y + 20},{z - 20},{z + 20}"
+    found = []
+    for region in (None, [box]):
+        files = PictureFiles(tmp_path / "a.png", values=tmp_path / "v.npy")
+        settings = RenderSettings.of("minip", size=SIZE, device=str(device.index), region=region)
+        report = make_pictures(folder, files, settings)
+        values, said = np.load(tmp_path / "v.npy"), report["pictures"][0]["left_out"]
+        assert said["body"] and said["region"] == (region is not None)
+        assert np.nanmin(values) > -300.0 and report["volume"]["hu_range"][0] < -900.0
+        assert report["volume"]["hu_range"][1] < 5000.0
+        found.append((said["share"], int(np.isfinite(values).sum())))
+    assert 0.5 < found[0][0] < found[1][0] < 1.0 and found[1][1] > 20

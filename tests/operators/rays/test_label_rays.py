@@ -162,3 +162,18 @@ def test_a_small_picture_under_the_simulator(device):
         lighting=Lighting(direction=(0.5, -0.5, 1.0)),
     )  # fmt: skip
     assert 20 < (found.image[..., 3] > 0).sum()
+
+
+def test_what_has_no_label_can_be_hidden(device):
+    volume, labels = two_blocks()
+    camera = Camera.fit(volume, "anterior")
+    whole, left, faint = (
+        cast(device, volume, camera, labelled(labels, {1: "red", 2: "blue"}, opacity))
+        for opacity in (None, {0: 0.0}, {0: 0.5})
+    )
+    alone = (whole.image[..., :3].min(axis=-1) > 200) & (whole.image[..., 3] > 0)  # the block of no label is white
+    assert alone.mean() > 0.02
+    assert (left.image[alone, 3] == 0).mean() > 0.95  # but for the edge where the nearest voxel has a label
+    red = (whole.image[..., 0] > 200) & (whole.image[..., 2] < 50)
+    assert red.mean() > 0.05 and np.array_equal(left.image[red], whole.image[red])
+    assert np.median(faint.image[alone, 3]) in range(120, 200)  # its front and its back

@@ -7,6 +7,7 @@ import pytest
 import tolerances
 from ray_scenes import GRIDS, blobs, centre_of, look, make_volume, premultiplied
 
+import clrecon
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.operators.rays import slices as operator
@@ -17,6 +18,7 @@ from clrecon.rendering import TransferFunction
 from clrecon.rendering.pictures.styles import SlicesInSpace
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
+from clrecon.rendering.views.directions import find_view
 
 SIZE = (56, 48)
 WINDOW = (-500.0, 700.0)
@@ -150,6 +152,20 @@ def test_slices_that_are_seen_edge_on_say_so(device):
     assert not overlay_slices(DeviceVolume(volume, device=device), Camera.fit(volume, (30, 20)), (8, 8)).report[
         "warnings"
     ]
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_slices_show_without_a_view_and_in_a_scene_too(device, axis):
+    """Slices across each axis of the patient, all tissue: edge-on from the front, unless they are coronal."""
+    affine = np.diag([2.0, 2.0, 2.0, 1.0])
+    affine[:3, :3] = np.roll(affine[:3, :3], axis, axis=1)
+    volume = Volume(np.full((16, 16, 16), 100, np.int16), affine)
+    for shown in (volume, [(volume, SlicesInSpace())]):
+        style = {} if shown is not volume else {"mode": "slices"}
+        picture = clrecon.render(shown, size=(64, 64), device=device, **style)
+        assert not [text for text in picture.report["warnings"] if "edge-on" in text]
+        assert np.isfinite(picture.depth).mean() > 0.25
+        assert np.allclose(picture.camera.basis().forward, -find_view("30,30")[0])
 
 
 def test_slices_are_chosen_evenly_or_by_number():

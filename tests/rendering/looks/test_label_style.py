@@ -30,6 +30,13 @@ def test_without_colours_each_label_has_its_own():
     assert (LabelStyle.of(LABELS, {}).table[:, :3] < 0).all()
 
 
+def test_an_opacity_leaves_all_colours_as_they_are():
+    plain, faint = LabelStyle.of(LABELS).table, LabelStyle.of(LABELS, opacity={"L2": 0.2, 0: 0.0}).table
+    assert np.array_equal(plain[:, :3], faint[:, :3])
+    assert faint[:, 3].tolist() == [0.0, 1.0, 1.0, 1.0, np.float32(0.2), 1.0, 1.0, 1.0, 1.0, 1.0]
+    assert np.array_equal(LabelStyle.of(LABELS, opacity={"0": 0.5}).table[0], np.array([-1, -1, -1, 0.5], np.float32))
+
+
 def test_many_labels_keep_colours_apart():
     colors = distinct_colors(30)
     assert (colors >= 0).all() and (colors <= 1).all()
@@ -47,6 +54,9 @@ def test_many_labels_keep_colours_apart():
         ({"opacity": {"L2": 1.5}}, "the opacity of label vertebrae_L2 is a number from 0 to 1, not 1.5"),
         ({"opacity": {"L2": "thin"}}, "from 0 to 1, not 'thin'"),
         ({"opacity": {"L2": float("nan")}}, "from 0 to 1"),
+        ({"colors": {0: "red"}}, r"what has no label \(0\) keeps the colours"),
+        ({"opacity": {"0": 0.5, 0: 0.6}}, "label 0 is named twice"),
+        ({"opacity": {0: 1.5}}, "the opacity of label 0 is a number from 0 to 1, not 1.5"),
         ({"opacity": {"L2": 0.5, 4: 0.6}}, "label 4 vertebrae_L2 is named twice"),
     ],
 )

@@ -66,6 +66,7 @@ WRONG: dict[type[Style], Wrong] = {
         **RAYS,
         "kind": [("max", "one of mip, minip, mean, drr, not 'max'"), (TWO, "projection")],
         "window": [((5, 5), "window"), ((np.nan, 5), "window"), ((1, 2, 3), "window")],
+        "keep_air": [("no", "keep_air is True or False, not 'no'"), (1, "keep_air")],
     },
     SurfaceLook: {
         **LABELLED,
