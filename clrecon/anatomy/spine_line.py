@@ -4,8 +4,8 @@ In slices across the patient every place is compared with what the middle of the
 Cortical bone encloses it in all directions (within 24 mm of height, so that arches close the gaps between them).  There
 is a vertebral body in front and nothing but muscle behind, and the left mirrors the right.  Dynamic programming finds
 the path through the slices that agrees best.  The path is the canal where it agrees over enough height; elsewhere
-nothing is reported.  Each slice's point is then moved to the middle of the space that the bone encloses, and the line
-is smoothed.
+it is followed as long as all but the mirror image agrees, see `clrecon.anatomy.spine_ends`.  Each slice's point is then
+moved to the middle of the space that the bone encloses, and the line is smoothed.
 
 The search is meant for the thoracic and lumbar spine of an adult, in a scan whose axes are those of the patient.
 """
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.anatomy.spine_cells import CELL_MM, Field, SpineCells, average_cells, disc_mean, grow_cortex, plan_cells
+from clrecon.anatomy.spine_ends import GAP_MM, SpineEnd, follow, look_beyond
 from clrecon.anatomy.spine_traits import BODY_RADIUS, WORTH, measure_likeness
 from clrecon.errors import RefusedInputError
 from clrecon.geometry.affine import Float64Array
@@ -33,8 +34,6 @@ BEND_COST = 0.05
 DEEPER_AHEAD = 1.2
 """The body is at least this many times deeper in front of the canal than behind it."""
 SHORTEST_MM = 35.0
-GAP_MM = 12.0
-"""Largest gap between sure slices: an artefact, or a vertebra that looks different."""
 SMOOTH_MM = 12.0
 POINT_STEP_MM = 15.0
 CANAL_WIDTH_MM = 11.0
@@ -53,11 +52,20 @@ class SpineLine:
         Share of the slices of the line whose traits are all sure, see `clrecon.anatomy.spine_traits.SURE`.
     searched_mm : float
         Height of the volume; the line may be shorter.
+    upper, lower : SpineEnd or None
+        Its ends: those of the scan, or where it was lost and why; None where only the sure part was asked for.
     """
 
     points: Float64Array
     sure_share: float
     searched_mm: float
+    upper: SpineEnd | None = None
+    lower: SpineEnd | None = None
+
+    @property
+    def ends(self) -> dict[str, SpineEnd | None]:
+        """The ends by name: ``upper`` and ``lower``."""
+        return {"upper": self.upper, "lower": self.lower}
 
     @property
     def height_mm(self) -> float:
@@ -65,13 +73,16 @@ class SpineLine:
         return float(self.points[0, 2] - self.points[-1, 2])
 
 
-def find_spine_line(volume: Volume, *, progress: Progress | None = None) -> SpineLine:
+def find_spine_line(volume: Volume, *, sure_only: bool = False, progress: Progress | None = None) -> SpineLine:
     """Find the middle of the spinal canal.
 
     Parameters
     ----------
     volume : Volume
         A scan in HU.
+    sure_only : bool
+        Only the longest part whose slices are sure, but for gaps; else the line goes on beyond it where left and
+        right alone are not alike.
     progress : callable, optional
         Called as ``progress("curve", slices done, slices)``, over the slices of three passes.
 
@@ -90,21 +101,38 @@ def find_spine_line(volume: Volume, *, progress: Progress | None = None) -> Spin
     likeness = measure_likeness(cells, steps.take_slice)
     path = _best_path(np.clip(likeness.worth - WORTH, -WORST, None))
     sure = likeness.sure[tuple(path.T)]
-    path += (0, *likeness.first)
     begin, end = _longest_run(sure)
     searched, height = len(cells.values) * CELL_MM[2], (end - begin) * CELL_MM[2]
     if height < SHORTEST_MM:
         raise RefusedInputError(
-            f"no spine was found that one could be sure of ({height:.0f} of {searched:.0f} mm look like one):"
+            f"no spine was found that one could be sure of ({_describe_run(cells, path[begin:end], searched)}):"
             " give points of the centre line"
         )
-    ahead, behind = _depths(cells, path[begin:end])
+    path = path[begin:end]
+    ahead, behind = _depths(cells, path + (0, *likeness.first))
     if behind is not None and ahead < DEEPER_AHEAD * behind:
         raise RefusedInputError(
             f"what looks like a spine has {ahead:.0f} mm of the body in front and {behind:.0f} mm behind: it is none,"
             " or front and back of the scan are mistaken; give points of the centre line"
         )
-    return SpineLine(_centre_points(cells, path[begin:end]), float(sure[begin:end].mean()), searched)
+    ends: list[SpineEnd | None] = [None, None]
+    if not sure_only:
+        path = follow(likeness, path)
+        ends = [look_beyond(cells, likeness, path[place], step) for place, step in ((-1, 1), (0, -1))]
+    share = float(likeness.sure[tuple(path.T)].mean())
+    return SpineLine(_centre_points(cells, path + (0, *likeness.first)), share, searched, *ends)
+
+
+def _describe_run(cells: SpineCells, run: NDArray[np.int64], searched: float) -> str:
+    """Say how much of a scan looks like a spine, and where."""
+    if not len(run):
+        return f"none of its {searched:.0f} mm look like one"
+    low, high = (float(cells.origin[2] + k * CELL_MM[2]) for k in (run[0, 0], run[-1, 0]))
+    where = f"z {low:.0f} mm" if len(run) == 1 else f"z {low:.0f} to {high:.0f} mm"
+    return (
+        f"{len(run) * CELL_MM[2]:.0f} of {searched:.0f} mm look like one, at {where}, and at least"
+        f" {SHORTEST_MM:.0f} mm are needed"
+    )
 
 
 def _depths(cells: SpineCells, path: NDArray[np.int64]) -> tuple[float, float | None]:

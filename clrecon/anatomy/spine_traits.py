@@ -21,7 +21,7 @@ from clrecon.anatomy.spine_cells import (
 )
 from clrecon.system.pieces import in_threads
 
-__all__ = ["WORTH", "Likeness", "measure_likeness"]
+__all__ = ["CANAL_RADIUS", "SOFT_HU", "STILL", "SURE", "WORTH", "Likeness", "measure_likeness", "traits_of"]
 
 CANAL_RADIUS, BODY_RADIUS = 5.0, 10.0
 RING_MM = (8.0, 10.0, 12.0, 14.0, 16.0)
@@ -35,6 +35,11 @@ WORTH = 2.2
 """Score that counts neither for nor against the path; the canal has about 3.2."""
 SURE = {"wall": 0.75, "mirror": 0.55, "body": 0.25, "soft": 0.6}
 """A cell is sure when each of its traits is at least this."""
+STILL = {name: least for name, least in SURE.items() if name != "mirror"}
+"""Beside a sure cell the canal goes on in a cell with these traits: a scan that is cropped at one side, or a patient
+who lies askew, has left and right that are not alike."""
+SOFT_HU = (-80.0, 130.0)
+"""Between these lies what a canal holds: fluid, nerves and fat around them."""
 TISSUE_HU = -300.0
 """Rows and columns of cells without a value above this are not looked at; values are cut there for the mirror."""
 BORDER = 10
@@ -53,13 +58,21 @@ class Likeness:
         Sum of the traits for it, less those against it.
     sure : ndarray, shape (nz, ny, nx), bool
         Each trait for it is at least as in `SURE`.
+    goes_on : ndarray, shape (nz, ny, nx), bool
+        The traits of `STILL` are at least as there.
     first : (int, int)
         Row and column of the box among the cells; outside of it are only air and what is not measured.
     """
 
     worth: Field
     sure: NDArray[np.bool_]
+    goes_on: NDArray[np.bool_]
     first: tuple[int, int]
+
+    def box_of(self, cells: SpineCells) -> SpineCells:
+        """Return the box of the cells that was measured."""
+        (row, column), (_, ny, nx) = self.first, self.worth.shape
+        return SpineCells(cells.values[:, row : row + ny, column : column + nx], cells.origin)
 
 
 def measure_likeness(cells: SpineCells, done: Callable[[slice], None]) -> Likeness:
@@ -73,13 +86,21 @@ def measure_likeness(cells: SpineCells, done: Callable[[slice], None]) -> Likene
     """
     rows, columns = (_extent(cells.values, axis) for axis in (1, 2))
     box = SpineCells(np.ascontiguousarray(cells.values[:, rows, columns]), cells.origin)
-    worth, sure = np.empty(box.values.shape, np.float32), np.empty(box.values.shape, bool)
+    worth = np.empty(box.values.shape, np.float32)
+    sure, goes_on = np.empty(box.values.shape, bool), np.empty(box.values.shape, bool)
 
     def work(where: slice) -> None:
-        worth[where], sure[where] = _look(box, where.start, where.stop)
+        worth[where], traits = _look(box, where.start, where.stop)
+        sure[where] = np.logical_and.reduce([traits[name] >= least for name, least in SURE.items()])
+        goes_on[where] = np.logical_and.reduce([traits[name] >= least for name, least in STILL.items()])
 
     in_threads(work, len(worth), PIECE, done)
-    return Likeness(worth, sure, (rows.start, columns.start))
+    return Likeness(worth, sure, goes_on, (rows.start, columns.start))
+
+
+def traits_of(cells: SpineCells, k: int) -> dict[str, Field]:
+    """Return the traits of the cells of one slice, (ny, nx) each, by their names in `SURE`."""
+    return {name: field[0] for name, field in _look(cells, k, k + 1)[1].items()}
 
 
 def _extent(values: Field, axis: int) -> slice:
@@ -92,13 +113,13 @@ def _extent(values: Field, axis: int) -> slice:
     return slice(max(first - BORDER, 0), min(last + 1 + BORDER, count))
 
 
-def _look(cells: SpineCells, first: int, end: int) -> tuple[Field, NDArray[np.bool_]]:
-    """Return what the cells of some slices are worth, and which are sure."""
+def _look(cells: SpineCells, first: int, end: int) -> tuple[Field, dict[str, Field]]:
+    """Return what the cells of some slices are worth, and their traits by name."""
     bone_reach = heights(16.0) // 2
     bone = np.clip((cells.around(first, end, bone_reach) - 110.0) / 130.0, 0.0, 1.0)
     bone = mean_along_z(bone, 2 * bone_reach + 1)
     values = cells.values[first:end]
-    soft = disc_mean(((values > -80.0) & (values < 130.0)).astype(np.float32), CANAL_RADIUS)
+    soft = disc_mean(((values > SOFT_HU[0]) & (values < SOFT_HU[1])).astype(np.float32), CANAL_RADIUS)
     cortex = grow_cortex(cells, first, end, 24.0)
     wide = np.pad(cortex, ((0, 0), (1, 0), (1, 0)), mode="edge")
     cortex = np.maximum(np.maximum(wide[:, 1:, 1:], wide[:, :-1, 1:]), np.maximum(wide[:, 1:, :-1], wide[:, :-1, :-1]))
@@ -112,7 +133,7 @@ def _look(cells: SpineCells, first: int, end: int) -> tuple[Field, NDArray[np.bo
     worth = body + wall + 0.5 * soft - disc_mean(bone, 4.0) - 0.5 * beside - behind
     mirror = np.where((worth > WORTH - 1.3) & (soft > 0.4), _mirrored(cells, first, end), np.float32(0.0))
     traits = {"wall": wall, "mirror": mirror, "body": body, "soft": soft}
-    return worth + mirror, np.logical_and.reduce([traits[name] >= least for name, least in SURE.items()])
+    return worth + mirror, traits
 
 
 def _steps(right: float, back: float) -> tuple[int, int]:

@@ -158,7 +158,9 @@ def _checked_seeds(seeds: ArrayLike) -> Float64Array:
 def _canal_points(volume: Volume, seeds: Float64Array | None, progress: Progress) -> Float64Array:
     """Return the middle of the canal; with seeds, where it is not found, it lies behind them."""
     try:
-        return find_spine_line(volume, progress=lambda _, done, total: progress("canal", done, total)).points
+        return find_spine_line(
+            volume, sure_only=True, progress=lambda _, done, total: progress("canal", done, total)
+        ).points
     except RefusedInputError as error:
         if seeds is not None:
             return np.asarray(seeds + np.array([0.0, SEED_TO_CANAL_MM, 0.0]))

@@ -131,7 +131,7 @@ def _holds_spine(mesh: Mesh, volume: Volume, count: int, labels: NDArray[np.int6
 
     found = np.zeros(count, dtype=bool)
     try:
-        line = find_spine_line(volume).points
+        line = find_spine_line(volume, sure_only=True).points
     except RefusedInputError:
         return found
     used = np.flatnonzero(labels >= 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -30,12 +31,12 @@ from clrecon.system.progress import Progress
 __all__ = ["cut_slice", "reformat_curve"]
 
 
-WHOLE_SHARE = 0.85
-"""Share of the volume's height; if the spine was found over less, a warning says so."""
-
 DEFAULT_WIDTH_MM = 120.0
 """Default width of a curved reformation without a size: a vertebra with its surroundings."""
 
+
+BESIDE_MM = 60.0
+"""Least width of a stretched picture beyond what its line sways to the sides: half a vertebra at both."""
 
 LEAST_PIXELS = 768
 """Least pixels along the longer side of a curved reformation without a size, so that short curves are large enough to
@@ -289,18 +290,30 @@ def _lay_sheet(
     """Return the sheet along a curve, and the side of its pixels in mm."""
     straight = style.kind == "straightened"
     length = line.length if straight else stretched_length(line, across)
-    fitted, pixel = _fit_picture(volume, length, size, style)
+    sway = 0.0 if straight else float(np.ptp(line.at(np.linspace(0.0, line.length, 500)) @ across))
+    fitted, pixel = _fit_picture(volume, length, sway, size, style)
     if straight:
         return straightened_sheet(line, across, fitted, pixel, style.angle), pixel
     return stretched_sheet(line, across, fitted, pixel), pixel
 
 
 def _warn_of_part(found: dict[str, Any] | None) -> list[str]:
-    """Return the warning for a spine that was found in a part of the volume only."""
-    if found is None or found["height_mm"] >= WHOLE_SHARE * found["searched_mm"]:
+    """Return the warning for a spine that was lost before the scan ends: where, and what was found instead."""
+    if found is None:
         return []
-    height, searched = found["height_mm"], found["searched_mm"]
-    return [f"the spine was found over {height:.0f} mm of the {searched:.0f} mm of the volume"]
+    ends = [(name, found[f"{name}_end"]) for name in ("upper", "lower")]
+    lost = [
+        f"{'above' if name == 'upper' else 'below'} it was lost at z {end['lost_mm']:.1f} mm: {end['because']}"
+        for name, end in ends
+        if end["lost_mm"] is not None
+    ]
+    if not lost:
+        return []
+    (_, upper), (_, lower) = ends
+    return [
+        f"the spinal canal was followed from z {upper['z_mm']:.1f} to {lower['z_mm']:.1f} mm,"
+        f" {found['height_mm']:.0f} of the {found['searched_mm']:.0f} mm of the scan; {'; '.join(lost)}"
+    ]
 
 
 def _find_line(
@@ -311,7 +324,9 @@ def _find_line(
         curve.check_within(volume)
         return curve, None
     spine = find_spine_line(volume, progress=progress)
-    known = {"height_mm": spine.height_mm, "searched_mm": spine.searched_mm, "sure_share": spine.sure_share}
+    known: dict[str, Any] = {"height_mm": spine.height_mm, "searched_mm": spine.searched_mm}
+    known |= {"sure_share": spine.sure_share}
+    known |= {f"{name}_end": None if end is None else asdict(end) for name, end in spine.ends.items()}
     return Curve(spine.points), known | {"points_lps_mm": spine.points.round(3).tolist()}
 
 
@@ -324,21 +339,23 @@ def _find_directions(view: str | Sequence[float], up: str | ArrayLike | None) ->
 
 
 def _fit_picture(
-    volume: Volume, length: float, size: Sequence[int] | None, style: CurveCut
+    volume: Volume, length: float, sway: float, size: Sequence[int] | None, style: CurveCut
 ) -> tuple[tuple[int, int], float]:
+    """Return the size of a picture and its pixels in mm: a curve of some length that sways to the sides fits."""
+    width = max(DEFAULT_WIDTH_MM, sway + BESIDE_MM) if style.width_mm is None else style.width_mm
     if style.pixel_mm is not None:
         pixel = style.pixel_mm
     elif size is not None:
-        pixel = length / checked_size(size)[1]
+        wide, high = checked_size(size)
+        pixel = max(length / high, (sway + BESIDE_MM) / wide if sway else 0.0)
     else:
         pixel = finest_step(volume)
-        longest = max(length, DEFAULT_WIDTH_MM if style.width_mm is None else style.width_mm) / pixel
+        longest = max(length, width) / pixel
         pixel /= max(1.0, np.ceil(LEAST_PIXELS / longest))  # a whole number of pixels a voxel
     if size is not None:
         if style.width_mm is not None:
             raise UsageError("the width of a picture is given by its size or in mm, not by both")
         return checked_size(size), pixel
-    width = DEFAULT_WIDTH_MM if style.width_mm is None else style.width_mm
     return checked_size((max(round(width / pixel), 1), max(round(length / pixel), 1))), pixel
 
 
