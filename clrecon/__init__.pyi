@@ -84,9 +84,9 @@ from clrecon.rendering.movies.movie import write_animation as write_animation
 from clrecon.rendering.pictures.likeness import make_control_pictures as make_control_pictures
 from clrecon.rendering.pictures.likeness import measure_pictures as measure_pictures
 from clrecon.rendering.pictures.mesh_look import MeshLook as MeshLook
+from clrecon.rendering.pictures.point_look import PointLook as PointLook
 from clrecon.rendering.pictures.styles import CurveCut as CurveCut
 from clrecon.rendering.pictures.styles import PlaneCut as PlaneCut
-from clrecon.rendering.pictures.styles import PointLook as PointLook
 from clrecon.rendering.pictures.styles import Projection as Projection
 from clrecon.rendering.pictures.styles import SlicesInSpace as SlicesInSpace
 from clrecon.rendering.pictures.styles import Style as Style

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import tolerances
@@ -151,3 +153,44 @@ def test_real_scans_are_found_or_refused(real_data):
 def test_a_long_real_spine_is_found(real_data):
     line = find_spine_line(read_volume(real_data / "lumbar_4p25mm"))
     assert line.height_mm >= 290.0 and line.sure_share > 0.9
+
+
+def test_a_scan_that_is_cropped_at_one_side_is_followed(phantom):
+    """Beside the canal 14 mm of the left are there: left and right are not alike, but where a half of it is whole."""
+    volume, canal = phantom
+    middle = volume.lps_to_ijk([canal.mean(axis=0)])[0, 0]
+    voxels = np.array(volume.voxels)
+    voxels[:32, :, round(middle + 26.0 / 1.9) :] = -1000
+    cropped = Volume(voxels, volume.affine)
+    sure, whole = find_spine_line(cropped, sure_only=True), find_spine_line(cropped)
+    assert sure.height_mm < 0.75 * whole.height_mm and sure.ends == {"upper": None, "lower": None}
+    assert whole.height_mm >= 0.85 * whole.searched_mm and whole.sure_share < 0.8
+    assert whole.upper.lost_mm is None and whole.lower.lost_mm is None
+    check_canal(whole, canal)
+
+
+def lost_below(phantom, value):
+    """Return the line of the phantom with one value in all of its lower slices, and the height where these begin."""
+    volume, _ = phantom
+    voxels = np.array(volume.voxels)
+    voxels[:25] = value
+    return find_spine_line(Volume(voxels, volume.affine)), float(volume.slice_origins()[24, 2])
+
+
+@pytest.mark.parametrize(
+    ("value", "words"), [(600, r"bone in its place \(\d+ HU\)"), (-1000, "air or fat in its place|no vertebral body")]
+)
+def test_where_it_is_lost_is_said_in_mm_and_what_was_found_instead(phantom, value, words):
+    line, z_mm = lost_below(phantom, value)
+    assert line.upper.lost_mm is None and line.upper.because == ""
+    assert re.search(words, line.lower.because), line.lower.because
+    assert line.lower.lost_mm == pytest.approx(z_mm, abs=10.0) and line.lower.lost_mm < line.lower.z_mm
+    assert line.points[-1, 2] == pytest.approx(line.lower.z_mm, abs=0.1)
+
+
+def test_a_scan_with_too_little_of_a_spine_says_where_that_is(phantom):
+    volume, canal = phantom
+    with pytest.raises(RefusedInputError, match=r"of 20 mm look like one, at z -?\d+ to -?\d+ mm, and at least 35 mm"):
+        find_spine_line(Volume(volume.voxels[:8], volume.affine))
+    with pytest.raises(RefusedInputError, match=r"none of its \d+ mm look like one"):
+        find_spine_line(made_up("air", phantom))

@@ -29,10 +29,10 @@ from clrecon.points import PointCloud, PointStep
 from clrecon.rendering import Lighting, Rendering, TransferFunction
 from clrecon.rendering.looks.label_style import LabelStyle
 from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.rendering.pictures.point_look import PointLook
 from clrecon.rendering.pictures.styles import (
     CurveCut,
     PlaneCut,
-    PointLook,
     Projection,
     SlicesInSpace,
     SurfaceLook,

@@ -42,7 +42,7 @@ def draw_points(cloud: PointCloud, camera: Camera, size: tuple[int, int], *, dev
     ndarray, shape (height, width, 3), uint8
     """
     from clrecon.operators.rays.point_pictures import PointPictures
-    from clrecon.rendering.pictures.styles import PointLook
+    from clrecon.rendering.pictures.point_look import PointLook
 
     with PointPictures(cloud, device=device) as pictures:
         return flatten(pictures.take(PointLook(color="bone"), camera, size, BACKGROUND).image)

@@ -15,7 +15,8 @@ from clrecon.jobs.shared.run_report import RunReport
 from clrecon.rendering.looks.label_style import NO_LABEL, find_shown
 from clrecon.rendering.pictures.annotations import edge_letters
 from clrecon.rendering.pictures.mesh_look import MeshLook
-from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, PointLook, Style, SurfaceLook, VolumeLook
+from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, Style, SurfaceLook, VolumeLook
 from clrecon.system.wording import name_parameter
 from clrecon.version import package_version
 

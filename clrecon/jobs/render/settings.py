@@ -25,12 +25,11 @@ from clrecon.rendering.movies.movie import turntable_cameras
 from clrecon.rendering.pictures.annotations import SMALLEST_SIDE
 from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.modes import MODES, check_known, choose_mode, keywords_of, make_style
+from clrecon.rendering.pictures.point_look import POINT_COLORS, PointLook
 from clrecon.rendering.pictures.styles import (
-    POINT_COLORS,
     SPINE,
     CurveCut,
     PlaneCut,
-    PointLook,
     SlicesInSpace,
     Style,
     SurfaceLook,

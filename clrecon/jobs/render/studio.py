@@ -12,10 +12,10 @@ from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.looks.label_style import NO_LABEL
 from clrecon.rendering.looks.presets import find_preset
 from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.rendering.pictures.point_look import PointLook
 from clrecon.rendering.pictures.styles import (
     SPINE,
     CurveCut,
-    PointLook,
     SlicesInSpace,
     Style,
     SurfaceLook,

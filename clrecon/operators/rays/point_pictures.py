@@ -19,7 +19,7 @@ from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.looks.label_style import distinct_colors
 from clrecon.rendering.looks.window import checked_window, choose_window
-from clrecon.rendering.pictures.styles import PointLook
+from clrecon.rendering.pictures.point_look import PointLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress

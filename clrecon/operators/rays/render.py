@@ -18,9 +18,10 @@ from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.modes import find_style
-from clrecon.rendering.pictures.styles import PointLook, SlicesInSpace, Style, VolumeLook
+from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.styles import SlicesInSpace, Style, VolumeLook
 from clrecon.rendering.views.camera import Camera
-from clrecon.rendering.views.default_view import ANTERIOR, default_view
+from clrecon.rendering.views.default_view import default_view
 from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size
 from clrecon.system.progress import Progress
 
@@ -99,9 +100,7 @@ def render(
         with VolumeRenderer(shown, device=device, memory=memory) as renderer:
             return renderer.render(style, size=size, background=background, progress=progress, **{**placing, **look})
     objects = _name_objects(shown, style, look)
-    if view is None and camera is None:
-        placing["view"] = _default_view(objects)
-    place = Place.checked(objects[0][1], **placing)
+    place = Place.checked(objects[0][1], **_with_view(placing, objects))
     size = checked_size(DEFAULT_SIZE if size is None else size)
     ground = None if is_transparent(background) else background
     if isinstance(shown, PointCloud) and isinstance(chosen := objects[0][1], PointLook):
@@ -135,12 +134,14 @@ def _name_objects(
     return [(shown, chosen)]
 
 
-def _default_view(objects: Sequence[tuple[Any, Style]]) -> str:
-    """Return the view from which slices in space show, where there are any."""
-    for subject, style in objects:
-        if isinstance(style, SlicesInSpace):
-            return default_view(style.mode, subject.volume if isinstance(subject, DeviceVolume) else subject)
-    return ANTERIOR
+def _with_view(placing: dict[str, Any], objects: Sequence[tuple[Any, Style]]) -> dict[str, Any]:
+    """Return what places a camera, with the view from which slices in space show where there are any and none is named."""
+    if placing["camera"] is None and placing["view"] is None:
+        for subject, style in objects:
+            if isinstance(style, SlicesInSpace):
+                volume = subject.volume if isinstance(subject, DeviceVolume) else subject
+                return {**placing, "view": default_view(style.mode, volume)}
+    return placing
 
 
 def _styled(given: Any) -> tuple[Any, Style]:

@@ -26,7 +26,8 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
 from clrecon.rendering import Rendering
 from clrecon.rendering.pictures.mesh_look import MeshLook
-from clrecon.rendering.pictures.styles import PointLook, SlicesInSpace, Style, SurfaceLook, VolumeLook
+from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.styles import SlicesInSpace, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress, ignore_progress

@@ -24,10 +24,10 @@ from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.modes import check_known, find_style
+from clrecon.rendering.pictures.point_look import PointLook
 from clrecon.rendering.pictures.styles import (
     CurveCut,
     PlaneCut,
-    PointLook,
     Projection,
     SlicesInSpace,
     Style,

@@ -9,10 +9,10 @@ from typing import NamedTuple
 from clrecon.errors import UsageError
 from clrecon.rendering.looks.presets import find_preset
 from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.rendering.pictures.point_look import PointLook
 from clrecon.rendering.pictures.styles import (
     CurveCut,
     PlaneCut,
-    PointLook,
     Projection,
     SlicesInSpace,
     Style,

@@ -12,7 +12,7 @@ from clrecon.operators.rays.point_pictures import PointPictures
 from clrecon.operators.rays.splats import LARGEST_DISC
 from clrecon.points import PointCloud
 from clrecon.points.spacing import mean_spacing
-from clrecon.rendering.pictures.styles import PointLook
+from clrecon.rendering.pictures.point_look import PointLook
 from clrecon.rendering.views.camera import Camera
 
 ABOVE = Camera((3.5, 3.5, 50.0), (3.5, 3.5, 0.0), (0.0, 1.0, 0.0), parallel_scale=5.0)

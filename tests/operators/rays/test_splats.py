@@ -16,7 +16,7 @@ from clrecon.operators.rays.splats import draw_splats
 from clrecon.points import PointCloud
 from clrecon.reference.rays.splats import find_splats, shade_splats
 from clrecon.rendering import UNSHADED, Lighting
-from clrecon.rendering.pictures.styles import PointLook
+from clrecon.rendering.pictures.point_look import PointLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 
