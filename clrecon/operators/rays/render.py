@@ -135,7 +135,7 @@ def _name_objects(
 
 
 def _with_view(placing: dict[str, Any], objects: Sequence[tuple[Any, Style]]) -> dict[str, Any]:
-    """Return what places a camera, with the view from which slices in space show where there are any and none is named."""
+    """Return what places a camera; where no view is named, with one from which slices in space show."""
     if placing["camera"] is None and placing["view"] is None:
         for subject, style in objects:
             if isinstance(style, SlicesInSpace):
