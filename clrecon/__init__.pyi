@@ -19,6 +19,7 @@ from clrecon.formats.write_volume import write_volume as write_volume
 from clrecon.geometry import Volume as Volume
 from clrecon.labels import LabelMap as LabelMap
 from clrecon.labels import read_labels as read_labels
+from clrecon.labels import resample_labels as resample_labels
 from clrecon.labels.statistics import measure_labels as measure_labels
 from clrecon.mesh import Mesh as Mesh
 from clrecon.mesh.compare.cells import GridCells as GridCells

@@ -10,8 +10,8 @@ from clrecon.formats.grid_file import GridFile
 from clrecon.formats.values import GridValues
 from clrecon.geometry.affine import column_spacing, slice_normal, tilt_degrees
 from clrecon.geometry.certificate import Certificate
+from clrecon.geometry.orientation import describe_orientation
 from clrecon.sources.gates import PADDING_SHARE, judge_figures, judge_steps, list_odd_values
-from clrecon.sources.orientation import describe_orientation
 from clrecon.system.gates import Gate, at_most, none_of, unmeasured
 
 __all__ = ["MODALITY", "certify_grid", "collect_header_warnings", "collect_value_warnings"]

@@ -23,6 +23,7 @@ from clrecon.formats.grid_file import GridFile, Purpose
 from clrecon.formats.stream import VoxelBytes, file_beside, read_bytes
 from clrecon.geometry.affine import Float64Array, checked_affine
 from clrecon.geometry.frames import lps_affine_from_ras
+from clrecon.geometry.nifti import MM_PER_UNIT
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
@@ -30,9 +31,6 @@ __all__ = ["is_nifti", "nifti_affine", "open_nifti"]
 
 LARGEST_HEADER = 2**24
 """Most bytes before the voxels; extensions of label maps have some 10,000."""
-
-MM_PER_UNIT = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
-"""Millimetres of each code of the spatial unit: unknown (read as mm, as other programs do), metre, mm, micron."""
 
 AFFINES_DIFFER_MM = 0.1
 """Distance at a corner from which sform and qform count as different; the quaternions of a qform are only float32."""

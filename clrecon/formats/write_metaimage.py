@@ -7,13 +7,11 @@ import tempfile
 from pathlib import Path
 from typing import BinaryIO
 
-import numpy as np
-
 from clrecon.errors import OutputError
 from clrecon.formats.content import VolumeContent
 from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import VOLUME
-from clrecon.geometry.affine import column_spacing
+from clrecon.geometry.itk import make_sitk
 from clrecon.system.foreign_words import hush
 
 __all__ = ["write_metaimage"]
@@ -33,11 +31,7 @@ def write_metaimage(stream: BinaryIO, content: VolumeContent) -> None:
     """
     sitk = import_extra("SimpleITK", VOLUME)
     content.progress("write", 0, 0)
-    spacing = column_spacing(content.affine)
-    image = sitk.GetImageFromArray(content.voxels)
-    image.SetSpacing(spacing)
-    image.SetOrigin(content.affine[:3, 3].tolist())
-    image.SetDirection((content.affine[:3, :3] / np.array(spacing)).ravel().tolist())
+    image = make_sitk(content.voxels, content.affine)
     for n, line in enumerate(("HU", *content.lines)):
         image.SetMetaData(f"clrecon_{n:02}", line)
     with tempfile.TemporaryDirectory(prefix="clrecon-") as folder:

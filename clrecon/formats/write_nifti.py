@@ -11,40 +11,12 @@ import numpy as np
 from clrecon.formats.content import PACKING, VolumeContent
 from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import VOLUME
-from clrecon.geometry.affine import Float64Array, column_spacing
-from clrecon.geometry.frames import lps_affine_from_ras
+from clrecon.geometry.nifti import place_in_header
 
-__all__ = ["place_in_header", "write_nifti"]
-
-MM = 2
-SCANNER = 1
-"""Codes of NIfTI: lengths in mm, positions as the scanner gave them."""
+__all__ = ["write_nifti"]
 
 COMMENT_CODE = 6
 """Code of the extension that holds plain text."""
-
-
-def place_in_header(header: Any, affine: Float64Array) -> None:
-    """Write the place of the voxels into a header of nibabel.
-
-    Parameters
-    ----------
-    header : nibabel.Nifti1Header
-    affine : ndarray, shape (4, 4)
-        Index (i, j, k) to LPS mm.
-    """
-    ras = lps_affine_from_ras(affine)
-    header.set_xyzt_units(MM)
-    header.set_sform(ras, SCANNER)
-    if _is_rigid(ras):
-        header.set_qform(ras, SCANNER)  # cannot hold a shear
-    else:
-        header["pixdim"][1:4] = column_spacing(affine)
-
-
-def _is_rigid(affine: Float64Array) -> bool:
-    axes = affine[:3, :3] / np.linalg.norm(affine[:3, :3], axis=0)
-    return bool(np.abs(axes.T @ axes - np.eye(3)).max() < 1e-6)
 
 
 def write_nifti(stream: BinaryIO, content: VolumeContent, *, packed: bool) -> None:

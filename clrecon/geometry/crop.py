@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.base import BaseVolume
 from clrecon.geometry.blocks import Block, describe_place, find_block, place_block
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.frames import frame_from_lps
-from clrecon.geometry.volume import Volume
 
 __all__ = ["crop_volume", "cut_block", "describe_extent", "find_extent"]
 
+Own = TypeVar("Own", bound=BaseVolume)
 
-def crop_volume(volume: Volume, low: ArrayLike, high: ArrayLike, *, margin: int = 0, space: str = "lps") -> Volume:
+
+def crop_volume(volume: Own, low: ArrayLike, high: ArrayLike, *, margin: int = 0, space: str = "lps") -> Own:
     """Crop a volume to the smallest block of whole voxels that holds every voxel centre in a box.
 
     Voxels keep their places; slices of an uneven volume keep their own positions.  Where the volume lies oblique to the
@@ -40,7 +43,7 @@ def crop_volume(volume: Volume, low: ArrayLike, high: ArrayLike, *, margin: int 
     Raises
     ------
     UsageError
-        The corners are no numbers, or in the wrong order, or no voxel centre lies in the box.
+        The corners are no numbers, or in the wrong order, no voxel centre lies in the box, or `margin` is below 0.
     """
     try:
         box = np.array([low, high], dtype=np.float64)
@@ -53,6 +56,8 @@ def crop_volume(volume: Volume, low: ArrayLike, high: ArrayLike, *, margin: int 
             raise UsageError(
                 f"the box runs from {below:g} to {above:g} mm along {axis}: it holds nothing; give the lower end first"
             )
+    if not isinstance(margin, int | np.integer) or margin < 0:
+        raise UsageError(f"the margin of a crop is a number of voxels from 0, not {margin!r}")
     turned = np.sort(box * np.diag(frame_from_lps(space)), axis=0)
     block = find_block(volume, volume.slice_origins(), turned[0], turned[1], margin)
     if block is None:
@@ -63,14 +68,14 @@ def crop_volume(volume: Volume, low: ArrayLike, high: ArrayLike, *, margin: int 
     return _certify(volume, cut_block(volume, block), block, box, space)
 
 
-def cut_block(volume: Volume, block: Block) -> Volume:
+def cut_block(volume: Own, block: Block) -> Own:
     """Return a block of a volume with the report of the whole."""
     (i0, j0, k0), (i1, j1, k1) = block
     affine, positions = place_block(volume.affine, volume.slice_origins(), volume.uneven, block)
-    return Volume(volume.voxels[k0:k1, j0:j1, i0:i1], affine, volume.report, positions)
+    return type(volume)(volume.voxels[k0:k1, j0:j1, i0:i1], affine, volume.report, positions)
 
 
-def _certify(volume: Volume, cropped: Volume, block: Block, box: np.ndarray, space: str) -> Volume:
+def _certify(volume: Own, cropped: Own, block: Block, box: np.ndarray, space: str) -> Own:
     every, kept = math.prod(volume.shape_ijk), math.prod(cropped.shape_ijk)
     place = describe_place(volume.report, cropped)
     size = [n * step for n, step in zip(cropped.shape_ijk, cropped.spacing, strict=True)]
@@ -92,14 +97,15 @@ def _certify(volume: Volume, cropped: Volume, block: Block, box: np.ndarray, spa
     return cropped
 
 
-def find_extent(volume: Volume) -> tuple[Float64Array, Float64Array]:
+def find_extent(volume: BaseVolume) -> tuple[Float64Array, Float64Array]:
     """Return the lowest and highest (x, y, z) of the box of the voxels' centres, LPS mm."""
-    ni, nj, nk = volume.shape_ijk
-    corners = volume.ijk_to_lps([(i, j, k) for i in (0, ni - 1) for j in (0, nj - 1) for k in (0, nk - 1)])
+    ni, nj, _ = volume.shape_ijk
+    in_plane = np.array([(i, j) for i in (0, ni - 1) for j in (0, nj - 1)]) @ volume.affine[:3, :2].T
+    corners = (volume.slice_origins()[:, None] + in_plane).reshape(-1, 3)
     return corners.min(axis=0), corners.max(axis=0)
 
 
-def describe_extent(volume: Volume, space: str) -> str:
+def describe_extent(volume: BaseVolume, space: str) -> str:
     """Describe the box of the voxels' centres, mm of the frame `space`, and their HU."""
     low, high = np.sort(np.array(find_extent(volume)) * np.diag(frame_from_lps(space)), axis=0)
     box = ", ".join(f"{name} {a:.1f} to {b:.1f}" for name, a, b in zip("xyz", low, high, strict=True))

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 
-__all__ = ["SPACES", "frame_from_lps", "lps_affine_from_ras"]
+__all__ = ["SPACES", "choose_space", "frame_from_lps", "lps_affine_from_ras"]
 
 SPACES = ("lps", "ras")
 
@@ -49,3 +49,32 @@ def lps_affine_from_ras(affine: ArrayLike) -> NDArray[np.float64]:
     ndarray, shape (4, 4), float64
     """
     return np.asarray(np.diag((-1.0, -1.0, 1.0, 1.0)) @ np.asarray(affine, dtype=np.float64), dtype=np.float64)
+
+
+def choose_space(asked: str | None, named: object, what: str) -> str:
+    """Return ``LPS`` or ``RAS``: the patient frame of what another library holds.
+
+    Parameters
+    ----------
+    asked : str or None
+        That of the caller; None: that which `named` says, else LPS.
+    named : object
+        What the data themselves say, None where they say nothing.
+    what : str
+        The data, for messages.
+
+    Raises
+    ------
+    UsageError
+        The frame that was asked for is unknown, or not the one that the data name; or that one is unknown.
+    """
+    if asked is not None:
+        frame_from_lps(asked)
+    if named is None:
+        return "LPS" if asked is None else asked.upper()
+    told = str(named).upper()
+    if told.lower() not in SPACES:
+        raise UsageError(f"{what} names the frame {str(named)[:40]!r}: {' or '.join(SPACES)} are known")
+    if asked is not None and asked.upper() != told:
+        raise UsageError(f"{what} says that its coordinates are {told}, {asked.upper()} was asked for: leave space out")
+    return told

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from clrecon.geometry.affine import Float64Array, apply_affine, column_spacing
 from clrecon.system.mapping import find_mapping
@@ -46,6 +46,26 @@ class Grid(Message):
     def voxels(self) -> NDArray[Any]:
         """The voxels, shape (nk, nj, ni)."""
         return self._voxels
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(nk, nj, ni), the shape of `voxels`; `shape_ijk` is its reverse."""
+        nk, nj, ni = self._voxels.shape
+        return nk, nj, ni
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the voxels."""
+        return self._voxels.dtype
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        """Return the voxels, shape (nk, nj, ni), for numpy; a copy only where one is asked for or the type changes."""
+        wanted = self._voxels.dtype if dtype is None else np.dtype(dtype)
+        if wanted == self._voxels.dtype:
+            return self._voxels.copy() if copy else self._voxels
+        if copy is False:
+            raise ValueError(f"voxels of type {self._voxels.dtype} are {wanted} only as a copy")
+        return self._voxels.astype(wanted)
 
     @property
     def affine(self) -> Float64Array:

@@ -60,7 +60,7 @@ def regular_grid(grid: Grid, origins: Float64Array, step_mm: float | None = None
     """Return the smallest regular grid that encloses all voxel centres of a grid.
 
     i runs as in the grid, j within the plane of the slices, k along their normal.  Without `step_mm`, i and j have the
-    steps of the grid and k the mean distance of the slices along the normal: where a volume is sheared but even, the
+    steps of the grid and k the smallest distance of slices along the normal: where a volume is sheared but even, the
     planes are those of its slices.
 
     Parameters
@@ -80,7 +80,7 @@ def regular_grid(grid: Grid, origins: Float64Array, step_mm: float | None = None
     in_plane = np.array([(i, j) for i, j in product((0, ni - 1), (0, nj - 1))]) @ grid.affine[:3, :2].T
     places = (origins[:, None, :] + in_plane).reshape(-1, 3) @ axes
     heights = origins @ axes[:, 2]
-    dk = abs(heights[-1] - heights[0]) / (nk - 1) if nk > 1 else abs(grid.affine[:3, 2] @ axes[:, 2])
+    dk = np.abs(np.diff(heights)).min() if nk > 1 else abs(grid.affine[:3, 2] @ axes[:, 2])
     spacing = np.array([di, dj, dk]) if step_mm is None else np.full(3, step_mm)
     low, high = places.min(axis=0), places.max(axis=0)
     counts = np.ceil((high - low) / spacing - ON_GRID).astype(int) + 1

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from typing import Any, TypeVar
 
 import numpy as np
 
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry.base import AIR_HU, BaseVolume
 from clrecon.geometry.blocks import describe_place
 from clrecon.geometry.certificate import amend
-from clrecon.geometry.regular import regular_grid, resample_grid
-from clrecon.geometry.volume import AIR_HU, Volume
+from clrecon.geometry.regular import RegularGrid, regular_grid, resample_grid
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["MOST_VOXELS", "SMALLEST_STEP_MM", "check_step", "resample_volume"]
+__all__ = ["MOST_VOXELS", "SMALLEST_STEP_MM", "air_of", "check_count", "check_step", "resample_volume"]
+
+Own = TypeVar("Own", bound=BaseVolume)
 
 SMALLEST_STEP_MM = 0.01
 MOST_VOXELS = 2**31
@@ -28,13 +31,39 @@ def check_step(step_mm: float) -> None:
     UsageError
         It is no number, or below 0.01 mm.
     """
-    if not (math.isfinite(step_mm) and step_mm >= SMALLEST_STEP_MM):
-        raise UsageError(
-            f"the step of a resampled volume is a length of at least {SMALLEST_STEP_MM:g} mm, not {step_mm:g}"
+    number = isinstance(step_mm, int | float | np.integer | np.floating)
+    if not (number and math.isfinite(step_mm) and step_mm >= SMALLEST_STEP_MM):
+        shown = f"{step_mm:g}" if number else repr(step_mm)[:40]
+        raise UsageError(f"the step of a resampled volume is a length of at least {SMALLEST_STEP_MM:g} mm, not {shown}")
+
+
+def check_count(regular: RegularGrid, steps: str) -> None:
+    """Refuse a grid that is too large.
+
+    Parameters
+    ----------
+    regular : RegularGrid
+    steps : str
+        What its steps are, for the message.
+
+    Raises
+    ------
+    RefusedInputError
+        It has more than 2^31 voxels.
+    """
+    if math.prod(regular.shape_ijk) > MOST_VOXELS:
+        shape = " x ".join(f"{n:,}" for n in regular.shape_ijk)
+        raise RefusedInputError(
+            f"{steps} the volume has {shape} voxels, at most {MOST_VOXELS:,} are made: take a longer step, or crop it"
         )
 
 
-def resample_volume(volume: Volume, step_mm: float, *, progress: Progress | None = None) -> Volume:
+def air_of(dtype: np.dtype[Any]) -> float:
+    """Return the value of voxels that hold no measurement, `AIR_HU` or the lowest value that the type has."""
+    return AIR_HU if dtype.kind == "f" else max(AIR_HU, int(np.iinfo(dtype).min))
+
+
+def resample_volume(volume: Own, step_mm: float, *, progress: Progress | None = None) -> Own:
     """Resample a volume (trilinear) to a regular grid with the same step along all axes, at right angles.
 
     i runs as in the volume, j within the plane of its slices, k along their normal.  The grid encloses all voxel
@@ -62,16 +91,9 @@ def resample_volume(volume: Volume, step_mm: float, *, progress: Progress | None
     """
     check_step(step_mm)
     regular = regular_grid(volume, volume.slice_origins(), step_mm)
-    count = math.prod(regular.shape_ijk)
-    if count > MOST_VOXELS:
-        shape = " x ".join(f"{n:,}" for n in regular.shape_ijk)
-        raise RefusedInputError(
-            f"in steps of {step_mm:g} mm the volume has {shape} voxels, at most {MOST_VOXELS:,} are made: take a longer"
-            " step, or crop it"
-        )
-    dtype = volume.voxels.dtype
-    air = AIR_HU if dtype.kind == "f" else max(AIR_HU, np.iinfo(dtype).min)
-    made = Volume(resample_grid(volume, regular, air, progress or ignore_progress), regular.affine)
+    check_count(regular, f"in steps of {step_mm:g} mm")
+    voxels = resample_grid(volume, regular, air_of(volume.dtype), progress or ignore_progress)
+    made = type(volume)(voxels, regular.affine)
     before = " x ".join(f"{step:.4g}" for step in volume.spacing)
     said = f"resampled (trilinear) from {'uneven slices' if volume.uneven else f'{before} mm'} to {step_mm:g} mm"
     made.report = amend(

@@ -1,77 +1,37 @@
-"""`Volume`: voxels and the affine that places them in the patient."""
+"""`Volume`: voxels and the affine that places them in the patient, its parts, and its ways to other libraries."""
 
 from __future__ import annotations
 
-import sys
-from copy import deepcopy
-from functools import cached_property
-from typing import Any
+import os
+from collections.abc import Sequence
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry.affine import Float64Array, checked_affine, checked_points
-from clrecon.geometry.certificate import Certificate, amend
-from clrecon.geometry.grid import Grid
-from clrecon.geometry.uneven import UnevenStack
+from clrecon.geometry.base import AIR_HU, DEVICE_DTYPES, BaseVolume
+from clrecon.geometry.boxes import CROPS, crop_box
+from clrecon.geometry.crop import crop_volume, find_extent
+from clrecon.geometry.images import image_of
+from clrecon.geometry.itk import make_sitk, take_sitk
+from clrecon.geometry.nifti import make_nibabel, take_nibabel
+from clrecon.geometry.resample import resample_volume
+from clrecon.geometry.slicing import slice_volume
+from clrecon.system.progress import Progress
+from clrecon.system.public import public_function
+from clrecon.system.targets import keep_existing
 
 __all__ = ["AIR_HU", "DEVICE_DTYPES", "Volume"]
 
-AIR_HU = -1024
-"""HU given to voxels that hold no measurement (padding): the floor of the 12-bit CT number scale.  Air is -1000 HU, so
-a lower value stays outside every surface of something denser than air."""
-
-DEVICE_DTYPES = tuple(np.dtype(name) for name in ("int8", "uint8", "int16", "uint16", "int32", "float32"))
-"""Voxel types that go to a device unchanged; others are converted once, when a Volume is made."""
+Own = TypeVar("Own", bound="Volume")
 
 
-def _device_ready(voxels: NDArray[Any]) -> NDArray[Any]:
-    """Return `voxels` C-contiguous, in native byte order and in one of `DEVICE_DTYPES`; refuse values outside its
-    range.
-    """
-    dtype = voxels.dtype.newbyteorder("=")
-    if dtype == np.bool_:
-        dtype = np.dtype(np.uint8)
-    elif dtype.kind == "f" and dtype != np.float32:
-        dtype = np.dtype(np.float32)
-        if np.abs(voxels).max() > np.finfo(np.float32).max and np.isfinite(voxels).all():
-            raise UsageError("the voxels go beyond the range of float32")
-    elif dtype.kind in "iu" and dtype not in DEVICE_DTYPES:
-        limits = np.iinfo(np.int32)
-        low, high = int(voxels.min()), int(voxels.max())
-        if low < limits.min or high > limits.max:
-            raise UsageError(f"voxels run from {low} to {high}: integers beyond 32 bits are not supported")
-        dtype = np.dtype(np.int32)
-    elif dtype not in DEVICE_DTYPES:
-        raise UsageError(f"voxels of type {voxels.dtype} are not supported: use integers or floats")
-    return np.ascontiguousarray(voxels, dtype=dtype)
-
-
-def _as_array(voxels: ArrayLike) -> NDArray[Any]:
-    if "numpy.ma" in sys.modules:  # where it is not loaded, no array is masked; to load it takes 10 ms
-        import numpy.ma as masked  # waits where another thread is about to load it: half loaded, it has no MaskedArray
-
-        if isinstance(voxels, masked.MaskedArray) and masked.is_masked(voxels):
-            raise UsageError("masked voxels: fill them first, for CT with voxels.filled(clrecon.geometry.AIR_HU)")
-    try:
-        return np.asarray(voxels)
-    except ValueError as error:
-        raise UsageError(f"voxels are no array of numbers: {error}") from error
-
-
-def _value_range(voxels: NDArray[Any]) -> tuple[float, float] | None:
-    """Return the lowest and highest finite number, found slice by slice; None where no number is finite."""
-    low, high = np.inf, -np.inf
-    for layer in voxels:
-        values = layer[np.isfinite(layer)] if layer.dtype.kind == "f" else layer
-        if values.size:
-            low, high = min(low, float(values.min())), max(high, float(values.max()))
-    return (low, high) if low <= high else None
-
-
-class Volume(Grid):
+class Volume(BaseVolume):
     """Voxels in HU with the affine that places them in the patient.
+
+    ``np.asarray(volume)`` are its voxels, without a copy.  ``volume[k0:k1, j0:j1, i0:i1]`` is a part of it at its own
+    place, in the axis order of `shape` and of the voxels.
 
     Parameters
     ----------
@@ -96,113 +56,126 @@ class Volume(Grid):
         `slice_positions` do not match the affine.
     """
 
-    def __init__(
-        self,
-        voxels: ArrayLike,
-        affine: ArrayLike,
-        report: dict[str, Any] | None = None,
-        slice_positions: ArrayLike | None = None,
-        *,
-        hu_range: tuple[float, float] | None = None,
-    ):
-        array = _as_array(voxels)
-        if array.ndim != 3:
-            raise UsageError(f"voxels have three axes (k, j, i), these have shape {array.shape}")
-        if array.size == 0:
-            raise UsageError(f"the volume is empty: its shape is {array.shape}")
-        super().__init__(_device_ready(array), checked_affine(affine))
-        self._stack: UnevenStack | None = None
-        if slice_positions is not None:
-            self._stack = UnevenStack.of(self._affine, slice_positions, self._voxels.shape[0])
-        self.report: dict[str, Any] = {"warnings": []} if report is None else report
-        if hu_range is not None:
-            self.hu_range = hu_range
+    __iter__ = None  # without it Python would try volume[0], volume[1], ...
 
     @property
-    def certificate(self) -> Certificate | None:
-        """The report of a volume that was read; None where the volume was made from arrays."""
-        return self.report if isinstance(self.report, Certificate) else None
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner of the box round the voxels' centres, shape (2, 3), LPS mm."""
+        return np.array(find_extent(self))
 
-    @cached_property
-    def hu_range(self) -> tuple[float, float] | None:
-        """Lowest and highest finite value, as found at the first call; None where no value is finite."""
-        return _value_range(self._voxels)
+    def __getitem__(self: Own, key: Any) -> Own:
+        """Return the part of the volume between indices along k, j, i; its voxels keep their places in the patient.
 
-    @property
-    def affine(self) -> Float64Array:
-        """4x4 float64, index (i, j, k) to LPS mm (read-only); where the slices are `uneven` only nominal along k."""
-        return self._affine
+        Ranges are taken as numpy takes them, steps and negative steps included, and never smoothed: ``volume[::2]``
+        has every other slice and twice the spacing.  A single index is refused, as by nibabel's ``slicer``, since
+        ``volume[7]`` would have no slice step; ``volume[7:8]`` has.  Uneven slices keep their own positions, and get an
+        affine where those left are even (within 0.01 mm or 1 % of the gap, as on reading).  Voxels are shared where
+        numpy can.
 
-    @property
-    def uneven(self) -> bool:
-        """True when the slices lie where `slice_origins` says and not at the affine's even steps."""
-        return self._stack is not None
-
-    def ijk_to_lps(self, points: ArrayLike) -> Float64Array:
-        """Map index coordinates (n, 3), fractions allowed, to LPS mm (n, 3), float64; exact for uneven slices too."""
-        if self._stack is not None:
-            return self._stack.ijk_to_lps(checked_points(points))
-        return super().ijk_to_lps(points)
-
-    def lps_to_ijk(self, points: ArrayLike) -> Float64Array:
-        """Map LPS mm (n, 3) to index coordinates (n, 3), float64; the inverse of `ijk_to_lps`."""
-        if self._stack is not None:
-            return self._stack.lps_to_ijk(checked_points(points))
-        return super().lps_to_ijk(points)
-
-    def slice_origins(self, border: int = 0) -> Float64Array:
-        """Positions in LPS mm of voxel (0, 0, k) for k from ``-border`` to ``nk - 1 + border``.
-
-        Parameters
-        ----------
-        border : int
-            Number of further positions beyond either end, in the steps of the ends.
-
-        Returns
-        -------
-        ndarray, shape (nk + 2 * border, 3), float64
-        """
-        k = np.arange(-border, self._voxels.shape[0] + border, dtype=np.float64)
-        if self._stack is not None:
-            return self._stack.origins_at(k)
-        return self._affine[:3, 3] + k[:, None] * self._affine[:3, 2]
-
-    def with_voxels(self, voxels: ArrayLike, report: dict[str, Any] | None = None) -> Volume:
-        """Return a volume with other values at the same places.
-
-        ``hu_range`` of the copied report is that of the new values.  Its other entries about voxels, such as
-        ``padding_share`` and ``padding_hu``, still describe the series as it was read.
-
-        Parameters
-        ----------
-        voxels : array_like, shape (nk, nj, ni)
-        report : dict, optional
-            In place of a copy of this volume's.
+        The certificate stays, with shape, place and range of the part, its entry ``sliced`` and a warning; its gates
+        are those of the scan as it was read.
 
         Raises
         ------
         UsageError
-            The shape differs.
+            An index is no slice, there are more than three, or nothing is left.
         """
-        array = _as_array(voxels)
-        if array.shape != self._voxels.shape:
-            raise UsageError(f"the voxels have shape {array.shape}, those of this volume {self._voxels.shape}")
-        positions = None if self._stack is None else self.slice_origins()
-        if report is not None:
-            return Volume(array, self._affine, report, positions)
-        report, found = deepcopy(self.report), None
-        if report.get("hu_range") is not None:
-            found = _value_range(array)
-            report = amend(report, hu_range=None if found is None else list(found))
-        return Volume(array, self._affine, report, positions, hu_range=found)
+        return slice_volume(self, key)
 
-    def release_slices(self, first: int, end: int) -> None:
-        """Let slices ``first`` to ``end - 1`` of a memory-mapped volume leave memory, because they are not needed soon.
+    def crop(
+        self: Own,
+        *,
+        clip_box: Sequence[float | None] | None = None,
+        between: Sequence[float | None] | None = None,
+        around: Sequence[float] | None = None,
+        margin: int = 0,
+        space: str = "lps",
+    ) -> Own:
+        """Return the smallest block of whole voxels that holds every voxel centre in a box of mm; see docs/export.md.
 
-        The values stay the same: the slices are read again when they are used.  Other volumes are not affected.
+        The certificate stays, with shape, place and range of the part, its entry ``crop`` and a warning.
+
+        Parameters
+        ----------
+        clip_box : (x0, x1, y0, y1, z0, z1), optional
+            A box along the patient's axes, mm; None leaves a side open.
+        between : (z0, z1), optional
+            Two heights, mm; one of them may be None.
+        around : (x, y, z, r), optional
+            A cube, r mm from a point to each side.  Of several, what is in all of them stays.
+        margin : int
+            Voxels more on each side, as far as the volume goes.
+        space : {"lps", "ras"}
+            Patient frame of the numbers.
+
+        Raises
+        ------
+        UsageError
+            No box is given, one is none, or no voxel centre lies in it.
         """
-        if self._mapping is not None:
-            self._mapping.release(self._voxels[first:end])
+        box = crop_box(clip_box, between, around)
+        if box is None:
+            raise UsageError(f"a crop needs a box: {', '.join(CROPS[:-1])} or {CROPS[-1]}")
+        return crop_volume(self, *box, margin=margin, space=space)
+
+    def resample(self: Own, step_mm: float, *, progress: Progress | None = None) -> Own:
+        """Return a copy (trilinear) on a regular grid with one step along all axes, at right angles.
+
+        i runs as in the volume, j within the plane of its slices, k along their normal; points beyond the voxels are
+        `AIR_HU`.  Uneven and tilted slices become even and straight.  The certificate stays, with the new shape and
+        place, its entry ``resampled`` and a warning.
+
+        Parameters
+        ----------
+        step_mm : float
+        progress : callable, optional
+            ``progress("resample", done, total)`` in slices.
+
+        Raises
+        ------
+        UsageError
+            `step_mm` is no length, or below 0.01 mm.
+        RefusedInputError
+            The result would have more than 2^31 voxels.
+        """
+        return resample_volume(self, step_mm, progress=progress)
+
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        resample: float | None = None,
+        no_clobber: bool = False,
+        keep_ids: bool = False,
+        progress: Progress | None = None,
+    ) -> int:
+        """Write the volume to .nii.gz, .nii, .nrrd or .mha, as `clrecon.write_volume` does: with its certificate.
+
+        Parameters
+        ----------
+        path : str or path
+        resample : float, optional
+            Step in mm of a regular grid, which uneven slices need, and in .mha sheared axes.
+        no_clobber : bool
+            True: a file of that name stays and is an `OutputError`.
+        keep_ids : bool
+            True: the file holds the hash of the frame of reference.
+        progress : callable, optional
+            ``progress("write", done, total)`` in slices.
+
+        Returns
+        -------
+        int
+            Size of the file in bytes.
+
+        Raises
+        ------
+        UsageError, OutputError
+            As `clrecon.write_volume`.
+        """
+        with keep_existing(no_clobber):
+            write_volume = public_function("write_volume")
+            return int(write_volume(self, path, resample=resample, keep_ids=keep_ids, progress=progress))
 
     def to_pyvista(self, resample: bool = False) -> Any:
         """Return the volume as ``pyvista.ImageData`` in LPS mm, its HU as the active point data ``HU``.
@@ -210,7 +183,7 @@ class Volume(Grid):
         The points lie where `ijk_to_lps` puts the voxels, i runs fastest.  The image shares the memory of the voxels:
         a change of one is a change of the other.  It is a copy where the axes are left-handed (a field array ``SLICES``
         then says that the slices are in reverse order, which VTK needs) or where it is resampled.  Field arrays
-        ``SPACE`` and ``UNIT`` say what the coordinates are.
+        ``SPACE`` and ``UNIT`` say what the coordinates are.  The certificate does not go with it.
 
         Contour it with ``image.contour([250], method="flying_edges")``: pyvista's default method does not look at an
         image's direction.
@@ -218,23 +191,115 @@ class Volume(Grid):
         Parameters
         ----------
         resample : bool
-            A sheared or unevenly spaced volume, which no image can hold, is resampled (trilinear) to a regular grid of
-            the same spacing around all its voxels; points beyond the voxels are `AIR_HU`.  A field array ``RESAMPLED``
-            says so.  Other volumes stay as they are.
+            A sheared or unevenly spaced volume, which no image can hold, is resampled (trilinear) to a regular grid
+            around all its voxels, i and j in their own steps and k in the smallest step of the slices; points beyond
+            the voxels are `AIR_HU`.  A field array ``RESAMPLED`` says so.  Other volumes stay as they are.
 
         Raises
         ------
         UsageError
             The volume is sheared or unevenly spaced, and is not to be resampled.
+        RefusedInputError
+            Resampled it would have more than 2^31 voxels: `resample` with a longer step comes first.
         """
         from clrecon.geometry.vtk import make_image_data
 
-        dtype = self.voxels.dtype
-        air = AIR_HU if dtype.kind == "f" else max(AIR_HU, np.iinfo(dtype).min)
-        return make_image_data(self, self.slice_origins(), self.uneven, resample, air)
+        return make_image_data(image_of(self, resample, "to_pyvista"))
+
+    @classmethod
+    def from_pyvista(cls: type[Own], image: Any, name: str | None = None, space: str | None = None) -> Own:
+        """Make a volume of a ``pyvista.ImageData``, or ``vtkImageData``; its voxels are a copy.
+
+        It has no certificate: nothing vouches for its HU.  What `to_pyvista` turned round comes back as it was.
+
+        Parameters
+        ----------
+        image : pyvista.ImageData
+            In mm, with one number at each point.
+        name : str, optional
+            Name of the point data; None: the active scalars.
+        space : {"lps", "ras"}, optional
+            Patient frame of the points; None: that of the field array ``SPACE``, which `to_pyvista` writes, else LPS.
+
+        Raises
+        ------
+        UsageError
+            It is no ImageData, has no such point data, or several numbers a point; or `space` is not that of the array.
+        """
+        from clrecon.geometry.vtk import take_image_data
+
+        return cls(*take_image_data(image, name, space))
+
+    def to_sitk(self, resample: bool = False) -> Any:
+        """Return the volume as ``SimpleITK.Image``, a copy in LPS mm, ITK's own frame.
+
+        The type stays, left-handed axes too.  The certificate does not go with it: `save` writes it.
+
+        Parameters
+        ----------
+        resample : bool
+            As in `to_pyvista`: of sheared or unevenly spaced volumes, which such an image cannot hold.
+
+        Raises
+        ------
+        UsageError
+            The volume is sheared or unevenly spaced and is not to be resampled, or SimpleITK is not installed.
+        RefusedInputError
+            As `to_pyvista`.
+        """
+        image = image_of(self, resample, "to_sitk")
+        return make_sitk(image.voxels, image.affine)
+
+    @classmethod
+    def from_sitk(cls: type[Own], image: Any) -> Own:
+        """Make a volume of a ``SimpleITK.Image`` of three axes, LPS mm; its voxels are a copy.
+
+        It has no certificate, and nothing of the image's metadata: nothing vouches for its HU.
+
+        Raises
+        ------
+        UsageError
+            It is no image of three axes with one real number a voxel, or SimpleITK is not installed.
+        """
+        return cls(*take_sitk(image))
+
+    def to_nibabel(self, resample: bool = False) -> Any:
+        """Return the volume as ``nibabel.Nifti1Image``: array (i, j, k) on the memory of the voxels, affine to RAS mm.
+
+        Sheared and left-handed axes stay as they are.  The certificate does not go with it: `save` writes it.
+
+        Parameters
+        ----------
+        resample : bool
+            As in `to_pyvista`, of unevenly spaced volumes, which have no affine.
+
+        Raises
+        ------
+        UsageError
+            The volume is unevenly spaced and is not to be resampled, or nibabel is not installed.
+        RefusedInputError
+            As `to_pyvista`.
+        """
+        image = image_of(self, resample, "to_nibabel", holds_shear=True)
+        return make_nibabel(image.voxels, image.affine)
+
+    @classmethod
+    def from_nibabel(cls: type[Own], image: Any) -> Own:
+        """Make a volume of an image of nibabel: its affine leads to RAS, that of the volume to LPS mm.
+
+        Values are as slope and intercept of the header make them; whole numbers stay whole.  It has no certificate:
+        nothing vouches for its HU.  `clrecon.read_volume` of a file also says where sform, qform and pixdim disagree.
+
+        Raises
+        ------
+        UsageError
+            It is no image of three axes with one real number a voxel, does not say where it lies, or nibabel is not
+            installed.
+        """
+        return cls(*take_nibabel(image))
 
     def __repr__(self) -> str:
         ni, nj, nk = self.shape_ijk
         di, dj, dk = self.spacing
         uneven = ", uneven slices" * self.uneven
-        return f"Volume({ni} x {nj} x {nk} {self._voxels.dtype}, spacing {di:.4g} x {dj:.4g} x {dk:.4g} mm{uneven})"
+        return f"Volume({ni} x {nj} x {nk} {self.dtype}, spacing {di:.4g} x {dj:.4g} x {dk:.4g} mm{uneven})"

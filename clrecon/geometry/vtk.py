@@ -1,4 +1,4 @@
-"""A volume as ``pyvista.ImageData``: how VTK treats an image's axes is handled here alone.
+"""Volumes as ``pyvista.ImageData`` and back: how VTK treats an image's axes is handled here alone.
 
 ``vtkImageData`` places its points by an origin, a spacing for each axis and a direction matrix: axes at right angles
 and even steps.  Further behaviour of VTK, as tried with VTK 9.7:
@@ -19,50 +19,24 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, is_left_handed
-from clrecon.geometry.grid import Grid
-from clrecon.geometry.regular import (
-    LARGEST_SHEAR_DEGREES,
-    describe_unevenness,
-    regular_grid,
-    resample_grid,
-    shear_degrees,
-)
+from clrecon.geometry.frames import choose_space, frame_from_lps
+from clrecon.geometry.images import Image, Taken
 
-__all__ = ["make_image_data"]
+__all__ = ["make_image_data", "take_image_data"]
+
+_TURNED = "in reverse order: the volume's axes are left-handed"
+"""Field array ``SLICES`` of an image whose slices run from the last one of the volume to its first."""
 
 
-def make_image_data(grid: Grid, origins: Float64Array, uneven: bool, resample: bool, air: float) -> Any:
-    """Make the image of `Volume.to_pyvista`.
-
-    Parameters
-    ----------
-    grid : Grid
-    origins : ndarray, shape (nk, 3)
-        LPS mm of voxel (0, 0, k) of each slice.
-    uneven : bool
-        The slices lie elsewhere than the affine says.
-    resample : bool
-    air : float
-        Value of the points beyond the voxels of a resampled volume.
-    """
+def make_image_data(own: Image) -> Any:
+    """Make the image of `Volume.to_pyvista`."""
     import pyvista
 
-    notes = {}
-    fault = _fault_of(grid, origins, uneven)
-    if fault is None:
-        affine, values = grid.affine, grid.voxels
-        if is_left_handed(affine):
-            notes["SLICES"] = "in reverse order: the volume's axes are left-handed"
-            affine, values = _reversed(grid)
-    elif resample:
-        notes["RESAMPLED"] = f"trilinear, to a regular grid: {fault}"
-        regular = regular_grid(grid, origins)
-        affine, values = regular.affine, resample_grid(grid, regular, air)
-    else:
-        raise UsageError(
-            f"an image of pyvista has even steps and axes at right angles, but {fault}: use"
-            " to_pyvista(resample=True) for a copy on a regular grid of the same spacing"
-        )
+    notes = {} if own.resampled is None else {"RESAMPLED": f"trilinear, to a regular grid: {own.resampled}"}
+    affine, values = own.affine, own.voxels
+    if is_left_handed(affine):
+        notes["SLICES"] = _TURNED
+        values, affine = _reversed(values, affine)
     steps = np.linalg.norm(affine[:3, :3], axis=0)
     image = pyvista.ImageData(dimensions=values.shape[::-1], spacing=tuple(steps), origin=tuple(affine[:3, 3]))
     image.SetDirectionMatrix(*(affine[:3, :3] / steps).ravel())  # pyvista has a property for it since 0.45
@@ -73,19 +47,65 @@ def make_image_data(grid: Grid, origins: Float64Array, uneven: bool, resample: b
     return image
 
 
-def _fault_of(grid: Grid, origins: Float64Array, uneven: bool) -> str | None:
-    """Return why an image cannot hold this volume as it is; None where it can."""
-    if uneven:
-        return describe_unevenness(origins)
-    shear = shear_degrees(grid.affine)
-    return f"the axes of this volume are sheared by {shear:.2f} degrees" if shear > LARGEST_SHEAR_DEGREES else None
+def take_image_data(image: Any, name: str | None, space: str | None) -> Taken:
+    """Take voxels, a copy, and affine of a ``pyvista.ImageData``; see `Volume.from_pyvista`.
 
-
-def _reversed(grid: Grid) -> tuple[Float64Array, NDArray[Any]]:
-    """Return the affine that counts slices from the last one, and the voxels in that order (a copy: VTK needs positive
-    steps).
+    Raises
+    ------
+    UsageError
+        It is no ImageData, or has not one real number at each point.
     """
-    affine = grid.affine.copy()
-    affine[:3, 3] += (grid.voxels.shape[0] - 1) * affine[:3, 2]
-    affine[:3, 2] *= -1.0
-    return affine, np.ascontiguousarray(grid.voxels[::-1])
+    import pyvista
+
+    found = pyvista.wrap(image) if hasattr(image, "GetPointData") else image
+    if not isinstance(found, pyvista.ImageData):
+        raise UsageError(f"{type(image).__name__} is no pyvista.ImageData: a volume has even steps along three axes")
+    values = np.array(_numbers_of(found, name)).reshape(found.dimensions[::-1])
+    affine = np.eye(4)
+    matrix = found.GetDirectionMatrix()
+    direction = [[matrix.GetElement(row, column) for column in range(3)] for row in range(3)]
+    affine[:3, :3] = np.array(direction) * found.GetSpacing()
+    affine[:3, 3] = found.GetPoint(0)  # an image that was cut out of another does not begin at its origin
+    turn = np.eye(4)
+    turn[:3, :3] = frame_from_lps(choose_space(space, _note(found, "SPACE"), "the ImageData"))
+    affine = turn @ affine  # its own inverse: to LPS as from LPS
+    if _note(found, "SLICES") == _TURNED:
+        values, affine = _reversed(values, affine)
+    return values, affine
+
+
+def _numbers_of(image: Any, name: str | None) -> Any:
+    """Return the point data `name`, or the active scalars, shape (n,)."""
+    held = list(image.point_data.keys())
+    chosen = image.point_data.active_scalars_name if name is None else name
+    if chosen is None and len(held) == 1:
+        chosen = held[0]
+    if chosen not in held:
+        if not held and image.cell_data.keys():
+            raise UsageError(
+                "the numbers of the ImageData belong to its cells, those of a volume to its points: take"
+                " image.cells_to_points() first"
+            )
+        asked = "no active scalars" if chosen is None else f"no point data {str(chosen)[:40]!r}"
+        raise UsageError(f"the ImageData has {asked}; it has {', '.join(map(str, held))[:100] or 'none'}")
+    values = image.point_data[chosen]
+    if values.ndim != 1:
+        raise UsageError(
+            f"the point data {str(chosen)[:40]!r} have {values.shape[1]} numbers a point: a volume has one real number"
+            " a voxel"
+        )
+    return values
+
+
+def _note(image: Any, name: str) -> str | None:
+    return str(image.field_data[name][0]) if name in image.field_data else None
+
+
+def _reversed(voxels: NDArray[Any], affine: Float64Array) -> Taken:
+    """Return the voxels with their slices in reverse order (a copy: VTK needs positive steps), and the affine that
+    counts slices from the last one.
+    """
+    turned = affine.copy()
+    turned[:3, 3] += (len(voxels) - 1) * affine[:3, 2]
+    turned[:3, 2] *= -1.0
+    return np.ascontiguousarray(voxels[::-1]), turned

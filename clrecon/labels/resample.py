@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import Volume, apply_affine
 from clrecon.labels.label_map import LabelMap
+from clrecon.system.progress import Progress, ignore_progress
 
 __all__ = ["LEAST_SHARE_INSIDE", "ResampledLabels", "check_together", "resample_labels"]
 
@@ -47,16 +48,25 @@ class ResampledLabels:
     warnings: tuple[str, ...]
 
 
-def resample_labels(labels: LabelMap, volume: Volume) -> ResampledLabels:
+def resample_labels(labels: LabelMap, volume: Volume, *, progress: Progress | None = None) -> ResampledLabels:
     """Resample a label map to the grid of a volume: for each voxel the label whose centre is nearest, in mm.
 
     "Nearest" is meant along the axes of the label grid, as usual for nearest-neighbour interpolation: it is the voxel
-    of the map that contains the centre.
+    of the map that contains the centre.  Axes in another order or direction are only rearranged.
 
     Parameters
     ----------
     labels : LabelMap
+        On any grid.
     volume : Volume
+        Its slices may be uneven.
+    progress : callable, optional
+        ``progress("resample", done, total)`` in slices.
+
+    Returns
+    -------
+    ResampledLabels
+        ``voxels[k, j, i]`` is the label of ``volume.voxels[k, j, i]``; 0 beyond the map.
 
     Raises
     ------
@@ -66,10 +76,16 @@ def resample_labels(labels: LabelMap, volume: Volume) -> ResampledLabels:
         The arguments are not a LabelMap and a Volume.
     """
     if not isinstance(labels, LabelMap) or not isinstance(volume, Volume):
-        raise UsageError("a label map is brought to a volume: resample_labels(LabelMap, Volume)")
+        raise UsageError(
+            "a label map is brought to a volume: resample_labels(LabelMap, Volume), not"
+            f" ({type(labels).__name__}, {type(volume).__name__})"
+        )
     shares = check_together(labels, volume)
     aligned = _take_aligned(labels, volume)
-    voxels, exact = (aligned, True) if aligned is not None else _take_nearest(labels, volume)
+    if aligned is not None:
+        voxels, exact = aligned, True
+    else:
+        voxels, exact = _take_nearest(labels, volume, progress or ignore_progress)
     return ResampledLabels(voxels, exact, shares, labels.warnings)
 
 
@@ -139,7 +155,7 @@ def _take_aligned(labels: LabelMap, volume: Volume) -> NDArray[Any] | None:
     return taken
 
 
-def _take_nearest(labels: LabelMap, volume: Volume) -> tuple[NDArray[Any], bool]:
+def _take_nearest(labels: LabelMap, volume: Volume, progress: Progress) -> tuple[NDArray[Any], bool]:
     """Take the nearest labels slice by slice: a slice of the volume is a plane in the map, linear along i and j."""
     ni, nj, nk = volume.shape_ijk
     inverse = np.asarray(np.linalg.inv(labels.affine), dtype=np.float64)
@@ -151,6 +167,7 @@ def _take_nearest(labels: LabelMap, volume: Volume) -> tuple[NDArray[Any], bool]
     taken = np.zeros((nk, nj, ni), dtype=labels.voxels.dtype)
     exact = True
     for k in range(nk):
+        progress("resample", k, nk)
         index, valid = [], np.ones((1, 1), dtype=bool)
         for a, size in enumerate(labels.shape_ijk):
             place = starts[k, a] + along[0][None, :, a] + along[1][:, None, a]
@@ -187,7 +204,7 @@ def _shares_inside(labels: LabelMap, volume: Volume) -> dict[int, float]:
 def _check_overlap(labels: LabelMap, volume: Volume, shares: dict[int, float]) -> None:
     total = sum(labels.counts.values())
     share = sum(shares[number] * count for number, count in labels.counts.items()) / max(total, 1)
-    is_crop = volume.report.get("crop") is not None  # which may leave most labels out
+    is_crop = any(volume.report.get(part) is not None for part in ("crop", "sliced"))  # which may leave most labels out
     if share >= LEAST_SHARE_INSIDE or (is_crop and share > 0.0):
         return
     if is_crop:

@@ -14,7 +14,7 @@ import numpy as np
 
 from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import LABEL_MAP
-from clrecon.formats.write_nifti import place_in_header
+from clrecon.geometry.nifti import place_in_header
 from clrecon.labels.label_map import LabelMap
 
 __all__ = ["encode_nifti", "load_nibabel"]

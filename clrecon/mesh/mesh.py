@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry import SPACES, frame_from_lps
+from clrecon.geometry.frames import choose_space, frame_from_lps
 from clrecon.mesh.base import BaseMesh
 from clrecon.mesh.components import select_components, split_components
 from clrecon.mesh.quality import MeshQuality, measure_quality, measure_triangles
@@ -149,7 +149,7 @@ class Mesh(BaseMesh):
         from clrecon.mesh.vtk import unwrap_polydata
 
         vertices, triangles, normals, named = unwrap_polydata(polydata)
-        return cls._of_others(vertices, triangles, normals, _choose_space(space, named, "the PolyData"))
+        return cls._of_others(vertices, triangles, normals, choose_space(space, named, "the PolyData"))
 
     def to_trimesh(self) -> Any:
         """Return the mesh as ``trimesh.Trimesh`` in LPS mm, its ``units`` "mm" and ``metadata["SPACE"]`` "LPS".
@@ -202,7 +202,7 @@ class Mesh(BaseMesh):
         if units not in (None, "mm", "millimeter", "millimeters"):
             raise UsageError(f"the mesh is in {units}, clrecon's are in mm: call its convert_units('mm') first")
         named = (getattr(mesh, "metadata", None) or {}).get("SPACE")
-        return cls._of_others(np.asarray(vertices), np.asarray(faces), None, _choose_space(space, named, "the Trimesh"))
+        return cls._of_others(np.asarray(vertices), np.asarray(faces), None, choose_space(space, named, "the Trimesh"))
 
     @classmethod
     def _of_others(
@@ -218,23 +218,3 @@ class Mesh(BaseMesh):
     def __repr__(self) -> str:
         normals = "" if self.normals is None else ", with normals"
         return f"Mesh({self.vertex_count} vertices, {self.triangle_count} triangles{normals}, LPS mm)"
-
-
-def _choose_space(asked: str | None, named: object, what: str) -> str:
-    """Return ``LPS`` or ``RAS``.
-
-    Raises
-    ------
-    UsageError
-        The frame that was asked for is unknown, or another than that which the mesh names; or that is unknown.
-    """
-    if asked is not None:
-        frame_from_lps(asked)
-    if named is None:
-        return "LPS" if asked is None else asked.upper()
-    told = str(named).upper()
-    if told.lower() not in SPACES:
-        raise UsageError(f"{what} names the frame {str(named)[:40]!r}: {' or '.join(SPACES)} are known")
-    if asked is not None and asked.upper() != told:
-        raise UsageError(f"{what} says that its coordinates are {told}, {asked.upper()} was asked for: leave space out")
-    return told

@@ -14,7 +14,7 @@ from clrecon import list_series, read_volume
 from clrecon.dicom import reader
 from clrecon.dicom.stack.layout import summarise_gaps
 from clrecon.geometry import compose_affine
-from clrecon.sources.orientation import describe_orientation
+from clrecon.geometry.orientation import describe_orientation
 
 IDENTITY = set_values(
     PatientName="SECRET^NAME", PatientID="SECRETID", SeriesDescription="SECRET scan", StudyID="SECRET",

@@ -123,7 +123,7 @@ def test_contours_lie_where_our_own_surface_does(name):
 
 
 def test_sheared_and_uneven_volumes_are_refused_with_their_numbers():
-    with pytest.raises(UsageError, match=r"sheared by 17\.19 degrees.*resample=True.*same spacing"):
+    with pytest.raises(UsageError, match=r"sheared by 17\.19 degrees.*resample=True.*smallest step"):
         sphere(TILTED).to_pyvista()
     with pytest.raises(
         UsageError, match=r"slices of this volume are uneven \(0\.57 to 1\.33 mm apart\).*resample=True"

@@ -15,7 +15,7 @@ DOCUMENTS = [
     "docs/certificate.md", "docs/formats.md", "docs/labels.md", "docs/calibration.md", "docs/transfer_functions.md",
     "docs/slices.md", "docs/rendering.md", "docs/clouds.md", "docs/filters.md", "docs/masks.md",
     "docs/papers.md", "docs/vertebrae.md", "docs/inside.md", "docs/measures.md", "docs/compare.md", "docs/corridor.md",
-    "docs/statistics.md", "docs/distance.md",
+    "docs/statistics.md", "docs/distance.md", "docs/export.md", "docs/python.md",
 ]  # fmt: skip
 LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)")
 QUOTED = re.compile(r"`((?:\.ci|cl|clrecon|docs|scripts|tests)/[\w./-]*|(?:setup\.cfg|\w+\.(?:md|toml)))`")

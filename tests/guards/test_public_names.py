@@ -28,7 +28,8 @@ TAKE_PROGRESS = {
     "list_series", "mask_field_of_view", "measure_cells", "measure_distance", "measure_labels", "measure_slices",
     "measure_truth", "measure_vertex_distances",
     "split_vertebrae", "read_labels", "read_volume", "reconstruct_surface", "reformat_curve",
-    "remove_outliers", "remove_sparse_cells", "remove_table", "render", "smooth_mesh", "thin_points",
+    "remove_outliers", "remove_sparse_cells", "remove_table", "render", "resample_labels", "smooth_mesh", "thin_points",
+    "Volume.resample", "Volume.save",
     "write_animation",
 }  # fmt: skip
 """What can take longer than a second."""

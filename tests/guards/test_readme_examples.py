@@ -1,4 +1,4 @@
-"""The Python examples of README.md and docs/rendering.md run as they stand, on a small phantom."""
+"""The Python examples of README.md, docs/rendering.md and docs/python.md run as they stand, on a small phantom."""
 
 from __future__ import annotations
 
@@ -62,3 +62,20 @@ def test_the_examples_of_styles_run(folder, device, monkeypatch):
     made: dict[str, Any] = {"clrecon": clrecon, "volume": clrecon.read_volume(folder / "ct")}
     exec(compile(textwrap.dedent(block[1]), "docs/rendering.md", "exec"), made)
     assert all(made[name].image[..., :3].any() for name in ("picture", "front", "side", "chest", "spine"))
+
+
+def test_the_examples_of_volumes_run(folder, monkeypatch):
+    text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"((?:^    .*\n)+)", text, re.MULTILINE)
+    assert len(blocks) == 4
+    monkeypatch.chdir(folder)
+    volume, labels = clrecon.read_volume("ct"), clrecon.read_labels("segmentation.seg.nrrd")
+    made: dict[str, Any] = {"clrecon": clrecon, "numpy": np, "volume": volume, "labels": labels}
+    made.update({name: pytest.importorskip(name) for name in ("SimpleITK", "nibabel")})
+    for block in blocks:
+        exec(compile(textwrap.dedent(block), "docs/python.md", "exec"), made)
+    assert made["spine"].shape == (30, 64, 32) and made["slab"].shape == (1, 64, 64)
+    assert made["coarse"].spacing == pytest.approx((6.0, 6.0, 6.0))
+    assert made["same"].affine == pytest.approx(volume.affine) and made["scan"].dtype == volume.dtype
+    assert made["mean_hu"] >= 226 and made["even"].spacing == pytest.approx((2.0, 2.0, 2.0))
+    assert made["loin"].shape[0] == 16 and made["near"].shape_ijk == (20, 20, 20)

@@ -30,9 +30,9 @@ from clrecon.dicom.stack.mixture import describe_differences
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import column_spacing
 from clrecon.geometry.certificate import Certificate
+from clrecon.geometry.orientation import describe_orientation
 from clrecon.sources.facts import PixelFacts
 from clrecon.sources.likeness import Likeness
-from clrecon.sources.orientation import describe_orientation
 from clrecon.system.text import hash_uid
 
 __all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]

@@ -11,8 +11,8 @@ import numpy as np
 from clrecon.errors import UsageError
 from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.boxes import CROPS, Box, crop_box
 from clrecon.geometry.grid import Grid
-from clrecon.jobs.shared.cropping import CROPS, Box, crop_box
 from clrecon.jobs.shared.settings import InputSettings
 from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import find_color

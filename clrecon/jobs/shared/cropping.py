@@ -2,98 +2,16 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from clrecon.errors import UsageError
-from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
+    from clrecon.geometry.boxes import Box
     from clrecon.labels import LabelMap
 
-__all__ = ["CROPS", "Box", "crop_box", "crop_labels", "crop_scan"]
-
-Box = tuple[tuple[float, ...], tuple[float, ...]]
-"""Lowest and highest corner (x, y, z) in mm; infinite where a side is open."""
-
-CROPS = ("clip_box", "between", "around")
-"""Names of the settings that make the box."""
-
-_COUNTS = {
-    "clip_box": (6, "six numbers, x0,x1,y0,y1,z0,z1"),
-    "between": (2, "two numbers, z0,z1"),
-    "around": (4, "a point and a radius, four numbers, x,y,z,r"),
-}
-
-
-def crop_box(
-    clip_box: Sequence[float] | None, between: Sequence[float] | None, around: Sequence[float] | None
-) -> Box | None:
-    """Return the box that is in all of those that are given; None without any.
-
-    Parameters
-    ----------
-    clip_box : (x0, x1, y0, y1, z0, z1), optional
-        A box in mm; infinite numbers leave a side open.
-    between : (z0, z1), optional
-        Heights in mm.
-    around : (x, y, z, r), optional
-        A point and half the side of the cube around it, mm.
-
-    Raises
-    ------
-    UsageError
-        A value has another count of numbers, is no number, or the box holds nothing.
-    """
-    boxes = []
-    for name, values in (("clip_box", clip_box), ("between", between), ("around", around)):
-        if values is not None:
-            boxes.append(_box_of(name, values))
-    if not boxes:
-        return None
-    low = tuple(max(corner[axis] for corner, _ in boxes) for axis in range(3))
-    high = tuple(min(corner[axis] for _, corner in boxes) for axis in range(3))
-    for axis, below, above in zip("xyz", low, high, strict=True):
-        if not below < above:
-            raise UsageError(
-                f"the boxes have nothing in common: along {axis} one begins at {below:g} mm and another ends at"
-                f" {above:g} mm"
-            )
-    return low, high
-
-
-def _box_of(name: str, values: Sequence[float]) -> Box:
-    """Return the corners of one box.
-
-    Raises
-    ------
-    UsageError
-    """
-    count, form = _COUNTS[name]
-    named = name_parameter(name)
-    if len(values) != count:
-        raise UsageError(f"{named} takes {form}, not {len(values)}")
-    if any(math.isnan(value) for value in values):
-        raise UsageError(f"{named} takes numbers, and one of them is NaN")
-    everywhere = math.inf
-    if name == "around":
-        x, y, z, radius = values
-        if not all(map(math.isfinite, values)) or radius <= 0.0:
-            raise UsageError(f"{named} takes a point and a length above 0 in mm, not {_numbers(values)}")
-        return (x - radius, y - radius, z - radius), (x + radius, y + radius, z + radius)
-    given = tuple(values) if name == "clip_box" else (-everywhere, everywhere, -everywhere, everywhere, *values)
-    for axis, low, high in zip("xyz", given[0::2], given[1::2], strict=True):
-        if not low < high:
-            raise UsageError(
-                f"{named} runs from {low:g} to {high:g} mm along {axis}: it holds nothing; give the lower end first"
-            )
-    return given[0::2], given[1::2]
-
-
-def _numbers(values: Sequence[float]) -> str:
-    return ",".join(f"{value:g}" for value in values)
+__all__ = ["crop_labels", "crop_scan"]
 
 
 def crop_scan(volume: Volume, box: Box | None, space: str, *, margin: int = 0) -> Volume:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from clrecon.errors import UsageError
-from clrecon.jobs.shared.cropping import Box, crop_box
 from clrecon.reading import Selection
+
+if TYPE_CHECKING:
+    from clrecon.geometry.boxes import Box
 
 __all__ = ["InputSettings"]
 
@@ -93,6 +96,8 @@ class InputSettings(Selection):
     @property
     def crop(self) -> Box | None:
         """The box that the scan is cropped to; None without a crop."""
+        from clrecon.geometry.boxes import crop_box  # loads numpy, which the help does without
+
         return crop_box(self.clip_box, self.between, self.around)
 
     @property

@@ -13,9 +13,9 @@ from label_files import write_nrrd
 from clrecon import PointLook, read_mesh, read_points
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
+from clrecon.geometry.boxes import crop_box
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.render.settings import RenderSettings
-from clrecon.jobs.shared.cropping import crop_box
 
 pytestmark = pytest.mark.first_device
 

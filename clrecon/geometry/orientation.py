@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from clrecon.geometry import is_left_handed, slice_normal
-from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.affine import Float64Array, is_left_handed, slice_normal
 
 __all__ = ["describe_orientation"]
 

@@ -1,0 +1,34 @@
+"""Packages that not every use of clrecon needs, imported where one is."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from clrecon.errors import UsageError
+
+__all__ = ["import_package"]
+
+
+def import_package(module: str, what: str, package: str | None = None) -> Any:
+    """Import `module`.
+
+    Parameters
+    ----------
+    module : str
+        As Python imports it.
+    what : str
+        What needs it, for the message.
+    package : str, optional
+        As it is installed, where that is another name.
+
+    Raises
+    ------
+    UsageError
+        It is not installed; the message says how to install it.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        named = package or module
+        raise UsageError(f"{what} needs the package {named}: pip install {named}") from error

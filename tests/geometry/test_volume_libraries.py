@@ -1,0 +1,312 @@
+"""Volumes to numpy, SimpleITK, nibabel and pyvista and back: every voxel at its place, the affine as it was."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+import tolerances
+from dicom_series import rotation
+from uneven_volume import uneven
+
+import clrecon
+from clrecon import LabelMap, OutputError, UsageError, Volume
+from clrecon.errors import RefusedInputError
+from clrecon.geometry import AIR_HU, compose_affine, is_left_handed
+
+pyvista = pytest.importorskip("pyvista")
+sitk = pytest.importorskip("SimpleITK")
+nibabel = pytest.importorskip("nibabel")
+
+SHAPE = (5, 4, 3)
+STEPS = rotation((25.0, -40.0, 70.0)) * (0.7, 0.5, 1.25)
+ORIGIN = (-120.0, 83.0, -210.5)
+
+
+def placed(steps: np.ndarray, origin: tuple[float, float, float] = ORIGIN) -> np.ndarray:
+    """Return the affine with the columns of `steps`, (3, 3)."""
+    i, j, k = steps.T
+    return compose_affine(i, j, k, origin)
+
+
+AFFINES = {
+    "straight": placed(np.diag((0.7, 0.5, 1.25))),
+    "oblique": placed(STEPS),
+    "left-handed": placed(STEPS * (1, 1, -1)),
+    "left-handed, i": placed(STEPS * (-1, 1, 1)),
+    "flipped": placed(np.diag((-0.7, -0.5, 1.25))),
+    "sagittal": compose_affine((0, 0.7, 0), (0, 0, -0.5), (-1.25, 0, 0), ORIGIN),
+}
+SHEARED = placed(STEPS @ np.array([[1, 0, 0], [0, 1, 0.3], [0, 0, 1]]))
+DTYPES = ("int8", "uint8", "int16", "uint16", "int32", "float32")
+IJK = np.array([(i, j, k) for k in range(5) for j in range(4) for i in range(3)])
+WAYS = {
+    "pyvista": (Volume.to_pyvista, Volume.from_pyvista),
+    "SimpleITK": (Volume.to_sitk, Volume.from_sitk),
+    "nibabel": (Volume.to_nibabel, Volume.from_nibabel),
+}
+
+
+def numbered(affine: np.ndarray, dtype: str = "int16") -> Volume:
+    return Volume(np.arange(60, dtype=dtype).reshape(SHAPE) - (0 if dtype[0] == "u" else 30), affine)
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("name", AFFINES)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_there_and_back(way, name, dtype):
+    volume = numbered(AFFINES[name], dtype)
+    there, back = WAYS[way]
+    made = back(there(volume))
+    assert type(made) is Volume and made.dtype == volume.dtype and np.array_equal(made.voxels, volume.voxels)
+    assert np.abs(made.affine - volume.affine).max() <= tolerances.FLOAT64_PLACE_MM
+    assert made.report == {"warnings": []} and made.certificate is None
+    assert is_left_handed(made.affine) == ("left" in name)
+
+
+@pytest.mark.parametrize("name", AFFINES)
+def test_the_libraries_put_every_voxel_where_it_is(name):
+    """By their own words: physical points of ITK in LPS, an affine to RAS, and points of VTK."""
+    volume = numbered(AFFINES[name])
+    places = volume.ijk_to_lps(IJK)
+    values = [volume.voxels[k, j, i] for i, j, k in IJK]
+    image = volume.to_sitk()
+    assert image.GetSize() == (3, 4, 5) and image.GetPixelIDTypeAsString() == "16-bit signed integer"
+    theirs = [image.TransformIndexToPhysicalPoint([int(n) for n in ijk]) for ijk in IJK]
+    assert np.abs(places - theirs).max() <= tolerances.FLOAT64_PLACE_MM
+    assert [image[tuple(map(int, ijk))] for ijk in IJK] == values
+    other = volume.to_nibabel()
+    assert other.shape == (3, 4, 5) and np.shares_memory(other.dataobj, volume.voxels)
+    theirs = nibabel.affines.apply_affine(other.affine, IJK) * (-1, -1, 1)
+    assert np.abs(places - theirs).max() <= tolerances.FLOAT64_PLACE_MM
+    assert [other.dataobj[tuple(ijk)] for ijk in IJK] == values
+    assert other.header.get_xyzt_units()[0] == "mm" and other.header["sform_code"] == other.header["qform_code"] == 1
+    assert nibabel.aff2axcodes(other.affine) == nibabel.aff2axcodes(np.diag((-1, -1, 1, 1)) @ volume.affine)
+
+
+@pytest.mark.parametrize("name", AFFINES)
+@pytest.mark.parametrize("extension", [".nii.gz", ".nrrd", ".mha"])
+def test_a_saved_volume_is_read_alike_by_all(tmp_path, name, extension):
+    volume = numbered(AFFINES[name])
+    path = tmp_path / f"ct{extension}"
+    assert volume.save(path) == path.stat().st_size
+    read = clrecon.read_volume(path)
+    itk = Volume.from_sitk(sitk.ReadImage(str(path)))
+    made = [read, itk, Volume.from_nibabel(nibabel.load(path))] if "nii" in extension else [read, itk]
+    for each in made:
+        ijk = np.rint(volume.lps_to_ijk(each.ijk_to_lps(IJK))).astype(int)
+        assert np.abs(volume.ijk_to_lps(ijk) - each.ijk_to_lps(IJK)).max() <= tolerances.NIFTI_LARGE_AFFINE_MM
+        assert np.array_equal(volume.voxels[tuple(ijk.T[::-1])], each.voxels[tuple(IJK.T[::-1])])
+
+
+def test_save_is_write_volume(tmp_path):
+    volume = numbered(SHEARED)
+    assert volume.save(tmp_path / "a.nrrd") == clrecon.write_volume(volume, tmp_path / "b.nrrd")
+    assert (tmp_path / "a.nrrd").read_bytes() == (tmp_path / "b.nrrd").read_bytes()
+    with pytest.raises(UsageError, match="right angles"):
+        volume.save(tmp_path / "a.mha")
+    told: list[tuple[str, int, int]] = []
+    volume.save(tmp_path / "a.mha", resample=0.5, progress=lambda *call: told.append(call))
+    assert Volume.from_sitk(sitk.ReadImage(str(tmp_path / "a.mha"))).spacing == pytest.approx((0.5, 0.5, 0.5))
+    assert {"resample", "write"} == {stage for stage, _, _ in told}
+    with pytest.raises(OutputError, match="exists"):
+        volume.save(tmp_path / "a.nrrd", no_clobber=True)
+    with pytest.raises(UsageError, match="ends with one of"):
+        volume.save(tmp_path / "a.stl")
+
+
+def test_the_array_of_a_volume():
+    volume = numbered(AFFINES["oblique"])
+    assert np.asarray(volume) is volume.voxels and np.asarray(volume).shape == volume.shape == SHAPE
+    assert not np.shares_memory(np.array(volume), volume.voxels)
+    wide = np.asarray(volume, dtype=np.float64)
+    assert wide.dtype == np.float64 and np.array_equal(wide, volume.voxels)
+    assert not np.shares_memory(volume.__array__(copy=True), volume.voxels)
+    if np.lib.NumpyVersion(np.__version__) >= "2.0.0":
+        assert np.asarray(volume, copy=False) is volume.voxels
+        with pytest.raises(ValueError, match="int16 are float32 only as a copy"):
+            np.asarray(volume, dtype="f4", copy=False)
+    assert np.mean(volume) == volume.voxels.mean() and (np.asarray(volume) > 3).sum() == 26
+    assert volume.dtype == np.int16
+    labels = LabelMap(np.ones(SHAPE, np.uint8), np.eye(4))
+    assert np.asarray(labels) is labels.voxels and labels.shape == SHAPE and labels.dtype == np.uint8
+
+
+@pytest.mark.parametrize("way", ["pyvista", "SimpleITK"])
+def test_sheared_volumes_are_resampled_only_when_asked(way):
+    there, back = WAYS[way]
+    with pytest.raises(UsageError, match=rf"sheared by 6\.84 degrees.*{there.__name__}\(resample=True\)"):
+        there(numbered(SHEARED))
+    straight = back(there(numbered(SHEARED), resample=True))
+    gap = 1.25
+    assert straight.spacing == pytest.approx((0.7, 0.5, gap)) and straight.shape[0] == SHAPE[0]
+    assert straight.voxels.min() == AIR_HU
+    same = back(there(numbered(AFFINES["oblique"]), resample=True))
+    assert np.array_equal(same.voxels, numbered(AFFINES["oblique"]).voxels)
+
+
+def test_nibabel_holds_shear():
+    volume = numbered(SHEARED)
+    made = Volume.from_nibabel(volume.to_nibabel())
+    assert np.abs(made.affine - SHEARED).max() <= tolerances.FLOAT64_PLACE_MM
+    header = volume.to_nibabel().header
+    assert (header["sform_code"], header["qform_code"]) == (1, 0)
+    assert header["pixdim"][1:4] == pytest.approx(volume.spacing, rel=1e-6)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_uneven_volumes_go_in_the_smallest_step_of_their_slices(way):
+    there, back = WAYS[way]
+    volume = uneven(np.zeros((6, 5, 4), np.float32))
+    ramp = np.array([17.0, -11.0, 9.0])
+    k, j, i = np.indices(volume.shape).reshape(3, -1)
+    field = volume.ijk_to_lps(np.column_stack([i, j, k])) @ ramp
+    volume = volume.with_voxels(field.reshape(volume.shape))
+    with pytest.raises(UsageError, match=rf"uneven.*{there.__name__}\(resample=True\).*volume\.resample\(MM\)"):
+        there(volume)
+    made = back(there(volume, resample=True))
+    assert made.spacing == pytest.approx((0.5, 0.7, 0.25))  # heights 8.75 and 9.0 are the nearest
+    assert made.shape[0] == 37
+    points = np.array([(i, j, k) for k in range(37) for j in range(5) for i in range(4)])
+    ijk = volume.lps_to_ijk(made.ijk_to_lps(points))
+    within = ((ijk >= 0) & (ijk <= np.array(volume.shape_ijk) - 1)).all(axis=1)
+    found = made.voxels[tuple(points.T[::-1])]
+    assert within.sum() > 100
+    assert np.abs(found - made.ijk_to_lps(points) @ ramp)[within].max() <= 10 * tolerances.RESAMPLED_RAMP_HU
+
+
+def test_slices_too_near_for_a_grid_are_refused():
+    table = np.array([(0, 0, 0), (0, 0, 1e-4), (0, 0, 100.0)])
+    volume = Volume(np.zeros((3, 50, 50), np.int16), np.diag((1.0, 1.0, 50.0, 1.0)), slice_positions=table)
+    with pytest.raises(RefusedInputError, match=r"smallest step .* 50 x 50 x 1,000,001 voxels.*longer step"):
+        volume.to_pyvista(resample=True)
+
+
+def test_frames_of_pyvista():
+    volume = numbered(AFFINES["oblique"])
+    image = volume.to_pyvista()
+    turned = pyvista.ImageData(dimensions=image.dimensions, spacing=image.spacing)
+    ras = np.diag((-1, -1, 1, 1)) @ volume.affine
+    turned.SetOrigin(ras[:3, 3])
+    turned.SetDirectionMatrix(*(ras[:3, :3] / image.spacing).ravel())
+    turned.point_data["values"] = image["HU"]
+    for space in ("ras", None):
+        assert np.abs(Volume.from_pyvista(turned, space="ras").affine - volume.affine).max() <= 1e-9
+        turned.field_data["SPACE"] = ["RAS"]
+        assert np.abs(Volume.from_pyvista(turned, space=space).affine - volume.affine).max() <= 1e-9
+    with pytest.raises(UsageError, match="RAS, LPS was asked for"):
+        Volume.from_pyvista(turned, space="lps")
+    with pytest.raises(UsageError, match="xyz"):
+        Volume.from_pyvista(image, space="xyz")
+
+
+def test_parts_of_pyvista_images_lie_where_they_were():
+    for name in ("oblique", "left-handed"):
+        volume = numbered(AFFINES[name])
+        part = volume.to_pyvista().extract_subset((1, 2, 0, 3, 2, 4))
+        made = Volume.from_pyvista(part)
+        ijk = np.rint(volume.lps_to_ijk(made.ijk_to_lps([(0, 0, 0), (1, 3, 2)]))).astype(int)
+        assert np.abs(volume.ijk_to_lps(ijk) - made.ijk_to_lps([(0, 0, 0), (1, 3, 2)])).max() <= 1e-9
+        assert [made.voxels[0, 0, 0], made.voxels[2, 3, 1]] == [volume.voxels[tuple(one[::-1])] for one in ijk]
+    image = volume.to_pyvista()
+    image.point_data["doubled"] = image["HU"] * 2
+    assert np.array_equal(Volume.from_pyvista(image, "doubled").voxels, 2 * volume.voxels)
+    made = Volume.from_pyvista(image)
+    image["HU"][:] = 0
+    assert np.array_equal(made.voxels, numbered(AFFINES["left-handed"]).voxels)
+
+
+def test_scaled_values_of_nibabel_are_hu(tmp_path):
+    stored = np.arange(60, dtype=np.int16).reshape(3, 4, 5)
+    for slope, kept in ((1.0, "int16"), (4096.0, "int32"), (0.5, "float32")):
+        image = nibabel.Nifti1Image(stored, np.eye(4))
+        image.header.set_slope_inter(slope, -1024.0)
+        path = tmp_path / f"{slope:g}.nii.gz"
+        nibabel.save(image, path)  # the numbers as they are, slope and intercept in the header
+        made = Volume.from_nibabel(nibabel.load(path))
+        assert made.dtype == kept
+        assert np.array_equal(made.voxels, (stored.T * slope - 1024.0).astype(kept))
+        read = clrecon.read_volume(path)
+        assert read.dtype == made.dtype and np.array_equal(read.voxels, made.voxels)
+        assert np.array_equal(read.affine, made.affine)
+
+
+def test_units_and_forms_of_nibabel():
+    image = numbered(AFFINES["oblique"]).to_nibabel()
+    image.header.set_xyzt_units("micron")
+    assert np.abs(Volume.from_nibabel(image).affine[:3] - 0.001 * AFFINES["oblique"][:3]).max() <= 1e-9
+    image.header["xyzt_units"] = 7
+    with pytest.raises(UsageError, match="code 7"):
+        Volume.from_nibabel(image)
+    bare = nibabel.Nifti1Image(np.zeros((3, 4, 5), np.int16), None)
+    with pytest.raises(UsageError, match="does not say where it lies"):
+        Volume.from_nibabel(bare)
+    other = nibabel.MGHImage(np.arange(60, dtype=np.int16).reshape(3, 4, 5), np.diag((1, 2, 3, 1)))
+    assert Volume.from_nibabel(other).affine.diagonal().tolist() == [-1, -2, 3, 1]
+    four = nibabel.Nifti1Image(np.zeros((3, 4, 5, 1), np.int16), np.eye(4))
+    assert Volume.from_nibabel(four).shape == (5, 4, 3)
+
+
+def not_a_number() -> object:
+    image = numbered(AFFINES["oblique"]).to_nibabel()
+    image.affine[0, 0] = np.nan
+    return image
+
+
+def rgb() -> object:
+    return nibabel.Nifti1Image(np.zeros((3, 4, 5), [("R", "u1"), ("G", "u1"), ("B", "u1")]), np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Volume.from_sitk(np.zeros((2, 2, 2))), "ndarray is no SimpleITK.Image"),
+        (lambda: Volume.from_sitk(sitk.Image(4, 4, sitk.sitkInt16)), "2 axes, a volume has three"),
+        (lambda: Volume.from_sitk(sitk.Image([4, 4, 4, 2], sitk.sitkInt16)), r"4 axes.*image\[:, :, :, 0\]"),
+        (lambda: Volume.from_sitk(sitk.Image([4, 4, 4], sitk.sitkVectorUInt8, 3)), "vector of 8-bit.*one real number"),
+        (lambda: Volume.from_sitk(sitk.Image([4, 4, 4], sitk.sitkComplexFloat32)), "complex.*one real number"),
+        (lambda: Volume.from_sitk(sitk.Image([4, 4, 4], sitk.sitkLabelUInt8)), "label.*one real number"),
+        (lambda: Volume.from_nibabel("ct.nii"), r"str is no image of nibabel.*nibabel\.load"),
+        (lambda: Volume.from_nibabel(rgb()), "colours"),
+        (
+            lambda: Volume.from_nibabel(nibabel.Nifti1Image(np.zeros((2, 3, 4), np.complex64), np.eye(4))),
+            "complex64: a volume has one real number",
+        ),
+        (
+            lambda: Volume.from_nibabel(nibabel.Nifti1Image(np.zeros((2, 3, 4, 5), np.int16), np.eye(4))),
+            r"\(2, 3, 4, 5\).*image\.slicer\[\.\.\., 0\]",
+        ),
+        (lambda: Volume.from_nibabel(nibabel.Nifti1Image(np.zeros((2, 3), np.int16), np.eye(4))), "three axes"),
+        (lambda: Volume.from_nibabel(not_a_number()), "NaN"),
+        (lambda: Volume.from_pyvista(pyvista.Cube()), "PolyData is no pyvista.ImageData"),
+        (lambda: Volume.from_pyvista(np.zeros(3)), "ndarray is no pyvista.ImageData"),
+        (lambda: Volume.from_pyvista(pyvista.RectilinearGrid([0, 1, 3])), "RectilinearGrid is no"),
+        (lambda: Volume.from_pyvista(pyvista.ImageData(dimensions=(2, 2, 2))), "no active scalars; it has none"),
+        (lambda: Volume.from_pyvista(numbered(AFFINES["oblique"]).to_pyvista(), "ct"), "no point data 'ct'; it has HU"),
+        (lambda: Volume.from_pyvista(with_data(cells=True)), r"belong to its cells.*cells_to_points"),
+        (lambda: Volume.from_pyvista(with_data(cells=False)), "3 numbers a point"),
+    ],
+)
+def test_what_is_no_volume_is_refused_in_one_line(make, words):
+    with pytest.raises(UsageError, match=words) as refused:
+        make()
+    assert "\n" not in str(refused.value) and len(str(refused.value)) < 250
+
+
+def with_data(cells: bool) -> object:
+    image = pyvista.ImageData(dimensions=(3, 3, 3))
+    if cells:
+        image.cell_data["HU"] = np.arange(8)
+    else:
+        image.point_data["RGB"] = np.zeros((27, 3), np.uint8)
+    return image
+
+
+@pytest.mark.parametrize(("module", "way"), [("SimpleITK", "sitk"), ("nibabel", "nibabel")])
+def test_a_missing_package_is_named(monkeypatch, module, way):
+    monkeypatch.setitem(sys.modules, module, None)
+    volume = numbered(AFFINES["straight"])
+    for call in (getattr(volume, f"to_{way}"), lambda: getattr(Volume, f"from_{way}")(None)):
+        with pytest.raises(UsageError, match=rf"an image of {module} needs the package {module}: .*install {module}"):
+            call()
