@@ -68,11 +68,12 @@ def read_volume(
     ----------
     path : str or path-like
         A folder of DICOM files, searched with its subfolders; one DICOM file; or a file with a grid and its affine:
-        NIfTI (.nii, .nii.gz, .hdr with .img), NRRD (.nrrd), MetaImage (.mha, .mhd).  Those need the extra
-        ``clrecon[volumes]``.  Told from the content.
+        NIfTI (.nii, .nii.gz, .hdr with .img), NRRD (.nrrd), MetaImage (.mha, .mhd), which needs the
+        package SimpleITK.  Told from the content.
     series : int or str, optional
-        Which series of a DICOM folder: its number in the listing (from 1), SeriesInstanceUID, its hash, or description.
-        Default: the CT series with most slices, of several with as many the usable one; the warnings name the others.
+        Which series of a DICOM folder: its number in the listing (from 1), SeriesInstanceUID, its hash, the start of
+        one of these, or description.  Default: the CT series with most slices; of those with a similar number original
+        images come before derived ones, then the thinnest slices.  The warnings name the others and the reason.
     phase : int, optional
         Number of the phase, where a series holds several volumes at the same places (`list_series` lists them).
     allow_gaps : bool

@@ -12,10 +12,14 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TextIO
 
 __all__ = ["ROOT", "SetupError", "ensure_environment", "find_python", "program_path"]
 
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+_TICK_SECONDS = 1.0
+_LINE_SECONDS = 15.0
+"""Time between two lines about an installation where no terminal shows a moving one."""
 _STAMP = "clrecon-installed.txt"
 _LOG = "clrecon-install.log"
 
@@ -61,7 +65,9 @@ def _is_finished(folder: str, stamp: str, program: str) -> bool:
         return False
 
 
-def ensure_environment(name: str, extras: str = "", program: str = "clrecon", compiled: bool = True) -> str:
+def ensure_environment(
+    name: str, extras: str = "", program: str = "clrecon", compiled: bool = True, megabytes: int = 0
+) -> str:
     """Return the folder of a finished environment; make it if it is missing.
 
     Parameters
@@ -74,6 +80,8 @@ def ensure_environment(name: str, extras: str = "", program: str = "clrecon", co
         A program of the finished environment.
     compiled : bool
         Whether pip compiles all modules, half a minute for the tests' ten thousand; else each is at its first import.
+    megabytes : int
+        Size of the finished environment on the disk, for messages; 0: not said.
 
     Raises
     ------
@@ -86,7 +94,7 @@ def ensure_environment(name: str, extras: str = "", program: str = "clrecon", co
         return folder
     with _locked(folder + ".lock"):
         if not _is_finished(folder, stamp, program):  # another process may have made it while this one waited
-            _make(folder, stamp, extras, compiled)
+            _make(folder, stamp, extras, compiled, megabytes)
     return folder
 
 
@@ -144,11 +152,12 @@ def _check_venv() -> None:
         ) from error
 
 
-def _make(folder: str, stamp: str, extras: str, compiled: bool) -> None:
+def _make(folder: str, stamp: str, extras: str, compiled: bool, megabytes: int) -> None:
     import subprocess
 
     _check_venv()
-    _say(f"making {os.path.basename(folder)} and installing clrecon (a minute or two, once)")
+    size = f", about {megabytes / 1000:.1f} GB on the disk" if megabytes else ""
+    _say(f"making {os.path.basename(folder)} and installing clrecon (a minute or two, once{size})")
     try:
         os.unlink(os.path.join(folder, _STAMP))
     except FileNotFoundError:
@@ -161,7 +170,7 @@ def _make(folder: str, stamp: str, extras: str, compiled: bool) -> None:
     command = [program_path(folder, "python"), "-m", "pip", "install", "--disable-pip-version-check", "--no-input"]
     command += ["--progress-bar", "off", *([] if compiled else ["--no-compile"]), "--editable", target]
     log = os.path.join(folder, _LOG)
-    code = _run_logged(command, log)
+    code = _run_logged(command, log, folder, megabytes)
     if code:
         raise SetupError("\n".join(["pip failed:", *_last_words(log), f"(its whole output: {log})"]))
     with open(os.path.join(folder, _STAMP + ".new"), "w", encoding="utf-8") as file:
@@ -176,20 +185,65 @@ def _last_words(log: str) -> list[str]:
     return [line for line in lines if "error:" in line.lower()][-8:] or lines[-8:]
 
 
-def _run_logged(command: list[str], log: str) -> int:
-    """Run `command` with its output in the file `log`; a terminal shows one line of progress."""
+def _run_logged(command: list[str], log: str, folder: str, megabytes: int) -> int:
+    """Run `command` with its output in the file `log`, and show how far it is.
+
+    A terminal shows one moving line, anything else a line every `_LINE_SECONDS`: seconds, size of the folder, and the
+    last words of the command.
+    """
     import subprocess
+    import threading
+    import time
 
     shows = sys.stderr.isatty()
+    start = told = time.monotonic()
+    words = ""
+
+    def keep(lines: Iterator[str], file: TextIO) -> None:
+        nonlocal words
+        for line in lines:
+            file.write(line)
+            words = line.strip() or words
+
     with (
         open(log, "w", encoding="utf-8") as file,
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process,
     ):
         assert process.stdout is not None
-        for line in process.stdout:
-            file.write(line)
-            if shows and line.strip():
-                print("\r\033[K  " + line.strip()[:76], end="", file=sys.stderr, flush=True)
+        reader = threading.Thread(target=keep, args=(process.stdout, file), daemon=True)
+        reader.start()
+        while reader.is_alive():
+            reader.join(_TICK_SECONDS)
+            now = time.monotonic()
+            if reader.is_alive() and (shows or now - told >= _LINE_SECONDS):
+                told = now
+                of = f" of about {megabytes:,}" if megabytes else ""
+                line = f"{now - start:4.0f} s, {_size_mb(folder):,.0f}{of} MB" + (f": {words}" if words else "")
+                if shows:
+                    print("\r\033[K  " + line[: _columns() - 3], end="", file=sys.stderr, flush=True)
+                else:
+                    _say(line[:100])
     if shows:
         print("\r\033[K", end="", file=sys.stderr, flush=True)
+    if process.returncode == 0:
+        _say(f"installed in {time.monotonic() - start:.0f} s: {_size_mb(folder):,.0f} MB in {os.path.basename(folder)}")
     return process.returncode
+
+
+def _size_mb(folder: str) -> float:
+    """Return the size of the files in a folder; what vanishes meanwhile counts nothing."""
+    total = 0
+    for where, _, names in os.walk(folder):
+        for name in names:
+            try:
+                total += os.lstat(os.path.join(where, name)).st_size
+            except OSError:
+                pass
+    return total / 1e6
+
+
+def _columns() -> int:
+    try:
+        return os.get_terminal_size(2).columns
+    except OSError:
+        return 80

@@ -12,10 +12,13 @@ if sys.version_info < (3, 10):
 
 from _environment import SetupError, ensure_environment, program_path
 
+_MEGABYTES = 1200
+"""Size of .venv on the disk, half of it VTK; see setup.cfg for what needs it."""
+
 
 def main() -> int:
     try:
-        folder = ensure_environment(".venv")
+        folder = ensure_environment(".venv", compiled=False, megabytes=_MEGABYTES)
     except SetupError as error:
         print(error, file=sys.stderr)
         return 1

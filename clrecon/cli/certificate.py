@@ -39,8 +39,10 @@ def _describe_places(of: dict[str, Any]) -> Iterator[tuple[str, str]]:
     if of["thickness"] is not None:
         yield "thickness", _describe_thickness(of["thickness"], of["gap_mm"]["median"])
     if of["tilt_deg"] is not None:
-        tilted = of["tilt_deg"] > _OBLIQUE_DEG
-        yield "tilt", f"{of['tilt_deg']:.2f} degrees, kept exactly as a shear" if tilted else "none"
+        edge = "front" if of["tilt_deg"] > 0.0 else "back"
+        tilted = abs(of["tilt_deg"]) > _OBLIQUE_DEG
+        said = f"{of['tilt_deg']:+.2f} degrees ({edge} edge towards the head), kept exactly as a shear"
+        yield "tilt", said if tilted else "none"
     reasons = "".join(f", {count} dropped ({reason})" for reason, count in of["dropped"].items())
     missing = f", {of['slices_missing']} missing" if of["slices_missing"] else ""
     yield "slices", f"{of['slices']} used{reasons or ', none dropped'}{missing}"

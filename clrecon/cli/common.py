@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 from clrecon.cli.console import Console
 from clrecon.errors import ClreconError, OutputError, UsageError
+from clrecon.system.text import guess_word
 from clrecon.system.time_limit import DEFAULT_SECONDS, check_time_limit
 
 __all__ = [
@@ -51,11 +52,29 @@ class Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
         """Parse as argparse does, but also accept lists that begin with a minus, as in ``--seed -12,3,40``."""
-        given = sys.argv[1:] if args is None else args
-        options, unknown = super().parse_known_args(_join_negative_lists(given), namespace)
+        given = _join_negative_lists(sys.argv[1:] if args is None else args)
+        if self._subparsers is None:  # before argparse complains that something required is missing
+            self._refuse_unknown([word.partition("=")[0] for word in _options_in(given)])
+        options, unknown = super().parse_known_args(given, namespace)
         if unknown:  # reported here, so that the hint names the command
+            self._refuse_unknown([word for word in unknown if word.startswith("--")])
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return options, unknown
+
+    def _refuse_unknown(self, words: Sequence[str]) -> None:
+        """Raise `UsageError` for the first word that is no option of this parser, with the one that is most like it."""
+        for word in words:
+            if word not in self._option_string_actions:
+                self.error(f"unrecognized arguments: {word}{guess_word(word, self._option_string_actions)}")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Refuse a command that there is not, with the one that is most like it."""
+        if isinstance(action, argparse._SubParsersAction) and value not in action.choices:
+            raise UsageError(
+                f"no command {value!r:.60}{guess_word(value, action.choices)}: use one of {', '.join(action.choices)}"
+                f" (see: {self.prog} --help)"
+            )
+        super()._check_value(action, value)
 
     def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:  # type: ignore[override]
         """Read ``--option=--`` as the value ``--``, as Python 3.13 does; before, argparse dropped it."""
@@ -78,6 +97,12 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message} (see: {self.prog} --help)")
+
+
+def _options_in(arguments: Sequence[str]) -> list[str]:
+    """Return the words that argparse takes for long options: they begin with two dashes and have no blank."""
+    ended = list(arguments).index("--") if "--" in arguments else len(arguments)
+    return [word for word in arguments[:ended] if word.startswith("--") and " " not in word]
 
 
 def _join_negative_lists(arguments: Sequence[str]) -> list[str]:

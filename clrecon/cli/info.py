@@ -45,7 +45,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         from clrecon.cli.certificate import describe_certificate
         from clrecon.cli.series_table import render_listing
 
-        lines = render_listing(found.listing, describe_certificate(found.listing["certificate"]))
+        lines = render_listing(found.listing, describe_certificate(found.listing["certificate"]), found.refused)
         for line in lines:
             console.say(line)
     for note in found.notes:

@@ -46,7 +46,10 @@ COMMANDS = {
     "bench": _Command("clrecon.cli.bench", "time every stage on this computer, beside VTK's flying edges"),
     "compare": _Command("clrecon.cli.compare", "compare methods of surfaces and clouds on your own scan, as a page"),
     "demo": _Command("clrecon.cli.demo", "phantom, mesh, picture and report in one go: what clrecon does, in seconds"),
+    "completion": _Command("clrecon.cli.completion", "print a script by which a shell completes clrecon's words"),
 }
+
+HELP = "help"
 
 UNUSED_MODULES = ("requests", "PIL")
 """Modules that are hidden from pydicom, by ``None`` in `sys.modules`, which means "not installed".
@@ -61,7 +64,7 @@ DESCRIPTION = "Surfaces in patient millimetres from CT series, computed on any O
 
 EPILOG = f"""\
 example:    clrecon mesh CT_FOLDER -o bone.stl
-            clrecon mesh --help
+            clrecon help mesh
 
 {EXIT_CODES}"""
 
@@ -114,8 +117,9 @@ def run() -> None:
 def _dispatch(arguments: list[str], console: Console) -> int:
     from clrecon.cli import common
 
+    arguments = _as_help_option(arguments)
     parser = Parser(prog="clrecon", description=DESCRIPTION, epilog=EPILOG)
-    parser.add_argument("--version", action="store_true", help="print the version and stop")
+    parser.add_argument("-V", "--version", action="store_true", help="print the version and stop")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands", parser_class=Parser)
     called = next((argument for argument in arguments if not argument.startswith("-")), None)
     module = None
@@ -126,6 +130,7 @@ def _dispatch(arguments: list[str], console: Console) -> int:
             module.add_arguments(subparser)
             common.add_common(subparser)
             subparser.epilog = "\n\n".join(filter(None, (subparser.epilog, EXIT_CODES)))
+    commands.add_parser(HELP, help="show the options of a command: clrecon help COMMAND")
     try:
         options = parser.parse_args(arguments)
     except SystemExit as stop:  # --help
@@ -142,6 +147,13 @@ def _dispatch(arguments: list[str], console: Console) -> int:
     limit = getattr(options, "timeout", None)
     with spoken_by(speaker_of(commands.choices[called])), time_limit(DEFAULT_SECONDS if limit is None else limit):
         return int(module.run(options, console))
+
+
+def _as_help_option(arguments: list[str]) -> list[str]:
+    """Write ``help COMMAND`` as ``COMMAND --help``, and ``help`` alone as ``--help``."""
+    if arguments[:1] != [HELP]:
+        return arguments
+    return [*(word for word in arguments[1:] if word != HELP), "--help"]
 
 
 def _escape_unencodable() -> None:

@@ -89,6 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     level.add_argument(
         "--preset",
+        type=str.lower,
         metavar="NAME",
         help=f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})",
     )
@@ -243,7 +244,7 @@ def describe_volume(volume: dict[str, Any]) -> str:
         along = f", uneven gaps of {gaps['min']:.4g} to {gaps['max']:.4g}" if volume["uneven"] else f" x {dk:.4g}"
         parts.append(f"spacing {di:.4g} x {dj:.4g}{along} mm")
     if volume.get("tilt_deg") and abs(volume["tilt_deg"]) >= 0.05:
-        parts.append(f"tilt {volume['tilt_deg']:.2f} degrees")
+        parts.append(f"tilt {volume['tilt_deg']:+.2f} degrees")
     return ", ".join(parts)
 
 

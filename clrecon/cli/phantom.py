@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  clrecon phantom phantom/ --levels C1-L5 --scoliosis 35 --facet-gap 0.3 --spacing 0.7 0.7 1"
     )
     parser.add_argument("output", metavar="OUT", help="folder for the series")
-    parser.add_argument("--kind", metavar="K", help="what to make, see below (default: spine)")
+    parser.add_argument("--kind", type=str.lower, metavar="K", help="what to make, see below (default: spine)")
     parser.add_argument("--size", metavar="N", help="columns and rows, like 256 or 256x192")
     parser.add_argument(
         "--slices", type=int, metavar="N", help="default: as many as the levels need, 120 without levels"
@@ -46,7 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--point-spread", dest="point_spread_mm", type=float, metavar="MM", help="standard deviation of the blur"
     )
     parser.add_argument("--radius", dest="radius_mm", type=float, metavar="MM", help="radius of an analytic shape")
-    parser.add_argument("--table", metavar="T", help="what a body lies on: none, flat, curved or headrest")
+    parser.add_argument(
+        "--table", type=str.lower, metavar="T", help="what a body lies on: none, flat, curved or headrest"
+    )
     parser.add_argument("--table-gap", dest="table_gap_mm", type=float, metavar="MM", help="between body and table")
     parser.add_argument("--prone", action="store_true", default=None, help="the patient lies on the face")
     parser.add_argument(
@@ -95,8 +97,8 @@ def _summary(truth: dict[str, Any], output: str) -> list[str]:
     ni, nj, nk = truth["shape_ijk"]
     spacing = " x ".join(f"{step:.4g}" for step in truth["spacing_mm"])
     lines = [f"phantom  {truth['kind']}, {nk} slices of {ni} x {nj}, spacing {spacing} mm"]
-    if truth["tilt_deg"] >= 0.05:
-        lines[0] += f", tilt {truth['tilt_deg']:.2f} degrees"
+    if abs(truth["tilt_deg"]) >= 0.05:
+        lines[0] += f", tilt {truth['tilt_deg']:+.2f} degrees"
     for material, part in (truth["parts"] or {}).items():
         dense = f", {part['voxels_above_300_hu']:,} voxels above 300 HU" if part["voxels_above_300_hu"] else ""
         lines.append(f"{material:<8} {part['volume_ml']:,.1f} ml{dense}")

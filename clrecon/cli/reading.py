@@ -13,8 +13,8 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--series",
         metavar="S",
-        help='number, hash, UID or description of the series, see "clrecon info" (default: the CT series with most'
-        " slices, of one patient)",
+        help='number, hash, UID (or the start of one) or description of the series, see "clrecon info" (default: the CT'
+        " series with most slices; of similar ones original before derived, then the thinnest)",
     )
     group.add_argument(
         "--phase", type=int, metavar="N", help="number of the phase, of a series with several volumes at one place"

@@ -65,6 +65,7 @@ def add_purpose(parser: argparse._ActionsContainer) -> None:
     """Add --for."""
     parser.add_argument(
         "--for",
+        type=str.lower,
         dest="purpose",
         metavar="PURPOSE",
         help="what the mesh is for, with the settings that this takes (others given beside it win); "

@@ -68,9 +68,14 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
     """Add the options for the content of a picture and its colours."""
     group = parser.add_argument_group("what is shown")
     group.add_argument(
-        "--mode", metavar="M", help=f"one of: {', '.join(describe_modes())} (default: what the other options ask)"
+        "--mode",
+        type=str.lower,
+        metavar="M",
+        help=f"one of: {', '.join(describe_modes())} (default: what the other options ask)",
     )
-    group.add_argument("--preset", metavar="NAME", help="colours, opacities, light and mode by tissue (default: bone)")
+    group.add_argument(
+        "--preset", type=str.lower, metavar="NAME", help="colours, opacities, light and mode by tissue (default: bone)"
+    )
     group.add_argument(
         "--transfer-function",
         metavar="FILE[:NAME]",
@@ -182,7 +187,7 @@ def add_curve(parser: argparse.ArgumentParser) -> None:
     """Add the options of slices (in space or single) and of curved reformations."""
     group = parser.add_argument_group("slices and curved reformations")
     group.add_argument("--thickness", type=float, metavar="MM", help="of the slab (default: 0, a plane)")
-    group.add_argument("--combine", metavar="HOW", help="mean, max or min of a slab (default: mean)")
+    group.add_argument("--combine", type=str.lower, metavar="HOW", help="mean, max or min of a slab (default: mean)")
     group.add_argument(
         "--offset", dest="offset_mm", type=float, metavar="MM", help="move the slice away from the camera by so much"
     )
@@ -199,7 +204,9 @@ def add_curve(parser: argparse.ArgumentParser) -> None:
         help="centre line: a text, CSV or JSON file of points in LPS mm, or markups of 3D Slicer; auto: the spinal"
         " canal, found in the scan",
     )
-    group.add_argument("--cpr", metavar="KIND", help="straightened or stretched (default: straightened)")
+    group.add_argument(
+        "--cpr", type=str.lower, metavar="KIND", help="straightened or stretched (default: straightened)"
+    )
 
 
 def add_labels(parser: argparse.ArgumentParser) -> None:

@@ -26,7 +26,6 @@ _UNLIMITED = 100_000
 _FOLDED_WIDTH = 20
 """The description is folded to this width before a column is left out."""
 _BETWEEN = 2
-_LAST = float("inf")
 _NARROWEST = 20
 
 
@@ -57,7 +56,9 @@ class _Sink(io.StringIO):
         return getattr(sys.stdout, "encoding", None) or "ascii"
 
 
-def render_listing(listing: dict[str, Any], certificate: Sequence[tuple[str, str]]) -> list[str]:
+def render_listing(
+    listing: dict[str, Any], certificate: Sequence[tuple[str, str]], refused: int | None = None
+) -> list[str]:
     """Lay out a listing.
 
     Parameters
@@ -66,6 +67,8 @@ def render_listing(listing: dict[str, Any], certificate: Sequence[tuple[str, str
         See `clrecon.jobs.info.InputListing`.
     certificate : sequence of (str, str)
         Description of the series that was judged, see `clrecon.cli.certificate`.
+    refused : int, optional
+        Number of a series whose problems are said elsewhere.
 
     Returns
     -------
@@ -74,12 +77,19 @@ def render_listing(listing: dict[str, Any], certificate: Sequence[tuple[str, str
     """
     terminal = is_terminal(sys.stdout)
     width = max(shutil.get_terminal_size().columns, _NARROWEST) if terminal else _UNLIMITED
-    entries = _sort_by_patient(listing["series"])
+    entries = listing["series"]  # in the order of their numbers: by patient, study and number in the study
     lines, left_out = _render_table(entries, listing["chosen"], width, terminal and not os.environ.get("NO_COLOR"))
     if left_out:
         lines += _wrap(f"({', '.join(left_out)} left out: a wider window or --json shows them)", width, "")
-    for what, place in (("problem", "problems"), ("warning", "warnings")):
-        for numbers, text in _collect_texts(entries, place):
+    told = [entry for entry in entries if entry["number"] != refused]
+    stacks = [entry for entry in told if entry["kind"] == "stack"]
+    others = [entry for entry in told if entry["kind"] != "stack"]
+    for group, what, place in (
+        (others, "not read", "problems"),  # which is no fault of an RT object, a capture or a localizer
+        (stacks, "problem", "problems"),
+        (entries, "warning", "warnings"),
+    ):
+        for numbers, text in _collect_texts(group, place):
             lines += _wrap(f"series {numbers}: {what}: {printable(text)}", width, "    ")
     if certificate:
         judged = "as clrecon mesh would read it" if listing["chosen"] else "refused"
@@ -88,15 +98,6 @@ def render_listing(listing: dict[str, Any], certificate: Sequence[tuple[str, str
             line for what, text in certificate for line in _wrap(f"  {what:<11}{printable(text)}", width, " " * 13)
         ]
     return lines
-
-
-def _sort_by_patient(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Group the series by patient and study if there are several; unknown ones come last."""
-    owners = {entry["study"]: entry["patient"] for entry in entries if entry["study"] and entry["patient"]}
-    # The patient of objects other than CT is not read, but a study has one patient.
-    known = [{**entry, "patient": entry["patient"] or owners.get(entry["study"])} for entry in entries]
-    several = [key for key in ("patient", "study") if _are_several(known, key)]
-    return sorted(known, key=lambda entry: (*(entry[key] or _LAST for key in several), entry["number"]))
 
 
 def _are_several(entries: Sequence[dict[str, Any]], key: str) -> bool:
@@ -122,8 +123,13 @@ def _columns(entries: Sequence[dict[str, Any]], chosen: int | None) -> Iterator[
     yield _Column("extent mm", [_times(entry["extent_mm"], ".0f") for entry in entries], left_out=1)
     thickness = [entry["slice_thickness_mm"] for entry in entries]
     yield _Column("thick", ["-" if t is None else f"{t:.4g}" for t in thickness], left_out=2, right=True)
-    tilts = [entry["tilt_deg"] for entry in entries]
-    yield _Column("tilt", ["-" if tilt is None else f"{tilt:.2f}" for tilt in tilts], left_out=4, right=True)
+    tilts = [None if (tilt := entry["tilt_deg"]) is None else round(tilt, 2) for entry in entries]
+    yield _Column(
+        "tilt",
+        ["-" if tilt is None else f"{tilt:+.2f}" if tilt else "0" for tilt in tilts],
+        left_out=4,
+        right=True,
+    )
     yield _Column("description", [printable(entry["description"] or "") for entry in entries], folds=True)
 
 

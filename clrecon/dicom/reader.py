@@ -74,9 +74,9 @@ def read_volume(
     """
     with _quiet_warnings():
         scan, found = _scan_and_group(path, progress, force)
-        chosen = choose_series(found, series)
-        left = describe_left(found, chosen)
-        chosen = chosen.choose(_checked_phase(phase), allow_gaps)
+        choice = choose_series(found, series)
+        left = describe_left(found, choice, series)
+        chosen = choice.series.choose(_checked_phase(phase), allow_gaps)
         stack = chosen.stack
         if chosen.problems or stack is None or stack.affine is None:
             raise RefusedInputError(_describe_refusal(chosen))
@@ -122,7 +122,7 @@ def list_slices(
     """
     with _quiet_warnings():
         _, found = _scan_and_group(path, None, force)
-        chosen = choose_series(found, series).choose(_checked_phase(phase), allow_gaps)
+        chosen = choose_series(found, series).series.choose(_checked_phase(phase), allow_gaps)
         if chosen.problems or chosen.stack is None:
             raise RefusedInputError(_describe_refusal(chosen))
         return [(header.file, header.frame, header.frames) for header in chosen.stack.slices]
@@ -173,13 +173,14 @@ def list_series(
         warnings = collect_scan_warnings(scan)
         number, certificate, refusal = None, None, None
         try:
-            chosen = choose_series(found, series)
+            choice = choose_series(found, series)
         except (NoDicomError, RefusedInputError) as error:
             refusal = error
             warnings.append(str(error))
         else:
+            chosen = choice.series
             number = chosen.number
-            warnings += describe_left(found, chosen)
+            warnings += describe_left(found, choice, series)
             judged = chosen.choose(phase, allow_gaps)
             found = [judged if one is chosen else one for one in found]
             certificate = _certify_chosen(judged, scan, warnings, pixels, progress)

@@ -12,6 +12,7 @@ from typing import Any, BinaryIO, Generic, TypeVar
 from clrecon.errors import OutputError, UsageError
 from clrecon.exchange.content import Assembly, PointContent
 from clrecon.system.files import StagedFile, stage_file
+from clrecon.system.text import guess_word
 
 __all__ = ["FOUR_GIB", "NO_LIMIT", "FileFormat", "find_extension", "stage_content"]
 
@@ -64,7 +65,7 @@ def find_extension(path: str | os.PathLike[str], formats: Mapping[str, Any], nou
     except TypeError as error:
         raise UsageError(f"a {noun} file is named by a string or a path, not {type(path).__name__}") from error
     if extension not in formats:
-        found = f"the extension {extension!r}" if extension else "no extension"
+        found = f"the extension {extension!r}{guess_word(extension, formats)}" if extension else "no extension"
         raise UsageError(f"the name of the {noun} file has {found}: use one of {', '.join(formats)}")
     return extension
 

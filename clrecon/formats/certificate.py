@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from clrecon.formats.grid_file import GridFile
 from clrecon.formats.values import GridValues
-from clrecon.geometry.affine import column_spacing, slice_normal, tilt_degrees
+from clrecon.geometry.affine import column_spacing, signed_tilt, slice_normal
 from clrecon.geometry.certificate import Certificate
 from clrecon.geometry.orientation import describe_orientation
 from clrecon.sources.gates import PADDING_SHARE, judge_figures, judge_steps, list_odd_values
@@ -70,7 +70,7 @@ def certify_grid(grid: GridFile, values: GridValues | None, warnings: Sequence[s
         extent_mm=[ni * spacing[0], nj * spacing[1], nk * gap],
         affine_ijk_to_lps_mm=grid.affine.tolist(),
         orientation=describe_orientation(grid.affine),
-        tilt_deg=tilt_degrees(grid.affine),
+        tilt_deg=signed_tilt(grid.affine),
         gap_mm={"min": gap, "max": gap, "median": gap},
         transfer_syntax_names=[f"{grid.kind}, {grid.dtype.name}"],
         rescale={"slope": [grid.slope] * 2, "intercept": [grid.intercept] * 2, "type": None},

@@ -1,4 +1,4 @@
-"""The libraries of the extras `labels` and `volumes`, imported when a file needs them."""
+"""The libraries that read NIfTI, NRRD and MetaImage, imported when a file needs them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 from clrecon.errors import UsageError
 from clrecon.formats.grid_file import Purpose
+from clrecon.system.installing import install_command
 
 __all__ = ["import_extra"]
 
@@ -24,7 +25,5 @@ def import_extra(module: str, purpose: Purpose) -> Any:
     try:
         return import_module(module)
     except ImportError as error:
-        extra = "volumes" if module == "SimpleITK" else purpose.extra
-        raise UsageError(
-            f"this {purpose.noun} needs the package {_PACKAGES.get(module, module)}: pip install 'clrecon[{extra}]'"
-        ) from error
+        package = _PACKAGES.get(module, module)
+        raise UsageError(f"this {purpose.noun} needs the package {package}: {install_command(package)}") from error

@@ -18,14 +18,13 @@ __all__ = ["LABEL_MAP", "VOLUME", "GridFile", "Purpose"]
 
 @dataclass(frozen=True)
 class Purpose:
-    """The purpose of reading a file, for messages: its noun, and the extra that installs the reader."""
+    """The purpose of reading a file, for messages: its noun."""
 
     noun: str
-    extra: str
 
 
-LABEL_MAP = Purpose("label map", "labels")
-VOLUME = Purpose("volume", "volumes")
+LABEL_MAP = Purpose("label map")
+VOLUME = Purpose("volume")
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from clrecon.geometry.affine import (
     compose_affine,
     is_left_handed,
     normal_matrix,
+    signed_tilt,
     slice_normal,
     tilt_degrees,
 )
@@ -26,5 +27,6 @@ __all__ = [
     "lps_affine_from_ras",
     "normal_matrix",
     "slice_normal",
+    "signed_tilt",
     "tilt_degrees",
 ]

@@ -25,6 +25,7 @@ __all__ = [
     "is_left_handed",
     "normal_matrix",
     "slice_normal",
+    "signed_tilt",
     "tilt_degrees",
 ]
 
@@ -33,6 +34,9 @@ Float64Array = NDArray[np.float64]
 
 TILT_REPORT_DEG = 0.05
 """Degrees of gantry tilt from which on it is reported."""
+
+_LONG_AXIS = 0.5
+"""Share of the slice step that runs from the feet to the head, from which on a tilt has a sign."""
 
 
 def compose_affine(i_step: ArrayLike, j_step: ArrayLike, k_step: ArrayLike, origin: ArrayLike) -> Float64Array:
@@ -137,6 +141,17 @@ def tilt_degrees(affine: Float64Array) -> float:
     along = float(step @ normal)
     across = float(np.linalg.norm(step - along * normal))
     return float(np.degrees(np.arctan2(across, abs(along))))
+
+
+def signed_tilt(affine: Float64Array) -> float:
+    """Angle of `tilt_degrees` with a sign: positive where the front edge of a slice lies nearer the head than its back.
+
+    Stacks that do not run along the patient's long axis have no such edges; their angle is positive.
+    """
+    step, normal = affine[:3, 2] / np.linalg.norm(affine[:3, 2]), slice_normal(affine)
+    forward = np.array((0.0, -1.0, 0.0)) + normal[1] * normal  # anterior, within the slice
+    leans_back = float(forward @ step) * float(np.sign(step[2])) < 0.0
+    return -tilt_degrees(affine) if leans_back and abs(step[2]) >= _LONG_AXIS else tilt_degrees(affine)
 
 
 def is_left_handed(affine: Float64Array) -> bool:

@@ -24,11 +24,14 @@ class InputListing(NamedTuple):
         Files that were passed over, series that were not chosen, and why none is chosen.
     problem : ClreconError or None
         Why the command fails: no series can be used, the requested one cannot, or a gate failed.
+    refused : int or None
+        Number of the series that was judged and cannot be used; `problem` or the notes say why.
     """
 
     listing: dict[str, Any]
     notes: list[str]
     problem: ClreconError | None
+    refused: int | None = None
 
 
 def describe_input(
@@ -78,18 +81,18 @@ def describe_input(
     )
     entries = [entry.as_dict() for entry in found.series]
     listing: dict[str, Any] = {"series": entries, "chosen": found.chosen, "certificate": found.certificate}
-    notes, problem = list(found.warnings), found.refusal
+    notes, problem, refused = list(found.warnings), found.refusal, None
     if found.chosen is not None:
         problem = _judge(next(entry for entry in entries if entry["number"] == found.chosen))
         if problem is None:
             failed = _judge_gates(listing) if strict else None
             return InputListing(listing, notes, failed)
-        listing["chosen"] = None
+        refused, listing["chosen"] = found.chosen, None
         notes.append(str(problem))
     if series is None and not strict and any(not entry["problems"] for entry in entries):
-        return InputListing(listing, notes, None)
+        return InputListing(listing, notes, None, refused)
     notes.pop()  # the command ends with this problem
-    return InputListing(listing, notes, problem)
+    return InputListing(listing, notes, problem, refused)
 
 
 def _judge(entry: dict[str, Any]) -> ClreconError | None:

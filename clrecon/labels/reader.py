@@ -48,8 +48,7 @@ def read_labels(
     """Read a label map: NIfTI (.nii, .nii.gz), NRRD and 3D Slicer's .seg.nrrd, MetaImage, DICOM SEG,
     or RTSTRUCT.
 
-    The kind is told from the content.  NIfTI and NRRD need the extra ``clrecon[labels]``, MetaImage
-    ``clrecon[volumes]``.
+    The kind is told from the content.  MetaImage needs the package SimpleITK.
 
     Parameters
     ----------

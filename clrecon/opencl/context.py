@@ -17,6 +17,7 @@ from clrecon.opencl.cache.folders import cache_warnings
 from clrecon.opencl.cache.known_good import KnownGood, known_good
 from clrecon.opencl.commands import Commands
 from clrecon.opencl.unknown_cpu import NameOfCpu, has_unknown_cpu
+from clrecon.system.installing import install_command
 from clrecon.system.log import get_logger
 
 __all__ = ["GROUP_SIZE", "Device", "describe_error", "kind_of_error"]
@@ -175,7 +176,8 @@ class Device:
         except LookupError as error:
             self.shortcoming = (
                 f"its compiler is older than this CPU and builds nothing for it ({error}): install PoCL 3.1 or newer"
-                " (pocl-opencl-icd of the system, or pocl of conda-forge) or `pip install intel-opencl-rt`"
+                " (pocl-opencl-icd of the system, or pocl of conda-forge) or"
+                f" `{install_command('intel-opencl-rt')}`"
             )
         else:
             self.build_options = (f"-DCPU_NAME={self._cpu.name}",)

@@ -13,6 +13,7 @@ from clrecon.opencl import quirks
 from clrecon.opencl.cache.folders import cache_warnings
 from clrecon.opencl.context import Device, describe_error
 from clrecon.opencl.first_use import find_fault, remembered_fault
+from clrecon.system.installing import install_command
 from clrecon.system.log import get_logger
 from clrecon.system.wording import name_parameter
 
@@ -49,10 +50,11 @@ def driver_advice() -> str:
     system = platform.system()
     if system == "Linux":
         if platform.machine() == "x86_64":
-            return "install the CPU driver with `pip install 'pyopencl[pocl]'` or `apt install pocl-opencl-icd`"
+            return f"install the CPU driver with `{install_command('pyopencl[pocl]')}` or `apt install pocl-opencl-icd`"
         return "install the CPU driver with `apt install pocl-opencl-icd`, or the GPU vendor's OpenCL package"
     if system == "Windows":
-        return "install the GPU vendor's graphics driver, or the Intel CPU runtime with `pip install intel-opencl-rt`"
+        runtime = install_command("intel-opencl-rt")
+        return f"install the GPU vendor's graphics driver, or the Intel CPU runtime with `{runtime}`"
     if system == "Darwin":
         return "install PoCL with `conda install -c conda-forge pocl`, macOS before 15 brings OpenCL itself"
     return "install the OpenCL driver (ICD) of your device"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.geometry import column_spacing, tilt_degrees
+from clrecon.geometry import column_spacing, signed_tilt
 from clrecon.phantom.bodies import choose_body
 from clrecon.phantom.describe import describe_series, describe_spine
 from clrecon.phantom.dicom_series import RESCALE_INTERCEPT, write_series
@@ -98,7 +98,7 @@ def _make(
         "affine_ijk_to_lps_mm": affine.tolist(),
         "spacing_mm": list(column_spacing(affine)),
         "slice_gap_along_normal_mm": float(placement.slice_thickness),
-        "tilt_deg": tilt_degrees(affine),
+        "tilt_deg": signed_tilt(affine),
         "iso_value_hu": _iso_value(settings, half_maximum),
         "half_maximum_hu": half_maximum,
         "surface": surface,

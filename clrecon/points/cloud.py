@@ -14,6 +14,7 @@ from clrecon.exchange.content import PointContent, describe_facts
 from clrecon.exchange.coordinates import as_stored
 from clrecon.geometry import frame_from_lps
 from clrecon.points.voxel_numbers import VoxelNumbers
+from clrecon.system.installing import install_command
 from clrecon.system.messages import Message
 from clrecon.system.targets import keep_existing
 
@@ -330,7 +331,7 @@ class PointCloud(Message):
         try:
             import open3d
         except ImportError as error:
-            raise UsageError(f"open3d cannot be imported ({error}): pip install open3d") from error
+            raise UsageError(f"open3d cannot be imported ({error}): {install_command('open3d')}") from error
         columns = {
             "positions": self._points,
             "normals": self._normals,

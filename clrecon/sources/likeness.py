@@ -96,7 +96,7 @@ def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool |
 
     A tilt of None is an unknown one.
     """
-    parts = tilt_deg is not None and tilt_deg <= TILT_REPORT_DEG
+    parts = tilt_deg is not None and abs(tilt_deg) <= TILT_REPORT_DEG
     count = len(voxels)
     if uneven or count <= WINDOW * WINDOWS:
         return measure_likeness(voxels, parts)

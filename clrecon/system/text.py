@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable
 from functools import lru_cache
 
-__all__ = ["escape_text", "hash_uid", "join_names"]
+__all__ = ["count_of", "escape_text", "guess_word", "hash_uid", "join_names", "say_unknown"]
 
 TEXT_LIMIT = 64
 NAMES_SHOWN = 5
@@ -21,6 +21,35 @@ def escape_text(text: str, limit: int = TEXT_LIMIT) -> str:
         return text
     safe = "".join(c if c.isprintable() else c.encode("unicode_escape", "replace").decode("ascii") for c in text)
     return safe if len(safe) <= limit else safe[: limit - 3] + "..."
+
+
+def guess_word(word: object, known: Iterable[str]) -> str:
+    """Return `` (did you mean X?)`` with the known word that is most like `word`; empty if none is like it.
+
+    Parameters
+    ----------
+    word : object
+        What was given; upper and lower case count alike.
+    known : iterable of str
+    """
+    if not isinstance(word, str) or len(word) > TEXT_LIMIT:
+        return ""
+    from difflib import get_close_matches  # only where something was misspelt
+
+    folded = {name.casefold(): name for name in known}
+    near = get_close_matches(word.casefold(), folded, n=1)
+    return f" (did you mean {folded[near[0]]}?)" if near else ""
+
+
+def say_unknown(noun: str, word: object, known: Iterable[str]) -> str:
+    """Return the start of a message: the word is unknown, which one it may have meant, and all that are known."""
+    known = list(known)
+    return f"unknown {noun} {word!r:.60}{guess_word(word, known)}: use one of {', '.join(known)}"
+
+
+def count_of(number: int, noun: str, several: str | None = None) -> str:
+    """Return a count with its noun: ``1 slice``, ``1,200 slices``; `several` is the plural if it is not noun + s."""
+    return f"{number:,} {noun if number == 1 else several or noun + 's'}"
 
 
 @lru_cache(1024)

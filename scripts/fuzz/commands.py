@@ -30,7 +30,7 @@ ODD = [
     "label:", "i-mc", "g-mc", "skimage", "golden",
     "L4-L5", "L5-L1", "C1-L5", "T12,L1", "2-3", "60",
 ]  # fmt: skip
-UNTRIED = {"bench", "selftest", "demo"}
+UNTRIED = {"bench", "selftest", "demo", "completion"}
 """Commands that take seconds each; their options are tried by the tests of the command line."""
 NEVER = ("-h", "--help", "--debug")
 COMMAND_LIMIT_S = 20.0

@@ -221,7 +221,7 @@ def test_two_series_and_the_choice(device: Any, tmp_path: Path, capsys: pytest.C
     assert main(["mesh", str(folder), "-o", str(tmp_path / "a.stl"), "--device", str(device.index)]) == 0
     captured = capsys.readouterr()
     assert "17 slices" in captured.out
-    assert captured.err.startswith("clrecon: warning: 1 other series left: [2: CT")
+    assert captured.err.startswith("clrecon: warning: 1 other CT series not used: [2: CT")
     assert main(["mesh", str(folder), "-o", str(tmp_path / "a.stl"), "--series", "9"]) == 3
     assert "no series matches" in capsys.readouterr().err
 
@@ -291,7 +291,7 @@ def test_phantom_and_its_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert main(["info", str(folder), "--json"]) == 0
     (entry,) = json.loads(capsys.readouterr().out)["series"]
     np.testing.assert_allclose(entry["affine_ijk_to_lps_mm"], truth["affine_ijk_to_lps_mm"], atol=1e-6)
-    assert entry["tilt_deg"] == pytest.approx(12.0, abs=1e-4)
+    assert entry["tilt_deg"] == pytest.approx(-12.0, abs=1e-4) == truth["tilt_deg"]
     assert main([*arguments, "--seed", "4"]) == 0
     assert "sphere, 24 slices of 40 x 32" in capsys.readouterr().out
 

@@ -31,7 +31,7 @@ def test_row_56_a_signal_ends_a_command_whose_kernel_hangs(device, tmp_path, com
     process.send_signal(number)
     start = time.perf_counter()
     _, errors = process.communicate(timeout=60)
-    assert time.perf_counter() - start < 3.0  # 0.6 s on an idle machine
+    assert time.perf_counter() - start < 12.0  # 0.6 s on an idle machine; the kernel spins for 30
     assert (process.returncode, errors) == (130, "clrecon: error: interrupted\n")
     assert [path.name for path in tmp_path.iterdir()] == ["ct"]
 
@@ -43,7 +43,7 @@ def test_row_56_the_time_limit_ends_a_command_whose_kernel_hangs(device, tmp_pat
     assert process.stderr.readline() == "the kernel spins\n"
     start = time.perf_counter()
     _, errors = process.communicate(timeout=60)
-    assert time.perf_counter() - start < 4.0  # 1.2 s on an idle machine
+    assert time.perf_counter() - start < 12.0  # 1.2 s on an idle machine; the kernel spins for 30
     assert process.returncode == 5
     assert errors.startswith("clrecon: error: kernel ")
     assert f"has not ended on {device.label} for 1 s, so it counts as hung: choose another --device" in errors

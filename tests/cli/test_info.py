@@ -113,7 +113,7 @@ def test_the_table_marks_the_choice(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert rows[0].split()[:4] == ["series", "hash", "kind", "slices"]
     assert rows[2].split()[:2] == ["*", "1"] and rows[3].split()[0] == "2"
     assert "31 x 25" in rows[2] and "0.8 x 1.1 x 1.5" in rows[2]
-    assert "series 3-5: problem: modality MR is not CT" in rows
+    assert "series 3-5: not read: modality MR is not CT" in rows
     assert "series 1, as clrecon mesh would read it" in rows
     assert any(re.fullmatch(r"  slices +17 used, none dropped", row) for row in rows)
 
@@ -219,15 +219,15 @@ def test_a_plain_encoding_draws_no_lines_that_it_lacks(monkeypatch: pytest.Monke
 def test_patients_and_studies_stand_apart() -> None:
     entries = [
         entry(1),
-        entry(2, patient=28, study=2),
-        entry(3, study=3, phases=[{"number": 1}, {"number": 2}]),
-        entry(4, patient=None, study=None),
-        entry(5, patient=None, study=2, modality="SEG", kind="other"),
+        entry(2, study=3, phases=[{"number": 1}, {"number": 2}]),
+        entry(3, patient=28, study=2),
+        entry(4, patient=28, study=2, modality="SEG", kind="other"),
+        entry(5, patient=None, study=None),
     ]
     lines = render_listing(listing(*entries), [])
     assert lines[0].split()[:3] == ["series", "patient", "study"] and "phases" in lines[0]
     rows = [line.removeprefix("*").split()[:3] for line in lines if re.match(r"[* ] +\d", line)]
-    assert rows == [["1", "1", "1"], ["3", "1", "3"], ["2", "28", "2"], ["5", "28", "2"], ["4", "-", "-"]]
+    assert rows == [["1", "1", "1"], ["2", "1", "3"], ["3", "28", "2"], ["4", "28", "2"], ["5", "-", "-"]]
 
 
 @pytest.mark.untraced
@@ -251,7 +251,7 @@ def test_the_certificate_in_words(tmp_path: Path) -> None:
     assert words["positions"] == "within 0.001 mm of even steps (allowed 0.0125)"
     assert words["gaps"] == "1.25 mm"
     assert words["thickness"] == "5 mm: 3.75 mm overlap between neighbouring slices (300 % of the gap)"
-    assert words["tilt"] == "12.00 degrees, kept exactly as a shear"
+    assert words["tilt"] == "-12.00 degrees (back edge towards the head), kept exactly as a shear"
     assert words["padding"] == "0.0 % of the voxels hold no measurement"
     assert words["values"] == "-124 to 145 HU; slope 1, intercept -1024"
     assert words["stored"] == "Explicit VR Little Endian"

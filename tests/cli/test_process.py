@@ -28,7 +28,7 @@ def test_help_goes_to_stdout_in_little_time() -> None:
     done = run("--help")
     elapsed = time.perf_counter() - start
     assert (done.returncode, done.stderr) == (0, "")
-    assert "mesh      make a mesh from a CT series" in done.stdout
+    assert "mesh         make a mesh from a CT series" in done.stdout
     assert elapsed < 3.0  # 0.07 s on an idle machine; what is imported is what the guards look at
 
 

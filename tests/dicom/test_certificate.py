@@ -68,7 +68,7 @@ def test_an_oblique_tilted_series(tmp_path):
     row, column, normal = plan.directions
     assert found["extent_mm"] == pytest.approx([6 * 0.5, 5 * 0.7, 7 * 1.25])
     assert found["gap_mm"] == pytest.approx({"min": 1.25, "max": 1.25, "median": 1.25})
-    assert found["tilt_deg"] == pytest.approx(12.0, abs=1e-6)
+    assert found["tilt_deg"] == pytest.approx(-12.0, abs=1e-6)
     assert found["grid_residual_max_mm"] <= tolerances.AFFINE_MM
     assert found["grid_tolerance_mm"] == pytest.approx(0.0125)
     for name, direction in (("row", row), ("column", column), ("normal", normal)):

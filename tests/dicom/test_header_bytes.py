@@ -271,6 +271,7 @@ def test_problems_of_a_series_and_which_of_them_hide_others(kind, bad, expected)
         others=[SimpleNamespace(problem=f"bad {number}") for number in range(bad)],
         corrupt=[],
         lost=["lost"],
+        is_file=False,
         _find_stack_problems=lambda: ["hole"],
     )
     assert Series.problems.func(series) == expected  # type: ignore[attr-defined]
@@ -321,15 +322,18 @@ def test_all_elements_are_kept_where_none_are_named():
 @pytest.mark.parametrize(
     ("kind", "count", "problems", "said"),
     [
-        ("stack", 5, ["bad"], "[2: CT, cannot be used]"),
-        ("stack", 4, ["bad"], "[2: CT]"),  # smaller than the chosen one
-        ("stack", 9, [], "[2: CT]"),
-        ("localizer", 9, ["bad"], "[2: CT]"),
+        ("stack", 5, ["bad"], ["1 other CT series not used: [2: CT, cannot be used]; series 1 is read, by lot"]),
+        ("stack", 4, ["bad"], ["1 other CT series not used: [2: CT]; series 1 is read, by lot"]),  # smaller
+        ("stack", 9, [], ["1 other CT series not used: [2: CT]; series 1 is read, by lot"]),
+        ("localizer", 9, ["bad"], []),
+        ("capture", 9, ["bad"], []),
+        ("other", 9, ["bad"], []),
     ],
 )
 def test_larger_stacks_that_cannot_be_used_are_told(kind, count, problems, said, monkeypatch):
     monkeypatch.setattr(choice, "_describe_other_planes", lambda left, chosen: [])
     other: Any = SimpleNamespace(kind=kind, count=count, problems=problems, describe=lambda: "2: CT")
-    chosen: Any = SimpleNamespace(count=5)
-    assert choice.describe_left([chosen, other], chosen) == [f"1 other series left: {said}"]
-    assert choice.describe_left([chosen], chosen) == []
+    chosen: Any = SimpleNamespace(count=5, number=1)
+    taken = choice.Choice(chosen, "by lot")
+    assert choice.describe_left([chosen, other], taken) == said
+    assert choice.describe_left([chosen], taken) == choice.describe_left([chosen, other], taken, "2") == []

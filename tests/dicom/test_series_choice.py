@@ -59,7 +59,9 @@ def test_listing_is_the_contract(two_series):
 def test_the_largest_series_is_taken_and_the_rest_said(two_series):
     volume = read_volume(two_series)
     assert volume.report["series"] == {"number": 1, "uid_hash": hash_of(2), "modality": "CT"}
-    assert volume.report["warnings"] == ["1 other series left: [2: CT, 4 slices]"]
+    assert volume.report["warnings"] == [
+        "1 other CT series not used: [2: CT, 4 slices]; series 1 is read, with the most slices"
+    ]
     assert volume.report["files"] == {"found": 11, "used": 7, "skipped": {}}
     assert list_series(two_series).warnings == volume.report["warnings"]
 
@@ -72,17 +74,34 @@ def test_a_series_is_named_in_many_ways(two_series, wanted):
     assert read_volume(two_series, wanted).report["series"]["number"] == 2
 
 
-@pytest.mark.parametrize(
-    ("wanted", "words"),
-    [(3, "no series matches series=3"), ("neck", "no series matches"), ("series", "2 series match"), ("", "no series")],
-)
-def test_unknown_or_vague_names_list_what_is_there(two_series, wanted, words):
+@pytest.mark.parametrize("wanted", [3, "neck", "", "9", "1.2.4"])
+def test_an_unknown_name_lists_what_is_there(two_series, wanted):
     with pytest.raises(UsageError) as caught:
         read_volume(two_series, wanted)
-    assert words in str(caught.value)
-    assert str(caught.value).endswith(
-        '; there are [1: CT, 7 slices], [2: CT, 4 slices] ("clrecon info" describes them)'
+    assert str(caught.value) == (
+        f"no series matches series={wanted!r}; there are [1: CT, 7 slices], [2: CT, 4 slices]"
+        ' ("clrecon info" describes them)'
     )
+
+
+def test_a_vague_name_lists_those_that_match(two_series):
+    write_series(
+        two_series, Plan(series=8, shape=(3, 5, 6), name="neck{}".format), set_values(SeriesDescription="neck")
+    )
+    with pytest.raises(UsageError) as caught:
+        read_volume(two_series, "erie")
+    assert str(caught.value) == (
+        "2 series match series='erie': [1: CT, 7 slices], [2: CT, 4 slices] (\"clrecon info\" describes them)"
+    )
+
+
+def test_the_start_of_a_hash_or_uid_names_a_series(two_series):
+    for wanted in (hash_of(5)[:4], hash_of(5)[:10].upper(), f"{ROOT}.5"[:-1] + "5"):
+        assert read_volume(two_series, wanted).report["series"]["number"] == 2
+    with pytest.raises(UsageError, match="no series matches"):
+        read_volume(two_series, hash_of(5)[:3])  # three characters are not enough
+    with pytest.raises(UsageError, match="2 series match series='"):
+        read_volume(two_series, ROOT)  # the start of both UIDs
 
 
 def test_two_series_of_equal_size_need_a_choice(tmp_path):
@@ -105,7 +124,7 @@ def test_a_faulty_largest_series_is_not_passed_over(two_series):
         read_volume(two_series)
     smaller = read_volume(two_series, 2)
     assert smaller.voxels.shape == (4, 5, 6)
-    assert smaller.report["warnings"] == ["1 other series left: [1: CT, 7 slices, cannot be used]"]
+    assert smaller.report["warnings"] == []  # it was asked for
 
 
 def test_of_two_equal_series_the_usable_one_is_taken(tmp_path):
@@ -113,7 +132,10 @@ def test_of_two_equal_series_the_usable_one_is_taken(tmp_path):
     write_series(tmp_path, Plan(series=2, name="x{}".format))
     volume = read_volume(tmp_path)
     assert volume.report["series"]["uid_hash"] == hash_of(2)
-    assert volume.report["warnings"] == ["1 other series left: [1: CT, 7 slices, cannot be used]"]
+    assert volume.report["warnings"] == [
+        "1 other CT series not used: [1: CT, 7 slices, cannot be used];"
+        " series 2 is read, the only one of its size that can be used"
+    ]
     write_series(tmp_path, Plan(series=3, name="y{}".format))
     with pytest.raises(
         RefusedInputError, match=r"2 CT series have 7 slices each, choose one .*: \[2: .*\[3: "
@@ -142,7 +164,9 @@ def test_old_multi_frame_images_do_not_win_over_a_usable_stack(tmp_path, frames)
     save_dataset(ds, tmp_path / "many")
     volume = read_volume(tmp_path)
     assert np.array_equal(volume.voxels, plan.hu())
-    assert volume.report["warnings"] == ["1 other series left: [2: CT, 1 slice]"]
+    assert volume.report["warnings"] == [
+        "1 other CT series not used: [2: CT, 1 slice]; series 1 is read, with the most slices"
+    ]
     with pytest.raises(RefusedInputError, match=f"many: multi-frame image of {frames} frames, SOP class"):
         read_volume(tmp_path, 2)
 
@@ -157,10 +181,9 @@ def test_a_localizer_in_the_series_is_parted(tmp_path, by_type):
     volume = read_volume(tmp_path)
     assert np.array_equal(volume.voxels, plan.hu())
     assert volume.spacing[2] == pytest.approx(1.25)
-    kind = ", localizer" if by_type else ""
-    told = [f"1 other series left: [2: CT, 1 slice{kind}]"]
-    told += [] if by_type else ["1 slice of the series that is read left: in another plane, 90.0 degrees off"]
-    assert volume.report["warnings"] == told
+    left = "1 slice of the series that is read left: in another plane, 90.0 degrees off"
+    told = ["1 other CT series not used: [2: CT, 1 slice]; series 1 is read, with the most slices", left]
+    assert volume.report["warnings"] == ([] if by_type else told)
     assert read_volume(tmp_path, f"{ROOT}.1").report["slices"] == 7
     assert len(list_series(tmp_path).series) == 2
 
@@ -239,11 +262,11 @@ def test_no_patient_data_and_no_folder_in_the_report(tmp_path):
     said = json.dumps([volume.report, listing.warnings, [entry.warnings for entry in listing.series]])
     assert "SECRET" not in said and "Doe" not in said and str(tmp_path) not in said
     assert volume.report["warnings"] == [
-        "gantry tilt 3.00 degrees: kept exactly, as a shear",
+        "gantry tilt -3.00 degrees: kept exactly, as a shear",
         "RescaleType is 'US': the values are not HU (3 of 7 slices, the first at -397.50 mm)",
         "1 corrupt file skipped",
         "1 skipped: named like DICOM but is none",
-        "1 other series left: [2: CT, 3 slices]",
+        "1 other CT series not used: [2: CT, 3 slices]; series 1 is read, with the most slices",
     ]
 
 

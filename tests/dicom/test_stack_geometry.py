@@ -49,8 +49,8 @@ def test_voxels_lie_where_they_were_written(tmp_path, plan):
 def test_tilt_is_reported(tmp_path, tilt):
     write_series(tmp_path, Plan(tilt_deg=tilt))
     report = read_volume(tmp_path).report
-    assert report["tilt_deg"] == pytest.approx(abs(tilt), abs=1e-6)
-    assert f"tilt {abs(tilt):.2f} degrees" in report["warnings"][0]
+    assert report["tilt_deg"] == pytest.approx(-tilt, abs=1e-6)  # a plan leans back
+    assert f"gantry tilt {-tilt:+.2f} degrees" in report["warnings"][0]
     assert report["gap_mm"]["max"] == pytest.approx(1.25)
     assert report["spacing_mm"][2] == pytest.approx(1.25 / np.cos(np.radians(tilt)))
 

@@ -211,16 +211,16 @@ def test_to_pyvista_shares_the_arrays():
 
 def test_without_open3d_the_message_says_so(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "open3d", None)
-    with pytest.raises(UsageError, match="open3d cannot be imported .*: pip install open3d"):
+    with pytest.raises(UsageError, match="open3d cannot be imported .*: .* install .*open3d"):
         make_cloud(2).to_open3d()
 
 
 def test_without_laspy_the_message_says_how_to_install_it(tmp_path, monkeypatch):
     make_cloud(2).save(tmp_path / "bone.las")
     monkeypatch.setitem(__import__("sys").modules, "laspy", None)
-    with pytest.raises(UsageError, match=r"pip install 'clrecon\[las\]'"):
+    with pytest.raises(UsageError, match=r"laspy: .* install .*laspy;"):
         make_cloud(2).save(tmp_path / "new.las")
-    with pytest.raises(UsageError, match=r"pip install 'clrecon\[las\]'"):
+    with pytest.raises(UsageError, match=r"laspy: .* install .*laspy;"):
         read_points(tmp_path / "bone.las")
     assert [entry.name for entry in tmp_path.iterdir()] == ["bone.las"]
 

@@ -74,10 +74,10 @@ def test_options_for_dicom_alone_are_refused(tmp_path, option):
     ("name", "module", "package"),
     [("a.nii", "nibabel", "nibabel"), ("raw.nrrd", "nrrd", "pynrrd"), ("a.mha", "SimpleITK", "SimpleITK")],
 )
-def test_without_its_package_the_extra_is_named(tmp_path, monkeypatch, name, module, package):
+def test_without_its_package_the_command_is_named(tmp_path, monkeypatch, name, module, package):
     path = WRITERS[name](tmp_path / name, make_ct(), OBLIQUE)
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(UsageError, match=rf"this volume needs the package {package}: pip install 'clrecon\[volumes\]'"):
+    with pytest.raises(UsageError, match=rf"this volume needs the package {package}: .* install .*{package}$"):
         clrecon.read_volume(path)
 
 

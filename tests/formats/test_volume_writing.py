@@ -99,7 +99,7 @@ def test_the_certificate_is_in_the_file(tmp_path):
     write_volume(volume, tmp_path / "a.nii")
     text = nibabel.load(tmp_path / "a.nii").header.extensions[0].get_content()
     text = text if isinstance(text, str) else text.decode()
-    assert "tilt_deg 12" in text and "gates " in text and "frame_of_reference" not in text
+    assert "tilt_deg -12" in text and "gates " in text and "frame_of_reference" not in text
     write_volume(volume, tmp_path / "a.nrrd", keep_ids=True)
     fields = nrrd.read_header(str(tmp_path / "a.nrrd"))
     assert any(str(value).startswith("frame_of_reference ") for value in fields.values())

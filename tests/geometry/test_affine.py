@@ -15,6 +15,7 @@ from clrecon.geometry import (
     is_left_handed,
     lps_affine_from_ras,
     normal_matrix,
+    signed_tilt,
     slice_normal,
     tilt_degrees,
 )
@@ -33,6 +34,25 @@ def test_compose_places_columns_rows_and_slices():
     assert np.allclose(mapped[2] - mapped[0], COLUMN * 1.4)
     assert np.allclose(mapped[3] - mapped[0], (0, 0.6, 5.0))
     assert column_spacing(affine) == pytest.approx((0.5, 0.7, np.hypot(0.3, 2.5)))
+
+
+@pytest.mark.parametrize("towards", [1.0, -1.0], ids=["to the head", "to the feet"])
+@pytest.mark.parametrize("prone", [False, True])
+@pytest.mark.parametrize("tilt", [0.0, 3.0, -20.0])
+def test_tilt_is_positive_where_the_front_edge_is_nearer_the_head(tilt, prone, towards):
+    angle = np.radians(tilt)
+    turned = -1.0 if prone else 1.0
+    row = np.array([turned, 0.0, 0.0])
+    back = np.array([0.0, np.cos(angle), -np.sin(angle)])  # the back edge of a slice lies lower
+    affine = compose_affine(row, turned * back, (0.0, 0.0, towards * 2.0), (0.0, 0.0, 0.0))
+    assert signed_tilt(affine) == pytest.approx(tilt, abs=1e-9)
+    assert tilt_degrees(affine) == pytest.approx(abs(tilt), abs=1e-9)
+
+
+def test_the_tilt_of_coronal_slices_has_no_sign():
+    for lean in (0.5, -0.5):
+        affine = compose_affine((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 2.0, lean), (0.0, 0.0, 0.0))
+        assert signed_tilt(affine) == tilt_degrees(affine) > 14.0
 
 
 @pytest.mark.parametrize("tilt", [0.0, 1.0, 12.0, -20.0])

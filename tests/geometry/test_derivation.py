@@ -137,7 +137,7 @@ def test_every_number_of_the_page_is_what_the_code_gives(page, volume):
         printed, half_a_digit = page[name]
         np.testing.assert_allclose(printed, values, rtol=0, atol=half_a_digit * 1.001, err_msg=name)
     assert not is_left_handed(volume.affine)
-    assert any(f"tilt {page['tilt'][0]:.2f} degrees" in text for text in volume.report["warnings"])
+    assert any(f"gantry tilt -{page['tilt'][0]:.2f} degrees" in text for text in volume.report["warnings"])
 
 
 def test_the_code_agrees_with_the_standard_alone(page, volume):

@@ -102,6 +102,34 @@ def test_a_project_that_cannot_be_written_is_told_so(tmp_path: Path) -> None:
     assert "cannot be written" in done.stderr and "Traceback" not in done.stderr
 
 
+SLOW = """
+import sys, time
+for step in range(3):
+    print("Collecting part", step, flush=True)
+    open(sys.argv[1] + f"/part{step}", "wb").write(bytes(1_500_000))
+    time.sleep(0.4)
+sys.exit(int(sys.argv[2]))
+"""
+
+
+@pytest.mark.parametrize("code", [0, 3])
+def test_an_installation_says_how_far_it_is(code: int, tmp_path: Path) -> None:
+    folder = tmp_path / "env"
+    folder.mkdir()
+    (tmp_path / "slow.py").write_text(SLOW)
+    command = [sys.executable, str(tmp_path / "slow.py"), str(folder), str(code)]
+    lines = "e._TICK_SECONDS = e._LINE_SECONDS = 0.1; "
+    source = f"import sys, _environment as e; {lines}sys.exit(e._run_logged({command}, {str(tmp_path / 'log')!r}, "
+    source += f"{str(folder)!r}, 1200))"
+    done = subprocess.run([sys.executable, "-c", source], cwd=ROOT / "scripts", capture_output=True, text=True)
+    assert done.returncode == code and done.stdout == ""
+    said = done.stderr.splitlines()
+    assert re.fullmatch(r" +\d+ s, \d of about 1,200 MB(: Collecting part \d)?", said[0])
+    assert any("2 of about 1,200 MB" in line for line in said) and "part 2" in " ".join(said)
+    assert (re.fullmatch(r"installed in \d+ s: 4 MB in env", said[-1]) is not None) == (code == 0)
+    assert (tmp_path / "log").read_text().splitlines() == [f"Collecting part {step}" for step in range(3)]
+
+
 @posix_only
 def test_commits_are_checked_as_the_script_checks() -> None:
     """The same programs with the same arguments, which .pre-commit-config.yaml cannot import."""

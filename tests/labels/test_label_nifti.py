@@ -203,10 +203,10 @@ def test_header_and_voxels_in_two_files_are_read(tmp_path):
         read_labels(tmp_path / "a.hdr")
 
 
-def test_without_nibabel_the_extra_is_named(tmp_path, monkeypatch):
+def test_without_nibabel_the_command_is_named(tmp_path, monkeypatch):
     path = write_nifti(tmp_path / "a.nii", make_labels())
     monkeypatch.setitem(__import__("sys").modules, "nibabel", None)
-    with pytest.raises(UsageError, match=r"needs the package nibabel: pip install 'clrecon\[labels\]'"):
+    with pytest.raises(UsageError, match=r"needs the package nibabel: .* install .*nibabel$"):
         read_labels(path)
 
 

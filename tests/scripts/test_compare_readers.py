@@ -66,7 +66,7 @@ def test_a_row_of_the_table(tmp_path, capsys):
     assert lines[-1].startswith("24 slices of 7 x 6, ") and "highdicom 0." in lines[-1]
     cells = json.loads((tmp_path / "table.json").read_text())["cases"]["tilt 1 deg"]
     assert cells["highdicom"]["error_mm"] == pytest.approx(23 * 1.25 * np.tan(np.radians(1.0)), rel=1e-3)
-    assert "tilt 1.00 degrees" in cells["clrecon"]["told"]
+    assert "tilt -1.00 degrees" in cells["clrecon"]["told"]
 
 
 def test_what_is_not_installed_and_what_is_not_known(monkeypatch, capsys):

@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib.util
 
 from clrecon.errors import RefusedInputError
+from clrecon.system.installing import install_command
 from clrecon.system.text import escape_text
 
 __all__ = ["NATIVE_SYNTAXES", "SYNTAX_NAMES", "choose_decoder", "describe_undecodable", "is_encapsulated"]
@@ -93,5 +94,5 @@ def choose_decoder(transfer_syntax: str) -> str:
         if importlib.util.find_spec(package) is not None:
             return decoder
     raise RefusedInputError(
-        f"transfer syntax {transfer_syntax} needs a decoder that is not installed: pip install {packages}"
+        f"transfer syntax {transfer_syntax} needs a decoder that is not installed: {install_command(*packages.split())}"
     )

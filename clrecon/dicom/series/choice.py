@@ -1,54 +1,71 @@
-"""The choice of the series to read: the one that is named, or the usable CT stack with the most slices."""
+"""The choice of the series to read: the one that is named, or the best of the usable CT stacks."""
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
 from collections.abc import Sequence
+from typing import NamedTuple
 
+from clrecon.dicom.series.rank import Rank, rank_series
 from clrecon.dicom.series.series import Series
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
-from clrecon.system.text import hash_uid, join_names
+from clrecon.system.text import count_of, hash_uid, join_names
 from clrecon.system.wording import name_parameter
 
-__all__ = ["choose_series", "describe_left"]
+__all__ = ["Choice", "choose_series", "describe_left"]
+
+SHORTEST_START = 4
+"""Fewest characters of a hash or UID that name a series by its start."""
+SIMILAR = 0.5
+"""Series with at least this share of the slices of the largest one are compared by more than their number of slices."""
 
 
-def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> Series:
+class Choice(NamedTuple):
+    """The series to read, and why it is this one: empty where nothing was left to choose."""
+
+    series: Series
+    why: str
+
+
+def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> Choice:
     """Choose the series to read.
 
     Parameters
     ----------
     found : sequence of Series
     wanted : int or str, optional
-        Number in the listing, SeriesInstanceUID, its hash, or the description (whole, or a part that only one
-        series has).  None takes the one CT stack with most slices; of several with as many, the one that is
-        usable.  With CT stacks of several patients there is no such choice.
+        Number in the listing, SeriesInstanceUID, its hash, the start of one of these (`SHORTEST_START` characters), or
+        the description (whole, or a part that only one series has).  None takes the CT stack with most slices.  Of
+        those with a similar number (`SIMILAR`) original images come before derived ones, then the thinnest slices, then
+        most slices; of equal ones the usable one is taken.  With CT stacks of several patients, or with similar ones in
+        different directions, there is no such choice.
 
     Raises
     ------
     UsageError
-        `wanted` matches no series or several; the message lists the series.
+        `wanted` matches no series or several; the message lists those that match, or all.
     NoDicomError
         There is no CT series, or the one that is named is not CT.
     RefusedInputError
-        Several usable CT stacks, or only unusable ones, have the same, largest number of slices; there is no
-        stack; or there are stacks of several patients.
+        Several usable CT stacks, or only unusable ones, are as good as each other; there is no stack; or there are
+        stacks of several patients or directions.
     """
     if wanted is None:
         ct = [series for series in found if series.kind != "other"]
         if not ct:
             raise NoDicomError(_describe_modalities(found))
         _check_one_patient(ct)
-        return _take_largest(ct)
+        return _take_best(ct)
     matches = _match_series(found, wanted)
+    if not matches:
+        raise UsageError(f"no series matches series={wanted!r}; there are {_list_lines(found)}")
     if len({series.identity for series in matches}) != 1:
-        count = "no series matches" if not matches else f"{len(matches)} series match"
-        raise UsageError(f"{count} series={wanted!r}; there are {_list_lines(found)}")
-    chosen = matches[0] if len(matches) == 1 else _take_largest(matches)
+        raise UsageError(f"{len(matches)} series match series={wanted!r}: {_list_lines(matches)}")
+    chosen, why = Choice(matches[0], "") if len(matches) == 1 else _take_best(matches)
     if chosen.kind == "other":
         raise NoDicomError(f"series {chosen.number} is of modality {chosen.identity.modality}, not CT")
-    return chosen
+    return Choice(chosen, why)
 
 
 def _check_one_patient(ct: Sequence[Series]) -> None:
@@ -64,51 +81,107 @@ def _check_one_patient(ct: Sequence[Series]) -> None:
 
 def _match_series(found: Sequence[Series], wanted: int | str) -> list[Series]:
     text = str(wanted).strip()
-    by_id = [series for series in found if text in (series.identity.uid, hash_uid(series.identity.uid)) and text]
+    if not text:
+        return []
+    by_id = [series for series in found if text in _ids_of(series)]
     if by_id:
         return by_id
     if text.isascii() and text.isdigit():
-        return [series for series in found if series.number == int(text)]
+        by_number = [series for series in found if series.number == int(text)]
+        if by_number or len(text) < SHORTEST_START:
+            return by_number
     folded = text.casefold()
     exact = [series for series in found if series.identity.description.casefold() == folded]
-    return exact or [series for series in found if folded and folded in series.identity.description.casefold()]
+    if exact:
+        return exact
+    begins = [
+        len(text) >= SHORTEST_START and any(own.startswith(folded) for own in _ids_of(series)) for series in found
+    ]
+    parts = [folded in series.identity.description.casefold() for series in found]
+    return [one for one, begun, part in zip(found, begins, parts, strict=True) if begun or part]
 
 
-def _take_largest(candidates: Sequence[Series]) -> Series:
+def _ids_of(series: Series) -> list[str]:
+    """Return the UID of a series and its hash, none for a series without a UID."""
+    uid = series.identity.uid
+    return [uid, hash_uid(uid) or ""] if uid else []
+
+
+def _take_best(candidates: Sequence[Series]) -> Choice:
+    """Choose among the stacks: of those with a similar number of slices the best by rank, and say by what it won."""
     stacks = [series for series in candidates if series.kind == "stack"]
     if not stacks:
         if len(candidates) == 1:
-            return candidates[0]  # read_volume refuses it with its own problem
+            return Choice(candidates[0], "")  # read_volume refuses it with its own problem
         raise RefusedInputError(f"no CT stack among {_list_lines(candidates)}")
-    counts = [series.count for series in stacks]
-    most = max(counts)
-    largest = [series for series, count in zip(stacks, counts, strict=True) if count == most]
-    if len(largest) == 1:
-        return largest[0]  # a fault does not exclude the series: read_volume refuses it
-    usable = [series for series in largest if not series.problems]
+    if len(stacks) == 1:
+        return Choice(stacks[0], "")
+    most = max(series.count for series in stacks)
+    near = [(series, rank_series(series)) for series in stacks if series.count >= SIMILAR * most and series.count > 1]
+    if not near:
+        raise RefusedInputError(f"a single slice cannot make a surface: {len(stacks)} series of one slice each")
+    best, why = _sift(near)
+    if len(best) == 1:
+        return Choice(best[0], why)  # a fault does not exclude the series: read_volume refuses it
+    usable = [series for series in best if not series.problems]
     if len(usable) == 1:
-        return usable[0]
-    if most == 1:
-        raise RefusedInputError(f"a single slice cannot make a surface: {len(largest)} series of one slice each")
+        return Choice(usable[0], "the only one of its size that can be used")
     if not usable:
-        reasons = join_names(f"[series {series.number}: {series.problems[0]}]" for series in largest)
-        raise RefusedInputError(f"{len(largest)} CT series have {most} slices each and none can be used: {reasons}")
+        reasons = join_names(f"[series {series.number}: {series.problems[0]}]" for series in best)
+        raise RefusedInputError(
+            f"{len(best)} CT series have {best[0].count} slices each and none can be used: {reasons}"
+        )
     raise RefusedInputError(
-        f"{len(usable)} CT series have {most} slices each, choose one with {name_parameter('series')}:"
+        f"{len(usable)} CT series have {usable[0].count} slices each, choose one with {name_parameter('series')}:"
         f" {_list_lines(usable)}"
     )
 
 
-def describe_left(found: Sequence[Series], chosen: Series) -> list[str]:
-    """Warn about the series that were not chosen, and about larger ones that cannot be used."""
+def _sift(near: Sequence[tuple[Series, Rank]]) -> tuple[list[Series], str]:
+    """Keep the best of similar series, step by step; returns those that are equally good and the last reason.
+
+    Raises
+    ------
+    RefusedInputError
+        Original images, or derived ones where there are no others, run in different directions.
+    """
+    why = "with the most slices"
+    kept = [each for each in near if each[1].original]
+    if kept and len(kept) < len(near):
+        why = "original images before derived ones"
+        kept_axes = {rank.direction for _, rank in kept}
+        if kept_axes == {"axial"} and any(rank.direction != "axial" for _, rank in near):
+            why = "original axial images before derived ones in other directions"
+    kept = kept or list(near)
+    if len({rank.direction for _, rank in kept}) > 1:
+        lines = join_names(f"[{series.describe()}, {rank.direction}]" for series, rank in kept)
+        raise RefusedInputError(
+            f"{len(kept)} CT series of similar size run in different directions, choose one with"
+            f" {name_parameter('series')}: {lines}"
+        )
+    known = [rank.thickness_mm for _, rank in kept if rank.thickness_mm is not None]
+    if len(known) == len(kept) and max(known) > min(known):
+        kept = [each for each in kept if each[1].thickness_mm == min(known)]
+        why = f"with the thinnest slices, {min(known):g} mm"
+    most = max(series.count for series, _ in kept)
+    return [series for series, _ in kept if series.count == most], why
+
+
+def describe_left(found: Sequence[Series], choice: Choice, wanted: int | str | None = None) -> list[str]:
+    """Say which CT series are not used and why, where the choice was not the caller's; warn about parted slices."""
+    chosen = choice.series
     left = [series for series in found if series is not chosen]
-    if not left:
-        return []
+    stacks = [series for series in left if series.kind == "stack"] if wanted is None else []
     lines = []
-    for series in left:
-        unusable = series.kind == "stack" and series.count >= chosen.count and series.problems
+    for series in stacks:
+        unusable = series.count >= chosen.count and series.problems
         lines.append(f"[{series.describe()}{', cannot be used' if unusable else ''}]")
-    return [f"{len(left)} other series left: {join_names(lines)}", *_describe_other_planes(left, chosen)]
+    told = []
+    if lines:
+        read = f"; series {chosen.number} is read, {choice.why}" if choice.why else ""
+        noun = "other CT series"
+        told = [f"{count_of(len(lines), noun, noun)} not used: {join_names(lines)}{read}"]
+    return [*told, *_describe_other_planes(left, chosen)]
 
 
 def _describe_other_planes(left: Sequence[Series], chosen: Series) -> list[str]:

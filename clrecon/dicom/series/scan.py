@@ -65,6 +65,8 @@ class Scan:
         All other files that are not DICOM.
     files : int
         Number of regular files examined.
+    is_file : bool
+        True: the path names one file and no folder.
     """
 
     slices: list[SliceHeader] = field(default_factory=list)
@@ -74,6 +76,7 @@ class Scan:
     suspects: list[CorruptFile] = field(default_factory=list)
     strangers: list[Stranger] = field(default_factory=list)
     files: int = 0
+    is_file: bool = False
 
 
 def scan_path(path: Path, progress: Progress | None = None, force: bool = False) -> Scan:
@@ -164,6 +167,7 @@ def _list_files(path: Path, scan: Scan, disk: DiskReader) -> list[str]:
     disk.touched = str(path)
     try:
         if path.is_file():
+            scan.is_file = True
             return [str(path)]
         if not path.is_dir():
             what = "is neither a folder nor a regular file" if os.path.lexists(path) else "does not exist"

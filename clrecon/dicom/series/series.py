@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -59,6 +60,8 @@ class Series:
         Number of the wanted phase.
     allow_gaps : bool
         True: missing slices give a warning and are not a problem.
+    is_file : bool
+        True: one file was named, and not the folder of the series.
     """
 
     identity: SeriesIdentity
@@ -72,6 +75,7 @@ class Series:
     study: int = 0
     phase: int | None = None
     allow_gaps: bool = False
+    is_file: bool = False
 
     @property
     def count(self) -> int:
@@ -194,6 +198,8 @@ class Series:
         # Bad files leave holes, whose message would only hide the cause.
         if self.kind == "stack" and not texts:
             problems += self._find_stack_problems()
+        if self.kind == "stack" and self.is_file and self.count == 1:
+            problems.append("the path names one file of a series: name the folder that holds them all")
         return problems
 
     def _find_stack_problems(self) -> list[str]:
@@ -220,8 +226,9 @@ def group_series(scan: Scan) -> list[Series]:
     """Group scanned files into numbered series.
 
     One SeriesInstanceUID (where it was removed: one folder) gives one `Series`, or several where it mixes planes,
-    localizers or secondary captures with a stack.  Numbers follow (SeriesNumber, SeriesInstanceUID, larger part first)
-    so they do not depend on file names.
+    localizers or secondary captures with a stack.  Numbers follow (patient, study, SeriesNumber, SeriesInstanceUID,
+    larger part first) so they do not depend on file names; patients and studies come in the order of their first
+    series, unknown ones last.
     """
     slices: dict[str, list[SliceHeader]] = defaultdict(list)
     others: dict[str, list[OtherImage]] = defaultdict(list)
@@ -247,9 +254,10 @@ def group_series(scan: Scan) -> list[Series]:
         parts.sort(key=lambda part: (part.kind != "stack", -part.count))
         found += parts
     found.sort(key=_listing_key)
-    for number, series in enumerate(found, start=1):
-        series.number = number
     _number_patients_and_studies(found)
+    found.sort(key=_owner_key(found))
+    for number, series in enumerate(found, start=1):
+        series.number, series.is_file = number, scan.is_file
     if scan.corrupt or scan.suspects:
         _blame_corrupt_files(found, scan)
     return found
@@ -265,6 +273,22 @@ def _number_patients_and_studies(found: Sequence[Series]) -> None:
             series.patient = patients.setdefault(patient, len(patients) + 1)
         if series.identity.study:
             series.study = studies.setdefault(series.identity.study, len(studies) + 1)
+
+
+def _owner_key(found: Sequence[Series]) -> Callable[[Series], tuple[float, float]]:
+    """Return a sort key by patient and by study, where there are several; unknown ones come last.
+
+    The patient of objects other than CT is not read, but a study has one patient.
+    """
+    owners = {series.study: series.patient for series in found if series.study and series.patient}
+    for series in found:
+        series.patient = series.patient or owners.get(series.study, 0)
+    patients = len({series.patient for series in found} - {0}) > 1
+    studies = len({series.study for series in found} - {0}) > 1
+    return lambda series: (
+        (series.patient or math.inf) if patients else 0,
+        (series.study or math.inf) if studies else 0,
+    )
 
 
 def _blame_corrupt_files(found: Sequence[Series], scan: Scan) -> None:

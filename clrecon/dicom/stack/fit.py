@@ -22,7 +22,7 @@ from clrecon.dicom.headers.slice_header import SliceHeader
 from clrecon.dicom.stack.directions import ORIENTATION_EXACT, ORIENTATION_LIMIT, measure_directions
 from clrecon.dicom.stack.holes import Holes, find_holes
 from clrecon.dicom.stack.numbers import median
-from clrecon.geometry import compose_affine, tilt_degrees
+from clrecon.geometry import compose_affine, signed_tilt
 from clrecon.geometry.affine import TILT_REPORT_DEG
 from clrecon.geometry.uneven import fit_line, position_tolerance
 from clrecon.system.text import join_names
@@ -86,7 +86,7 @@ class Stack:
         Index (i, j, k) to LPS mm; None for a stack with problems.
     line : Line
     tilt_deg : float or None
-        None where there is no affine.
+        See `signed_tilt`; None where there is no affine.
     problems, warnings : tuple of str
         A stack with problems is refused.
     missing : int
@@ -146,12 +146,12 @@ def measure_stack(headers: Sequence[SliceHeader], allow_gaps: bool = False) -> S
             assert line.step is not None and line.origin is not None
             affine = compose_affine(row * slices[0].di_mm, column * slices[0].dj_mm, line.step, line.origin)
         warnings += _describe_stated_gap(measure_stated_gap(slices, positions, line.gap_median_mm))
-    tilt = None if affine is None else tilt_degrees(affine)
+    tilt = None if affine is None else signed_tilt(affine)
     aside = _measure_sideways(positions, distances) if line.uneven else 0.0
     if affine is not None and aside > (line.tolerance_mm or 0.0):
         warnings.append(f"slices are shifted sideways, up to {aside:.3f} mm off a straight line: placed as they say")
-    elif tilt is not None and tilt > TILT_REPORT_DEG:
-        warnings.append(f"gantry tilt {tilt:.2f} degrees: kept exactly, as a shear")
+    elif tilt is not None and abs(tilt) > TILT_REPORT_DEG:
+        warnings.append(f"gantry tilt {tilt:+.2f} degrees: kept exactly, as a shear")
     return Stack(slices, positions, distances, affine, line, tilt, tuple(problems), tuple(warnings), holes.missing)
 
 

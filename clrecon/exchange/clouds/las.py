@@ -16,6 +16,7 @@ import numpy as np
 from clrecon.errors import OutputError, RefusedInputError, UsageError
 from clrecon.exchange.clouds.raw_cloud import RawCloud, read_remarks, say_cut
 from clrecon.exchange.content import PointContent, refuse_file
+from clrecon.system.installing import install_command
 from clrecon.system.text import escape_text
 
 __all__ = ["estimate", "import_laspy", "read", "verify", "write"]
@@ -43,7 +44,7 @@ def import_laspy() -> Any:
         import laspy
     except ImportError as error:
         raise UsageError(
-            "LAS files need the package laspy: pip install 'clrecon[las]'; PLY, VTP, NPZ and XYZ need none"
+            f"LAS files need the package laspy: {install_command('laspy')}; PLY, VTP, NPZ and XYZ need none"
         ) from error
     return laspy
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from clrecon.errors import UsageError
+from clrecon.system.text import say_unknown
 
 __all__ = ["DEFAULT_PRESET", "HIGHEST_BONE_HU", "LOWEST_BONE_HU", "PRESETS", "Preset", "find_preset"]
 
@@ -61,7 +62,7 @@ PRESETS: dict[str, Preset] = {
 
 
 def find_preset(name: str) -> Preset:
-    """Return the preset called `name`.
+    """Return the preset called `name`, in upper or lower case.
 
     Raises
     ------
@@ -69,8 +70,6 @@ def find_preset(name: str) -> Preset:
         There is no preset of this name; the message lists all names.
     """
     try:
-        return PRESETS[name]
-    except KeyError:
-        raise UsageError(
-            f"unknown preset {name!r}: use one of {', '.join(PRESETS)}, or give the iso value in HU"
-        ) from None
+        return PRESETS[name.lower()]
+    except (KeyError, AttributeError):
+        raise UsageError(f"{say_unknown('preset', name, PRESETS)}, or give the iso value in HU") from None

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from clrecon.errors import UsageError
+from clrecon.system.text import guess_word
 
 __all__ = ["PURPOSES", "Purpose", "find_purpose"]
 
@@ -58,5 +59,5 @@ def find_purpose(name: str) -> Purpose:
         There is no purpose of this name.
     """
     if name not in PURPOSES:
-        raise UsageError(f"a mesh can be for {', '.join(PURPOSES)}, not for {name!r}")
+        raise UsageError(f"a mesh can be for {', '.join(PURPOSES)}, not for {name!r}{guess_word(name, PURPOSES)}")
     return PURPOSES[name]

@@ -307,7 +307,7 @@ class MeshSettings(InputSettings):
     def preset_used(self) -> str | None:
         """Name of the preset behind `levels`; None if the value was given, is half way, or there is none."""
         named = any(given is not None for given in (self.iso_value, self.below, self.half_way))
-        return None if named or not self.follows_hu else (self.preset or DEFAULT_PRESET)
+        return None if named or not self.follows_hu else find_preset(self.preset or DEFAULT_PRESET).name
 
     @property
     def selects(self) -> bool:

@@ -40,6 +40,7 @@ from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.default_view import ANTERIOR, SLICES_VIEWS
 from clrecon.rendering.views.directions import DEFAULT_SIZE, DIRECTIONS, checked_size
 from clrecon.rendering.views.plane import find_plane
+from clrecon.system.text import say_unknown
 from clrecon.system.wording import name_parameter
 
 __all__ = [
@@ -392,8 +393,8 @@ def _turn_light(light: str | Sequence[float], lighting: Lighting) -> Lighting:
     direction: Any = light
     if isinstance(light, str):
         if light not in (*LIGHTS, *DIRECTIONS):
-            known = ", ".join((*LIGHTS, *DIRECTIONS))
-            raise UsageError(f"unknown light {light!r}: use one of {known}, or a direction X,Y,Z in LPS")
+            known = (*LIGHTS, *DIRECTIONS)
+            raise UsageError(f"{say_unknown('light', light, known)}, or a direction X,Y,Z in LPS")
         direction = DIRECTIONS.get(light)
     return replace(lighting if lighting.shades else Lighting(), direction=direction)
 

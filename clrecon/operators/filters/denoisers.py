@@ -18,6 +18,7 @@ from clrecon.geometry.regular import shear_degrees
 from clrecon.operators.filters.result import report_filter
 from clrecon.operators.filters.settings import checked_length
 from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.system.installing import install_command
 from clrecon.system.progress import Progress, ignore_progress
 
 __all__ = ["DENOISERS", "filter_volume"]
@@ -34,6 +35,10 @@ ITK_TIME_STEP = 0.0625
 """Largest stable time step of curvature flow in three dimensions, for steps of 1 mm and more."""
 
 
+_INSTALLED_AS = {"skimage": "scikit-image"}
+"""Names that packages have for pip, where these differ from their modules."""
+
+
 @dataclass(frozen=True)
 class _Denoiser:
     """A filter of another package.
@@ -42,8 +47,6 @@ class _Denoiser:
     ----------
     package : str
         Module that has it.
-    extra : str
-        What to install for it; empty where clrecon always brings it.
     defaults : dict of str to number or None
         Its parameters.
     run : callable
@@ -53,7 +56,6 @@ class _Denoiser:
     """
 
     package: str
-    extra: str
     defaults: dict[str, Any]
     run: Callable[[Any, Volume, dict[str, Any], Progress], tuple[NDArray[Any], dict[str, Any]]]
     needs_grid: bool = True
@@ -139,9 +141,9 @@ def _import_package(name: str, denoiser: _Denoiser) -> Any:
     try:
         return import_module(denoiser.package)
     except ImportError as error:
-        install = f"clrecon[{denoiser.extra}]" if denoiser.extra else "scikit-image"
         package = denoiser.package.split(".")[0]
-        raise UsageError(f"the filter {name} needs the package {package}: pip install '{install}'") from error
+        command = install_command(_INSTALLED_AS.get(package, package))
+        raise UsageError(f"the filter {name} needs the package {package}: {command}") from error
 
 
 def _as_voxels(found: NDArray[Any], volume: Volume) -> NDArray[Any]:
@@ -222,11 +224,11 @@ def _run_non_local_means(
 
 
 DENOISERS = {
-    "median": _Denoiser("SimpleITK", "volumes", {"radius_mm": None}, _run_median),
-    "gaussian": _Denoiser("skimage.filters", "", {"sigma_mm": 0.7}, _run_gaussian),
-    "curvature-flow": _Denoiser("SimpleITK", "volumes", {"iterations": 5, "time_step": None}, _run_curvature_flow),
+    "median": _Denoiser("SimpleITK", {"radius_mm": None}, _run_median),
+    "gaussian": _Denoiser("skimage.filters", {"sigma_mm": 0.7}, _run_gaussian),
+    "curvature-flow": _Denoiser("SimpleITK", {"iterations": 5, "time_step": None}, _run_curvature_flow),
     "non-local-means": _Denoiser(
-        "skimage.restoration", "", {"sigma_hu": None, "patch": 5, "reach": 6}, _run_non_local_means, needs_grid=False
+        "skimage.restoration", {"sigma_hu": None, "patch": 5, "reach": 6}, _run_non_local_means, needs_grid=False
     ),
 }
 """The filters by name."""

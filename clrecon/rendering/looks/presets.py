@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from clrecon.errors import UsageError
 from clrecon.rendering.looks.lighting import UNSHADED, Lighting
 from clrecon.rendering.looks.transfer_function import TransferFunction
+from clrecon.system.text import say_unknown
 
 __all__ = ["DEFAULT_PRESET", "PRESETS", "Preset", "find_preset"]
 
@@ -231,7 +232,7 @@ PRESETS: dict[str, Preset] = {
 
 
 def find_preset(name: str) -> Preset:
-    """Return the rendering preset called `name`.
+    """Return the rendering preset called `name`, in upper or lower case.
 
     Raises
     ------
@@ -239,8 +240,8 @@ def find_preset(name: str) -> Preset:
         There is no preset of this name; the message lists all names.
     """
     try:
-        return PRESETS[name]
-    except (KeyError, TypeError):
+        return PRESETS[name.lower()]
+    except (KeyError, TypeError, AttributeError):
         raise UsageError(
-            f"unknown rendering preset {name!r}: use one of {', '.join(PRESETS)}, or a file with a transfer function"
+            f"{say_unknown('rendering preset', name, PRESETS)}, or a file with a transfer function"
         ) from None

@@ -19,6 +19,7 @@ from clrecon.rendering.views.camera import Camera
 from clrecon.system.files import Staged, check_writable, stage_file
 from clrecon.system.progress import Progress
 from clrecon.system.targets import keep_existing
+from clrecon.system.text import guess_word
 
 if TYPE_CHECKING:
     from clrecon.rendering.pictures.picture import Rendering
@@ -114,8 +115,8 @@ def check_animation(path: str | os.PathLike[str], fps: float = 25.0) -> str:
     extension = animation_kind(text)
     if extension and extension not in ANIMATIONS:
         raise UsageError(
-            f"a moving picture is not written as {extension!r}: use one of {', '.join(ANIMATIONS)},"
-            " or a name without extension for a folder of PNG files"
+            f"a moving picture is not written as {extension!r}{guess_word(extension, ANIMATIONS)}: use one of"
+            f" {', '.join(ANIMATIONS)}, or a name without extension for a folder of PNG files"
         )
     if not isinstance(fps, (int, float)) or not SLOWEST <= fps <= FASTEST[extension]:
         kind = extension[1:].upper() or "a folder of frames"

@@ -20,13 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
+from clrecon.system.installing import install_command
 
 __all__ = ["find_encoder", "write_video"]
 
 QUALITY = 18
 """x264's constant rate factor; at 18 the loss is not visible."""
-
-INSTALL = "pip install 'clrecon[motion]', or put an ffmpeg with libx264 on the PATH"
 
 
 @lru_cache(maxsize=1)
@@ -40,14 +39,18 @@ def find_encoder() -> str:
     """
     program = _find_ffmpeg()
     if program is None:
-        raise UsageError(f"no encoder for MP4: {INSTALL}; GIF, APNG and a folder of PNG files need none")
+        raise UsageError(f"no encoder for MP4: {_advice()}; GIF, APNG and a folder of PNG files need none")
     try:
         listed = subprocess.run([program, "-hide_banner", "-encoders"], capture_output=True, timeout=60).stdout
     except (OSError, subprocess.SubprocessError) as error:
-        raise UsageError(f"{program} does not run ({error}): {INSTALL}") from error
+        raise UsageError(f"{program} does not run ({error}): {_advice()}") from error
     if b" libx264 " not in listed:
-        raise UsageError(f"{program} has no H.264 encoder (libx264): {INSTALL}")
+        raise UsageError(f"{program} has no H.264 encoder (libx264): {_advice()}")
     return program
+
+
+def _advice() -> str:
+    return f"{install_command('imageio-ffmpeg')}, or put an ffmpeg with libx264 on the PATH"
 
 
 def _find_ffmpeg() -> str | None:

@@ -13,6 +13,7 @@ from clrecon.errors import UsageError
 from clrecon.rendering.pictures.picture_data import PictureData
 from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.system.files import replace_file
+from clrecon.system.text import guess_word
 from clrecon.version import package_version
 
 __all__ = [
@@ -142,7 +143,7 @@ def _extension(path: str | os.PathLike[str], known: tuple[str, ...], what: str) 
     except TypeError as error:
         raise UsageError(f"a {what} file is named by a string or a path, not {type(path).__name__}") from error
     if extension not in known:
-        found = f"the extension {extension!r}" if extension else "no extension"
+        found = f"the extension {extension!r}{guess_word(extension, known)}" if extension else "no extension"
         raise UsageError(f"the name of the {what} file has {found}: use one of {', '.join(known)}")
     return extension
 

@@ -19,6 +19,7 @@ from clrecon.rendering.pictures.styles import (
     SurfaceLook,
     VolumeLook,
 )
+from clrecon.system.text import say_unknown
 from clrecon.system.wording import name_parameter
 
 __all__ = ["MODES", "Mode", "check_known", "choose_mode", "find_style", "keywords_of", "make_style"]
@@ -111,7 +112,7 @@ def choose_mode(mode: str | None = None, preset: str | None = None, **look: obje
     """
     if mode is not None:
         if not isinstance(mode, str) or mode not in MODES:
-            raise UsageError(f"unknown mode {mode!r:.60}: use one of {', '.join(MODES)}")
+            raise UsageError(say_unknown("mode", mode, MODES))
         return mode
     if look.get("iso_value") is not None:
         return "surface"
@@ -157,7 +158,7 @@ def make_style(mode: str | None = None, preset: str | None = None, **look: objec
         check_known(mode, "preset")
         chosen = find_preset(preset)
         if style is VolumeLook:
-            given["transfer_function"] = preset
+            given["transfer_function"] = chosen.name
         elif style is SlicesInSpace and "window" not in given:
             given["transfer_function"] = chosen.transfer_function
         elif mode != "drr":  # its window is in mm of water

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
+from clrecon.system.text import say_unknown
 
 __all__ = ["DEFAULT_SIZE", "DIRECTIONS", "LARGEST_SIDE", "checked_size", "checked_vector", "find_up", "find_view"]
 
@@ -129,7 +130,7 @@ def _find_angles(view: str | Sequence[float]) -> tuple[float, float]:
         azimuth = elevation = float("nan")
     if not (np.isfinite(azimuth) and abs(elevation) <= 90.0):
         raise UsageError(
-            f"unknown view {view!r}: use one of {', '.join(DIRECTIONS)}, or AZIMUTH,ELEVATION in degrees,"
+            f"{say_unknown('view', view, DIRECTIONS)}, or AZIMUTH,ELEVATION in degrees,"
             " elevation from -90 to 90, such as 30,15"
         )
     return azimuth, elevation

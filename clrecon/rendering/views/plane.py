@@ -19,6 +19,7 @@ from clrecon.geometry.grid import Grid
 from clrecon.geometry.volume import Volume
 from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.rendering.views.directions import DIRECTIONS, checked_size
+from clrecon.system.text import say_unknown
 
 __all__ = [
     "PLANES",
@@ -174,10 +175,7 @@ def find_plane(
         name = view.strip().lower()
         view = PLANES.get(name, name)
         if "," not in view and view not in DIRECTIONS:
-            raise UsageError(
-                f"unknown plane {name!r}: use one of {', '.join([*PLANES, *DIRECTIONS])},"
-                " or AZIMUTH,ELEVATION in degrees"
-            )
+            raise UsageError(f"{say_unknown('plane', name, [*PLANES, *DIRECTIONS])}, or AZIMUTH,ELEVATION in degrees")
     width, height = checked_size(size)
     camera = Camera.fit(volume, view, up=up, size=size)
     right, top, _ = camera.basis()

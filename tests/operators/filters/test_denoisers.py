@@ -99,5 +99,5 @@ def test_nan_and_missing_packages_are_told(monkeypatch):
     with pytest.raises(UsageError, match="a filter needs a Volume, not ndarray"):
         clrecon.filter_volume(voxels, "median")  # type: ignore[type-var]
     monkeypatch.setitem(sys.modules, "SimpleITK", None)
-    with pytest.raises(UsageError, match=r"median needs the package SimpleITK: pip install 'clrecon\[volumes\]'"):
+    with pytest.raises(UsageError, match=r"median needs the package SimpleITK: .* install .*SimpleITK"):
         clrecon.filter_volume(noisy()[0], "median")

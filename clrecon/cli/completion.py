@@ -1,0 +1,205 @@
+"""``clrecon completion``: a script by which a shell completes commands, options and their words."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from dataclasses import dataclass, field
+from importlib import import_module
+
+from clrecon.cli.common import Parser, add_common
+from clrecon.cli.console import Console
+from clrecon.errors import UsageError
+from clrecon.jobs.words import list_words
+from clrecon.system.text import guess_word
+
+__all__ = ["SHELLS", "add_arguments", "run", "write_script"]
+
+SHELLS = ("bash", "zsh", "fish")
+_WORDS = re.compile(r"[a-z][a-z0-9-]*(?:\|[a-z][a-z0-9-]*)*")
+"""A metavar that lists all words of an option, such as ``lps|ras``."""
+
+
+@dataclass
+class _Option:
+    """An option: its names, one line of help, whether a value follows, and the words that the value can be."""
+
+    names: list[str]
+    help: str
+    takes_value: bool
+    words: list[str]
+
+
+@dataclass
+class _Words:
+    """A command: one line of help, its options, and the words of its first argument if that is no file."""
+
+    help: str
+    options: list[_Option] = field(default_factory=list)
+    first: list[str] = field(default_factory=list)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.epilog = (
+        "The script is made from the options of this version. Where it goes:\n"
+        "  bash   clrecon completion bash > ~/.local/share/bash-completion/completions/clrecon\n"
+        '  zsh    clrecon completion zsh > "${fpath[1]}/_clrecon"\n'
+        "  fish   clrecon completion fish > ~/.config/fish/completions/clrecon.fish\n"
+        "For this shell alone: source <(clrecon completion bash), or source <(clrecon completion zsh) after compinit."
+    )
+    parser.add_argument("shell", metavar="|".join(SHELLS), type=str.lower, help="the shell that completes")
+
+
+def run(options: argparse.Namespace, console: Console) -> int:
+    """Run the command; returns the exit code."""
+    script = write_script(options.shell)
+    console.result({"shell": options.shell, "script": script})
+    console.say(script.rstrip("\n"))
+    return 0
+
+
+def write_script(shell: str) -> str:
+    """Return the script of a shell, made from the parsers of all commands.
+
+    Parameters
+    ----------
+    shell : {"bash", "zsh", "fish"}
+
+    Raises
+    ------
+    UsageError
+        Another shell.
+    """
+    if shell not in SHELLS:
+        raise UsageError(f"no completion for {shell!r:.60}{guess_word(shell, SHELLS)}: use one of {', '.join(SHELLS)}")
+    return {"bash": _write_bash, "zsh": _write_zsh, "fish": _write_fish}[shell](_survey())
+
+
+def _survey() -> dict[str, _Words]:
+    """Collect what can be said: every command with its options."""
+    from clrecon.cli.main import COMMANDS, HELP
+
+    found = {}
+    for name, command in COMMANDS.items():
+        parser = Parser(prog=name)
+        import_module(command.module).add_arguments(parser)
+        add_common(parser)
+        found[name] = _Words(
+            command.help, [_describe(name, action) for action in parser._actions if action.option_strings]
+        )
+    found["completion"].first = list(SHELLS)
+    found[HELP] = _Words("show the options of a command", first=list(COMMANDS))
+    return found
+
+
+def _describe(command: str, action: argparse.Action) -> _Option:
+    said = (action.help or "").replace("%%", "%")
+    words = _find_words(command, action)
+    return _Option(list(action.option_strings), re.split(r"[;:(]", said)[0].strip(), action.nargs != 0, words)
+
+
+def _find_words(command: str, action: argparse.Action) -> list[str]:
+    """Return the words that an option knows; empty where it takes something else."""
+    if action.nargs == 0:
+        return []
+    if isinstance(action.metavar, str) and _WORDS.fullmatch(action.metavar):
+        return action.metavar.split("|")
+    return list_words(command, action.dest)
+
+
+def _write_bash(commands: dict[str, _Words]) -> str:
+    lines = [
+        "# bash completion of clrecon, written by: clrecon completion bash",
+        "_clrecon() {",
+        "    local current=${COMP_WORDS[COMP_CWORD]} previous=${COMP_WORDS[COMP_CWORD-1]} words=",
+        "    COMPREPLY=()",
+        "    if [[ $COMP_CWORD -eq 1 ]]; then",
+        f'        words="{" ".join(commands)} --help --version"',
+        "    else",
+        "        case ${COMP_WORDS[1]} in",
+    ]
+    for name, command in commands.items():
+        lines += [f"        {name})", "            case $previous in"]
+        for option in command.options:
+            if option.takes_value:  # without words nothing is offered, and the shell completes files
+                lines.append(f'                {"|".join(option.names)}) words="{" ".join(option.words)}" ;;')
+        flags = " ".join(one for option in command.options for one in option.names if one.startswith("--"))
+        lines += [
+            "                *)",
+            f'                    if [[ $current == -* ]]; then words="{flags}"',
+            f'                    else words="{" ".join(command.first)}"; fi ;;',
+            "            esac ;;",
+        ]
+    return "\n".join(
+        (
+            *lines,
+            "        esac",
+            "    fi",
+            '    [[ -n $words ]] && COMPREPLY=($(compgen -W "$words" -- "$current"))',
+            "    return 0",
+            "}",
+            "complete -o default -o bashdefault -F _clrecon clrecon",
+            "",
+        )
+    )
+
+
+def _quote(text: str) -> str:
+    """Quote a text for a shell: between single quotes nothing is special but the quote itself."""
+    return "'" + text.replace("'", "'\\''") + "'"
+
+
+def _write_zsh(commands: dict[str, _Words]) -> str:
+    def entry(word: str, said: str) -> str:
+        return _quote(f"{word}:{said}" if said else word)
+
+    lines = [
+        "#compdef clrecon",
+        "# zsh completion of clrecon, written by: clrecon completion zsh",
+        "_clrecon() {",
+        "    local -a found",
+        "    if (( CURRENT == 2 )); then",
+        f"        found=({' '.join(entry(name, command.help) for name, command in commands.items())})",
+        "        _describe command found",
+        "        return",
+        "    fi",
+        "    case $words[2] in",
+    ]
+    for name, command in commands.items():
+        lines += [f"    {name})", "        case $words[CURRENT-1] in"]
+        for option in command.options:
+            if option.takes_value:
+                act = f"compadd -- {' '.join(option.words)}" if option.words else "_files"
+                lines.append(f"            {'|'.join(option.names)}) {act}; return ;;")
+        entries = " ".join(
+            entry(one, option.help) for option in command.options for one in option.names if one[1] == "-"
+        )
+        lines += [
+            "        esac",
+            "        if [[ $words[CURRENT] == -* ]]; then",
+            f"            found=({entries})",
+            "            _describe option found",
+            f"        else {'compadd -- ' + ' '.join(command.first) if command.first else '_files'}; fi ;;",
+        ]
+    return "\n".join((*lines, "    esac", "}", "compdef _clrecon clrecon", ""))
+
+
+def _write_fish(commands: dict[str, _Words]) -> str:
+    lines = ["# fish completion of clrecon, written by: clrecon completion fish"]
+    for name, command in commands.items():
+        lines.append(f"complete -c clrecon -n __fish_use_subcommand -f -a {name} -d {_fish_quote(command.help)}")
+    for name, command in commands.items():
+        seen = f"complete -c clrecon -n '__fish_seen_subcommand_from {name}'"
+        if command.first:
+            lines.append(f"{seen} -f -a '{' '.join(command.first)}'")
+        for option in command.options:
+            names = " ".join(f"-l {one[2:]}" if one.startswith("--") else f"-s {one[1:]}" for one in option.names)
+            value = (f" -x -a '{' '.join(option.words)}'" if option.words else " -r") if option.takes_value else ""
+            said = f" -d {_fish_quote(option.help)}" if option.help else ""
+            lines.append(f"{seen} {names}{value}{said}")
+    return "\n".join((*lines, ""))
+
+
+def _fish_quote(text: str) -> str:
+    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
