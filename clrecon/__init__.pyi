@@ -38,6 +38,7 @@ from clrecon.opencl import list_devices
 from clrecon.operators import choose_device
 from clrecon.operators.filters.bilateral import filter_bilateral as filter_bilateral
 from clrecon.operators.filters.denoisers import filter_volume as filter_volume
+from clrecon.operators.masks.enclosed import fill_enclosed as fill_enclosed
 from clrecon.operators.masks.mask import Mask as Mask
 from clrecon.operators.points.bilateral import denoise_points as denoise_points
 from clrecon.operators.points.clusters import Clustering as Clustering

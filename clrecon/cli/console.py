@@ -18,6 +18,7 @@ _STAGES = {
     "build": "building kernels (takes seconds on the first run on this device), extracting the surface",
     "mask": "leaving out what is not the patient",
     "choose": "choosing the iso value",
+    "solid": "filling what is enclosed",
     "inside": "looking into vertebrae",
     "curve": "looking for the spinal canal",
     "render": "rendering (takes seconds longer on the first run on this device)",

@@ -48,7 +48,6 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
         help="hu: HU place the vertices (default); mask: the label's own surface, smoothed within its voxels and with"
         " their volume, whatever the HU: organs, lungs, what HU do not show",
     )
-    group.add_argument("--solid", action="store_true", help="fill what is less dense within a label: marrow")
     group.add_argument(
         "--grow",
         type=float,
@@ -73,7 +72,7 @@ def label_choice(options: argparse.Namespace) -> LabelChoice | None:
             options.labels,
             tuple(options.label or ()),
             options.grow,
-            options.solid,
+            bool(options.solid),
             surface,
             hidden=tuple(options.hide_label or ()),
             colors=tuple(options.label_color or ()),
@@ -84,7 +83,6 @@ def label_choice(options: argparse.Namespace) -> LabelChoice | None:
         "--hide-label": options.hide_label,
         "--label-color": options.label_color,
         "--one-file": options.one_file,
-        "--solid": options.solid,
         "--grow": options.grow is not None,
         "--surface": options.surface,
     }

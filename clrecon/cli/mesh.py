@@ -28,7 +28,7 @@ from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS
 __all__ = ["add_arguments", "describe_mesh", "describe_volume", "run"]
 
 _PARTS = (
-    *("device", "read", "mask", "choose", "upload", "build", "kernels", "download"),
+    *("device", "read", "mask", "choose", "solid", "upload", "build", "kernels", "download"),
     *("select", "refine", "measure", "write", "other"),
 )
 _SHOWN_PARTS = 12
@@ -52,7 +52,7 @@ def _epilog() -> str:
             "  clrecon mesh CT_FOLDER -o skull.glb --hu 300 --keep-largest 1 --report skull.json",
             "  clrecon mesh CT_FOLDER -o bone.stl --hu auto",
             "  clrecon mesh CT_FOLDER -o print.3mf --for print",
-            "  clrecon mesh CT_FOLDER -o bone.stl --hu auto --keep bone",
+            "  clrecon mesh CT_FOLDER -o bone.stl --hu auto --keep bone --solid",
             "  clrecon mesh CT_FOLDER -o bone.stl --hu 200,350 --min-volume 1 --split",
             "  clrecon mesh CT_FOLDER -o fat.stl --hu -150:-30 --remove-table",
             "  clrecon mesh CT_FOLDER -o lung.stl --below -400 --keep-largest 2",
@@ -93,6 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help=f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})",
     )
+    _add_solid(surface)
     surface.add_argument("--keep-outside", action="store_true", help="with --below: leave the air round the patient in")
     surface.add_argument(
         "--space", type=str.lower, default="lps", metavar="lps|ras", help="patient frame of the mesh (default: lps)"
@@ -144,6 +145,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_checks(parser)
 
 
+def _add_solid(surface: argparse._ArgumentGroup) -> None:
+    surface.add_argument(
+        "--solid",
+        action=argparse.BooleanOptionalAction,
+        help="fill what the bone encloses: marrow, and canals that the ends of the scan cut; the brain, the chest and"
+        " air stay out; with --labels: what is less dense within a label",
+    )
+    surface.add_argument(
+        "--seal",
+        dest="seal_mm",
+        type=float,
+        metavar="MM",
+        help="with --solid: pores up to twice as wide are no way in (default: 2.5 to 3, by the voxels)",
+    )
+
+
 def _add_checks(parser: argparse.ArgumentParser) -> None:
     checks = parser.add_argument_group("checks")
     add_strict(checks)
@@ -155,12 +172,15 @@ def _add_checks(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
     from clrecon.jobs.mesh.for_purpose import settings_for
+    from clrecon.jobs.mesh.growing import is_label_seed
     from clrecon.jobs.mesh.job import make_mesh
     from clrecon.jobs.mesh.settings import MeshSettings
 
     names = {own.name for own in fields(MeshSettings)} - {"purpose"}
     given = {**pick(options, names), **options.hu, "labels": label_choice(options)}
     given = {name: value for name, value in given.items() if value is not None}
+    if options.labels is not None and not any(map(is_label_seed, options.grow_from)):
+        given.pop("solid", None)  # it says how each label becomes a mesh
     settings = MeshSettings(**settings_for(options.purpose, given))
     report = make_mesh(
         options.input,
@@ -187,6 +207,7 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
     return [
         f"input    {describe_volume(report['volume'])}",
         f"surface  {_describe_surfaces(report)}, {border} at the border of the {end}",
+        *_describe_solid(report["volume"].get("solid")),
         f"mesh     {report['vertices']:,} vertices, {report['triangles']:,} triangles",
         *_describe_quality(report),
         *describe_cells(report),
@@ -205,6 +226,16 @@ def _describe_surfaces(report: dict[str, Any]) -> str:
     if () in inside:
         return "masks of labels, whatever their HU"
     return f"{', '.join(_describe_inside(*ends) for ends in inside)} HU ({_describe_choice(report)})"
+
+
+def _describe_solid(solid: dict[str, Any] | None) -> list[str]:
+    """Describe what was filled in a line; no line where nothing should be."""
+    if solid is None:
+        return []
+    left = sum(kind["ml"] for kind in solid["open"].values())
+    stays = f", {left:.3g} ml enclosed stay open" if left >= 0.05 else ""
+    share = 100.0 * solid["filled_share"]
+    return [f"solid    {solid['filled_ml']:,.1f} ml filled, {share:.0f} % of the solid{stays}"]
 
 
 def _describe_inside(low: float | None, high: float | None) -> str:

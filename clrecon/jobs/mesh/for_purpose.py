@@ -26,9 +26,9 @@ def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
     Returns
     -------
     dict
-        The given fields, and ``purpose``. If components are chosen in another way, the purpose leaves none out.  Bone
+        The given fields, and ``purpose``.  If components are chosen in another way, the purpose leaves none out.  Bone
         is distinguished from other material only if all iso values are those of bone, from 100 to 1500 HU or
-        ``"auto"``.
+        ``"auto"``; it is made solid if there is one of them, and ``solid`` is not given as False.
 
     Raises
     ------
@@ -45,18 +45,22 @@ def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
         if any(given.get(other) for other in ("seeds", "min_volume_ml", "split", "labels")):
             del fields["keep_largest"]
         chosen = any(given.get(other) for other in ("keep_largest", "seeds", "min_volume_ml"))
-        if chosen or not _at_levels_of_bone(given):
+        levels = _levels_of_bone(given)
+        if chosen or not levels:
             del fields["keep"]
+        if levels != 1 or given.get("solid") is False:
+            del fields["solid"]
     elif given.get("region"):
         fields["preprocess"] += ",region"  # the paper's order
     taken = {field: value for field, value in fields.items() if not given.get(field)}
     return {**given, **taken, "purpose": name}
 
 
-def _at_levels_of_bone(given: dict[str, Any]) -> bool:
-    """True where all surfaces that these fields of `MeshSettings` ask for are iso surfaces at levels of bone."""
+def _levels_of_bone(given: dict[str, Any]) -> int:
+    """Return the number of iso surfaces that these fields of `MeshSettings` ask for, 0 if one is not of bone."""
     settings = MeshSettings(**given)
     if settings.labels is not None or settings.inside != "above":
-        return False
+        return 0
     levels = [float(level) for level in settings.levels if not isinstance(level, tuple)]
-    return all(math.isnan(level) or LOWEST_BONE_HU <= level <= HIGHEST_BONE_HU for level in levels)
+    of_bone = all(math.isnan(level) or LOWEST_BONE_HU <= level <= HIGHEST_BONE_HU for level in levels)
+    return len(levels) if of_bone else 0

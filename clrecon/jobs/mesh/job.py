@@ -12,7 +12,7 @@ from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import extract_label_surfaces, judge_label_volumes, name_label_files, open_labels
 from clrecon.jobs.mesh.levels import choose_level
 from clrecon.jobs.mesh.parts import SELECT_STEPS, check_levels, extract_surfaces, first_names, select_parts
-from clrecon.jobs.mesh.prepare import mask_parts, narrow_volume, prepare_surfaces
+from clrecon.jobs.mesh.prepare import fill_solid, mask_parts, narrow_volume, prepare_surfaces
 from clrecon.jobs.mesh.refinement import describe_purposes, judge_parts, refine_surface, warn_of_gates
 from clrecon.jobs.mesh.report import MeshReport, describe_job, describe_part
 from clrecon.jobs.mesh.settings import MeshSettings
@@ -95,8 +95,7 @@ def make_mesh(
     UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError, NoSurfaceError
         After an error nothing is written, and older files are intact.
     """
-    settings = settings or MeshSettings()
-    progress = progress or ignore_progress
+    settings, progress = settings or MeshSettings(), progress or ignore_progress
     measure = report_path is not None if measure is None else measure
     watch = Laps()
     surfaces = plan_surfaces(settings.levels, below=settings.below is not None)
@@ -107,7 +106,8 @@ def make_mesh(
     volume = mask_parts(volume, surfaces, settings, device, progress)
     watch.lap("mask")
     volume, surfaces, choice = _choose(volume, surfaces, settings, device, progress, watch)
-    surfaces, extracted = _extract(volume, surfaces, labels, device, settings, progress)
+    solid = fill_solid(volume, surfaces, settings, device.current, progress, watch)
+    surfaces, extracted = _extract(solid, surfaces, labels, device, settings, progress)
     origins = [mesh.report for mesh in extracted]
     watch.lap("surface")
     parts = _select(volume, surfaces, extracted, device.current, settings, progress)
@@ -115,7 +115,7 @@ def make_mesh(
     paths = _name_files(output, parts, report_path, settings)
     judge_surfaces(parts, volume, settings)
     watch.lap("select")
-    gates = _refine_and_measure(parts, volume, settings, device, measure or settings.strict, progress, watch)
+    gates = _refine_and_measure(parts, solid, settings, device, measure or settings.strict, progress, watch)
     purpose_warnings = describe_purposes(parts)
     watch.lap("measure")
 
@@ -124,7 +124,7 @@ def make_mesh(
         warnings += warn_of_walls(parts, settings, choice) + purpose_warnings + warn_of_gates(gates)
         seconds = _seconds(watch, origins)
         return describe_job(
-            volume, parts, meshes, settings, device.current, choice, gates=gates, warnings=warnings, seconds=seconds
+            solid, parts, meshes, settings, device.current, choice, gates=gates, warnings=warnings, seconds=seconds
         )
 
     with keep_existing(no_clobber):
@@ -218,6 +218,7 @@ def _open(
         prepare_surfaces, components=settings.selects, topology=settings.topology, inside=settings.inside,
         vertex_rule=settings.vertex_rule, grows=settings.method_used == "i-mc",
         decimates=settings.decimate_used is not None and settings.method != "g-mc" and settings.memory is None,
+        solid=settings.solid,
     )  # fmt: skip
     with DeviceOpening(settings.device, prepare) as opening:
         volume, labels = read_with_labels(
@@ -310,7 +311,7 @@ def _seconds(watch: Laps, origins: Sequence[dict[str, Any]]) -> dict[str, float]
     measured = [origin.get("seconds", {}) for origin in origins]
     seconds = {"device": watch.seconds.get("device", 0.0), "read": watch.seconds.get("read", 0.0)}
     seconds.update({part: sum(float(own.get(part, 0.0)) for own in measured) for part in _DEVICE_PARTS})
-    later = ("mask", "choose", "select", "refine", "measure", "write")
+    later = ("mask", "choose", "solid", "select", "refine", "measure", "write")
     seconds.update({part: watch.seconds.get(part, 0.0) for part in later})
     seconds["other"] = max(0.0, watch.total() - sum(seconds.values()))
     seconds["total"] = watch.total()

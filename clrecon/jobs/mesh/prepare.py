@@ -6,8 +6,10 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from clrecon.jobs.mesh.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Surface
+from clrecon.jobs.shared.laps import Laps
 from clrecon.jobs.shared.masking import mask_volume
 from clrecon.jobs.shared.preprocess import preprocess_volume
 from clrecon.jobs.shared.region import Band, restrict_volume
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.opencl import Device
 
-__all__ = ["leave_outside", "mask_parts", "narrow_volume", "prepare_surfaces"]
+__all__ = ["fill_solid", "leave_outside", "mask_parts", "narrow_volume", "prepare_surfaces"]
 
 
 def prepare_surfaces(
@@ -29,8 +31,9 @@ def prepare_surfaces(
     vertex_rule: str = "linear",
     grows: bool = False,
     decimates: bool = False,
+    solid: bool = False,
 ) -> None:
-    """Build the kernels for surfaces of this topology and, if wanted, for components, growing and decimation."""
+    """Build the kernels for surfaces of this topology and, if wanted, for components, growing and so on."""
     from clrecon.operators.primitives.union_find import prepare_components
     from clrecon.operators.surface.extract import prepare_isosurface
 
@@ -43,6 +46,12 @@ def prepare_surfaces(
         from clrecon.operators.surface.near_faces import prepare_near_faces
 
         prepare_near_faces(device)
+    if solid:
+        from clrecon.operators.masks.balls import prepare_balls
+        from clrecon.operators.masks.runs import prepare_runs
+
+        prepare_balls(device)
+        prepare_runs(device)
     if components:
         prepare_components(device)
 
@@ -93,6 +102,39 @@ def narrow_volume(
     if settings.below is not None:
         volume = restrict_volume(volume, settings, device, bands, progress)
     return preprocess_volume(volume, settings, device, bands, progress)
+
+
+def fill_solid(
+    volume: Volume,
+    surfaces: Sequence[Surface],
+    settings: MeshSettings,
+    device: Device,
+    progress: Progress,
+    watch: Laps,
+) -> Volume:
+    """Return the volume with what the only surface encloses filled, if the settings ask for that.
+
+    At levels of bone, spaces that are too wide for marrow stay open, and such that hold air; at others, as that of
+    skin, all is filled.
+
+    Raises
+    ------
+    ClreconError
+        As `clrecon.fill_enclosed`.
+    """
+    if not settings.solid:
+        return volume
+    from clrecon.operators.masks.enclosed import LARGEST_MARROW_MM, fill_enclosed
+
+    level = surfaces[0].iso_value
+    assert level is not None and not isinstance(level, tuple)  # the settings check it
+    of_bone = LOWEST_BONE_HU <= level <= HIGHEST_BONE_HU
+    filled: Volume = fill_enclosed(
+        volume, level, seal_mm=settings.seal_mm, largest_mm=LARGEST_MARROW_MM if of_bone else None, keep_air=of_bone,
+        device=device, memory=settings.memory, progress=progress,
+    )  # fmt: skip
+    watch.lap("solid")
+    return filled
 
 
 def leave_outside(volume: Volume, settings: MeshSettings, progress: Progress) -> Volume:

@@ -37,8 +37,8 @@ PURPOSES: dict[str, Purpose] = {
     for purpose in (
         Purpose(
             "print",
-            {"keep": "bone", "keep_largest": 1, "smooth": 20, "decimate": 0.9, "strict": True},
-            "one closed piece, of bone at iso values of bone; size and thickness of walls are said",
+            {"keep": "bone", "keep_largest": 1, "solid": True, "smooth": 20, "decimate": 0.9, "strict": True},
+            "one closed piece, of solid bone at iso values of bone; size and thickness of walls are said",
             is_for_print=True,
         ),
         Purpose(

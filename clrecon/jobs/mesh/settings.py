@@ -61,6 +61,10 @@ class MeshSettings(InputSettings):
         Keep only components of at least this volume.  With `keep_largest`: of these the largest.
     seeds : sequence of (x, y, z)
         Keep only the components whose surface lies nearest to these points, in mm of the frame `space`.
+    solid : bool
+        Fill what the surface encloses, such as marrow, see `clrecon.fill_enclosed`.
+    seal_mm : float, optional
+        With `solid`: radius of the balls that close pores, mm; None: 2.5 to 3, by the voxels.
     split : bool
         Write one mesh for each component, the largest first.
     labels : LabelChoice, optional
@@ -100,6 +104,8 @@ class MeshSettings(InputSettings):
     keep_largest: int | None = None
     min_volume_ml: float | None = None
     seeds: Sequence[Sequence[float]] = ()
+    solid: bool = False
+    seal_mm: float | None = None
     split: bool = False
     labels: LabelChoice | None = None
     smooth: int | None = None
@@ -129,6 +135,7 @@ class MeshSettings(InputSettings):
             if len(seed) != 3 or not all(map(math.isfinite, seed)):
                 raise UsageError(f"a seed is a point of three numbers in mm, not {tuple(seed)}")
         self._check_refinement()
+        self._check_solid()
         from clrecon.geometry import frame_from_lps  # numpy: not loaded before a job starts
         from clrecon.geometry.iso_rule import check_topology
 
@@ -215,6 +222,28 @@ class MeshSettings(InputSettings):
             raise UsageError(f"labels take one iso value, not the range {name} HU")
         if self.topology == "trilinear":
             raise UsageError(f"the topology trilinear follows one level, the range {name} HU has two: leave it out")
+
+    def _check_solid(self) -> None:
+        solid = name_parameter("solid", True)
+        if self.seal_mm is not None:
+            if not self.solid:
+                raise UsageError(f"{name_parameter('seal_mm')} closes pores for {solid}: ask for that too")
+            if not (math.isfinite(self.seal_mm) and self.seal_mm > 0.0):
+                raise UsageError(f"the radius that closes pores is a length in mm above 0, not {self.seal_mm:g}")
+        if not self.solid:
+            return
+        if self.labels_pick:
+            raise UsageError("labels are made solid one by one: LabelChoice(solid=True)")
+        if self.inside != "above":
+            raise UsageError(
+                f"{solid} fills what lies within the values from one level on: it goes with neither"
+                f" {name_parameter('below')} nor a range"
+            )
+        if len(self.levels) > 1:
+            raise UsageError(
+                f"{solid} takes one iso value, not {len(self.levels)}: what is enclosed differs at each; make one mesh"
+                " at a time"
+            )
 
     def _check_refinement(self) -> None:
         if self.smooth is not None and not 1 <= self.smooth <= 1000:

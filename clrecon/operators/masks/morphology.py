@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry import Volume
 from clrecon.opencl import check_budget
 from clrecon.operators.masks.balls import ball_of, reaches_beyond, spread_bits, table_bytes, whole_ball_of
 from clrecon.operators.masks.band_mask import mask_bytes, zero_words
 from clrecon.operators.masks.mask_bits import MaskBits
 from clrecon.operators.masks.regions import checked_mm
+from clrecon.points.stencil import SLACK, Stencil
 
 __all__ = ["MaskShapes"]
 
@@ -91,6 +96,37 @@ class MaskShapes(MaskBits):
         dilated = self._made(self._spread(mm, by_slice), self.name)
         return self._made(dilated._spread(mm, by_slice, erode=True, beyond=True), f"({self.name}) closed by {mm:g} mm")
 
+    def dilate_within(self: Shapes, room: Shapes, mm: float) -> Shapes:
+        """Choose the voxels of another mask that short ways over faces of its voxels join with chosen ones.
+
+        A way takes a step along i, j or k at a time; along each axis it may be as long as `mm`, in whole steps rounded
+        up.  Along an axis whose step is longer than `mm` there is none.
+
+        Parameters
+        ----------
+        room : Mask
+            Of the same volume.
+        mm : float
+            Above 0.
+
+        Raises
+        ------
+        UsageError
+            `mm` is not a number above 0, or the other mask is of another volume.
+        DeviceError
+            As for `dilate`.
+        """
+        radius = checked_mm(mm, "the length of the ways")
+        steps = np.array(self.volume.spacing)
+        most = np.where(steps <= radius * (1.0 + SLACK), np.ceil(radius / steps - SLACK), 0).astype(int)
+        reached = self
+        for done in range(int(most.max())):
+            self._check_budget(4)
+            cross = _cross_of(self.volume, most > done)
+            spread = self._made(spread_bits(self.device, reached.bits, cross), self.name)
+            reached = reached | (spread & room)
+        return self._made(reached._mask_d, f"({self.name}) dilated by {mm:g} mm within ({room.name})")
+
     def _erode(self, mm: float, by_slice: bool) -> Any:
         radius = checked_mm(mm, "the radius of the ball")
         if not reaches_beyond(self.volume, radius, by_slice=by_slice):
@@ -107,3 +143,14 @@ class MaskShapes(MaskBits):
         needs = {"2 masks of the voxels": 2 * size, "row extents": extents, "rows of the ball": table_bytes(ball)}
         check_budget(self.device, needs, self.memory)
         return spread_bits(self.device, self.bits, ball, erode=erode, beyond=beyond)
+
+
+def _cross_of(volume: Volume, axes: NDArray[np.bool_]) -> Stencil:
+    """Return the neighbours of a voxel by its faces along some of the axes i, j, k, and itself."""
+    rows = [[0, 0, -int(axes[0]), int(axes[0])]]
+    rows += [[step, 0, 0, 0] for step in (-1, 1) if axes[1]] + [[0, step, 0, 0] for step in (-1, 1) if axes[2]]
+    nk = volume.shape_ijk[2]
+    tables = np.tile(np.array([[0, len(rows)]], np.int32), (nk, 1))
+    in_plane = 1 + 2 * int(axes[0]) + 2 * int(axes[1])
+    members = in_plane + 2 * int(axes[2])
+    return Stencil(np.array(rows, np.int32), tables, in_plane, (members, members), int(axes[0]))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +14,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, Level, check_topology, choose_iso_rule
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device
+from clrecon.operators.masks.enclosed import fill_enclosed
 from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Extraction, Part, prepare_isosurface
@@ -195,6 +197,7 @@ def extract_isosurface(
     below: bool = False,
     grow_from: Any = None,
     vertex_rule: str = "linear",
+    solid: bool = False,
     memory: int | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
@@ -217,9 +220,8 @@ def extract_isosurface(
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.
     closed : bool
-        True: the volume is surrounded by air, and the surface is closed where an object leaves the volume.
-        Beyond the border the field has the volume's lowest value, but not less than -1024 HU.
-        False: the surface ends open at the outermost voxel centres.
+        True: the surface is closed where an object leaves the volume: beyond the border the field has the volume's
+        lowest value, but not less than -1024 HU.  False: it ends open at the outermost voxel centres.
     topology : {"separated", "trilinear"}
         How corners are joined where the case of a cell leaves it open: "separated" keeps inside voxels apart that only
         meet across a face; "trilinear" joins what the trilinear interpolation of the voxels joins, on faces and inside
@@ -231,6 +233,8 @@ def extract_isosurface(
         Make only what hangs together with a seed, cell by cell: see `clrecon.operators.surface.seeds.Seeds.read`.
     vertex_rule : {"linear", "golden", "golden-search"}
         Where on an edge a vertex lies, see `docs/methods.md`.  "golden" misses the surface by up to 0.6 voxels.
+    solid : bool
+        True: what is enclosed is filled, see `clrecon.fill_enclosed`; not with `below` and ranges.
     memory : int, optional
         See `SurfaceExtractor`.
     progress : callable, optional
@@ -252,19 +256,38 @@ def extract_isosurface(
         An argument is not what it should be, values or the volume are too large for float32, a row of the volume is
         too long, or a seed is outside of the volume or not near the surface.
     DeviceError
-        No device, not even one slice fits its memory, 2^32 vertices or triangles or more, or the device fails or
-        computes wrongly.
+        No device, not even one slice fits its memory, 2^32 vertices or triangles or more, or it fails or errs.
 
     References
     ----------
-    Lorensen and Cline 1987; Schroeder, Maynard and Geveci 2015; for "trilinear" Nielson and Hamann 1991, Chernyaev
-    1995 and Grosso 2016.
+    Lorensen and Cline 1987; Schroeder et al. 2015; "trilinear": Nielson and Hamann 1991, Chernyaev 1995, Grosso 2016.
     """
-    with SurfaceExtractor(volume, device=device, memory=memory) as extractor:
+    with _open(volume, iso_value, solid, below, device=device, memory=memory, progress=progress) as extractor:
         return extractor.extract(
             iso_value, closed=closed, topology=topology, below=below, grow_from=grow_from, vertex_rule=vertex_rule,
             progress=progress,
         )  # fmt: skip
+
+
+@contextmanager
+def _open(
+    volume: Volume | DeviceVolume,
+    iso_value: Level,
+    solid: bool,
+    below: bool,
+    *,
+    progress: Progress | None,
+    **where: Any,
+) -> Iterator[SurfaceExtractor]:
+    """Yield an extractor for a volume, or with `solid` for one in which what the level encloses is filled."""
+    with ExitStack() as opened:
+        if solid:
+            if below or np.ndim(iso_value):
+                raise UsageError(f"{name_parameter('solid', True)} goes with one iso value, not with below or a range")
+            volume = fill_enclosed(volume, iso_value, progress=progress, **where)  # type: ignore[arg-type]
+            if isinstance(volume, DeviceVolume):
+                opened.enter_context(volume)
+        yield opened.enter_context(SurfaceExtractor(volume, **where))
 
 
 def extract_isosurfaces(

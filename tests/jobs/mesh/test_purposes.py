@@ -22,10 +22,12 @@ def test_what_is_given_wins() -> None:
     assert settings_for(None, {"smooth": None}) == {"smooth": None}
     plain = settings_for("print", {"smooth": None, "strict": False, "closed": True, "seeds": []})
     assert MeshSettings(**plain) == MeshSettings(
-        keep="bone", keep_largest=1, smooth=20, decimate=0.9, strict=True, purpose="print", seeds=[]
+        keep="bone", keep_largest=1, solid=True, smooth=20, decimate=0.9, strict=True, purpose="print", seeds=[]
     )
     own = settings_for("print", {"keep_largest": 2, "smooth": 5, "decimate": 0.5})
     assert (own["keep_largest"], own["smooth"], own["decimate"]) == (2, 5, 0.5)
+    for hollow in ({"solid": False}, {"iso_value": (200, 300)}, {"iso_value": -300}, {"below": -400}):
+        assert not settings_for("print", hollow).get("solid")
     for other in ({"seeds": [(0, 0, 0)]}, {"min_volume_ml": 1.0}, {"split": True}):
         assert settings_for("print", {**other, "keep_largest": None})["keep_largest"] is None
 

@@ -1,0 +1,58 @@
+"""What marrow cannot be: how wide a space is, and where the end of a scan is open."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["BLOCK_MM", "find_open_places", "measure_width"]
+
+BLOCK_MM = 2.0
+"""Side of the blocks by which the width of a space is measured."""
+
+
+def measure_width(
+    body: NDArray[np.bool_], ends: tuple[tuple[bool, bool], ...], steps: tuple[float, float, float]
+) -> float:
+    """Return the radius of the largest ball that fits into a body, mm, right to about `BLOCK_MM`.
+
+    Where an end of the volume cuts the body, a disc in that end counts as a ball: of a skull only the cap may be there.
+
+    Parameters
+    ----------
+    body : ndarray, shape (nk, nj, ni), bool
+        Without room around it.
+    ends : 3 pairs of bool
+        For each axis of the array whether its first and its last layer lie at an end of the volume: the body goes on
+        there as it is.  All else around it is outside.
+    steps : (float, float, float)
+        Of the voxels along k, j, i, mm.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    blocks = [max(1, round(BLOCK_MM / step)) for step in steps]
+    counts = body.astype(np.int32)
+    for axis, (block, (first, last)) in enumerate(zip(blocks, ends, strict=True)):
+        rest = [(0, -counts.shape[axis] % block if a == axis else 0) for a in range(3)]
+        whole = np.pad(counts, rest, mode="edge") if last else np.pad(counts, rest)
+        counts = np.add.reduceat(whole, np.arange(0, whole.shape[axis], block), axis=axis)
+        counts = np.pad(counts, [(int(not first), int(not last)) if a == axis else (0, 0) for a in range(3)])
+    full = 2 * counts >= math.prod(blocks)
+    if full.all():
+        return float(np.inf)
+    sides = [block * step for block, step in zip(blocks, steps, strict=True)]
+    widths = [distance_transform_edt(full, sampling=sides).max()]
+    for axis, at_ends in enumerate(ends):
+        across = [side for other, side in enumerate(sides) if other != axis]
+        faces = [np.take(full, place, axis=axis) for place, is_end in zip((0, -1), at_ends, strict=True) if is_end]
+        widths += [distance_transform_edt(face, sampling=across).max() for face in faces if not face.all()]
+    return float(max(widths))
+
+
+def find_open_places(face: ArrayLike) -> NDArray[np.bool_]:
+    """Return the places of an end slice that what is chosen in it does not enclose there, of the same shape, bool."""
+    from scipy.ndimage import binary_fill_holes
+
+    return np.asarray(~binary_fill_holes(np.asarray(face, dtype=bool)), dtype=bool)

@@ -1,0 +1,218 @@
+"""Solid bodies without labels: what bone encloses, its marrow, joins the voxels of the bone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import NoSurfaceError
+from clrecon.geometry import Volume
+from clrecon.geometry.certificate import amend
+from clrecon.geometry.iso_rule import choose_iso_rule
+from clrecon.opencl import Device
+from clrecon.operators.masks.mask import Mask
+from clrecon.operators.masks.regions import checked_mm
+from clrecon.operators.masks.spaces import Spaces, find_joints, find_spaces
+from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
+from clrecon.system.progress import Progress, Steps
+
+LEAST_SAID_ML = 0.1
+"""Smaller spaces that stay open are in the report alone."""
+
+__all__ = ["AIR_LIMIT_HU", "LARGEST_MARROW_MM", "SEAL_MM", "fill_enclosed"]
+
+SEAL_MM, LARGEST_SEAL_MM = 2.5, 3.0
+"""Radius of the balls that close pores and vessels of the cortex, and the largest, for coarse voxels: at levels of bone
+the thin cortex of vertebrae has openings of up to 5 mm."""
+
+SEAL_STEPS = 1.25
+"""The same radius in largest steps of the voxels: below one it would close nothing along that axis."""
+
+BONE_ML = 1.0
+"""Pieces at the level from this volume on are bones of their own: what lies between two of them is a joint."""
+
+LARGEST_MARROW_MM = 35.0
+"""Radius of the smallest ball that fits into no marrow: the head of a femur is 20 to 29 mm in radius, the skull of a
+newborn more than 45."""
+
+AIR_LIMIT_HU = -200.0
+"""A space whose mean is lower holds air: fat is -100, air cells with thin walls are below -400."""
+
+
+def fill_enclosed(
+    volume: Volume | DeviceVolume,
+    iso_value: float,
+    *,
+    seal_mm: float | None = None,
+    largest_mm: float | None = LARGEST_MARROW_MM,
+    keep_air: bool = True,
+    device: Device | str | int | None = None,
+    memory: int | None = None,
+    progress: Progress | None = None,
+) -> Any:
+    """Return a volume in which what the voxels at a level and above enclose, as marrow, is above the level too.
+
+    The voxels at the level and above are closed by a ball, so that pores of the cortex are no way in.  A space is
+    enclosed where no way over faces of voxels leads from it to the border of the volume, or only to places of an end
+    of the volume that are enclosed in that end's own slice: the canal of a long bone that the scan cuts.  From outside
+    voxels become free again as deep as the ball's radius, so that grooves, and pores at their mouth, keep their shape.
+    Between two bones nothing is closed: pieces that were apart stay so, with the vessels full of contrast medium.
+
+    No other voxel changes: where bone borders on what is outside, an iso surface of the result has the same vertices
+    as one of `volume`, bit for bit.
+
+    Parameters
+    ----------
+    volume : Volume or DeviceVolume
+        Not changed.
+    iso_value : float
+        HU; inside is ``>= iso_value``.
+    seal_mm : float, optional
+        Radius of the ball, mm.  Below every step of the voxels it closes nothing.  None: 1.25 of the largest step, from
+        2.5 to 3 mm.
+    largest_mm : float, optional
+        A space into which a ball of this radius fits stays open: no marrow is so thick, but the skull, the chest and
+        the pelvis are.  None fills all.
+    keep_air : bool
+        True: a space that holds air stays open (sinuses, airways), unless what surrounds the bone is air too.
+    device, memory
+        As for `Mask.from_band`.
+    progress : callable, optional
+        Called as ``progress("solid", steps done, steps)``.
+
+    Returns
+    -------
+    Volume or DeviceVolume
+        As `volume`.  ``report["solid"]``: ``seal_mm``, ``bone_ml``, ``filled_ml``, ``filled_share`` (of both together),
+        ``filled_air_ml`` (cells with air that the ball closed), ``filled_hu`` (the value of what was filled: the mean
+        of the bone), ``spaces`` (number of spaces filled that are wider than the ball), ``at_ends`` (of these, how many
+        the ends of the volume cut), ``largest_ml``, and ``open``: for each kind (``wide``, ``air``) ``spaces``, ``ml``,
+        ``largest_ml`` and ``at_mm``, LPS mm of a place in the largest;
+        ``warnings`` say what stays open, and if more was filled than the bone itself has.
+
+    Raises
+    ------
+    UsageError
+        These are no Volume and no number, or a length is no number above 0.
+    NoSurfaceError
+        No voxel is inside, or every one is.
+    DeviceError
+        The device has no room for the masks, or it fails.
+    """
+    seal = None if seal_mm is None else checked_mm(seal_mm, "the radius that closes pores")
+    largest = np.inf if largest_mm is None else checked_mm(largest_mm, "the radius of the thickest marrow")
+    steps = Steps(progress, "solid", 5)
+    with open_volume(volume, device, memory, "a solid body") as resident:
+        own = resident.volume
+        rule = choose_iso_rule(own, iso_value, values=resident.values)
+        bone = Mask.from_band(resident, (float(rule.lowest_inside), np.inf))
+        if not bone.count or bone.count == own.voxels.size:
+            what = "no voxel has" if not bone.count else "every voxel has"
+            low, high = own.hu_range or (float(own.voxels.min()), float(own.voxels.max()))
+            raise NoSurfaceError(f"{what} {iso_value:g} HU or more: the volume runs from {low:g} to {high:g} HU")
+        if seal is None:
+            seal = float(np.clip(SEAL_STEPS * max(own.spacing), SEAL_MM, LARGEST_SEAL_MM))
+        steps.take()
+        made = _fill(bone, (seal, largest, keep_air), float(rule.lowest_inside), steps)
+        return resident.follow(made) if isinstance(volume, DeviceVolume) else made
+
+
+def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, steps: Steps) -> Volume:
+    """Fill what a mask encloses, see `fill_enclosed`; `how` is the radius of the seal, that of wide spaces, and whether
+    air stays.
+    """
+    volume = bone.volume
+    seal_mm, largest_mm, keep_air = how
+    # Near the ends of the volume no ball fits; there discs close what lies in the end slices themselves.
+    sealed = bone.dilate(seal_mm).erode(seal_mm) | bone
+    sealed = sealed | bone.dilate(seal_mm, by_slice=True).erode(seal_mm, by_slice=True)
+    steps.take()
+    spaces = find_spaces(sealed)
+    steps.take()
+    kinds = {"wide": spaces.are_wide(largest_mm), "air": np.zeros(spaces.count, bool)}
+    airy = spaces.mean_hu < AIR_LIMIT_HU
+    if keep_air and airy.any() and not _lies_in_air(bone, sealed, spaces):
+        kinds["air"] = airy & ~kinds["wide"]
+    left = kinds["wide"] | kinds["air"]
+    body = sealed | spaces.choose(~left)
+    room = body - bone
+    joints = find_joints(bone, seal_mm, BONE_ML) & (sealed - bone)
+    # what was closed only at the mouth of a pore, in a groove or in a joint is outside again
+    filled = room - (~body | joints).dilate_within(room, seal_mm)
+    steps.take()
+    marked = filled.to_numpy()
+    value = _mean_inside(volume, bone, lowest_inside)
+    voxels = np.where(marked, value, volume.voxels)
+    steps.take()
+    from clrecon.labels.volumes import slice_voxel_ml  # label maps load pydicom, which others need not wait for
+
+    ml = slice_voxel_ml(volume)
+    bone_ml = float(_count_by_slice(bone.to_numpy()) @ ml)
+    filled_ml = float(_count_by_slice(marked) @ ml)
+    facts = {
+        "seal_mm": seal_mm,
+        "bone_ml": bone_ml,
+        "filled_ml": filled_ml,
+        "filled_share": filled_ml / (filled_ml + bone_ml),
+        "filled_air_ml": float(_count_by_slice(marked & (volume.voxels < AIR_LIMIT_HU)) @ ml),
+        "filled_hu": float(value),
+        "spaces": int(np.count_nonzero(~left)),
+        "at_ends": int(np.count_nonzero(spaces.at_ends & ~left)),
+        "largest_ml": float(spaces.ml[~left].max(initial=0.0)),
+        "open": {kind: spaces.describe(which) for kind, which in kinds.items()},
+    }
+    made = volume.with_voxels(voxels)
+    report = volume.report
+    if report.get("hu_range") is not None:
+        report = amend(report, hu_range=made.report["hu_range"])
+    made.report = amend(report, solid=facts, warnings=[*report.get("warnings", ()), *_warn(facts)])
+    return made
+
+
+def _count_by_slice(marked: NDArray[np.bool_]) -> NDArray[np.int64]:
+    return np.count_nonzero(marked, axis=(1, 2))  # type: ignore[return-value]
+
+
+def _lies_in_air(bone: Mask, sealed: Mask, spaces: Spaces) -> bool:
+    """Tell whether most of what lies beside the bone, outside, is air, as round a specimen."""
+    inner = sealed | spaces.choose(np.ones(spaces.count, bool))
+    step = float(np.max(bone.volume.spacing))
+    beside = bone.dilate(2.0 * max(SEAL_MM, step)) - inner
+    low = float(np.finfo(np.float32).min)
+    air = Mask.from_band(bone.volume, (low, AIR_LIMIT_HU), device=bone.device, memory=bone.memory)
+    return bool(2 * (beside & air).count > beside.count)
+
+
+def _mean_inside(volume: Volume, bone: Mask, lowest_inside: float) -> Any:
+    """Return the mean of the voxels inside, as a scalar of the voxels' type that is inside too."""
+    marked = bone.to_numpy()
+    total = sum(float(layer[own].sum(dtype=np.float64)) for layer, own in zip(volume.voxels, marked, strict=True))
+    mean = max(total / bone.count, lowest_inside + 1.0)
+    dtype = volume.voxels.dtype
+    if dtype.kind == "f":
+        return dtype.type(mean)
+    return dtype.type(min(round(mean), int(np.iinfo(dtype).max)))
+
+
+def _warn(facts: dict[str, Any]) -> list[str]:
+    """Return what stays open, and whether more was filled than there is bone."""
+    warnings = []
+    for kind, what in (("wide", "too wide for marrow"), ("air", "air, as in sinuses and airways")):
+        left = facts["open"][kind]
+        if left["ml"] >= LEAST_SAID_ML:
+            at = ", ".join(f"{x:.0f}" for x in left["at_mm"])
+            several = f", the largest {left['largest_ml']:.3g} ml" if left["spaces"] > 1 else ""
+            warnings.append(
+                f"solid: {left['ml']:.3g} ml stay open in {left['spaces']:,} enclosed"
+                f" space{'s' * (left['spaces'] != 1)} ({what}{several}, round {at} mm LPS)"
+            )
+    if not facts["filled_ml"]:
+        warnings.append("solid: nothing is enclosed at this level, and nothing was filled")
+    elif facts["filled_ml"] > facts["bone_ml"]:
+        warnings.append(
+            f"solid: {facts['filled_ml']:.3g} ml were filled, more than the {facts['bone_ml']:.3g} ml of the bone"
+            " itself: see in a picture that it is marrow"
+        )
+    return warnings

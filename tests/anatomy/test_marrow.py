@@ -1,0 +1,46 @@
+"""How wide a space is: balls, ends of the volume, discs in them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.anatomy.marrow import find_open_places, measure_width
+
+FREE = ((False, False),) * 3
+
+
+def ball(radius: float, steps: tuple[float, float, float]) -> np.ndarray:
+    sizes = [2 * int(radius / step) + 1 for step in steps]
+    axes = np.indices(sizes)
+    centre = [(size - 1) / 2 for size in sizes]
+    squares = [((axis - c) * step) ** 2 for axis, c, step in zip(axes, centre, steps, strict=True)]
+    return np.asarray(sum(squares) <= radius**2)
+
+
+@pytest.mark.parametrize("steps", [(1.0, 1.0, 1.0), (0.5, 0.4, 0.4), (4.0, 0.9, 0.9), (2.0, 3.0, 1.0)])
+@pytest.mark.parametrize("radius", [12.0, 20.0])
+def test_a_ball_has_its_radius(radius, steps):
+    assert measure_width(ball(radius, steps), FREE, steps) == pytest.approx(radius, abs=max(2.5, steps[0]))
+
+
+def test_a_body_goes_on_beyond_the_ends_of_the_volume_and_a_disc_there_counts():
+    whole = ball(20.0, (1.0, 1.0, 1.0))
+    half = whole[20:]
+    assert measure_width(half, FREE, (1.0,) * 3) == pytest.approx(10.0, abs=2.0)
+    cut = ((True, False), (False, False), (False, False))
+    assert measure_width(half, cut, (1.0,) * 3) == pytest.approx(20.0, abs=2.0)
+    assert measure_width(whole[:10], ((False, True), *FREE[1:]), (1.0,) * 3) == pytest.approx(17.3, abs=2.0)
+    slab = np.ones((3, 30, 30), bool)
+    through = ((True, True), (False, False), (False, False))
+    assert measure_width(slab, through, (1.0,) * 3) == pytest.approx(15.0, abs=2.0)
+    assert measure_width(slab, ((True, True),) * 3, (1.0,) * 3) == np.inf
+
+
+def test_places_of_an_end_are_open_outside_of_rings():
+    face = np.zeros((5, 6), int)
+    face[1:4, 1:5] = 1
+    face[2, 2:4] = 0
+    expected = face == 0
+    expected[2, 2:4] = False
+    np.testing.assert_array_equal(find_open_places(face), expected)

@@ -1,0 +1,215 @@
+"""What bone encloses is filled: known bodies, twins on any grid, and what must stay open."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from surface_volumes import MIRRORED, OBLIQUE
+from uneven_volume import uneven
+
+import clrecon
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.operators.masks import enclosed
+from clrecon.phantom import PhantomSettings, make_phantom
+from clrecon.reference.masks import enclosed as twin
+
+TILTED = np.array([[0.6, 0.0, 0.0, -20.0], [0.0, 0.6, 0.4, 5.0], [0.0, 0.0, 1.4, 100.0], [0, 0, 0, 1.0]])
+
+
+def distances(shape, centre=None):
+    """Distance of each voxel from the centre, in voxels, shape (nk, nj, ni)."""
+    centre = [(n - 1) / 2 for n in shape] if centre is None else centre
+    return np.sqrt(sum((axis - middle) ** 2 for axis, middle in zip(np.indices(shape), centre, strict=True)))
+
+
+def body(distance, outer, inner, hu=(0, 800, 50)):
+    """A shell with partial volume: its field is linear in the distance, over a voxel and a half at each wall."""
+    out, bone, marrow = hu
+    wall = np.clip((outer - distance) / 1.5 + 0.5, 0, 1) * np.clip((distance - inner) / 1.5 + 0.5, 0, 1)
+    return np.where(distance < (outer + inner) / 2, marrow + (bone - marrow) * wall, out + (bone - out) * wall)
+
+
+def whole(values, spacing=(1.0, 1.0, 1.0)):
+    return Volume(np.rint(values).astype(np.int16), np.diag([*spacing, 1.0]))
+
+
+def marks(volume, filled, level):
+    return (filled.voxels >= level) & (volume.voxels < level)
+
+
+def test_a_hollow_sphere_with_a_pore_becomes_solid_and_keeps_the_vertices_of_its_outer_wall(device):
+    distance = distances((49, 49, 49))
+    values = body(distance, 20.0, 15.0)
+    values[24, 24, 24:] = np.minimum(values[24, 24, 24:], 50)  # a pore of one voxel right through the wall
+    volume = whole(values)
+    filled = clrecon.fill_enclosed(volume, 400, device=device)
+    facts = filled.report["solid"]
+    inner = (distance < 17) & (volume.voxels < 400)
+    assert marks(volume, filled, 400)[inner].all()
+    # of the pore the outermost voxels stay as deep as the radius of the seal
+    pore = np.flatnonzero((volume.voxels[24, 24] < 400) & ~marks(volume, filled, 400)[24, 24] & (np.arange(49) > 24))
+    assert volume.voxels[24, 24, 44] < 400 and pore[0] == 41
+    assert facts["filled_ml"] == pytest.approx(np.count_nonzero(inner) / 1000, rel=0.005)
+    assert facts["spaces"] == 1 and facts["at_ends"] == 0 and facts["filled_air_ml"] == 0
+    assert filled.report["warnings"] == []
+    plain = clrecon.extract_isosurface(volume, 400, device=device)
+    solid = clrecon.extract_isosurface(volume, 400, solid=True, device=device)
+    quality = solid.quality()
+    assert (quality["closed"], quality["manifold"], quality["components"]) == (True, True, 1)
+    assert quality["volume_ml"] == pytest.approx(4 / 3 * np.pi * 20**3 / 1000, rel=0.005)
+    there = {tuple(vertex) for vertex in plain.vertices.tolist()}
+    away = np.linalg.norm(solid.vertices - 24, axis=1)
+    outer = (away > 18.5) & (np.hypot(*(solid.vertices[:, 1:] - 24).T) > 3)
+    assert outer.mean() > 0.95
+    assert all(tuple(vertex) in there for vertex in solid.vertices[outer].tolist())
+    assert solid.report["certificate"]["solid"] if "certificate" in solid.report else True
+    unchanged = ~marks(volume, filled, 400)
+    assert np.array_equal(filled.voxels[unchanged], volume.voxels[unchanged])
+
+
+def test_a_canal_that_the_ends_of_the_scan_cut_is_filled_and_one_that_ends_in_the_scan_is_not(device):
+    nk = 24
+    _, j, i = np.indices((nk, 41, 41))
+    tube = body(np.hypot(j - 20, i - 20), 14.0, 10.0)
+    cut = clrecon.fill_enclosed(whole(tube), 400, device=device)
+    facts = cut.report["solid"]
+    assert facts["at_ends"] == facts["spaces"] == 1
+    canal = np.hypot(j - 20, i - 20) <= 9.5
+    assert marks(whole(tube), cut, 400)[canal].all()
+    assert facts["filled_ml"] == pytest.approx(np.pi * 10.0**2 * nk / 1000, rel=0.03)
+    short = tube.copy()
+    short[[0, 1, 2, -3, -2, -1]] = 0  # open at both ends, in the scan
+    left = clrecon.fill_enclosed(whole(short), 400, device=device)
+    assert left.report["solid"]["filled_ml"] == 0.0
+    assert left.report["warnings"] == ["solid: nothing is enclosed at this level, and nothing was filled"]
+    half = tube.copy()
+    half[:3] = 0  # open at one end
+    assert clrecon.fill_enclosed(whole(half), 400, device=device).report["solid"]["filled_ml"] == 0.0
+
+
+def test_what_is_too_wide_for_marrow_stays_open_with_the_end_of_the_scan_as_its_lid_too(device):
+    distance = distances((93, 93, 93))
+    skull = whole(body(distance, 44.0, 40.0))
+    left = clrecon.fill_enclosed(skull, 400, device=device)
+    wide = left.report["solid"]["open"]["wide"]
+    assert wide["spaces"] == 1 and wide["ml"] == pytest.approx(4 / 3 * np.pi * 40**3 / 1000, rel=0.01)
+    assert np.linalg.norm(np.array(wide["at_mm"]) - 46) < 40  # within
+    assert left.report["solid"]["filled_ml"] == 0.0
+    [first, _] = left.report["warnings"]
+    assert first.startswith(f"solid: {wide['ml']:.3g} ml stay open in 1 enclosed space (too wide for marrow, round ")
+    everything = clrecon.fill_enclosed(skull, 400, largest_mm=None, device=device)
+    assert everything.report["solid"]["filled_ml"] == pytest.approx(wide["ml"], rel=0.1)
+    [more] = everything.report["warnings"]
+    assert "more than the" in more and "of the bone itself" in more
+    lid = whole(body(distance, 44.0, 40.0)[:30])  # a cap of the skull, cut 17 mm over its middle
+    assert clrecon.fill_enclosed(lid, 400, device=device).report["solid"]["open"]["wide"]["spaces"] == 1
+    head_of_femur = whole(body(distances((69, 69, 69)), 32.0, 29.0))
+    assert clrecon.fill_enclosed(head_of_femur, 400, device=device).report["solid"]["open"]["wide"]["spaces"] == 0
+
+
+def test_air_in_bone_stays_open_in_a_patient_and_is_filled_in_a_dry_bone(device):
+    distance = distances((41, 41, 41))
+    sinus = clrecon.fill_enclosed(whole(body(distance, 15.0, 11.0, (40, 800, -950))), 400, device=device)
+    assert sinus.report["solid"]["filled_ml"] == 0.0
+    air = sinus.report["solid"]["open"]["air"]
+    assert air["spaces"] == 1 and air["at_mm"] is not None
+    assert any("air, as in sinuses and airways" in text for text in sinus.report["warnings"])
+    for options in ({"keep_air": False}, {}):
+        around = 40 if options else -1000
+        dry = clrecon.fill_enclosed(
+            whole(body(distance, 15.0, 11.0, (around, 800, -950))), 400, **options, device=device
+        )
+        facts = dry.report["solid"]
+        assert facts["filled_ml"] > facts["filled_air_ml"] > 0.8 * facts["filled_ml"] > 4.5
+
+
+def test_two_bones_are_not_joined_and_a_groove_of_one_is_only_shallower(device):
+    k, j, i = np.indices((30, 30, 40))
+    block = (k >= 5) & (k < 25) & (j >= 5) & (j < 25)
+    apart = np.where(block & (((i >= 4) & (i < 18)) | ((i >= 21) & (i < 35))), 800, 0)  # a joint of 3 mm
+    volume = whole(apart)
+    assert clrecon.fill_enclosed(volume, 400, device=device).report["solid"]["filled_ml"] == 0.0
+    joined = apart.copy()
+    joined[5:7, 5:25, 4:35] = 800  # one bone with a slit that is open on three sides
+    filled = marks(whole(joined), clrecon.fill_enclosed(whole(joined), 400, device=device), 400)
+    assert filled.any() and not filled[:, :8].any() and not filled[:, 22:].any() and not filled[22:].any()
+
+
+@pytest.mark.parametrize("which", range(6))
+@pytest.mark.parametrize("seal_mm", [0.3, 0.7, 1.5])
+def test_any_grid_equals_the_twin(device, which, seal_mm):
+    rng = np.random.default_rng(which)
+    noise = rng.integers(0, 100, (6, 13, 34)).astype(np.int16)
+    noise[1:5, 2:11, 3:16] += 60  # thick pieces with holes
+    noise[1:5, 2:11, 19:31] += 45
+    frames = [Volume(noise, frame) for frame in (np.eye(4), OBLIQUE, MIRRORED, TILTED)]
+    volume = [*frames, uneven(noise), Volume(noise[:1], OBLIQUE)][which]
+    bone = volume.voxels >= 75
+    filled = clrecon.fill_enclosed(volume, 75, seal_mm=seal_mm, largest_mm=None, keep_air=False, device=device)
+    expected = twin.find_filled(volume, bone, seal_mm, enclosed.BONE_ML)
+    np.testing.assert_array_equal(marks(volume, filled, 75), expected)
+    if seal_mm == 0.3 and which != 5:
+        assert expected.any()
+
+
+def test_ways_within_a_room_equal_the_twin(device):
+    rng = np.random.default_rng(5)
+    for frame in (np.eye(4), TILTED, OBLIQUE):
+        volume = Volume(rng.integers(0, 100, (6, 9, 40)).astype(np.int16), frame)
+        start, room = rng.random((2, 6, 9, 40)) < [[[[0.02]]], [[[0.6]]]]
+        one, other = (clrecon.Mask.from_array(volume, bits, device=device) for bits in (start, room))
+        for mm in (0.1, 0.7, 1.5, 4.0):
+            made = one.dilate_within(other, mm).to_numpy()
+            np.testing.assert_array_equal(made, twin.dilate_within(volume, start, room, mm))
+    with pytest.raises(UsageError, match="the length of the ways is 0"):
+        one.dilate_within(other, 0)
+
+
+def test_a_vertebra_of_the_phantom_is_as_large_as_its_truth_and_what_the_level_adds(device):
+    settings = PhantomSettings(levels="L2", size=(128, 128), spacing=(0.7, 0.7, 0.8))
+    voxels, affine, _ = make_phantom(settings)
+    volume = Volume(voxels, affine)
+    truth = clrecon.phantom_truth(settings)
+    true_ml = float(np.count_nonzero(truth.label_map())) * 0.7 * 0.7 * 0.8e-3
+    # levels below 450 HU, half way to the cortex, lie farther out: as docs/inside.md has it of the same bone by label
+    for level, more in ((226, 0.12), (300, 0.08), (350, 0.05)):
+        plain = clrecon.extract_isosurface(volume, level, device=device).quality()
+        solid = clrecon.extract_isosurface(volume, level, solid=True, device=device).quality()
+        assert plain["volume_ml"] < 0.75 * true_ml
+        assert solid["volume_ml"] == pytest.approx((1 + more) * true_ml, rel=0.02)
+        assert (solid["closed"], solid["manifold"]) == (True, True)
+
+
+def test_values_types_and_a_volume_on_a_device(device):
+    values = body(distances((41, 41, 41)), 15.0, 10.0)
+    short = whole(values)
+    as_float = Volume(values.astype(np.float32), np.eye(4))
+    as_byte = Volume(np.rint(values / 4).astype(np.uint8), np.eye(4))
+    expected = marks(short, clrecon.fill_enclosed(short, 400, device=device), 400)
+    assert np.array_equal(marks(as_float, clrecon.fill_enclosed(as_float, 399.5, device=device), 399.5), expected)
+    assert clrecon.fill_enclosed(as_byte, 100, device=device).report["solid"]["filled_hu"] <= 255
+    seen = []
+    with clrecon.DeviceVolume(short, device=device) as resident:
+        with clrecon.fill_enclosed(resident, 400, progress=lambda *step: seen.append(step)) as filled:
+            assert np.array_equal(marks(short, filled.volume, 400), expected)
+        mesh = clrecon.extract_isosurface(resident, 400, solid=True)
+        assert mesh.quality()["components"] == 1 == len({done for _, done, _ in seen if done == 5})
+    assert {stage for stage, _, _ in seen} >= {"solid"}
+
+
+def test_what_cannot_be_filled_is_refused(device):
+    volume = whole(body(distances((21, 21, 21)), 8.0, 5.0))
+    with pytest.raises(NoSurfaceError, match="no voxel has 2000 HU or more: the volume runs from 0 to"):
+        clrecon.fill_enclosed(volume, 2000, device=device)
+    with pytest.raises(NoSurfaceError, match="every voxel has -10 HU or more"):
+        clrecon.fill_enclosed(volume, -10, device=device)
+    with pytest.raises(UsageError, match="the radius that closes pores is 0"):
+        clrecon.fill_enclosed(volume, 400, seal_mm=0, device=device)
+    with pytest.raises(UsageError, match="the radius of the thickest marrow is -1"):
+        clrecon.fill_enclosed(volume, 400, largest_mm=-1, device=device)
+    with pytest.raises(UsageError, match="needs a Volume"):
+        clrecon.fill_enclosed(volume.voxels, 400, device=device)
+    for options in ({"below": True}, {}):
+        with pytest.raises(UsageError, match="solid=True goes with one iso value"):
+            clrecon.extract_isosurface(volume, 400 if options else (100, 300), solid=True, **options, device=device)
