@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import Any, NoReturn
 
 from clrecon.cli.console import Console
+from clrecon.cli.standard_output import STREAMED
 from clrecon.errors import ClreconError, OutputError, UsageError
 from clrecon.system.text import guess_word
 from clrecon.system.time_limit import DEFAULT_SECONDS, check_time_limit
@@ -23,6 +24,7 @@ __all__ = [
     "add_keep_ids",
     "add_memory",
     "add_no_clobber",
+    "describe_space",
     "guard",
     "has_hung_device",
     "megabytes",
@@ -33,6 +35,9 @@ __all__ = [
 INTERRUPTED = 130
 
 _LONG_WORD = re.compile(r"[^\s/\\]{300,}")
+
+_STREAM = re.compile(r"-\.[A-Za-z0-9.]+")
+"""``-.ply`` behind ``-o``: standard output, and the format."""
 
 _NEGATIVE_LIST = re.compile(r"-[0-9.]+(?:[eE][+-]?[0-9]+)?[,:]")
 
@@ -106,7 +111,7 @@ def _options_in(arguments: Sequence[str]) -> list[str]:
 
 
 def _join_negative_lists(arguments: Sequence[str]) -> list[str]:
-    """Write ``--option -1,2`` as ``--option=-1,2``: argparse takes a list that begins with a minus for an option."""
+    """Write ``--option -1,2`` as ``--option=-1,2``: argparse takes what begins with a minus for an option."""
     joined: list[str] = []
     for place, argument in enumerate(arguments):
         if argument == "--":
@@ -114,6 +119,8 @@ def _join_negative_lists(arguments: Sequence[str]) -> list[str]:
         previous = joined[-1] if joined else ""
         if previous.startswith("--") and "=" not in previous and _NEGATIVE_LIST.match(argument):
             joined[-1] = f"{previous}={argument}"
+        elif previous in ("-o", "--output") and _STREAM.fullmatch(argument):
+            joined[-1] = f"--output={argument}"
         else:
             joined.append(argument)
     return joined
@@ -121,7 +128,11 @@ def _join_negative_lists(arguments: Sequence[str]) -> list[str]:
 
 def add_common(parser: argparse.ArgumentParser) -> None:
     """Add --json, -q, -v and --debug."""
-    group = parser.add_argument_group("output")
+    streams = [option for option in ("-o", "--report") if option in parser._option_string_actions]
+    if "-o" in streams and parser.prog.split()[-1] not in STREAMED:
+        streams.remove("-o")
+    told = f"{' and '.join(f'{option} -' for option in streams)} write to standard output" if streams else None
+    group = parser.add_argument_group("output", told)
     group.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
     loudness = group.add_mutually_exclusive_group()
     loudness.add_argument("-q", "--quiet", action="store_true", help="print errors only")
@@ -278,7 +289,7 @@ def _report_error(error: BaseException, console: Console, debug: bool) -> int:
     try:
         from clrecon.jobs.shared.report import error_as_dict
 
-        console.result(error_as_dict(known))
+        console.fail(error_as_dict(known))
     except OutputError:
         pass  # only the first error is reported
     return known.exit_code
@@ -300,6 +311,11 @@ def table(rows: Sequence[Sequence[object]], right: Sequence[int] = ()) -> list[s
         ).rstrip()
         for row in cells
     ]
+
+
+def describe_space(path: str, space: str) -> str:
+    """Say in what unit and frame the coordinates of a file are: ``LPS mm``; glTF prescribes metres, Y up."""
+    return "metres, Y up" if path.lower().endswith(".glb") else f"{space.upper()} mm"
 
 
 def megabytes(size: int) -> str:

@@ -76,6 +76,8 @@ class Console:
     def __init__(self, as_json: bool = False):
         self.as_json, self.quiet, self.verbose = as_json, False, False
         self.has_result = False
+        self._streams_result, self._said_on_stderr = False, False
+        self._hidden_name, self._shown_name = "", ""
         self._stdout_closed = sys.stdout is None
         self._stage = ""
         self._drawn = 0
@@ -88,18 +90,40 @@ class Console:
         self.quiet, self.verbose = quiet, verbose
         self._moving = is_terminal(sys.stderr) and not quiet and not verbose
 
+    def stream_result(self) -> None:
+        """Print the JSON object on stdout, and what is said for people on stderr: ``--report -``."""
+        self._streams_result = self._said_on_stderr = True
+
+    def stream_file(self, path: str, name: str) -> None:
+        """Leave stdout to a file, see `send`, and call the temporary `path` of it by a `name`: ``-o -``."""
+        self._said_on_stderr, self._hidden_name, self._shown_name = True, path, name
+
+    def send(self, piece: bytes) -> None:
+        """Write bytes of a file to stdout."""
+        self.clear()
+        self._guard_stdout(lambda: sys.stdout.buffer.write(piece))
+
     def say(self, text: str = "") -> None:
         """Print a line of the result for people; nothing with ``--json`` or ``-q``."""
-        if not self.as_json and not self.quiet:
+        if self.as_json or self.quiet:
+            return
+        if self._said_on_stderr:
+            self._to_stderr(text)
+        else:
             self._to_stdout(text)
 
     def result(self, value: dict[str, Any]) -> None:
-        """Print the JSON object; nothing without ``--json``."""
-        if self.as_json and not self.has_result:
+        """Print the JSON object; nothing without ``--json`` or ``--report -``."""
+        if (self.as_json or self._streams_result) and not self.has_result:
             from clrecon.jobs.shared.report import to_json
 
             self.has_result = True
             self._to_stdout(to_json(value))
+
+    def fail(self, value: dict[str, Any]) -> None:
+        """Print the JSON object of an error; nothing without ``--json``: a report is there when all went well."""
+        if self.as_json:
+            self.result(value)
 
     def warn(self, text: str, with_json: bool = False) -> None:
         """Print a warning; with ``--json`` only if the JSON object has no place for it (`with_json`)."""
@@ -155,6 +179,9 @@ class Console:
 
     def _to_stderr(self, line: str) -> None:
         self.clear()
+        if self._hidden_name:
+            for hidden in (self._hidden_name, os.path.splitext(self._hidden_name)[0]):  # one of several files too
+                line = line.replace(hidden, self._shown_name)
         if sys.stderr is not None:
             _write(sys.stderr, line + "\n")
 

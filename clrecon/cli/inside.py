@@ -6,7 +6,7 @@ import argparse
 import math
 from typing import Any
 
-from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes, pick
+from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, describe_space, megabytes, pick
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.reading import add_reading
@@ -139,9 +139,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
         console.say(line)
     files = [mesh for vertebra in report["vertebrae"] for mesh in vertebra["meshes"]]
     size = megabytes(sum(mesh["bytes"] for mesh in files))
-    console.say(
-        f"wrote    {len(files)} meshes beside {printable(options.output)}, {size}, {report['space'].upper()} mm"
-    )
+    space = describe_space(options.output, report["space"])
+    console.say(f"wrote    {len(files)} meshes beside {printable(options.output)}, {size}, {space}")
     if options.picture:
         count = sum(len(vertebra["pictures"]) for vertebra in report["vertebrae"])
         console.say(f"picture  {count} pictures beside {printable(options.picture)}")

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from clrecon.cli.common import EXIT_CODES, Parser, guard, has_hung_device
 from clrecon.cli.console import Console
+from clrecon.cli.standard_output import run_with_streams
 from clrecon.cli.wording import speaker_of
 from clrecon.errors import UsageError
 from clrecon.system.foreign_words import own_streams
@@ -146,7 +147,7 @@ def _dispatch(arguments: list[str], console: Console) -> int:
     console.set_loudness(quiet=options.quiet, verbose=options.verbose)
     limit = getattr(options, "timeout", None)
     with spoken_by(speaker_of(commands.choices[called])), time_limit(DEFAULT_SECONDS if limit is None else limit):
-        return int(module.run(options, console))
+        return run_with_streams(called, lambda: int(module.run(options, console)), options, console)
 
 
 def _as_help_option(arguments: list[str]) -> list[str]:

@@ -6,7 +6,7 @@ import argparse
 from dataclasses import fields
 from typing import Any
 
-from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes, pick
+from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, describe_space, megabytes, pick
 from clrecon.cli.console import Console, printable
 from clrecon.cli.cropping import add_cropping
 from clrecon.cli.growing import add_methods, describe_cells
@@ -298,7 +298,7 @@ def _describe_files(output: str, report: dict[str, Any], *, together: bool) -> s
     paths = [output] if together else name_outputs(output, [mesh["name"] or "" for mesh in report["meshes"]])
     names = [printable(str(path)) for path in (paths[0], paths[-1])]
     files = {1: names[0], 2: " and ".join(names)}.get(len(paths), f"{names[0]} to {names[1]}, {len(paths):,} files")
-    return f"{files}, {megabytes(report['output']['bytes'])}, {report['space'].upper()} mm"
+    return f"{files}, {megabytes(report['output']['bytes'])}, {describe_space(output, report['space'])}"
 
 
 def _describe_quality(report: dict[str, Any]) -> list[str]:

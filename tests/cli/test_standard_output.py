@@ -1,0 +1,132 @@
+"""``-o -`` and ``--report -``: what standard output holds, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from clrecon.cli import standard_output
+from clrecon.cli.main import main
+from clrecon.phantom import PhantomSettings, write_phantom
+
+
+@pytest.fixture(scope="module")
+def ct(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stream") / "ct"
+    write_phantom(folder, PhantomSettings(kind="sphere", size=(40, 40)))
+    return folder
+
+
+def run(*arguments: object) -> int:
+    return main([str(argument) for argument in arguments])
+
+
+@pytest.mark.parametrize(("name", "start"), [("-", None), ("-.ply", b"ply\n"), ("-.glb", b"glTF"), ("-.3mf", b"PK")])
+def test_a_mesh_goes_to_standard_output_as_the_file_has_it(device, ct, tmp_path, capfdbinary, name, start):
+    common = ("mesh", ct, "--hu", 200, "--device", device.index)
+    extension = ".stl" if name == "-" else name[1:]
+    assert run(*common, "-o", tmp_path / f"a{extension}") == 0
+    capfdbinary.readouterr()
+    assert run(*common, "-o", name) == 0
+    out, err = capfdbinary.readouterr()
+    assert out == (tmp_path / f"a{extension}").read_bytes() or name == "-.3mf"  # which holds the time
+    assert start is None or out.startswith(start)
+    assert b"wrote    standard output, " in err and b"clrecon-" not in err and b"input    " in err
+    assert (b"metres, Y up" in err) == (name == "-.glb")
+
+
+def test_a_report_goes_to_standard_output_and_the_remarks_to_standard_error(device, ct, tmp_path, capsys):
+    common = ("mesh", ct, "--hu", 200, "-o", tmp_path / "a.stl", "--device", device.index)
+    assert run(*common, "--report", tmp_path / "r.json") == 0
+    written = json.loads((tmp_path / "r.json").read_text())
+    capsys.readouterr()
+    assert run(*common, "--report", "-") == 0
+    said = capsys.readouterr()
+    streamed = json.loads(said.out)
+    assert streamed.keys() == written.keys()
+    assert streamed["volume_ml"] == written["volume_ml"] is not None
+    assert "wrote    " in said.err and "report   " not in said.err
+    assert not (tmp_path / "-").exists() and not os.path.exists("-")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("cloud", "--hu", 200, "-o", "-"),
+        ("cloud", "--hu", 200, "-o", "-.xyz"),
+        ("export", "-o", "-.nrrd"),
+        ("render", "--size", "40x40", "-o", "-"),
+    ],
+)
+def test_other_commands_too(device, ct, capfdbinary, arguments):
+    command, *rest = arguments
+    at = [] if command == "export" else ["--device", device.index]
+    assert run(command, ct, *rest, *at) == 0
+    out, err = capfdbinary.readouterr()
+    starts = {"-.nrrd": b"NRRD", "-.xyz": b""}.get(rest[-1], b"ply" if command == "cloud" else b"\x89PNG")
+    assert out.startswith(starts) and len(out) > 500
+    assert b"wrote    " in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("mesh", "-o", "-", "--report", "-"), 3, "-o and --report cannot share standard output"),
+        (("mesh", "-o", "-", "--json"), 3, "-o and --json cannot share standard output"),
+        (("mesh", "-o", "-.stp"), 3, "the extension '.stp'"),
+        (("mesh", "-o", "-", "--hu", "200,300"), 3, "2 files were made, and one stream holds one"),
+        (("compare", "-o", "-"), 3, "-o -: compare writes several files, which one stream cannot hold"),
+        (("mesh", "-o", "-", "--hu", "5000"), 2, "the volume runs from"),
+    ],
+)
+def test_what_one_stream_cannot_hold_is_refused_in_one_line(ct, capfdbinary, arguments, code, words):
+    command, *rest = arguments
+    assert run(command, ct, *rest) == code
+    out, err = capfdbinary.readouterr()
+    if "--json" not in rest:
+        assert out == b""
+    assert words in err.decode() and b"/stream" not in err
+    assert len([line for line in err.decode().splitlines() if "error" in line]) == 1
+
+
+def test_a_failed_job_streams_no_report_and_a_terminal_gets_no_bytes(ct, tmp_path, capsys, monkeypatch):
+    assert run("mesh", ct, "-o", tmp_path / "a.stl", "--hu", 5000, "--report", "-") == 2
+    assert capsys.readouterr().out == ""
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    assert run("mesh", ct, "-o", "-") == 3
+    said = capsys.readouterr()
+    assert "standard output is a terminal" in said.err and said.out == ""
+
+
+def test_a_reader_that_closes_early_is_no_error(device, ct):
+    command = [
+        sys.executable,
+        "-m",
+        "clrecon",
+        "mesh",
+        str(ct),
+        "--hu",
+        "200",
+        "-o",
+        "-",
+        "--device",
+        str(device.index),
+    ]
+    job = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert job.stdout is not None and job.stderr is not None
+    job.stdout.read(10)
+    job.stdout.close()
+    errors = job.stderr.read().decode()
+    job.stderr.close()
+    assert job.wait(120) == 0, errors
+    assert "Traceback" not in errors and "error" not in errors
+
+
+def test_each_streamed_command_has_the_option():
+    from clrecon.cli.main import COMMANDS
+
+    assert set(standard_output.STREAMED) <= set(COMMANDS)
