@@ -78,21 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_masking(parser)
     add_cropping(parser)
     surface = parser.add_argument_group("surface")
-    level = surface.add_mutually_exclusive_group()
-    level.add_argument("--hu", type=parse_hu, default={}, metavar="N[,N...]|A:B|auto|half:B,T", help=LEVELS_HELP)
-    level.add_argument(
-        "--below",
-        type=parse_levels,
-        metavar="N[,N...]",
-        help="in place of an iso value: inside is what lies below N HU, such as lungs, airways and sinuses (-400); the"
-        " air round the patient is left out",
-    )
-    level.add_argument(
-        "--preset",
-        type=str.lower,
-        metavar="NAME",
-        help=f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})",
-    )
+    _add_levels(surface)
     _add_solid(surface)
     surface.add_argument("--keep-outside", action="store_true", help="with --below: leave the air round the patient in")
     surface.add_argument(
@@ -143,6 +129,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_device(device)
     add_memory(device)
     _add_checks(parser)
+
+
+def _add_levels(surface: argparse._ArgumentGroup) -> None:
+    level = surface.add_mutually_exclusive_group()
+    level.add_argument("--hu", type=parse_hu, default={}, metavar="N[,N...]|A:B|auto|half:B,T", help=LEVELS_HELP)
+    level.add_argument(
+        "--below",
+        type=parse_levels,
+        metavar="N[,N...]",
+        help="in place of an iso value: inside is what lies below N HU, such as lungs, airways and sinuses (-400); the"
+        " air round the patient is left out",
+    )
+    level.add_argument(
+        "--preset",
+        type=str.lower,
+        metavar="NAME",
+        help=f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})",
+    )
 
 
 def _add_solid(surface: argparse._ArgumentGroup) -> None:
