@@ -26,6 +26,7 @@ from clrecon.jobs.shared.clouds import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file,
 
 __all__ = ["add_arguments", "run"]
 
+_LABELS_LISTED = 24
 _PARTS = ("read", "mask", "render", "turntable", "write")
 _EXAMPLES = """\
 examples:
@@ -34,6 +35,8 @@ examples:
   clrecon render CT_FOLDER -o xray.png --preset x-ray --view left
   clrecon render CT_FOLDER -o skull.png --iso 300 --light 1,-1,1 --shadows --background white
   clrecon render CT_FOLDER -o slice.png --mode slice --view axial,coronal,sagittal --window -450,1050
+  clrecon render CT_FOLDER -o sheet.png --sheet 20 --window soft
+  clrecon render CT_FOLDER -o slices.png --sheet --view sagittal --labels map.nii.gz
   clrecon render CT_FOLDER -o spine.png --curve auto
   clrecon render CT_FOLDER --turntable bone.mp4
   clrecon render cloud.ply -o cloud.png --color label --point-radius 0.5
@@ -119,6 +122,7 @@ def describe_report(report: dict[str, Any]) -> list[str]:
         f"picture  {_describe_look(report)}",
         *(f"         {line}" for line in map(_describe_picture, report["pictures"])),
         *(f"         {line}" for line in _describe_legend(report["pictures"])),
+        *(f"         {line}" for line in _describe_labels(report["pictures"])),
         *(f"mesh     {line}" for line in map(_describe_mesh, report["meshes"][report["mode"] == "mesh" :])),
         f"device   {printable(report['device'])}",
         f"time     {_describe_times(report['seconds'])}",
@@ -154,6 +158,16 @@ def _describe_legend(pictures: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
+def _describe_labels(pictures: list[dict[str, Any]]) -> list[str]:
+    """Name the labels that are drawn over the slices of any picture, and their colours, in a line each."""
+    drawn = {
+        (entry["color"], entry["label"]): entry["label_number"] for each in pictures for entry in each["labels"] or ()
+    }
+    lines = [f"{color} {printable(label)} ({number})" for (color, label), number in drawn.items()]
+    more = len(lines) - _LABELS_LISTED
+    return lines if more <= 0 else [*lines[:_LABELS_LISTED], f"and {more} more labels, see the report"]
+
+
 def _describe_look(report: dict[str, Any]) -> str:
     parts = [f"mode {report['mode']}"]
     if report["preset"]:
@@ -182,6 +196,10 @@ def _describe_picture(picture: dict[str, Any]) -> str:
     if left_out and left_out["voxels"]:
         where = "the body or the region" if left_out["region"] else "the body"
         shown += f", without {100.0 * left_out['share']:.3g} % of the voxels, outside of {where}"
+    if picture["tiles"]:
+        many = len(picture["tiles"])
+        wide, high = picture["tile_size"]
+        shown += f", {many} slice{'s' * (many > 1)} of {wide} x {high} pixels"
     return f"{picture['view']}: {width} x {height}, {scale}{shown}"
 
 

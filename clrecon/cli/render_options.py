@@ -23,6 +23,7 @@ from clrecon.cli.render_values import (
 from clrecon.errors import UsageError
 from clrecon.jobs.render.settings import (
     POINT_COLORS,
+    SHEET_SLICES,
     VIEWS,
     WINDOWS,
     LabelLook,
@@ -195,7 +196,15 @@ def add_curve(parser: argparse.ArgumentParser) -> None:
         "--slices",
         type=parse_slices,
         metavar="N|K,K,...",
-        help="of mode slices: every N-th, or with a comma those numbers, from 0 (default: about twelve)",
+        help="of mode slices and of a sheet: every N-th, or with a comma those numbers, from 0 (default: about twelve)",
+    )
+    group.add_argument(
+        "--sheet",
+        nargs="?",
+        const=SHEET_SLICES,
+        metavar="N|MMmm",
+        help=f"contact sheet of mode slice: N slices side by side (default: {SHEET_SLICES}), or one every so many mm,"
+        " such as 5mm; --view says in which plane, --slices which planes of voxels",
     )
     group.add_argument("--slice-opacity", type=float, metavar="SHARE", help="of each of them (default: 0.5)")
     group.add_argument(
@@ -221,7 +230,8 @@ def add_labels(parser: argparse.ArgumentParser) -> None:
         "--label-opacity",
         parse_label_opacity,
         "LABEL=SHARE",
-        "factor on the opacity of a label, 0 to 1; label 0 is all without a label",
+        "factor on the opacity of a label, 0 to 1, label 0 is all without a label; over slices the share of its colour"
+        " (default: 0.3)",
     )
 
 

@@ -116,6 +116,8 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[
     for name in ("depth", "values"):
         if getattr(files, name) is not None:
             check_known(settings.mode, name)
+    if files.depth is not None and settings.is_sheet:
+        raise UsageError("a contact sheet has no depths: its slices lie in planes of their own")
     if settings.background == "transparent":
         picture = "" if files.picture is None else format_of(files.picture)
         turntable = "" if files.turntable is None else animation_kind(files.turntable)[1:]

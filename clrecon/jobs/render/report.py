@@ -80,6 +80,9 @@ def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]
         "edges": made.get("edges") if picture.camera is None else edge_letters(picture.camera),
         "points": _describe_points(made),
         "left_out": made.get("left_out"),
+        "labels": made.get("labels"),
+        "tiles": made.get("tiles"),
+        "tile_size": made.get("tile_size"),
         "slabs": made.get("slabs", 1),
         "seconds": made.get("seconds"),
     }

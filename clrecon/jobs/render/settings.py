@@ -23,9 +23,11 @@ from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.looks.window import WINDOWS
 from clrecon.rendering.movies.movie import turntable_cameras
 from clrecon.rendering.pictures.annotations import SMALLEST_SIDE
+from clrecon.rendering.pictures.contact_sheet import SHEET_SIZE
 from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.modes import MODES, check_known, choose_mode, keywords_of, make_style
 from clrecon.rendering.pictures.point_look import POINT_COLORS, PointLook
+from clrecon.rendering.pictures.style_checks import SHEET_SLICES
 from clrecon.rendering.pictures.styles import (
     SPINE,
     CurveCut,
@@ -48,6 +50,7 @@ __all__ = [
     "MeshFile",
     "POINT_COLORS",
     "RenderSettings",
+    "SHEET_SLICES",
     "Turntable",
     "VIEWS",
     "WINDOWS",
@@ -164,7 +167,8 @@ class RenderSettings(InputSettings):
         One picture is taken per view, see `clrecon.rendering.views.camera.Camera.fit`.  Slices also know axial, coronal
         and sagittal.
     up, zoom, size, view_angle, center
-        As in `Camera.fit`.  The default size is 1024 x 1024; for a curved reformation it depends on the curve.
+        As in `Camera.fit`.  The default size is 1024 x 1024, of a contact sheet 1600 x 1200; for a curved reformation
+        it depends on the curve.
     background : str
         Colour, or "transparent".
     letters, scale_bar : bool
@@ -326,7 +330,11 @@ class RenderSettings(InputSettings):
             style = replace(style, lighting=_turn_light(self.light, made_for or Lighting()))
         if curve is not None and isinstance(style, CurveCut):
             style = replace(style, curve=curve)
-        if labels is not None and self.labels is not None and isinstance(style, VolumeLook | SurfaceLook):
+        if (
+            labels is not None
+            and self.labels is not None
+            and isinstance(style, VolumeLook | SurfaceLook | PlaneCut | CurveCut)
+        ):
             colors = dict(self.labels.colors) or None  # without any, every label has its own colour
             style = replace(style, labels=labels, label_colors=colors, label_opacity=dict(self.labels.opacities))
         return style
@@ -339,7 +347,14 @@ class RenderSettings(InputSettings):
     @property
     def size_used(self) -> tuple[int, int]:
         """Width and height in pixels; for a curved reformation without `size` they depend on the curve."""
-        return DEFAULT_SIZE if self.size is None else self.size
+        if self.size is not None:
+            return self.size
+        return SHEET_SIZE if self.is_sheet else DEFAULT_SIZE
+
+    @property
+    def is_sheet(self) -> bool:
+        """True for a contact sheet."""
+        return isinstance(self.style, PlaneCut) and self.style.sheet is not None
 
     @property
     def files_read(self) -> tuple[str, ...]:

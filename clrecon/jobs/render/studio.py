@@ -196,7 +196,8 @@ class Studio(Closing):
             picture = self._take_points(self.style, place["camera"], place["size"])
         else:
             picture = self._open_volume().render(self.style, background=settings.background, **place)
-        return picture.annotated(letters=settings.letters, scale_bar=settings.scale_bar, caption=settings.caption)
+        letters = settings.letters and not settings.is_sheet  # each slice of a sheet has its own
+        return picture.annotated(letters=letters, scale_bar=settings.scale_bar, caption=settings.caption)
 
     def _open_volume(self) -> Any:
         from clrecon.operators.rays.render import VolumeRenderer

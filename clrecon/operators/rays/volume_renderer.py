@@ -18,10 +18,12 @@ from clrecon.operators.rays.framing import shown_box
 from clrecon.operators.rays.ray_pictures import take_picture, take_with_layers
 from clrecon.operators.rays.slices import overlay_slices, overlay_with_layers
 from clrecon.operators.rays.surface import cast_surface
-from clrecon.operators.reformat.cut import cut_slice, reformat_curve
+from clrecon.operators.reformat.contact_sheet import take_contact_sheet
+from clrecon.operators.reformat.cut import take_curve, take_cut
 from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
+from clrecon.rendering.pictures.contact_sheet import SHEET_SIZE
 from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.modes import check_known, find_style
 from clrecon.rendering.pictures.point_look import PointLook
@@ -124,7 +126,8 @@ class VolumeRenderer(Closing):
         place = Place.checked(style, camera, seen_from, up, zoom, view_angle, center)
         if isinstance(style, CurveCut):
             return self._reformat(style, place, size, background, progress)
-        size = checked_size(DEFAULT_SIZE if size is None else size)
+        is_sheet = isinstance(style, PlaneCut) and style.sheet is not None
+        size = checked_size((SHEET_SIZE if is_sheet else DEFAULT_SIZE) if size is None else size)
         if isinstance(style, Projection) and style.leaves_out and LEFT_OUT not in self.volume.report:
             return self._within(progress).render(
                 style, camera=camera, view=view, up=up, zoom=zoom, view_angle=view_angle, center=center,
@@ -192,14 +195,17 @@ class VolumeRenderer(Closing):
         background: str | Sequence[float],
         progress: Progress | None,
     ) -> Rendering:
-        look = style.parameters()
         plane = place.camera
         if plane is None:
             plane = find_plane(
                 place.checked_box(self.frame(style)), place.view, size,
-                zoom=place.zoom, up=place.up, pixel_mm=look.pop("pixel_mm"), center=place.center,
+                zoom=place.zoom, up=place.up, pixel_mm=style.pixel_mm, center=place.center,
             )  # fmt: skip
-        return cut_slice(self._resident, plane, size, background=background, progress=progress, **look)
+        elif style.pixel_mm is not None:
+            raise UsageError("the size of pixels is that of the camera: leave it out, or the camera")
+        if style.sheet is not None:
+            return take_contact_sheet(self._resident, style, plane, self.frame(style), size, background, progress)
+        return take_cut(self._resident, style, plane, size, background, progress)
 
     def _reformat(
         self,
@@ -209,10 +215,7 @@ class VolumeRenderer(Closing):
         background: str | Sequence[float],
         progress: Progress | None,
     ) -> Rendering:
-        return reformat_curve(
-            self._resident, size=size, view=place.view, up=place.up, background=background, progress=progress,
-            **style.parameters(),
-        )  # fmt: skip
+        return take_curve(self._resident, style, place.view, place.up, size, background, progress)
 
     def _checked_step(self, ray_step: float | None) -> float:
         smallest = min(self.volume.spacing)

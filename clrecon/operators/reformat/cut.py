@@ -13,22 +13,20 @@ from clrecon.anatomy.spine_line import find_spine_line
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
-from clrecon.opencl import Device, Stopwatch
-from clrecon.operators.reformat.sample import Reformation, sample_sheet
+from clrecon.opencl import Device
+from clrecon.operators.reformat.cut_job import CutJob
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.rendering import Rendering
-from clrecon.rendering.looks.colors import is_transparent
-from clrecon.rendering.looks.window import BONE_WINDOW, checked_window, grey_image
 from clrecon.rendering.pictures.annotations import sheet_letters
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.curved import CurvedSheet, straightened_sheet, stretched_length, stretched_sheet
 from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size, find_up, find_view
-from clrecon.rendering.views.plane import Sheet, find_plane, finest_step, plane_sheet, slab_samples
+from clrecon.rendering.views.plane import find_plane, finest_step, plane_sheet
 from clrecon.system.progress import Progress
 
-__all__ = ["cut_slice", "reformat_curve"]
+__all__ = ["cut_slice", "reformat_curve", "take_curve", "take_cut"]
 
 
 DEFAULT_WIDTH_MM = 120.0
@@ -41,59 +39,6 @@ BESIDE_MM = 60.0
 LEAST_PIXELS = 768
 """Least pixels along the longer side of a curved reformation without a size, so that short curves are large enough to
 look at."""
-
-
-class _Job:
-    """The common part of both kinds of pictures: the device, how samples are combined, the picture and its report."""
-
-    def __init__(
-        self,
-        resident: DeviceVolume,
-        style: PlaneCut | CurveCut,
-        progress: Progress | None,
-    ):
-        self.resident, self.style, self.progress = resident, style, progress
-        self.samples = slab_samples(resident.volume, style.thickness)
-        self.window = BONE_WINDOW if style.window is None else checked_window(style.window)
-        self.stopwatch = Stopwatch()
-        self.warnings: list[str] = []
-
-    def sample(self, sheet: Sheet) -> Reformation:
-        return sample_sheet(
-            self.resident, sheet, self.samples, self.style.combine,
-            stopwatch=self.stopwatch, progress=self.progress, warnings=self.warnings,
-        )  # fmt: skip
-
-    def picture(
-        self,
-        made: Reformation,
-        depth: NDArray[np.float32],
-        camera: Camera | None,
-        mode: str,
-        report: dict[str, Any],
-        background: str | Sequence[float],
-    ) -> Rendering:
-        """Return the sampled values as a grey picture, before its background."""
-        image = grey_image(made.values, self.window)
-        seen = Rendering(image, depth, depth.copy(), camera, made.values, mode=mode, report=report)
-        return seen if is_transparent(background) else seen.with_background(background)
-
-    def describe(self, made: Reformation, pixel_mm: float) -> dict[str, Any]:
-        return {
-            "pixel_mm": pixel_mm,
-            "thickness_mm": self.style.thickness,
-            "combine": self.style.combine if self.samples.intervals else None,
-            "samples_a_pixel": self.samples.intervals + 1,
-            "sample_step_mm": self.samples.step if self.samples.intervals else None,
-            "window_hu": list(self.window),
-            "device": self.resident.device.label,
-            "driver": self.resident.device.driver,
-            "slabs": made.slabs,
-            "device_bytes": made.device_bytes,
-            "seconds": dict(self.stopwatch.seconds),
-            "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": [*self.resident.device.warnings, *self.warnings],
-        }
 
 
 def cut_slice(
@@ -164,18 +109,31 @@ def cut_slice(
     pixels = checked_size(size)
     style = PlaneCut(thickness=thickness, combine=combine, window=window, pixel_mm=pixel_mm, offset_mm=offset_mm)
     with open_volume(volume, device, memory, "a slice") as resident:
-        job = _Job(resident, style, progress)
         if not isinstance(plane, Camera):
             plane = find_plane(resident.volume, plane, pixels, zoom=zoom, up=up, pixel_mm=style.pixel_mm)
         elif pixel_mm is not None or zoom != 1.0 or up is not None:
             raise UsageError("zoom, up and the size of pixels are those of the camera: leave them out, or the camera")
-        sheet, camera = plane_sheet(plane, pixels, style.offset_mm)
-        made = job.sample(sheet)
-        if np.isnan(made.values).all():
-            raise UsageError(_describe_miss(resident.volume, camera))
+        return take_cut(resident, style, plane, pixels, background, progress)
+
+
+def take_cut(
+    resident: DeviceVolume,
+    style: PlaneCut,
+    plane: Camera,
+    size: tuple[int, int],
+    background: str | Sequence[float] = "black",
+    progress: Progress | None = None,
+) -> Rendering:
+    """Cut the slice of a camera, as `cut_slice` does, with the labels of the style."""
+    job = CutJob(resident, style, progress)
+    sheet, camera = plane_sheet(plane, size, style.offset_mm)
+    made = job.sample(sheet)
+    if np.isnan(made.values).all():
+        raise UsageError(_describe_miss(resident.volume, camera))
+    image, numbers = job.draw(made.values, sheet)
     depth = np.where(np.isnan(made.values), np.float32(np.nan), np.float32(camera.distance))
-    report = job.describe(made, camera.pixel_mm(pixels)) | _describe_plane(camera)
-    return job.picture(made, depth, camera, "slice", report, background)
+    report = job.describe(made, camera.pixel_mm(size)) | _describe_plane(camera)
+    return job.finish(image, made.values, depth, camera, numbers, report, background)
 
 
 def _describe_plane(camera: Camera) -> dict[str, Any]:
@@ -269,19 +227,33 @@ def reformat_curve(
     style = CurveCut(curve, kind=kind, angle=angle, width_mm=width_mm, pixel_mm=pixel_mm,
                      thickness=thickness, combine=combine, window=window)  # fmt: skip
     with open_volume(volume, device, memory, "a slice") as resident:
-        job = _Job(resident, style, progress)
-        line, found = _find_line(resident.volume, style.curve, progress)
-        across, top = _find_directions(view, up)
-        turned = bool((line.points[-1] - line.points[0]) @ top > 0.0)
-        line = line.reversed() if turned else line
-        curved, pixel = _lay_sheet(resident.volume, style, line, across, size)
-        made = job.sample(curved.sheet)
+        return take_curve(resident, style, view, up, size, background, progress)
+
+
+def take_curve(
+    resident: DeviceVolume,
+    style: CurveCut,
+    view: str | Sequence[float],
+    up: str | ArrayLike | None,
+    size: Sequence[int] | None,
+    background: str | Sequence[float] = "black",
+    progress: Progress | None = None,
+) -> Rendering:
+    """Make the picture along the curve of a style, as `reformat_curve` does, with its labels."""
+    job = CutJob(resident, style, progress)
+    line, found = _find_line(resident.volume, style.curve, progress)
+    across, top = _find_directions(view, up)
+    turned = bool((line.points[-1] - line.points[0]) @ top > 0.0)
+    line = line.reversed() if turned else line
+    curved, pixel = _lay_sheet(resident.volume, style, line, across, size)
+    made = job.sample(curved.sheet)
     made.values[np.isnan(curved.arc)] = np.nan
-    said = _describe_curve(line, curved, kind, across, turned) | {"angle_deg": style.angle, "found": found}
+    image, numbers = job.draw(made.values, curved.sheet)
+    said = _describe_curve(line, curved, style.kind, across, turned) | {"angle_deg": style.angle, "found": found}
     edges = sheet_letters(curved.sheet, ~np.isnan(curved.arc))
     report = job.describe(made, pixel) | {"curve": said, "edges": edges}
     report["warnings"] += _warn_of_part(found)
-    return job.picture(made, np.full(made.values.shape, np.nan, np.float32), None, "cpr", report, background)
+    return job.finish(image, made.values, None, None, numbers, report, background)
 
 
 def _lay_sheet(

@@ -101,8 +101,8 @@ def check_known(mode: str, keyword: str, called: str | None = None) -> None:
 def choose_mode(mode: str | None = None, preset: str | None = None, **look: object) -> str:
     """Choose the mode that names and keywords ask for: a name of `MODES`.
 
-    Without `mode` an iso value means a surface, a curve means a curved reformation, a radius of points or what they are
-    coloured by means points, and a preset means its own mode.
+    Without `mode` an iso value means a surface, a curve means a curved reformation, a sheet means slices, a radius of
+    points or what they are coloured by means points, and a preset means its own mode.
     The default is volume rendering.
 
     Raises
@@ -118,6 +118,8 @@ def choose_mode(mode: str | None = None, preset: str | None = None, **look: obje
         return "surface"
     if look.get("curve") is not None:
         return "cpr"
+    if look.get("sheet") is not None:
+        return "slice"
     if look.get("color_by") is not None or look.get("radius_mm") is not None:
         return "points"
     return "dvr" if preset is None else find_preset(preset).mode

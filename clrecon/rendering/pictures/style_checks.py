@@ -15,6 +15,7 @@ from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.views.centre_line import Curve
 
 __all__ = [
+    "SHEET_SLICES",
     "SPINE",
     "color",
     "curve",
@@ -25,6 +26,7 @@ __all__ = [
     "one_of",
     "preset_or_function",
     "ray_step",
+    "sheet",
     "slices",
 ]
 
@@ -116,6 +118,28 @@ def slices(value: Any) -> int | tuple[int, ...]:
     if len(set(chosen)) < len(chosen):
         raise UsageError(f"slices are named twice: {value!r:.60}")
     return chosen
+
+
+SHEET_SLICES = 20
+"""Slices of a contact sheet for which no number is given."""
+
+
+def sheet(value: Any) -> int | str:
+    """Check for a number of slices, True for `SHEET_SLICES`, or for their distance as text; returns it as "5 mm"."""
+    if value is True:
+        return SHEET_SLICES
+    if isinstance(value, int) and not isinstance(value, bool) and value >= 1:
+        return value
+    if isinstance(value, str):
+        text = value.strip().lower()
+        try:
+            if not text.endswith("mm") and int(text) >= 1:
+                return int(text)
+            if text.endswith("mm") and 0.0 < float(text[:-2]) < math.inf:
+                return f"{float(text[:-2]):g} mm"
+        except ValueError:
+            pass
+    raise UsageError(f"a contact sheet has a number of slices, or their distance such as '5mm', not {value!r:.60}")
 
 
 def mapping(what: str) -> Callable[[Any], Any]:

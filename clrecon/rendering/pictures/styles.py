@@ -105,9 +105,6 @@ class Style:
 class _Labelled(Style):
     """Base of styles in which labels can look different."""
 
-    lighting: Lighting | None = style_field(None, checks.instance_of("lighting", Lighting))
-    ray_step: float | None = style_field(None, checks.ray_step)
-    clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
     labels: LabelMap | None = style_field(None, checks.instance_of("labels", LabelMap))
     label_colors: _ByLabel[_Color] | None = style_field(None, checks.mapping("colours"))
     label_opacity: _ByLabel[float] | None = style_field(None, checks.mapping("opacities"))
@@ -120,11 +117,6 @@ class _Labelled(Style):
                     raise UsageError(f"{name} says how labels look: give the labels too")
         _ = self.label_style
 
-    @property
-    def light(self) -> Lighting:
-        """The lighting that is used."""
-        return self.lighting or Lighting()
-
     @cached_property
     def label_style(self) -> LabelStyle | None:
         """Colour and opacity of each label, None without labels."""
@@ -134,8 +126,22 @@ class _Labelled(Style):
         return LabelStyle.of(self.labels, colors, cast("Mapping[int | str, float] | None", self.label_opacity))
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Lit(_Labelled):
+    """Base of shaded styles."""
+
+    lighting: Lighting | None = style_field(None, checks.instance_of("lighting", Lighting))
+    ray_step: float | None = style_field(None, checks.ray_step)
+    clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
+
+    @property
+    def light(self) -> Lighting:
+        """The lighting that is used."""
+        return self.lighting or Lighting()
+
+
 @dataclass(frozen=True)
-class VolumeLook(_Labelled):
+class VolumeLook(_Lit):
     """Volume rendering: every HU with the colour and opacity of a transfer function, composited along the ray.
 
     Parameters
@@ -230,7 +236,7 @@ class Projection(Style):
 
 
 @dataclass(frozen=True)
-class SurfaceLook(_Labelled):
+class SurfaceLook(_Lit):
     """The shaded surface at an iso value: that of the closed mesh, but no mesh is made.
 
     Parameters
@@ -324,8 +330,8 @@ class SlicesInSpace(Style):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Cut(Style):
-    """Base of cuts through the volume; a thick one combines samples across it."""
+class _Cut(_Labelled):
+    """Base of cuts through the volume; a thick one combines samples across it, and labels are those of its middle."""
 
     thickness: float = style_field(0.0, checked_thickness)
     combine: str = style_field(
@@ -351,12 +357,32 @@ class PlaneCut(_Cut):
         HU shown as black and white; default: -450 to 1050, a window for bone.
     pixel_mm : float, optional
         Side of a pixel; by default the volume fits the picture.
+    sheet : int or str, optional
+        A contact sheet: so many slices side by side, or as text their distance, such as "5 mm".
+    slices : int or sequence of int, optional
+        Of a contact sheet: every n-th plane of voxels, or a list of them.
+    labels : LabelMap, optional
+        Labels that are drawn over the slice, see `clrecon.rendering.pictures.label_overlay`.
+    label_colors : mapping of label to colour, optional
+        Labels that are drawn, with their colours; default: all, each with one of its own.
+    label_opacity : mapping of label to float, optional
+        Share of its colour within a label, 0 to 1, default 0.3; 0 hides the label with its outline.
     """
 
     _mode: ClassVar[str] = "slice"
 
     _: KW_ONLY
     offset_mm: float = style_field(0.0, checked_offset)
+    sheet: int | str | None = style_field(None, checks.sheet)
+    slices: int | Sequence[int] | None = style_field(None, checks.slices)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.slices is not None and self.sheet is None:
+            object.__setattr__(self, "sheet", checks.SHEET_SLICES)
+        if self.sheet is not None and (self.offset_mm or self.pixel_mm is not None):
+            what = name_parameter("offset_mm" if self.offset_mm else "pixel_mm")
+            raise UsageError(f"a contact sheet shows slices through all of the scan, at one scale: leave {what} out")
 
 
 @dataclass(frozen=True)
@@ -373,7 +399,7 @@ class CurveCut(_Cut):
         Rotation of the rows of a straightened picture about the centre line, in degrees.
     width_mm : float, optional
         Width of the picture if no size is given; default: 120 mm.
-    thickness, combine, window
+    thickness, combine, window, labels, label_colors, label_opacity
         As of `PlaneCut`; the thick slice lies across the picture.
     pixel_mm : float, optional
         Side of a pixel; by default the curve fills the height of the size; without a size it is the smallest spacing,

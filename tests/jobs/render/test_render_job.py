@@ -335,6 +335,30 @@ def test_slices_show_by_default_and_the_report_names_their_view(
     assert report["pictures"][0]["view"] == "30,30"
 
 
+def test_a_sheet_is_reported_with_its_slices_and_labels(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    from clrecon.labels import LabelMap
+    from clrecon.labels.write_nifti import encode_nifti
+    from clrecon.reading import read_volume
+
+    volume = read_volume(sphere[0])
+    numbers = (volume.voxels > 100).astype(np.uint8)
+    ball = encode_nifti(LabelMap(numbers, volume.affine, {1: "ball"}), packed=True)
+    (tmp_path / "ball.nii.gz").write_bytes(ball)
+    labels = LabelLook(str(tmp_path / "ball.nii.gz"), {"1": "#ff0000"})
+    settings = RenderSettings.of(sheet=6, labels=labels, letters=True, scale_bar=True, device=str(device.index))
+    assert settings.mode == "slice" and settings.size_used == (1600, 1200) and settings.is_sheet
+    report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png", values=tmp_path / "v.npy"), settings)
+    picture = report["pictures"][0]
+    assert picture["size"] == [1600, 1200] and len(picture["tiles"]) == 6 and picture["camera"] is None
+    assert [entry["color"] for entry in picture["labels"]] == ["#ff0000"]
+    image, values = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int), np.load(tmp_path / "v.npy")
+    assert ((image[..., 0] - image[..., 1]) > 30).sum() == pytest.approx((values > 100).sum(), rel=0.15)
+    with pytest.raises(UsageError, match="a contact sheet has no depths"):
+        make_pictures(sphere[0], PictureFiles(tmp_path / "a.png", depth=tmp_path / "d.npy"), settings)
+
+
 def test_a_minimum_says_what_it_leaves_out_and_regions_go_too(device: Any, tmp_path: Path) -> None:
     """A ball of tissue in air; a region leaves a part of it, and no air round that."""
     folder = tmp_path / "ct"

@@ -43,14 +43,18 @@ RAYS: Wrong = {
     ],
     "clip": [([(0, 0, 1, 0)], "the clip of a picture is a Clip or None, not list")],
 }
-LABELLED: Wrong = {
-    **RAYS,
-    "lighting": [("head", "the lighting of a picture is a Lighting or None, not str")],
+DRAWN: Wrong = {
     "labels": [("labels.nii", "the labels of a picture is a LabelMap or None, not str")],
     "label_colors": [({1: "red"}, "give the labels too"), ("red", "colours of labels are a mapping")],
     "label_opacity": [({1: 0.5}, "give the labels too"), (0.5, "opacities of labels are a mapping")],
 }
+LABELLED: Wrong = {
+    **RAYS,
+    **DRAWN,
+    "lighting": [("head", "the lighting of a picture is a Lighting or None, not str")],
+}
 CUTS: Wrong = {
+    **DRAWN,
     "thickness": [(-1.0, "thickness of a slice"), (np.inf, "thickness"), (None, "thickness"), ("5 mm", "'5 mm'")],
     "combine": [("sum", "mean, max, min, not 'sum'"), (TWO, "combined by"), (None, "combined by")],
     "window": [((5, 5), "a window is its lowest and highest HU"), (100, "window")],
@@ -100,7 +104,12 @@ WRONG: dict[type[Style], Wrong] = {
         "lighting": LABELLED["lighting"],
         "clip": RAYS["clip"],
     },
-    PlaneCut: {**CUTS, "offset_mm": [(np.nan, "offset of a slice"), (np.inf, "offset"), (TWO, "offset")]},
+    PlaneCut: {
+        **CUTS,
+        "offset_mm": [(np.nan, "offset of a slice"), (np.inf, "offset"), (TWO, "offset")],
+        "sheet": [(0, "a number of slices, or their distance"), ("many", "not 'many'"), (TWO, "contact sheet")],
+        "slices": [(0, "every 0th slice"), ("all", "whole numbers")],
+    },
     CurveCut: {
         **CUTS,
         "curve": [("auto", "'spine' to look for it"), ([(0, 0, 0)], "two different points"), (3, "shape")],
@@ -200,6 +209,8 @@ ASKED: dict[str, tuple[dict[str, Any], Style]] = {
     "a surface": ({"mode": "surface", "color": "red", "depth_cue": 0.0}, SurfaceLook(color="red", depth_cue=0.0)),
     "slices": ({"mode": "slices", "slices": 4, "slice_opacity": 1.0}, SlicesInSpace(4, opacity=1.0)),
     "a plane": ({"mode": "slice", "offset_mm": 2.0, "combine": "max"}, PlaneCut(offset_mm=2.0, combine="max")),
+    "a sheet": ({"sheet": "5mm"}, PlaneCut(sheet="5 mm")),
+    "slices of a sheet": ({"mode": "slice", "slices": 4}, PlaneCut(sheet=20, slices=4)),
     "a kind of curve": ({"mode": "cpr", "cpr": "stretched"}, CurveCut(kind="stretched")),
     "a curve": ({"curve": "spine"}, CurveCut()),
     "points": ({"mode": "points", "window": (0, 9)}, PointLook(window=(0.0, 9.0))),
