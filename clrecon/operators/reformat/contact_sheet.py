@@ -29,6 +29,9 @@ PARALLEL = 1.0 - 1e-6
 
 MOST_SLICES = 1000
 
+MOST_TURNED = 30.0
+"""Degrees between a plane that is asked for and planes of voxels that are shown in its place: gantries tilt less."""
+
 
 class _Place(NamedTuple):
     """A slice: its distance in mm from the plane of the camera, and the number of its plane of voxels."""
@@ -81,6 +84,8 @@ def take_contact_sheet(
     tell = progress or ignore_progress
     job = CutJob(resident, style, None)
     _, plane = plane_sheet(plane, size)
+    if style.slices is not None:
+        plane = _turn_to_slices(resident.volume, plane, job.warnings)
     right, up, forward = plane.basis()
     seen = box_corners(shown) - plane.focal_point
     places = _choose(resident.volume, style, plane, seen @ forward)
@@ -115,6 +120,28 @@ def take_contact_sheet(
     assert made is not None
     report = job.describe(made, layout.pixel_mm) | {"edges": edges, "tiles": tiles, "tile_size": [width, height]}
     return job.finish(image, values, None, None, numbers, report, background)
+
+
+def _turn_to_slices(volume: Volume, plane: Camera, warnings: list[str]) -> Camera:
+    """Return a camera across the planes of voxels that lie nearest to its own: a tilted stack is shown as it was taken.
+
+    The camera stays where no planes of voxels lie within `MOST_TURNED` degrees.
+    """
+    forward = plane.basis()[2]
+    columns = volume.affine[:3, :3]
+    normals = [np.cross(columns[:, (axis + 1) % 3], columns[:, (axis + 2) % 3]) for axis in range(3)]
+    normals = [normal / np.linalg.norm(normal) for normal in normals]
+    cosines = [float(normal @ forward) for normal in normals]
+    nearest = int(np.abs(cosines).argmax())
+    turned = float(np.degrees(np.arccos(min(1.0, abs(cosines[nearest])))))
+    if abs(cosines[nearest]) > PARALLEL or turned > MOST_TURNED:
+        return plane
+    warnings.append(
+        f"the slices are tilted by {turned:.1f} degrees from the plane asked for: they are as they were taken"
+    )
+    towards = np.sign(cosines[nearest]) * normals[nearest]
+    position = np.asarray(plane.focal_point) - plane.distance * towards
+    return replace(plane, position=tuple(position.tolist()))
 
 
 def _choose(volume: Volume, style: PlaneCut, plane: Camera, depths: Float64Array) -> list[_Place]:

@@ -82,7 +82,19 @@ def test_oblique_slices_have_a_distance_and_no_number(device: Any) -> None:
     picture = take(oblique, device, sheet=4)
     assert {tile["slice"] for tile in picture.report["tiles"]} == {None} and len(picture.report["tiles"]) == 4
     with pytest.raises(UsageError, match="planes of voxels do not lie in this view"):
-        take(oblique, device, slices=2)
+        take(oblique, device, "45,45", slices=2)
+
+
+def test_slices_of_a_tilted_gantry_are_shown_as_they_were_taken(device: Any) -> None:
+    tilted = AFFINE.copy()
+    tilted[:3, 1] = 2.0 * np.array([0.0, np.cos(np.radians(18.5)), np.sin(np.radians(18.5))])
+    picture = take(Volume(steps().voxels, tilted), device, slices=[3, 12])
+    assert [tile["slice"] for tile in picture.report["tiles"]] == [12, 3]
+    for number, values in zip((12, 3), tiles_of(picture), strict=True):
+        there = values[np.isfinite(values)]
+        assert np.allclose(there, 10 * number, atol=0.05) and np.isfinite(values).mean() > 0.5
+    assert [text for text in picture.report["warnings"] if "tilted by 18.5 degrees from the plane asked for" in text]
+    assert picture.report["edges"]["right"] == "L" and picture.report["edges"]["top"][0] == "A"
 
 
 def test_sides_scale_and_zoom_are_those_of_a_single_slice(device: Any) -> None:
