@@ -13,14 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.anatomy.spine_cells import CELL_MM, SpineCells
-from clrecon.anatomy.spine_traits import CANAL_RADIUS, SOFT_HU, STILL, Likeness, traits_of
+from clrecon.anatomy.spine_traits import CANAL_RADIUS, SOFT_HU, STILL, SURE, Likeness, traits_of
 
-__all__ = ["GAP_MM", "SpineEnd", "follow", "look_beyond"]
+__all__ = ["GAP_MM", "SpineEnd", "follow", "look_beyond", "missing_traits"]
 
 GAP_MM = 12.0
 """Largest gap between slices of the canal: an artefact, or a vertebra that looks different."""
 REACH = 2
 """Cells by which the canal may move aside from slice to slice."""
+
+
+MISSING = {
+    "wall": "bone around it on all sides",
+    "body": "a vertebral body in front of it",
+    "soft": "soft tissue in its middle",
+    "mirror": "left and right that are alike",
+}
+LOOKED_AT = 9
+"""Slices of a path on which traits are compared."""
 
 
 @dataclass(frozen=True)
@@ -120,3 +130,14 @@ def _lacking(cells: SpineCells, place: NDArray[np.int64]) -> str:
     if traits["body"] < STILL["body"]:
         parts.append("no vertebral body in front of it")
     return " and ".join(filter(None, (", ".join(parts[:-1]), *parts[-1:])))
+
+
+def missing_traits(cells: SpineCells, likeness: Likeness, path: NDArray[np.int64]) -> str:
+    """Say in words which traits most slices lack on a path that is no canal; empty where there is no path."""
+    box = likeness.box_of(cells)
+    chosen = path[np.unique(np.linspace(0, len(path) - 1, LOOKED_AT).astype(int))] if len(path) else path
+    found = [({name: field[j, i] for name, field in traits_of(box, int(k)).items()}) for k, j, i in chosen]
+    lacking = [
+        text for name, text in MISSING.items() if 2 * sum(traits[name] < SURE[name] for traits in found) > len(found)
+    ]
+    return " and ".join(filter(None, (", ".join(lacking[:-1]), *lacking[-1:])))

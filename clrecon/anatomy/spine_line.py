@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.anatomy.spine_cells import CELL_MM, Field, SpineCells, average_cells, disc_mean, grow_cortex, plan_cells
-from clrecon.anatomy.spine_ends import GAP_MM, SpineEnd, follow, look_beyond
+from clrecon.anatomy.spine_ends import GAP_MM, SpineEnd, follow, look_beyond, missing_traits
 from clrecon.anatomy.spine_traits import BODY_RADIUS, WORTH, measure_likeness
 from clrecon.errors import RefusedInputError
 from clrecon.geometry.affine import Float64Array
@@ -104,8 +104,10 @@ def find_spine_line(volume: Volume, *, sure_only: bool = False, progress: Progre
     begin, end = _longest_run(sure)
     searched, height = len(cells.values) * CELL_MM[2], (end - begin) * CELL_MM[2]
     if height < SHORTEST_MM:
+        missing = missing_traits(cells, likeness, path)
+        what = f"; the place most like a canal lacks {missing}" if missing else ""
         raise RefusedInputError(
-            f"no spine was found that one could be sure of ({_describe_run(cells, path[begin:end], searched)}):"
+            f"no spine was found that one could be sure of ({_describe_run(cells, path[begin:end], searched)}{what}):"
             " give points of the centre line"
         )
     path = path[begin:end]

@@ -192,5 +192,9 @@ def test_a_scan_with_too_little_of_a_spine_says_where_that_is(phantom):
     volume, canal = phantom
     with pytest.raises(RefusedInputError, match=r"of 20 mm look like one, at z -?\d+ to -?\d+ mm, and at least 35 mm"):
         find_spine_line(Volume(volume.voxels[:8], volume.affine))
-    with pytest.raises(RefusedInputError, match=r"none of its \d+ mm look like one"):
+    with pytest.raises(RefusedInputError, match=r"none of its \d+ mm look like one\): give points"):
         find_spine_line(made_up("air", phantom))
+    askew = np.eye(4)
+    askew[:3, :3] = rotation((0.0, 0.0, 20.0))
+    with pytest.raises(RefusedInputError, match="most like a canal lacks left and right that are alike"):
+        find_spine_line(Volume(volume.voxels, askew @ volume.affine))

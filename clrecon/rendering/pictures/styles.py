@@ -96,10 +96,6 @@ class Style:
         """The name of this kind of picture, one of `clrecon.rendering.pictures.modes.MODES`."""
         return self._mode
 
-    def parameters(self) -> dict[str, Any]:
-        """The fields by name, as keyword arguments of a function."""
-        return {own.name: getattr(self, own.name) for own in fields(self)}
-
 
 @dataclass(frozen=True, kw_only=True)
 class _Labelled(Style):
