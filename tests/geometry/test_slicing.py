@@ -106,6 +106,8 @@ def test_spacing_handedness_and_a_single_slice():
     volume = VOLUMES["oblique"]
     assert volume[::2, ::3].spacing == pytest.approx((0.7, 1.5, 2.5))
     assert is_left_handed(volume[::-1].affine) and not is_left_handed(volume[::-1, ::-1].affine)
+    backward = VOLUMES["flipped"][::-1, ::-1, ::-1].affine
+    assert not np.signbit(backward[backward == 0.0]).any()
     single = volume[3:4:2, 4:5, 1:0:-1]
     assert single.shape == (1, 1, 1) and single.spacing == pytest.approx(volume.spacing)
     assert single.voxels.item() == volume.voxels[3, 4, 1] and is_left_handed(single.affine)

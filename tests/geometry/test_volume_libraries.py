@@ -212,9 +212,18 @@ def test_parts_of_pyvista_images_lie_where_they_were():
     image = volume.to_pyvista()
     image.point_data["doubled"] = image["HU"] * 2
     assert np.array_equal(Volume.from_pyvista(image, "doubled").voxels, 2 * volume.voxels)
+
+
+def test_voxels_of_pyvista_are_copied_and_lie_where_its_points_do():
+    volume = numbered(AFFINES["oblique"])
+    image = volume.to_pyvista()
     made = Volume.from_pyvista(image)
     image["HU"][:] = 0
-    assert np.array_equal(made.voxels, numbered(AFFINES["left-handed"]).voxels)
+    assert (volume.voxels == 0).all() and np.array_equal(made.voxels, numbered(AFFINES["oblique"]).voxels)
+    image.offset = (2, -1, 7)  # indices that begin elsewhere: the first point is no longer the origin
+    moved = Volume.from_pyvista(image)
+    assert np.abs(moved.ijk_to_lps(IJK) - image.points).max() <= tolerances.IMAGE_POINT_MM
+    assert np.abs(moved.affine - volume.affine).max() > 1.0
 
 
 def test_scaled_values_of_nibabel_are_hu(tmp_path):
