@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import Any
 
-from clrecon.errors import UsageError
 from clrecon.formats.grid_file import Purpose
-from clrecon.system.installing import install_command
+from clrecon.system.packages import import_package
 
 __all__ = ["import_extra"]
 
@@ -22,8 +20,4 @@ def import_extra(module: str, purpose: Purpose) -> Any:
     UsageError
         It is not installed; the message says how to install it.
     """
-    try:
-        return import_module(module)
-    except ImportError as error:
-        package = _PACKAGES.get(module, module)
-        raise UsageError(f"this {purpose.noun} needs the package {package}: {install_command(package)}") from error
+    return import_package(module, f"this {purpose.noun}", _PACKAGES.get(module))

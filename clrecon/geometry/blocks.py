@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from clrecon.geometry.affine import Float64Array, slice_normal, tilt_degrees
+from clrecon.geometry.affine import Float64Array, signed_tilt, slice_normal
 from clrecon.geometry.grid import Grid
 from clrecon.geometry.orientation import describe_orientation
 from clrecon.geometry.uneven import fit_even
@@ -129,7 +129,7 @@ def describe_place(report: Mapping[str, Any], volume: Any) -> dict[str, Any]:
         "extent_mm": [ni * di, nj * dj, float(gaps.sum()) + usual if nk > 1 else usual],
         "affine_ijk_to_lps_mm": volume.affine.tolist(),
         "orientation": describe_orientation(volume.affine),
-        "tilt_deg": tilt_degrees(volume.affine),
+        "tilt_deg": signed_tilt(volume.affine),
         "gap_mm": {"min": float(gaps.min()), "max": float(gaps.max()), "median": usual},
         "uneven": volume.uneven,
         "gap_runs": None,

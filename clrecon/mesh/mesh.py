@@ -14,6 +14,7 @@ from clrecon.geometry.frames import choose_space, frame_from_lps
 from clrecon.mesh.base import BaseMesh
 from clrecon.mesh.components import select_components, split_components
 from clrecon.mesh.quality import MeshQuality, measure_quality, measure_triangles
+from clrecon.system.packages import import_package
 
 __all__ = ["Mesh"]
 
@@ -161,10 +162,7 @@ class Mesh(BaseMesh):
         UsageError
             trimesh is not installed, or the mesh fails `check`.
         """
-        try:
-            import trimesh
-        except ImportError as error:
-            raise UsageError("trimesh is not installed: pip install trimesh") from error
+        trimesh = import_package("trimesh", "to_trimesh")
         self.check()
         made = trimesh.Trimesh(
             np.array(self.vertices, dtype=np.float64),

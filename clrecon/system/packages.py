@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import Any
 
 from clrecon.errors import UsageError
+from clrecon.system.installing import install_command
 
 __all__ = ["import_package"]
 
@@ -31,4 +32,4 @@ def import_package(module: str, what: str, package: str | None = None) -> Any:
         return import_module(module)
     except ImportError as error:
         named = package or module
-        raise UsageError(f"{what} needs the package {named}: pip install {named}") from error
+        raise UsageError(f"{what} needs the package {named}: {install_command(named)}") from error

@@ -164,7 +164,7 @@ def test_a_volume_is_no_sequence_of_parts():
         3 in VOLUMES["oblique"]  # type: ignore[operator]  # noqa: B015
 
 
-@pytest.mark.parametrize("tilt", [0.0, 12.0])
+@pytest.mark.parametrize("tilt", [0.0, 12.0, -12.0])
 def test_the_certificate_is_that_of_the_part(tmp_path, tilt):
     dicom_series.write_series(tmp_path, dicom_series.Plan(shape=(7, 6, 9), gap=1.25, tilt_deg=tilt))
     volume = read_volume(tmp_path)
@@ -175,7 +175,8 @@ def test_the_certificate_is_that_of_the_part(tmp_path, tilt):
     assert np.allclose(own.affine_ijk_to_lps_mm, part.affine) and own.hu_range == list(part.hu_range)
     assert own.gap_mm["median"] == pytest.approx(2 * volume.certificate.gap_mm["median"])
     assert own.orientation == describe_orientation(part.affine) and not own.orientation["right_handed"]
-    assert own.tilt_deg == pytest.approx(tilt, abs=1e-3)
+    assert own.tilt_deg == pytest.approx(volume.certificate.tilt_deg, abs=1e-6)
+    assert abs(own.tilt_deg) == pytest.approx(abs(tilt), abs=1e-3) and own.tilt_deg * tilt <= 0.0
     assert own.frame_of_reference_hash == volume.certificate.frame_of_reference_hash is not None
     assert own.warnings[-1].startswith("sliced to 5:1:-2, 1:4, : of k, j, i: 54 of 378 voxels stay")
     assert "sliced" not in volume.report

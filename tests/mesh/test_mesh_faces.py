@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 from sample_meshes import ball, box, torus, torus_volume_ml
@@ -112,6 +114,12 @@ def test_there_and_back_by_trimesh() -> None:
     assert np.array_equal(Mesh.from_trimesh(far.to_trimesh()).vertices, far.vertices)
     with_normals = Mesh(*ball(1.0, 6), ball(1.0, 6)[0])
     np.testing.assert_allclose(with_normals.to_trimesh().vertex_normals, with_normals.normals, atol=1e-6)
+
+
+def test_a_missing_trimesh_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    with pytest.raises(UsageError, match="to_trimesh needs the package trimesh: .*install trimesh"):
+        three_parts().to_trimesh()
 
 
 def test_what_is_no_mesh_is_refused() -> None:

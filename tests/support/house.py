@@ -106,7 +106,7 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "viewer": frozenset({"numpy"}),
 }
 INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
-    "geometry": frozenset({"scipy", "pyvista"}),
+    "geometry": frozenset({"scipy", "pyvista", "nibabel", "SimpleITK"}),
     "anatomy": frozenset({"scipy"}),
     "dicom": frozenset({"imagecodecs", "openjpeg", "rle", "jpeg_ls", "pylibjpeg"}),
     "formats": frozenset({"nibabel", "nrrd", "SimpleITK"}),
