@@ -1,10 +1,13 @@
-"""Command lines of documents, parsed as clrecon does."""
+"""Command lines: those of documents, parsed as clrecon does, and wrong ones, which are refused."""
 
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 
-__all__ = ["parse_command"]
+import pytest
+
+__all__ = ["check_refused", "parse_command"]
 
 
 def parse_command(arguments: list[str]) -> None:
@@ -27,3 +30,16 @@ def parse_command(arguments: list[str]) -> None:
     import_module(COMMANDS[arguments[0]].module).add_arguments(parser)
     add_common(parser)
     parser.parse_args(arguments[1:])
+
+
+def check_refused(
+    arguments: list[str], code: int, words: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Run `arguments`, which end with `code` and one line with `words`, and leave `folder` as it was."""
+    from clrecon.cli.main import main
+
+    before = sorted(folder.iterdir())
+    assert main([*arguments, "-q"]) == code
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line
+    assert sorted(folder.iterdir()) == before

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_lines import check_refused
 from sample_meshes import ball, box
 
 import clrecon
@@ -139,12 +140,8 @@ def test_wrong_usage_is_one_line_and_writes_nothing(
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
-    before = sorted(tmp_path.iterdir())
     given = [files["b.ply"] if word == "B" else word for word in extra]
-    assert main(["distance", files["a.stl"], *given, "-q"]) == code
-    (line,) = capsys.readouterr().err.splitlines()
-    assert words in line
-    assert sorted(tmp_path.iterdir()) == before
+    check_refused(["distance", files["a.stl"], *given], code, words, tmp_path, capsys)
 
 
 def test_a_mesh_of_nothing_has_no_distances(files: dict[str, str], tmp_path: Path, capsys: Any) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_lines import check_refused
 from label_files import write_nifti
 
 from clrecon.cli.main import main
@@ -91,12 +92,8 @@ def test_wrong_usage_is_one_line_and_writes_nothing(
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
-    before = sorted(tmp_path.iterdir())
     given = [files["labels"] if word == "LABELS" else word for word in extra]
-    assert main(["stats", files["ct"], *given, "-q"]) == code
-    (line,) = capsys.readouterr().err.splitlines()
-    assert words in line
-    assert sorted(tmp_path.iterdir()) == before
+    check_refused(["stats", files["ct"], *given], code, words, tmp_path, capsys)
 
 
 def test_what_exists_stays_with_no_clobber(files: dict[str, str], tmp_path: Path, capsys: Any) -> None:
