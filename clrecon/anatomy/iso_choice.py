@@ -32,6 +32,7 @@ from clrecon.anatomy.bone_edges import Background, BoneEdges, leave_contrast_med
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry.volume import AIR_HU, Volume
 from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.text import count_of
 from clrecon.system.wording import name_parameter
 
 __all__ = ["CONTRAST_SAID", "IsoChoice", "choose_iso_value", "half_iso_value"]
@@ -204,7 +205,8 @@ def _describe(background: Background, edges: BoneEdges, flat: tuple[float, float
     steepness = _median(edges.step, edges.contrast)
     reason = (
         f"half way between {'air' if background.name == 'air' else 'tissue'} {tissue:.0f} and bone {bone:.0f} HU, "
-        f"medians of {len(half):,} edges in {len(sampled)} slices; single edges spread by {spread:.0f} HU, "
+        f"medians of {count_of(len(half), 'edge')} in {count_of(len(sampled), 'slice')}; single"
+        f" edges spread by {spread:.0f} HU, "
         f"{spread / steepness:.2f} voxel"
     )
     if flat_share >= CONTRAST_SAID:

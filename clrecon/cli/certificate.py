@@ -91,12 +91,21 @@ def _describe_thickness(thickness: dict[str, Any], usual_gap: float) -> str:
     text = f"{low:g} mm" if low == high else f"{low:g} to {high:g} mm"
     least, most, overlap = (thickness["overlap_mm"][name] for name in ("min", "max", "median"))
     if most - least > _SAME * usual_gap:
-        return f"{text}: between neighbouring slices from {_overlap(least, usual_gap)} to {_overlap(most, usual_gap)}"
+        return f"{text}: {_overlaps(least, most)}"
     if abs(overlap) <= _SAME * usual_gap:
         return f"{text}: neighbouring slices touch"
     percent = thickness["overlap_percent"]
     share = "" if percent is None else f" ({abs(percent):.0f} % of the gap)"
     return f"{text}: {_overlap(overlap, usual_gap)} between neighbouring slices{share}"
+
+
+def _overlaps(least: float, most: float) -> str:
+    """Describe by how much neighbouring slices overlap where that differs; below 0 is what lies between them."""
+    if least >= 0.0:
+        return f"neighbouring slices overlap by {least:.3g} to {most:.3g} mm"
+    if most <= 0.0:
+        return f"{-most + 0.0:.3g} to {-least:.3g} mm between neighbouring slices are not measured"
+    return f"neighbouring slices overlap by up to {most:.3g} mm, or up to {-least:.3g} mm between them are not measured"
 
 
 def _overlap(length: float, usual_gap: float) -> str:

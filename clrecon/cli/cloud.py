@@ -16,6 +16,7 @@ from clrecon.cli.points import parse_point
 from clrecon.cli.reading import add_reading
 from clrecon.jobs.cloud.settings import DENOISERS, GHOSTS, KINDS, STEPS, CloudSettings
 from clrecon.jobs.shared.clouds import CLOUD_INPUTS
+from clrecon.system.text import count_of
 
 __all__ = ["add_arguments", "describe_cloud_job", "run"]
 
@@ -216,7 +217,7 @@ def describe_cloud_job(report: dict[str, Any]) -> list[str]:
         f"input    {_describe_input(report)}",
         *_describe_steps(report["steps"]),
         *_describe_removed(report),
-        f"cloud    {report['points']:,} points{_describe_known(report)}",
+        f"cloud    {count_of(report['points'], 'point')}{_describe_known(report)}",
         *_describe_surface(report["surface"]),
         f"device   {printable(report['device'])}",
         f"time     {_describe_times(report['seconds'])}",
@@ -250,10 +251,12 @@ def _describe_step(step: dict[str, Any]) -> str:
         level = f" of {step['iso_value_hu']:g} HU" if step.get("iso_value_hu") is not None else ""
         level = f" of {band[0]:g} to {band[1]:g} HU" if band and band[1] is not None else level
         share = f", {100.0 * step['share']:.3g} % of {step['voxels']:,} voxels" if "share" in step else ""
-        return f"{after:,} points ({step['kind']}{level}){share}"
+        return f"{count_of(after, 'point')} ({step['kind']}{level}){share}"
     if "clusters" in step and "eps_mm" in step:
         noise = f", {step['noise_points']:,} points are noise" if "noise_points" in step else ""
-        return f"{step['clusters']:,} clusters at eps {step['eps_mm']:.4g} mm, min {step['min_samples']}{noise}"
+        return (
+            f"{count_of(step['clusters'], 'cluster')} at eps {step['eps_mm']:.4g} mm, min {step['min_samples']}{noise}"
+        )
     if "rms_move_mm" in step:
         return f"{after:,} points moved by {step['rms_move_mm']:.3f} mm rms, at most {step['largest_move_mm']:.3f} mm"
     if "doubtful" in step:

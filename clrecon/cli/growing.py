@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from clrecon.cli.points import parse_point
+from clrecon.system.text import count_of
 
 __all__ = ["add_methods", "describe_cells"]
 
@@ -64,7 +65,8 @@ def describe_cells(report: dict[str, Any]) -> list[str]:
             f"cells    {cells['visited']:,} visited, {cells['active']:,} active, {cells['all']:,} in all (1 in"
             f" {share:,.0f} visited)",
             f"grown    from {', '.join(growing['from'])}: {growing['components_taken']:,} of"
-            f" {growing['components']:,} parts; {100 * growing['cells_left_out_share']:.1f} % of the active cells left"
+            f" {count_of(growing['components'], 'part')};"
+            f" {100 * growing['cells_left_out_share']:.1f} % of the active cells left"
             f" out, the largest part of them {growing['largest_left_out_cells']:,}",
         ]
         lines += [line for line in told if line not in lines]

@@ -11,6 +11,7 @@ from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.reading import add_reading
 from clrecon.jobs.inside.pictures import DEFAULT_VIEW
+from clrecon.system.text import count_of
 
 __all__ = ["add_arguments", "run"]
 
@@ -140,10 +141,12 @@ def run(options: argparse.Namespace, console: Console) -> int:
     files = [mesh for vertebra in report["vertebrae"] for mesh in vertebra["meshes"]]
     size = megabytes(sum(mesh["bytes"] for mesh in files))
     space = describe_space(options.output, report["space"])
-    console.say(f"wrote    {len(files)} meshes beside {printable(options.output)}, {size}, {space}")
+    console.say(
+        f"wrote    {count_of(len(files), 'mesh', 'meshes')} beside {printable(options.output)}, {size}, {space}"
+    )
     if options.picture:
         count = sum(len(vertebra["pictures"]) for vertebra in report["vertebrae"])
-        console.say(f"picture  {count} pictures beside {printable(options.picture)}")
+        console.say(f"picture  {count_of(count, 'picture')} beside {printable(options.picture)}")
     if options.report:
         console.say(f"report   {printable(options.report)}")
     for warning in report["warnings"]:

@@ -24,6 +24,7 @@ from clrecon.cli.refinement import (
     finish_with_gates,
 )
 from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS
+from clrecon.system.text import count_of, say_digits
 
 __all__ = ["add_arguments", "describe_mesh", "describe_volume", "run"]
 
@@ -237,7 +238,7 @@ def _describe_solid(solid: dict[str, Any] | None) -> list[str]:
     if solid is None:
         return []
     left = sum(kind["ml"] for kind in solid["open"].values())
-    stays = f", {left:.3g} ml enclosed stay open" if left >= 0.05 else ""
+    stays = f", {say_digits(left)} ml enclosed stay open" if left >= 0.05 else ""
     share = 100.0 * solid["filled_share"]
     return [f"solid    {solid['filled_ml']:,.1f} ml filled, {share:.0f} % of the solid{stays}"]
 
@@ -272,7 +273,7 @@ def describe_volume(volume: dict[str, Any]) -> str:
     parts = []
     if volume.get("shape_ijk"):
         ni, nj, nk = volume["shape_ijk"]
-        parts.append(f"{nk} slices of {ni} x {nj}")
+        parts.append(f"{count_of(nk, 'slice')} of {ni} x {nj}")
     if volume.get("spacing_mm"):
         di, dj, dk = volume["spacing_mm"]
         gaps = volume["gap_mm"]

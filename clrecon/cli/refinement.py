@@ -8,6 +8,7 @@ from typing import Any
 
 from clrecon.cli.console import Console
 from clrecon.jobs.mesh.purposes import PURPOSES, Purpose
+from clrecon.system.text import count_of, say_digits
 
 __all__ = [
     "GATE_FAILED",
@@ -81,7 +82,7 @@ def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
     worst = max(found, key=lambda each: each["deviation"]["hd95_mm"] / each["voxel_mm"])
     parts = []
     if "smooth" in worst:
-        parts.append(f"smoothed ({worst['smooth']['iterations']} iterations)")
+        parts.append(f"smoothed ({count_of(worst['smooth']['iterations'], 'iteration')})")
     if "decimate" in worst:
         parts.append(_describe_decimation(worst["decimate"]))
     deviation, voxel = worst["deviation"], worst["voxel_mm"]
@@ -101,7 +102,7 @@ def _describe_decimation(found: dict[str, Any]) -> str:
     topology = _describe_topology(found["topology"])
     if found["ended_by"] == "share":
         return f"{reached:.1f} % of the triangles taken away, as asked, {topology}"
-    bound = f"the bound of {found['max_deviation_mm']:.3g} mm"
+    bound = f"the bound of {say_digits(found['max_deviation_mm'])} mm"
     return f"{reached:.1f} % of the triangles taken away of {asked:g} % asked for: {bound} ended it, {topology}"
 
 
@@ -136,17 +137,20 @@ def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
     lines = [f"{which}size {' x '.join(f'{length:.1f}' for length in facts['size_mm'])} mm"]
     if wall["median_mm"] is not None:
         lines[0] += (
-            f", walls {wall['median_mm']:.1f} mm (median), 5 % below {wall['p5_mm']:.2g} mm,"
+            f", walls {wall['median_mm']:.1f} mm (median), 5 % below {say_digits(wall['p5_mm'], 2)} mm,"
             f" {100 * wall['thin_share']:.1f} % below {wall['thin_mm']:g} mm"
         )
-    pieces = f"{left_out['pieces']:,} pieces of {left_out['pieces_ml']:.3g} ml together"
-    cavities = f"{left_out['cavities']:,} closed cavities of {left_out['cavities_ml'] + 0.0:.3g} ml"  # + 0.0: no "-0"
+    pieces = f"{count_of(left_out['pieces'], 'piece')} of {say_digits(left_out['pieces_ml'])} ml together"
+    cavities = (
+        f"{count_of(left_out['cavities'], 'closed cavity', 'closed cavities')} of"
+        f" {say_digits(left_out['cavities_ml'])} ml"
+    )
     lines.append(f"         left out {pieces}, filled {cavities}")
     if left_out["not_bone"] is not None:
         bone = left_out["pieces"] + facts["pieces"] - left_out["not_bone"]
         lines.append(
             f"         kept {facts['pieces']:,} of {bone:,} pieces with walls like bone; {left_out['not_bone']:,} of"
-            f" {left_out['not_bone_ml']:.3g} ml are not, or are crumbs"
+            f" {say_digits(left_out['not_bone_ml'])} ml are not, or are crumbs"
         )
     return lines
 

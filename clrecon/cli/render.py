@@ -23,6 +23,7 @@ from clrecon.cli.render_options import (
 )
 from clrecon.jobs.render.settings import describe_modes, describe_presets
 from clrecon.jobs.shared.clouds import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file, is_mesh_file
+from clrecon.system.text import count_of
 
 __all__ = ["add_arguments", "run"]
 
@@ -136,12 +137,12 @@ def _describe_input(report: dict[str, Any]) -> str:
     if cloud is None:
         return describe_volume(report["volume"])
     known = [name for name in ("normals", "hu", "labels") if cloud[name]]
-    return f"{cloud['points']:,} points" + (f" with {', '.join(known)}" if known else "")
+    return f"{count_of(cloud['points'], 'point')}" + (f" with {', '.join(known)}" if known else "")
 
 
 def _describe_mesh(mesh: dict[str, Any]) -> str:
     color = "#" + "".join(f"{round(255 * share):02x}" for share in mesh["color"])
-    return f"{mesh['triangles']:,} triangles, {color}, opacity {mesh['opacity']:g}, {mesh['file']['space']}"
+    return f"{count_of(mesh['triangles'], 'triangle')}, {color}, opacity {mesh['opacity']:g}, {mesh['file']['space']}"
 
 
 def _describe_legend(pictures: list[dict[str, Any]]) -> list[str]:
@@ -180,7 +181,10 @@ def _describe_look(report: dict[str, Any]) -> str:
         parts.append(f"{report['combine']} of {report['thickness_mm']:g} mm")
     if report["turntable"]:
         turn = report["turntable"]
-        parts.append(f"{turn['frames']} frames over {turn['degrees']:g} degrees, {turn['seconds_a_frame']:.3f} s each")
+        parts.append(
+            f"{count_of(turn['frames'], 'frame')} over {turn['degrees']:g} degrees,"
+            f" {turn['seconds_a_frame']:.3f} s each"
+        )
     return ", ".join(parts)
 
 

@@ -10,6 +10,7 @@ from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.points import parse_point
 from clrecon.cli.reading import add_reading
+from clrecon.system.text import count_of
 
 __all__ = ["add_arguments", "run"]
 
@@ -123,7 +124,8 @@ def _describe(report: dict[str, Any]) -> list[str]:
     found = len(report["vertebrae"])
     return [
         f"input    {describe_volume(report['volume'])}",
-        f"found    {found} vertebra{'e' * (found != 1)}, {report['unsure']} unsure, {len(report['discs'])} discs;"
+        f"found    {found} vertebra{'e' * (found != 1)}, {report['unsure']} unsure,"
+        f" {count_of(len(report['discs']), 'disc')};"
         f" bone is {report['level_hu']:.0f} HU and more",
         *(f"         {line}" for line in table(rows, right=(1, 2, 3, 4))),
         *(f"         {text}" for text in report["left_out"]),

@@ -19,6 +19,7 @@ from clrecon.geometry.affine import normal_matrix
 from clrecon.geometry.precision import find_vertex_origin, float32_step, largest_coordinate, power_of_two_over
 from clrecon.geometry.vertex_rules import check_vertex_rule
 from clrecon.geometry.volume import AIR_HU, Volume
+from clrecon.system.text import say_digits
 
 LARGEST_INTEGER = 2**23
 """Integer voxels are interpolated in float32, which holds multiples of 0.5 exactly up to here."""
@@ -365,8 +366,8 @@ def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
     margin = 4.0 * unit / steps
     if margin.max() > LARGEST_MARGIN:
         raise UsageError(
-            f"the volume reaches {largest:.3g} mm from its centre with steps of {steps.min():.3g} mm:"
-            f" float32 vertices come in steps of {unit:.2g} mm there; take a part of it"
+            f"the volume reaches {say_digits(largest)} mm from its centre with steps of {say_digits(steps.min())} mm:"
+            f" float32 vertices come in steps of {say_digits(unit, 2)} mm there; take a part of it"
         )
     return margin
 

@@ -17,6 +17,7 @@ from clrecon.labels.resample import ResampledLabels, resample_labels
 from clrecon.labels.volumes import label_ml, slice_voxel_ml
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
+from clrecon.system.text import say_digits
 
 __all__ = ["PERCENTILES", "LabelFigures", "check_percentiles", "measure_labels", "measure_resampled", "name_percentile"]
 
@@ -72,7 +73,7 @@ class LabelFigures(Record):
         """What is doubtful about this label."""
         if not self.voxels:
             where = "outside of the scan" if self.inside_share == 0.0 else "smaller than the voxels of the scan"
-            return [f"{self.name} has no voxel in the scan: its {self.label_ml:.3g} ml are {where}"]
+            return [f"{self.name} has no voxel in the scan: its {say_digits(self.label_ml)} ml are {where}"]
         told = []
         if self.inside_share < 1.0:
             told.append(
@@ -81,7 +82,8 @@ class LabelFigures(Record):
         wanted = self.label_ml * self.inside_share
         if abs(self.ml - wanted) > _ODD_VOLUME * wanted:
             told.append(
-                f"{self.name} has {self.ml:.4g} ml on the grid of the scan and {wanted:.4g} ml on its own:"
+                f"{self.name} has {say_digits(self.ml, 4)} ml on the grid of the scan and"
+                f" {say_digits(wanted, 4)} ml on its own:"
                 " look at the slices of both"
             )
         if self.unmeasured:

@@ -26,7 +26,7 @@ from clrecon.labels.overlap import Painter
 from clrecon.labels.stream import empty_labels
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.regular_files import open_regular
-from clrecon.system.text import escape_text, hash_uid
+from clrecon.system.text import count_of, escape_text, hash_uid
 
 __all__ = ["STRUCTURE_SET", "read_structures"]
 
@@ -188,7 +188,7 @@ class _Raster:
             kinds = ", ".join(f"{count} {escape_text(kind, 30)}" for kind, count in self._structure.others.items())
             said.append(f"{self._shown}: {kinds} left out, only closed planar contours enclose voxels")
         if self._beyond:
-            said.append(f"{self._shown}: {self._beyond} contours lie beyond the slices of the scan and were left out")
+            said.append(f"{self._shown}: {count_of(self._beyond, 'contour')} beyond the slices of the scan left out")
         if not self._structure.contours:
             said.append(f"{self._shown} has no closed contour and no voxel")
         elif self.slices:

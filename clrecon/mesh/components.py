@@ -17,6 +17,7 @@ from clrecon.mesh.connectivity import label_components
 from clrecon.mesh.nearest import find_nearest_triangle
 from clrecon.mesh.triangles import cross_products
 from clrecon.system.pieces import CHUNK, local_origin
+from clrecon.system.text import say_digits
 from clrecon.system.wording import name_parameter
 
 __all__ = ["Labelled", "select_components", "split_components"]
@@ -218,7 +219,7 @@ def _choose(
         if not keep.any():
             raise NoSurfaceError(
                 f"none of the {np.count_nonzero(candidates)} components encloses {min_volume_ml:g} ml: "
-                f"the largest has {volumes[candidates].max(initial=0.0):.4g} ml, ask for less"
+                f"the largest has {say_digits(volumes[candidates].max(initial=0.0), 4)} ml, ask for less"
             )
     facts: dict[str, object] = {}
     if len(seeds):

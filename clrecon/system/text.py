@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterable
 from functools import lru_cache
 
-__all__ = ["count_of", "escape_text", "guess_word", "hash_uid", "join_names", "say_unknown"]
+__all__ = ["count_of", "escape_text", "guess_word", "hash_uid", "join_names", "say_digits", "say_hu", "say_unknown"]
 
 TEXT_LIMIT = 64
 NAMES_SHOWN = 5
+MOST_PLACES = 12
+LARGEST_HU, LARGEST_WRITTEN = 1e6, 1e15
 
 
 def escape_text(text: str, limit: int = TEXT_LIMIT) -> str:
@@ -50,6 +53,27 @@ def say_unknown(noun: str, word: object, known: Iterable[str]) -> str:
 def count_of(number: int, noun: str, several: str | None = None) -> str:
     """Return a count with its noun: ``1 slice``, ``1,200 slices``; `several` is the plural if it is not noun + s."""
     return f"{number:,} {noun if number == 1 else several or noun + 's'}"
+
+
+def say_digits(value: float, digits: int = 3) -> str:
+    """Return a number with so many significant digits, never with an exponent: ``10,000``, ``0.0039``, ``-312``.
+
+    Digits before the point are all there, as in ``12,346``.
+    """
+    if value == 0.0:
+        return "0"
+    if not math.isfinite(value) or abs(value) >= LARGEST_WRITTEN:
+        return f"{value:g}"
+    places = min(max(0, digits - 1 - math.floor(math.log10(abs(value)))), MOST_PLACES)
+    text = f"{value:,.{places}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def say_hu(value: float) -> str:
+    """Return HU as far as they mean something: whole numbers as they are, others with three significant digits."""
+    if math.isfinite(value) and value == round(value) and abs(value) < LARGEST_HU:
+        return str(round(value))
+    return say_digits(value)
 
 
 @lru_cache(1024)

@@ -259,7 +259,9 @@ def test_the_certificate_in_words(tmp_path: Path) -> None:
     write_plan(tmp_path / "uneven", Plan(offsets={3: 0.4}), set_values(SliceThickness=1))
     words = dict(describe_certificate(list_series(tmp_path / "uneven").certificate))
     assert words["gaps"] == "2 of 1.25, then 1 of 1.65, then 1 of 0.85, then 2 of 1.25 mm"
-    assert words["thickness"] == "1 mm: between neighbouring slices from 0.65 mm not measured to 0.15 mm overlap"
+    assert words["thickness"] == (
+        "1 mm: neighbouring slices overlap by up to 0.15 mm, or up to 0.65 mm between them are not measured"
+    )
     assert words["positions"].startswith("uneven, up to 0.34")
 
 

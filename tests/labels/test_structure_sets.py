@@ -97,7 +97,7 @@ def test_what_lies_beyond_the_slices_is_cut_off(volume, tmp_path):
     rois = {"x": [rectangle(volume, 1, (-30, -30), (5, 90)), *(rectangle(volume, k, (2, 2), (4, 4)) for k in (-3, 9))]}
     labels = read_labels(write_structures(tmp_path / "rt.dcm", rois), volume=volume)
     assert labels.counts == {1: 20 * 6}
-    assert labels.warnings == ("ROI x: 2 contours lie beyond the slices of the scan and were left out",)
+    assert labels.warnings == ("ROI x: 2 contours beyond the slices of the scan left out",)
 
 
 def test_what_is_left_out_is_said(volume, tmp_path):

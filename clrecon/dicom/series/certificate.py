@@ -33,7 +33,7 @@ from clrecon.geometry.certificate import Certificate
 from clrecon.geometry.orientation import describe_orientation
 from clrecon.sources.facts import PixelFacts
 from clrecon.sources.likeness import Likeness
-from clrecon.system.text import hash_uid
+from clrecon.system.text import count_of, hash_uid
 
 __all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]
 
@@ -100,10 +100,10 @@ def _describe_what_was_left(series: Series) -> list[str]:
         chosen = choose_phase(places.phases, series.phase)
         left = sum(len(phase.headers) for phase in places.phases) - len(chosen.headers)
         which = f"phase {chosen.number} of {len(places.phases)} ({chosen.keyword} {chosen.value})"
-        warnings.append(f"{which} read, {left} slices of others left")
+        warnings.append(f"{which} read, {count_of(left, 'slice')} of others left")
         most = max(len(phase.headers) for phase in places.phases)
         if not places.interleaved and len(chosen.headers) < most:
-            warnings.append(f"phase {chosen.number} has {len(chosen.headers)} slices, another one {most}")
+            warnings.append(f"phase {chosen.number} has {count_of(len(chosen.headers), 'slice')}, another one {most}")
     kernels = (
         {dict(header.phase).get("ConvolutionKernel", "") for header in series.stack.slices} if series.stack else ()
     )

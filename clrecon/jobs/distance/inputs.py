@@ -10,7 +10,7 @@ import numpy as np
 
 from clrecon.mesh import Mesh
 from clrecon.mesh.reader import read_mesh
-from clrecon.system.text import escape_text
+from clrecon.system.text import escape_text, say_digits
 
 __all__ = ["describe_mesh", "doubt_frames", "read_side"]
 
@@ -66,12 +66,15 @@ def doubt_frames(meshes: Sequence[Mesh], entries: Sequence[dict[str, Any]]) -> l
         return doubts
     sizes = [float(np.linalg.norm(box[1] - box[0])) for box in boxes]
     if min(sizes) > 0.0 and max(sizes) / min(sizes) >= _OTHER_UNIT:
-        doubts.append(f"{a} is {sizes[0]:.4g} mm across and {b} {sizes[1]:.4g} mm: is one of them in another unit?")
+        doubts.append(
+            f"{a} is {say_digits(sizes[0], 4)} mm across and {b} {say_digits(sizes[1], 4)} mm: is"
+            f" one of them in another unit?"
+        )
     gap = float(np.linalg.norm(np.maximum(0.0, np.maximum(boxes[0][0] - boxes[1][1], boxes[1][0] - boxes[0][1]))))
     if gap > 0.0:
         sources = {entry["space_from"] for entry in entries}
         hint = ": is the frame of the file that names none another?" if "assumed" in sources else ""
-        doubts.append(f"the boxes round {a} and {b} lie {gap:.4g} mm apart{hint}")
+        doubts.append(f"the boxes round {a} and {b} lie {say_digits(gap, 4)} mm apart{hint}")
     return doubts
 
 

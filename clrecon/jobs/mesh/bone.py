@@ -11,6 +11,7 @@ from clrecon.jobs.mesh.levels import warn_of_contrast
 from clrecon.jobs.mesh.presets import LOWEST_BONE_HU
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Bones, Part, Surface
+from clrecon.system.text import count_of
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
@@ -95,10 +96,10 @@ def _describe_none(told: Sequence[dict[str, Any]], count: int, rails: int) -> st
     but = f"; {_describe_rails(rails)}" if rails else ""
     if not told:
         others = "all others" if rails else "all of them"
-        return f"nothing that could be bone: {count:,} components, {others} crumbs{but}"
+        return f"nothing that could be bone: {count_of(count, 'component')}, {others} crumbs{but}"
     largest = max(told, key=lambda one: int(one["samples"]))
     return (
-        f"nothing here looks like bone: of {count:,} components the largest {_looks(largest)};"
+        f"nothing here looks like bone: of {count_of(count, 'component')} the largest {_looks(largest)};"
         f" those of bone reach 600 at 5 % and more of it{but}"
     )
 

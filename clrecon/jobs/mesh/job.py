@@ -36,6 +36,7 @@ from clrecon.reading import read_selected
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, Steps, ignore_progress
 from clrecon.system.targets import keep_existing
+from clrecon.system.text import count_of
 
 if TYPE_CHECKING:
     from clrecon.anatomy.iso_choice import IsoChoice
@@ -303,7 +304,10 @@ def _warn_of_leftovers(output: str | Path, paths: Sequence[str | Path]) -> list[
     leftovers = count_leftovers(output, paths)
     if not leftovers:
         return []
-    return [f"{leftovers:,} more numbered files of this name lie beside the new ones, from an earlier run"]
+    return [
+        f"{count_of(leftovers, 'more numbered file')} of this name lie{'s' * (leftovers == 1)}"
+        f" beside the new ones, from an earlier run"
+    ]
 
 
 def _seconds(watch: Laps, origins: Sequence[dict[str, Any]]) -> dict[str, float]:

@@ -13,6 +13,7 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface
 from clrecon.jobs.shared.outputs import MOST_FILES
 from clrecon.system.progress import Progress, Steps
+from clrecon.system.text import say_hu
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
@@ -52,7 +53,8 @@ def check_levels(volume: Volume, surfaces: Sequence[Surface]) -> None:
             all_inside = level > high if surface.below else level <= low
         if all_inside:  # the surface would be the box of the scan
             raise NoSurfaceError(
-                f"no surface {surface.place}: every voxel is inside, the volume runs from {low:g} to {high:g} HU"
+                f"no surface {surface.place}: every voxel is inside, the volume runs from"
+                f" {say_hu(low)} to {say_hu(high)} HU"
             )
 
 

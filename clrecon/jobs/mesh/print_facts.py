@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from clrecon.system.text import count_of, say_digits
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
@@ -87,7 +88,8 @@ def warn_of_print(facts: dict[str, Any]) -> list[str]:
         )
     if facts["cavities"]:
         warnings.append(
-            f"{facts['cavities']:,} closed cavities of {facts['cavities_ml']:.2g} ml together are in it: powder or"
+            f"{count_of(facts['cavities'], 'closed cavity', 'closed cavities')} of"
+            f" {say_digits(facts['cavities_ml'], 2)} ml together are in it: powder or"
             f" resin stays in them; {name_parameter('keep_largest', 1)} fills them"
         )
     bone_told = left_out.get("not_bone") is not None
@@ -96,8 +98,9 @@ def warn_of_print(facts: dict[str, Any]) -> list[str]:
         away, seed = name_parameter("remove_table", True), name_parameter("seeds", "X,Y,Z")
         table = "" if bone_told else f" The piece of largest area can be a table ({away});"
         warnings.append(
-            f"{'bone that' if bone_told else 'what'} was left out encloses {other_ml:.3g} ml, more than the"
-            f" {facts['pieces_ml']:.3g} ml that were kept: is it the right piece?{table} {seed} keeps the one at a"
+            f"{'bone that' if bone_told else 'what'} was left out encloses {say_digits(other_ml)} ml, more than the"
+            f" {say_digits(facts['pieces_ml'])} ml that were kept: is it the right piece?{table}"
+            f" {seed} keeps the one at a"
             " point"
         )
     return warnings

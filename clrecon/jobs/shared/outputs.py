@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from clrecon.errors import ClreconError, OutputError, UsageError
 from clrecon.system.progress import Progress
+from clrecon.system.text import count_of
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
@@ -170,7 +171,8 @@ def refuse_numbered(output: str | Path) -> None:
 
     if existing_stay() and (found := count_leftovers(output, [])):
         raise OutputError(
-            f"{found:,} numbered files of {output} exist already and stay ({name_parameter('no_clobber', True)}):"
+            f"{count_of(found, 'numbered file')} of {output} exist{'s' * (found == 1)} already and"
+            f" stay{'s' * (found == 1)} ({name_parameter('no_clobber', True)}):"
             " name another"
         )
 

@@ -17,6 +17,7 @@ from clrecon.operators.masks.regions import checked_mm
 from clrecon.operators.masks.spaces import Spaces, find_joints, find_spaces
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.system.progress import Progress, Steps
+from clrecon.system.text import count_of, say_digits, say_hu
 
 LEAST_SAID_ML = 0.1
 """Smaller spaces that stay open are in the report alone."""
@@ -111,7 +112,9 @@ def fill_enclosed(
         if not bone.count or bone.count == own.voxels.size:
             what = "no voxel has" if not bone.count else "every voxel has"
             low, high = own.hu_range or (float(own.voxels.min()), float(own.voxels.max()))
-            raise NoSurfaceError(f"{what} {iso_value:g} HU or more: the volume runs from {low:g} to {high:g} HU")
+            raise NoSurfaceError(
+                f"{what} {iso_value:g} HU or more: the volume runs from {say_hu(low)} to {say_hu(high)} HU"
+            )
         if seal is None:
             seal = float(np.clip(SEAL_STEPS * max(own.spacing), SEAL_MM, LARGEST_SEAL_MM))
         steps.take()
@@ -203,16 +206,17 @@ def _warn(facts: dict[str, Any]) -> list[str]:
         left = facts["open"][kind]
         if left["ml"] >= LEAST_SAID_ML:
             at = ", ".join(f"{x:.0f}" for x in left["at_mm"])
-            several = f", the largest {left['largest_ml']:.3g} ml" if left["spaces"] > 1 else ""
+            several = f", the largest {say_digits(left['largest_ml'])} ml" if left["spaces"] > 1 else ""
             warnings.append(
-                f"solid: {left['ml']:.3g} ml stay open in {left['spaces']:,} enclosed"
-                f" space{'s' * (left['spaces'] != 1)} ({what}{several}, round {at} mm LPS)"
+                f"solid: {say_digits(left['ml'])} ml stay open in {count_of(left['spaces'], 'enclosed space')}"
+                f" ({what}{several}, round {at} mm LPS)"
             )
     if not facts["filled_ml"]:
         warnings.append("solid: nothing is enclosed at this level, and nothing was filled")
     elif facts["filled_ml"] > facts["bone_ml"]:
         warnings.append(
-            f"solid: {facts['filled_ml']:.3g} ml were filled, more than the {facts['bone_ml']:.3g} ml of the bone"
+            f"solid: {say_digits(facts['filled_ml'])} ml were filled, more than the"
+            f" {say_digits(facts['bone_ml'])} ml of the bone"
             " itself: see in a picture that it is marrow"
         )
     return warnings

@@ -12,6 +12,7 @@ from clrecon.geometry import Volume
 from clrecon.opencl import Device, check_budget, download, upload
 from clrecon.operators.masks import logic
 from clrecon.operators.masks.band_mask import VoxelMask, mask_bytes
+from clrecon.system.text import say_digits
 
 __all__ = ["MaskBits"]
 
@@ -128,4 +129,4 @@ class MaskBits:
         turned = np.abs((volume.affine - own.affine)[:3, :2] * (ni, nj)).max()
         away = max(float(turned), float(np.abs(volume.slice_origins() - own.slice_origins()).max()))
         if away > PLACE_TOLERANCE_MM:
-            raise UsageError(f"the voxels of the mask and of the other volume lie up to {away:.3g} mm apart")
+            raise UsageError(f"the voxels of the mask and of the other volume lie up to {say_digits(away)} mm apart")

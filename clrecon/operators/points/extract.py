@@ -22,6 +22,7 @@ from clrecon.points import PointCloud
 from clrecon.points.kinds import KINDS
 from clrecon.points.voxel_numbers import VoxelNumbers
 from clrecon.system.progress import Progress
+from clrecon.system.text import say_hu
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:  # label maps load pydicom, which other clouds need not wait for
@@ -141,7 +142,9 @@ def _describe(band: Band) -> str:
 
 def _refuse_band(volume: Volume, band: Band, where: str) -> NoSurfaceError:
     low, high = data_range(volume)
-    return NoSurfaceError(f"no voxel {where}of {_describe(band)}: the volume runs from {low:g} to {high:g} HU")
+    return NoSurfaceError(
+        f"no voxel {where}of {_describe(band)}: the volume runs from {say_hu(low)} to {say_hu(high)} HU"
+    )
 
 
 def _voxels(

@@ -14,6 +14,7 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
 from clrecon.operators.rays.triangles import MOST_TRIANGLES, MeshPart
 from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.system.text import say_digits
 
 __all__ = ["box_around", "make_part", "mesh_corners"]
 
@@ -41,7 +42,8 @@ def mesh_corners(mesh: Mesh) -> Float64Array:
     corners = np.array([vertices.min(axis=0), vertices.max(axis=0)], dtype=np.float64)
     if np.abs(mesh.vertices).max() > FARTHEST_MM:
         raise UsageError(
-            f"vertices of the mesh lie up to {np.abs(mesh.vertices).max():.3g} mm from the origin: pictures show what"
+            f"vertices of the mesh lie up to {say_digits(np.abs(mesh.vertices).max())} mm from the"
+            f" origin: pictures show what"
             f" is within {FARTHEST_MM:.0e} mm"
         )
     return corners

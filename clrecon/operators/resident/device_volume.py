@@ -33,6 +33,7 @@ from clrecon.operators.resident.stack_table import StackTable
 from clrecon.operators.resident.voxel_types import ray_variants
 from clrecon.system.closing import Closing
 from clrecon.system.log import get_logger
+from clrecon.system.text import count_of
 
 if TYPE_CHECKING:  # label maps load pydicom, which surfaces need not wait for
     from clrecon.labels import LabelMap, ResampledLabels
@@ -385,7 +386,7 @@ class DeviceVolume(Closing):
                 slices = self.most_slices[what] = max(fewest, -(-slices // 2))
                 log.info("%s: no room on %s, continued with slabs of %d slices", what, self.device.label, slices)
                 if warnings is not None:
-                    warnings.append(f"{error}: continued with slabs of {slices} slices")
+                    warnings.append(f"{error}: continued with slabs of {count_of(slices, 'slice')}")
 
 
 @contextmanager

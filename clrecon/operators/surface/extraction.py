@@ -26,6 +26,7 @@ from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import BRICKS, SampleGrid, Slab
 from clrecon.operators.surface.trilinear import prepare_trilinear
 from clrecon.system.progress import Progress
+from clrecon.system.text import say_hu
 
 __all__ = ["Extraction", "Part", "prepare_isosurface", "voxel_level"]
 
@@ -35,7 +36,7 @@ Part = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]
 
 def _refuse_level(device: Device, volume: Volume, rule: IsoRule) -> ClreconError:
     low, high = data_range(volume)
-    runs = f"the volume runs from {low:g} to {high:g} HU"
+    runs = f"the volume runs from {say_hu(low)} to {say_hu(high)} HU"
     if rule.inside == "between":
         marked = sum(int(np.count_nonzero(rule.mark_inside(voxels))) for voxels in volume.voxels)
         if 0 < marked < volume.voxels.size or (marked and rule.closed):

@@ -19,6 +19,7 @@ from clrecon.operators.masks.regions import checked_mm
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.label_extraction import LabelExtraction
 from clrecon.operators.vertebrae.crop import LabelCrop, check_types, crop_label
+from clrecon.system.text import say_hu
 
 __all__ = ["CLOSE_MM", "label_margin", "make_solid", "vertebra_solid"]
 
@@ -118,7 +119,9 @@ def _refuse_empty(crop: LabelCrop, own: NDArray[np.bool_], iso_value: float | No
     if iso_value is None or not hu.size:
         return NoSurfaceError(f"{called} holds the centre of no voxel of the CT: it is smaller than they are")
     low, high = float(hu.min()), float(hu.max())
-    return NoSurfaceError(f"no voxel of {called} has {iso_value:g} HU: they run from {low:g} to {high:g} HU")
+    return NoSurfaceError(
+        f"no voxel of {called} has {iso_value:g} HU: they run from {say_hu(low)} to {say_hu(high)} HU"
+    )
 
 
 def _inside(resident: DeviceVolume, crop: LabelCrop, iso_value: float, grow_mm: float | None) -> NDArray[np.bool_]:

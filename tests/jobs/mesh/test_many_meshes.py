@@ -98,7 +98,7 @@ def test_components_of_an_earlier_run_are_left_and_said(device: Any, tmp_path: P
     first = run(tmp_path, device, iso_value=200.0, split=True)
     again = run(tmp_path, device, iso_value=200.0, split=True, keep_largest=1)
     assert [report["warnings"][1:] for report in (first, again)] == [
-        ["1 more numbered files of this name lie beside the new ones, from an earlier run"],
+        ["1 more numbered file of this name lies beside the new ones, from an earlier run"],
         ["3 more numbered files of this name lie beside the new ones, from an earlier run"],
     ]
     assert (tmp_path / "bone_500hu_003.ply").read_bytes() == b"other"
