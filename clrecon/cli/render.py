@@ -199,7 +199,7 @@ def _describe_picture(picture: dict[str, Any]) -> str:
     left_out = picture["left_out"]
     if left_out and left_out["voxels"]:
         where = "the body or the region" if left_out["region"] else "the body"
-        shown += f", without {100.0 * left_out['share']:.3g} % of the voxels, outside of {where}"
+        shown += f", without the {100.0 * left_out['share']:.3g} % of the voxels outside of {where}"
     if picture["tiles"]:
         many = len(picture["tiles"])
         wide, high = picture["tile_size"]

@@ -90,8 +90,9 @@ def apply_region(
         "outside_hu": float(outside),
         **facts,
     }
+    now = "is air now" if outside == value_outside((), volume.voxels.dtype) else "is left out"
     said = (
-        f"outside of the region {' and '.join(facts['rules'])} is air now:"
+        f"outside of the region {' and '.join(facts['rules'])} {now}:"
         f" {kept:,} of {every:,} voxels stay ({100.0 * kept / every:.3g} %), {cells:,} of {all_cells:,} cells"
     )
     report = carry_report(volume, restricted.volume)

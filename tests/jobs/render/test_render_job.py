@@ -374,6 +374,7 @@ def test_a_minimum_says_what_it_leaves_out_and_regions_go_too(device: Any, tmp_p
         report = make_pictures(folder, files, settings)
         values, said = np.load(tmp_path / "v.npy"), report["pictures"][0]["left_out"]
         assert said["body"] and said["region"] == (region is not None)
+        assert any("is left out:" in text for text in report["warnings"]) == (region is not None)
         assert np.nanmin(values) > -300.0 and report["volume"]["hu_range"][0] < -900.0
         assert report["volume"]["hu_range"][1] < 5000.0
         found.append((said["share"], int(np.isfinite(values).sum())))
