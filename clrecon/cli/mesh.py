@@ -26,13 +26,16 @@ from clrecon.cli.refinement import (
 from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS
 from clrecon.system.text import count_of, say_digits
 
-__all__ = ["add_arguments", "describe_mesh", "describe_volume", "run"]
+__all__ = ["WHAT_BONE_COSTS", "add_arguments", "describe_mesh", "describe_volume", "run"]
 
 _PARTS = (
     *("device", "read", "mask", "choose", "solid", "upload", "build", "kernels", "download"),
     *("select", "refine", "measure", "write", "other"),
 )
 _SHOWN_PARTS = 12
+
+WHAT_BONE_COSTS = "in soft tissue 0.4 to 1.1 mm outside of the bone; --hu auto lies closer"
+"""What the default level costs, measured by scripts/measure_levels.py."""
 
 
 def _epilog() -> str:
@@ -261,6 +264,8 @@ def _describe_choice(report: dict[str, Any]) -> str:
     """Give the reason for the iso value in a few words."""
     choice = report["iso_value_choice"]
     if choice is None:
+        if report["preset"] == "bone":
+            return f"preset bone: {WHAT_BONE_COSTS}"
         return f"preset {report['preset']}" if report["preset"] else "as given"
     if choice["method"] != "auto":
         return f"half way between tissue {choice['tissue_hu']:g} and bone {choice['bone_hu']:g} HU, as given"

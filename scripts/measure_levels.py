@@ -1,0 +1,299 @@
+#!/usr/bin/env python3
+"""What the default level of `clrecon mesh` costs and saves beside `--hu auto`, on phantoms and on scans of your own.
+
+    python scripts/measure_levels.py phantoms
+    python scripts/measure_levels.py scans thorax=CT_FOLDER head=OTHER_FOLDER
+    python scripts/measure_levels.py page
+
+`phantoms` measures every phantom of `level_phantoms.py` (about five minutes on one core) at the preset bone, at
+`--hu auto`, at `--hu half:BONE,TISSUE` with the phantom's own materials, and at the best of the levels from 100 to
+900 HU. `scans` does what can be done without a truth: the level that auto picks in the scan, in its two halves and in
+every other slice, and how the surface differs. Both keep their figures in docs/benchmarks/levels; `page` writes them
+into docs/iso_value.md. The scans need an OpenCL device.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+
+from level_phantoms import NOTHING, PHANTOMS, SCANNING, Phantom, Profiles, draw_phantom, sample_profiles  # noqa: E402
+from marked_tables import markdown_table, put_table  # noqa: E402
+
+from clrecon.anatomy.iso_choice import IsoChoice, choose_iso_value, half_iso_value  # noqa: E402
+from clrecon.errors import ClreconError, NoSurfaceError  # noqa: E402
+from clrecon.geometry import Volume  # noqa: E402
+from clrecon.jobs.mesh.presets import PRESETS  # noqa: E402
+
+FIGURES = ROOT / "docs" / "benchmarks" / "levels"
+PAGE = ROOT / "docs" / "iso_value.md"
+TRIED = range(100, 901, 25)
+CLOSE_MM = 0.5
+RULES = ("preset", "auto", "half", "best")
+SHARES = (0.3, 0.35, 0.4, 0.45)
+"""Levels at these shares of the way from tissue to bone, both as auto measures them."""
+
+
+def measure_errors(profiles: Profiles, level: float) -> dict[str, float]:
+    """Measure a level: mean signed and absolute distance where it is crossed, share lost, share within `CLOSE_MM`."""
+    errors = profiles.errors(level)
+    found = errors[np.isfinite(errors)]
+    if not len(found):
+        return {"level_hu": level, "lost_share": 1.0, "close_share": 0.0}
+    return {
+        "level_hu": level,
+        "bias_mm": round(float(found.mean()), 4),
+        "mean_mm": round(float(np.abs(found).mean()), 4),
+        "p95_mm": round(float(np.percentile(np.abs(found), 95)), 4),
+        "lost_share": round(1.0 - len(found) / len(errors), 4),
+        "close_share": round(float((np.abs(found) <= CLOSE_MM).sum() / len(errors)), 4),
+    }
+
+
+def choose(volume: Volume) -> tuple[IsoChoice | None, str, float]:
+    """Return the choice of auto, or None, its reason or refusal, and its seconds."""
+    start = time.perf_counter()
+    try:
+        choice = choose_iso_value(volume)
+    except NoSurfaceError as error:
+        return None, str(error), time.perf_counter() - start
+    return choice, choice.reason, time.perf_counter() - start
+
+
+def _level(choice: IsoChoice | None) -> float | None:
+    return None if choice is None else choice.iso_value
+
+
+def measure_phantom(phantom: Phantom) -> dict[str, Any]:
+    """Measure all rules on one phantom; "best" has the largest share within `CLOSE_MM`."""
+    volume = draw_phantom(phantom)
+    choice, reason, seconds = choose(volume)
+    level = _level(choice)
+    figures: dict[str, Any] = {
+        "name": phantom.name,
+        "group": phantom.group,
+        "spacing_mm": [round(float(step), 4) for step in volume.spacing],
+        "auto": {"level_hu": level, "reason": reason},
+        "seconds": round(seconds, 3),
+    }
+    if phantom.group == NOTHING:
+        return figures
+    profiles = sample_profiles(phantom, volume)
+    figures["points"] = len(profiles.values)
+    half = half_iso_value(phantom.bone_hu, phantom.tissue_hu).iso_value
+    levels = {"preset": PRESETS["bone"].iso_value, "auto": level, "half": half}
+    tried = {float(hu): measure_errors(profiles, float(hu)) for hu in TRIED}
+    for rule, hu in levels.items():
+        if hu is not None:
+            figures[rule] = {**figures.get(rule, {}), **measure_errors(profiles, hu)}
+    figures["best"] = max(tried.values(), key=lambda one: one["close_share"])
+    if choice is not None:
+        tissue, way = choice.tissue_hu, choice.bone_hu - choice.tissue_hu
+        figures["shares"] = {f"{share:g}": measure_errors(profiles, round(tissue + share * way)) for share in SHARES}
+    figures["fixed"] = {f"{hu:g}": tried[hu] for hu in (150.0, 225.0, 250.0, 300.0, 350.0, 400.0)}
+    return figures
+
+
+def measure_scan(name: str, folder: Path) -> dict[str, Any]:
+    """Measure a scan without a truth: the choice, its steadiness, and both surfaces."""
+    import clrecon
+
+    start = time.perf_counter()
+    try:
+        volume = clrecon.read_volume(folder)
+    except ClreconError as error:
+        return {"name": name, "refused": str(error)}
+    read_s = time.perf_counter() - start
+    choice, reason, seconds = choose(volume)
+    level = _level(choice)
+    count = len(volume.voxels)
+    parts = {"lower half": volume.voxels[: count // 2], "upper half": volume.voxels[count // 2 :],
+             "every other slice": volume.voxels[::2]}  # fmt: skip
+    figures: dict[str, Any] = {
+        "name": name,
+        "shape_ijk": list(volume.voxels.shape[::-1]),
+        "spacing_mm": [round(float(step), 4) for step in volume.spacing],
+        "read_seconds": round(read_s, 3),
+        "choose_seconds": round(seconds, 3),
+        "auto": {"level_hu": level, "reason": reason},
+        "parts_hu": {
+            part: _level(choose(Volume(voxels, np.eye(4), volume.report))[0])
+            for part, voxels in parts.items()
+            if len(voxels)
+        },
+    }
+    for rule, hu in (("preset", PRESETS["bone"].iso_value), ("auto", level)):
+        if hu is not None:
+            figures[rule] = {**figures.get(rule, {}), "level_hu": hu, **_measure_surface(volume, hu)}
+    if level is not None:
+        figures["moved_mm"] = _moved(volume, PRESETS["bone"].iso_value, level)
+    return figures
+
+
+def _measure_surface(volume: Volume, hu: float) -> dict[str, Any]:
+    import clrecon
+
+    try:
+        quality = clrecon.extract_isosurface(volume, hu).quality()
+    except ClreconError as error:
+        return {"refused": str(error)}
+    return {name: quality[name] for name in ("components", "volume_ml", "area_mm2", "triangles", "closed")}
+
+
+def _moved(volume: Volume, one: float, other: float) -> float:
+    """Median distance from the surface at `one` to that at `other`, mm."""
+    import clrecon
+    from clrecon.mesh.compare.distances import SurfaceDistance, sample_surface
+
+    first, second = (clrecon.extract_isosurface(volume, hu) for hu in (other, one))
+    points = sample_surface(first.vertices, first.triangles, 5000)
+    return round(float(np.median(SurfaceDistance(second.vertices, second.triangles)(points))), 4)
+
+
+def summarise(figures: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Return over all phantoms with bone, by rule: means, the worst case, and the spread over one body's scans."""
+    summary = {}
+    with_bone = [one for one in figures if "best" in one]
+    shares = [f"{100.0 * float(share):.0f} % of the way" for share in with_bone[0]["shares"]]
+    flat = [
+        {**one, **{f"{hu} HU": row for hu, row in one["fixed"].items()},
+         **dict(zip(shares, one.get("shares", {}).values(), strict=False))}
+        for one in with_bone
+    ]  # fmt: skip
+    for rule in (*RULES, *(f"{hu} HU" for hu in with_bone[0]["fixed"]), *shares):
+        rows = [one.get(rule, {}) for one in flat]
+        measured = [row for row in rows if "bias_mm" in row]
+        same = [row["bias_mm"] for row, one in zip(rows, with_bone, strict=True)
+                if one["group"] == SCANNING and "bias_mm" in row]  # fmt: skip
+        summary[rule] = {
+            "measured": len(measured),
+            "mean_mm": round(float(np.mean([row["mean_mm"] for row in measured])), 3),
+            "worst_mm": max(row["mean_mm"] for row in measured),
+            "lost_share": round(float(np.mean([row["lost_share"] for row in measured])), 4),
+            "worst_lost_share": max(row["lost_share"] for row in measured),
+            "close_share": round(float(np.mean([row["close_share"] for row in measured])), 4),
+            "spread_of_bias_mm": round(float(np.std(same)), 3),
+        }
+    return summary
+
+
+# --- tables ---
+def _cell(figures: dict[str, Any]) -> str:
+    if "bias_mm" not in figures:
+        return "refused" if figures.get("level_hu") is None else "none"
+    lost = 100.0 * figures["lost_share"]
+    return f"{figures['level_hu']:.0f}: {figures['bias_mm']:+.2f}, {lost:.0f} %, {100.0 * figures['close_share']:.0f} %"
+
+
+def phantom_table(figures: Sequence[dict[str, Any]]) -> str:
+    """Return the table of phantoms."""
+    head = ("phantom", "preset bone", "auto", "half", "best")
+    rows = []
+    for one in figures:
+        cells = [_cell(one[rule]) if rule in one else "" for rule in RULES]
+        rows.append((one["name"], *cells))
+    return markdown_table(head, rows)
+
+
+def summary_table(figures: Sequence[dict[str, Any]]) -> str:
+    """Return the table over all phantoms."""
+    head = ("level", "mean distance, mm", "worst phantom, mm", "lost", "worst phantom", "within 0.5 mm",
+            "spread over ten scans of one body, mm")  # fmt: skip
+    rows = []
+    for rule, row in summarise(figures).items():
+        rows.append((
+            rule, f"{row['mean_mm']:.2f}", f"{row['worst_mm']:.2f}", f"{100 * row['lost_share']:.1f} %",
+            f"{100 * row['worst_lost_share']:.0f} %", f"{100 * row['close_share']:.0f} %",
+            f"{row['spread_of_bias_mm']:.2f}",
+        ))  # fmt: skip
+    return markdown_table(head, rows)
+
+
+def _number(value: Any) -> str:
+    return "refused" if value is None else f"{value:.0f}"
+
+
+def scan_table(figures: Sequence[dict[str, Any]]) -> str:
+    """Return the table of scans."""
+    head = ("scan", "auto, HU", "halves; every other slice", "volume at 200 HU, auto", "pieces at 200 HU, auto",
+            "surface moves (median)")  # fmt: skip
+    rows: list[tuple[str, ...]] = []
+    for one in figures:
+        if "refused" in one:
+            rows.append((one["name"], one["refused"], *[""] * 4))
+            continue
+        parts = [_number(value) for value in one["parts_hu"].values()]
+        both = [one.get(rule, {}) for rule in ("preset", "auto")]
+        volumes, pieces = ([row.get(name) for row in both] for name in ("volume_ml", "components"))
+        moved = one.get("moved_mm")
+        rows.append((
+            f"{one['name']}, {' x '.join(map(str, one['shape_ijk']))}, {one['spacing_mm'][2]:.3g} mm",
+            _number(one["auto"]["level_hu"]), f"{', '.join(parts[:2])}; {parts[-1]}",
+            ", ".join("none" if v is None else f"{v:,.0f} ml" for v in volumes),
+            ", ".join("none" if v is None else f"{v:,}" for v in pieces),
+            "" if moved is None else f"{moved:.2f} mm",
+        ))  # fmt: skip
+    return markdown_table(head, rows)
+
+
+def tables() -> dict[str, str]:
+    """Return all tables of docs/iso_value.md by the names of their markers."""
+    phantoms, scans = (json.loads((FIGURES / f"{name}.json").read_text("utf-8")) for name in ("phantoms", "scans"))
+    return {
+        "levels of phantoms": phantom_table(phantoms),
+        "levels in all": summary_table(phantoms),
+        "levels of scans": scan_table(scans),
+    }
+
+
+def write_page() -> None:
+    """Write the tables into docs/iso_value.md."""
+    text = PAGE.read_text("utf-8")
+    for name, table in tables().items():
+        text = put_table(text, name, table)
+    PAGE.write_text(text, "utf-8")
+
+
+def _keep(name: str, figures: Sequence[dict[str, Any]]) -> None:
+    FIGURES.mkdir(parents=True, exist_ok=True)
+    finite = json.loads(json.dumps(figures), parse_constant=lambda _: math.nan)
+    (FIGURES / f"{name}.json").write_text(json.dumps(finite, indent=1) + "\n", "utf-8")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("phantoms", "scans", "page"))
+    parser.add_argument("scans", nargs="*", metavar="NAME=CT_FOLDER")
+    options = parser.parse_args()
+    if options.what == "page":
+        write_page()
+        return
+    figures = []
+    if options.what == "phantoms":
+        for phantom in PHANTOMS:
+            figures.append(measure_phantom(phantom))
+            print(
+                phantom.name,
+                *(f"{rule} {_cell(figures[-1][rule])};" for rule in RULES if rule in figures[-1]),
+                flush=True,
+            )
+    for given in options.scans:
+        name, _, folder = given.partition("=")
+        figures.append(measure_scan(name, Path(folder)))
+        print(json.dumps(figures[-1]), flush=True)
+    _keep(options.what, figures)
+
+
+if __name__ == "__main__":
+    main()
