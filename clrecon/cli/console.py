@@ -30,7 +30,7 @@ _STAGES = {
     "compare": "comparing with the surface before",
     "write": "writing",
     "measure": "measuring the mesh",
-    "crossings": "looking for crossing triangles",
+    "crossings": "measuring the mesh, looking for crossing triangles",
     "distance": "measuring its distance from the scan",
     "canal": "looking for the spinal canal",
     "vertebrae": "looking for vertebrae",

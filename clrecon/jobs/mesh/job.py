@@ -13,7 +13,7 @@ from clrecon.jobs.mesh.labels import extract_label_surfaces, judge_label_volumes
 from clrecon.jobs.mesh.levels import choose_level
 from clrecon.jobs.mesh.parts import SELECT_STEPS, check_levels, extract_surfaces, first_names, select_parts
 from clrecon.jobs.mesh.prepare import fill_solid, mask_parts, narrow_volume, prepare_surfaces
-from clrecon.jobs.mesh.refinement import describe_purposes, judge_parts, refine_surface, warn_of_gates
+from clrecon.jobs.mesh.refinement import describe_purposes, judge_parts, measure_parts, refine_surface, warn_of_gates
 from clrecon.jobs.mesh.report import MeshReport, describe_job, describe_part
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface, plan_surfaces
@@ -293,11 +293,8 @@ def _refine_and_measure(
             part.mesh = refine_surface(part.mesh, settings, device, progress)
         watch.lap("refine")
     if measure:
-        steps = Steps(progress, "measure", len(parts))
-        for part in parts:
-            part.quality = part.mesh.quality()
-            steps.take()
-    return judge_parts(parts, volume, settings, device, progress) + judge_label_volumes(parts, settings.closed)
+        measure_parts(parts, volume, settings, device, progress)
+    return judge_parts(parts, volume, settings, progress) + judge_label_volumes(parts, settings.closed)
 
 
 def _warn_of_leftovers(output: str | Path, paths: Sequence[str | Path]) -> list[str]:

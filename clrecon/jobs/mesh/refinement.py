@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part
+from clrecon.system.pieces import side_by_side
 from clrecon.system.progress import Progress, Steps, ignore_progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.mesh import Mesh
+    from clrecon.mesh.compare.iso_distance import IsoDistance
+    from clrecon.mesh.quality import MeshQuality
     from clrecon.opencl import Device
 
-__all__ = ["describe_purposes", "judge_parts", "refine_surface", "warn_of_gates"]
+__all__ = ["describe_purposes", "judge_parts", "measure_parts", "refine_surface", "warn_of_gates"]
 
 
 def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress: Progress = ignore_progress) -> Mesh:
@@ -55,28 +56,72 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress:
     return mesh
 
 
-def judge_parts(
+def measure_parts(
     parts: Sequence[Part],
     volume: Volume,
     settings: MeshSettings,
     device: Device | None = None,
     progress: Progress = ignore_progress,
+) -> None:
+    """Measure the quality of each part, and with `strict` the triangles that cut each other.
+
+    The device looks for these while the host measures all else, the distance from the scan too.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        As they are written; the result is their `quality`.
+    volume : Volume
+        The volume that they were made from.
+    settings : MeshSettings
+    device : Device, optional
+        Helps with the search; without one the host finds the same.
+    progress : callable, optional
+        Called as ``progress("measure", parts done, parts)``, with `strict` as ``progress("crossings", triangles done,
+        triangles)``.
+    """
+    if not settings.strict:
+        steps = Steps(progress, "measure", len(parts))
+        for part in parts:
+            part.quality = part.mesh.quality()
+            steps.take()
+        return
+    steps = Steps(progress, "crossings", sum(part.mesh.triangle_count for part in parts))
+    for part in parts:
+        (quality, distance), crossings = side_by_side(
+            partial(_measure_on_host, part, volume), partial(_count_crossings, part.mesh, device, steps)
+        )
+        part.quality = quality.changed(self_intersections=crossings)
+        part.facts["iso_distance"] = distance
+
+
+def _measure_on_host(part: Part, volume: Volume) -> tuple[MeshQuality, IsoDistance | None]:
+    return part.mesh.quality(), _measure_distance(part, volume)
+
+
+def _measure_distance(part: Part, volume: Volume) -> IsoDistance | None:
+    """Measure how far a part lies from the scan, None where HU do not place it."""
+    from clrecon.mesh.compare.iso_distance import measure_iso_distance, rule_of_report
+
+    rule = None if part.surface.label is not None else rule_of_report(part.mesh.report)
+    return None if rule is None else measure_iso_distance(part.mesh, volume, rule)
+
+
+def judge_parts(
+    parts: Sequence[Part], volume: Volume, settings: MeshSettings, progress: Progress = ignore_progress
 ) -> list[dict[str, Any]]:
     """Judge the parts of a job by the gates; the measures are stored in the `facts` of each.
 
     Parameters
     ----------
     parts : sequence of Part
-        Parts as they are written, with the result of `Mesh.quality`. A part that was not measured has only the gates of
+        Parts as they are written, after `measure_parts`.  A part that was not measured has only the gates of
         refinement.
     volume : Volume
         The volume that they were made from.
     settings : MeshSettings
-        With `strict`, triangles that cut each other are searched.
-    device : Device, optional
-        Helps with the search; without one the host finds the same.
     progress : callable, optional
-        Called as ``progress("distance", parts done, parts)`` and ``progress("crossings", triangles done, triangles)``.
+        Called as ``progress("distance", parts done, parts)``.
 
     Returns
     -------
@@ -88,18 +133,14 @@ def judge_parts(
             part.facts |= {"iso_distance": None, "refinement": None}
         return []
     from clrecon.mesh.compare.gates import judge_mesh
-    from clrecon.mesh.compare.iso_distance import measure_iso_distance, rule_of_report
 
     gates = []
-    if settings.strict:
-        _count_crossings([part for part in parts if part.quality is not None], device, progress)
     steps = Steps(progress, "distance", len(parts))
     for part in parts:
-        mesh, refinement = part.mesh, part.mesh.report.get("refinement")
-        iso_distance = None
-        if part.quality is not None:
-            rule = None if part.surface.label is not None else rule_of_report(mesh.report)
-            iso_distance = None if rule is None else measure_iso_distance(mesh, volume, rule)
+        refinement = part.mesh.report.get("refinement")
+        iso_distance = part.facts.get("iso_distance")
+        if part.quality is not None and "iso_distance" not in part.facts:
+            iso_distance = _measure_distance(part, volume)
         found = judge_mesh(
             part.quality,
             closed=settings.closed,
@@ -114,30 +155,15 @@ def judge_parts(
     return gates
 
 
-def _count_crossings(parts: Sequence[Part], device: Device | None, progress: Progress) -> None:
-    """Store in the quality of each part how many pairs of its triangles cut each other."""
+def _count_crossings(mesh: Mesh, device: Device | None, steps: Steps) -> int:
+    """Count the pairs of triangles that cut each other."""
     from clrecon.mesh.intersections import find_self_intersections
     from clrecon.opencl import work_on
     from clrecon.operators.surface.crossings import find_crossings
 
-    steps = Steps(progress, "crossings", sum(part.mesh.triangle_count for part in parts))
-    for part in parts:
-        vertices, triangles = part.mesh.vertices, part.mesh.triangles
-
-        def look(
-            current: Device,
-            _: list[str],
-            vertices: NDArray[np.floating] = vertices,
-            triangles: NDArray[np.uint32] = triangles,
-        ) -> NDArray[np.int64]:
-            return find_crossings(current, vertices, triangles, steps=steps)
-
-        if device is None:
-            found = find_self_intersections(vertices, triangles, steps=steps)
-        else:
-            found = work_on(device, look)
-        assert part.quality is not None
-        part.quality = part.quality.changed(self_intersections=len(found))
+    if device is None:
+        return len(find_self_intersections(mesh.vertices, mesh.triangles, steps=steps))
+    return len(work_on(device, lambda current, _: find_crossings(current, mesh.vertices, mesh.triangles, steps=steps)))
 
 
 def describe_purposes(parts: Sequence[Part]) -> list[str]:
