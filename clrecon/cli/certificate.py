@@ -91,7 +91,7 @@ def _describe_thickness(thickness: dict[str, Any], usual_gap: float) -> str:
     text = f"{low:g} mm" if low == high else f"{low:g} to {high:g} mm"
     least, most, overlap = (thickness["overlap_mm"][name] for name in ("min", "max", "median"))
     if most - least > _SAME * usual_gap:
-        return f"{text}: {_overlaps(least, most)}"
+        return f"{text}: {_overlaps(least, most, _SAME * usual_gap)}"
     if abs(overlap) <= _SAME * usual_gap:
         return f"{text}: neighbouring slices touch"
     percent = thickness["overlap_percent"]
@@ -99,12 +99,13 @@ def _describe_thickness(thickness: dict[str, Any], usual_gap: float) -> str:
     return f"{text}: {_overlap(overlap, usual_gap)} between neighbouring slices{share}"
 
 
-def _overlaps(least: float, most: float) -> str:
+def _overlaps(least: float, most: float, nothing: float) -> str:
     """Describe by how much neighbouring slices overlap where that differs; below 0 is what lies between them."""
+    least, most = (0.0 if abs(length) <= nothing else length for length in (least, most))
     if least >= 0.0:
         return f"neighbouring slices overlap by {least:.3g} to {most:.3g} mm"
     if most <= 0.0:
-        return f"{-most + 0.0:.3g} to {-least:.3g} mm between neighbouring slices are not measured"
+        return f"{abs(most):.3g} to {-least:.3g} mm between neighbouring slices are not measured"
     return f"neighbouring slices overlap by up to {most:.3g} mm, or up to {-least:.3g} mm between them are not measured"
 
 

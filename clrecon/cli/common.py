@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 from clrecon.cli.console import Console
 from clrecon.cli.standard_output import STREAMED
+from clrecon.cli.wrapping import fit_help
 from clrecon.errors import ClreconError, OutputError, UsageError
 from clrecon.system.text import guess_word
 from clrecon.system.time_limit import DEFAULT_SECONDS, check_time_limit
@@ -99,6 +100,10 @@ class Parser(argparse.ArgumentParser):
             number = "whole number" if action.type is int else "number"
             unit = ": write the length in mm, without a unit" if action.metavar == "MM" else ""
             raise argparse.ArgumentError(action, f"{arg_string!r:.80} is no {number}{unit}") from None
+
+    def format_help(self) -> str:
+        """Return the help text, with no line longer than the terminal."""
+        return fit_help(super().format_help(), sys.stdout)
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message} (see: {self.prog} --help)")

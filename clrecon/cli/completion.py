@@ -55,7 +55,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
     script = write_script(options.shell)
     console.result({"shell": options.shell, "script": script})
-    console.say(script.rstrip("\n"))
+    console.say(script.rstrip("\n"), whole=True)
     return 0
 
 

@@ -7,6 +7,7 @@ import sys
 import time
 from typing import Any
 
+from clrecon.cli.wrapping import fit, is_terminal
 from clrecon.errors import OutputError
 
 __all__ = ["Console", "is_terminal", "printable"]
@@ -103,14 +104,17 @@ class Console:
         self.clear()
         self._guard_stdout(lambda: sys.stdout.buffer.write(piece))
 
-    def say(self, text: str = "") -> None:
-        """Print a line of the result for people; nothing with ``--json`` or ``-q``."""
+    def say(self, text: str = "", *, whole: bool = False) -> None:
+        """Print a line of the result for people; nothing with ``--json`` or ``-q``.
+
+        On terminals long lines are broken between words, unless it is to stay `whole`.
+        """
         if self.as_json or self.quiet:
             return
         if self._said_on_stderr:
             self._to_stderr(text)
         else:
-            self._to_stdout(text)
+            self._to_stdout(text if whole else fit(text, sys.stdout))
 
     def result(self, value: dict[str, Any]) -> None:
         """Print the JSON object; nothing without ``--json`` or ``--report -``."""
@@ -183,7 +187,7 @@ class Console:
             for hidden in (self._hidden_name, os.path.splitext(self._hidden_name)[0]):  # one of several files too
                 line = line.replace(hidden, self._shown_name)
         if sys.stderr is not None:
-            _write(sys.stderr, line + "\n")
+            _write(sys.stderr, fit(line, sys.stderr) + "\n")
 
     def _to_stdout(self, text: str) -> None:
         self.clear()
@@ -220,11 +224,6 @@ def _discard_stdout() -> None:
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, descriptor)
     os.close(null)
-
-
-def is_terminal(stream: Any) -> bool:
-    """True if `stream` is a terminal that can show moving lines and styles."""
-    return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
 
 
 def _columns() -> int:

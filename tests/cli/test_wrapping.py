@@ -1,0 +1,45 @@
+"""Lines for terminals of 60 columns: no break within a word, commands that can be pasted; pipes get whole lines."""
+
+from __future__ import annotations
+
+import pytest
+
+from clrecon.cli import wrapping
+from clrecon.cli.main import COMMANDS, main
+
+
+class Terminal:
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def narrow(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setenv("TERM", "xterm")
+
+
+def test_lines_break_between_words_and_go_on_under_their_text(narrow):
+    line = "surface  200 HU (as given), closed at the border of the volume, and more words that are too long for it"
+    parts = wrapping.fit(line, Terminal()).split("\n")
+    assert max(map(len, parts)) <= 60 and len(parts) == 2
+    assert parts[1].startswith(" " * 9) and parts[1][9] != " "
+    assert " ".join(part.strip() for part in parts) == line
+    assert wrapping.fit(line, None) == line and wrapping.fit("short", Terminal()) == "short"
+    styled = "\x1b[1m" + "table  " * 20
+    assert wrapping.fit(styled, Terminal()) == styled
+    path = "wrote    /" + "x" * 80
+    assert wrapping.fit(path, Terminal()).replace("\n", " ").split() == path.split()  # a word stays whole
+    warning = "clrecon: warning: " + "word " * 20
+    assert all(part.startswith("  word") for part in wrapping.fit(warning, Terminal()).split("\n")[1:])
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_help_fits_60_columns_and_its_examples_can_be_pasted(command, narrow, capsys):
+    assert main([command, "--help"]) == 0
+    lines = capsys.readouterr().out.split("\n")
+    # what is longer is one word with its indentation, or in brackets that argparse keeps whole
+    assert not [line for line in lines if len(line) > 60 and len(line.split()) > 1]
+    for line, following in zip(lines, lines[1:], strict=False):
+        if line.endswith(" \\"):
+            assert following.startswith("    ")
