@@ -89,9 +89,9 @@ def read_volume(
     -------
     Volume
         ``voxels`` (nk, nj, ni) int16, int32 or float32; ``affine`` index (i, j, k) to LPS mm; ``report`` the
-        certificate.  Unevenly spaced slices keep their own positions (`Volume.uneven`). For files other than DICOM the
-        values are those of the file (with its slope and intercept): whole numbers of any stored type become int16 or
-        int32, others float32, NaN -1024.
+        certificate.  Unevenly spaced slices keep their own positions (``Volume.uneven``). For files other than DICOM
+        the values are those of the file (with its slope and intercept): whole numbers of any stored type become int16
+        or int32, others float32, NaN -1024.
 
     Raises
     ------
@@ -100,8 +100,8 @@ def read_volume(
     RefusedInputError
         Files are corrupt, or geometry or values cannot be trusted; the message names files and figures.
     UsageError
-        `series` matches no series or several; the `phase` does not exist; an option for DICOM is given with another
-        format; a package is missing; or `path` is empty.
+        ``series`` matches no series or several; the ``phase`` does not exist; an option for DICOM is given with another
+        format; a package is missing; or ``path`` is empty.
     """
     kind = tell_format(path)
     if kind is None:
@@ -141,7 +141,7 @@ def list_series(
     Raises
     ------
     NoDicomError, RefusedInputError, UsageError
-        As `clrecon.dicom.list_series`; a file of another format is corrupt, its package is missing, or an option for
+        As `list_series`; a file of another format is corrupt, its package is missing, or an option for
         DICOM is given with it.
     """
     kind = tell_format(path)

@@ -58,7 +58,7 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Pro
     """Turn everything outside the patient's body into air: table, blankets, cables.
 
     Bone and all else within the body keep their values; so does a margin of 3 mm around it.  Dry specimens are kept
-    whole, see `clrecon.anatomy.dense_pieces`.  Look at the result: a part of the table that lies within the margin
+    whole, see ``clrecon.anatomy.dense_pieces``.  Look at the result: a part of the table that lies within the margin
     stays.
 
     Parameters
@@ -74,7 +74,7 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Pro
     -------
     Volume
         A volume with the same places; ``report["remove_table"]`` has ``voxels_removed``, ``dense_voxels_removed``
-        (above -300 HU), ``removed_share`` (of all voxels), ``body_share``, ``air_hu`` and the facts of `judge_bone`;
+        (above -300 HU), ``removed_share`` (of all voxels), ``body_share``, ``air_hu`` and the facts of ``judge_bone``;
         ``report["gates"]`` has the gate ``bone_kept`` too.
 
     Raises
@@ -121,7 +121,7 @@ def mask_field_of_view(volume: Volume, radius_mm: float | None = None, *, progre
     -------
     Volume
         A volume with the same places; ``report["field_of_view"]`` has ``radius_mm``, ``voxels_removed``,
-        ``dense_voxels_removed`` (above -300 HU), ``removed_share``, ``air_hu`` and the facts of `judge_circle`.
+        ``dense_voxels_removed`` (above -300 HU), ``removed_share``, ``air_hu`` and the facts of ``judge_circle``.
         Without a radius ``report["gates"]`` has the gate ``bone_in_circle``: a circle that was not chosen should cut no
         bone.
 

@@ -113,7 +113,7 @@ def write_volume(
         .nii.gz, .nii (NIfTI-1; RAS mm, as that format has it), .nrrd or .mha (LPS mm).
     resample : float, optional
         Resample (trilinear) to a regular grid with this step in mm along all axes, see
-        `clrecon.geometry.resample.resample_volume`.  Without it voxels stay as they are.
+        ``clrecon.geometry.resample.resample_volume``.  Without it voxels stay as they are.
     keep_ids : bool
         Write the hash of the frame of reference with the certificate.
     progress : callable, optional

@@ -31,7 +31,7 @@ class Volume(BaseVolume):
     """Voxels in HU with the affine that places them in the patient.
 
     ``np.asarray(volume)`` are its voxels, without a copy.  ``volume[k0:k1, j0:j1, i0:i1]`` is a part of it at its own
-    place, in the axis order of `shape` and of the voxels.
+    place, in the axis order of ``shape`` and of the voxels.
 
     Parameters
     ----------
@@ -40,20 +40,20 @@ class Volume(BaseVolume):
         rows, k over the slices.  int8, uint8, int16, uint16, int32 and float32 are kept as they are (and not
         copied when C-contiguous); bool becomes uint8, other floats float32, other integers int32.
     affine : array_like, shape (4, 4)
-        Index (i, j, k) to LPS mm, see `clrecon.geometry.affine`.
+        Index (i, j, k) to LPS mm, see ``clrecon.geometry.affine``.
     report : dict, optional
-        What is known of the origin and the quality of this volume; `read_volume` gives a `Certificate`.
+        What is known of the origin and the quality of this volume; `read_volume` gives a ``Certificate``.
     slice_positions : array_like, shape (nk, 3), optional
         LPS mm of voxel (0, 0, k), for slices that no single affine places.  Between two slices k runs linearly, beyond
-        the ends in the steps of the ends.  The third column of `affine` is then only nominal.
+        the ends in the steps of the ends.  The third column of ``affine`` is then only nominal.
     hu_range : (float, float), optional
         Lowest and highest value, if the caller knows them; else they are found when first asked for.
 
     Raises
     ------
     UsageError
-        `voxels` is not three-dimensional, empty, or of a type that cannot be used; `affine` is not an affine;
-        `slice_positions` do not match the affine.
+        ``voxels`` is not three-dimensional, empty, or of a type that cannot be used; ``affine`` is not an affine;
+        ``slice_positions`` do not match the affine.
     """
 
     __iter__ = None  # without it Python would try volume[0], volume[1], ...
@@ -122,7 +122,7 @@ class Volume(BaseVolume):
         """Return a copy (trilinear) on a regular grid with one step along all axes, at right angles.
 
         i runs as in the volume, j within the plane of its slices, k along their normal; points beyond the voxels are
-        `AIR_HU`.  Uneven and tilted slices become even and straight.  The certificate stays, with the new shape and
+        ``AIR_HU``.  Uneven and tilted slices become even and straight.  The certificate stays, with the new shape and
         place, its entry ``resampled`` and a warning.
 
         Parameters
@@ -134,7 +134,7 @@ class Volume(BaseVolume):
         Raises
         ------
         UsageError
-            `step_mm` is no length, or below 0.01 mm.
+            ``step_mm`` is no length, or below 0.01 mm.
         RefusedInputError
             The result would have more than 2^31 voxels.
         """
@@ -180,7 +180,7 @@ class Volume(BaseVolume):
     def to_pyvista(self, resample: bool = False) -> Any:
         """Return the volume as ``pyvista.ImageData`` in LPS mm, its HU as the active point data ``HU``.
 
-        The points lie where `ijk_to_lps` puts the voxels, i runs fastest.  The image shares the memory of the voxels:
+        The points lie where ``ijk_to_lps`` puts the voxels, i runs fastest.  The image shares the memory of the voxels:
         a change of one is a change of the other.  It is a copy where the axes are left-handed (a field array ``SLICES``
         then says that the slices are in reverse order, which VTK needs) or where it is resampled.  Field arrays
         ``SPACE`` and ``UNIT`` say what the coordinates are.  The certificate does not go with it.
@@ -193,7 +193,7 @@ class Volume(BaseVolume):
         resample : bool
             A sheared or unevenly spaced volume, which no image can hold, is resampled (trilinear) to a regular grid
             around all its voxels, i and j in their own steps and k in the smallest step of the slices; points beyond
-            the voxels are `AIR_HU`.  A field array ``RESAMPLED`` says so.  Other volumes stay as they are.
+            the voxels are ``AIR_HU``.  A field array ``RESAMPLED`` says so.  Other volumes stay as they are.
 
         Raises
         ------
@@ -224,7 +224,7 @@ class Volume(BaseVolume):
         Raises
         ------
         UsageError
-            It is no ImageData, has no such point data, or several numbers a point; or `space` is not that of the array.
+            It is no ImageData, has no such point data, or several numbers a point; ``space`` is not that of the array.
         """
         from clrecon.geometry.vtk import take_image_data
 

@@ -41,7 +41,7 @@ class LabelMap(Grid):
     Raises
     ------
     UsageError
-        `voxels` has not three axes, is empty, or holds other values than whole numbers in range; `affine` is not an
+        ``voxels`` has not three axes, is empty, or holds other values than whole numbers in range; ``affine`` is not an
         affine; or a name is not text.
     """
 
@@ -79,7 +79,7 @@ class LabelMap(Grid):
         return {number: self.name(number) for number in sorted({*self.counts, *self._names} - {0})}
 
     def name(self, number: int) -> str:
-        """Return the name of `number`, ``label_N`` where the file gives none."""
+        """Return the name of ``number``, ``label_N`` where the file gives none."""
         return self._names.get(number) or f"label_{number}"
 
     def find(self, label: str | int) -> int:

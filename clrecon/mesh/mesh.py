@@ -94,19 +94,19 @@ class Mesh(BaseMesh):
         Raises
         ------
         UsageError, NoSurfaceError
-            See `clrecon.mesh.select_components`.
+            See ``clrecon.mesh.select_components``.
         """
         return split_components(self, keep_largest, min_volume_ml, seeds=seeds)
 
     def keep_largest(self, count: int = 1) -> Mesh:
-        """Return the mesh with its `count` parts of largest area alone.
+        """Return the mesh with its ``count`` parts of largest area alone.
 
         The walls of cavities are parts of their own, so with one part cavities are filled.
 
         Raises
         ------
         UsageError
-            `count` is below 1.
+            ``count`` is below 1.
         NoSurfaceError
             The mesh is empty.
         """
@@ -123,7 +123,7 @@ class Mesh(BaseMesh):
         Raises
         ------
         UsageError
-            The mesh fails `check`: VTK would crash on it.
+            The mesh fails ``check``: VTK would crash on it.
         """
         from clrecon.mesh.vtk import wrap_polydata
 
@@ -145,7 +145,7 @@ class Mesh(BaseMesh):
         Raises
         ------
         UsageError
-            It is no PolyData, has no faces, or a number that a mesh cannot have; or `space` is not that of the array.
+            It is no PolyData, has no faces, or a number that a mesh cannot have; or ``space`` is not that of the array.
         """
         from clrecon.mesh.vtk import unwrap_polydata
 
@@ -160,7 +160,7 @@ class Mesh(BaseMesh):
         Raises
         ------
         UsageError
-            trimesh is not installed, or the mesh fails `check`.
+            trimesh is not installed, or the mesh fails ``check``.
         """
         trimesh = import_package("trimesh", "to_trimesh")
         self.check()
@@ -188,7 +188,7 @@ class Mesh(BaseMesh):
         Raises
         ------
         UsageError
-            It is no Trimesh, its ``units`` are not mm, or it has a number that a mesh cannot have; or `space` is not
+            It is no Trimesh, its ``units`` are not mm, or it has a number that a mesh cannot have; or ``space`` is not
             that of the metadata.
         """
         vertices, faces = getattr(mesh, "vertices", None), getattr(mesh, "faces", None)
@@ -206,7 +206,7 @@ class Mesh(BaseMesh):
     def _of_others(
         cls, vertices: NDArray[Any], triangles: NDArray[Any], normals: NDArray[Any] | None, space: str
     ) -> Mesh:
-        """Make a mesh of arrays in `space`."""
+        """Make a mesh of arrays in ``space``."""
         if space != "LPS":
             signs = np.diag(frame_from_lps(space))
             vertices = vertices * signs.astype(vertices.dtype)

@@ -44,7 +44,7 @@ def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh
     Raises
     ------
     UsageError
-        The extension or `space` is unknown, or the file names another frame.
+        The extension or ``space`` is unknown, or the file names another frame.
     RefusedInputError
         The file cannot be read, is cut or corrupt, or has numbers that a mesh cannot have.
     """

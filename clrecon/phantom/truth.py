@@ -96,7 +96,7 @@ class PhantomTruth:
         Returns
         -------
         ndarray, shape (n,), uint8
-            Keys of `names`, and 0.
+            Keys of ``names``, and 0.
 
         Raises
         ------

@@ -107,8 +107,8 @@ class PointCloud(Message):
     ) -> PointCloud:
         """Make a cloud of arrays that an operator has made: they have the promised types and are finite.
 
-        Nothing is checked or copied, which would take longer than making them.  Of `VoxelNumbers` the indices are made
-        when they are first asked for.
+        Nothing is checked or copied, which would take longer than making them.  Of ``VoxelNumbers`` the indices are
+        made when they are first asked for.
         """
         made = cls.__new__(cls)
         made._points, made._normals, made._hu, made._labels, made._ijk = points, normals, hu, labels, ijk
@@ -196,7 +196,7 @@ class PointCloud(Message):
         return array.copy() if copy else array
 
     def changed(self, **arrays: ArrayLike | None) -> PointCloud:
-        """Return a cloud with other `points`, `normals`, `hu`, `labels`, `ijk` or `report`; all else stays."""
+        """Return a cloud with other `points`, `normals`, `hu`, `labels`, `ijk` or ``report``; all else stays."""
         known = ("points", "normals", "hu", "labels", "ijk", "report")
         unknown = arrays.keys() - set(known)
         if unknown:
@@ -262,9 +262,9 @@ class PointCloud(Message):
         return points, None if self._normals is None else self._normals * signs + np.float32(0)
 
     def describe(self, space: str, *, keep_ids: bool = False, with_ijk: bool = True) -> PointContent:
-        """Return the contents of a file of the cloud in `space`; nothing else of `report` is ever written.
+        """Return the contents of a file of the cloud in ``space``; nothing else of ``report`` is ever written.
 
-        Only with `keep_ids` they have the hash of the frame of reference, and only with `with_ijk` voxel indices.
+        Only with ``keep_ids`` they have the hash of the frame of reference, and only with ``with_ijk`` voxel indices.
         """
         points, normals = self.in_space(space)
         facts = describe_facts(self.report, space, keep_ids=keep_ids)

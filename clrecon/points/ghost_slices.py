@@ -113,11 +113,11 @@ def drop_ghost_slices(cloud: PointCloud, found: GhostSlices, *, volume: Volume |
     Parameters
     ----------
     cloud : PointCloud
-        Voxel centres, or with `volume` points of a surface, of which those nearer than one slice to a ghost go.
+        Voxel centres, or with ``volume`` points of a surface, of which those nearer than one slice to a ghost go.
     found : GhostSlices
         Of the volume that the cloud comes from, see `find_ghost_slices`.
     volume : Volume, optional
-        That volume, for clouds without `ijk`.
+        That volume, for clouds without ``ijk``.
 
     Returns
     -------

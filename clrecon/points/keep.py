@@ -73,7 +73,7 @@ def keep_clusters(
     """Keep some clusters of a cloud; noise goes, and without a rule nothing else does.
 
     Sheets go first, then small clusters; the largest are counted among what is left.  A seed keeps its cluster alone,
-    several seeds theirs, and may not be used with `largest`.
+    several seeds theirs, and may not be used with ``largest``.
 
     Parameters
     ----------
@@ -85,9 +85,9 @@ def keep_clusters(
         ``no-sheets``: no cluster of 500 points or more whose second principal standard deviation is over 15 times its
         first: table tops, image planes.
     cores : array_like, shape (n,), bool, optional
-        Core points, see `Clustering.cores`; without them a seed takes the nearest point of any cluster.
+        Core points, see ``Clustering.cores``; without them a seed takes the nearest point of any cluster.
     figures : ClusterFigures, optional
-        The figures of the clusters of this cloud, see `Clustering.figures`; default: they are measured.
+        The figures of the clusters of this cloud, see ``Clustering.figures``; default: they are measured.
 
     Returns
     -------
@@ -98,7 +98,7 @@ def keep_clusters(
     Raises
     ------
     UsageError
-        The cloud has no labels, a rule has another form, or `cores` do not fit.
+        The cloud has no labels, a rule has another form, or ``cores`` do not fit.
     NoSurfaceError
         No cluster is left.
     """

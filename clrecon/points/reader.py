@@ -47,7 +47,7 @@ def read_points(path: str | os.PathLike[str], *, space: str | None = None) -> Po
     Raises
     ------
     UsageError
-        `space` is unknown, or is not the frame that the file names; or the file is LAS and laspy is not installed.
+        ``space`` is unknown, or is not the frame that the file names; or the file is LAS and laspy is not installed.
     RefusedInputError
         The file cannot be read, is cut or corrupt, has no points or points that are not finite.
     """

@@ -52,7 +52,7 @@ def time_limit(timeout: float) -> Iterator[None]:
     Raises
     ------
     UsageError
-        `timeout` is not a number from 0 on.
+        ``timeout`` is not a number from 0 on.
     """
     global _seconds
     before, _seconds = _seconds, check_time_limit(timeout)

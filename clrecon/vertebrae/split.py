@@ -98,7 +98,7 @@ def split_vertebrae(
     Raises
     ------
     UsageError
-        A parameter is impossible, or `name_at` is in no vertebra.
+        A parameter is impossible, or ``name_at`` is in no vertebra.
     RefusedInputError
         No spine, fewer than two discs, or no vertebra of which the search is sure.
     """

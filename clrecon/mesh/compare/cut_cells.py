@@ -54,7 +54,7 @@ def find_cut_cells(
     Raises
     ------
     UsageError
-        `truth` has no signed distance.
+        ``truth`` has no signed distance.
     """
     if not hasattr(truth, "signed_distance"):
         raise UsageError(f"a {type(truth).__name__} has no signed distance: give the truth of a phantom")

@@ -176,7 +176,7 @@ def compare_meshes(
     NoSurfaceError
         A mesh is empty or has no area.
     UsageError
-        `samples` is below 1.
+        ``samples`` is below 1.
     """
     if samples < 1:
         raise UsageError(f"distances need at least 1 sample, not {samples}")

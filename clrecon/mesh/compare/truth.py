@@ -82,7 +82,7 @@ def measure_truth(
     samples : int
         Points on the mesh.
     reach_mm : float, optional
-        Points farther from the true surface are left out.  Default: 1.5 mm, and with `grid` not less than the longest
+        Points farther from the true surface are left out.  Default: 1.5 mm, and with ``grid`` not less than the longest
         step of its voxels.
     grid : Volume or LabelMap, optional
         The scan; points within a voxel of its border, where a mesh is closed by a cut, are then left out.

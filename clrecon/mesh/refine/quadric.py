@@ -57,7 +57,7 @@ def collapse_quadric(mesh: Mesh, fraction: float, *, progress: Progress | None =
         Normals from the faces; the report is taken over, with ``refinement["quadric"]``: ``fraction`` (asked for),
         ``reached``, ``triangles_before``, ``farthest_mm`` (the largest distance found between the surfaces, from
         points that cover each evenly, and from all vertices of the parts that were lost), ``samples``, ``topology``
-        (`clrecon.mesh.refine.topology.TopologyChange`) and ``gates`` (no components lost, no edge more that is not in
+        (``clrecon.mesh.refine.topology.TopologyChange``) and ``gates`` (no components lost, no edge more that is not in
         two triangles); a gate that fails is a warning in ``warnings`` too.
 
     Raises

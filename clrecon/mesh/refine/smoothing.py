@@ -43,7 +43,7 @@ def smooth_mesh(
     max_deviation_mm : float, optional
         No point of the result lies farther than this from the given surface, and no point of that from the result: the
         triangles are the same and no corner moves farther, so no point between them does.  Default:
-        `default_deviation`.
+        ``default_deviation``.
     progress : callable, optional
         Called as ``progress("smooth", steps done, all steps)``.
 

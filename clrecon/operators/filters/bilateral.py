@@ -77,15 +77,15 @@ def filter_bilateral(
     memory: int | None = None,
     progress: Progress | None = None,
 ) -> VolumeKind:
-    """Filter a volume by distance and difference: noise goes, edges of more than some `sigma_hu` stay (Tomasi and
+    """Filter a volume by distance and difference: noise goes, edges of more than some ``sigma_hu`` stay (Tomasi and
     Manduchi 1998).
 
     Each voxel becomes the mean of its neighbours with the weights ``exp(-|t|^2 / (2 sigma_mm^2) - d^2 / (2
-    sigma_hu^2))``, |t| the distance in mm and d the difference in HU.  Distances are those of the voxels' places, in
-    anisotropic, sheared and uneven volumes too.  Beyond the border lies the value of the nearest voxel.  NaN and
+    sigma_hu^2))``, ``|t|`` the distance in mm and d the difference in HU.  Distances are those of the voxels' places,
+    in anisotropic, sheared and uneven volumes too.  Beyond the border lies the value of the nearest voxel.  NaN and
     infinite voxels of floats stay as they are, and count nowhere.
 
-    The window is the box around the ball of 2.5 sigma_mm.  Of one with more than `taps` voxels the nearest stay, in
+    The window is the box around the ball of 2.5 sigma_mm.  Of one with more than ``taps`` voxels the nearest stay, in
     whole rings of equal distance.
 
     It removes specks and smooths plateaus.  It does not make the surface more accurate: see docs/filters.md.
@@ -105,7 +105,7 @@ def filter_bilateral(
         side of it as after the whole filter, and the positions of the surface are the same bit for bit.  All else stays
         as it was.
     normals : bool
-        With `near`: the voxels that decide the normals at the vertices are filtered too.
+        With ``near``: the voxels that decide the normals at the vertices are filtered too.
     taps : int, optional
         Most voxels of a window, 2 to 4,096; default 125, in 2 dimensions 29.  In slices with square pixels 13 are
         OpenCV's disc of diameter 5.
@@ -128,10 +128,10 @@ def filter_bilateral(
     Raises
     ------
     UsageError
-        A sigma is not above 0 or not finite, or longer than the volume; `taps` leave no neighbour; there is no soft
+        A sigma is not above 0 or not finite, or longer than the volume; ``taps`` leave no neighbour; there is no soft
         tissue to measure the noise in; integers beyond 2^24.
     NoSurfaceError
-        The type of the voxels has no value at `near`.
+        The type of the voxels has no value at ``near``.
     DeviceError
         No device, no room for three slices, or the device fails.
     """

@@ -62,7 +62,7 @@ def fill_enclosed(
     Between two bones nothing is closed: pieces that were apart stay so, with the vessels full of contrast medium.
 
     No other voxel changes: where bone borders on what is outside, an iso surface of the result has the same vertices
-    as one of `volume`, bit for bit.
+    as one of ``volume``, bit for bit.
 
     Parameters
     ----------
@@ -86,12 +86,12 @@ def fill_enclosed(
     Returns
     -------
     Volume or DeviceVolume
-        As `volume`.  ``report["solid"]``: ``seal_mm``, ``bone_ml``, ``filled_ml``, ``filled_share`` (of both together),
-        ``filled_air_ml`` (cells with air that the ball closed), ``filled_hu`` (the value of what was filled: the mean
-        of the bone), ``spaces`` (number of spaces filled that are wider than the ball), ``at_ends`` (of these, how many
-        the ends of the volume cut), ``largest_ml``, and ``open``: for each kind (``wide``, ``air``) ``spaces``, ``ml``,
-        ``largest_ml`` and ``at_mm``, LPS mm of a place in the largest;
-        ``warnings`` say what stays open, and if more was filled than the bone itself has.
+        As ``volume``.  ``report["solid"]``: ``seal_mm``, ``bone_ml``, ``filled_ml``, ``filled_share`` (of both
+        together), ``filled_air_ml`` (cells with air that the ball closed), ``filled_hu`` (the value of what was filled:
+        the mean of the bone), ``spaces`` (number of spaces filled that are wider than the ball), ``at_ends`` (of these,
+        how many the ends of the volume cut), ``largest_ml``, and ``open``: for each kind (``wide``, ``air``)
+        ``spaces``, ``ml``, ``largest_ml`` and ``at_mm``, LPS mm of a place in the largest; ``warnings`` say what stays
+        open, and if more was filled than the bone itself has.
 
     Raises
     ------

@@ -113,7 +113,7 @@ class Mask(MaskComponents):
         Raises
         ------
         UsageError
-            `labels` is not a LabelMap, or it has no such label.
+            ``labels`` is not a LabelMap, or it has no such label.
         RefusedInputError
             The map names another frame of reference, or lies outside of the volume.
         DeviceError
@@ -262,7 +262,7 @@ class Mask(MaskComponents):
         Returns
         -------
         Volume or DeviceVolume
-            As `volume`; its report says what was chosen, under ``region``.
+            As ``volume``; its report says what was chosen, under ``region``.
 
         Raises
         ------

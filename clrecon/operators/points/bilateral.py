@@ -72,7 +72,7 @@ def denoise_points(
     """Smooth a cloud: move each point along its normal to the bilaterally weighted mean of its neighbours' heights.
 
     Paper B, eq. 3 to 5: p' = p - beta n with Gaussian weights of the distance (sigma_c: the distance to the kth
-    neighbour) and of the height over the neighbour (sigma_s: `range_factor` times the standard deviation of the
+    neighbour) and of the height over the neighbour (sigma_s: ``range_factor`` times the standard deviation of the
     heights).  The paper prints p + beta n, which makes noise worse; the sign of the normal cancels.  Neighbours and
     normals are those before each iteration.  How far points moved is part of the result: a filter that smooths also
     shrinks.
@@ -92,7 +92,7 @@ def denoise_points(
         D_i > D0, with D0 = 1.2 times the median D_i; this ratio of distances does not see edges.  "variation": features
         have a surface variation above 0.05.
     paper : bool
-        True: as the paper has it, `range_factor` 1 and `features` "paper".
+        True: as the paper has it, ``range_factor`` 1 and ``features`` "paper".
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.
     memory : int, optional

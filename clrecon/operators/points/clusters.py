@@ -72,15 +72,15 @@ def cluster_points(
 ) -> Clustering:
     """Cluster points by density (DBSCAN), equal to scikit-learn label for label for points in the same order.
 
-    Points are core points when at least `min_samples` points lie within `eps`, themselves included.  Core points
-    within `eps` of each other belong to one cluster.  Clusters are numbered by their first core point; other points
+    Points are core points when at least ``min_samples`` points lie within ``eps``, themselves included.  Core points
+    within ``eps`` of each other belong to one cluster.  Clusters are numbered by their first core point; other points
     near core points take the lowest number among these; all others are noise, -1.
 
     Parameters
     ----------
     cloud : PointCloud, Volume or DeviceVolume
-        A cloud of voxel centres (with `ijk`), a cloud of free points (without), or a volume whose voxels in the band
-        `hu` are clustered, in the order k, j, i.
+        A cloud of voxel centres (with ``ijk``), a cloud of free points (without), or a volume whose voxels in the band
+        ``hu`` are clustered, in the order k, j, i.
     eps : float, optional
         mm in the patient, a ball whatever the spacing.  Distances up to ``eps * (1 + 1e-6)`` are within.  By default
         1.5 times the largest of the steps of the lattice: the pixels and the largest slice gap.  Free points need it.
@@ -110,7 +110,7 @@ def cluster_points(
     Raises
     ------
     UsageError
-        `eps`, `min_samples` or `hu` cannot be used, the points are no voxels of a known lattice, or there are none.
+        ``eps``, ``min_samples`` or ``hu`` cannot be used, points are no voxels of a known lattice, or there are none.
     DeviceError
         No device, no room for the masks, or the device fails.
 

@@ -60,13 +60,13 @@ def extract_points(
         `clrecon.remove_table`.
     iso_value : float, optional
         HU; for voxels the lower end of a band without an upper one.  None: that of `clrecon.choose_iso_value`, unless
-        `hu` is given.
+        ``hu`` is given.
     kind : {"surface", "shell", "voxels"}, optional
-        None: "voxels" where `hu` is given, else "surface".
+        None: "voxels" where ``hu`` is given, else "surface".
     hu : (float or None, float or None), optional
         Lowest and highest value of a band, both included; None: no such end.  For "surface" both ends are levels.
     labels : LabelMap, optional
-        Only points of a label, on any grid; see `clrecon.labels.resample_labels`.  For voxels the label is what the map
+        Only points of a label, on any grid; see `resample_labels`.  For voxels the label is what the map
         says; for a surface what `clrecon.extract_labels` makes of it, which grows it by a voxel.
     label : int or str, optional
         Number or name, as `LabelMap.find` takes it; None: all labels.  ``labels`` of the cloud tells which.
@@ -79,12 +79,12 @@ def extract_points(
     Returns
     -------
     PointCloud
-        Voxels in the order k, j, i, with `hu` and `ijk`; surfaces in the order of the mesh, with `normals` and, at one
-        iso value, `hu`.  Places are exact to the rounding of float32, 1.5e-5 mm within 512 mm of the origin; from
-        4096 mm on they are float64.  Entries of `PointCloud.report`: ``kind``, ``iso_value_hu`` or ``band_hu``,
+        Voxels in the order k, j, i, with ``hu`` and ``ijk``; surfaces in the order of the mesh, with ``normals`` and,
+        at one iso value, ``hu``.  Places are exact to the rounding of float32, 1.5e-5 mm within 512 mm of the origin;
+        from 4096 mm on they are float64.  Entries of ``PointCloud.report``: ``kind``, ``iso_value_hu`` or ``band_hu``,
         ``voxels`` (of the volume), ``points``, and of voxels ``voxels_in_band`` and ``share`` (points of all voxels);
         ``label``; the affine, the certificate, device, ``slabs``, ``device_bytes``, seconds and warnings as in
-        `Mesh.report`; with `paper` ``paper``: ``nonzero_voxels``, ``error_max_mm`` and ``error_rms_mm``.
+        ``Mesh.report``; with ``paper`` ``paper``: ``nonzero_voxels``, ``error_max_mm`` and ``error_rms_mm``.
 
     Raises
     ------

@@ -122,7 +122,7 @@ def take_points(points: PointCloud | ArrayLike) -> NDArray[np.floating]:
 
 
 def check_neighbours(k: int, points: int, fewest: int = 1) -> tuple[int, tuple[str, ...]]:
-    """Return the number of neighbours that a cloud has for each point, at most `k`, and a warning if it is less.
+    """Return the number of neighbours that a cloud has for each point, at most ``k``, and a warning if it is less.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def check_neighbours(k: int, points: int, fewest: int = 1) -> tuple[int, tuple[s
     Raises
     ------
     UsageError
-        `k` is not a whole number from `fewest` to `MOST_NEIGHBOURS`.
+        ``k`` is not a whole number from `fewest` to `MOST_NEIGHBOURS`.
     """
     if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not fewest <= k <= MOST_NEIGHBOURS:
         raise UsageError(
@@ -322,7 +322,7 @@ def find_neighbours(
     Raises
     ------
     UsageError
-        The cloud is empty or has coordinates that are not finite, `k` is out of range, or more than 1e12 pairs of
+        The cloud is empty or has coordinates that are not finite, ``k`` is out of range, or more than 1e12 pairs of
         points of single cells would have to be compared.
     DeviceMemoryError
         The device has no room for the cloud and 8 k bytes a point.

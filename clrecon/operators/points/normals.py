@@ -136,7 +136,7 @@ def estimate_normals(
     Returns
     -------
     PointStep
-        The cloud with `normals`.  Its facts: ``neighbours``, ``oriented_by`` ("gradient", "viewpoint" or None),
+        The cloud with ``normals``.  Its facts: ``neighbours``, ``oriented_by`` ("gradient", "viewpoint" or None),
         ``doubtful`` (normals that are the gradient's), ``unoriented`` (of either direction: the gradient is zero
         there), ``without_plane`` (neighbours in a line or at one place; without a gradient these normals are zero),
         ``seconds`` and ``device``.
@@ -144,7 +144,7 @@ def estimate_normals(
     Raises
     ------
     UsageError
-        The cloud is empty, `k` is out of range, or volume and viewpoint are given both.
+        The cloud is empty, ``k`` is out of range, or volume and viewpoint are given both.
     DeviceMemoryError
         The device has no room for the cloud.
     DeviceError

@@ -90,8 +90,8 @@ def remove_outliers(
     """Remove points that lie far from their neighbours: statistical outliers.
 
     The mean distance of each point to its k - 1 nearest others is compared with that of all points.  A point goes where
-    it exceeds their mean by more than `deviations` standard deviations.  It is the rule of Rusu et al. 2008, as PCL and
-    Open3D have it.
+    it exceeds their mean by more than ``deviations`` standard deviations.  It is the rule of Rusu et al. 2008, as PCL
+    and Open3D have it.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def remove_outliers(
     Raises
     ------
     UsageError
-        The cloud is empty, `k` is out of range, or `deviations` is negative or no number.
+        The cloud is empty, ``k`` is out of range, or ``deviations`` is negative or no number.
     DeviceMemoryError
         The device has no room for the cloud.
     DeviceError

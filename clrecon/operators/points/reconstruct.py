@@ -83,14 +83,14 @@ def reconstruct_surface(
 ) -> Mesh:
     """Make a closed surface from points with normals that point outward.
 
-    On nodes of a cubic grid the distances from the planes of all points within `reach` are averaged, with the weight
-    ``(1 - d^2 / reach^2)^2 / (d^2 + smoothing^2)`` at distance d.  Nodes farther than `bridge` from every point form
+    On nodes of a cubic grid the distances from the planes of all points within ``reach`` are averaged, with the weight
+    ``(1 - d^2 / reach^2)^2 / (d^2 + smoothing^2)`` at distance d.  Nodes farther than ``bridge`` from every point form
     regions, each inside or outside as most of the near nodes at its border say.  The surface is the level 0 of that
     field (`extract_isosurface`), so that it is closed always.
 
-    A hole in the cloud that is wider than 2 `bridge` joins inside and outside.  The votes are then split: where more
-    than a tenth of them is against the winner, `bridge` is made 1.25 times as wide, at most `widenings` times, and then
-    the cloud is refused.
+    A hole in the cloud that is wider than 2 ``bridge`` joins inside and outside.  The votes are then split: where more
+    than a tenth of them is against the winner, ``bridge`` is made 1.25 times as wide, at most ``widenings`` times, and
+    then the cloud is refused.
 
     Parameters
     ----------
@@ -99,23 +99,23 @@ def reconstruct_surface(
     spacing : float, optional
         h, mm between the nodes; None is the mean spacing of the points, as estimated from the cells that they occupy.
     noisy : bool
-        True: points scatter about the surface.  `reach` is then 3 h by default, and all points within it count much the
-        same.
+        True: points scatter about the surface.  ``reach`` is then 3 h by default, and all points within it count much
+        the same.
     reach : float, optional
-        R, mm, at least `bridge` and at most 32 h.  None is `bridge`, and at least 3 h where `noisy`.
+        R, mm, at least ``bridge`` and at most 32 h.  None is ``bridge``, and at least 3 h where ``noisy``.
     smoothing : float, optional
-        s, mm.  None: 0.1 h, with which the surface follows each point, and 1000 h where `noisy`.
+        s, mm.  None: 0.1 h, with which the surface follows each point, and 1000 h where ``noisy``.
     bridge : float, optional
         B, mm, at least h; None is 2 h.
     widenings : int
-        0 to 3: how often `bridge` may be widened.
+        0 to 3: how often ``bridge`` may be widened.
     device, memory, progress
         As in `extract_isosurface`.  Nodes that do not fit are worked on in slabs, with the same mesh bit for bit.
 
     Returns
     -------
     Mesh
-        In LPS mm.  `Mesh.report` has ``surface`` ("cloud"), ``points``, ``spacing_mm`` and ``spacing_from``,
+        In LPS mm.  ``Mesh.report`` has ``surface`` ("cloud"), ``points``, ``spacing_mm`` and ``spacing_from``,
         ``reach_mm``, ``smoothing_mm``, ``bridge_mm``, ``tries``, ``votes``, ``votes_against_share``, ``regions``,
         ``wall_share``, ``lost_share`` and ``open_cubes`` (see docs/clouds.md), ``nodes``, ``bricks``, ``slabs``, the
         device, the seconds, and the certificate of the cloud.

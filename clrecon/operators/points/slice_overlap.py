@@ -91,7 +91,7 @@ def find_ghost_slices(
     Raises
     ------
     UsageError
-        `hu` is no band.
+        ``hu`` is no band.
     NoSurfaceError
         The type of the voxels has no value in the band.
     DeviceError

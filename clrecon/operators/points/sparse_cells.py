@@ -193,7 +193,7 @@ def remove_sparse_cells(
         Growth begins in cells with at least so many points, and goes on over neighbours by faces, edges and corners.
     keep_largest : bool
         True: keep the component with the most cells alone; of several the one with the most points, then the first.
-        It takes real bone too, since ribs and vertebrae stand apart: `facts` and a warning say how much.
+        It takes real bone too, since ribs and vertebrae stand apart: ``facts`` and a warning say how much.
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.
     memory : int, optional

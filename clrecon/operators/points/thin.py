@@ -95,7 +95,7 @@ def thin_points(
     Raises
     ------
     UsageError
-        The cloud is empty, `spacing` is not a positive length, or the grid would have more than 2^31 cubes.
+        The cloud is empty, ``spacing`` is not a positive length, or the grid would have more than 2^31 cubes.
     DeviceError
         No device, no room for the points, or the device fails.
     """

@@ -54,18 +54,18 @@ def render(
     Parameters
     ----------
     shown : Volume, DeviceVolume, PointCloud or Mesh; or a sequence of them
-        Of several objects each may be a pair with its style, and `style` and `look` are refused.  All are in LPS mm.
-        One volume of them may be translucent (a `VolumeLook` or `SlicesInSpace`); see `docs/rendering.md`.
+        Of several objects each may be a pair with its style, and ``style`` and ``look`` are refused.  All are in LPS
+        mm. One volume of them may be translucent (a `VolumeLook` or `SlicesInSpace`); see ``docs/rendering.md``.
     style : Style or str, optional
         What the picture shows: a `VolumeLook`, `Projection`, `SurfaceLook`, `SlicesInSpace`, `PlaneCut` or `CurveCut`,
         of a point cloud a `PointLook`, of a mesh a `MeshLook`; or the name of a mode, see
-        `clrecon.rendering.pictures.modes.MODES`.  Default: volume rendering of bone, of a cloud its points, and of a
+        ``clrecon.rendering.pictures.modes.MODES``.  Default: volume rendering of bone, of a cloud its points, and of a
         mesh its triangles.
     camera : Camera, optional
-        In place of `view`, `up`, `zoom`, `view_angle` and `center`, which are refused beside it.
+        In place of ``view``, ``up``, ``zoom``, ``view_angle`` and ``center``, which are refused beside it.
     view : str or (azimuth, elevation), optional
-        Where the camera stands, default "anterior", of slices in space (30, 30); `up`, `zoom`, `view_angle` and
-        `center` (LPS mm) go with it, see `Camera.fit`.  A plane knows axial, coronal and sagittal too.  It fits the
+        Where the camera stands, default "anterior", of slices in space (30, 30); ``up``, ``zoom``, ``view_angle`` and
+        ``center`` (LPS mm) go with it, see `Camera.fit`.  A plane knows axial, coronal and sagittal too.  It fits the
         volume; where a part of that was turned into air or is clipped or hidden, the box of what is left.
     size : (width, height), optional
         Pixels; default 1024 x 1024, and for a `CurveCut` what the curve needs.
@@ -79,7 +79,7 @@ def render(
         ``progress(stage, done, total)``, called as slabs are finished.
     **look
         In place of a style: ``mode``, ``preset`` and fields of the mode's style, see
-        `clrecon.rendering.pictures.modes.make_style`.
+        ``clrecon.rendering.pictures.modes.make_style``.
 
     Returns
     -------

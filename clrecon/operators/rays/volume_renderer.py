@@ -73,7 +73,7 @@ class VolumeRenderer(Closing):
     Raises
     ------
     UsageError
-        `volume` is not a Volume or holds NaN, or `memory` is not a number of bytes.
+        ``volume`` is not a Volume or holds NaN, or ``memory`` is not a number of bytes.
     DeviceError
         The device does not exist.
     """
@@ -157,7 +157,7 @@ class VolumeRenderer(Closing):
     def frame(self, style: Style) -> Grid:
         """Return what cameras fit: the volume, or the box of what is left of it where a part is masked, cut or hidden.
 
-        See `clrecon.operators.rays.framing`; that of the last style is kept.
+        See ``clrecon.operators.rays.framing``; that of the last style is kept.
         """
         if isinstance(style, Projection) and style.leaves_out and LEFT_OUT not in self.volume.report:
             return self._within(None).frame(style)

@@ -75,17 +75,17 @@ def cut_slice(
     device : Device, str or int, optional
         See `clrecon.device`.
     zoom, up, pixel_mm
-        Options for a plane by name, see `clrecon.rendering.views.plane.find_plane`.
+        Options for a plane by name, see ``clrecon.rendering.views.plane.find_plane``.
     offset_mm : float
         Moves the plane along the view, away from the camera.
     thickness : float
         Thickness in mm of a thick slice, half of it on either side of the plane; its samples are combined.  0 is the
         plane alone.  Samples are at most half the smallest distance of voxels apart, see
-        `clrecon.rendering.views.plane.SlabSamples`.
+        ``clrecon.rendering.views.plane.SlabSamples``.
     combine : {"mean", "max", "min"}
         How the samples within the volume are combined.
     window : (low, high) or str, optional
-        HU that are black and white, or a name of `clrecon.rendering.looks.window.WINDOWS`; default "bone".
+        HU that are black and white, or a name of ``clrecon.rendering.looks.window.WINDOWS``; default "bone".
     background : str or colour
         Colour outside the volume; "transparent" gives opacity 0 there.
     memory : int, optional
@@ -186,13 +186,13 @@ def reformat_curve(
     volume : Volume or DeviceVolume
     curve : Curve, array_like of shape (n, 3), or "spine"
         Points of the centre line in LPS mm, all within the volume; the curve is smooth.  "spine" searches for the
-        spinal canal, see `clrecon.anatomy.spine_line`.
+        spinal canal, see ``clrecon.anatomy.spine_line``.
     kind : {"straightened", "stretched"}
         Straightened: the centre line is a straight line down the picture, and each row crosses it.  Stretched: all rows
         have one direction in the patient and form a surface, which the picture shows unrolled; all lengths within that
-        surface are kept.  See `clrecon.rendering.views.curved`.
+        surface are kept.  See ``clrecon.rendering.views.curved``.
     size : (int, int), optional
-        Width and height of the picture; default: the whole curve, and `width_mm`.
+        Width and height of the picture; default: the whole curve, and ``width_mm``.
     device : Device, str or int, optional
         See `clrecon.device`.
     view, up : str or direction
@@ -202,10 +202,10 @@ def reformat_curve(
     angle : float
         Degrees by which the rows of a straightened picture are turned about the centre line.
     pixel_mm : float, optional
-        Side of a pixel; default: the curve fills the height of `size`, else the smallest distance of voxels,
+        Side of a pixel; default: the curve fills the height of ``size``, else the smallest distance of voxels,
         or a whole part of it so that the longer side has at least 768 pixels.
     width_mm : float, optional
-        Width of the picture where no `size` is given; default 120 mm.
+        Width of the picture where no ``size`` is given; default 120 mm.
     thickness, combine, window, background, memory, progress
         As in `cut_slice`; a thick slice extends across the picture.
 

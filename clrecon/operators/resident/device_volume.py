@@ -85,7 +85,7 @@ class DeviceVolume(Closing):
     Raises
     ------
     UsageError
-        `volume` is not a Volume, or `memory` is not a number of bytes.
+        ``volume`` is not a Volume, or ``memory`` is not a number of bytes.
     DeviceError
         The device does not exist.
 
@@ -163,7 +163,7 @@ class DeviceVolume(Closing):
             return self._whole_d
 
     def part(self, first: int, end: int, stopwatch: Stopwatch) -> Any:
-        """Return slices `first` to ``end - 1`` on the device, replacing all other voxels there."""
+        """Return slices ``first`` to ``end - 1`` on the device, replacing all other voxels there."""
         self.make_way()
         part_d = self.upload(self.volume.voxels[first:end], stopwatch)
         self._part_bytes += self.volume.voxels[first:end].nbytes
@@ -176,7 +176,7 @@ class DeviceVolume(Closing):
             self._kept = {what: kept for what, kept in self._kept.items() if not kept.nbytes}
 
     def pays_whole(self, slices: int) -> bool:
-        """True if all voxels should be uploaded for `slices` slices: with earlier uploads these are as many."""
+        """True if all voxels should be uploaded for ``slices`` slices: with earlier uploads these are as many."""
         return self.is_held or self._part_bytes + slices * self.slice_bytes >= self.volume.voxels.nbytes
 
     @property
@@ -267,14 +267,14 @@ class DeviceVolume(Closing):
         return memory_limits(self.device, self.memory)
 
     def shortage(self, needs: Mapping[str, int], own: tuple[str, ...] = ()) -> str:
-        """Return why the device has no room for `needs`; empty if it has.
+        """Return why the device has no room for ``needs``; empty if it has.
 
         Parameters
         ----------
         needs : mapping of str to int
             Bytes of all buffers that an operator uses at a time, the voxels among them, by description.
         own : tuple of str
-            Kinds of kept objects that `needs` already counts; all others are added, and dropped if they are in the way.
+            Kinds of kept objects that ``needs`` already counts; others are added, and dropped if they are in the way.
         """
         with self._lock:
             others = {what: kept.nbytes for what, kept in self._kept.items() if what not in own and kept.nbytes}
@@ -293,7 +293,7 @@ class DeviceVolume(Closing):
         own: tuple[str, ...] = (),
         most: int | None = None,
     ) -> int:
-        """Return the number of slices in a slab: `total` if all fit, else as many as fit, or 0.
+        """Return the number of slices in a slab: ``total`` if all fit, else as many as fit, or 0.
 
         Parameters
         ----------
@@ -353,7 +353,7 @@ class DeviceVolume(Closing):
         fewest: int = 1,
         warnings: list[str] | None = None,
     ) -> Made:
-        """Try with `slices` slices in a slab, then with half as many as long as the device has no room.
+        """Try with ``slices`` slices in a slab, then with half as many as long as the device has no room.
 
         Parameters
         ----------
@@ -371,7 +371,7 @@ class DeviceVolume(Closing):
         Raises
         ------
         DeviceMemoryError
-            Slabs of `fewest` slices do not fit either.
+            Slabs of ``fewest`` slices do not fit either.
         """
         is_last = False
         while True:

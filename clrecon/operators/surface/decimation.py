@@ -21,7 +21,7 @@ def decimate_mesh(
     device: Device | str | int | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
-    """Remove triangles by collapsing edges in order of their quadric error, see `clrecon.mesh.refine.decimation`.
+    """Remove triangles by collapsing edges in order of their quadric error, see ``clrecon.mesh.refine.decimation``.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def decimate_mesh(
     Returns
     -------
     Mesh
-        As that of `clrecon.mesh.refine.decimation.decimate_mesh`.
+        As that of `decimate_mesh`.
 
     Raises
     ------

@@ -50,7 +50,7 @@ class SurfaceExtractor(Closing):
     Raises
     ------
     UsageError
-        `volume` is not a Volume, `memory` is not a number of bytes, or a row of the volume is too long.
+        ``volume`` is not a Volume, ``memory`` is not a number of bytes, or a row of the volume is too long.
     DeviceError
         The device does not exist.
     """
@@ -204,11 +204,11 @@ def extract_isosurface(
     """Extract the iso surface of a volume, as a closed manifold mesh in LPS mm.
 
     Marching cubes with a derived, face-consistent case table and vertices shared between cells.  A voxel is inside when
-    its value is >= `iso_value`. For integer voxels and an integer `iso_value` k the surface lies at k - 0.5, between
-    the integers.  Vertices are mapped once through the volume's affine, shear included.  They are exact to one unit in
-    the last place of float32 at the volume's largest coordinate (6e-5 mm at 1 m), but stay four of these units away
-    from voxel centres.  From 4096 mm on they are given as float64.  A volume that does not fit the device is processed
-    slab by slab; the mesh is the same bit for bit.
+    its value is >= ``iso_value``. For integer voxels and an integer ``iso_value`` k the surface lies at k - 0.5,
+    between the integers.  Vertices are mapped once through the volume's affine, shear included.  They are exact to one
+    unit in the last place of float32 at the volume's largest coordinate (6e-5 mm at 1 m), but stay four of these units
+    away from voxel centres.  From 4096 mm on they are given as float64.  A volume that does not fit the device is
+    processed slab by slab; the mesh is the same bit for bit.
 
     Parameters
     ----------
@@ -230,11 +230,11 @@ def extract_isosurface(
     below : bool
         True: enclose the voxels below the iso value: the same vertices and triangles, turned round, and closed too.
     grow_from : "auto", (3,) float, LabelMap, (LabelMap, label), Mask, or a list of these, optional
-        Make only what hangs together with a seed, cell by cell: see `clrecon.operators.surface.seeds.Seeds.read`.
+        Make only what hangs together with a seed, cell by cell: see ``clrecon.operators.surface.seeds.Seeds.read``.
     vertex_rule : {"linear", "golden", "golden-search"}
-        Where on an edge a vertex lies, see `docs/methods.md`.  "golden" misses the surface by up to 0.6 voxels.
+        Where on an edge a vertex lies, see ``docs/methods.md``.  "golden" misses the surface by up to 0.6 voxels.
     solid : bool
-        True: what is enclosed is filled, see `clrecon.fill_enclosed`; not with `below` and ranges.
+        True: what is enclosed is filled, see `clrecon.fill_enclosed`; not with ``below`` and ranges.
     memory : int, optional
         See `SurfaceExtractor`.
     progress : callable, optional
@@ -243,8 +243,8 @@ def extract_isosurface(
     Returns
     -------
     Mesh
-        Triangles are counter-clockwise and normals point as seen from outside: from lower values, with `below` from
-        higher ones; `Mesh.report` holds the iso value or the range, the affine, the certificate (``volume.report``),
+        Triangles are counter-clockwise and normals point as seen from outside: from lower values, with ``below`` from
+        higher ones; ``Mesh.report`` holds the iso value or the range, the affine, the certificate (``volume.report``),
         the device, the number of slabs, ``device_bytes`` of the largest, the seconds, ``cells`` {visited, all}, of a
         grown surface {grown, active} too, and ``growing``, what was left out of it.
 
@@ -311,7 +311,7 @@ def extract_isosurfaces(
     Returns
     -------
     list of Mesh
-        In the order of `iso_values`; for all else see `extract_isosurface`.
+        In the order of ``iso_values``; for all else see `extract_isosurface`.
     """
     if len(iso_values) == 0:
         raise UsageError("no iso value is given")

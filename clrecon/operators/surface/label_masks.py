@@ -64,14 +64,14 @@ def extract_label_masks(
     Returns
     -------
     dict of int to Mesh
-        In the order asked for, else ascending.  Each mesh is closed and manifold.  `Mesh.report` has ``surface``
+        In the order asked for, else ascending.  Each mesh is closed and manifold.  ``Mesh.report`` has ``surface``
         ("mask"), ``label``, ``label_name``, ``label_ml`` (the volume of its voxels), ``mask_level`` (the share of
         occupancy at which it lies), ``closed_at_border``, the affine, the device and the seconds.
 
     Raises
     ------
     UsageError
-        `labels` is not a LabelMap, a label is unknown, or rows of the map are too long.
+        ``labels`` is not a LabelMap, a label is unknown, or rows of the map are too long.
     RefusedInputError
         The label map is empty.
     DeviceError

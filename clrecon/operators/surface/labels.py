@@ -62,8 +62,8 @@ def extract_labels(
 ) -> dict[int, Mesh]:
     """Extract the iso surface of a volume label by label: the label selects the cells, HU place the vertices.
 
-    A voxel is inside of a label when it is dense (`iso_value` or more) and belongs to the label: by the map, or, if it
-    has no label, because the label is the nearest one within the growth.  Between a dense voxel of the label and one
+    A voxel is inside of a label when it is dense (``iso_value`` or more) and belongs to the label: by the map, or, if
+    it has no label, because the label is the nearest one within the growth.  Between a dense voxel of the label and one
     that is neither dense nor labelled, the vertex is that of `extract_isosurface`, bit for bit.  Elsewhere (the border
     of two labels, dense voxels beyond the growth) it lies half way.  Every mesh is closed and manifold; two labels
     share the vertices of their border, bit for bit.
@@ -73,7 +73,7 @@ def extract_labels(
     volume : Volume or DeviceVolume
         A `DeviceVolume` is used directly, with its own device and memory.
     labels : LabelMap
-        On any grid, see `clrecon.labels.resample_labels`.
+        On any grid, see `resample_labels`.
     iso_value : float
         HU.
     device : Device, str or int, optional
@@ -85,7 +85,7 @@ def extract_labels(
     closed : bool
         As `extract_isosurface`.
     solid : bool
-        True: fill less dense parts within a label, see `clrecon.labels.solid`.
+        True: fill less dense parts within a label, see ``clrecon.labels.solid``.
     memory : int, optional
         Bytes that may be taken on the device; None is all that it has.  If the slices of all labels do not fit
         together, the labels are processed one by one; the meshes are the same.
@@ -95,7 +95,7 @@ def extract_labels(
     Returns
     -------
     dict of int to Mesh
-        In the order asked for, else ascending.  `Mesh.report` has, beside what `extract_isosurface` says, ``label``,
+        In the order asked for, else ascending.  ``Mesh.report`` has, beside what `extract_isosurface` says, ``label``,
         ``label_name``, ``label_inside_share`` (of the labelled voxels, in the volume), ``label_ml`` (volume of its
         voxels, on the map's own grid), ``label_taken_ml`` (the same on the grid of the volume),
         ``vertices_by_hu_share``, ``grow_mm`` and ``solid``.

@@ -133,7 +133,7 @@ def extract_by_method(
     iso_value : float or (float, float)
         HU, see `extract_isosurface`.
     method : {"t-mc", "i-mc", "g-mc", "s-mc", "t-mc-soup", "skimage"}
-        See `METHODS` and `docs/methods.md`.
+        See ``METHODS`` and ``docs/methods.md``.
     grow_from : optional
         Seeds of "i-mc", see `extract_isosurface`; None: "auto".
     vertex_rule : {"linear", "golden", "golden-search"}

@@ -48,7 +48,7 @@ one slice in a vertebra that is tilted sideways."""
 class VertebraInside:
     """The parts of one vertebra as masks, made by `vertebra_inside`.
 
-    All masks are of `volume`, the part of the scan around the vertebra at its place in the patient.
+    All masks are of ``volume``, the part of the scan around the vertebra at its place in the patient.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class VertebraInside:
     solid : Mask
         All bone, without the canal.
     dense : Mask
-        Voxels of the solid bone in the band `dense_hu`.
+        Voxels of the solid bone in the band ``dense_hu``.
     trabecular : Mask
         The rest of the solid bone.
     canal : Mask or None
@@ -100,7 +100,7 @@ class VertebraInside:
 
     @property
     def masks(self) -> dict[str, Mask]:
-        """The masks by the names of `PARTS`, without those that are absent or empty."""
+        """The masks by the names of ``PARTS``, without those that are absent or empty."""
         found = {name: getattr(self, name) for name in PARTS}
         return {name: mask for name, mask in found.items() if mask is not None and mask.count}
 
@@ -115,7 +115,7 @@ class VertebraInside:
         }
 
     def to_label_map(self) -> LabelMap:
-        """Return the parts that do not overlap as a label map: dense 1, trabecular 2, canal 3, on the grid of `volume`.
+        """Return parts that do not overlap as a label map: dense 1, trabecular 2, canal 3, on the grid of ``volume``.
 
         Raises
         ------
@@ -125,7 +125,7 @@ class VertebraInside:
         return self._map({name: mask for name, mask in self.masks.items() if name != "solid"})
 
     def extract_meshes(self, *, memory: int | None = None) -> dict[str, Mesh]:
-        """Return the surface of each part, as `extract_label_masks` makes it, by the names of `PARTS`.
+        """Return the surface of each part, as `extract_label_masks` makes it, by the names of ``PARTS``.
 
         Dense and trabecular bone share the vertices of their border; the outer surface is that of ``solid``.
 

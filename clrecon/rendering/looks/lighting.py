@@ -32,7 +32,7 @@ class Lighting:
 
     ``c * (ambient + diffuse * n . l) + specular * (n . h) ** specular_power`` with h halfway between l and v, and n
     turned towards v.  Where n . l is not above 0, only the ambient light remains.  Colours above 1 become 1. Ambient 1
-    without diffuse and specular light means no shading (`UNSHADED`).
+    without diffuse and specular light means no shading (``UNSHADED``).
 
     In volume rendering n is the direction of the gradient g.  It is unreliable where g is small: in the middle of thin
     bone, and in noise.  There the light changes, with ``s = |g|^2 / (|g|^2 + soft_gradient^2)``, from Phong's formula
@@ -46,7 +46,7 @@ class Lighting:
         Sharpness of the highlight, 1 to 128.
     soft_gradient : float
         HU per mm, 0 to 10,000: the gradient that gets half of its shading in volume rendering; 0 shades all gradients
-        alike, except in flat fields (`LEAST_SOFT_GRADIENT`).
+        alike, except in flat fields (``LEAST_SOFT_GRADIENT``).
     direction : (float, float, float) or None
         Direction from the patient towards a fixed light, LPS, kept as a unit vector; None is a light at the camera.
 

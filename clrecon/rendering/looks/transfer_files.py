@@ -51,7 +51,7 @@ def load_transfer_function(path: str | os.PathLike[str], name: str | None = None
     Returns
     -------
     TransferFunction
-        With the light of the file (`UNSHADED` where its shading is off; None where the format has no light).
+        With the light of the file (``UNSHADED`` where its shading is off; None where the format has no light).
 
     Raises
     ------

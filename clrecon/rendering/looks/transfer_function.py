@@ -160,7 +160,7 @@ class TransferFunction(Message):
 
     @property
     def range_hu(self) -> tuple[float, float]:
-        """HU beyond which the function is constant: those of the first and the last point, and `END_STEP_HU` more at a
+        """HU beyond which the function is constant: those of the first and last point, and ``END_STEP_HU`` more at a
         step.
 
         The first is always lower than the second.
@@ -180,13 +180,13 @@ class TransferFunction(Message):
         return evaluate_curve(self._points[:, 0], self._points[:, 1:], np.asarray(hu, dtype=np.float64))
 
     def table(self, low: float, high: float, nodes: int) -> NDArray[np.float32]:
-        """Return red, green, blue, opacity (nodes, 4), float32, at `nodes` evenly spaced HU from low to high, both
+        """Return red, green, blue, opacity (nodes, 4), float32, at ``nodes`` evenly spaced HU from low to high, both
         included.
 
         Raises
         ------
         UsageError
-            There are fewer than two nodes, or `low` and `high` are not finite or descend.
+            There are fewer than two nodes, or ``low`` and ``high`` are not finite or descend.
         """
         return self(_nodes(low, high, nodes)).astype(np.float32)
 
@@ -200,7 +200,7 @@ class TransferFunction(Message):
         return evaluate_curve(self._gradient_opacity[:, 0], self._gradient_opacity[:, 1:], at)[..., 0]
 
     def gradient_table(self, high: float, nodes: int) -> NDArray[np.float32]:
-        """Return `gradient_factor` (nodes,), float32, at `nodes` evenly spaced magnitudes from 0 to `high` HU per mm.
+        """Return `gradient_factor` (nodes,), float32, at ``nodes`` even magnitudes from 0 to ``high`` HU per mm.
 
         Raises
         ------
@@ -215,7 +215,7 @@ class TransferFunction(Message):
         return TransferFunction(**{**own, "name": self._name, "description": self._description, **changes})
 
     def scaled(self, opacity: float) -> TransferFunction:
-        """Return a copy with every opacity multiplied by `opacity`, at most 1.
+        """Return a copy with every opacity multiplied by ``opacity``, at most 1.
 
         Raises
         ------
@@ -229,7 +229,7 @@ class TransferFunction(Message):
         return self.changed(points=points)
 
     def shifted(self, hu: float) -> TransferFunction:
-        """Return a copy with every point moved up by `hu`.
+        """Return a copy with every point moved up by ``hu``.
 
         Raises
         ------
@@ -242,19 +242,19 @@ class TransferFunction(Message):
 
     @classmethod
     def from_window(cls, low: float, high: float, **parameters: Any) -> TransferFunction:
-        """Return a window for projections: grey from black at `low` HU to white at `high` HU, with opacity from 0 to 1.
+        """Return a window for projections: grey from black at ``low`` HU to white at ``high`` HU, opacity from 0 to 1.
 
         Parameters
         ----------
         low, high : float
-            HU.  A `low` above `high` makes the lowest HU white (and opaque).
+            HU.  A ``low`` above ``high`` makes the lowest HU white (and opaque).
         **parameters
             Further parameters of `TransferFunction`.
 
         Raises
         ------
         UsageError
-            `low` and `high` are equal or not finite.
+            ``low`` and ``high`` are equal or not finite.
         """
         if low == high:
             raise UsageError(f"a window needs two different HU, not {low:g} twice")
@@ -265,7 +265,7 @@ class TransferFunction(Message):
     def from_pyvista(
         cls, cmap: Any, opacity: Any, clim: tuple[float, float], *, unit_distance: float = 1.0, **parameters: Any
     ) -> TransferFunction:
-        """Return the function that `pyvista.Plotter.add_volume` makes of a colour map, an opacity and limits in HU.
+        """Return the function that ``pyvista.Plotter.add_volume`` makes of a colour map, an opacity and limits in HU.
 
         Parameters
         ----------
@@ -314,7 +314,7 @@ class TransferFunction(Message):
     def to_vtk(self, *, voxel_mm: float = 1.0) -> Any:
         """Return a vtkVolumeProperty: colours, opacities, unit distance, light (`Lighting()` where it has none).
 
-        It cannot hold a light with a direction or one that fades with the gradient.  `voxel_mm` as in `from_vtk`.
+        It cannot hold a light with a direction or one that fades with the gradient.  ``voxel_mm`` as in `from_vtk`.
         """
         from clrecon.rendering.looks.vtk import property_to_vtk
 
@@ -323,7 +323,7 @@ class TransferFunction(Message):
     def save(self, path: Any, *, no_clobber: bool = False) -> None:
         """Write it as JSON, as docs/transfer_functions.md says; `load_transfer_function` reads it.
 
-        With `no_clobber` a file of that name stays and is an error.
+        With ``no_clobber`` a file of that name stays and is an error.
 
         Raises
         ------

@@ -63,7 +63,7 @@ def turntable_cameras(camera: Camera, frames: int, degrees: float = 360.0) -> li
     Raises
     ------
     UsageError
-        `frames` is not from 1 to 10000, or `degrees` is not finite.
+        ``frames`` is not from 1 to 10000, or ``degrees`` is not finite.
     """
     if not isinstance(frames, (int, np.integer)) or not 1 <= frames <= MOST_FRAMES:
         raise UsageError(f"a turntable has 1 to {MOST_FRAMES} frames, not {frames!r}")
@@ -150,7 +150,7 @@ def write_animation(
     frames : iterable of Rendering or of ndarray, shape (h, w, 3) or (h, w, 4), uint8
         Frames of one size.  The next frame is requested after the one before has been written.
     path : str or path
-        See `check_animation`. MP4 is H.264 (BT.709, quality 18), an odd side made even by repeating its last row or
+        See ``check_animation``. MP4 is H.264 (BT.709, quality 18), an odd side made even by repeating its last row or
         column.  GIF has a palette for each frame, dithered after Floyd and Steinberg, and repeats.  APNG repeats too,
         and keeps every colour and the opacity.  A folder gets frame_0000.png, frame_0001.png, ...
     fps : float
@@ -158,7 +158,7 @@ def write_animation(
     no_clobber : bool
         True: what has that name stays and is an `OutputError`; an empty folder is filled.
     total : int
-        Number of frames, for `progress`.
+        Number of frames, for ``progress``.
     progress : callable, optional
         Called as ``progress("frames", done, total)``.
 
@@ -170,7 +170,7 @@ def write_animation(
     Raises
     ------
     UsageError
-        As in `check_animation`; or there is no frame, frames differ in size, or have opacity that the format would
+        As in ``check_animation``; or there is no frame, frames differ in size, or have opacity that the format would
         lose.
     OutputError
         The file cannot be written; an older one is intact.

@@ -133,7 +133,7 @@ def _structural_similarity(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> 
 
 
 def make_control_pictures(picture: ArrayLike, next_picture: ArrayLike | None = None) -> Mapping[str, NDArray[Any]]:
-    """Return pictures whose likeness to `picture` shows what the figures are worth.
+    """Return pictures whose likeness to ``picture`` shows what the figures are worth.
 
     Parameters
     ----------

@@ -43,14 +43,14 @@ class MeshLook(Style):
     Parameters
     ----------
     color : str or (float, float, float), optional
-        See `clrecon.rendering.looks.colors.find_color`; default: "bone".
+        See ``clrecon.rendering.looks.colors.find_color``; default: "bone".
     opacity : float
         Of each surface, above 0 and up to 1: a ray that enters and leaves a closed mesh meets two.
     flat : bool
         Every triangle is lit by its own normal.  Else the normals of the mesh are interpolated, or, where it has
         none, those of its vertices' triangles.
     vertex_colors : array_like, shape (n, 3), optional
-        A colour for each vertex, interpolated between them, in place of `color`: uint8, or floats from 0 to 1.
+        A colour for each vertex, interpolated between them, in place of ``color``: uint8, or floats from 0 to 1.
     lighting : Lighting, optional
         Default: ``Lighting()``.
     clip : Clip, optional

@@ -25,7 +25,7 @@ class Rendering(PictureData):
     image : ndarray, shape (h, w, 4), uint8
         Red, green, blue and opacity, not premultiplied; row 0 is the top.
     depth : ndarray, shape (h, w), float32
-        Distance along the ray to the first hit in mm, see `Camera.position`; NaN where nothing is hit.
+        Distance along the ray to the first hit in mm, see ``Camera.position``; NaN where nothing is hit.
     expected_depth : ndarray, shape (h, w), float32
         Mean distance in mm of all samples of the pixel, weighted with what each adds to the pixel; NaN in empty pixels.
     camera : Camera or None
@@ -49,12 +49,12 @@ class Rendering(PictureData):
         Parameters
         ----------
         color : str or (float, float, float)
-            See `clrecon.rendering.looks.colors.find_color`.
+            See ``clrecon.rendering.looks.colors.find_color``.
 
         Returns
         -------
         Rendering
-            A picture with its own `image`; the other arrays are shared.
+            A picture with its own ``image``; the other arrays are shared.
         """
         from clrecon.rendering.looks.colors import find_color
 
@@ -68,7 +68,7 @@ class Rendering(PictureData):
     def annotated(self, *, letters: bool = False, scale_bar: bool = False, caption: str | None = None) -> Rendering:
         """Return the same picture with sides of the patient, a scale bar or a line of text.
 
-        See `clrecon.rendering.pictures.annotations.annotate`.
+        See ``clrecon.rendering.pictures.annotations.annotate``.
         """
         from clrecon.rendering.pictures.annotations import annotate
 
@@ -106,13 +106,13 @@ class Rendering(PictureData):
             return write_image(self, path, quality)
 
     def save_depth(self, path: str | os.PathLike[str], *, expected: bool = False, no_clobber: bool = False) -> int:
-        """Write `depth` in mm to ``.npy`` or, as float32 with NaN, to ``.tif``.
+        """Write ``depth`` in mm to ``.npy`` or, as float32 with NaN, to ``.tif``.
 
         Parameters
         ----------
         path : str or path
         expected : bool
-            Write `expected_depth` instead.
+            Write ``expected_depth`` instead.
         no_clobber : bool
             As in `save`.
 
@@ -127,7 +127,7 @@ class Rendering(PictureData):
             return write_floats(self.expected_depth if expected else self.depth, path, self.pixel_mm)
 
     def save_values(self, path: str | os.PathLike[str], *, no_clobber: bool = False) -> int:
-        """Write `values` as `save_depth` writes depths.
+        """Write ``values`` as `save_depth` writes depths.
 
         Raises
         ------
@@ -146,15 +146,15 @@ class Rendering(PictureData):
         """Return the picture as a PyVista data set in LPS mm, for a scene with meshes.
 
         Show it with ``plotter.add_mesh(data, scalars="RGBA", rgba=True, lighting=False)``, or let
-        `clrecon.viewer.add_rendering` do it.  Field arrays ``SPACE`` and ``UNIT`` name the space and its unit.
+        ``clrecon.viewer.add_rendering`` do it.  Field arrays ``SPACE`` and ``UNIT`` name the space and its unit.
 
         Parameters
         ----------
         form : {"points", "plane"}
             ``"points"``: ``pyvista.PolyData`` with a point at each hit of a ray.  Point data: ``RGBA``, ``depth`` (mm)
-            and, if there are `values`, ``HU``.
+            and, if there are ``values``, ``HU``.
             ``"plane"``: ``pyvista.ImageData`` across the view with a cell for each pixel.  Cell data: ``RGBA`` and, if
-            there are `values`, ``HU``.  From the picture's camera the plane looks like the picture.
+            there are ``values``, ``HU``.  From the picture's camera the plane looks like the picture.
         expected : bool
             Points at the expected depth, not at the first hit.
         distance : float, optional

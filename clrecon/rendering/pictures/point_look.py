@@ -36,9 +36,9 @@ class PointLook(Style):
     color_by : {"hu", "label", "removed"}, optional
         "hu": in grey.  "label": a colour for each label or cluster, noise (-1) dark.  "removed": label 0 grey, which
         are points that are kept, and a colour for each other label, which is the reason why points were removed.
-        Default: by label where there are labels, else by HU where they differ, else `color`.
+        Default: by label where there are labels, else by HU where they differ, else ``color``.
     color : str or (float, float, float), optional
-        One colour for all, see `clrecon.rendering.looks.colors.find_color`; default: "bone".
+        One colour for all, see ``clrecon.rendering.looks.colors.find_color``; default: "bone".
     window : (float, float) or str, optional
         HU shown as black and white; default: the 99th percentile of the points is white, the 1st dark grey.
     lighting : Lighting, optional

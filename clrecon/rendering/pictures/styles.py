@@ -93,7 +93,7 @@ class Style:
 
     @property
     def mode(self) -> str:
-        """The name of this kind of picture, one of `clrecon.rendering.pictures.modes.MODES`."""
+        """The name of this kind of picture, one of ``clrecon.rendering.pictures.modes.MODES``."""
         return self._mode
 
 
@@ -143,7 +143,7 @@ class VolumeLook(_Lit):
     Parameters
     ----------
     transfer_function : TransferFunction or str
-        Colours and opacities by HU, or the name of a preset, see `clrecon.rendering.looks.presets`.
+        Colours and opacities by HU, or the name of a preset, see ``clrecon.rendering.looks.presets``.
     lighting : Lighting, optional
         Default: that of the transfer function, else ``Lighting()``.
     ray_step : float, optional
@@ -155,7 +155,7 @@ class VolumeLook(_Lit):
     labels : LabelMap, optional
         Labels that get a look of their own.
     label_colors : mapping of label to colour, optional
-        Labels by number or name, see `clrecon.rendering.looks.label_style.LabelStyle.of`; default: a colour for each.
+        Labels by number or name, see ``clrecon.rendering.looks.label_style.LabelStyle.of``; default: a colour for each.
     label_opacity : mapping of label to float, optional
         Factors on the opacity, 0 to 1; label 0 is all that has no label.
     """
@@ -187,13 +187,13 @@ class Projection(Style):
         The highest, lowest or mean HU; "drr" is a radiograph: the thickness of water in mm with the same attenuation.
     window : (float, float) or str, optional
         Values shown as black and white, in HU or (drr) mm of water, or a name of
-        `clrecon.rendering.looks.window.WINDOWS` such as "lung"; default: the 1st and the 99th percentile of the
+        ``clrecon.rendering.looks.window.WINDOWS`` such as "lung"; default: the 1st and the 99th percentile of the
         picture, in "drr" of the rays that meet the body.
     ray_step : float, optional
         mm between samples; default: half the smallest spacing of the volume.
     keep_air : bool
         Of "minip": count what lies outside of the body, and what a mask took, too; else it is left out, see
-        `clrecon.anatomy.surroundings`.
+        ``clrecon.anatomy.surroundings``.
     clip : Clip, optional
         The part of space that is shown.
     """
@@ -240,7 +240,7 @@ class SurfaceLook(_Lit):
     iso_value : float
         HU; inside is ``>= iso_value``.
     color : str or (float, float, float), optional
-        See `clrecon.rendering.looks.colors.find_color`; default: "bone".
+        See ``clrecon.rendering.looks.colors.find_color``; default: "bone".
     shadows : bool
         Parts that other parts hide from the light get ambient light only.  The light must have a fixed direction.
     depth_cue : float, optional
@@ -358,7 +358,7 @@ class PlaneCut(_Cut):
     slices : int or sequence of int, optional
         Of a contact sheet: every n-th plane of voxels, or a list of them.
     labels : LabelMap, optional
-        Labels that are drawn over the slice, see `clrecon.rendering.pictures.label_overlay`.
+        Labels that are drawn over the slice, see ``clrecon.rendering.pictures.label_overlay``.
     label_colors : mapping of label to colour, optional
         Labels that are drawn, with their colours; default: all, each with one of its own.
     label_opacity : mapping of label to float, optional
@@ -390,7 +390,7 @@ class CurveCut(_Cut):
     curve : Curve, array_like of shape (n, 3), or "spine"
         Points of the centre line in LPS mm; "spine": the spinal canal, found in the volume.
     kind : {"straightened", "stretched"}
-        See `clrecon.rendering.views.curved`.
+        See ``clrecon.rendering.views.curved``.
     angle : float
         Rotation of the rows of a straightened picture about the centre line, in degrees.
     width_mm : float, optional

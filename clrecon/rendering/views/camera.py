@@ -75,7 +75,7 @@ class Camera:
     up : (float, float, float)
         Direction in LPS that points to the top of the picture; need not be perpendicular to the view.
     view_angle : float or None
-        Degrees from the bottom to the top of a perspective picture; None if `parallel_scale` is given, 30 if neither
+        Degrees from the bottom to the top of a perspective picture; None if ``parallel_scale`` is given, 30 if neither
         is.
     parallel_scale : float or None
         Half the height of a parallel picture in mm; None for a perspective one.
@@ -83,7 +83,7 @@ class Camera:
     Raises
     ------
     UsageError
-        A vector is not three finite numbers; position and focal point coincide; `up` is along the view; the angle is
+        A vector is not three finite numbers; position and focal point coincide; ``up`` is along the view; the angle is
         outside 0.001 to 179 degrees; the scale is not positive; or both angle and scale are given.
     """
 
@@ -141,7 +141,7 @@ class Camera:
             May be sheared or uneven.
         view : str or (float, float)
             anterior, posterior, left, right, superior, inferior: the side where the camera stands; or azimuth and
-            elevation in degrees, as a pair or as text ``"AZ,EL"``, see `clrecon.rendering.views.directions.find_view`.
+            elevation in degrees, as a pair or text ``"AZ,EL"``, see ``clrecon.rendering.views.directions.find_view``.
         zoom : float
             2 shows everything twice as large, see `zoomed`.
         up : str or array_like, shape (3,), optional
@@ -160,7 +160,7 @@ class Camera:
         Raises
         ------
         UsageError
-            Unknown view (the message lists them) or direction, `up` along the view, or impossible numbers.
+            Unknown view (the message lists them) or direction, ``up`` along the view, or impossible numbers.
         """
         width, height = checked_size(size)
         towards, default_up = find_view(view)
@@ -193,7 +193,7 @@ class Camera:
 
     @classmethod
     def from_pyvista(cls, source: Any, size: Sequence[int] | None = None) -> Camera:
-        """Return the camera of a PyVista plotter, a PyVista camera or a VTK camera, see `clrecon.rendering.views.vtk`.
+        """Return the camera of a PyVista plotter, a PyVista or a VTK camera, see ``clrecon.rendering.views.vtk``.
 
         Parameters
         ----------
@@ -207,7 +207,7 @@ class Camera:
         return cls(**parameters_from_vtk(source, size))
 
     def to_pyvista(self) -> Any:
-        """Return a `pyvista.Camera` with the same view, for a scene in LPS mm: ``plotter.camera =
+        """Return a ``pyvista.Camera`` with the same view, for a scene in LPS mm: ``plotter.camera =
         camera.to_pyvista()``.
         """
         from clrecon.rendering.views.vtk import make_pyvista_camera
@@ -230,7 +230,7 @@ class Camera:
         Raises
         ------
         UsageError
-            Position and focal point coincide, or `up` is along the view.
+            Position and focal point coincide, or ``up`` is along the view.
         """
         forward = np.subtract(self.focal_point, self.position)
         length = np.linalg.norm(forward)
@@ -333,7 +333,7 @@ class Camera:
         Returns
         -------
         Camera
-            At the same distance from the focal point; `up` has turned with it.
+            At the same distance from the focal point; ``up`` has turned with it.
         """
         if not np.isfinite([_number(azimuth), _number(elevation)]).all():
             raise UsageError(f"a camera orbits by finite angles in degrees, not by {azimuth!r} and {elevation!r}")
@@ -342,12 +342,12 @@ class Camera:
         return replace(self, position=_triple(self.focal_point + offset), up=_triple(turn @ self.up))
 
     def zoomed(self, zoom: float) -> Camera:
-        """Return a camera at the same place that shows everything `zoom` times as large.
+        """Return a camera at the same place that shows everything ``zoom`` times as large.
 
         Raises
         ------
         UsageError
-            `zoom` is not positive, or gives an angle out of range.
+            ``zoom`` is not positive, or gives an angle out of range.
         """
         factor = _number(zoom)
         if not (0.0 < factor < np.inf):

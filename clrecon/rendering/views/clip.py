@@ -59,7 +59,7 @@ class Clip(Message):
         Raises
         ------
         UsageError
-            Not three numbers each, or `low` is not below `high`.
+            Not three numbers each, or ``low`` is not below ``high``.
         """
         try:
             corners = np.array([low, high], dtype=np.float64)
