@@ -239,6 +239,28 @@ def test_what_another_process_is_building_stays(records, tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
+@pytest.mark.parametrize("is_shared", [True, False])
+def test_what_another_process_replaces_is_built_again_without_a_word(is_shared, records, tmp_path):
+    """Two processes build one program; the first has recorded its files when the second replaces them."""
+    store = records()
+    build(store, tmp_path)
+    store.record()
+    store = records()
+    other = KnownGood(tmp_path)
+    try:
+        (tmp_path / PROGRAM / "scan" / "64" / "scan.so").write_bytes(b"of the second process")
+        if not is_shared:
+            os.close(other._handle)
+        assert not build(store, tmp_path) and store.warnings == ([] if is_shared else [DAMAGED])
+    finally:
+        if is_shared:
+            os.close(other._handle)
+    store.record()
+    store = records()
+    assert build(store, tmp_path) and store.warnings == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
 def test_a_process_that_asked_in_vain_still_counts(records, tmp_path):
     """A lock that cannot be made exclusive is lost: it has to be taken again."""
     first, second = records(), KnownGood(tmp_path)

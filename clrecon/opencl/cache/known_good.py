@@ -7,6 +7,10 @@ its files are compared with the record, and a program with a difference is remov
 Files that no record mentions come from a process that runs, or from one that died while it built.  They are removed
 when no other process uses the folder: each holds a lock on it.
 
+Two processes that build the same program at once write the same files: the one that ends first records them, and the
+other replaces them until it ends and records its own.  So a difference is called damage only when no other process uses
+the folder; the program is built again in any case.
+
 Not covered: contents that change while size and time stay the same, and damage between the check and PoCL's reading.
 """
 
@@ -118,9 +122,10 @@ class KnownGood:
         """Remove what is damaged, and what was left by a process that died."""
         for name, files in recorded.items():
             if not self._is_intact(name, files):
-                log.info("kept program %s is damaged", name)
+                log.info("kept program %s differs from its record", name)
                 shutil.rmtree(self._folder / name, ignore_errors=True)
-                self._warn(DAMAGED)
+                if not self._is_shared():
+                    self._warn(DAMAGED)
         strange = any(self._list(name) - files.keys() for name, files in recorded.items())
         if (strange or not recorded) and not self._is_swept:
             self.sweep()
@@ -188,6 +193,15 @@ class KnownGood:
             fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             self._share()  # a lock that cannot be changed is lost
+            return False
+        return True
+
+    def _is_shared(self) -> bool:
+        """Return whether another process uses the folder; False where there are no locks to tell."""
+        if sys.platform == "win32":
+            return False
+        if self._is_alone():
+            self._share()
             return False
         return True
 
