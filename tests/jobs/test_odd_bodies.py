@@ -13,6 +13,7 @@ from clrecon.cli.refinement import describe_purposes
 from clrecon.errors import ClreconError, NoSurfaceError, RefusedInputError
 from clrecon.jobs.mesh.for_purpose import settings_for
 from clrecon.jobs.mesh.job import make_mesh
+from clrecon.jobs.mesh.print_facts import LEFT_SHARE
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.render.files import PictureFiles
 from clrecon.jobs.render.job import make_pictures
@@ -270,7 +271,7 @@ def test_a_print_is_of_bone_and_says_what_is_none(odd: OddBodies, device: Any, t
     assert 0.0 <= left_out["not_bone_ml"] <= left_out["pieces_ml"]
     assert any(f"{left_out['not_bone']:,} of" in line and "kept 1 of" in line for line in describe_purposes([report]))
     warned = any("bone that was left out encloses" in warning for warning in report["warnings"])
-    assert warned == (left_out["pieces_ml"] - left_out["not_bone_ml"] > kept_ml)
+    assert warned == (left_out["pieces_ml"] - left_out["not_bone_ml"] > LEFT_SHARE * kept_ml)
 
 
 def test_a_print_of_what_is_no_bone_is_refused_and_says_how_to_have_it(

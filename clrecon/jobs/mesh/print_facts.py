@@ -18,6 +18,9 @@ __all__ = ["describe_print", "measure_pieces", "warn_of_print"]
 THIN_MM = 1.0
 """Thinner walls break or are not printed at all by common printers (layers of 0.1 to 0.3 mm, nozzles of 0.4 mm)."""
 
+LEFT_SHARE = 0.5
+"""What was left out in volumes of what was kept, from which on there is a warning: the other leg of a pair."""
+
 THIN_SHARE = 0.05
 """Share of the surface with thin walls from which on there is a warning."""
 
@@ -94,11 +97,11 @@ def warn_of_print(facts: dict[str, Any]) -> list[str]:
         )
     bone_told = left_out.get("not_bone") is not None
     other_ml = left_out["pieces_ml"] - (left_out["not_bone_ml"] if bone_told else 0.0)
-    if other_ml > facts["pieces_ml"]:
+    if other_ml > LEFT_SHARE * facts["pieces_ml"]:
         away, seed = name_parameter("remove_table", True), name_parameter("seeds", "X,Y,Z")
         table = "" if bone_told else f" The piece of largest area can be a table ({away});"
         warnings.append(
-            f"{'bone that' if bone_told else 'what'} was left out encloses {say_digits(other_ml)} ml, more than the"
+            f"{'bone that' if bone_told else 'what'} was left out encloses {say_digits(other_ml)} ml, beside the"
             f" {say_digits(facts['pieces_ml'])} ml that were kept: is it the right piece?{table}"
             f" {seed} keeps the one at a"
             " point"
