@@ -49,7 +49,7 @@ __kernel void find_near_faces(
     int nearest = NO_FACE, vertex = -1;
     for (int hint = 0; hint < hints && !(least < enough); ++hint) {
         vertex = near[number * (uint)hints + (uint)hint];
-        look_around(places, faces, begin, around, point, vertex, &least, &nearest);
+        look_around(places, faces, begin, around, point, vertex, enough, &least, &nearest);
     }
     for (int walk = 0; walk < walks && nearest != NO_FACE && !(least < enough); ++walk) {
         const uint3 face = vload3((uint)nearest, faces);
@@ -60,7 +60,7 @@ __kernel void find_near_faces(
         if (next == vertex)
             break;
         vertex = next;
-        look_around(places, faces, begin, around, point, vertex, &least, &nearest);
+        look_around(places, faces, begin, around, point, vertex, enough, &least, &nearest);
     }
     squares[number] = least;
     rows[number] = nearest;
@@ -130,7 +130,7 @@ __kernel void find_witnesses(
                 continue;
             least = MAXFLOAT;
             for (int i = 0; i < 3 && !(least < enough); ++i)
-                look_around(places, faces, begin, around, point, names[vertex[i]], &least, &nearest);
+                look_around(places, faces, begin, around, point, names[vertex[i]], 0.0f, &least, &nearest);
             if (least < enough)
                 witnesses[(3u + (uint)middle) * count + number] = nearest;
             else

@@ -66,13 +66,15 @@ static inline float square_to_row(
     return square_to_face(point, place_of(places, face.x), place_of(places, face.y), place_of(places, face.z));
 }
 
-/* The least of the squares of the distances to the faces around a vertex, if it is less than `least`. */
+/* The least of the squares of the distances to the faces around a vertex, if it is less than `least`.  Once it is below
+ * `enough`, the rest of them is left out. */
 static inline void look_around(
     __global const float *restrict places, __global const uint *restrict faces, __global const int *restrict begin,
-    __global const int *restrict around, const float3 point, const int vertex, float *least, int *nearest)
+    __global const int *restrict around, const float3 point, const int vertex, const float enough, float *least,
+    int *nearest)
 {
     const int end = begin[vertex + 1];
-    for (int entry = begin[vertex]; entry < end; ++entry) {
+    for (int entry = begin[vertex]; entry < end && !(*least < enough); ++entry) {
         const int row = around[entry];
         const float square = square_to_row(places, faces, point, row);
         if (square < *least) {

@@ -15,6 +15,7 @@ __all__ = [
     "Edges",
     "Fans",
     "count_duplicate_faces",
+    "find_duplicate_faces",
     "find_edges",
     "find_faces_back_to_back",
     "find_split_vertices",
@@ -287,11 +288,20 @@ def count_duplicate_faces(triangles: NDArray[np.uint32], vertex_count: int, oppo
     """Count the triangles that have the three vertices of an earlier one, in any order.
 
     Where every edge has two faces (`opposite` is given, see `opposite_half_edges`), two triangles with the same
-    vertices are neighbours on all three sides.  Else sums of scrambled vertex numbers are compared, which do not depend
-    on the order (splitmix64, Steele, Lea and Flood 2014); only triangles with equal sums are compared in full.
+    vertices are neighbours on all three sides.  Else they are found as by `find_duplicate_faces`.
     """
     if opposite is not None:
         return len(find_faces_back_to_back(opposite)) // 2
+    found = find_duplicate_faces(triangles, vertex_count)
+    return len(found) - len(np.unique(np.sort(triangles[found], axis=1), axis=0))
+
+
+def find_duplicate_faces(triangles: NDArray[np.uint32], vertex_count: int) -> IntArray:
+    """Find the triangles that have the three vertices of another one, in any order; all of them, in their order.
+
+    Sums of scrambled vertex numbers are compared, which do not depend on the order (splitmix64, Steele, Lea and Flood
+    2014); only triangles with equal sums are compared in full.
+    """
     with np.errstate(over="ignore"):
         mixed = np.arange(1, vertex_count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
         mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -301,9 +311,10 @@ def count_duplicate_faces(triangles: NDArray[np.uint32], vertex_count: int, oppo
     ordered = np.sort(sums)
     repeated = ordered[1:][ordered[1:] == ordered[:-1]]
     if len(repeated) == 0:
-        return 0
-    suspects = np.sort(triangles[np.isin(sums, repeated)], axis=1)
-    return len(suspects) - len(np.unique(suspects, axis=0))
+        return np.zeros(0, dtype=np.int64)
+    suspects = np.flatnonzero(np.isin(sums, repeated))
+    _, number, uses = np.unique(np.sort(triangles[suspects], axis=1), axis=0, return_inverse=True, return_counts=True)
+    return suspects[uses[number.reshape(-1)] > 1]
 
 
 def find_faces_back_to_back(opposite: IntArray) -> IntArray:

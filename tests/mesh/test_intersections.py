@@ -7,7 +7,12 @@ import pytest
 import sample_meshes as samples
 
 from clrecon.mesh import Mesh, intersections
-from clrecon.mesh.intersections import count_self_intersections, find_beside, find_self_intersections
+from clrecon.mesh.intersections import (
+    count_self_intersections,
+    find_beside,
+    find_changed_intersections,
+    find_self_intersections,
+)
 
 pytestmark = pytest.mark.unit
 
@@ -127,6 +132,27 @@ def test_what_touches_a_changed_triangle_lies_beside_it():
     numbers = np.flatnonzero(beside)
     found = numbers[find_self_intersections(vertices, triangles[beside], changed[beside])]
     assert sorted(map(sorted, found.tolist())) == sorted(map(sorted, touched.tolist()))
+    found = find_changed_intersections(vertices, triangles, changed)
+    assert sorted(map(sorted, found.tolist())) == sorted(map(sorted, touched.tolist()))
+
+
+def test_what_finds_crossings_elsewhere_is_asked_where_many_have_changed():
+    vertices, triangles = samples.join(samples.box(), samples.box((0.4, 0.5, 0.6)))
+    triangles = np.asarray(triangles, np.uint32)
+    asked: list[object] = []
+
+    def elsewhere(*arguments):
+        asked.append(arguments[2])
+        return find_self_intersections(*arguments)
+
+    every = find_self_intersections(vertices, triangles)
+    assert len(every) > 3
+    for changed in (np.ones(24, bool), np.arange(24) < 2, np.arange(24) == every[0, 0]):
+        found = find_changed_intersections(vertices, triangles, changed, elsewhere)
+        assert sorted(map(sorted, found.tolist())) == sorted(map(sorted, every[changed[every].any(axis=1)].tolist()))
+    assert asked[0] is None and len(asked) == 2  # one of 24 is less than one of twenty
+    assert find_changed_intersections(vertices, triangles, np.zeros(24, bool), elsewhere).shape == (0, 2)
+    assert len(asked) == 2
 
 
 @pytest.mark.parametrize("axis", range(3))

@@ -12,6 +12,7 @@ from clrecon.mesh import Mesh, measure_quality
 from clrecon.mesh.connectivity import (
     _index_type,
     count_duplicate_faces,
+    find_duplicate_faces,
     find_edges,
     find_split_vertices,
     opposite_half_edges,
@@ -228,6 +229,17 @@ def test_going_round_the_vertices_finds_what_joining_the_corners_finds():
     np.testing.assert_array_equal(found, find_split_vertices(glued, len(vertices), edges))
     assert 3 <= len(found) <= 5
     assert count_duplicate_faces(glued, len(vertices), opposite) == count_duplicate_faces(glued, len(vertices)) == 0
+
+
+def test_all_faces_with_the_vertices_of_another_are_found():
+    _, triangles = samples.sphere(rounds=1)
+    triangles = np.concatenate([triangles, triangles[[5, 9]][:, (2, 0, 1)], triangles[[9]][:, (1, 0, 2)]]).astype(
+        np.uint32
+    )
+    last = len(triangles) - 3
+    assert find_duplicate_faces(triangles, int(triangles.max()) + 1).tolist() == [5, 9, last, last + 1, last + 2]
+    assert count_duplicate_faces(triangles, int(triangles.max()) + 1) == 3
+    assert len(find_duplicate_faces(triangles[:-3], int(triangles.max()) + 1)) == 0
 
 
 def test_a_vertex_with_many_faces():

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from clrecon.exchange.coordinates import as_stored, find_coincident
 from clrecon.mesh.connectivity import Edges, Fans, find_edges, label_components
-from clrecon.mesh.intersections import find_beside, find_self_intersections
+from clrecon.mesh.intersections import FindCrossings, find_changed_intersections, find_self_intersections
 from clrecon.mesh.refine.bounds import WITNESSES
 from clrecon.mesh.refine.collapses import Collapses, Quadrics, last_of_collapses
 from clrecon.mesh.refine.deviation import Deviation
@@ -38,10 +38,18 @@ class Clusters:
     triangles : ndarray, shape (m, 3), uint32
     origin : ndarray, shape (3,), float64, mm
         Places are rounded as a `Mesh` stores them after this is added.
+    find_crossings : callable
+        `find_self_intersections`, or what finds the same elsewhere.
     """
 
-    def __init__(self, vertices: Float64Array, triangles: NDArray[np.uint32], origin: Float64Array):
-        self._triangles, self._origin = triangles, origin
+    def __init__(
+        self,
+        vertices: Float64Array,
+        triangles: NDArray[np.uint32],
+        origin: Float64Array,
+        find_crossings: FindCrossings = find_self_intersections,
+    ):
+        self._triangles, self._origin, self._find_crossings = triangles, origin, find_crossings
         self._names, self._original = np.arange(len(vertices)), self._rounded(vertices)
         self._places = self._original.copy()
         self._collapses = Collapses(len(vertices))
@@ -278,6 +286,8 @@ class Clusters:
         largest[found] = order[first]
         part = parts[self._names]
         lost = (labels >= 0) & ((part < 0) | (largest[labels] != part))
+        if not lost.any():
+            return np.zeros(0, dtype=np.int64)
         # With their surroundings: a part that has come apart can consist of vertices without clusters.
         return np.unique(self._names[self._triangles[lost[self._triangles].any(axis=1)]])
 
@@ -303,12 +313,9 @@ class Clusters:
         faces = self.faces()
         changed = any_corner(self._new_to_cuts, faces)
         if changed.any():
-            changed &= any_corner(self._has_moved(), self._triangles[self._is_face])
+            changed[changed] = self._have_moved(np.flatnonzero(self._is_face)[changed])
         self._new_to_cuts[:] = False
-        stored = self._stored()
-        near = find_beside(stored, faces, changed)
-        faces = faces[near]
-        return np.unique(faces[find_self_intersections(stored, faces, changed[near])])
+        return np.unique(faces[find_changed_intersections(self._stored(), faces, changed, self._find_crossings)])
 
     def find_far(self, deviation: Deviation) -> IntArray:
         """Find names of clusters where either surface is too far from the other.

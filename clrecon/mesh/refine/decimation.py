@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange.coordinates import as_stored, rounding_step
+from clrecon.mesh.intersections import FindCrossings, find_self_intersections
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
 from clrecon.mesh.refine.bounds import SurfaceBounds
@@ -125,6 +126,7 @@ def decimate_mesh(
     *,
     progress: Progress | None = None,
     make_bounds: MakeBounds = SurfaceBounds,
+    find_crossings: FindCrossings = find_self_intersections,
 ) -> Mesh:
     """Remove triangles by collapsing edges in order of their quadric error (Garland and Heckbert 1997).
 
@@ -146,6 +148,8 @@ def decimate_mesh(
         Called as ``progress("decimate", triangles removed, triangles to remove)``, several times in a round.
     make_bounds : callable
         `SurfaceBounds`, or what does the same elsewhere.
+    find_crossings : callable
+        `find_self_intersections`, or what finds the same elsewhere.
 
     Returns
     -------
@@ -164,7 +168,7 @@ def decimate_mesh(
     check_share(fraction)
     bound = check_refinement(mesh, max_deviation_mm)
     origin = local_origin(mesh.vertices)
-    clusters = Clusters(mesh.vertices - origin, mesh.triangles, origin)
+    clusters = Clusters(mesh.vertices - origin, mesh.triangles, origin, find_crossings)
     # Both surfaces are stored rounded, each coordinate by at most half a step.
     longest = max(_SHARE_FOR_VOLUME * bound - rounding_step(mesh.vertices), 0.0)
     deviation_bound = (1.0 - _SHARE_FOR_VOLUME) * bound
@@ -177,7 +181,7 @@ def decimate_mesh(
             progress("decimate", min(mesh.triangle_count - left, to_go), to_go)
 
     rounds, taken_back = _collapse_in_rounds(clusters, deviation, wanted, bound, tell)
-    vertices, triangles, undone = _with_volumes(clusters, deviation, mesh, origin, longest)
+    vertices, triangles, undone = _with_volumes(clusters, deviation, mesh, origin, longest, find_crossings)
     said = {
         "fraction": fraction,
         "reached": 1.0 - len(triangles) / mesh.triangle_count,
@@ -232,7 +236,12 @@ def _collapse_in_rounds(
 
 
 def _with_volumes(
-    clusters: Clusters, deviation: Deviation, mesh: Mesh, origin: NDArray[np.float64], longest: float
+    clusters: Clusters,
+    deviation: Deviation,
+    mesh: Mesh,
+    origin: NDArray[np.float64],
+    longest: float,
+    find_crossings: FindCrossings,
 ) -> tuple[NDArray[np.floating], NDArray[np.uint32], int]:
     """Return the surface of clusters as it is stored, each closed component with its original volume.
 
@@ -252,7 +261,7 @@ def _with_volumes(
         if not clusters.undo(standing[differ[labels[standing]]]):
             break
         _mend(clusters, deviation)
-    vertices = move_vertices(as_stored(places + origin), triangles, step)[0]
+    vertices = move_vertices(as_stored(places + origin), triangles, step, find_crossings)[0]
     return vertices, triangles, collapsed - clusters.collapsed_count
 
 

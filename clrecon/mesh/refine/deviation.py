@@ -12,6 +12,7 @@ from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.connectivity import Fans, find_edges
 from clrecon.mesh.refine.bounds import MIDDLES, SurfaceBounds
 from clrecon.mesh.refine.faults import any_corner
+from clrecon.mesh.triangles import corner_edges
 
 __all__ = ["Deviation", "MakeBounds"]
 
@@ -63,8 +64,10 @@ class Deviation:
         self._places = vertices.astype(np.float32)
         self._distance = make_bounds(vertices, triangles, fans)
         self._exact: SurfaceDistance | None = None
-        edges = vertices[triangles[:, (1, 2, 0)]] - vertices[triangles]
-        self._step = float(np.sqrt(np.einsum("nia,nia->ni", edges, edges)).mean())
+        total = 0.0
+        for _, _, p, q in corner_edges(vertices, triangles, np.zeros(3)):
+            total += sum(float(np.sqrt(np.einsum("an,an->n", edge, edge)).sum()) for edge in (p, q, q - p))
+        self._step = total / max(triangles.size, 1)
 
     def can_be_far(self, rows: IntArray, names: IntArray, places: Float64Array) -> NDArray[np.bool_]:
         """Mark triangles that have changed, or have a corner that moved farther than the bound.

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from clrecon.mesh.connectivity import (
     Edges,
-    count_duplicate_faces,
+    find_duplicate_faces,
     find_edges,
     find_faces_back_to_back,
     find_split_vertices,
@@ -83,9 +83,7 @@ def find_faults_beside(faces: NDArray[np.uint32], new: NDArray[np.bool_]) -> Int
         return np.zeros(0, dtype=np.int64)
     edges = find_edges(local, len(numbers))
     faults = _find_ridges(local, edges)
-    if count_duplicate_faces(local, len(numbers)):
-        _, first, uses = np.unique(np.sort(local, axis=1), axis=0, return_index=True, return_counts=True)
-        faults.append(local[first[uses > 1]].reshape(-1))
+    faults.append(local[find_duplicate_faces(local, len(numbers))].reshape(-1))
     split = find_split_vertices(local, len(numbers), edges)
     split = split[touched[numbers[split]]]
     faults += [split, local[np.isin(local, split).any(axis=1)].reshape(-1) if len(split) else split]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from clrecon.exchange.coordinates import as_stored, find_coincident
 from clrecon.mesh.connectivity import find_edges, label_components
-from clrecon.mesh.intersections import find_beside, find_self_intersections
+from clrecon.mesh.intersections import FindCrossings, find_changed_intersections, find_self_intersections
 from clrecon.mesh.triangles import cross_products
 
 __all__ = ["Volumes", "measure_volumes", "move_vertices", "restore_volumes", "shorten_steps"]
@@ -135,7 +135,10 @@ def shorten_steps(step: Float64Array, longest: float) -> int:
 
 
 def move_vertices(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], step: Float64Array
+    vertices: NDArray[np.floating],
+    triangles: NDArray[np.uint32],
+    step: Float64Array,
+    find_crossings: FindCrossings = find_self_intersections,
 ) -> tuple[NDArray[np.floating], int]:
     """Move vertices, but by less or not at all where triangles would cut, lose their area or share a place.
 
@@ -144,6 +147,8 @@ def move_vertices(
     vertices : ndarray, shape (n, 3), float32 or float64, mm
     triangles : ndarray, shape (m, 3), uint32
     step : ndarray, shape (n, 3), float64, mm
+    find_crossings : callable
+        `find_self_intersections`, or what finds the same elsewhere.
 
     Returns
     -------
@@ -156,7 +161,7 @@ def move_vertices(
     moved = as_stored(vertices + step)
     look_at = np.ones(len(triangles), dtype=bool)
     for turn in range(_ROUNDS):
-        spoilt = _find_spoilt(moved, triangles, look_at)
+        spoilt = _find_spoilt(moved, triangles, look_at, find_crossings)
         if turn >= _ROUNDS_OF_ITS_OWN:
             beside = np.zeros(len(vertices), dtype=bool)
             beside[spoilt] = True
@@ -174,15 +179,16 @@ def move_vertices(
 
 
 def _find_spoilt(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], look_at: NDArray[np.bool_]
+    vertices: NDArray[np.floating],
+    triangles: NDArray[np.uint32],
+    look_at: NDArray[np.bool_],
+    find_crossings: FindCrossings,
 ) -> NDArray[np.int64]:
     """Find vertices of triangles without area, of triangles that cut each other, and vertices that coincide."""
     flat = [
         where.start + np.flatnonzero(~cross.any(axis=0))
         for where, _, cross in cross_products(vertices, triangles, np.zeros(3))
     ]
-    beside = find_beside(vertices, triangles, look_at)
-    near = triangles[beside]
-    cut = near[find_self_intersections(vertices, near, None if look_at.all() else look_at[beside])]
+    cut = triangles[find_changed_intersections(vertices, triangles, look_at, find_crossings)]
     found = [triangles[np.concatenate(flat)].reshape(-1), cut.reshape(-1), find_coincident(vertices)]
     return np.unique(np.concatenate(found).astype(np.int64))

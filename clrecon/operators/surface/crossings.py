@@ -174,6 +174,7 @@ def find_crossings(
     device: Device,
     vertices: NDArray[np.floating],
     triangles: NDArray[np.uint32],
+    changed: NDArray[np.bool_] | None = None,
     *,
     memory: int | None = None,
     steps: Steps | None = None,
@@ -188,6 +189,8 @@ def find_crossings(
     device : Device
     vertices : ndarray, shape (v, 3), mm
     triangles : ndarray, shape (n, 3), uint32
+    changed : ndarray, shape (n,), bool, optional
+        Only pairs with one of these are found.
     memory : int, optional
         Bytes that may be taken on the device; None is all that it has.
     steps : Steps, optional
@@ -204,9 +207,9 @@ def find_crossings(
         The device fails.
     """
     if len(triangles) < FEWEST or vertices.dtype != np.float32:
-        return find_self_intersections(vertices, triangles, steps=steps)
+        return find_self_intersections(vertices, triangles, changed, steps=steps)
     plan = plan_crossings(vertices, triangles)
     if describe_shortage(memory_limits(device, memory), plan.needs()):
-        return find_self_intersections(vertices, triangles, steps=steps)
+        return find_self_intersections(vertices, triangles, changed, steps=steps)
     marked = np.flatnonzero(mark_crossings(device, plan, steps=steps))
-    return marked[find_self_intersections(vertices, triangles[marked])]
+    return marked[find_self_intersections(vertices, triangles[marked], None if changed is None else changed[marked])]

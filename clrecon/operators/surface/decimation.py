@@ -1,4 +1,4 @@
-"""Decimation within a bound, with distances on a device if one is named."""
+"""Decimation within a bound, with distances and crossings on a device if one is named."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from functools import partial
 from clrecon.mesh import Mesh
 from clrecon.mesh.refine import decimation
 from clrecon.opencl import Device, take_device, work_on
+from clrecon.operators.surface.crossings import find_crossings
 from clrecon.operators.surface.near_faces import DeviceBounds
 from clrecon.system.progress import Progress
 
@@ -32,7 +33,8 @@ def decimate_mesh(
         No vertex and no middle of an edge or a triangle of either surface lies farther than this from the other.
         Default: a quarter of the shortest voxel step.
     device : Device, str or int, optional
-        Bounds distances, see `clrecon.device`.  None: numpy does it, which takes longer and needs no device.  The
+        Bounds distances and finds triangles that cut each other, see `clrecon.device`.  None: numpy does it, which
+        takes longer and needs no device.  The
         result is the same but for rounding: another triangle may have been found to be near enough first.
     progress : callable, optional
         Called as ``progress("decimate", triangles removed, triangles to remove)``, several times in a round.
@@ -58,6 +60,11 @@ def decimate_mesh(
     return work_on(
         take_device(device),
         lambda device, told: decimation.decimate_mesh(
-            mesh, fraction, max_deviation_mm, progress=progress, make_bounds=partial(DeviceBounds, device)
-        ),
+            mesh,
+            fraction,
+            max_deviation_mm,
+            progress=progress,
+            make_bounds=partial(DeviceBounds, device),
+            find_crossings=partial(find_crossings, device),
+        ),  # fmt: skip
     )

@@ -51,7 +51,8 @@ def prepare_near_faces(device: Device) -> Program:
 class DeviceBounds(SurfaceBounds):
     """A surface to which distances are bounded on a device; its twin is `SurfaceBounds`.
 
-    The nearest point of each triangle is found, where the twin may take one near it: bounds are as short or shorter.
+    The nearest point of each triangle is found, where the twin may take one near it: bounds are as short or shorter,
+    or within the limit.
 
     Parameters
     ----------

@@ -57,6 +57,18 @@ def test_pairs_are_those_of_the_host(device, sizes, extent, place, monkeypatch):
     assert pairs(find_crossings(device, vertices, triangles)) == pairs(expected)
 
 
+@pytest.mark.parametrize("fewest", [1, 10_000])
+def test_pairs_with_a_changed_triangle(device, fewest, monkeypatch):
+    monkeypatch.setattr(crossings, "FEWEST", fewest)
+    vertices, triangles = scattered(900)
+    changed = np.arange(900) % 4 == 1
+    every = find_self_intersections(vertices, triangles)
+    expected = every[changed[every].any(axis=1)]
+    assert pairs(find_crossings(device, vertices, triangles, changed)) == pairs(expected) and 10 < len(expected) < len(
+        every
+    )
+
+
 @pytest.mark.parametrize("scale", [2.0**-60, 2.0**-9, 1.0, 2.0**30])
 def test_bodies_that_cut_each_other(device, scale, monkeypatch):
     """Whatever the unit of length; two spheres whose triangles lie in each other's planes too."""
