@@ -144,10 +144,15 @@ class Clusters:
 
     def surface(self) -> tuple[Float64Array, NDArray[np.uint32]]:
         """Places relative to the origin, and triangles, numbered without gaps."""
-        faces, standing = self.faces(), self.standing()
+        standing, faces = self._without_gaps()
+        return self._places[standing], faces
+
+    def _without_gaps(self) -> tuple[IntArray, NDArray[np.uint32]]:
+        """Return the vertices as of `standing`, and the faces as rows of these, shape (k, 3)."""
+        standing = self.standing()
         number = np.zeros(len(self._names), dtype=np.uint32)
         number[standing] = np.arange(len(standing), dtype=np.uint32)
-        return self._places[standing], number[faces]
+        return standing, number.take(self.faces(), mode="clip")
 
     def undo(self, names: IntArray) -> int:
         """Undo the last collapses of these clusters; return the number of vertices in those that had collapses."""
@@ -247,19 +252,22 @@ class Clusters:
         return found
 
     def _find_faults_everywhere(self) -> IntArray:
-        faces = self.faces()
-        edges = find_edges(faces, len(self._names))
-        faults = find_sheets(faces, len(self._names), edges)
-        if not any(map(len, faults)):  # the other faults can only be found, or cost less, after these are repaired
-            faults += [self._find_lost(faces, edges), *self._find_flat(faces), self._find_coincident()]
-        if not any(map(len, faults)):
-            faults.append(self._find_torn(faces, edges))
+        standing, faces = self._without_gaps()
+        if len(faces) == 0:
+            return np.unique(self._names[self._triangles])
+        edges = find_edges(faces, len(standing))
+        faults = find_sheets(faces, len(standing), edges)
+        if any(map(len, faults)):  # the other faults can only be found, or cost less, after these are repaired
+            return np.asarray(standing[np.unique(np.concatenate(faults).astype(np.int64))])
+        stored = as_stored(self._places[standing] + self._origin)
+        placed = standing[np.concatenate([*_find_flat(stored, faces), find_coincident(stored)]).astype(np.int64)]
+        faults = [placed, self._find_lost(standing, faces, edges), self._find_torn(standing, faces, edges)]
         return np.unique(np.concatenate(faults).astype(np.int64))
 
-    def _find_torn(self, faces: NDArray[np.uint32], edges: Edges) -> IntArray:
+    def _find_torn(self, standing: IntArray, faces: NDArray[np.uint32], edges: Edges) -> IntArray:
         """Find names where components have got another Euler number."""
         count, labels = self._components
-        differ = measure_topology(faces, labels, count, edges).euler != self._topology.euler
+        differ = measure_topology(faces, labels[standing], count, edges).euler != self._topology.euler
         if not differ.any():
             return np.zeros(0, dtype=np.int64)
         return find_torn(self._triangles[differ[labels[self._triangles[:, 0]]]], self._names)
@@ -273,18 +281,20 @@ class Clusters:
         count, labels = self._components
         return compare_topology(self._topology, measure_topology(self.faces(), labels, count))
 
-    def _find_lost(self, faces: NDArray[np.uint32], edges: Edges) -> IntArray:
+    def _find_lost(self, standing: IntArray, faces: NDArray[np.uint32], edges: Edges) -> IntArray:
         """Find names of components without a face, and of all but the largest part of those that came apart."""
         count, labels = self._components
-        now, parts = label_components(faces, len(self._names), edges)
+        now, parts = label_components(faces, len(standing), edges)
         part_size = np.bincount(parts[faces[:, 0]], minlength=now)
         whole = np.full(now, -1)
-        whole[parts[faces[:, 0]]] = labels[faces[:, 0]]
+        whole[parts] = labels[standing]
         order = np.lexsort((-part_size, whole))
         largest = np.full(count, -1)
         found, first = np.unique(whole[order], return_index=True)
         largest[found] = order[first]
-        part = parts[self._names]
+        of_name = np.full(len(self._names), -1)
+        of_name[standing] = parts
+        part = of_name[self._names]
         lost = (labels >= 0) & ((part < 0) | (largest[labels] != part))
         if not lost.any():
             return np.zeros(0, dtype=np.int64)
@@ -293,16 +303,6 @@ class Clusters:
 
     def _stored(self) -> NDArray[np.floating]:
         return as_stored(self._places + self._origin)
-
-    def _find_flat(self, faces: NDArray[np.uint32]) -> list[NDArray[np.uint32]]:
-        """Find corners of faces without area after coordinates are rounded."""
-        pieces = cross_products(self._stored(), faces, np.zeros(3))
-        return [faces[where][~cross.any(axis=0)].reshape(-1) for where, _, cross in pieces]
-
-    def _find_coincident(self) -> IntArray:
-        """Find names that coincide after coordinates are rounded."""
-        standing = self.standing()
-        return standing[find_coincident(as_stored(self._places[standing] + self._origin))]
 
     def find_crossing(self) -> IntArray:
         """Find names of clusters at faces that cut each other after coordinates are rounded.
@@ -382,6 +382,12 @@ def _are_faces(named: IntArray) -> NDArray[np.bool_]:
     """True for triangles, shape (m, 3), with three different corners."""
     a, b, c = named.T
     return np.asarray((a != b) & (b != c) & (c != a))
+
+
+def _find_flat(places: NDArray[np.floating], faces: NDArray[np.uint32]) -> list[NDArray[np.uint32]]:
+    """Find corners of faces without area."""
+    pieces = cross_products(places, faces, np.zeros(3))
+    return [faces[where][~cross.any(axis=0)].reshape(-1) for where, _, cross in pieces]
 
 
 def _any_witness(flags: NDArray[np.bool_], witnesses: IntArray) -> NDArray[np.bool_]:

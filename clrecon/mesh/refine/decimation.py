@@ -38,7 +38,7 @@ _AGGRESSIVENESS = 3.0
 """How fast fast-simplification lets its error grow.  With the bound, 2 to 7 give the same surface, and 3 is fastest."""
 
 _LAST_ITERATION = 99
-_FIRST_ERROR = 256.0
+_FIRST_ERROR = 800.0
 """Largest quadric error of the first round, in squares of the bound.  The error sums the squared distances to dozens of
 planes that meet in a vertex.  The last collapses are undone where they went too far: what matters is their order."""
 

@@ -15,7 +15,7 @@ from clrecon.geometry import Volume
 from clrecon.mesh import Mesh, split_components
 from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.intersections import count_self_intersections
-from clrecon.mesh.refine.clusters import Clusters
+from clrecon.mesh.refine.clusters import Clusters, _find_flat
 from clrecon.mesh.refine.collapses import Quadrics
 from clrecon.mesh.refine.decimation import _collapse, _mend, check_refinement, decimate_mesh
 from clrecon.mesh.refine.deviation import Deviation
@@ -305,12 +305,19 @@ def test_a_cluster_whose_place_alone_has_changed_is_undone():
     np.testing.assert_array_equal(clusters.places[a], before)
 
 
+def test_all_of_a_surface_without_faces_is_a_fault():
+    vertices, triangles = samples.box()
+    clusters = Clusters(vertices, triangles.astype(np.uint32), np.zeros(3))
+    clusters.collapse(np.array([[5, n] for n in range(8) if n != 5]), np.zeros((0, 3)), np.zeros((0, 3), int))
+    assert len(clusters.faces()) == 0 and clusters.find_faults().tolist() == [5]
+
+
 def test_the_corners_of_faces_without_area_are_faults():
     """A corner on the edge between two others: the face between them is flat, and its neighbour is not."""
     vertices, triangles = samples.box()
     vertices = np.concatenate([vertices, [[0.5, 0.0, 0.0]]])
     clusters = Clusters(vertices, np.concatenate([triangles, [[0, 8, 1]]]).astype(np.uint32), np.zeros(3))
-    found = np.concatenate(clusters._find_flat(clusters.faces()))
+    found = np.concatenate(_find_flat(clusters._stored(), clusters.faces()))
     assert found.tolist() == [0, 8, 1]
 
 
