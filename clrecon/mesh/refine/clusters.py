@@ -307,13 +307,11 @@ class Clusters:
     def find_crossing(self) -> IntArray:
         """Find names of clusters at faces that cut each other after coordinates are rounded.
 
-        Only faces that changed since the last call, and differ from those at first, are examined with their
-        surroundings.
+        Only faces that changed since the last call are examined with their surroundings: also those that are as at
+        first again, as others may have moved to where they were not.
         """
         faces = self.faces()
         changed = any_corner(self._new_to_cuts, faces)
-        if changed.any():
-            changed[changed] = self._have_moved(np.flatnonzero(self._is_face)[changed])
         self._new_to_cuts[:] = False
         return np.unique(faces[find_changed_intersections(self._stored(), faces, changed, self._find_crossings)])
 

@@ -305,6 +305,24 @@ def test_a_cluster_whose_place_alone_has_changed_is_undone():
     np.testing.assert_array_equal(clusters.places[a], before)
 
 
+def test_a_face_that_is_as_at_first_again_can_cut_one_that_has_moved_there():
+    """The upper tip of an octahedron is taken away, the bottom of a box comes down there, and the tip comes back."""
+    vertices, triangles = samples.join(samples.sphere(radius=1.0, rounds=0), samples.box((-3, -3, 1.5), (6, 6, 1)))
+    clusters = Clusters(vertices, triangles.astype(np.uint32), np.zeros(3))
+    pairs = np.array([[0, 4], [6, 7]])
+    names = np.arange(len(vertices))
+    names[pairs[:, 1]] = pairs[:, 0]
+    left = names[triangles]
+    left = left[(left != left[:, (1, 2, 0)]).all(axis=1)]
+    standing = np.unique(left)
+    points = vertices[standing]
+    points[standing == 6] = [0.0, -3.0, -0.5]
+    clusters.collapse(pairs, points, np.searchsorted(standing, left))
+    assert len(clusters.find_crossing()) == 0
+    assert clusters.undo(np.array([0])) == 2
+    assert {4, 6} <= set(clusters.find_crossing().tolist())
+
+
 def test_all_of_a_surface_without_faces_is_a_fault():
     vertices, triangles = samples.box()
     clusters = Clusters(vertices, triangles.astype(np.uint32), np.zeros(3))
