@@ -20,8 +20,8 @@ def _parse_color(text: str) -> tuple[str, str]:
     return parse_label_color(text)
 
 
-def add_label_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options for label maps."""
+def add_label_arguments(parser: argparse.ArgumentParser, files: bool = True) -> None:
+    """Declare the options for label maps; without `files` all labels go into one."""
     group = parser.add_argument_group("labels", "one mesh a label: the label picks the cells, HU place the vertices")
     group.add_argument(
         "--labels", metavar="FILE", help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG or RTSTRUCT"
@@ -35,13 +35,14 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="LABEL=COLOUR",
         type=_parse_color,
         action="append",
-        help="colour of a label in .ply, .glb and .3mf, such as L3=orange; may be given again",
+        help="colour of a label in .ply, .glb, .3mf and .html, such as L3=orange; may be given again",
     )
-    group.add_argument(
-        "--one-file",
-        action="store_true",
-        help="all labels in one file (.3mf or .glb), each an object with its name and a colour of its own",
-    )
+    if files:
+        group.add_argument(
+            "--one-file",
+            action="store_true",
+            help="all labels in one file (.3mf, .glb or .html), each an object with its name and a colour of its own",
+        )
     group.add_argument(
         "--surface",
         metavar="hu|mask",
@@ -76,13 +77,13 @@ def label_choice(options: argparse.Namespace) -> LabelChoice | None:
             surface,
             hidden=tuple(options.hide_label or ()),
             colors=tuple(options.label_color or ()),
-            one_file=options.one_file,
+            one_file=getattr(options, "one_file", True),
         )
     given = {
         "--label": options.label,
         "--hide-label": options.hide_label,
         "--label-color": options.label_color,
-        "--one-file": options.one_file,
+        "--one-file": getattr(options, "one_file", False),
         "--grow": options.grow is not None,
         "--surface": options.surface,
     }

@@ -35,6 +35,7 @@ COMMANDS = {
     "cloud": _Command("clrecon.cli.cloud", "make a cloud of points from a CT series, or clean one"),
     "inside": _Command("clrecon.cli.inside", "take vertebrae apart: dense and trabecular bone, canal, volumes"),
     "render": _Command("clrecon.cli.render", "make pictures of a CT series, still or moving"),
+    "view": _Command("clrecon.cli.view", "look at a CT series or meshes: a page that turns, clips and measures"),
     "export": _Command("clrecon.cli.export", "write the volume of a CT series as NIfTI, NRRD or MetaImage"),
     "vertebrae": _Command("clrecon.cli.vertebrae", "make a first guess of a label map of the vertebrae"),
     "corridor": _Command("clrecon.cli.corridor", "find the widest straight line through each pedicle of a vertebra"),

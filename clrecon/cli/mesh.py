@@ -26,7 +26,10 @@ from clrecon.cli.refinement import (
 from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS
 from clrecon.system.text import count_of, say_digits
 
-__all__ = ["WHAT_BONE_COSTS", "add_arguments", "describe_mesh", "describe_volume", "run"]
+__all__ = [
+    "WHAT_BONE_COSTS", "add_arguments", "add_levels", "add_selection", "add_solid", "describe_mesh",
+    "describe_volume", "run",
+]  # fmt: skip
 
 _PARTS = (
     *("device", "read", "mask", "choose", "solid", "upload", "build", "kernels", "download"),
@@ -75,16 +78,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="DICOM folder (subfolders and any file names are fine) or file; or a NIfTI, NRRD or MetaImage file",
     )
     parser.add_argument(
-        "-o", "--output", metavar="OUT", required=True, help="mesh file: .stl .ply .obj .glb .vtp or .3mf"
+        "-o", "--output", metavar="OUT", required=True, help="mesh file: .stl .ply .obj .glb .vtp .3mf, or .html"
     )
     add_purpose(parser)
     add_reading(parser)
     add_masking(parser)
     add_cropping(parser)
     surface = parser.add_argument_group("surface")
-    _add_levels(surface)
-    _add_solid(surface)
-    surface.add_argument("--keep-outside", action="store_true", help="with --below: leave the air round the patient in")
+    add_levels(surface)
+    add_solid(surface)
     surface.add_argument(
         "--space", type=str.lower, default="lps", metavar="lps|ras", help="patient frame of the mesh (default: lps)"
     )
@@ -101,6 +103,55 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_methods(parser)
     components = parser.add_argument_group("components")
+    add_selection(components)
+    components.add_argument("--split", action="store_true", help="write one file a component, the largest first")
+    add_label_arguments(parser)
+    add_refinement(parser)
+    device = parser.add_argument_group("device")
+    add_device(device)
+    add_memory(device)
+    _add_checks(parser)
+
+
+def add_levels(surface: argparse._ArgumentGroup) -> None:
+    """Declare --hu, --below, --preset and --keep-outside: which values a surface encloses."""
+    level = surface.add_mutually_exclusive_group()
+    level.add_argument("--hu", type=parse_hu, default={}, metavar="N[,N...]|A:B|auto|half:B,T", help=LEVELS_HELP)
+    level.add_argument(
+        "--below",
+        type=parse_levels,
+        metavar="N[,N...]",
+        help="in place of an iso value: inside is what lies below N HU, such as lungs, airways and sinuses (-400); the"
+        " air round the patient is left out",
+    )
+    level.add_argument(
+        "--preset",
+        type=str.lower,
+        metavar="NAME",
+        help=f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})",
+    )
+    surface.add_argument("--keep-outside", action="store_true", help="with --below: leave the air round the patient in")
+
+
+def add_solid(surface: argparse._ArgumentGroup) -> None:
+    """Declare --solid and --seal: whether what is enclosed is filled."""
+    surface.add_argument(
+        "--solid",
+        action=argparse.BooleanOptionalAction,
+        help="fill what the bone encloses: marrow, and canals that the ends of the scan cut; the brain, the chest and"
+        " air stay out; with --labels: what is less dense within a label",
+    )
+    surface.add_argument(
+        "--seal",
+        dest="seal_mm",
+        type=float,
+        metavar="MM",
+        help="with --solid: pores up to twice as wide are no way in (default: 2.5 to 3, by the voxels)",
+    )
+
+
+def add_selection(components: argparse._ArgumentGroup) -> None:
+    """Declare --keep, --keep-largest, --min-volume and --seed: which components stay."""
     components.add_argument(
         "--keep",
         type=str.lower,
@@ -125,47 +176,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="keep the component whose surface lies nearest to this point, in mm of the frame of --space;"
         " repeat it for several",
-    )
-    components.add_argument("--split", action="store_true", help="write one file a component, the largest first")
-    add_label_arguments(parser)
-    add_refinement(parser)
-    device = parser.add_argument_group("device")
-    add_device(device)
-    add_memory(device)
-    _add_checks(parser)
-
-
-def _add_levels(surface: argparse._ArgumentGroup) -> None:
-    level = surface.add_mutually_exclusive_group()
-    level.add_argument("--hu", type=parse_hu, default={}, metavar="N[,N...]|A:B|auto|half:B,T", help=LEVELS_HELP)
-    level.add_argument(
-        "--below",
-        type=parse_levels,
-        metavar="N[,N...]",
-        help="in place of an iso value: inside is what lies below N HU, such as lungs, airways and sinuses (-400); the"
-        " air round the patient is left out",
-    )
-    level.add_argument(
-        "--preset",
-        type=str.lower,
-        metavar="NAME",
-        help=f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})",
-    )
-
-
-def _add_solid(surface: argparse._ArgumentGroup) -> None:
-    surface.add_argument(
-        "--solid",
-        action=argparse.BooleanOptionalAction,
-        help="fill what the bone encloses: marrow, and canals that the ends of the scan cut; the brain, the chest and"
-        " air stay out; with --labels: what is less dense within a label",
-    )
-    surface.add_argument(
-        "--seal",
-        dest="seal_mm",
-        type=float,
-        metavar="MM",
-        help="with --solid: pores up to twice as wide are no way in (default: 2.5 to 3, by the voxels)",
     )
 
 

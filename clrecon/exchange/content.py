@@ -13,7 +13,13 @@ from clrecon.errors import OutputError
 from clrecon.exchange.certificate import certificate_lines, plain_lines
 from clrecon.geometry import frame_from_lps
 
-__all__ = ["Assembly", "Content", "PointContent", "Writable", "describe_facts", "parts_of", "refuse_file"]
+__all__ = [
+    "BONE_COLOR", "Assembly", "Content", "Pieces", "PointContent", "Writable", "describe_facts", "parts_of",
+    "refuse_file",
+]  # fmt: skip
+
+BONE_COLOR = (0.89, 0.86, 0.78)
+"""Colour of a surface without one of its own, in formats that must have one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +80,25 @@ class PointContent:
         return remarks + [f"CERTIFICATE {line}" for line in self.certificate]
 
 
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """Parts of a mesh, for a format that shows them one by one.
+
+    Attributes
+    ----------
+    of_triangle : ndarray, shape (m,), integer
+        The part of each triangle, from 0.
+    names : tuple of str
+        One for each part.
+    volumes_ml : tuple of float or None
+        What each part encloses.
+    """
+
+    of_triangle: NDArray[np.integer]
+    names: tuple[str, ...]
+    volumes_ml: tuple[float | None, ...]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Content(PointContent):
     """A mesh as it goes into a file.
@@ -89,6 +114,8 @@ class Content(PointContent):
         A colour for each vertex, in PLY, in place of `color`.
     distances : ndarray, shape (n,), float32, or None
         mm from another surface at each vertex, in PLY.
+    pieces : Pieces or None
+        For pages.
     """
 
     triangles: NDArray[np.uint32]
@@ -96,6 +123,7 @@ class Content(PointContent):
     color: tuple[float, float, float] | None = None
     vertex_colors: NDArray[np.uint8] | None = None
     distances: NDArray[np.float32] | None = None
+    pieces: Pieces | None = None
 
 
 @dataclass(frozen=True)
@@ -167,6 +195,7 @@ class Writable(Protocol):
     def vertices(self) -> NDArray[np.floating]: ...
     def check(self) -> None: ...
     def describe(self, space: str, *, keep_ids: bool = False) -> Content: ...
+    def describe_parts(self, space: str, most: int, *, keep_ids: bool = False) -> Content: ...
 
 
 def refuse_file(words: str, found: object, expected: object) -> OutputError:

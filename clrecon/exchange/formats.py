@@ -17,14 +17,14 @@ from contextlib import AbstractContextManager
 import numpy as np
 
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.exchange import glb, obj, ply, stl, threemf, vtp
+from clrecon.exchange import glb, obj, page, ply, stl, threemf, vtp
 from clrecon.exchange.content import Assembly, Content, Writable
 from clrecon.exchange.file_format import FOUR_GIB, NO_LIMIT, FileFormat, find_extension, stage_content
 from clrecon.geometry.precision import float32_step
 from clrecon.system.files import StagedFile
 
 __all__ = [
-    "ASSEMBLIES", "FORMATS", "check_assembly", "check_format", "describe_rounding", "stage_assembly",
+    "ASSEMBLIES", "FORMATS", "MOST_PARTS", "check_assembly", "check_format", "describe_rounding", "stage_assembly",
     "stage_mesh", "write_mesh",
 ]  # fmt: skip
 
@@ -36,14 +36,20 @@ FORMATS: dict[str, FileFormat[Content]] = {
     ".glb": FileFormat(glb.estimate, glb.write, glb.verify, FOUR_GIB),
     ".vtp": FileFormat(vtp.estimate, vtp.write, vtp.verify, NO_LIMIT),
     ".3mf": FileFormat(threemf.estimate, threemf.write, threemf.verify, NO_LIMIT),
+    ".html": FileFormat(page.estimate, page.write, page.verify, NO_LIMIT),
 }
 
 
 ASSEMBLIES: dict[str, FileFormat[Assembly]] = {
     ".glb": FileFormat(glb.estimate, glb.write, glb.verify, FOUR_GIB),
     ".3mf": FileFormat(threemf.estimate, threemf.write, threemf.verify, NO_LIMIT),
+    ".html": FileFormat(page.estimate, page.write, page.verify, NO_LIMIT),
 }
 """Formats that hold several named objects in a file."""
+
+
+MOST_PARTS = 20
+"""Most components of a mesh that a page lists one by one; the smaller ones are one part together."""
 
 
 def check_assembly(path: str | os.PathLike[str]) -> None:
@@ -55,7 +61,7 @@ def check_assembly(path: str | os.PathLike[str]) -> None:
     """
     extension = check_format(path)
     if extension not in ASSEMBLIES:
-        raise UsageError(f"{extension} holds one mesh: several with their names in one file are .3mf or .glb")
+        raise UsageError(f"{extension} holds one mesh: several with their names in one file are .3mf, .glb or .html")
 
 
 def stage_assembly(
@@ -65,11 +71,14 @@ def stage_assembly(
     check_assembly(path)
     for mesh in meshes:
         mesh.check()
-    content = Assembly(tuple(mesh.describe(space, keep_ids=keep_ids) for mesh in meshes if mesh.triangle_count))
+    extension = check_format(path)
+    content = Assembly(
+        tuple(_describe(mesh, extension, space, 1, keep_ids=keep_ids) for mesh in meshes if mesh.triangle_count)
+    )
     if not content.parts:
         raise NoSurfaceError("the surfaces are empty: no file is written")
     count = sum(mesh.triangle_count for mesh in meshes)
-    return stage_content(content, path, ASSEMBLIES[check_format(path)], f"{count} triangles", "fewer labels")
+    return stage_content(content, path, ASSEMBLIES[extension], f"{count} triangles", "fewer labels")
 
 
 def check_format(path: str | os.PathLike[str]) -> str:
@@ -114,7 +123,14 @@ def stage_mesh(
     extension = check_format(path)
     chosen = FORMATS[extension]
     mesh.check()
-    content = mesh.describe(space, keep_ids=keep_ids)
+    content = _describe(mesh, extension, space, MOST_PARTS, keep_ids=keep_ids)
     if mesh.triangle_count == 0:
         raise NoSurfaceError(f"the surface is empty: no {extension[1:].upper()} file is written")
     return stage_content(content, path, chosen, f"{mesh.triangle_count} triangles", "PLY or VTP")
+
+
+def _describe(mesh: Writable, extension: str, space: str, parts: int, *, keep_ids: bool) -> Content:
+    """Return the contents of a file, with normals and parts where its format shows them."""
+    if extension == ".html":
+        return mesh.describe_parts(space, parts, keep_ids=keep_ids)
+    return mesh.describe(space, keep_ids=keep_ids)

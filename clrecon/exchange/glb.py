@@ -20,7 +20,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from clrecon.exchange.content import Assembly, Content, parts_of, refuse_file
+from clrecon.exchange.content import BONE_COLOR, Assembly, Content, parts_of, refuse_file
 from clrecon.system.pieces import local_origin
 
 __all__ = ["estimate", "verify", "write"]
@@ -29,7 +29,6 @@ _METRES_PER_MM = 0.001
 _FLOAT, _UINT32 = 5126, 5125
 _VERTEX_DATA, _INDEX_DATA = 34962, 34963
 _JSON_CHUNK, _BINARY_CHUNK = b"JSON", b"BIN\0"
-_BONE_COLOUR = [0.89, 0.86, 0.78, 1.0]
 
 _SCENE_FROM_LPS = np.array(((1, 0, 0), (0, 0, 1), (0, -1, 0)), dtype=np.float64)
 """Rows X, Y, Z of the scene in terms of L, P, S."""
@@ -67,7 +66,7 @@ def _document(content: Content | Assembly) -> dict[str, Any]:
         name = part.name or "surface"
         nodes.append({"name": name, "mesh": number, "matrix": _column_major(rotation, _METRES_PER_MM, _origin(part))})
         meshes.append({"name": name, "primitives": [primitive]})
-        color = _BONE_COLOUR if part.color is None else [_linear(value) for value in part.color] + [1.0]
+        color = [*BONE_COLOR, 1.0] if part.color is None else [_linear(value) for value in part.color] + [1.0]
         look = {"baseColorFactor": color, "metallicFactor": 0.0, "roughnessFactor": 0.6}
         # Visible from both sides: a surface that is open at the border of the scan shows its inside.
         materials.append({"name": part.name or "bone", "doubleSided": True, "pbrMetallicRoughness": look})

@@ -6,6 +6,7 @@ What makes other meshes of one, or goes to other libraries, is in `clrecon.mesh.
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -17,6 +18,8 @@ from clrecon.exchange.coordinates import as_stored
 from clrecon.exchange.formats import write_mesh
 from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import apply_affine, checked_affine, normal_matrix
+from clrecon.mesh.normals import vertex_normals
+from clrecon.mesh.pieces import find_pieces
 from clrecon.system.messages import Message
 from clrecon.system.targets import keep_existing
 
@@ -198,21 +201,31 @@ class BaseMesh(Message):
             **facts,
         )
 
+    def describe_parts(self, space: str, most: int, *, keep_ids: bool = False) -> Content:
+        """Return what `describe` does, with normals, and with up to `most` components and the rest as parts."""
+        content = self.describe(space, keep_ids=keep_ids)
+        if not self.triangle_count:
+            return content
+        normals = vertex_normals(content.vertices, self.triangles) if content.normals is None else content.normals
+        return replace(content, normals=normals, pieces=find_pieces(self.vertices, self.triangles, most))
+
     def save(
         self, path: str | os.PathLike[str], space: str = "lps", *, no_clobber: bool = False, keep_ids: bool = False
     ) -> int:
         """Write the mesh to a file; its extension gives the format.
 
-        STL (binary), PLY (binary), OBJ, GLB, VTP and 3MF.  The file is either complete or absent, and an older file of
-        that name is replaced in one step.  It holds no patient data, date or path.
+        STL (binary), PLY (binary), OBJ, GLB, VTP, 3MF, or a page of HTML that shows it (`docs/view.md`).  The file is
+        either complete or absent, and an older file of that name is replaced in one step.  It holds no patient data,
+        date or path.
 
         Parameters
         ----------
         path : str or path
-            ``.stl``, ``.ply``, ``.obj``, ``.glb``, ``.vtp`` or ``.3mf``, upper or lower case.
+            ``.stl``, ``.ply``, ``.obj``, ``.glb``, ``.vtp``, ``.3mf`` or ``.html``, upper or lower case.
         space : {"lps", "ras"}
             Patient frame of the coordinates; the file names it.  Units are mm; a node matrix in GLB maps them to the
-            metres, Y up, of glTF.  STL holds only float32, the other formats keep float64 vertices.
+            metres, Y up, of glTF.  STL holds only float32, a page 65,536 steps a side, which it names; the other
+            formats keep float64 vertices.
         no_clobber : bool
             True: a file of that name stays and is an `OutputError`.
         keep_ids : bool

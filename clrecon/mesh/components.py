@@ -15,8 +15,7 @@ from clrecon.exchange.coordinates import rounding_step
 from clrecon.mesh.base import BaseMesh
 from clrecon.mesh.connectivity import label_components
 from clrecon.mesh.nearest import find_nearest_triangle
-from clrecon.mesh.triangles import cross_products
-from clrecon.system.pieces import CHUNK, local_origin
+from clrecon.mesh.pieces import measure_components
 from clrecon.system.text import say_digits
 from clrecon.system.wording import name_parameter
 
@@ -201,8 +200,9 @@ def _choose(
 
     count, labels = label_components(mesh.triangles, mesh.vertex_count) if labelled is None else labelled
     label_of_triangle = labels[mesh.triangles[:, 0]]
-    areas, volumes = _measure_components(
-        mesh,
+    areas, volumes = measure_components(
+        mesh.vertices,
+        mesh.triangles,
         label_of_triangle,
         count,
         areas=rank or keep_largest is not None or min_volume_ml is not None,
@@ -277,34 +277,6 @@ def _find_at_seeds(
         found[label_of_triangle[rows[row]]] = True
         distances.append(distance)
     return found, distances
-
-
-def _measure_components(
-    mesh: BaseMesh, label_of_triangle: NDArray[np.int64], count: int, *, areas: bool, volumes: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Measure area in mm2 and enclosed volume in ml, without sign, of each component; zeros where not wanted."""
-    twice_area = np.zeros(count)
-    six_volumes = np.zeros(count)
-    cross_sum = np.zeros((3, count))
-    corner_sum = np.zeros((3, count))
-    if not areas and not volumes:
-        return twice_area, six_volumes
-    # Every piece adds to all components: with many components, larger pieces save time.
-    size = max(CHUNK, count)
-    for where, corner, cross in cross_products(mesh.vertices, mesh.triangles, local_origin(mesh.vertices), size):
-        label = label_of_triangle[where]
-        if areas:
-            twice_area += np.bincount(label, np.sqrt(np.einsum("ij,ij->j", cross, cross)), count)
-        if volumes:
-            six_volumes += np.bincount(label, np.einsum("ij,ij->j", corner, cross), count)
-            for axis in range(3):
-                cross_sum[axis] += np.bincount(label, cross[axis], count)
-                corner_sum[axis] += np.bincount(label, corner[axis], count)
-    # From the common origin to one within each component.  This changes nothing for closed components, whose cross
-    # products sum to zero.
-    centre = corner_sum / np.bincount(label_of_triangle, minlength=count)
-    six_volumes -= np.einsum("ij,ij->j", centre, cross_sum)
-    return twice_area / 2.0, np.abs(six_volumes) / 6000.0
 
 
 def _take(mesh: Own, keep_triangle: NDArray[np.bool_], report: dict[str, object]) -> Own:

@@ -16,6 +16,7 @@ DOCUMENTS = [
     "docs/slices.md", "docs/rendering.md", "docs/clouds.md", "docs/filters.md", "docs/masks.md",
     "docs/papers.md", "docs/vertebrae.md", "docs/inside.md", "docs/measures.md", "docs/compare.md", "docs/corridor.md",
     "docs/statistics.md", "docs/distance.md", "docs/export.md", "docs/python.md",
+    "docs/view.md",
 ]  # fmt: skip
 LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)")
 QUOTED = re.compile(r"`((?:\.ci|cl|clrecon|docs|scripts|tests)/[\w./-]*|(?:setup\.cfg|\w+\.(?:md|toml)))`")
@@ -62,6 +63,7 @@ def test_the_commands_of_documents_are_understood() -> None:
         "labels",
         "rendering",
         "statistics",
+        "view",
     ):
         found = find_commands((ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8"))
         assert found

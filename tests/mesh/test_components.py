@@ -8,8 +8,8 @@ import sample_meshes as samples
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh import Mesh, select_components, split_components
-from clrecon.mesh.components import _measure_components
 from clrecon.mesh.connectivity import label_components
+from clrecon.mesh.pieces import measure_components
 from clrecon.mesh.triangles import enclosed_ml
 
 pytestmark = pytest.mark.unit
@@ -39,7 +39,9 @@ def test_a_cube_of_10_mm_holds_a_millilitre(edge):
     assert enclosed_ml(mesh.vertices, mesh.triangles) == volume_ml
     assert mesh.quality()["volume_ml"] == volume_ml
     for areas, volumes in ((True, True), (True, False), (False, True), (False, False)):
-        figures = _measure_components(mesh, np.zeros(12, np.int64), 1, areas=areas, volumes=volumes)
+        figures = measure_components(
+            mesh.vertices, mesh.triangles, np.zeros(12, np.int64), 1, areas=areas, volumes=volumes
+        )
         assert [part.tolist() for part in figures] == [[6.0 * edge**2 * areas], [volume_ml * volumes]]
 
 

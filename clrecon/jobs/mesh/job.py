@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
-from clrecon.jobs.mesh.labels import extract_label_surfaces, judge_label_volumes, name_label_files, open_labels
-from clrecon.jobs.mesh.levels import choose_level
-from clrecon.jobs.mesh.parts import SELECT_STEPS, check_levels, extract_surfaces, first_names, select_parts
-from clrecon.jobs.mesh.prepare import fill_solid, mask_parts, narrow_volume, prepare_surfaces
+from clrecon.jobs.mesh.labels import judge_label_volumes, name_label_files
+from clrecon.jobs.mesh.make import make_parts
+from clrecon.jobs.mesh.parts import first_names
 from clrecon.jobs.mesh.refinement import describe_purposes, judge_parts, measure_parts, refine_surface, warn_of_gates
 from clrecon.jobs.mesh.report import MeshReport, describe_job, describe_part
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface, plan_surfaces
-from clrecon.jobs.shared.labelled import read_with_labels
 from clrecon.jobs.shared.laps import Laps
-from clrecon.jobs.shared.opening import DeviceOpening
 from clrecon.jobs.shared.outputs import (
     check_kept,
     check_outputs,
@@ -32,17 +28,14 @@ from clrecon.jobs.shared.outputs import (
     stage_together,
 )
 from clrecon.jobs.shared.report import stage_report
-from clrecon.reading import read_selected
 from clrecon.system.log import get_logger, log_warnings
-from clrecon.system.progress import Progress, Steps, ignore_progress
+from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.targets import keep_existing
 from clrecon.system.text import count_of
 
 if TYPE_CHECKING:
-    from clrecon.anatomy.iso_choice import IsoChoice
     from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
-    from clrecon.mesh import Mesh
     from clrecon.opencl import Device
 
 __all__ = ["make_mesh"]
@@ -103,16 +96,12 @@ def make_mesh(
     with keep_existing(no_clobber):
         _check_files(source, output, report_path, surfaces, settings)
 
-    volume, labels, device = _open(source, output, surfaces, settings, no_clobber, progress, watch)
-    volume = mask_parts(volume, surfaces, settings, device, progress)
-    watch.lap("mask")
-    volume, surfaces, choice = _choose(volume, surfaces, settings, device, progress, watch)
-    solid = fill_solid(volume, surfaces, settings, device.current, progress, watch)
-    surfaces, extracted = _extract(solid, surfaces, labels, device, settings, progress)
-    origins = [mesh.report for mesh in extracted]
-    watch.lap("surface")
-    parts = _select(volume, surfaces, extracted, device.current, settings, progress)
-    del extracted
+    def check_map(labels: LabelMap) -> None:
+        if settings.labels is not None and no_clobber and not settings.one_file:
+            refuse_files(name_outputs(output, name_label_files(labels, settings.labels, surfaces)))
+
+    made = make_parts(source, settings, progress, watch, check_map)
+    volume, solid, parts, device, choice = made.volume, made.solid, made.parts, made.device, made.choice
     paths = _name_files(output, parts, report_path, settings)
     judge_surfaces(parts, volume, settings)
     watch.lap("select")
@@ -123,7 +112,7 @@ def make_mesh(
     def compose(meshes: Sequence[dict[str, Any]]) -> MeshReport:
         warnings = _warn_of_leftovers(output, paths) if settings.split else []
         warnings += warn_of_walls(parts, settings, choice) + purpose_warnings + warn_of_gates(gates)
-        seconds = _seconds(watch, origins)
+        seconds = _seconds(watch, made.origins)
         return describe_job(
             solid, parts, meshes, settings, device.current, choice, gates=gates, warnings=warnings, seconds=seconds
         )
@@ -194,88 +183,6 @@ def _write(
             files.append(staged.enter_context(stage_report(report_path, report)))
         commit_all(files)
     return report
-
-
-def _open(
-    source: str | Path,
-    output: str | Path,
-    surfaces: Sequence[Surface],
-    settings: MeshSettings,
-    no_clobber: bool,
-    progress: Progress,
-    watch: Laps,
-) -> tuple[Volume, LabelMap | None, Device]:
-    """Read the input while the device opens and builds its kernels."""
-    progress("device", 0, 0)
-
-    def read_map(volume: Volume | None) -> LabelMap | None:
-        labels = open_labels(settings.labels, volume)
-        several = settings.labels_pick and not settings.one_file
-        if labels is not None and settings.labels is not None and several and no_clobber:
-            refuse_files(name_outputs(output, name_label_files(labels, settings.labels, surfaces)))
-        return labels
-
-    prepare = partial(
-        prepare_surfaces, components=settings.selects, topology=settings.topology, inside=settings.inside,
-        vertex_rule=settings.vertex_rule, grows=settings.method_used == "i-mc",
-        decimates=settings.decimate_used is not None and settings.method != "g-mc" and settings.memory is None,
-        solid=settings.solid,
-    )  # fmt: skip
-    with DeviceOpening(settings.device, prepare) as opening:
-        volume, labels = read_with_labels(
-            partial(read_selected, source, settings, progress=progress),
-            None if settings.labels is None else settings.labels.path,
-            read_map,
-        )
-        watch.lap("read")
-        device = opening.wait()
-        watch.lap("device")
-    return volume, labels, device
-
-
-def _choose(
-    volume: Volume, surfaces: list[Surface], settings: MeshSettings, device: Device, progress: Progress, watch: Laps
-) -> tuple[Volume, list[Surface], IsoChoice | None]:
-    """Return the volume for extraction, its surfaces, and the choice of the iso value if it was not given."""
-    choice = choose_level(volume, settings, progress)
-    if choice is not None:
-        surfaces = plan_surfaces([choice.iso_value])
-    watch.lap("choose")
-    check_levels(volume, surfaces)
-    volume = narrow_volume(volume, surfaces, settings, device, progress)
-    watch.lap("mask")
-    return volume, surfaces, choice
-
-
-def _extract(
-    volume: Volume,
-    surfaces: list[Surface],
-    labels: LabelMap | None,
-    device: Device,
-    settings: MeshSettings,
-    progress: Progress,
-) -> tuple[list[Surface], list[Mesh]]:
-    """Extract the surfaces, those of labels included, with one mesh each."""
-    if labels is not None and settings.labels is not None and settings.labels_pick:
-        return extract_label_surfaces(volume, surfaces, labels, settings.labels, device, settings, progress)
-    return surfaces, extract_surfaces(volume, surfaces, device, settings, progress, labels)
-
-
-def _select(
-    volume: Volume,
-    surfaces: Sequence[Surface],
-    extracted: Sequence[Mesh],
-    device: Device,
-    settings: MeshSettings,
-    progress: Progress,
-) -> list[Part]:
-    """Select the components of each surface that are written."""
-    steps = Steps(progress if settings.selects else None, "select", SELECT_STEPS * len(surfaces))
-    parts: list[Part] = []
-    for place, (surface, mesh) in enumerate(zip(surfaces, extracted, strict=True), start=1):
-        parts += select_parts(surface, mesh, settings, device, volume, steps)
-        steps.take(SELECT_STEPS * place - steps.done)
-    return parts
 
 
 def _refine_and_measure(

@@ -1,0 +1,1 @@
+"""The job that shows scans and meshes together: as a page."""

@@ -1,0 +1,253 @@
+"""Scans and meshes in, a page that shows them together out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.exchange.formats import stage_assembly, stage_mesh
+from clrecon.exchange.page import read_facts
+from clrecon.geometry.certificate import without_ids
+from clrecon.jobs.distance.inputs import doubt_frames, read_side
+from clrecon.jobs.mesh.bone import judge_surfaces
+from clrecon.jobs.mesh.make import make_parts
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.shared.laps import Laps
+from clrecon.jobs.shared.outputs import check_kept, commit_all
+from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
+from clrecon.jobs.view.report import ViewReport
+from clrecon.jobs.view.settings import ViewSettings
+from clrecon.mesh import Mesh
+from clrecon.mesh.reader import MESH_INPUTS
+from clrecon.rendering.looks.label_style import distinct_colors
+from clrecon.system.files import check_writable
+from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.targets import keep_existing
+from clrecon.system.text import escape_text
+from clrecon.system.wording import name_parameter
+from clrecon.version import package_version
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+
+__all__ = ["is_mesh_file", "write_view"]
+
+log = get_logger(__name__)
+
+_OF_THE_MACHINE = ("device", "memory", "space", "keep_ids")
+"""Settings of scans that may be given without one."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """What became of an input: its meshes, its entry in the report, and the device that worked on it."""
+
+    meshes: list[Mesh]
+    entry: dict[str, Any]
+    warnings: list[str]
+    device: str | None = None
+
+
+def is_mesh_file(path: str | Path) -> bool:
+    """True for a file that is read as a mesh, by its extension; everything else is taken for a scan."""
+    return Path(path).suffix.lower() in MESH_INPUTS
+
+
+def write_view(
+    inputs: Sequence[str | Path],
+    output: str | Path,
+    settings: ViewSettings | None = None,
+    *,
+    no_clobber: bool = False,
+    progress: Progress | None = None,
+) -> ViewReport:
+    """Write a page that shows scans and meshes together, each in its place.
+
+    The surface of one mesh without labels is divided into its components, which can be switched; of several meshes each
+    is a part.
+
+    Parameters
+    ----------
+    inputs : sequence of path
+        Scans, as `clrecon.read_volume` takes them, and mesh files, as `clrecon.read_mesh` takes them.
+    output : path
+        ``.html``.
+    settings : ViewSettings, optional
+    no_clobber : bool
+        True: a file of that name stays and is an `OutputError`, before any work.
+    progress : callable, optional
+        ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    ViewReport
+
+    Raises
+    ------
+    UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError, NoSurfaceError
+        After an error nothing is written, and an older file is intact.
+    """
+    settings, progress = settings or ViewSettings(), progress or ignore_progress
+    watch = Laps()
+    _check_inputs(inputs, output, settings)
+    with keep_existing(no_clobber):
+        check_writable(output)
+    check_kept([("the page", output)], *inputs, None if settings.scan.labels is None else settings.scan.labels.path)
+    # Mesh files first: they are read in a moment, and a wrong one is said before the device works on a scan.
+    order = sorted(range(len(inputs)), key=lambda place: not is_mesh_file(inputs[place]))
+    found = {place: _read(inputs[place], settings, progress, watch) for place in order}
+    shown = [found[place] for place in range(len(inputs))]
+    meshes = _name_and_color(shown, settings)
+    warnings = [text for one in shown for text in one.warnings] + _doubt(shown)
+    progress("write", 0, 0)
+    space, keep_ids = settings.scan.space, settings.scan.keep_ids
+    stage = stage_mesh(meshes[0], output, space, keep_ids=keep_ids) if len(meshes) == 1 else None
+    with keep_existing(no_clobber), ExitStack() as staged:
+        file = staged.enter_context(stage or stage_assembly(meshes, output, space, keep_ids=keep_ids))
+        commit_all([file])
+    watch.lap("write")
+    facts = read_facts(output)
+    report = ViewReport(
+        inputs=[one.entry for one in shown],
+        parts=[
+            {"name": part["name"], "triangles": part["count"], "ml": part["ml"], "color": part["color"]}
+            for part in facts["parts"]
+        ],
+        vertices=facts["vertices"],
+        triangles=facts["triangles"],
+        half_step_mm=facts["half_step_mm"],
+        space=space,
+        output={"format": "html", "bytes": file.size},
+        device=next((one.device for one in shown if one.device), None),
+        version=package_version(),
+        platform=platform_name(),
+        warnings=list(dict.fromkeys(warnings)),
+        seconds={part: round(value, 4) for part, value in {**watch.seconds, "total": watch.total()}.items()},
+        peak_memory_bytes=peak_memory_bytes(),
+    )
+    log_warnings(log, report.warnings)
+    return report
+
+
+def _check_inputs(inputs: Sequence[str | Path], output: str | Path, settings: ViewSettings) -> None:
+    """Refuse what can be refused before anything is read."""
+    if not inputs:
+        raise UsageError("there is nothing to show: name a scan or a mesh file")
+    if Path(output).suffix.lower() != ".html":
+        raise UsageError(f"a page is a file .html, not {escape_text(Path(output).name)[-40:]!r}")
+    if len(settings.names) > len(inputs):
+        raise UsageError(f"{len(settings.names)} names for {len(inputs)} input{'s' * (len(inputs) > 1)}: one for each")
+    scans = [path for path in inputs if not is_mesh_file(path)]
+    for path in inputs:
+        if is_mesh_file(path) and not Path(path).is_file():
+            raise UsageError(f"{escape_text(Path(path).name)}: there is no file of that name")
+    changed = [
+        own.name
+        for own in fields(MeshSettings)
+        if own.name not in _OF_THE_MACHINE and _is_set(getattr(settings.scan, own.name), own.default)
+    ]
+    if changed and not scans:
+        raise UsageError(
+            f"{name_parameter(changed[0])} says what is made of a scan, and all inputs are mesh files: leave it out, or"
+            " name a scan"
+        )
+    if settings.scan.labels is not None and len(scans) > 1:
+        raise UsageError(f"a label map belongs to one scan, {len(scans)} are given")
+
+
+def _is_set(value: object, default: object) -> bool:
+    """True for a value that is not the default; an empty list is as good as an empty tuple."""
+    return value != default and not (isinstance(value, Sequence) and not value)
+
+
+def _read(path: str | Path, settings: ViewSettings, progress: Progress, watch: Laps) -> _Shown:
+    if is_mesh_file(path):
+        progress("read", 0, 0)
+        shown = _read_mesh(path, settings)
+        watch.lap("read")
+        return shown
+    made = make_parts(path, settings.scan, progress, watch)
+    judge_surfaces(made.parts, made.volume, settings.scan)
+    watch.lap("select")
+    meshes = []
+    for part in made.parts:
+        if len(made.parts) > 1 and "part_name" not in part.mesh.report:
+            part.mesh.report["part_name"] = part.name.replace("_", " ")
+        meshes.append(part.mesh)
+    return _Shown(
+        meshes,
+        {
+            **_describe_scan(path, made.volume, meshes, settings),
+            "surface": ", ".join(dict.fromkeys(part.surface.describe() for part in made.parts)),
+        },
+        [
+            *made.volume.report.get("warnings", ()),
+            *(text for mesh in meshes for text in mesh.report.get("warnings", ())),
+        ],
+        made.device.current.label,
+    )
+
+
+def _read_mesh(path: str | Path, settings: ViewSettings) -> _Shown:
+    mesh = read_side(path, settings.mesh_space)
+    name = escape_text(Path(path).name)
+    if not mesh.triangle_count:
+        raise RefusedInputError(f"{name} has no triangle: there is nothing to show")
+    file = mesh.report["file"]
+    entry = {
+        "name": name,
+        "kind": file["kind"],
+        "space": file["space"],
+        "space_from": file["space_from"],
+        "triangles": mesh.triangle_count,
+        "volume": None,
+        "surface": None,
+    }
+    return _Shown([mesh], entry, list(file["warnings"]))
+
+
+def _describe_scan(path: str | Path, volume: Volume, meshes: Sequence[Mesh], settings: ViewSettings) -> dict[str, Any]:
+    certificate = dict(volume.report) if settings.scan.keep_ids else without_ids(volume.report)
+    certificate.pop("warnings", None)
+    return {
+        "name": escape_text(Path(path).name),
+        "kind": "scan",
+        "space": None,
+        "space_from": None,
+        "triangles": sum(mesh.triangle_count for mesh in meshes),
+        "volume": certificate,
+    }
+
+
+def _name_and_color(shown: Sequence[_Shown], settings: ViewSettings) -> list[Mesh]:
+    """Return all meshes with the names and colours under which they are shown."""
+    colors = distinct_colors(len(shown))
+    for number, one in enumerate(shown, start=1):
+        given = settings.names[number - 1] if number <= len(settings.names) else ""
+        name = given or (f"surface {number}" if len(shown) > 1 else "")
+        for mesh in one.meshes:
+            words = " ".join(filter(None, (name, mesh.report.get("part_name"))))
+            if words:
+                mesh.report["part_name"] = words
+            if len(shown) > 1 and "color" not in mesh.report:
+                mesh.report["color"] = [float(value) for value in colors[number - 1]]
+    return [mesh for one in shown for mesh in one.meshes]
+
+
+def _doubt(shown: Sequence[_Shown]) -> list[str]:
+    """Return what speaks against the inputs lying in one frame, each compared with the first."""
+    placed = [
+        (mesh, {"name": one.entry["name"], "space_from": one.entry["space_from"], "bounds_mm": mesh.bounds})
+        for one in shown
+        for mesh in one.meshes[:1]
+    ]
+    doubts = []
+    for mesh, entry in placed[1:]:
+        pair = [{**own, "bounds_mm": own["bounds_mm"].tolist()} for own in (placed[0][1], entry)]
+        doubts += doubt_frames([placed[0][0], mesh], pair)
+    return doubts

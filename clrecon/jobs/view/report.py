@@ -1,0 +1,52 @@
+"""`ViewReport`: what is shown, and in which file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from clrecon.system.records import Record
+
+__all__ = ["ViewReport"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ViewReport(Record):
+    """Report of `write_view`.
+
+    Attributes
+    ----------
+    inputs : list of mapping
+        Each input: ``name`` of the file or folder without those above it, ``kind`` ("scan", "STL", "PLY"), ``space``
+        and ``space_from`` of a mesh (None for a scan), ``triangles``; of a scan ``volume``, its certificate, and
+        ``surface``, the values that it encloses.
+    parts : list of mapping
+        ``name``, ``triangles``, ``ml`` and ``color`` of each part that can be switched.
+    vertices, triangles : int
+    half_step_mm : float
+        Largest distance along an axis that a vertex is moved by.
+    space : str
+    output : mapping
+        ``format`` and ``bytes``.
+    device : str or None
+        None where no input is a scan.
+    version, platform : str
+    warnings : list of str
+    seconds : mapping
+    peak_memory_bytes : int or None
+    """
+
+    inputs: list[dict[str, Any]]
+    parts: list[dict[str, Any]]
+    vertices: int
+    triangles: int
+    half_step_mm: float
+    space: str
+    output: Mapping[str, Any]
+    device: str | None
+    version: str
+    platform: str
+    warnings: list[str]
+    seconds: Mapping[str, float]
+    peak_memory_bytes: int | None
