@@ -332,8 +332,44 @@ def test_all_elements_are_kept_where_none_are_named():
 )
 def test_larger_stacks_that_cannot_be_used_are_told(kind, count, problems, said, monkeypatch):
     monkeypatch.setattr(choice, "_describe_other_planes", lambda left, chosen: [])
-    other: Any = SimpleNamespace(kind=kind, count=count, problems=problems, describe=lambda: "2: CT")
-    chosen: Any = SimpleNamespace(count=5, number=1)
+    identity = SimpleNamespace(modality="SR")
+    other: Any = SimpleNamespace(
+        kind=kind, count=count, problems=problems, describe=lambda: "2: CT", key="b", identity=identity
+    )
+    chosen: Any = SimpleNamespace(count=5, number=1, key="a")
     taken = choice.Choice(chosen, "by lot")
     assert choice.describe_left([chosen, other], taken) == said
     assert choice.describe_left([chosen], taken) == choice.describe_left([chosen, other], taken, "2") == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "modality", "key", "told"),
+    [
+        ("other", "unknown", "b", True),
+        ("other", "other", "b", True),
+        ("other", "SR", "b", False),
+        ("other", "SR", "a", True),
+        ("capture", "CT", "a", True),
+        ("capture", "CT", "b", False),
+        ("localizer", "CT", "a", True),
+        ("localizer", "CT", "b", False),
+    ],
+)
+@pytest.mark.parametrize("wanted", [None, "1"])
+def test_files_that_may_be_harmed_slices_are_told(kind, modality, key, told, wanted):
+    """A slice that lost its modality, its UID or its class leaves no hole at the end of a stack."""
+    identity = SimpleNamespace(modality=modality)
+    other: Any = SimpleNamespace(kind=kind, count=1, problems=[], describe=lambda: "2: x", key=key, identity=identity)
+    other.headers = [SimpleNamespace(row_cosines=(1.0, 0.0, 0.0), column_cosines=(0.0, 1.0, 0.0))]
+    chosen: Any = SimpleNamespace(kind="stack", count=5, number=1, key="a", headers=other.headers)
+    said = ["not used, though they may be harmed slices of series 1: [2: x]"]
+    assert choice.describe_left([chosen, other], choice.Choice(chosen, ""), wanted) == (said if told else [])
+
+
+def test_a_scout_of_the_same_series_that_runs_across_is_not_told():
+    def header(row, column):
+        return [SimpleNamespace(row_cosines=row, column_cosines=column)]
+
+    scout: Any = SimpleNamespace(kind="localizer", key="a", headers=header((1.0, 0.0, 0.0), (0.0, 0.0, -1.0)))
+    chosen: Any = SimpleNamespace(kind="stack", key="a", headers=header((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    assert choice.describe_left([chosen, scout], choice.Choice(chosen, "")) == []

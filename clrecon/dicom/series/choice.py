@@ -7,6 +7,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from clrecon.dicom.headers.slice_header import SliceHeader
+from clrecon.dicom.parse.terms import OTHER_TERM
 from clrecon.dicom.series.rank import Rank, rank_series
 from clrecon.dicom.series.series import Series
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
@@ -19,6 +21,8 @@ SHORTEST_START = 4
 """Fewest characters of a hash or UID that name a series by its start."""
 SIMILAR = 0.5
 """Series with at least this share of the slices of the largest one are compared by more than their number of slices."""
+SAME_PLANE = 0.1
+"""Directions of a localizer that lie no further apart from those of the slices, as unit vectors, are theirs."""
 
 
 class Choice(NamedTuple):
@@ -168,7 +172,7 @@ def _sift(near: Sequence[tuple[Series, Rank]]) -> tuple[list[Series], str]:
 
 
 def describe_left(found: Sequence[Series], choice: Choice, wanted: int | str | None = None) -> list[str]:
-    """Say which CT series are not used and why, where the choice was not the caller's; warn about parted slices."""
+    """Say which CT series are not used and why, where the choice was not the caller's; warn of what may be slices."""
     chosen = choice.series
     left = [series for series in found if series is not chosen]
     stacks = [series for series in left if series.kind == "stack"] if wanted is None else []
@@ -181,7 +185,32 @@ def describe_left(found: Sequence[Series], choice: Choice, wanted: int | str | N
         read = f"; series {chosen.number} is read, {choice.why}" if choice.why else ""
         noun = "other CT series"
         told = [f"{count_of(len(lines), noun, noun)} not used: {join_names(lines)}{read}"]
-    return [*told, *_describe_other_planes(left, chosen)]
+    return [*told, *_describe_doubtful(left, chosen), *_describe_other_planes(left, chosen)]
+
+
+def _describe_doubtful(left: Sequence[Series], chosen: Series) -> list[str]:
+    """Warn about files that may be harmed slices of the chosen series: missing at its end they leave no hole."""
+    doubtful = [series for series in left if _may_be_slices(series, chosen)]
+    if not doubtful:
+        return []
+    lines = join_names(f"[{series.describe()}]" for series in doubtful)
+    return [f"not used, though they may be harmed slices of series {chosen.number}: {lines}"]
+
+
+def _may_be_slices(series: Series, chosen: Series) -> bool:
+    """Return whether a series that is no stack may be slices that lost what they are; true scouts run across them."""
+    if series.kind == "other" and series.identity.modality in ("unknown", OTHER_TERM):
+        return True
+    if series.kind == "stack" or series.key != chosen.key:
+        return False
+    if series.kind != "localizer" or not series.headers or not chosen.headers:
+        return True
+    return _chord(series.headers[0], chosen.headers[0]) < SAME_PLANE
+
+
+def _chord(one: SliceHeader, other: SliceHeader) -> float:
+    """Return how far the directions of two slices lie apart, as unit vectors."""
+    return max(math.dist(one.row_cosines, other.row_cosines), math.dist(one.column_cosines, other.column_cosines))
 
 
 def _describe_other_planes(left: Sequence[Series], chosen: Series) -> list[str]:
@@ -189,11 +218,7 @@ def _describe_other_planes(left: Sequence[Series], chosen: Series) -> list[str]:
     parts = [one for one in left if one.kind == "stack" and one.headers and one.key == chosen.key]
     if not parts or not chosen.headers:
         return []
-    first = chosen.headers[0]
-    chords = [
-        max(math.dist(first.row_cosines, h.row_cosines), math.dist(first.column_cosines, h.column_cosines))
-        for h in (part.headers[0] for part in parts)
-    ]
+    chords = [_chord(part.headers[0], chosen.headers[0]) for part in parts]
     low, high = (math.degrees(2.0 * math.asin(min(chord / 2.0, 1.0))) for chord in (min(chords), max(chords)))
     count = sum(len(part.headers) for part in parts)
     angles = f"{low:.1f}" if len(parts) == 1 else f"{low:.1f} to {high:.1f}"
