@@ -69,7 +69,7 @@ def main() -> int:
     fast = "--fast" in arguments
     arguments = [argument for argument in arguments if argument != "--fast"]
     try:
-        folder = ensure_environment(".venv-test", extras="test,dev", program="pytest", compiled=False)
+        folder = ensure_environment(".venv-test", extras="test,dev,docs", program="pytest", compiled=False)
     except SetupError as error:
         print(error, file=sys.stderr)
         return 1

@@ -17,6 +17,7 @@ DOCUMENTS = [
     "docs/papers.md", "docs/vertebrae.md", "docs/inside.md", "docs/measures.md", "docs/compare.md", "docs/corridor.md",
     "docs/statistics.md", "docs/distance.md", "docs/export.md", "docs/python.md",
     "docs/view.md",
+    *(path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "docs" / "guide").rglob("*.md"))),
 ]  # fmt: skip
 LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)")
 QUOTED = re.compile(r"`((?:\.ci|cl|clrecon|docs|scripts|tests)/[\w./-]*|(?:setup\.cfg|\w+\.(?:md|toml)))`")
