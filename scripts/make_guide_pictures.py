@@ -4,6 +4,8 @@
     python scripts/make_guide_pictures.py [NAME...]
 
 NAME: only those; default: all.  The commands stand in `PICTURES`; the gallery's are what its scripts write.
+command-view.png is a screenshot, in a browser of 1000 x 640, of `clrecon view ct --html page.html --labels
+ct/levels.nrrd`.
 """
 
 from __future__ import annotations
