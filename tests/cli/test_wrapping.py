@@ -43,3 +43,17 @@ def test_help_fits_60_columns_and_its_examples_can_be_pasted(command, narrow, ca
     for line, following in zip(lines, lines[1:], strict=False):
         if line.endswith(" \\"):
             assert following.startswith("    ")
+
+
+def test_texts_of_help_are_broken_anew_as_a_whole(narrow, capsys):
+    """Lines that were full are one text: no short rest of a line before the next."""
+    assert main(["view", "--help"]) == 0
+    lines = capsys.readouterr().out.split("\n")
+    at = next(place for place, line in enumerate(lines) if line.startswith("The page is one file"))
+    text = lines[at : lines.index("", at)]
+    assert len(text) > 3 and all(line[0] != " " for line in text)
+    assert all(len(line) + 1 + len(after.split()[0]) > 60 for line, after in zip(text, text[1:], strict=False))
+    at = next(place for place, line in enumerate(lines) if line.startswith("exit codes: 0 done"))
+    codes = [line for line in lines[at:] if line]
+    assert all(line.startswith(" " * 12) for line in codes[1:])
+    assert all(len(line) + 1 + len(after.split()[0]) > 60 for line, after in zip(codes, codes[1:], strict=False))
