@@ -102,6 +102,7 @@ from clrecon.vertebrae.result import MiddlePlane as MiddlePlane
 from clrecon.vertebrae.result import Vertebra as Vertebra
 from clrecon.vertebrae.result import VertebraSplit as VertebraSplit
 from clrecon.vertebrae.split import split_vertebrae as split_vertebrae
+from clrecon.viewer.notebook import to_html as to_html
 
 __all__: list[str]
 __version__: str

@@ -22,7 +22,10 @@ SUBJECTS = {
     "vertebrae": ("Vertebrae", "clrecon.vertebrae clrecon.operators.vertebrae clrecon.corridors"),
     "filters": ("Filters and masks", "clrecon.operators.filters clrecon.operators.masks"),
     "clouds": ("Point clouds", "clrecon.points clrecon.operators.points"),
-    "pictures": ("Pictures", "clrecon.rendering clrecon.operators.rays clrecon.operators.reformat"),
+    "pictures": (
+        "Pictures and notebooks",
+        "clrecon.rendering clrecon.operators.rays clrecon.operators.reformat clrecon.viewer",
+    ),
     "devices": ("Devices and time", "clrecon.opencl clrecon.operators clrecon.system"),
     "errors": ("Errors", "clrecon.errors"),
 }

@@ -298,6 +298,11 @@ class Volume(BaseVolume):
         """
         return cls(*take_nibabel(image))
 
+    def _repr_html_(self) -> str | None:
+        """Return the HTML that a notebook shows: three slices and the certificate; None where it shows the text."""
+        html: str | None = public_function("to_html")(self)
+        return html
+
     def __repr__(self) -> str:
         ni, nj, nk = self.shape_ijk
         di, dj, dk = self.spacing

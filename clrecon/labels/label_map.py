@@ -13,6 +13,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Grid
 from clrecon.geometry.affine import checked_affine
 from clrecon.labels.names import check_name, find_number
+from clrecon.system.public import public_function
 
 __all__ = ["LARGEST_NUMBER", "LabelMap"]
 
@@ -97,6 +98,11 @@ class LabelMap(Grid):
             map.
         """
         return find_number(label, self.names, self.counts)
+
+    def _repr_html_(self) -> str | None:
+        """Return the HTML that a notebook shows: a table; None where it shows the text."""
+        html: str | None = public_function("to_html")(self)
+        return html
 
     def __repr__(self) -> str:
         ni, nj, nk = self.shape_ijk

@@ -214,7 +214,7 @@ class BaseMesh(Message):
     ) -> int:
         """Write the mesh to a file; its extension gives the format.
 
-        STL (binary), PLY (binary), OBJ, GLB, VTP, 3MF, or a page of HTML that shows it (`docs/view.md`).  The file is
+        STL (binary), PLY (binary), OBJ, GLB, VTP, 3MF, or a page of HTML that shows it (``docs/view.md``).  The file is
         either complete or absent, and an older file of that name is replaced in one step.  It holds no patient data,
         date or path.
 

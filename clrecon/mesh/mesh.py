@@ -15,6 +15,7 @@ from clrecon.mesh.base import BaseMesh
 from clrecon.mesh.components import select_components, split_components
 from clrecon.mesh.quality import MeshQuality, measure_quality, measure_triangles
 from clrecon.system.packages import import_package
+from clrecon.system.public import public_function
 
 __all__ = ["Mesh"]
 
@@ -212,6 +213,11 @@ class Mesh(BaseMesh):
             vertices = vertices * signs.astype(vertices.dtype)
             normals = None if normals is None else normals * signs.astype(normals.dtype)
         return cls(vertices, triangles, normals)
+
+    def _repr_html_(self) -> str | None:
+        """Return the HTML that a notebook shows: the page, or a picture; None where it shows the text."""
+        html: str | None = public_function("to_html")(self)
+        return html
 
     def __repr__(self) -> str:
         normals = "" if self.normals is None else ", with normals"

@@ -16,6 +16,7 @@ from clrecon.geometry import frame_from_lps
 from clrecon.points.voxel_numbers import VoxelNumbers
 from clrecon.system.installing import install_command
 from clrecon.system.messages import Message
+from clrecon.system.public import public_function
 from clrecon.system.targets import keep_existing
 
 __all__ = ["MOST_POINTS", "PointCloud"]
@@ -343,6 +344,11 @@ class PointCloud(Message):
             if values is not None:
                 cloud.point[name] = make_tensor(values)
         return cloud
+
+    def _repr_html_(self) -> str | None:
+        """Return the HTML that a notebook shows: a picture; None where it shows the text."""
+        html: str | None = public_function("to_html")(self)
+        return html
 
     def __repr__(self) -> str:
         known = [name for name in ("normals", "hu", "labels", "ijk") if getattr(self, name) is not None]

@@ -7,6 +7,7 @@ from typing import Any
 
 from clrecon.errors import ClreconError
 from clrecon.geometry.certificate import Certificate
+from clrecon.system.public import public_function
 
 __all__ = ["SeriesEntry", "SeriesListing"]
 
@@ -96,3 +97,8 @@ class SeriesListing:
     warnings: list[str]
     certificate: Certificate | None = None
     refusal: ClreconError | None = None
+
+    def _repr_html_(self) -> str | None:
+        """Return the HTML that a notebook shows: a table; None where it shows the text."""
+        html: str | None = public_function("to_html")(self)
+        return html

@@ -60,7 +60,19 @@ _layer(
     "vertebrae",
     "corridors",
 )
-_layer("viewer", "errors", "rendering")
+_layer(
+    "viewer",
+    "errors",
+    "system",
+    "geometry",
+    "exchange",
+    "sources",
+    "labels",
+    "mesh",
+    "points",
+    "rendering",
+    "operators",
+)
 _layer("cli", "errors", "version", "system", "jobs")
 _layer("__main__", "cli")
 _layer(
@@ -81,6 +93,7 @@ _layer(
     "rendering",
     "operators",
     "vertebrae",
+    "viewer",
 )
 
 # Third-party packages: at module level (paid by whoever imports the layer), or only inside functions.

@@ -1,0 +1,97 @@
+"""What notebooks show: pages, pictures and tables that need nothing from outside, and text where nothing works."""
+
+from __future__ import annotations
+
+import html
+import re
+
+import numpy as np
+import pytest
+import sample_meshes as samples
+from html_check import PageCheck
+
+import clrecon
+from clrecon.errors import DeviceError
+from clrecon.exchange.page import parse_page
+from clrecon.geometry import Volume
+from clrecon.labels import LabelMap
+from clrecon.mesh import Mesh
+from clrecon.points import PointCloud
+from clrecon.sources.listing import SeriesEntry, SeriesListing
+from clrecon.viewer import notebook
+
+VOLUME = Volume(np.arange(6 * 8 * 10, dtype=np.int16).reshape(6, 8, 10) * 4 - 900, np.diag([1.0, 1.0, 2.0, 1.0]))
+ENTRY = SeriesEntry(
+    2, "ab", "<b>thin</b>", "CT", 4, [6, 5, 4], [1.0, 1.0, 2.5], None, 0.0, 0.0, {"min": 1.0}, False, [], ["doubt"]
+)
+
+
+def addresses(text: str) -> list[str]:
+    """Addresses of other places in HTML."""
+    return re.findall(r"(?:https?:)?//[\w.-]+\.\w+", re.sub(r"data:[^\"&]*|base64[^<]*", "", text))
+
+
+@pytest.mark.unit
+def test_a_mesh_is_its_page_in_a_frame_that_may_do_nothing_but_its_script():
+    mesh = Mesh(*samples.torus(), report={"iso_value_hu": 250.0})
+    shown = mesh._repr_html_()
+    assert shown.startswith('<iframe sandbox="allow-scripts" ') and shown.count("<") == 2
+    page = html.unescape(re.search('srcdoc="([^"]*)"', shown)[1])
+    assert parse_page(page.encode())[0]["triangles"] == mesh.triangle_count
+    assert addresses(shown) == []
+
+
+@pytest.mark.opencl
+def test_a_mesh_whose_page_is_too_large_is_a_picture(device, monkeypatch):
+    monkeypatch.setattr(notebook, "MOST_PAGE_BYTES", 20_000)
+    shown = Mesh(*samples.torus())._repr_html_()
+    check = PageCheck(shown)
+    assert check.faults == [] and len(check.pictures) == 1
+    assert "mesh.save(" in shown
+    assert addresses(shown) == []
+
+
+@pytest.mark.opencl
+def test_a_volume_is_three_slices_and_its_certificate(device):
+    check = PageCheck(VOLUME._repr_html_())
+    assert check.faults == [] and len(check.pictures) == 3
+    VOLUME_WITH = Volume(VOLUME.voxels, VOLUME.affine, {"tilt_deg": 12.5})
+    ((heads, *rows),) = PageCheck(VOLUME_WITH._repr_html_()).tables
+    assert heads[0] == "certificate" and ["tilt_deg", "12.5"] in rows
+
+
+@pytest.mark.opencl
+def test_a_cloud_is_a_picture(device):
+    cloud = PointCloud(np.random.default_rng(1).normal(size=(50, 3)), hu=np.arange(50.0))
+    assert len(PageCheck(cloud._repr_html_()).pictures) == 1
+
+
+@pytest.mark.unit
+def test_a_label_map_and_a_listing_are_tables():
+    labels = LabelMap((np.arange(4 * 5 * 6) > 59).reshape(4, 5, 6), np.diag([1, 2, 5, 1.0]), {1: "<L1>"})
+    ((_, row),) = PageCheck(labels._repr_html_()).tables
+    assert row[1:] == ["<L1>", "60", "0.60"]
+    listing = SeriesListing([ENTRY], 2, {}, ["one <warning>"])
+    shown = listing._repr_html_()
+    ((_, row),) = PageCheck(shown).tables
+    assert row == ["2", "<b>thin</b>", "CT", "4", "6 x 5 x 4", "1 x 1 x 2.5", "read by default", "doubt"]
+    assert "one &lt;warning&gt;" in shown
+
+
+@pytest.mark.unit
+def test_without_a_device_nothing_is_raised(monkeypatch):
+    def refuse(*_: object, **__: object) -> None:
+        raise DeviceError("no device here")
+
+    monkeypatch.setattr("clrecon.operators.reformat.cut.cut_slice", refuse)
+    monkeypatch.setattr("clrecon.operators.rays.render.render", refuse)
+    monkeypatch.setattr(notebook, "MOST_PAGE_BYTES", 1000)
+    assert Mesh(*samples.torus())._repr_html_() is None
+    assert PointCloud([[0, 0, 0], [1, 2, 3]])._repr_html_() is None
+    assert "No slices: no device here" in VOLUME._repr_html_()
+
+
+@pytest.mark.unit
+def test_what_is_empty_and_what_is_not_ours():
+    assert "0 triangles" in Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))._repr_html_()
+    assert clrecon.to_html("text") is None  # type: ignore[arg-type]
