@@ -38,6 +38,7 @@ _HEAD = """\
 .. currentmodule:: clrecon
 
 .. autosummary::
+   :nosignatures:
 
 {summary}
 

@@ -46,6 +46,8 @@ contributing
     "how_to.md": """# How to
 
 ```{{toctree}}
+:maxdepth: 1
+
 print_a_vertebra
 labels_to_meshes
 other_programs
@@ -54,6 +56,8 @@ devices
 """,
     "commands/index.md": """
 ```{{toctree}}
+:maxdepth: 1
+
 {commands}
 ```
 """,
@@ -61,6 +65,7 @@ devices
 
 ```{{toctree}}
 :glob:
+:maxdepth: 1
 
 *
 ```

@@ -24,13 +24,16 @@ myst_enable_extensions = ["deflist", "attrs_block"]
 myst_heading_anchors = 4
 myst_links_external_new_tab = False
 
+smartquotes = False  # it makes a dash of the two hyphens of an option
+
 html_theme = "pydata_sphinx_theme"
 html_title = "clrecon"
 html_show_sourcelink = False
 html_copy_source = False
 html_static_path = ["_static"]
 html_css_files = ["guide.css"]
-html_sidebars = {"index": [], "changes": [], "readme": []}
+_ALONE = ("index", "quickstart", "concepts", "limits", "citing", "readme", "changes", "contributing")
+html_sidebars = {page: [] for page in _ALONE}  # pages without others below them
 # Nothing that asks a server for anything: no icons of other sites, no switcher of versions, no search engine.
 html_theme_options = {
     "logo": {"text": "clrecon"},

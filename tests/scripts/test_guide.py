@@ -143,6 +143,7 @@ def test_every_command_has_a_page_with_its_options(site: Path) -> None:
         text = (site / "commands" / f"{command}.html").read_text(encoding="utf-8")
         options = [name for action in command_parser(command)._actions for name in action.option_strings]
         assert [name for name in options if name not in text] == [], command
+        assert "\u2013" not in text, "two hyphens of an option became a dash"
 
 
 def test_options_are_those_of_the_help() -> None:
