@@ -2,7 +2,8 @@
 """Make the pictures of README and docs/rendering.md again, from a phantom.
 
     clrecon phantom SPINE --kind spine --size 512x512 --slices 149 --spacing 0.7 0.7 1.0
-    python scripts/make_gallery.py SPINE docs/images
+    clrecon phantom CHEST --levels T4-L5 --size 512 --spacing 0.7 0.7 1.0 --scoliosis 12 --seed 3
+    python scripts/make_gallery.py SPINE CHEST docs/images
 
 The picture beside VTK's also needs scikit-image; the likeness of the two is printed.
 """
@@ -64,21 +65,31 @@ def draw_beside_vtk(renderer: clrecon.VolumeRenderer) -> np.ndarray:
     return np.hstack([ours, theirs])
 
 
+def draw_chest(folder: str) -> np.ndarray:
+    """Draw spine and ribs from the front and from behind, in one picture; (h, w, 3) uint8."""
+    volume = clrecon.read_volume(folder)
+    look = clrecon.VolumeLook("bone", ray_step=0.35 * min(volume.spacing))
+    with clrecon.VolumeRenderer(volume) as renderer:
+        front = renderer.render(look, view="25,10", size=(520, 620), zoom=1.12)
+        behind = renderer.render(look, view="150,12", size=(480, 620), zoom=1.12)
+    return np.hstack([front.image[..., :3], behind.annotated(scale_bar=True).image[..., :3]])
+
+
 def main() -> None:
-    """Read the phantom and write three pictures."""
+    """Read the phantoms and write the pictures."""
     from clrecon.rendering.pictures.pillow import load_pillow
 
-    if len(sys.argv) != 3:
+    if len(sys.argv) != 4:
         raise SystemExit(__doc__)
-    folder = Path(sys.argv[2])
+    folder = Path(sys.argv[3])
     load_pillow()
     from PIL import Image
 
+    chest = Image.fromarray(draw_chest(sys.argv[2]))
+    chest.convert("P", palette=Image.Palette.ADAPTIVE, colors=255).save(folder / "hero.png", optimize=True)
     volume = clrecon.read_volume(sys.argv[1])
     fine = 0.25 * min(volume.spacing)
     with clrecon.VolumeRenderer(volume) as renderer:
-        bone = renderer.render(preset="bone", view="25,10", size=(760, 400), zoom=1.1, ray_step=fine)
-        bone.annotated(letters=True, scale_bar=True).save(folder / "render-bone.png")
         modes = Image.fromarray(draw_modes(renderer, fine))
         modes.convert("P", palette=Image.Palette.ADAPTIVE, colors=255).save(folder / "render-modes.png", optimize=True)
         Image.fromarray(draw_beside_vtk(renderer)).save(folder / "render-vtk.png")

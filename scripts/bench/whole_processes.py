@@ -259,7 +259,10 @@ def table_of(figures: dict[str, Any], tilted: dict[str, Any]) -> str:
             program.name, f"{one['seconds']['median']:.1f}", f"{one['peak_bytes'] / 1e9:.2f} GB", _yes(one["closed"]),
             _place(one), _yes(one["inside_out"]), _place(other),
         ))  # fmt: skip
-    return markdown_table(head, rows)
+    machine = figures["machine"]
+    load = machine["load_average"]
+    busy = "" if load is None else f", load average {load[1]:.1f} while it ran"
+    return f"{markdown_table(head, rows)}\n\n{machine['processor']}, {machine['cores']} cores{busy}."
 
 
 def _yes(value: bool) -> str:
@@ -303,7 +306,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--work", default=str(Path(tempfile.gettempdir()) / "clrecon-processes"))
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     write_pages() if options.what == "page" else run(options)
 
 

@@ -18,6 +18,8 @@ DOCUMENTS = [
     "docs/statistics.md", "docs/distance.md", "docs/export.md", "docs/python.md",
     "docs/view.md",
     *(path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "docs" / "guide").rglob("*.md"))),
+    "docs/series.md", "docs/mesh.md", "docs/tour.md", "docs/devices.md", "docs/limits.md", "docs/benchmarks.md",
+    "docs/printing.md", "docs/solid.md",
 ]  # fmt: skip
 LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)")
 QUOTED = re.compile(r"`((?:\.ci|cl|clrecon|docs|scripts|tests)/[\w./-]*|(?:setup\.cfg|\w+\.(?:md|toml)))`")
@@ -62,7 +64,11 @@ def test_the_commands_of_documents_are_understood() -> None:
         "inside",
         "iso_value",
         "labels",
+        "mesh",
+        "printing",
         "rendering",
+        "series",
+        "solid",
         "statistics",
         "view",
     ):
@@ -80,6 +86,18 @@ def test_a_wrong_command_is_found(command: str) -> None:
     (arguments,) = find_commands(f"text\n\n    clrecon {command}   # why\n")
     with pytest.raises(UsageError, match="required|unrecognized|no command"):
         parse_command(arguments)
+
+
+def test_the_readme_is_short_and_leads_to_every_document() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    pages = {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")}
+    assert pages <= set(LINK.findall(text)) and text.count("\n") <= 240
+
+
+def test_the_contents_of_the_readme_are_its_sections() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    sections = [name.lower().replace(" ", "-") for name in re.findall(r"^## (.+)$", text, re.MULTILINE)]
+    assert re.findall(r"\]\(#([\w-]+)\)", text) == sections
 
 
 def test_exit_codes_are_documented() -> None:

@@ -1,4 +1,4 @@
-"""The Python examples of README.md, docs/rendering.md and docs/python.md run as they stand, on a small phantom."""
+"""The Python examples of README.md, docs/tour.md, rendering.md and python.md run as they stand, on a small phantom."""
 
 from __future__ import annotations
 
@@ -39,17 +39,30 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
-def test_the_example_of_the_readme_runs(folder, device, monkeypatch):
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+def block_of(name: str) -> str:
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / name).read_text(encoding="utf-8"), re.DOTALL)
     assert len(blocks) == 1
-    source = blocks[0]
+    return blocks[0]
+
+
+def test_the_example_of_the_readme_runs(folder, device, monkeypatch):
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
+    made: dict = {}
+    exec(compile(block_of("README.md").replace('"CT_FOLDER"', '"ct"'), "README.md", "exec"), made)
+    assert made["mesh"].quality()["closed"] and made["choice"].method == "auto"
+    assert {"bone.stl", "spine.png"} <= {path.name for path in folder.iterdir()}
+
+
+def test_the_tour_runs(folder, device, monkeypatch):
+    source = block_of("docs/tour.md")
     for text, other in SMALLER.items():
         assert text in source, text
         source = source.replace(text, other)
     monkeypatch.chdir(folder)
     monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
     made: dict = {}
-    exec(compile(source, "README.md", "exec"), made)
+    exec(compile(source, "docs/tour.md", "exec"), made)
     assert made["vertebra"].quality()["closed"] and made["front"].image[..., :3].any()
     assert {"bone.stl", "spine.png", "bone.gif"} <= {path.name for path in folder.iterdir()}
 
