@@ -80,6 +80,7 @@ def site_pages(root: Path) -> dict[str, str]:
     pages |= {f"docs/{path.name}": f"methods/{path.name}" for path in sorted(root.glob("docs/*.md"))}
     for path in sorted(root.glob("docs/guide/**/*.md")):
         pages[path.relative_to(root).as_posix()] = path.relative_to(root / "docs" / "guide").as_posix()
+    pages |= {f"docs/{path.name}": f"methods/{path.name}" for path in sorted(root.glob("docs/*.ipynb"))}  # to download
     pages |= {f"docs/images/{path.name}": f"images/{path.name}" for path in sorted(root.glob("docs/images/*.png"))}
     return pages
 
