@@ -76,10 +76,10 @@ def test_warnings_say_what_can_go_wrong() -> None:
     assert "20 % of the surface" in warn_of_print({**good, "wall": {**wall, "thin_share": 0.2}})[0]
     assert "closed cavities" in warn_of_print({**good, "cavities": 3, "cavities_ml": 0.2})[0]
     assert "is it the right piece" in warn_of_print({**good, "left_out": {"pieces_ml": 2.1}})[0]
-    told = {"pieces_ml": 4.1, "not_bone": 1, "not_bone_ml": 2.2}
+    told = {"pieces_ml": 4.1, "not_bone": 1, "not_bone_ml": 3.2}  # bone of 0.9 ml beside 2 ml
     assert warn_of_print({**good, "left_out": told}) == []
-    told["not_bone_ml"] = 1.0
-    assert "bone that was left out encloses 3.1 ml" in warn_of_print({**good, "left_out": told})[0]
+    told["not_bone_ml"] = 3.0
+    assert "bone that was left out encloses 1.1 ml" in warn_of_print({**good, "left_out": told})[0]
 
 
 def test_a_print_of_a_phantom(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -59,7 +59,7 @@ def test_the_default_preset_keeps_thin_cortex() -> None:
         ({"iso_value": 3.0, "preset": "bone"}, "not both"),
         ({"iso_value": math.nan}, "finite"),
         ({"iso_value": -math.inf}, "finite"),
-        ({"preset": "Bone"}, "unknown preset 'Bone'"),
+        ({"preset": "Bon"}, "unknown preset 'Bon'"),
         ({"seeds": [(1.0, 2.0)]}, "point of three numbers"),
         ({"seeds": [(1.0, 2.0, math.inf)]}, "point of three numbers"),
         ({"space": "world"}, "unknown space 'world'"),
