@@ -17,7 +17,6 @@ from clrecon.jobs.phantom import make_phantom
 
 SMALLER = {
     '"CT_FOLDER"': '"ct"',
-    '"segmentation.nii.gz"': '"segmentation.seg.nrrd"',  # NIfTI has no names of labels, and the example asks for one
     "clrecon.device(\"gpu\")": "clrecon.device()",
     "size=(800, 800)": "size=(80, 80)",
     "clrecon.Camera.fit(volume), 120)": "clrecon.Camera.fit(volume, size=(64, 64)), 2)",
