@@ -20,7 +20,7 @@ def _parse_color(text: str) -> tuple[str, str]:
     return parse_label_color(text)
 
 
-def add_label_arguments(parser: argparse.ArgumentParser, files: bool = True) -> None:
+def add_label_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options for label maps; without `files` all labels go into one."""
     group = parser.add_argument_group("labels", "one mesh a label: the label picks the cells, HU place the vertices")
     group.add_argument(
@@ -35,14 +35,8 @@ def add_label_arguments(parser: argparse.ArgumentParser, files: bool = True) -> 
         metavar="LABEL=COLOUR",
         type=_parse_color,
         action="append",
-        help="colour of a label in .ply, .glb, .3mf and .html, such as L3=orange; may be given again",
+        help="colour of a label in .ply and in the formats of several objects, such as L3=orange; may be given again",
     )
-    if files:
-        group.add_argument(
-            "--one-file",
-            action="store_true",
-            help="all labels in one file (.3mf, .glb or .html), each an object with its name and a colour of its own",
-        )
     group.add_argument(
         "--surface",
         metavar="hu|mask",
@@ -77,13 +71,11 @@ def label_choice(options: argparse.Namespace) -> LabelChoice | None:
             surface,
             hidden=tuple(options.hide_label or ()),
             colors=tuple(options.label_color or ()),
-            one_file=getattr(options, "one_file", True),
         )
     given = {
         "--label": options.label,
         "--hide-label": options.hide_label,
         "--label-color": options.label_color,
-        "--one-file": getattr(options, "one_file", False),
         "--grow": options.grow is not None,
         "--surface": options.surface,
     }

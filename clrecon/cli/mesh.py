@@ -105,6 +105,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     components = parser.add_argument_group("components")
     add_selection(components)
     components.add_argument("--split", action="store_true", help="write one file a component, the largest first")
+    components.add_argument(
+        "--one-file",
+        action="store_true",
+        help="labels, components of --split or several iso values in one file (.3mf, .glb, .obj, .vtp or .html), each"
+        " an object with its name and a colour of its own",
+    )
     add_label_arguments(parser)
     add_refinement(parser)
     device = parser.add_argument_group("device")

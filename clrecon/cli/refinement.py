@@ -111,7 +111,7 @@ def _describe_topology(found: Mapping[str, Any]) -> str:
     before, after = found["euler_number_before"], found["euler_number_after"]
     if not (found["components_changed"] or found["components_lost"]):
         return f"Euler number {before} before and after"
-    parts = [f"changed in {found['components_changed']} of {found['components_before']} components"]
+    parts = [f"changed in {found['components_changed']} of {count_of(found['components_before'], 'component')}"]
     if found["components_lost"]:
         parts.append(f"{found['components_lost']} lost")
     return f"Euler number {before} before, {after} after ({', '.join(parts)})"

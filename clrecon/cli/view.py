@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_levels(surface)
     add_solid(surface)
     add_selection(parser.add_argument_group("components of a scan"))
-    add_label_arguments(parser, files=False)
+    add_label_arguments(parser)
     device = parser.add_argument_group("device, for scans")
     add_device(device)
     add_memory(device)

@@ -43,6 +43,8 @@ FORMATS: dict[str, FileFormat[Content]] = {
 ASSEMBLIES: dict[str, FileFormat[Assembly]] = {
     ".glb": FileFormat(glb.estimate, glb.write, glb.verify, FOUR_GIB),
     ".3mf": FileFormat(threemf.estimate, threemf.write, threemf.verify, NO_LIMIT),
+    ".obj": FileFormat(obj.estimate, obj.write, obj.verify, NO_LIMIT),
+    ".vtp": FileFormat(vtp.estimate, vtp.write, vtp.verify, NO_LIMIT),
     ".html": FileFormat(page.estimate, page.write, page.verify, NO_LIMIT),
 }
 """Formats that hold several named objects in a file."""
@@ -61,7 +63,9 @@ def check_assembly(path: str | os.PathLike[str]) -> None:
     """
     extension = check_format(path)
     if extension not in ASSEMBLIES:
-        raise UsageError(f"{extension} holds one mesh: several with their names in one file are .3mf, .glb or .html")
+        raise UsageError(
+            f"{extension} holds one mesh: several with their names in one file are .3mf, .glb, .obj, .vtp or .html"
+        )
 
 
 def stage_assembly(

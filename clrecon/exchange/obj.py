@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from clrecon.exchange.content import Content, refuse_file
+from clrecon.exchange.content import Assembly, Content, parts_of, refuse_file
 from clrecon.system.pieces import chunks
 
 __all__ = ["estimate", "verify", "write"]
@@ -21,46 +21,75 @@ _CHUNK = 1 << 14
 _PIECE = 1 << 22
 
 
-def _header(content: Content) -> bytes:
-    return "".join(f"# {remark}\n" for remark in content.remarks).encode("ascii")
+def _header(content: Content | Assembly) -> bytes:
+    remarks = parts_of(content)[0].remarks
+    return "".join(f"# {remark}\n" for remark in remarks).encode("ascii")
 
 
-def estimate(content: Content) -> int:
+def estimate(content: Content | Assembly) -> int:
     """Estimate the size of the file in bytes."""
-    digits = len(str(len(content.vertices)))
-    head = len(_header(content))
+    parts = parts_of(content)
+    digits = len(str(sum(len(part.vertices) for part in parts)))
+    return len(_header(content)) + sum(_estimate_part(part, digits) for part in parts)
+
+
+def _estimate_part(content: Content, digits: int) -> int:
+    color = 0 if content.color is None else 18
     if content.normals is None:
-        return head + 30 * len(content.vertices) + (3 * digits + 5) * len(content.triangles)
-    return head + 58 * len(content.vertices) + (6 * digits + 11) * len(content.triangles)
+        return (30 + color) * len(content.vertices) + (3 * digits + 5) * len(content.triangles)
+    return (58 + color) * len(content.vertices) + (6 * digits + 11) * len(content.triangles)
 
 
-def write(stream: BinaryIO, content: Content) -> None:
-    """Write vertices, normals (if there are any) and faces; indices count from 1."""
+def write(stream: BinaryIO, content: Content | Assembly) -> None:
+    """Write vertices, normals (if there are any) and faces; indices count from 1 and go on from object to object.
+
+    Each mesh of several is an object by its name.  Colours stand behind the coordinates of vertices, as MeshLab,
+    Blender and others read and write them: a file of materials would be a second file.
+    """
     stream.write(_header(content))
-    line = f"v {content.number} {content.number} {content.number}\n"
+    before = normals_before = 1
+    for number, part in enumerate(parts_of(content), start=1):
+        if isinstance(content, Assembly):
+            stream.write(f"o {_name(part, number)}\n".encode("ascii"))
+        _write_part(stream, part, before, normals_before)
+        before += len(part.vertices)
+        normals_before += 0 if part.normals is None else len(part.normals)
+
+
+def _name(part: Content, number: int) -> str:
+    """Return the name of an object: one word of ASCII, as some readers take no more."""
+    words = (part.name or f"object {number}").encode("ascii", "replace").decode("ascii").split()
+    return "_".join(words) or f"object_{number}"
+
+
+def _write_part(stream: BinaryIO, part: Content, before: int, normals_before: int) -> None:
+    color = "" if part.color is None else " " + " ".join(f"{value:.4f}" for value in part.color)
+    line = f"v {part.number} {part.number} {part.number}{color}\n"
     # One % for many lines takes two thirds of the time of one % for each line.
-    for where in chunks(len(content.vertices), _CHUNK):
-        rows = content.vertices[where]
+    for where in chunks(len(part.vertices), _CHUNK):
+        rows = part.vertices[where]
         stream.write((line * len(rows) % tuple(rows.ravel().tolist())).encode("ascii"))
     face = "f %d %d %d\n"
-    if content.normals is not None:
+    if part.normals is not None:
         face = "f %d//%d %d//%d %d//%d\n"
-        for where in chunks(len(content.normals), _CHUNK):
-            rows = content.normals[where]
+        for where in chunks(len(part.normals), _CHUNK):
+            rows = part.normals[where]
             stream.write(("vn %.6f %.6f %.6f\n" * len(rows) % tuple(rows.ravel().tolist())).encode("ascii"))
-    for where in chunks(len(content.triangles), _CHUNK):
-        corners = content.triangles[where].astype(np.int64) + 1
-        if content.normals is not None:
-            corners = np.repeat(corners, 2, axis=1)
+    for where in chunks(len(part.triangles), _CHUNK):
+        corners = part.triangles[where].astype(np.int64) + before
+        if part.normals is not None:
+            corners = np.stack((corners, corners - before + normals_before), axis=2)
         stream.write((face * len(corners) % tuple(corners.ravel().tolist())).encode("ascii"))
 
 
-def verify(path: Path, content: Content) -> None:
+def verify(path: Path, content: Content | Assembly) -> None:
     """Check the header and count the lines of a finished file."""
+    parts = parts_of(content)
     expected = {
-        "vertices": (b"\nv ", len(content.vertices)),
-        "normals": (b"\nvn ", 0 if content.normals is None else len(content.normals)),
-        "triangles": (b"\nf ", len(content.triangles)),
+        "vertices": (b"\nv ", sum(len(part.vertices) for part in parts)),
+        "normals": (b"\nvn ", sum(0 if part.normals is None else len(part.normals) for part in parts)),
+        "triangles": (b"\nf ", sum(len(part.triangles) for part in parts)),
+        "objects": (b"\no ", len(parts) if isinstance(content, Assembly) else 0),
     }
     counts = dict.fromkeys(expected, 0)
     header = _header(content)

@@ -16,7 +16,7 @@ from clrecon.mesh.base import BaseMesh
 from clrecon.mesh.connectivity import label_components
 from clrecon.mesh.nearest import find_nearest_triangle
 from clrecon.mesh.pieces import measure_components
-from clrecon.system.text import say_digits
+from clrecon.system.text import count_of, say_digits
 from clrecon.system.wording import name_parameter
 
 __all__ = ["Labelled", "select_components", "split_components"]
@@ -218,7 +218,7 @@ def _choose(
         keep &= volumes + way * areas / 1000.0 >= min_volume_ml
         if not keep.any():
             raise NoSurfaceError(
-                f"none of the {np.count_nonzero(candidates)} components encloses {min_volume_ml:g} ml: "
+                f"none of {count_of(int(np.count_nonzero(candidates)), 'component')} encloses {min_volume_ml:g} ml: "
                 f"the largest has {say_digits(volumes[candidates].max(initial=0.0), 4)} ml, ask for less"
             )
     facts: dict[str, object] = {}

@@ -216,7 +216,7 @@ def test_components_and_refinement_of_masks(
 @pytest.mark.parametrize(
     ("options", "code", "words"),
     [
-        (["--min-volume", "0.5"], 2, "label_3 at the mask: none of the 1 components encloses 0.5 ml"),
+        (["--min-volume", "0.5"], 2, "label_3 at the mask: none of 1 component encloses 0.5 ml"),
         (["--seed", "0,0,0"], 3, "label_1 at the mask: the seed at LPS (0, 0, 0) mm lies"),
         (["--seed", "1,2"], 3, "'1,2' is no point: three numbers in mm with commas"),
         (["--keep-largest", "0"], 3, "the number of components to keep must be 1 or more"),

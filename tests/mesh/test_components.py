@@ -117,7 +117,7 @@ def test_volume_of_an_open_component_does_not_depend_on_its_place():
 
 
 def test_nothing_left():
-    with pytest.raises(NoSurfaceError, match="none of the 3 components encloses 1 ml: the largest has 0.06 ml"):
+    with pytest.raises(NoSurfaceError, match="none of 3 components encloses 1 ml: the largest has 0.06 ml"):
         select_components(three_boxes(), min_volume_ml=1.0)
     with pytest.raises(NoSurfaceError, match="surface is empty"):
         select_components(Mesh([], []), keep_largest=1)

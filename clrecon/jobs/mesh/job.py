@@ -171,6 +171,7 @@ def _write(
     with ExitStack() as staged:  # all files are on the disk before the first replaces an older one
         meshes = [part.mesh for part in parts]
         if settings.one_file:
+            _name_objects(parts)
             files = [stage_together(staged, meshes, paths[0], settings.space, progress, keep_ids=settings.keep_ids)]
         else:
             files = stage_meshes(staged, meshes, paths, settings.space, progress, keep_ids=settings.keep_ids)
@@ -183,6 +184,16 @@ def _write(
             files.append(staged.enter_context(stage_report(report_path, report)))
         commit_all(files)
     return report
+
+
+def _name_objects(parts: Sequence[Part]) -> None:
+    """Give each mesh the name and the colour that it has as an object of a file; those of labels stay."""
+    from clrecon.rendering.looks.label_style import distinct_colors
+
+    for part, color in zip(parts, distinct_colors(len(parts)), strict=True):
+        given = part.mesh.report
+        given["part_name"] = part.name or given.get("part_name")
+        given.setdefault("color", [float(value) for value in color])
 
 
 def _refine_and_measure(

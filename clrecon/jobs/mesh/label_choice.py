@@ -37,8 +37,6 @@ class LabelChoice:
         Labels that become no mesh.
     colors : tuple of (str or int, str)
         Labels and their colours, for PLY, GLB and 3MF.
-    one_file : bool
-        True: all meshes are named objects of one file (GLB, 3MF), each in a colour of its own.
 
     Raises
     ------
@@ -53,7 +51,6 @@ class LabelChoice:
     surface: str = "hu"
     hidden: tuple[str | int, ...] = ()
     colors: tuple[tuple[str | int, str], ...] = ()
-    one_file: bool = False
 
     def __post_init__(self) -> None:
         from clrecon.rendering.looks.colors import find_color  # numpy: not loaded before a job starts
@@ -83,8 +80,10 @@ class LabelChoice:
             raise UsageError("all labels are hidden: there is no mesh to make")
         return left
 
-    def colors_of(self, labels: LabelMap, numbers: Sequence[int]) -> dict[int, tuple[float, float, float]]:
-        """Return the colours of labels: those given, and with `one_file` distinct ones for all others.
+    def colors_of(
+        self, labels: LabelMap, numbers: Sequence[int], distinct: bool
+    ) -> dict[int, tuple[float, float, float]]:
+        """Return the colours of labels: those given, and where wanted distinct ones for all others.
 
         Raises
         ------
@@ -100,10 +99,10 @@ class LabelChoice:
             if number in given:
                 raise UsageError(f"label {number} {labels.name(number)} has two colours")
             given[number] = _as_tuple(find_color(color))
-        if not self.one_file:
+        if not distinct:
             return given
-        distinct = distinct_colors(len(numbers))
-        return {number: _as_tuple(own) for number, own in zip(numbers, distinct, strict=True)} | given
+        own = distinct_colors(len(numbers))
+        return {number: _as_tuple(color) for number, color in zip(numbers, own, strict=True)} | given
 
 
 def _as_tuple(color: Any) -> tuple[float, float, float]:

@@ -89,7 +89,7 @@ def extract_label_surfaces(
 
     found: list[tuple[Surface, int, Mesh]] = []
     numbers = choice.numbers_of(labels)
-    colors = choice.colors_of(labels, numbers)
+    colors = choice.colors_of(labels, numbers, settings.one_file)
     asked = numbers if choice.wanted or choice.hidden else None
     suffixes = file_suffixes({number: labels.name(number) for number in numbers})  # reports contain no other names
     for surface in surfaces:

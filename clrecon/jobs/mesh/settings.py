@@ -67,6 +67,8 @@ class MeshSettings(InputSettings):
         With `solid`: radius of the balls that close pores, mm; None: 2.5 to 3, by the voxels.
     split : bool
         Write one mesh for each component, the largest first.
+    one_file : bool
+        Write all meshes (labels, components, iso values) as named objects of one file, each in a colour of its own.
     labels : LabelChoice, optional
         A label map: one mesh for each label, see `LabelChoice`.
     smooth : int, optional
@@ -107,6 +109,7 @@ class MeshSettings(InputSettings):
     solid: bool = False
     seal_mm: float | None = None
     split: bool = False
+    one_file: bool = False
     labels: LabelChoice | None = None
     smooth: int | None = None
     decimate: float | None = None
@@ -136,6 +139,11 @@ class MeshSettings(InputSettings):
                 raise UsageError(f"a seed is a point of three numbers in mm, not {tuple(seed)}")
         self._check_refinement()
         self._check_solid()
+        if self.one_file and not (self.labels_pick or self.split or len(self.levels) > 1):
+            raise UsageError(
+                f"there is one mesh: {name_parameter('one_file', True)} puts labels, components"
+                f" ({name_parameter('split', True)}) or several iso values into one file"
+            )
         from clrecon.geometry import frame_from_lps  # numpy: not loaded before a job starts
         from clrecon.geometry.iso_rule import check_topology
 
@@ -285,11 +293,6 @@ class MeshSettings(InputSettings):
     def follows_hu(self) -> bool:
         """True where HU place the surfaces; False for labels' own surfaces."""
         return self.labels is None or self.labels.surface == "hu"
-
-    @property
-    def one_file(self) -> bool:
-        """True where all meshes are objects of one file."""
-        return self.labels is not None and self.labels.one_file
 
     @property
     def labels_pick(self) -> bool:

@@ -45,6 +45,5 @@ class ViewSettings:
         for name in self.names:
             if not name.strip() or len(name) > MOST_NAME or not name.isprintable():
                 raise UsageError(f"a name has 1 to {MOST_NAME} printable characters, not {name[:MOST_NAME]!r}")
-        labels = self.scan.labels
-        if labels is not None and not labels.one_file:  # each label with a colour of its own
-            object.__setattr__(self, "scan", replace(self.scan, labels=replace(labels, one_file=True)))
+        if self.scan.labels_pick and not self.scan.one_file:  # each label with a colour of its own
+            object.__setattr__(self, "scan", replace(self.scan, one_file=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +89,7 @@ def test_a_ply_has_the_colour_at_its_vertices(scan: Path, device: Any, tmp_path:
 @pytest.mark.parametrize(
     ("extra", "words"),
     [
-        (["-o", "a.stl", "--one-file"], ".3mf or .glb"),
+        (["-o", "a.stl", "--one-file"], ".3mf, .glb, .obj, .vtp"),
         (["-o", "a.glb", "--one-file", "--hide-label", "L4"], "L4"),
         (["-o", "a.glb", "--hide-label", "2", "--hide-label", "3", "--hide-label", "9"], "all labels are hidden"),
         (["-o", "a.glb", "--label-color", "L3=nocolour"], "nocolour"),
@@ -112,7 +113,84 @@ def test_colours_are_looked_at_when_they_are_chosen() -> None:
         LabelChoice("a.nii", colors=(("L3", "no"),))
 
 
-@pytest.mark.parametrize("option", ["--one-file", "--hide-label=L3", "--label-color=L3=red"])
+@pytest.mark.parametrize("option", ["--hide-label=L3", "--label-color=L3=red"])
 def test_they_need_labels(option: str, scan: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["mesh", str(scan / "ct.nii"), "-o", "a.glb", option]) == 3
     assert "--labels FILE" in capsys.readouterr().err
+
+
+def test_one_mesh_needs_no_objects(scan: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["mesh", str(scan / "ct.nii"), "-o", "a.glb", "--one-file"]) == 3
+    assert "there is one mesh: --one-file puts labels" in capsys.readouterr().err
+
+
+def test_an_obj_has_named_coloured_objects(scan: Path, device: Any, tmp_path: Path) -> None:
+    assert run(scan, device, tmp_path / "a.obj", "--one-file", "--label-color", "L3=#ff0000") == 0
+    assert run(scan, device, tmp_path / "one.obj") == 0
+    found = read_objects(tmp_path / "a.obj")
+    assert sorted(found) == ["left_right", "vertebrae_L2", "vertebrae_L3"]
+    for name, (vertices, triangles, colors) in found.items():
+        alone = trimesh.load(tmp_path / f"one_{name}.obj", process=False)
+        assert np.array_equal(vertices[triangles], alone.vertices[alone.faces])
+        assert (colors == (1, 0, 0)).all() == (name == "vertebrae_L3")
+    whole = trimesh.load(tmp_path / "a.obj", process=False)  # a reader that joins them
+    assert whole.is_watertight and len(whole.faces) == sum(len(triangles) for _, triangles, _ in found.values())
+
+
+def read_objects(path: Path) -> dict[str, tuple[Any, Any, Any]]:
+    """Read vertices, triangles and colours of the vertices of each object of an OBJ file with normals."""
+    found: dict[str, tuple[list, list, list]] = {}
+    name, before, count, normals = "", 0, 0, 0
+    for line in path.read_text().splitlines():
+        kind, *words = line.split()
+        if kind == "o":
+            (name,), before = words, count
+            found[name] = [], [], []
+        elif kind == "v":
+            numbers = [float(word) for word in words]
+            found[name][0].append(numbers[:3])
+            found[name][2].append(numbers[3:])
+            count += 1
+        elif kind == "vn":
+            normals += 1
+        elif kind == "f":
+            assert all(word == f"{word.split('/')[0]}//{word.split('/')[0]}" for word in words)
+            found[name][1].append([int(word.split("/")[0]) - 1 - before for word in words])
+    assert normals == count
+    return {name: tuple(map(np.array, own)) for name, own in found.items()}  # type: ignore[misc]
+
+
+def test_a_vtp_tells_the_mesh_of_each_triangle(scan: Path, device: Any, tmp_path: Path) -> None:
+    pyvista = pytest.importorskip("pyvista")
+    assert run(scan, device, tmp_path / "a.vtp", "--one-file", "--label-color", "L3=#ff0000") == 0
+    assert run(scan, device, tmp_path / "one.vtp") == 0
+    found = pyvista.read(tmp_path / "a.vtp")
+    names = list(found.field_data["PART_NAMES"])
+    assert sorted(names) == ["left_right", "vertebrae_L2", "vertebrae_L3"]
+    for number, name in enumerate(names):
+        own = found.extract_cells(found.cell_data["PART"] == number).extract_surface()
+        alone = pyvista.read(tmp_path / f"one_{name}.vtp")
+        assert own.n_cells == alone.n_cells and own.volume == pytest.approx(alone.volume, rel=1e-6)
+        assert ((own.cell_data["COLOR"] == [255, 0, 0]).all()) == (name == "vertebrae_L3")
+
+
+@pytest.mark.parametrize("kind", ["glb", "3mf", "obj", "vtp"])
+def test_components_and_iso_values_without_labels_are_objects(
+    kind: str, scan: Path, device: Any, tmp_path: Path
+) -> None:
+    given = ["mesh", str(scan / "ct.nii"), "-o", str(tmp_path / f"a.{kind}"), "--device", str(device.index), "-q"]
+    for extra, names in (
+        (["--hu", "300", "--split"], ["001", "002", "003"]),
+        (["--hu", "200,500"], ["200hu", "500hu"]),
+    ):
+        assert main([*given, *extra, "--one-file", "--report", str(tmp_path / "a.json")]) == 0
+        assert {path.name for path in tmp_path.iterdir()} == {"a.json", f"a.{kind}"}
+        report = json.loads((tmp_path / "a.json").read_text())
+        assert [mesh["name"] for mesh in report["meshes"]] == names
+        if kind == "vtp":
+            pyvista = pytest.importorskip("pyvista")
+            assert list(pyvista.read(tmp_path / "a.vtp").field_data["PART_NAMES"]) == names
+        elif kind == "obj":
+            assert list(read_objects(tmp_path / "a.obj")) == names
+        else:
+            assert sorted(trimesh.load(tmp_path / f"a.{kind}").geometry) == names
