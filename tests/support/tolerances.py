@@ -235,3 +235,9 @@ SEGMENT_DISTANCE_MM = 2e-3
 CORRIDOR_HALF_MM = 0.5
 CORRIDOR_226_MM = 1.0
 """Bars for a corridor's radius against the truth along its line, at the half level and at 226 HU."""
+
+PICTURE_ACTOR_LEVELS = 8
+PICTURE_ACTOR_OPAQUE_SHARE = 0.001
+PICTURE_ACTOR_TRANSLUCENT_SHARE = 0.01
+"""Bars for a picture that is drawn by VTK with its own depth, against `merge_scene`: levels of 255, and shares of the
+pixels that may differ by more, where two surfaces lie in one place."""

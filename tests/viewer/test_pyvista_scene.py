@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
+import drawn_balls
 import numpy as np
 import pytest
 import tolerances
+from drawn_balls import CAMERAS, CENTRE, RADIUS, need_off_screen
 
 from clrecon.errors import UsageError
 from clrecon.rendering import Rendering
@@ -17,21 +16,11 @@ from clrecon.viewer import add_rendering, merge_scene
 pyvista = pytest.importorskip("pyvista")
 
 SIZE = (120, 90)
-CENTRE = np.array([12.0, -30.0, 850.0])
-RADIUS = 20.0
-CAMERAS = [
-    Camera((10.0, -400.0, 870.0), tuple(CENTRE), (0.2, 0, 1), parallel_scale=40.0),
-    Camera((10.0, -400.0, 870.0), tuple(CENTRE), (0.2, 0, 1), view_angle=12.0),
-]
 
 
 @pytest.fixture(scope="module", autouse=True)
 def can_draw():
-    """A driver that cannot draw off screen may end the process: it is tried in another one."""
-    code = "import pyvista; p = pyvista.Plotter(off_screen=True); p.add_mesh(pyvista.Cube()); p.screenshot()"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    if done.returncode != 0:
-        pytest.skip(f"no off-screen OpenGL here: {done.stderr.strip()[-200:]}")
+    need_off_screen()
 
 
 @pytest.fixture
@@ -42,15 +31,7 @@ def plotter():
 
 
 def ball(camera: Camera, center=CENTRE, radius=RADIUS, color=(250, 40, 10)) -> Rendering:
-    """What a raycaster makes of an opaque ball: its colour, and depths from analysis."""
-    origins, directions = camera.rays(SIZE)
-    to_center = np.asarray(center) - origins
-    along = (to_center * directions).sum(axis=2)
-    inside = radius**2 - (to_center**2).sum(axis=2) + along**2
-    depth = np.where(inside > 0.0, along - np.sqrt(np.maximum(inside, 0.0)), np.nan).astype(np.float32)
-    image = np.zeros((SIZE[1], SIZE[0], 4), np.uint8)
-    image[np.isfinite(depth)] = (*color, 255)
-    return Rendering(image, depth, depth, camera)
+    return drawn_balls.ball(camera, SIZE, center, radius, color)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
