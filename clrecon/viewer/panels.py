@@ -1,6 +1,6 @@
 """The window's panels as pictures: what stands in them, and which command a click on a place gives.  No toolkit.
 
-They are drawn with Pillow and shown as textures: they look the same with every driver, and are tested without a display.
+They are drawn with Pillow and shown as textures: they look the same with every driver and need no display in tests.
 """
 
 from __future__ import annotations
