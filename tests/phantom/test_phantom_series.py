@@ -51,7 +51,7 @@ def test_files_hold_the_affine_and_voxels_of_the_truth(tmp_path: Path, kind: str
     voxels, made_affine, made_truth = make_phantom(settings)
     assert np.array_equal(hu, voxels) and np.array_equal(made_affine, truth["affine_ijk_to_lps_mm"])
     assert made_truth == truth
-    assert truth["tilt_deg"] == pytest.approx(abs(extra.get("tilt", 0.0)), abs=1e-6)
+    assert truth["tilt_deg"] == pytest.approx(extra.get("tilt", 0.0), abs=1e-6)
     normal = np.cross(affine[:3, 0], affine[:3, 1])
     gap = affine[:3, 2] @ normal / np.linalg.norm(normal)
     assert gap == pytest.approx(2.5, abs=1e-9)

@@ -42,9 +42,8 @@ def mesh_corners(mesh: Mesh) -> Float64Array:
     corners = np.array([vertices.min(axis=0), vertices.max(axis=0)], dtype=np.float64)
     if np.abs(mesh.vertices).max() > FARTHEST_MM:
         raise UsageError(
-            f"vertices of the mesh lie up to {say_digits(np.abs(mesh.vertices).max())} mm from the"
-            f" origin: pictures show what"
-            f" is within {FARTHEST_MM:.0e} mm"
+            f"vertices of the mesh lie up to {say_digits(np.abs(mesh.vertices).max())} mm from the origin:"
+            f" pictures show what is within {FARTHEST_MM / 1e6:,.0f} kilometres"
         )
     return corners
 

@@ -167,7 +167,7 @@ def test_bounds_and_files_follow_the_space(device: Any, tmp_path: Path) -> None:
     [
         ({"iso_value": (200.0, 900.0)}, NoSurfaceError, "900 HU"),
         ({"iso_value": (200.0, -1000.0)}, NoSurfaceError, "-1000 HU: every voxel is inside"),
-        ({"iso_value": (200.0, 500.0), "min_volume_ml": 1000.0}, NoSurfaceError, "at 200 HU: none of the 3"),
+        ({"iso_value": (200.0, 500.0), "min_volume_ml": 1000.0}, NoSurfaceError, "at 200 HU: none of 3 components"),
     ],
 )
 def test_one_surface_that_is_not_there_ends_the_job(

@@ -9,6 +9,8 @@ import tolerances
 import clrecon
 from clrecon.exchange.coordinates import find_coincident
 from clrecon.exchange.formats import FORMATS, describe_rounding
+from clrecon.exchange.page import parse_page, read_facts
+from clrecon.exchange.page_coding import decode_surface
 from clrecon.geometry import Volume
 from clrecon.geometry.precision import FAR_MM, find_vertex_origin, float32_step
 from clrecon.labels import LabelMap
@@ -113,7 +115,7 @@ def far_mesh() -> Mesh:
 
 
 def read_back(path, space):
-    """Vertices in LPS mm, in the order of the file, and triangles, by other libraries than ours."""
+    """Vertices in LPS mm, in the order of the file, and triangles, by other libraries than ours if they read it."""
     if path.suffix == ".vtp":
         from vtkmodules.util.numpy_support import vtk_to_numpy
         from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
@@ -123,6 +125,9 @@ def read_back(path, space):
         reader.Update()
         points = vtk_to_numpy(reader.GetOutput().GetPoints().GetData())
         faces = vtk_to_numpy(reader.GetOutput().GetPolys().GetConnectivityArray()).reshape(-1, 3)
+    elif path.suffix == ".html":
+        points, _, faces = decode_surface(parse_page(path.read_bytes())[1])
+        return points, faces  # of a page always in LPS; `space` is the frame of the places that it shows
     else:
         trimesh = pytest.importorskip("trimesh")
         scene = trimesh.load_scene(path, process=False, maintain_order=True).to_mesh()
@@ -147,6 +152,8 @@ def test_files_hold_what_the_mesh_does(far_mesh, extension, space, tmp_path):
         assert off[~meeting].max() <= 0.5 * float32_step(1e5)
         assert off[meeting].max(initial=0.0) <= 1.5 * float32_step(1e5)  # rounding joins them: one goes on by a step
         assert "steps of 0.0078 mm" in warnings[0]
+    elif extension == ".html":
+        assert off.max() <= 1.001 * read_facts(path)["half_step_mm"] <= 0.001
     else:
         assert off.max() <= tolerances.FAR_FILE_MM
         assert warnings == []

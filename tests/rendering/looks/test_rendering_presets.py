@@ -26,9 +26,9 @@ def passes(name: str, hu: float, mm: float) -> float:
 def test_they_are_there_and_found() -> None:
     assert list(PRESETS) == NAMES
     assert find_preset(DEFAULT_PRESET).name == "bone"
-    for name in ("bonne", "Bone", "", None):
+    for name, meant in (("bonne", r" \(did you mean bone\?\)"), ("xyz", ""), ("", ""), (None, "")):
         with pytest.raises(
-            UsageError, match=f"unknown rendering preset {name!r}: use one of bone, spine, skin, .*file"
+            UsageError, match=f"unknown rendering preset {name!r}{meant}: use one of bone, spine, skin, .*file"
         ):
             find_preset(name)
 
