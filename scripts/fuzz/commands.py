@@ -142,6 +142,11 @@ def _content(stream: object) -> str:
     return str(stream.read())  # type: ignore[attr-defined]
 
 
+_DRIVERS_WORDS = ("MESA: warning: Treating load_kernel_arg in control flow as uniform",)
+"""Said by Mesa 22.3 when it compiles a kernel that follows rays; the self-test passes there.  Not hidden from users: a
+driver's doubt of its own results is theirs to know."""
+
+
 def check_call(given: list[str], code: int, out: str, err: str) -> None:
     """Raise `WrongOutcome` where code and streams are not what they shall be."""
     if code < 0:
@@ -151,7 +156,7 @@ def check_call(given: list[str], code: int, out: str, err: str) -> None:
     errors = [line for line in err.splitlines() if line.startswith("clrecon: error:")]
     if code not in (0, 8) and len(errors) != 1 and "--strict" not in given:
         raise WrongOutcome("foreign", f"exit {code} with {len(errors)} error lines: {err[-500:]}")
-    foreign = [line for line in err.splitlines() if line and not line.startswith(("clrecon:", " "))]
+    foreign = [line for line in err.splitlines() if line and not line.startswith(("clrecon:", " ", *_DRIVERS_WORDS))]
     if foreign and not {"-v", "--verbose"} & set(given):
         raise WrongOutcome("noise", "\n".join(foreign)[:500])
     flags = given[: given.index("--")] if "--" in given else given
