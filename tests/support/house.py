@@ -64,14 +64,18 @@ _layer(
     "viewer",
     "errors",
     "system",
+    "opencl",
     "geometry",
+    "anatomy",
     "exchange",
     "sources",
+    "formats",
     "labels",
     "mesh",
     "points",
     "rendering",
     "operators",
+    "jobs",
 )
 _layer("cli", "errors", "version", "system", "jobs")
 _layer("__main__", "cli")

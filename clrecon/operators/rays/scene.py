@@ -89,6 +89,9 @@ class ScenePictures(Closing):
         See `clrecon.device`; None is the best of the machine.
     memory : int, optional
         Bytes that may be taken on the device.
+    takers : dict, optional
+        What takes pictures of volumes and clouds alone, by the `id` of the object; the caller keeps it for its next
+        scenes and closes what is in it.  Objects are not looked at then, and there is no `box`.
 
     Raises
     ------
@@ -104,11 +107,13 @@ class ScenePictures(Closing):
         *,
         device: Device | str | int | None = None,
         memory: int | None = None,
+        takers: dict[int, VolumeRenderer | PointPictures] | None = None,
     ):
         check_memory(memory)
         check_objects(objects)
         self.memory = memory
-        self.box = _box_of(objects)
+        if takers is None:
+            self.box = _box_of(objects)
         self._parts: list[MeshPart] = []
         self._objects = list(objects)
         for subject, style in objects:
@@ -119,12 +124,14 @@ class ScenePictures(Closing):
             raise UsageError(f"a picture shows at most {MOST_TRIANGLES:,} triangles, these are {self._triangles:,}")
         self._stack = ExitStack()
         self._device = take_device(device)
-        self._takers: dict[int, VolumeRenderer | PointPictures] = {}
+        self._is_own = takers is None
+        self._takers: dict[int, VolumeRenderer | PointPictures] = {} if takers is None else takers
 
     def close(self) -> None:
         """Free what was made for the pictures."""
         self._stack.close()
-        self._takers.clear()
+        if self._is_own:
+            self._takers.clear()
         self._parts = []
 
     @property
@@ -190,8 +197,8 @@ class ScenePictures(Closing):
 
     def _taker(self, place: int) -> VolumeRenderer | PointPictures:
         """Return what takes pictures of an object alone; it stays open."""
-        if place not in self._takers:
-            subject = self._objects[place][0]
+        subject = self._objects[place][0]
+        if id(subject) not in self._takers:
             opened: VolumeRenderer | PointPictures
             if isinstance(subject, PointCloud):
                 opened = PointPictures(subject, device=self._device.current, memory=self.memory)
@@ -200,9 +207,10 @@ class ScenePictures(Closing):
                 own = None if isinstance(subject, DeviceVolume) else self._device.current
                 memory = None if isinstance(subject, DeviceVolume) else self.memory
                 opened = VolumeRenderer(subject, device=own, memory=memory)
-            self._stack.enter_context(opened)
-            self._takers[place] = opened
-        return self._takers[place]
+            if self._is_own:
+                self._stack.enter_context(opened)
+            self._takers[id(subject)] = opened
+        return self._takers[id(subject)]
 
     def _draw_alone(
         self, place: int, style: PointLook | SurfaceLook, camera: Camera, size: tuple[int, int]

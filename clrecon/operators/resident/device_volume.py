@@ -259,6 +259,11 @@ class DeviceVolume(Closing):
                 self._taken = labels, resample_labels(labels, self.volume)
             return self._taken[1]
 
+    def place(self, labels: LabelMap, placed: ResampledLabels) -> None:
+        """Take a label map whose place on the grid of the volume is known: `bring` returns it until another comes."""
+        with self._lock:
+            self._taken = labels, placed
+
     # Slabs
 
     @property

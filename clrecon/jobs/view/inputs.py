@@ -1,0 +1,191 @@
+"""Inputs of a view: scans, meshes, clouds and a label map, each read by what the other jobs read it with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.jobs.distance.inputs import read_side
+from clrecon.jobs.mesh.labels import open_labels
+from clrecon.jobs.shared.clouds import is_cloud_file, refuse_other_clouds
+from clrecon.jobs.shared.cropping import crop_labels
+from clrecon.jobs.shared.masking import mask_volume
+from clrecon.jobs.view.settings import ViewSettings
+from clrecon.mesh import Mesh
+from clrecon.mesh.reader import MESH_INPUTS
+from clrecon.reading import read_selected
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.text import escape_text
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+    from clrecon.labels import LabelMap
+    from clrecon.points import PointCloud
+
+__all__ = ["OpenedInput", "open_inputs"]
+
+_MOST_LABELS = 1000
+"""Values up to which whole numbers from 0 are taken for labels; air of a CT is negative."""
+
+_LEAST_EMPTY = 0.2
+"""Least share of voxels without a label."""
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedInput:
+    """What was read of an input.
+
+    Attributes
+    ----------
+    subject : Volume, Mesh, PointCloud or LabelMap
+        In LPS mm.
+    said : tuple of str
+        What has to be said of it: its certificate's warnings, the frame that it was turned from.
+    """
+
+    subject: Volume | Mesh | PointCloud | LabelMap
+    said: tuple[str, ...] = ()
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+def open_inputs(
+    inputs: Sequence[str | Path],
+    settings: ViewSettings | None = None,
+    *,
+    progress: Progress | None = None,
+    ready: Callable[[OpenedInput], None] | None = None,
+) -> list[OpenedInput]:
+    """Read the inputs of a view, and the label map of its settings as the last one.
+
+    Parameters
+    ----------
+    inputs : sequence of path
+        Scans as `clrecon.read_volume` takes them, meshes as `clrecon.read_mesh`, clouds as `clrecon.read_points`, and
+        label maps in files of volumes.
+    settings : ViewSettings, optional
+        How scans are read, masked and cropped, and the label map.
+    progress : callable, optional
+    ready : callable, optional
+        Called with each input as soon as it is read.
+
+    Raises
+    ------
+    UsageError, NoDicomError, RefusedInputError, DeviceError
+        An input cannot be read; files of meshes and clouds are read before scans, so that a wrong one is said at once.
+    """
+    settings, tell = settings or ViewSettings(), progress or ignore_progress
+    labels = settings.scan.labels
+    if not inputs and labels is None:
+        raise UsageError("there is nothing to show: name a scan, a mesh, a cloud or a label map")
+    kinds = [_tell_kind(path) for path in inputs]
+    if labels is not None and kinds.count("scan") > 1:
+        raise UsageError(f"a label map belongs to one scan, {kinds.count('scan')} are given")
+    readers: dict[str, Callable[[str | Path], OpenedInput]] = {
+        "mesh": partial(_open_mesh, space=settings.mesh_space),
+        "cloud": partial(_open_cloud, space=settings.mesh_space),
+        "scan": partial(_open_scan, settings=settings, progress=tell),
+    }
+    found: dict[int, OpenedInput] = {}
+    for place in sorted(range(len(inputs)), key=lambda place: kinds[place] == "scan"):
+        tell("read", len(found), len(inputs))
+        found[place] = readers[kinds[place]](inputs[place])
+        if ready is not None:
+            ready(found[place])
+    made = [found[place] for place in range(len(inputs))]
+    if labels is not None:
+        made.append(_open_labels(settings, next((each.subject for each in made if _is_scan(each)), None)))
+        if ready is not None:
+            ready(made[-1])
+    return made
+
+
+def _is_scan(opened: OpenedInput) -> bool:
+    from clrecon.geometry import Volume
+
+    return isinstance(opened.subject, Volume)
+
+
+def _tell_kind(path: str | Path) -> str:
+    """Return "mesh", "cloud" or "scan" by the extension; a PLY file with faces is a mesh."""
+    file = Path(path)
+    refuse_other_clouds(file)
+    suffix = file.suffix.lower()
+    if suffix not in MESH_INPUTS and not is_cloud_file(file):
+        return "scan"
+    if not file.is_file():
+        raise UsageError(f"{escape_text(file.name)}: there is no file of that name")
+    if suffix == ".ply":
+        from clrecon.exchange.clouds.read_ply import read_header
+
+        with file.open("rb") as stream:
+            elements = read_header(stream, escape_text(file.name)).elements
+        return "mesh" if any(each.name == "face" and each.count for each in elements) else "cloud"
+    return "mesh" if suffix in MESH_INPUTS else "cloud"
+
+
+def _describe_frame(name: str, file: dict[str, Any]) -> tuple[str, ...]:
+    turned = () if file["space"] == "LPS" else (f"{name} was turned from {file['space']} to LPS",)
+    return (*turned, *file["warnings"])
+
+
+def _open_mesh(path: str | Path, space: str | None) -> OpenedInput:
+    mesh = read_side(path, space)
+    name = escape_text(Path(path).name)
+    if not mesh.triangle_count:
+        raise RefusedInputError(f"{name} has no triangle: there is nothing to show")
+    return OpenedInput(mesh, _describe_frame(name, mesh.report["file"]), dict(mesh.report["file"]))
+
+
+def _open_cloud(path: str | Path, space: str | None) -> OpenedInput:
+    from clrecon.points.reader import read_points
+
+    cloud = read_points(path)
+    if space is not None and cloud.report["file"]["space_from"] == "assumed":
+        cloud = read_points(path, space=space)
+    file = cloud.report["file"]
+    return OpenedInput(cloud, _describe_frame(escape_text(Path(path).name), file), dict(file))
+
+
+def _open_scan(path: str | Path, settings: ViewSettings, progress: Progress) -> OpenedInput:
+    """Read a scan, and mask and crop it; a file of whole numbers from 0 is a label map."""
+    scan = settings.scan
+    volume = read_selected(path, scan, progress=progress)
+    if _holds_labels(volume):
+        from clrecon.labels import read_labels
+
+        labels = read_labels(path)
+        name = escape_text(Path(path).name)
+        return OpenedInput(
+            labels, (f"{name} is taken for a label map: its values are whole numbers from 0", *labels.warnings)
+        )
+    volume = mask_volume(volume, scan, progress)
+    if scan.crop is not None or scan.region or scan.preprocess is not None:
+        from clrecon.jobs.shared.preprocess import preprocess_volume
+        from clrecon.jobs.shared.region import restrict_volume
+        from clrecon.operators import take_device
+
+        device = take_device(scan.device)
+        volume = restrict_volume(volume, scan, device, [], progress)
+        volume = preprocess_volume(volume, scan, device, [], progress)
+    return OpenedInput(volume, tuple(volume.report.get("warnings", ())), dict(volume.report))
+
+
+def _holds_labels(volume: Volume) -> bool:
+    """True for whole numbers from 0, many of them 0, as no scan in HU has."""
+    if volume.voxels.dtype.kind not in "iu" or volume.report.get("source") == "DICOM":
+        return False
+    low, high = volume.hu_range or (0.0, 0.0)
+    if low != 0.0 or not 1.0 <= high <= _MOST_LABELS:
+        return False
+    return float((volume.voxels == 0).mean()) >= _LEAST_EMPTY
+
+
+def _open_labels(settings: ViewSettings, scan: Any) -> OpenedInput:
+    labels = open_labels(settings.scan.labels, scan)
+    assert labels is not None
+    labels = crop_labels(labels, settings.scan.crop, settings.scan.space)
+    return OpenedInput(labels, labels.warnings)

@@ -1,0 +1,251 @@
+"""`ChangingView`: the state of a view, its camera and its parts, with every change as a step of undo."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from clrecon.errors import UsageError
+from clrecon.geometry.affine import Float64Array
+from clrecon.rendering.looks.label_style import distinct_colors
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.directions import checked_vector
+from clrecon.system.text import say_unknown
+from clrecon.viewer.framing import fit_camera
+from clrecon.viewer.gestures import pan_camera, roll_camera, turn_camera, zoom_camera
+from clrecon.viewer.objects import ShownObject
+from clrecon.viewer.parts import FoundParts, carry_looks
+from clrecon.viewer.state import Color, ShownPart, ViewState, as_point
+
+__all__ = ["ChangingView", "checked_numbers"]
+
+MOST_UNDO = 200
+"""Changes that can be taken back."""
+
+SAME_GESTURE_S = 1.0
+"""Changes of one kind that follow each other within this time are one step of undo."""
+
+_GESTURES = frozenset(
+    {"turn", "pan", "zoom", "roll", "iso", "window", "picture", "cross", "scroll", "opacity", "color", "move"}
+)
+"""First words of the kinds of changes that come many at a time."""
+
+
+class ChangingView:
+    """What `clrecon.viewer.model.ViewModel` is made of.
+
+    Parameters
+    ----------
+    objects : tuple of ShownObject
+    state : ViewState
+        At the start.
+    clock : callable
+        Seconds, see `SAME_GESTURE_S`.
+    """
+
+    def __init__(self, objects: tuple[ShownObject, ...], state: ViewState, clock: Callable[[], float] = monotonic):
+        self.objects, self.state = objects, state
+        self.version = 0
+        self.aspect = 1.0
+        self._clock, self._undo = clock, list[tuple[ViewState, str]]()
+        self._last = ("", -math.inf)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera, LPS mm."""
+        return self.state.camera
+
+    # Camera
+
+    def turn(self, dx: float, dy: float) -> None:
+        """Turn as if the pointer held what is seen; half a turn over the height of the picture."""
+        self._change("turn", "the turn", camera=turn_camera(self.camera, *checked_numbers("a turn", dx, dy)))
+
+    def pan(self, dx: float, dy: float) -> None:
+        """Shift what is seen by shares of the picture's height, to the right and down."""
+        self._change("pan", "the shift", camera=pan_camera(self.camera, *checked_numbers("a shift", dx, dy)))
+
+    def zoom(self, factor: float, at: tuple[float, float] = (0.0, 0.0)) -> None:
+        """Show everything larger by a factor; what is seen at `at` stays there.
+
+        Parameters
+        ----------
+        at : (x, y)
+            From the middle of the picture to the right and down, in shares of its height.
+        """
+        (factor,) = checked_numbers("the factor of a zoom", factor)
+        x, y = checked_numbers("the place of a zoom", *at)
+        self._change("zoom", "the zoom", camera=zoom_camera(self.camera, factor, (x, y)))
+
+    def roll(self, degrees: float) -> None:
+        """Turn the picture clockwise."""
+        self._change("roll", "the roll", camera=roll_camera(self.camera, *checked_numbers("a roll", degrees)))
+
+    def look(self, view: str | Sequence[float] = "anterior") -> None:
+        """Look from a side of the patient, so that what is shown fits; see `clrecon.Camera.fit` for the sides."""
+        parallel = self.camera.is_parallel
+        camera = fit_camera(self._shown_corners(), view, self.aspect, None if parallel else self.camera.view_angle)
+        self._change("look", f"the view {view if isinstance(view, str) else ''}".strip(), camera=camera)
+
+    def set_perspective(self, on: bool) -> None:
+        """Take a perspective camera, or a parallel one, with the same size at the focal point."""
+        camera = self.camera
+        if on == (not camera.is_parallel):
+            return
+        if on:
+            angle = 30.0
+            away = float(camera.parallel_scale or 1.0) / math.tan(math.radians(0.5 * angle))
+            place = np.array(camera.focal_point) - away * camera.basis().forward
+            made = replace(camera, position=as_point(place), parallel_scale=None, view_angle=angle)
+        else:
+            made = replace(camera, parallel_scale=camera.half_height() * camera.distance, view_angle=None)
+        self._change("perspective", "the perspective", camera=made)
+
+    # Parts
+
+    def show(self, key: str, visible: bool) -> None:
+        """Show or hide a part."""
+        part = self._part(key)
+        self._change_part(part, f"the part {part.name}", visible=bool(visible))
+
+    def only(self, key: str) -> None:
+        """Show one part and hide all others; an object as a whole with all of its parts."""
+        chosen = self._part(key)
+        parts = []
+        for each in self.state.parts:
+            with_it = each.key == key or (each.object == chosen.object and (each.is_whole or chosen.is_whole))
+            parts.append(replace(each, visible=with_it))
+        self._change("only", f"the choice of {chosen.name}", parts=tuple(parts))
+
+    def show_all(self) -> None:
+        """Show all parts."""
+        self._change("show all", "the choice", parts=tuple(replace(each, visible=True) for each in self.state.parts))
+
+    def set_color(self, key: str, rgb: Sequence[float] | None) -> None:
+        """Give a part a colour, three numbers from 0 to 1; None: as it looks by itself."""
+        part = self._part(key)
+        color: Color | None = None
+        if rgb is not None:
+            red, green, blue = checked_vector("a colour", rgb)
+            if not (0.0 <= min(red, green, blue) and max(red, green, blue) <= 1.0):
+                raise UsageError(f"a colour is red, green and blue from 0 to 1, not {red:g}, {green:g}, {blue:g}")
+            color = (red, green, blue)
+        if part.kind == "rest" and color is not None:
+            raise UsageError(f"{part.name} keeps the colours of the mode: it can be hidden, and made translucent")
+        self._change_part(part, f"the colour of {part.name}", f"color {key}", color=color)
+
+    def color_parts(self, distinct: bool = True) -> None:
+        """Give every part of scans a colour of its own, or none."""
+        numbered = [each for each in self.state.parts if each.kind == "cluster"]
+        if not numbered:
+            raise UsageError("the parts of the scan are not found yet")
+        table = distinct_colors(len(numbered)) if distinct else None
+        colors = {each.key: None if table is None else as_point(table[place]) for place, each in enumerate(numbered)}
+        parts = tuple(
+            replace(each, color=colors[each.key]) if each.key in colors else each for each in self.state.parts
+        )
+        self._change("colors", "the colours", parts=parts)
+
+    def set_opacity(self, key: str, value: float) -> None:
+        """Make a part translucent: 0 to 1; at 0 it is not seen, but stays in the list as shown."""
+        part = self._part(key)
+        (opacity,) = checked_numbers("an opacity", value)
+        if not 0.0 <= opacity <= 1.0:
+            raise UsageError(f"an opacity is a number from 0 to 1, not {opacity:g}")
+        self._change_part(part, f"the opacity of {part.name}", f"opacity {key}", opacity=opacity)
+
+    def take_parts(self, found: Sequence[FoundParts]) -> None:
+        """Take the parts of scans that were found; those that were hidden, coloured or translucent stay so.
+
+        This is not a step of undo: nothing else is seen than before.
+        """
+        numbers = {each.scan for each in found}
+        kept = [each for each in self.state.parts if each.is_whole or each.object not in numbers]
+        for one in found:
+            old = [each for each in self.state.parts if each.object == one.scan and not each.is_whole]
+            fresh = carry_looks(old, one)
+            at = next(place for place, each in enumerate(kept) if each.object == one.scan and each.is_whole)
+            kept[at + 1 : at + 1] = fresh
+        self.state = replace(self.state, parts=tuple(kept), parts_at=found[0].iso_value, parts_table=found[0].table)
+        self.version += 1
+
+    # Undo
+
+    def undo(self) -> str | None:
+        """Take the last change back; returns what it was, None where there is nothing to take back."""
+        if not self._undo:
+            return None
+        before, words = self._undo.pop()
+        self.state = before
+        self._last = ("", -math.inf)
+        self.version += 1
+        return words
+
+    # How changes are made
+
+    def _change(self, kind: str, words: str, **changes: Any) -> None:
+        """Make a change that can be undone; those of one gesture are one step."""
+        made = replace(self.state, **changes)
+        if made == self.state:
+            return
+        now = self._clock()
+        last_kind, last_time = self._last
+        goes_on = kind == last_kind and kind.split(" ")[0] in _GESTURES and now - last_time <= SAME_GESTURE_S
+        if not goes_on:
+            self._undo.append((self.state, words))
+            del self._undo[:-MOST_UNDO]
+        self._last = (kind, now)
+        self.state = made
+        self.version += 1
+
+    def _change_part(self, part: ShownPart, words: str, kind: str = "part", **changes: Any) -> None:
+        made = replace(part, **changes)
+        parts = tuple(made if each.key == part.key else each for each in self.state.parts)
+        self._change(kind, words, parts=parts)
+
+    def _part(self, key: str) -> ShownPart:
+        part = self.state.part(key)
+        if part is None:
+            raise UsageError(say_unknown("part", key, [each.key for each in self.state.parts]))
+        return part
+
+    def _shown_corners(self) -> Float64Array:
+        """Return points around what is shown."""
+        state, corners = self.state, []
+        for each in self.objects:
+            whole = state.whole(each.number)
+            if whole is not None and not whole.visible:
+                continue
+            own = [part for part in state.parts_of(each.number) if part.box is not None]
+            boxes = [part.box for part in own if part.visible and part.box is not None]
+            some = boxes and len(boxes) < len(own) and state.mode == "surface"
+            corners.append(np.array(boxes, dtype=np.float64).reshape(-1, 3) if some else each.corners)
+        if not corners:
+            corners = [each.corners for each in self.objects]
+        points = np.concatenate(corners)
+        if state.clip_box is not None:
+            points = np.clip(points, *np.array(state.clip_box))
+        return points
+
+
+def checked_numbers(what: str, *values: Any) -> list[float]:
+    """Return finite numbers as floats.
+
+    Raises
+    ------
+    UsageError
+        One is not; the message begins with `what`.
+    """
+    found = []
+    for value in values:
+        is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+        number = float(value) if is_number else math.nan
+        if not math.isfinite(number):
+            raise UsageError(f"{what} is a finite number, not {value!r:.40}")
+        found.append(number)
+    return found

@@ -1,0 +1,184 @@
+"""The table of commands of a view: name, checked arguments, and the method that each calls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from clrecon.errors import UsageError
+from clrecon.system.text import say_unknown
+
+__all__ = ["COMMANDS", "Command", "check_command"]
+
+MOST_TEXT = 200
+"""Characters of a name in a command."""
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError("a number")
+    return float(value)
+
+
+def _whole(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or int(value) != value:
+        raise TypeError("a whole number")
+    return int(value)
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str) or len(value) > MOST_TEXT:
+        raise TypeError("a name")
+    return value
+
+
+def _flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise TypeError("true or false")
+    return value
+
+
+def _numbers(count: int) -> Callable[[Any], tuple[float, ...]]:
+    def check(value: Any) -> tuple[float, ...]:
+        if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != count:
+            raise TypeError(f"{count} numbers")
+        return tuple(_number(each) for each in value)
+
+    return check
+
+
+def _size(value: Any) -> tuple[int, int]:
+    if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
+        raise TypeError("width and height")
+    width, height = (_whole(each) for each in value)
+    return width, height
+
+
+def _direction(value: Any) -> str | tuple[float, ...]:
+    return _text(value) if isinstance(value, str) else _numbers(3)(value)
+
+
+def _view(value: Any) -> str | tuple[float, ...]:
+    return _text(value) if isinstance(value, str) else _numbers(2)(value)
+
+
+def _or_none(check: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return lambda value: None if value is None else check(value)
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command.
+
+    Attributes
+    ----------
+    words : str
+        What it does.
+    needs, takes : mapping of str to callable
+        Arguments that must be there, and those that may be, with the check of each.
+    call : callable
+        Called with the session and the checked arguments; a mapping that it returns is added to the facts.
+    """
+
+    words: str
+    needs: Mapping[str, Callable[[Any], Any]]
+    takes: Mapping[str, Callable[[Any], Any]]
+    call: Callable[..., Any]
+
+
+COMMANDS: dict[str, Command] = {}
+
+
+def _model(command: str, words: str, method: str, /, *, takes: Mapping[str, Any] | None = None, **needs: Any) -> None:
+    """Add a command that is a method of the model, with arguments of the same names."""
+
+    def call(session: Any, **given: Any) -> None:
+        getattr(session.model, method)(**given)
+
+    COMMANDS[command] = Command(words, needs, takes or {}, call)
+
+
+def _session(command: str, words: str, method: str, /, *, takes: Mapping[str, Any] | None = None, **needs: Any) -> None:
+    """Add a command that is a method of the session."""
+
+    def call(session: Any, **given: Any) -> Any:
+        return getattr(session, method)(**given)
+
+    COMMANDS[command] = Command(words, needs, takes or {}, call)
+
+
+_model("turn", "turn about the middle, in shares of the height", "turn", dx=_number, dy=_number)
+_model("pan", "shift what is seen, in shares of the height", "pan", dx=_number, dy=_number)
+_model("zoom", "show larger; at: from the middle, in shares of the height", "zoom",
+       factor=_number, takes={"at": _numbers(2)})  # fmt: skip
+_model("roll", "turn the picture clockwise, degrees", "roll", degrees=_number)
+_model("look", "look from a side of the patient, or azimuth and elevation", "look", view=_view)
+_model("set_perspective", "a perspective or a parallel camera", "set_perspective", on=_flag)
+_model("set_iso", "iso value of the surfaces, HU", "set_iso", hu=_number)
+_model("set_mode", "what scans are shown as", "set_mode", name=_text)
+_model("set_window", "HU of black and white; of: slices or picture", "set_window",
+       low=_number, high=_number, takes={"of": _text})  # fmt: skip
+_session("set_table", "show or take away table and blankets", "set_table", shown=_flag)
+_model("scroll", "move a slice by steps of its voxels", "scroll", plane=_text, steps=_number)
+_model("set_cross", "move the slices to a place, LPS mm", "set_cross", point=_numbers(3))
+_session("find_parts", "find the parts of the scans at the iso value", "find_parts")
+_model("show", "show or hide a part", "show", key=_text, visible=_flag)
+_model("only", "show one part alone", "only", key=_text)
+_model("show_all", "show all parts", "show_all")
+_model("set_color", "colour of a part, 0 to 1; null: its own", "set_color", key=_text, rgb=_or_none(_numbers(3)))
+_model("color_parts", "a colour for each part of scans", "color_parts", takes={"distinct": _flag})
+_model("set_opacity", "opacity of a part, 0 to 1", "set_opacity", key=_text, value=_number)
+_AT = {"x": _number, "y": _number, "size": _size}
+_session("pick", "what is seen at a pixel; plane: of a slice", "pick", takes={"plane": _or_none(_text)}, **_AT)
+_session("hide_at", "hide the part at a pixel", "hide_at", takes={"plane": _or_none(_text)}, **_AT)
+_session("only_at", "show the part at a pixel alone", "only_at", takes={"plane": _or_none(_text)}, **_AT)
+_session("cross_at", "move the slices to what is seen at a pixel", "cross_at", takes={"plane": _or_none(_text)}, **_AT)
+_session("add_point", "add what is seen at a pixel to the tool", "add_point", takes={"plane": _or_none(_text)}, **_AT)
+_model("start_tool", "take points for: distance, angle, curve, seed", "start_tool", name=_text)
+_model("end_tool", "put the tool away; a curve is made", "end_tool")
+_model("clear_measures", "drop all measures", "clear_measures")
+_model("add_clip", "cut with a plane towards a side", "add_clip", direction=_direction)
+_model("move_clip", "move a plane, 0 to 1", "move_clip", n=_whole, share=_number)
+_model("flip_clip", "take the other side of a plane away", "flip_clip", n=_whole)
+_model("remove_clip", "drop a plane", "remove_clip", n=_whole)
+_model("set_clip_box", "show a box, LPS mm; null: all", "set_clip_box",
+       low=_or_none(_numbers(3)), high=_or_none(_numbers(3)))  # fmt: skip
+_session("undo", "take the last change back", "undo")
+_session("save", "write what is shown; the extension says as what", "save_to", path=_text, takes={"size": _size})
+_session("cancel", "stop the work in the background", "cancel")
+_session("dismiss", "drop the words of the last error", "dismiss")
+
+
+def check_command(command: Any) -> tuple[Command, dict[str, Any]]:
+    """Return the command that a mapping names, and its checked arguments.
+
+    Raises
+    ------
+    UsageError
+        It is no mapping with a known ``"do"``, an argument is missing, unknown or of the wrong kind.
+    """
+    if not isinstance(command, Mapping):
+        raise UsageError(f'a command is a mapping such as {{"do": "undo"}}, not {type(command).__name__}')
+    name = command.get("do")
+    if not isinstance(name, str) or name not in COMMANDS:
+        raise UsageError(say_unknown("command", name, COMMANDS))
+    found = COMMANDS[name]
+    given = {key: value for key, value in command.items() if key != "do"}
+    known = {**found.needs, **found.takes}
+    for key in given:
+        if key not in known:
+            raise UsageError(
+                f"the command {name} has no argument {str(key)!r:.60}: {', '.join(known) or 'it takes none'}"
+            )
+    missing = [key for key in found.needs if key not in given]
+    if missing:
+        raise UsageError(f"the command {name} needs {', '.join(missing)}")
+    checked = {}
+    for key, value in given.items():
+        try:
+            checked[key] = known[key](value)
+        except (TypeError, ValueError, OverflowError) as error:
+            wanted = str(error) if isinstance(error, TypeError) else "a number"
+            raise UsageError(f"{key} of the command {name} is {wanted}, not {value!r:.60}") from None
+    return found, checked

@@ -1,0 +1,386 @@
+"""`ViewModel`: the state of one view, and every change of it; no toolkit, no drawing, no thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from clrecon.errors import UsageError
+from clrecon.geometry import frame_from_lps
+from clrecon.geometry.affine import Float64Array
+from clrecon.rendering.pictures.annotations import edge_letters
+from clrecon.rendering.pictures.styles import DEFAULT_ISO_VALUE
+from clrecon.rendering.views.clip import Clip
+from clrecon.rendering.views.directions import checked_vector
+from clrecon.rendering.views.plane import PLANES
+from clrecon.system.text import say_hu, say_unknown
+from clrecon.viewer.changes import ChangingView, checked_numbers
+from clrecon.viewer.first_state import find_iso_range, first_parts
+from clrecon.viewer.framing import fit_camera, plane_step
+from clrecon.viewer.modes import SLICE_WINDOW, ViewMode, find_modes
+from clrecon.viewer.objects import ShownLabels, ShownObject, ShownScan
+from clrecon.viewer.state import Box, Point, ShownPart, ViewState, as_point
+from clrecon.viewer.tools import POINTS_OF, TOOLS, ClipPlane, Measure, Pick, clip_direction, measure_points
+
+__all__ = ["ViewModel"]
+
+
+class ViewModel(ChangingView):
+    """The state of one view.
+
+    Every change is a method, and can be undone.  It is not safe for several threads at once: `ViewSession` locks it.
+
+    Parameters
+    ----------
+    objects : sequence of ShownObject
+    space : {"lps", "ras"}
+        Frame in which places are said; everything in here is LPS mm.
+    iso_value : float, optional
+        HU; default: 200, or the nearest value that the slider has.
+    clock : callable
+        Seconds, see `SAME_GESTURE_S`.
+
+    Attributes
+    ----------
+    state : ViewState
+    version : int
+        Grows with each change.
+    aspect : float
+        Width of the picture by its height, for views that fit.
+    iso_range : (float, float)
+        HU at the ends of the slider.
+
+    Raises
+    ------
+    UsageError
+        There is no object, or the space is unknown.
+    """
+
+    def __init__(
+        self,
+        objects: Sequence[ShownObject],
+        *,
+        space: str = "lps",
+        iso_value: float | None = None,
+        clock: Callable[[], float] = monotonic,
+    ) -> None:
+        if not objects:
+            raise UsageError("there is nothing to show")
+        self.space, self.signs = space, np.diag(frame_from_lps(space))
+        scans = [each for each in objects if isinstance(each, ShownScan)]
+        self.iso_range = find_iso_range(scans)
+        low, high = self.iso_range
+        corners = np.concatenate([each.corners for each in objects])
+        middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+        only_labels = not scans and any(isinstance(each, ShownLabels) for each in objects)
+        first = ViewState(
+            camera=fit_camera(corners, "anterior", 1.0),
+            mode="labels" if only_labels else "surface",
+            iso_value=min(high, max(low, DEFAULT_ISO_VALUE)) if iso_value is None else iso_value,
+            window=SLICE_WINDOW,
+            cross=as_point(middle),
+            parts=tuple(first_parts(objects)),
+        )
+        super().__init__(tuple(objects), first, clock)
+
+    # What there is
+
+    @property
+    def scans(self) -> list[ShownScan]:
+        """The scans."""
+        return [each for each in self.objects if isinstance(each, ShownScan)]
+
+    @property
+    def label_maps(self) -> list[ShownLabels]:
+        """The label maps."""
+        return [each for each in self.objects if isinstance(each, ShownLabels)]
+
+    @property
+    def modes(self) -> dict[str, ViewMode]:
+        """The modes that mean something for these objects, by name."""
+        every = find_modes()
+        if self.scans:
+            return {name: mode for name, mode in every.items() if name != "labels" or self.label_maps}
+        return {"labels": every["labels"]} if self.label_maps else {"surface": every["surface"]}
+
+    @property
+    def mode(self) -> str:
+        """Name of the mode."""
+        return self.state.mode
+
+    @property
+    def iso_value(self) -> float:
+        """HU of the surfaces of all scans."""
+        return self.state.iso_value
+
+    @property
+    def cross(self) -> Point:
+        """Where the three slices go through, LPS mm."""
+        return self.state.cross
+
+    @property
+    def parts(self) -> list[ShownPart]:
+        """All parts, those of a scan once they are found."""
+        return list(self.state.parts)
+
+    @property
+    def tool(self) -> str | None:
+        """The tool that takes the next points."""
+        return self.state.tool
+
+    @property
+    def measures(self) -> list[Measure]:
+        """What was measured."""
+        return list(self.state.measures)
+
+    @property
+    def clips(self) -> list[ClipPlane]:
+        """The clip planes."""
+        return list(self.state.clips)
+
+    @property
+    def clip(self) -> Clip | None:
+        """The part of space that is shown; None: all."""
+        return self.state.clip
+
+    def snapshot(self) -> ViewState:
+        """Return the state, which is frozen."""
+        return self.state
+
+    # What is shown of scans
+
+    def set_iso(self, hu: float) -> None:
+        """Set the iso value of all scans, HU.
+
+        Raises
+        ------
+        UsageError
+            It is not a number within `iso_range`.
+        """
+        (value,) = checked_numbers("the iso value", hu)
+        low, high = self.iso_range
+        if not self.scans:
+            raise UsageError("there is no scan: nothing has an iso value")
+        if not low <= value <= high:
+            raise UsageError(f"the iso value runs from {say_hu(low)} to {say_hu(high)} HU here, not to {say_hu(value)}")
+        self._change("iso", f"the iso value {say_hu(self.iso_value)} HU", iso_value=value)
+
+    def set_mode(self, name: str) -> None:
+        """Set the mode, one of `modes`."""
+        if name not in self.modes:
+            raise UsageError(say_unknown("mode", name, self.modes))
+        self._change("mode", f"the mode {self.mode}", mode=name, picture_window=None)
+
+    def set_window(self, low: float, high: float, of: str = "slices") -> None:
+        """Set the HU that are black and white.
+
+        Parameters
+        ----------
+        of : {"slices", "picture"}
+            The three slices, or the projection.
+        """
+        low, high = checked_numbers("a window", low, high)
+        if not low < high:
+            raise UsageError(f"a window runs from black to white, the lower HU first, not from {low:g} to {high:g}")
+        if of == "picture":
+            mode = self.modes[self.mode]
+            if mode.kind not in ("projection", "slices"):
+                raise UsageError(f"the mode {self.mode} has no window: mip, minip, drr and slices have one")
+            self._change("picture window", "the window", picture_window=(low, high))
+        elif of == "slices":
+            self._change("window", "the window", window=(low, high))
+        else:
+            raise UsageError(say_unknown("window", of, ("slices", "picture")))
+
+    def set_table(self, shown: bool) -> None:
+        """Show the table and the blankets, or the body alone."""
+        if not self.scans:
+            raise UsageError("there is no scan: there is no table to take away")
+        self._change("table", "the table", table=bool(shown))
+
+    def scroll(self, plane: str, steps: float) -> None:
+        """Move the cross through a plane, by the distance of the voxels there; positive steps go away from the eye."""
+        if plane not in PLANES:
+            raise UsageError(say_unknown("plane", plane, PLANES))
+        (count,) = checked_numbers("steps", steps)
+        step = plane_step(self.scans, plane)
+        low, high = self._span()
+        moved = np.clip(np.array(self.cross) + count * step, low, high)
+        self._change(f"scroll {plane}", "the slice", cross=as_point(moved))
+
+    def set_cross(self, point: Sequence[float]) -> None:
+        """Move the cross to a place, LPS mm; outside of everything it goes to the nearest place within."""
+        low, high = self._span()
+        place = np.clip(np.array(checked_vector("the cross", point)), low, high)
+        self._change("cross", "the place of the slices", cross=as_point(place))
+
+    # Tools
+
+    def start_tool(self, name: str) -> None:
+        """Let the next points be those of a tool; points of an unfinished measure are dropped."""
+        if name not in TOOLS:
+            raise UsageError(say_unknown("tool", name, TOOLS))
+        self._change("tool", f"the tool {name}", tool=name, points=())
+
+    def add_point(self, pick: Pick) -> Measure | None:
+        """Add a point to the tool; returns the measure that it completes."""
+        tool = self.state.tool
+        if tool is None:
+            raise UsageError(f"no tool takes points: start one of {', '.join(TOOLS)} first")
+        points = (*self.state.points, pick)
+        if len(points) != POINTS_OF[tool]:
+            self._change("point", "the point", points=points)
+            return None
+        made = measure_points(tool, [each.point for each in points])
+        self._change("point", f"the {tool}", points=(), measures=(*self.state.measures, made))
+        return made
+
+    def end_tool(self) -> Measure | None:
+        """Put the tool away; the points of a curve become a measure, other unfinished points are dropped."""
+        tool, points = self.state.tool, [each.point for each in self.state.points]
+        if tool is None:
+            return None
+        made = measure_points(tool, points) if tool == "curve" and len(points) > 1 else None
+        measures = self.state.measures if made is None else (*self.state.measures, made)
+        self._change("end tool", f"the end of the {tool}", tool=None, points=(), measures=measures)
+        return made
+
+    def clear_measures(self) -> None:
+        """Drop all measures."""
+        self._change("clear measures", "the measures", measures=(), points=())
+
+    @property
+    def curve(self) -> list[Point]:
+        """Points of the curve that is being made, else of the last one; LPS mm."""
+        return list(self.state.curve)
+
+    # Clips
+
+    def add_clip(self, direction: str | Sequence[float]) -> None:
+        """Cut with a plane half way along a direction; the side that the direction points to is taken away.
+
+        Parameters
+        ----------
+        direction : str or (x, y, z)
+            A side of the patient, "view" for the side of the camera, or a vector in LPS.
+        """
+        if direction == "view":
+            direction = (-self.camera.basis().forward).tolist()
+        towards, name = clip_direction(direction)
+        heights = np.concatenate([each.corners for each in self.objects]) @ np.array(towards)
+        plane = ClipPlane(direction=towards, name=name, low=float(heights.min()), high=float(heights.max()), share=0.5)
+        self._change("clips", "the clip plane", clips=(*self.state.clips, plane))
+
+    def move_clip(self, n: int, share: float) -> None:
+        """Move the plane of number n (from 0): 0 at the one end of what is shown, 1 at the other."""
+        plane = self._clip(n)
+        (value,) = checked_numbers("the place of a clip plane", share)
+        if not 0.0 <= value <= 1.0:
+            raise UsageError(f"the place of a clip plane is a share from 0 to 1, not {value:g}")
+        self._set_clip(n, replace(plane, share=value), f"move clip {n}")
+
+    def flip_clip(self, n: int) -> None:
+        """Take the other side of the plane of number n away."""
+        plane = self._clip(n)
+        self._set_clip(n, replace(plane, flipped=not plane.flipped), "flip")
+
+    def remove_clip(self, n: int) -> None:
+        """Drop the plane of number n."""
+        self._clip(n)
+        self._change("clips", "the clip plane", clips=(*self.state.clips[:n], *self.state.clips[n + 1 :]))
+
+    def set_clip_box(self, low: Sequence[float] | None, high: Sequence[float] | None) -> None:
+        """Show what lies in a box along the axes of the patient, LPS mm; None: no box."""
+        box: Box | None = None
+        if low is not None and high is not None:
+            box = checked_vector("the corner of a clip box", low), checked_vector("the corner of a clip box", high)
+            Clip.box(*box)
+        elif not (low is None and high is None):
+            raise UsageError("a clip box has two corners, or none")
+        self._change("clip box", "the clip box", clip_box=box)
+
+    # What panels show
+
+    def facts(self) -> dict[str, Any]:
+        """Return all that panels show, for JSON; places are in `space`, those for other commands in LPS."""
+        state = self.state
+        mode = self.modes[state.mode]
+        return {
+            "version": self.version,
+            "space": self.space.upper(),
+            "objects": [
+                {"number": each.number, "name": each.name, "kind": each.kind, "said": list(each.said)}
+                for each in self.objects
+            ],
+            "modes": [{"name": each.name, "words": each.words} for each in self.modes.values()],
+            "mode": state.mode,
+            "iso": {"hu": state.iso_value, "low": self.iso_range[0], "high": self.iso_range[1]} if self.scans else None,
+            "window": list(state.window),
+            "picture_window": list(state.picture_window or mode.window or ()) or None,
+            "table": state.table,
+            "cross": [round(value, 3) for value in state.cross],
+            "cross_text": self._say_place(state.cross),
+            "parts": [each.describe() for each in state.parts],
+            "parts_known": self.parts_known,
+            "tool": state.tool,
+            "points": [each.describe() for each in state.points],
+            "measures": [
+                {**each.describe(), "text": self._say_place(each.points[0]) if each.kind == "seed" else each.text}
+                for each in state.measures
+            ],
+            "clips": [each.describe() for each in state.clips],
+            "clip_box": None if state.clip_box is None else [list(corner) for corner in state.clip_box],
+            "letters": edge_letters(state.camera),
+            "camera": {
+                "position": list(state.camera.position),
+                "focal_point": list(state.camera.focal_point),
+                "up": list(state.camera.up),
+                "parallel": state.camera.is_parallel,
+                "height_mm": 2.0
+                * state.camera.half_height()
+                * (1.0 if state.camera.is_parallel else state.camera.distance),
+            },
+            "undo": self._undo[-1][1] if self._undo else None,
+            "notes": self._notes(mode),
+        }
+
+    @property
+    def parts_known(self) -> bool:
+        """True where the parts of the scans are those of the iso value and the table as they are now."""
+        state = self.state
+        divided = [each.within for each in self.label_maps]
+        is_new = state.parts_at == state.iso_value and state.parts_table == state.table
+        return is_new or all(each.number in divided for each in self.scans)
+
+    def _notes(self, mode: ViewMode) -> list[str]:
+        """Return what is not shown as one might think."""
+        notes = []
+        hidden = [each.name for each in self.objects if each.kind != "labels"][1:]
+        if not mode.joins and hidden:
+            notes.append(f"a picture of mode {mode.name} shows one scan alone: {', '.join(hidden)} left out")
+        elif mode.kind in ("volume", "slices") and len(self.scans) > 1:
+            others = ", ".join(each.name for each in self.scans[1:])
+            notes.append(f"one scan is shown in mode {mode.name}, {others} by the surface")
+        return notes
+
+    def _say_place(self, point: Sequence[float]) -> str:
+        place = self.signs * np.array(point) + 0.0
+        return f"{', '.join(f'{value:.1f}' for value in place)} mm {self.space.upper()}"
+
+    def _set_clip(self, n: int, plane: ClipPlane, kind: str) -> None:
+        clips = (*self.state.clips[:n], plane, *self.state.clips[n + 1 :])
+        self._change(kind, "the clip plane", clips=clips)
+
+    def _clip(self, n: int) -> ClipPlane:
+        count = len(self.state.clips)
+        if isinstance(n, bool) or not isinstance(n, int) or not 0 <= n < count:
+            raise UsageError(f"there is no clip plane {n!r}: there are {count}, numbered from 0")
+        return self.state.clips[n]
+
+    def _span(self) -> tuple[Float64Array, Float64Array]:
+        corners = np.concatenate([each.corners for each in self.scans or self.objects])
+        return corners.min(axis=0), corners.max(axis=0)

@@ -1,0 +1,411 @@
+"""`Painter`: pictures of states of a view on the device, for any number of views of the same objects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import Cancelled, UsageError
+from clrecon.geometry import Volume
+from clrecon.labels.resample import ResampledLabels
+from clrecon.mesh import Mesh
+from clrecon.opencl import Device
+from clrecon.operators.rays.scene import ScenePictures
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.points import PointCloud
+from clrecon.rendering import Rendering
+from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, SlicesInSpace, Style, VolumeLook
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.directions import checked_size
+from clrecon.rendering.views.plane import PLANES, find_plane
+from clrecon.system.progress import Progress
+from clrecon.system.text import say_unknown
+from clrecon.viewer.coarse import coarsen_mesh
+from clrecon.viewer.gestures import pixel_camera
+from clrecon.viewer.looks import LEAST_OPACITY, LabelledLook, Looks, to_voxels
+from clrecon.viewer.modes import ViewMode, find_modes
+from clrecon.viewer.objects import ShownCloud, ShownLabels, ShownMesh, ShownObject, ShownScan
+from clrecon.viewer.shown_meshes import make_meshes
+from clrecon.viewer.stage import Stage
+from clrecon.viewer.state import ShownPart, ViewState
+from clrecon.viewer.tools import Pick
+from clrecon.viewer.warming import warm_kernels
+
+__all__ = ["Painter", "never"]
+
+SMALLEST_SIDE = 64
+"""Pixels of the shorter side of a coarse picture."""
+
+COARSE_STEP_VOXELS = 2.0
+"""Ray step of coarse pictures by volume rendering."""
+
+MOST_FOUND = 6
+"""Sets of parts that are kept, of all views together."""
+
+COARSE_TRIANGLES = 200_000
+"""Meshes with more triangles are drawn by a coarse one while anything moves."""
+
+
+def never() -> bool:
+    """Return False: not cancelled."""
+    return False
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """An object with its look."""
+
+    number: int
+    subject: DeviceVolume | Mesh | PointCloud
+    style: Style
+    labelled: LabelledLook | None = None
+
+
+class Painter(Stage):
+    """Draws states of views; safe for several threads and views, which take turns.
+
+    Use it as a context manager, or `close` it.
+
+    Parameters
+    ----------
+    objects : sequence of ShownObject
+    device : Device, str or int, optional
+        See `clrecon.device`; None is the best of the machine.
+    memory : int, optional
+        Bytes that may be taken on the device.  A scan that does not fit goes through in slabs, which is slow.
+
+    Raises
+    ------
+    DeviceError
+        The device does not exist.
+    """
+
+    def __init__(
+        self, objects: Sequence[ShownObject], *, device: Device | str | int | None = None, memory: int | None = None
+    ):
+        super().__init__(objects, device=device, memory=memory)
+        self._looks = Looks()
+        self._scene: tuple[tuple[Any, ...], ScenePictures] | None = None
+        self._coarse: dict[int, Mesh] = {}
+
+    def close(self) -> None:
+        """Free everything on the device."""
+        with self.lock:
+            if self._scene is not None:
+                self._scene[1].close()
+                self._scene = None
+            super().close()
+
+    # Pictures
+
+    def picture(
+        self,
+        state: ViewState,
+        size: Sequence[int],
+        *,
+        sharp: bool = True,
+        share: float = 1.0,
+        cancelled: Callable[[], bool] = never,
+    ) -> Rendering:
+        """Take the picture of a state.
+
+        Parameters
+        ----------
+        state : ViewState
+        size : (width, height)
+        sharp : bool
+            False: coarse meshes, translucent ones opaque, longer steps in volume rendering.
+        share : float
+            Of a coarse picture, its width as a share of `size`.
+        cancelled : callable
+            True ends the work with `Cancelled`.
+
+        Returns
+        -------
+        Rendering
+            With a transparent background; ``depth`` in mm, NaN where there is nothing.  A coarse one is smaller than
+            `size`.  ``report["ms"]`` is the time it took, that of waiting for other views not counted.
+        """
+        width, height = checked_size(size)
+        if not sharp:
+            share = min(1.0, max(share, SMALLEST_SIDE / min(width, height)))
+            width, height = max(1, round(share * width)), max(1, round(share * height))
+        with self.lock:
+            _stop(cancelled)
+            begun = perf_counter()
+            made = self._take(self._drawn(state, sharp), state, (width, height), cancelled)
+            made.report["ms"] = 1000.0 * (perf_counter() - begun)
+            made.report["sharp"] = sharp
+            return made
+
+    def slice(self, state: ViewState, plane: str, size: Sequence[int]) -> Rendering:
+        """Cut a slice through the cross.
+
+        Parameters
+        ----------
+        plane : {"axial", "coronal", "sagittal"}
+
+        Returns
+        -------
+        Rendering
+            Its camera maps pixels to LPS and back; empty where there is no scan.
+        """
+        width, height = checked_size(size)
+        with self.lock:
+            found = self._sliced(state)
+            if found is None:
+                return self._empty(state, (width, height), "slice", self.slice_camera(state, plane, (width, height)))
+            resident, labelled = found
+            camera = self.slice_camera(state, plane, (width, height))
+            style = self._looks.plane(state, labelled, 0.0)
+            self.place(resident, labelled)
+            try:
+                return self.renderer(resident).render(style, camera=camera, size=(width, height))
+            except UsageError:  # the cross lies beside an oblique scan
+                return self._empty(state, (width, height), "slice", camera)
+
+    def slice_camera(self, state: ViewState, plane: str, size: Sequence[int]) -> Camera:
+        """Return the camera of a slice: its focal point lies in the slice, so that places can be told from pixels."""
+        if plane not in PLANES:
+            raise UsageError(say_unknown("plane", plane, PLANES))
+        found = self._sliced(state)
+        grid = found[0].volume if found is not None else _box_grid(self.objects)
+        camera = find_plane(grid, plane, size)
+        forward = camera.basis().forward
+        shift = float(forward @ np.subtract(state.cross, camera.focal_point)) * forward
+        return replace(
+            camera,
+            position=_triple(np.add(camera.position, shift)),
+            focal_point=_triple(np.add(camera.focal_point, shift)),
+        )
+
+    # Places
+
+    def pick(self, state: ViewState, size: Sequence[int], x: float, y: float) -> Pick | None:
+        """Return what is seen at a place of the picture, None where nothing is.
+
+        One ray is sent through the place; the nearest object is taken.
+
+        Parameters
+        ----------
+        size : (width, height)
+        x, y : float
+            Pixels from the top left corner of a picture of this size; the first pixel's centre is (0.5, 0.5).
+        """
+        camera = pixel_camera(state.camera, checked_size(size), x, y)
+        nearest: tuple[float, _Drawn] | None = None
+        with self.lock:
+            for drawn in self._drawn(state, sharp=True):
+                made = self._take([drawn], state, (1, 1), never, camera)
+                hazy = isinstance(drawn.style, VolumeLook | SlicesInSpace)
+                depth = float((made.expected_depth if hazy else made.depth)[0, 0])
+                if np.isfinite(depth) and (nearest is None or depth < nearest[0]):
+                    nearest = depth, drawn
+            if nearest is None:
+                return None
+            depth, drawn = nearest
+            origins, directions = camera.rays((1, 1))
+            point = _triple(origins[0, 0] + depth * directions[0, 0])
+            part = self._part_at(drawn, point)
+            return Pick(point=point, object=drawn.number, part=part, hu=self.hu_at(point))
+
+    def pick_slice(self, state: ViewState, plane: str, size: Sequence[int], x: float, y: float) -> Pick:
+        """Return the place at a pixel of a slice."""
+        camera = self.slice_camera(state, plane, checked_size(size))
+        spot = pixel_camera(camera, checked_size(size), x, y)
+        point = spot.focal_point
+        with self.lock:
+            key, number = None, None
+            found = self._sliced(state)
+            if found is not None and found[1] is not None:
+                key = _key_of(found[1], self._number_at(found[0], found[1], point))
+                part = state.part(key) if key else None
+                number = None if part is None else part.object
+            return Pick(point=point, object=number, part=key, hu=self.hu_at(point))
+
+    def _part_at(self, drawn: _Drawn, point: tuple[float, float, float]) -> str:
+        labelled = drawn.labelled
+        if labelled is None or not isinstance(drawn.subject, DeviceVolume):
+            return str(drawn.number)
+        key = _key_of(labelled, self._number_at(drawn.subject, labelled, point))
+        return key or str(drawn.number)
+
+    def _number_at(self, resident: DeviceVolume, labelled: LabelledLook, point: tuple[float, float, float]) -> int:
+        voxels = self.labels_on(resident, labelled)
+        ijk = np.rint(resident.volume.lps_to_ijk([point])[0]).astype(np.int64)
+        if (ijk < 0).any() or (ijk >= resident.volume.shape_ijk).any():
+            return 0
+        i, j, k = ijk
+        return int(voxels[k, j, i])
+
+    def mesh_of_shown(self, state: ViewState, progress: Progress | None = None) -> list[Mesh]:
+        """Make the meshes of what is shown, see `clrecon.viewer.saving`."""
+        return make_meshes(self, state, progress)
+
+    def curve_picture(self, state: ViewState, size: Sequence[int]) -> Rendering:
+        """Straighten the first scan along the curve of the tool, or the last one that was made.
+
+        Raises
+        ------
+        UsageError
+            There is no scan, or no curve of two points and more.
+        """
+        scan = next((each for each in self.objects if isinstance(each, ShownScan)), None)
+        if scan is None:
+            raise UsageError("there is no scan: a picture along a curve needs one")
+        if len(state.curve) < 2:
+            raise UsageError("a picture along a curve needs two points and more: pick them with the tool curve")
+        with self.lock:
+            renderer = self.renderer(self.resident(scan.number, state))
+            return renderer.render(CurveCut(list(state.curve), window=state.window), size=checked_size(size))
+
+    def prepare(self, progress: Progress | None = None) -> None:
+        """Build the kernels of the surface picture, the slices and the extraction, that of bricks too.
+
+        The second extraction from a volume uses bricks, whose kernels would be built at the first move of the slider.
+        """
+        warm_kernels(self.objects, self.device, progress)
+
+    def make_coarse(self, cancelled: Callable[[], bool] = never) -> None:
+        """Make the coarse meshes that are drawn while anything moves, once."""
+        for each in self.objects:
+            if isinstance(each, ShownMesh) and each.mesh.triangle_count > COARSE_TRIANGLES:
+                if each.number not in self._coarse:
+                    _stop(cancelled)
+                    self._coarse[each.number] = coarsen_mesh(each.mesh, COARSE_TRIANGLES)
+
+    def _drawn(self, state: ViewState, sharp: bool) -> list[_Drawn]:
+        """Return what a state shows, with looks; the first scan first."""
+        mode = find_modes()[state.mode]
+        made: list[_Drawn] = []
+        for each in self.objects:
+            whole = state.whole(each.number)
+            if whole is None or not whole.visible:
+                continue
+            if isinstance(each, ShownScan):
+                if mode.kind == "labels" or (made and not mode.joins):
+                    continue
+                used = mode if not any(isinstance(one.subject, DeviceVolume) for one in made) else _SURFACE
+                made.append(self._drawn_scan(each, state, used, whole, sharp))
+            elif not mode.joins:
+                continue
+            elif isinstance(each, ShownMesh):
+                if whole.opacity >= LEAST_OPACITY:
+                    mesh = each.mesh if sharp else self._coarse.get(each.number, each.mesh)
+                    made.append(_Drawn(each.number, mesh, self._looks.mesh(state, whole, opaque=not sharp)))
+            elif isinstance(each, ShownCloud):
+                made.append(_Drawn(each.number, each.cloud, self._looks.cloud(state, whole)))
+            elif isinstance(each, ShownLabels) and (mode.kind == "labels" or each.within is None):
+                made.append(self._drawn_labels(each, state, whole, sharp))
+        return made
+
+    def _drawn_scan(self, scan: ShownScan, state: ViewState, mode: ViewMode, whole: ShownPart, sharp: bool) -> _Drawn:
+        resident = self.resident(scan.number, state)
+        labelled = self.labelled(scan.number, state)
+        coarse = None if sharp or mode.kind == "surface" else COARSE_STEP_VOXELS * min(resident.volume.spacing)
+        used = labelled
+        if labelled is not None and labelled.is_plain:
+            used = None
+        if used is None and whole.opacity < 1.0:
+            used = self.blank_labels(scan.number, resident.volume)
+        if mode.kind not in ("surface", "volume"):
+            used = None
+        style = self._looks.scan(state, mode, whole, used, coarse)
+        return _Drawn(scan.number, resident, style, used or labelled)
+
+    def _drawn_labels(self, shown: ShownLabels, state: ViewState, whole: ShownPart, sharp: bool) -> _Drawn:
+        """Return a label map as the surface of its own voxels."""
+        if shown.number not in self._solid:
+            volume = Volume(to_voxels(shown.labels), shown.labels.affine.copy(), hu_range=(0, 1))
+            made = DeviceVolume(volume, device=self._device, memory=self.memory)
+            self._solid[shown.number] = made, ResampledLabels(shown.labels.voxels, True, {}, ())
+        resident, placed = self._solid[shown.number]
+        labelled = LabelledLook(shown.labels, placed, tuple(state.parts_of(shown.number)))
+        style = self._looks.scan(state, find_modes()["labels"], whole, labelled, None)
+        return _Drawn(shown.number, resident, style, labelled)
+
+    def _sliced(self, state: ViewState) -> tuple[DeviceVolume, LabelledLook | None] | None:
+        """Return the volume that slices are cut through: the first scan that is shown, else a label map."""
+        scans = [each for each in self.objects if isinstance(each, ShownScan)]
+        shown = [each for each in scans if (whole := state.whole(each.number)) is not None and whole.visible]
+        for scan in shown or scans:
+            return self.resident(scan.number, state), self.labelled(scan.number, state)
+        for each in self.objects:
+            if isinstance(each, ShownLabels):
+                whole = state.whole(each.number)
+                assert whole is not None
+                drawn = self._drawn_labels(each, state, whole, sharp=True)
+                assert isinstance(drawn.subject, DeviceVolume)
+                return drawn.subject, drawn.labelled
+        return None
+
+    def _take(
+        self,
+        drawn: list[_Drawn],
+        state: ViewState,
+        size: tuple[int, int],
+        cancelled: Callable[[], bool],
+        camera: Camera | None = None,
+    ) -> Rendering:
+        camera = camera or state.camera
+        if not drawn:
+            return self._empty(state, size, state.mode, camera)
+
+        def check(stage: str, done: int, total: int) -> None:
+            _stop(cancelled)
+
+        for each in drawn:
+            if isinstance(each.subject, DeviceVolume):
+                self.place(each.subject, each.labelled)
+        first = drawn[0]
+        if len(drawn) == 1 and isinstance(first.subject, DeviceVolume):
+            assert not isinstance(first.style, PlaneCut)
+            return self.renderer(first.subject).render(
+                first.style, camera=camera, size=size, background="transparent", progress=check
+            )
+        return self._open_scene(drawn).take(camera, size, None, check)
+
+    def _open_scene(self, drawn: Sequence[_Drawn]) -> ScenePictures:
+        """Return the scene of these objects and looks; the last one is kept."""
+        key = tuple((id(each.subject), id(each.style)) for each in drawn)
+        if self._scene is None or self._scene[0] != key:
+            if self._scene is not None:
+                self._scene[1].close()
+            objects = [(each.subject, each.style) for each in drawn]
+            made = ScenePictures(objects, device=self._device, memory=self.memory, takers=self._takers)
+            self._scene = key, made
+        return self._scene[1]
+
+    def _empty(self, state: ViewState, size: tuple[int, int], mode: str, camera: Camera) -> Rendering:
+        width, height = size
+        nothing: NDArray[np.float32] = np.full((height, width), np.nan, np.float32)
+        image = np.zeros((height, width, 4), np.uint8)
+        return Rendering(image, nothing, nothing.copy(), camera, None, mode, {"mode": mode, "warnings": []})
+
+
+_SURFACE = find_modes()["surface"]
+
+
+def _key_of(labelled: LabelledLook, number: int) -> str | None:
+    return next((part.key for part in labelled.parts if part.number == number), None)
+
+
+def _stop(cancelled: Callable[[], bool]) -> None:
+    if cancelled():
+        raise Cancelled
+
+
+def _box_grid(objects: Sequence[ShownObject]) -> Any:
+    from clrecon.operators.rays.mesh_pictures import box_around
+
+    return box_around([each.corners for each in objects])
+
+
+def _triple(vector: Any) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in vector)
+    return x, y, z

@@ -1,0 +1,250 @@
+"""Parts of a scan at an iso value: clusters of voxels that share faces, and the label map by which they are drawn.
+
+The label map lies on the scan's own grid.  A voxel at the iso value or above has the number of its cluster, 1 for the
+largest; the smaller ones have one number together.  Clusters are grown by one voxel, so that the surface, which lies
+between voxels, and what volume rendering shows of the edge belong to them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import NoSurfaceError
+from clrecon.labels import LabelMap
+from clrecon.labels.resample import ResampledLabels
+from clrecon.opencl import download
+from clrecon.operators.masks.mask import Mask
+from clrecon.operators.masks.runs import find_components
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.text import say_hu
+from clrecon.viewer.state import Box, Point, ShownPart
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+
+__all__ = ["MOST_CLUSTERS", "FoundParts", "carry_looks", "find_clusters", "grow_labels"]
+
+MOST_CLUSTERS = 20
+"""Clusters that are parts of their own."""
+
+SMALLER = MOST_CLUSTERS + 1
+"""Number of all others together."""
+
+STEPS = 5
+"""Steps of the search, as progress counts them."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FoundParts:
+    """The parts of a scan.
+
+    Attributes
+    ----------
+    scan : int
+        Number of the object.
+    iso_value : float
+        HU.
+    table : bool
+        True: of the scan with its table.
+    volume : Volume
+    labels : LabelMap
+        Clusters by number, grown by one voxel; 0 is all else.
+    placed : ResampledLabels
+        The same, on the grid of the scan.
+    parts : tuple of ShownPart
+        The clusters, the smaller ones together, and what lies below the iso value.
+    """
+
+    scan: int
+    iso_value: float
+    table: bool
+    volume: Volume
+    labels: LabelMap
+    placed: ResampledLabels
+    parts: tuple[ShownPart, ...]
+
+    def number_at(self, place: Point) -> int:
+        """Return the number of the part whose voxel is nearest to a place in LPS mm; 0 outside."""
+        ijk = np.rint(self.volume.lps_to_ijk([place])[0]).astype(np.int64)
+        if (ijk < 0).any() or (ijk >= self.volume.shape_ijk).any():
+            return 0
+        i, j, k = ijk
+        return int(self.labels.voxels[k, j, i])
+
+
+@dataclass(frozen=True, eq=False)
+class _Runs:
+    """Runs of voxels along i: cluster, row, first and last voxel of each."""
+
+    clusters: NDArray[np.int32]
+    rows: NDArray[np.int64]
+    first: NDArray[np.int64]
+    last: NDArray[np.int64]
+
+
+def find_clusters(
+    resident: DeviceVolume,
+    scan: int,
+    iso_value: float,
+    table: bool,
+    progress: Progress | None = None,
+    *,
+    lock: AbstractContextManager[Any] | None = None,
+) -> FoundParts:
+    """Find the parts of a scan.
+
+    Parameters
+    ----------
+    resident : DeviceVolume
+    scan : int
+        Number of the object.
+    iso_value : float
+        HU; voxels that are not lower are inside.
+    table : bool
+        See `FoundParts`.
+    progress : callable, optional
+        ``progress("parts", done, 5)``; what it raises ends the search.
+    lock : context manager, optional
+        Held while the device works, which is not most of the time.
+
+    Raises
+    ------
+    DeviceError
+        The device has no room for the runs of voxels, or it fails.
+    """
+    tell, volume = progress or ignore_progress, resident.volume
+    tell("parts", 0, STEPS)
+    with lock or nullcontext():
+        runs = _find_runs(resident, iso_value)
+    tell("parts", 1, STEPS)
+    lengths = runs.last - runs.first + 1
+    sizes = np.bincount(runs.clusters, weights=lengths).astype(np.int64)
+    order = np.argsort(-sizes, kind="stable")
+    numbers = np.full(len(sizes), SMALLER, np.uint8)
+    numbers[order[:MOST_CLUSTERS]] = np.arange(1, min(MOST_CLUSTERS, len(sizes)) + 1)
+    of_runs = numbers[runs.clusters]
+    voxels = _fill_runs(volume, runs, of_runs)
+    tell("parts", 2, STEPS)
+    grow_labels(voxels)
+    tell("parts", 3, STEPS)
+    parts = _describe_parts(volume, scan, iso_value, runs, of_runs, sizes)
+    tell("parts", 4, STEPS)
+    labels = LabelMap(voxels, volume.affine.copy())
+    tell("parts", STEPS, STEPS)
+    return FoundParts(
+        scan=scan, iso_value=iso_value, table=table, volume=volume, labels=labels,
+        placed=ResampledLabels(labels.voxels, True, {}, ()), parts=parts,
+    )  # fmt: skip
+
+
+def _find_runs(resident: DeviceVolume, iso_value: float) -> _Runs:
+    """Find runs of voxels at the iso value or above, and their clusters; none where no voxel is so high."""
+    nothing = np.empty(0, np.int64)
+    try:
+        mask = Mask.from_band(resident, (iso_value, np.inf))
+    except NoSurfaceError:
+        return _Runs(nothing.astype(np.int32), nothing, nothing, nothing)
+    found = find_components(mask.device, mask.bits, memory=resident.memory)
+    count, rows = found.runs.count, mask.bits.rows
+    if not count:
+        return _Runs(nothing.astype(np.int32), nothing, nothing, nothing)
+    clusters = download(mask.device, np.empty(count, np.int32), found.numbers_d)
+    columns = download(mask.device, np.empty((count, 2), np.uint16), found.runs.runs_d)
+    counts = download(mask.device, np.empty(rows + 1, np.uint32), found.runs.row_counts_d).astype(np.int64)
+    of_rows = np.repeat(np.arange(rows, dtype=np.int64), np.diff(counts))
+    return _Runs(clusters, of_rows, columns[:, 0].astype(np.int64), columns[:, 1].astype(np.int64))
+
+
+def _fill_runs(volume: Volume, runs: _Runs, numbers: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Write the number of each run to its voxels: differences at the ends of runs, summed up along memory."""
+    ni = volume.shape_ijk[0]
+    steps = np.zeros(volume.voxels.size + 1, np.uint8)
+    steps[runs.rows * ni + runs.first] = numbers
+    steps[runs.rows * ni + runs.last + 1] -= numbers  # wraps round, as the sum does
+    return np.cumsum(steps[:-1], dtype=np.uint8, out=steps[:-1]).reshape(volume.voxels.shape)
+
+
+def grow_labels(voxels: NDArray[np.uint8]) -> None:
+    """Give voxels without a label that of a neighbour, over faces, edges and corners, in place."""
+    for axis in range(3):
+        turned = np.moveaxis(voxels, axis, 0)
+        before = turned.copy()
+        for here, there in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
+            np.copyto(turned[here], before[there], where=turned[here] == 0)
+
+
+def _describe_parts(
+    volume: Volume, scan: int, iso_value: float, runs: _Runs, numbers: NDArray[np.uint8], sizes: NDArray[np.int64]
+) -> tuple[ShownPart, ...]:
+    voxel_ml = abs(float(np.linalg.det(volume.affine[:3, :3]))) / 1000.0
+    nj = volume.shape_ijk[1]
+    lengths = runs.last - runs.first
+    parts = []
+    order = np.argsort(numbers, kind="stable")
+    ends = np.searchsorted(numbers[order], np.arange(SMALLER + 2))
+    for number in range(1, SMALLER + 1):
+        own = order[ends[number] : ends[number + 1]]
+        if not len(own):
+            continue
+        count = int((lengths[own] + 1).sum())
+        k, j = np.divmod(runs.rows[own], nj)
+        longest = int(np.argmax(lengths[own]))
+        middle = (runs.first[own][longest] + lengths[own][longest] // 2, j[longest], k[longest])
+        low, high = (runs.first[own].min(), j.min(), k.min()), (runs.last[own].max(), j.max(), k.max())
+        several = len(sizes) - MOST_CLUSTERS
+        name = f"part {number}" if number < SMALLER else f"{several:,} smaller part{'s' * (several > 1)}"
+        parts.append(
+            ShownPart(
+                key=f"{scan}/{number}",
+                name=name,
+                kind="cluster",
+                object=scan,
+                number=number,
+                ml=count * voxel_ml,
+                count=count,
+                box=_box_of(volume, low, high),
+                inside=_place(volume, middle),
+            )  # fmt: skip
+        )
+    below = f"below {say_hu(iso_value)} HU"
+    return (*parts, ShownPart(key=f"{scan}/0", name=below, kind="rest", object=scan, number=0))
+
+
+def _place(volume: Volume, ijk: Sequence[int]) -> Point:
+    x, y, z = volume.ijk_to_lps([ijk])[0].tolist()
+    return x, y, z
+
+
+def _box_of(volume: Volume, low: Sequence[int], high: Sequence[int]) -> Box:
+    """Return the box in LPS around a block of voxels, half a voxel more on each side."""
+    (i0, j0, k0), (i1, j1, k1) = low, high
+    corners = [(i, j, k) for i in (i0 - 0.5, i1 + 0.5) for j in (j0 - 0.5, j1 + 0.5) for k in (k0 - 0.5, k1 + 0.5)]
+    places = volume.ijk_to_lps(corners)
+    (x0, y0, z0), (x1, y1, z1) = places.min(axis=0).tolist(), places.max(axis=0).tolist()
+    return (x0, y0, z0), (x1, y1, z1)
+
+
+def carry_looks(old: Sequence[ShownPart], found: FoundParts) -> list[ShownPart]:
+    """Return found parts with the looks of those before them at another iso value.
+
+    A part is known again by a place within it; one that was hidden, coloured or translucent gives its look to the part
+    that holds this place now.
+    """
+    fresh = {part.number: part for part in found.parts}
+    for part in sorted(old, key=lambda each: -(each.count or 0)):
+        if part.is_plain:
+            continue
+        number = 0
+        if part.kind == "cluster":
+            number = SMALLER if part.number == SMALLER else 0 if part.inside is None else found.number_at(part.inside)
+        known = fresh.get(number)
+        if known is not None and known.is_plain and (number == 0) == (part.kind == "rest"):
+            fresh[number] = replace(known, color=part.color, opacity=part.opacity, visible=part.visible)
+    return list(fresh.values())

@@ -1,0 +1,186 @@
+"""What a view shows, written by the writers of meshes, clouds, volumes and pictures; the extension says as what."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.exchange.clouds.formats import CLOUD_FORMATS
+from clrecon.exchange.formats import ASSEMBLIES, FORMATS, stage_assembly
+from clrecon.formats.write_volume import FORMATS as VOLUME_FORMATS
+from clrecon.geometry import Volume
+from clrecon.mesh import Mesh
+from clrecon.operators.masks.mask import Mask
+from clrecon.points import PointCloud
+from clrecon.rendering.pictures.image_files import IMAGE_FORMATS
+from clrecon.system.progress import Progress
+from clrecon.system.text import count_of, escape_text
+from clrecon.viewer.objects import ShownCloud, ShownScan
+from clrecon.viewer.painter import Painter
+from clrecon.viewer.state import ViewState
+
+__all__ = ["KINDS", "check_target", "save_shown", "shown_volume"]
+
+KINDS: dict[str, tuple[str, ...]] = {
+    "picture": tuple(IMAGE_FORMATS),
+    "mesh": tuple(FORMATS),
+    "cloud": tuple(CLOUD_FORMATS),
+    "volume": tuple(VOLUME_FORMATS),
+}
+"""What is written, and the extensions of its files; those of meshes and clouds both are meshes where one is shown."""
+
+
+def check_target(path: str | os.PathLike[str], painter: Painter, state: ViewState) -> str:
+    """Return as what a file is written, a key of `KINDS`.
+
+    Raises
+    ------
+    UsageError
+        The extension is unknown, or there is nothing of this kind.
+    """
+    name = Path(path).name.lower()
+    found = [kind for kind, endings in KINDS.items() if any(name.endswith(ending) for ending in endings)]
+    if not found:
+        known = "; ".join(f"{kind}: {', '.join(endings)}" for kind, endings in KINDS.items())
+        raise UsageError(f"{escape_text(Path(path).name)}: the extension says as what it is written ({known})")
+    shown = [each for each in painter.objects if (whole := state.whole(each.number)) is not None and whole.visible]
+    kind = found[0]
+    if kind == "mesh" and "cloud" in found and shown and all(isinstance(each, ShownCloud) for each in shown):
+        kind = "cloud"
+    if kind == "volume" and not any(isinstance(each, ShownScan) for each in painter.objects):
+        raise UsageError("there is no scan: a file of a volume needs one")
+    if kind == "mesh" and not [each for each in shown if not isinstance(each, ShownCloud)]:
+        raise UsageError("nothing that has a surface is shown: show a part first, or write a cloud or a picture")
+    return kind
+
+
+def save_shown(
+    path: str | os.PathLike[str],
+    painter: Painter,
+    state: ViewState,
+    *,
+    size: Sequence[int] = (1024, 1024),
+    space: str = "lps",
+    keep_ids: bool = False,
+    progress: Progress | None = None,
+) -> list[str]:
+    """Write what is shown; returns lines that say what was written.
+
+    Raises
+    ------
+    UsageError, NoSurfaceError, OutputError, DeviceError
+        After any of them no file is written, and an older one is intact.
+    """
+    kind = check_target(path, painter, state)
+    name = escape_text(Path(path).name)
+    if kind == "picture":
+        made = painter.picture(state, size, sharp=True)
+        made = made.with_background("black").annotated(letters=True, scale_bar=True)
+        written = made.save(path)
+        return [f"{name}: picture of {made.size[0]} x {made.size[1]} pixels, {_megabytes(written)}"]
+    if kind == "volume":
+        volume = shown_volume(painter, state, progress)
+        ni, nj, nk = volume.shape_ijk
+        written = volume.save(path, keep_ids=keep_ids, progress=progress)
+        return [f"{name}: volume of {ni} x {nj} x {nk} voxels, {_megabytes(written)}"]
+    if kind == "cloud":
+        cloud = shown_cloud(painter, state, progress)
+        written = cloud.save(path, space, keep_ids=keep_ids)
+        return [f"{name}: {count_of(len(cloud), 'point')}, {_megabytes(written)}"]
+    meshes = painter.mesh_of_shown(state, progress)
+    triangles = sum(mesh.triangle_count for mesh in meshes)
+    if Path(path).suffix.lower() in ASSEMBLIES and len(meshes) > 1:
+        with stage_assembly(meshes, path, space, keep_ids=keep_ids) as staged:
+            staged.commit()
+        written = staged.size
+    else:
+        written = _join(meshes).save(path, space, keep_ids=keep_ids)
+    return [f"{name}: {count_of(len(meshes), 'mesh', 'meshes')}, {triangles:,} triangles, {_megabytes(written)}"]
+
+
+def shown_volume(painter: Painter, state: ViewState, progress: Progress | None = None) -> Volume:
+    """Return the first scan that is shown, with air where a part is hidden or cut off, cropped to the clip box."""
+    scans = [each for each in painter.objects if isinstance(each, ShownScan)]
+    shown = [each for each in scans if (whole := state.whole(each.number)) is not None and whole.visible]
+    scan = (shown or scans)[0]
+    resident = painter.resident(scan.number, state)
+    volume = resident.volume
+    kept = None
+    labelled = painter.labelled(scan.number, state)
+    if labelled is not None and not all(part.visible for part in labelled.parts):
+        with painter.lock:
+            voxels = painter.labels_on(resident, labelled)
+        wanted = np.ones(int(voxels.max()) + 1, np.bool_)
+        wanted[[part.number for part in labelled.parts if not part.visible and part.number <= int(voxels.max())]] = (
+            False
+        )
+        kept = wanted[voxels]
+    if state.clips:
+        within = np.empty(volume.voxels.shape, np.bool_)
+        planes = np.array([each.row for each in state.clips])
+        _, nj, ni = volume.voxels.shape
+        for layer, origin in zip(within, volume.slice_origins(), strict=True):
+            layer[...] = True
+            for *normal, offset in planes.tolist():
+                along_i, along_j = np.array(normal) @ volume.affine[:3, :2]
+                start = float(np.dot(normal, origin)) - offset
+                layer &= start + along_j * np.arange(nj)[:, None] + along_i * np.arange(ni) >= 0.0
+        kept = within if kept is None else kept & within
+    if kept is not None:
+        chosen = Mask.from_array(volume, kept, device=painter.device, memory=painter.memory)
+        volume = chosen.apply(volume)
+    if state.clip_box is not None:
+        (x0, y0, z0), (x1, y1, z1) = state.clip_box
+        volume = volume.crop(clip_box=(x0, x1, y0, y1, z0, z1))
+    return volume
+
+
+def shown_cloud(painter: Painter, state: ViewState, progress: Progress | None = None) -> PointCloud:
+    """Return the points of the clouds that are shown; without one the vertices of what has a surface.
+
+    Raises
+    ------
+    NoSurfaceError
+        Nothing is shown.
+    """
+    clouds = []
+    for each in painter.objects:
+        whole = state.whole(each.number)
+        if isinstance(each, ShownCloud) and whole is not None and whole.visible:
+            clip = state.clip
+            clouds.append(each.cloud if clip is None else each.cloud.select(clip.contains(each.cloud.points)))
+    if not clouds:
+        meshes = painter.mesh_of_shown(state, progress)
+        clouds = [PointCloud(mesh.vertices, mesh.normals, report=dict(mesh.report)) for mesh in meshes]
+    if not sum(map(len, clouds)):
+        raise NoSurfaceError("no point is shown: nothing is written")
+    if len(clouds) == 1:
+        return clouds[0]
+    arrays: dict[str, Any] = {}
+    for name in ("normals", "hu", "labels"):
+        values = [getattr(cloud, name) for cloud in clouds]
+        if all(value is not None for value in values):
+            arrays[name] = np.concatenate(values)
+    return PointCloud(np.concatenate([cloud.points for cloud in clouds]), **arrays)
+
+
+def _join(meshes: Sequence[Mesh]) -> Mesh:
+    """Return several meshes as one, for formats that hold one."""
+    if len(meshes) == 1:
+        return meshes[0]
+    starts = np.cumsum([0, *(mesh.vertex_count for mesh in meshes[:-1])])
+    normals = None
+    if all(mesh.normals is not None for mesh in meshes):
+        normals = np.concatenate([mesh.normals for mesh in meshes])  # type: ignore[misc]
+    triangles = [mesh.triangles.astype(np.int64) + start for mesh, start in zip(meshes, starts, strict=True)]
+    report = {key: value for key, value in meshes[0].report.items() if key not in ("part_name", "color")}
+    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(triangles), normals, report)
+
+
+def _megabytes(size: int) -> str:
+    return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"

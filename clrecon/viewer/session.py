@@ -1,0 +1,425 @@
+"""`ViewSession`: what a window or a browser holds: model, painter and worker, and nothing of a toolkit."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from clrecon.errors import ClreconError, UsageError
+from clrecon.opencl import Device
+from clrecon.rendering import Rendering
+from clrecon.rendering.views.directions import checked_size
+from clrecon.system.closing import Closing
+from clrecon.system.log import get_logger
+from clrecon.viewer.commands import check_command
+from clrecon.viewer.model import ViewModel
+from clrecon.viewer.objects import ShownObject
+from clrecon.viewer.painter import Painter
+from clrecon.viewer.saving import check_target, save_shown
+from clrecon.viewer.tools import Pick
+from clrecon.viewer.worker import Job, Worker
+
+__all__ = ["ViewSession"]
+
+log = get_logger(__name__)
+
+MOVING_MS = 40.0
+"""Time of a coarse picture that its size is steered to."""
+
+LEAST_SHARE = 0.15
+"""Least width of a coarse picture, as a share of the picture's."""
+
+FIRST_SHARE = 0.5
+
+LARGE_VOXELS = 1 << 31
+"""Voxels above which pictures are said to be slow."""
+
+_WORDS = {
+    "prepare": "building kernels",
+    "parts": "finding parts",
+    "table": "taking the table away",
+    "coarse": "making coarse meshes",
+    "save": "writing",
+}
+
+
+class ViewSession(Closing):
+    """One view.
+
+    Methods may be called from any thread.  Pictures come in a thread of the session, work that takes longer in another.
+
+    Parameters
+    ----------
+    objects : sequence of ShownObject
+    painter : Painter, optional
+        Shared with other views of the same objects; it stays open.  None: one of its own.
+    device, memory
+        Of its own painter.
+    space : {"lps", "ras"}
+        Frame in which places are said and saved.
+    iso_value : float, optional
+        HU at the start.
+    keep_ids : bool
+        Write hashes of UIDs into files.
+    on_change : callable, optional
+        Called, in any thread, when something happened that was not asked for by the caller just now: work began or
+        ended, parts were found, an error came.
+
+    Attributes
+    ----------
+    model : ViewModel
+    painter : Painter
+
+    Raises
+    ------
+    UsageError, DeviceError
+        There is nothing to show; the device does not exist.
+    """
+
+    def __init__(
+        self,
+        objects: Sequence[ShownObject],
+        painter: Painter | None = None,
+        *,
+        device: Device | str | int | None = None,
+        memory: int | None = None,
+        space: str = "lps",
+        iso_value: float | None = None,
+        keep_ids: bool = False,
+        on_change: Callable[[], None] | None = None,
+    ):
+        self.model = ViewModel(objects, space=space, iso_value=iso_value)
+        self._owns = painter is None
+        self.painter = Painter(objects, device=device, memory=memory) if painter is None else painter
+        self.keep_ids = keep_ids
+        self._lock = threading.RLock()
+        self._on_change = on_change
+        self._share = FIRST_SHARE
+        self._error: str | None = None
+        self._said: str | None = None
+        self._timing: dict[str, Any] = {}
+        self._closed = False
+        self._pictures = Worker("view-pictures", self._failed)
+        self._work = Worker("view-work", self._failed, self._changed)
+
+    def close(self) -> None:
+        """Cancel everything; within about a second."""
+        if self._closed:
+            return
+        self._closed = True
+        ended = [self._work.close(), self._pictures.close()]
+        if self._owns and all(ended):
+            self.painter.close()
+
+    # Pictures
+
+    def picture(self, size: Sequence[int], moving: bool, then: Callable[[Rendering], None]) -> None:
+        """Ask for the picture; the latest request wins.
+
+        Parameters
+        ----------
+        size : (width, height)
+        moving : bool
+            True: coarse, its width steered so that it takes 40 ms.  A coarse one that is drawn is always delivered, a
+            sharp one is dropped when the next is asked for.
+        then : callable
+            Called with the `Rendering` in a thread of the session.
+        """
+        width, height = checked_size(size)
+        with self._lock:
+            self.model.aspect = width / height
+            state = self.model.snapshot()
+
+        def take(job: Job) -> None:
+            with self._lock:
+                now, share = self.model.snapshot() if moving else state, self._share
+            made = self.painter.picture(now, (width, height), sharp=not moving, share=share, cancelled=job.cancelled)
+            if moving:
+                self._steer(made, (width, height))
+            with self._lock:
+                self._timing = {
+                    "ms": round(made.report["ms"], 1),
+                    "size": list(made.size),
+                    "sharp": not moving,
+                    "device": self.painter.device.label,
+                }
+            if not job.cancelled():
+                then(made)
+
+        self._pictures.ask("picture", take, rank=0, gives_way=not moving)
+
+    def slice(self, plane: str, size: Sequence[int], then: Callable[[Rendering], None]) -> None:
+        """Ask for a slice through the cross: "axial", "coronal" or "sagittal"; the latest of each plane wins."""
+        checked = checked_size(size)
+
+        def take(job: Job) -> None:
+            with self._lock:
+                state = self.model.snapshot()
+            made = self.painter.slice(state, plane, checked)
+            if not job.cancelled():
+                then(made)
+
+        self._pictures.ask(f"slice {plane}", take, rank=1, gives_way=False)
+
+    def curve_picture(self, size: Sequence[int], then: Callable[[Rendering], None]) -> None:
+        """Ask for the picture along the curve."""
+        checked = checked_size(size)
+        with self._lock:
+            state = self.model.snapshot()
+        self._pictures.ask(
+            "curve", lambda job: then(self.painter.curve_picture(state, checked)), rank=2, gives_way=False
+        )
+
+    def prepare(self) -> None:
+        """Build the kernels that are needed soon, and the coarse meshes, in the background."""
+        self._work.ask("prepare", lambda job: self.painter.prepare(job.progress), rank=0)
+        self._work.ask("coarse", lambda job: self.painter.make_coarse(job.cancelled), rank=1)
+
+    # Commands
+
+    def do(self, command: Mapping[str, Any]) -> dict[str, Any]:
+        """Do a command, such as ``{"do": "set_iso", "hu": 250}``; see `clrecon.viewer.commands.COMMANDS`.
+
+        Returns
+        -------
+        dict
+            `facts`, and what the command itself has to say: ``"pick"``, ``"undone"``, ``"measure"``.
+
+        Raises
+        ------
+        UsageError
+            The command or an argument is wrong; nothing is changed.
+        """
+        found, arguments = check_command(command)
+        with self._lock:
+            said = found.call(self, **arguments)
+            if self.model.parts_known and self.painter.has_parts(self.model.state):
+                self._work.cancel("parts")
+            return {**self.facts(), **(said if isinstance(said, dict) else {})}
+
+    def facts(self) -> dict[str, Any]:
+        """Return all that panels show, for JSON."""
+        with self._lock:
+            busy = [_WORDS.get(kind, kind) for kind in self._work.busy]
+            notes = self.model.facts()
+            return {
+                **notes,
+                "busy": busy,
+                "error": self._error,
+                "said": self._said,
+                "timing": self._timing,
+                "warnings": self._warnings(),
+            }
+
+    def rest(self) -> None:
+        """Say that nothing moves: parts that are hidden, coloured or listed are found again where they are outdated."""
+        with self._lock:
+            state = self.model.snapshot()
+            wanted = state.parts_at is not None or any(not part.is_plain for part in state.parts)
+            known = self.model.parts_known and self.painter.has_parts(state)
+        if wanted and not known and "parts" not in self._work.busy:
+            self.find_parts()
+
+    def find_parts(self, then: Callable[[], None] | None = None) -> None:
+        """Find the parts of the scans in the background; `then` is called in its thread with the lock held."""
+
+        def find(job: Job) -> None:
+            with self._lock:
+                state = self.model.snapshot()
+            found = self.painter.find_parts(state, job.progress)
+            with self._lock:
+                if job.cancelled():
+                    return
+                if found:
+                    self.model.take_parts(found)
+                if then is not None:
+                    then()
+            self._changed()
+
+        self._work.ask("parts", find, rank=2)
+
+    def set_table(self, shown: bool) -> None:
+        """Show the table, or take it away, which takes a moment the first time."""
+        if not self.model.scans:
+            raise UsageError("there is no scan: there is no table to take away")
+        self._work.cancel("table")
+        if shown or self.painter.knows_table:
+            self._apply_table(shown)
+            return
+
+        def remove(job: Job) -> None:
+            self.painter.remove_table(job.progress)
+            with self._lock:
+                if not job.cancelled():
+                    self._apply_table(False)
+            self._changed()
+
+        self._work.ask("table", remove, rank=3)
+
+    def _apply_table(self, shown: bool) -> None:
+        self.model.set_table(shown)
+        if not shown:
+            taken = self.painter.remove_table()
+            self._said = "; ".join(
+                f"{100.0 * facts['removed_share']:.3g} % of the voxels are air now, {facts['dense_voxels_removed']:,}"
+                " of them dense: look whether the body is whole"
+                for facts in taken.values()
+            )
+        self.rest()
+
+    def pick(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
+        """Return what is seen at a pixel of the picture, or of a slice."""
+        found = self._pick(x, y, size, plane)
+        return {"pick": None if found is None else found.describe()}
+
+    def cross_at(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
+        """Move the slices to what is seen at a pixel."""
+        found = self._pick(x, y, size, plane)
+        if found is not None:
+            self.model.set_cross(found.point)
+        return {"pick": None if found is None else found.describe()}
+
+    def add_point(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
+        """Add what is seen at a pixel to the tool that is used."""
+        found = self._pick(x, y, size, plane)
+        if found is None:
+            return {"pick": None, "measure": None}
+        made = self.model.add_point(found)
+        return {"pick": found.describe(), "measure": None if made is None else made.describe()}
+
+    def hide_at(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
+        """Hide the part at a pixel; parts that are not known yet are found first, in the background."""
+        return self._with_part(x, y, size, plane, lambda key: self.model.show(key, False))
+
+    def only_at(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
+        """Show the part at a pixel alone; see `hide_at`."""
+        return self._with_part(x, y, size, plane, self.model.only)
+
+    def undo(self) -> dict[str, Any]:
+        """Take the last change back."""
+        undone = self.model.undo()
+        self.rest()
+        return {"undone": undone}
+
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        then: Callable[[list[str]], None] | None = None,
+        size: Sequence[int] = (1024, 1024),
+    ) -> None:
+        """Write what is shown to a file, in the background; the extension says as what.
+
+        Parameters
+        ----------
+        path : path
+            See `clrecon.viewer.saving.KINDS`.
+        then : callable, optional
+            Called with lines that say what was written.
+        size : (width, height)
+            Of a picture.
+
+        Raises
+        ------
+        UsageError
+            The extension is unknown, or there is nothing of this kind.
+        """
+        checked = checked_size(size)
+        with self._lock:
+            state = self.model.snapshot()
+        check_target(path, self.painter, state)
+
+        def write(job: Job) -> None:
+            lines = save_shown(
+                path, self.painter, state, size=checked, space=self.model.space, keep_ids=self.keep_ids,
+                progress=job.progress,
+            )  # fmt: skip
+            with self._lock:
+                self._said = "; ".join(lines)
+            if then is not None:
+                then(lines)
+
+        self._work.ask("save", write, rank=1, gives_way=False)
+
+    def save_to(self, path: str, size: tuple[int, int] = (1024, 1024)) -> None:
+        """Write what is shown, see `save`; the facts say when it is written."""
+        self.save(path, size=size)
+
+    def cancel(self) -> None:
+        """Stop the work in the background."""
+        for kind in _WORDS:
+            if kind != "prepare":
+                self._work.cancel(kind)
+
+    def dismiss(self) -> None:
+        """Drop the words of the last error and of what was said."""
+        self._error = self._said = None
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until no work and no picture is under way; False where time ran out."""
+        return self._work.wait(timeout) and self._pictures.wait(timeout)
+
+    # Inside
+
+    def _pick(self, x: float, y: float, size: tuple[int, int], plane: str | None) -> Pick | None:
+        width, height = checked_size(size)
+        if not (0.0 <= x <= width and 0.0 <= y <= height):
+            raise UsageError(f"the pixel {x:g}, {y:g} lies outside of a picture of {width} x {height}")
+        state = self.model.snapshot()
+        if plane is not None:
+            return self.painter.pick_slice(state, plane, (width, height), x, y)
+        return self.painter.pick(state, (width, height), x, y)
+
+    def _with_part(
+        self, x: float, y: float, size: tuple[int, int], plane: str | None, apply: Callable[[str], None]
+    ) -> dict[str, Any]:
+        found = self._pick(x, y, size, plane)
+        if found is None:
+            return {"pick": None}
+        state = self.model.state
+        part = None if found.part is None else state.part(found.part)
+        divided = self.model.parts_known and self.painter.has_parts(state)
+        if divided or (part is not None and part.kind in ("mesh", "cloud", "label")):
+            if found.part is not None:
+                apply(found.part)
+            return {"pick": found.describe()}
+
+        def again() -> None:
+            at = self._pick(x, y, size, plane)
+            if at is not None and at.part is not None:
+                apply(at.part)
+
+        self.find_parts(again)
+        return {"pick": found.describe()}
+
+    def _steer(self, made: Rendering, size: tuple[int, int]) -> None:
+        """Choose the width of the next coarse picture by the time of this one."""
+        took = max(1.0, made.report["ms"])
+        share = made.size[0] / size[0] * math.sqrt(MOVING_MS / took)
+        with self._lock:
+            self._share = min(1.0, max(LEAST_SHARE, share))
+
+    def _warnings(self) -> list[str]:
+        said = [text for each in self.model.objects for text in each.said]
+        for scan in self.model.scans:
+            voxels = scan.volume.voxels
+            if voxels.nbytes > self.painter.device.memory_bytes // 2:
+                said.append(
+                    f"{scan.name} has {voxels.nbytes / 1e9:.3g} GB: it may go through the device in slabs, slowly"
+                )
+        return said
+
+    def _failed(self, kind: str, words: str) -> None:
+        log.warning("%s: %s", kind, words)
+        with self._lock:
+            self._error = words
+        self._changed()
+
+    def _changed(self) -> None:
+        if self._on_change is not None and not self._closed:
+            try:
+                self._on_change()
+            except ClreconError as error:  # a face that fails must not stop the work
+                log.warning("a view does not take news: %s", error)

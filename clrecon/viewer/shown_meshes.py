@@ -1,0 +1,176 @@
+"""Meshes of what a view shows: extracted at the iso value, without hidden parts, cut where it is clipped."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import NoSurfaceError
+from clrecon.geometry import Volume
+from clrecon.geometry.certificate import amend
+from clrecon.geometry.iso_rule import choose_iso_rule
+from clrecon.mesh import Mesh
+from clrecon.operators.surface.extract import extract_isosurface
+from clrecon.operators.surface.label_masks import extract_label_masks
+from clrecon.rendering.views.clip import Clip
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.viewer.coarse import select_triangles
+from clrecon.viewer.cutting import cut_mesh
+from clrecon.viewer.modes import find_modes
+from clrecon.viewer.objects import ShownLabels, ShownMesh, ShownScan
+from clrecon.viewer.stage import Stage
+from clrecon.viewer.state import Color, ShownPart, ViewState
+
+__all__ = ["clip_volume", "make_meshes", "number_vertices"]
+
+CUT_HU_PER_MM = 100.0
+"""Slope of the values across a cut: steep enough that whole HU place it to 0.005 mm."""
+
+
+def make_meshes(stage: Stage, state: ViewState, progress: Progress | None = None) -> list[Mesh]:
+    """Make the meshes of what is shown; scans by their surface at the iso value, whatever the mode.
+
+    Parts with colours of their own are meshes of their own, else a scan is one.  What clip planes cut off a scan is
+    closed, meshes stay open there, as in the picture.
+
+    Returns
+    -------
+    list of Mesh
+        With ``report["part_name"]`` and, where it was set, ``report["color"]``.
+
+    Raises
+    ------
+    NoSurfaceError
+        Nothing is shown.
+    """
+    tell = progress or ignore_progress
+    only_labels = find_modes()[state.mode].kind == "labels"
+    made: list[Mesh] = []
+    for each in stage.objects:
+        tell("surface", len(made), 0)
+        whole = state.whole(each.number)
+        if whole is None or not whole.visible:
+            continue
+        if isinstance(each, ShownScan) and not only_labels:
+            made += _mesh_scan(stage, each, whole, state, progress)
+        elif isinstance(each, ShownMesh):
+            cut = each.mesh if state.clip is None else cut_mesh(each.mesh, state.clip)
+            if cut.triangle_count:
+                made.append(_named(cut, whole.name, whole.color))
+        elif isinstance(each, ShownLabels) and (only_labels or each.within is None):
+            made += _mesh_labels(stage, each, state, progress)
+    if not made:
+        raise NoSurfaceError("nothing that has a surface is shown: show a part first")
+    return made
+
+
+def _mesh_scan(
+    stage: Stage, scan: ShownScan, whole: ShownPart, state: ViewState, progress: Progress | None
+) -> list[Mesh]:
+    resident = stage.resident(scan.number, state)
+    volume, clip = resident.volume, state.clip
+    try:
+        if clip is None:
+            with stage.lock:
+                mesh = extract_isosurface(resident, state.iso_value, progress=progress)
+        else:
+            volume = clip_volume(volume, clip, state.iso_value)
+            mesh = extract_isosurface(
+                volume, state.iso_value, device=stage.device, memory=stage.memory, progress=progress
+            )
+    except NoSurfaceError:
+        return []
+    labelled = stage.labelled(scan.number, state)
+    if labelled is None or labelled.is_plain:
+        return [_named(mesh, whole.name, whole.color)]
+    with stage.lock:
+        voxels = stage.labels_on(resident, labelled)
+    numbers = number_vertices(mesh, volume, state.iso_value, voxels)[mesh.triangles[:, 0]]
+    hidden = [part.number for part in labelled.parts if not part.visible]
+    colored = {part.number: part for part in labelled.parts if part.visible and part.number and part.color}
+    made = []
+    rest = ~np.isin(numbers, [*hidden, *colored])
+    for kept, name, color in (
+        *((numbers == number, part.name, part.color) for number, part in colored.items()),
+        (rest, whole.name, whole.color),
+    ):
+        if kept.any():
+            made.append(_named(select_triangles(mesh, kept), name, color))
+    return made
+
+
+def _mesh_labels(stage: Stage, shown: ShownLabels, state: ViewState, progress: Progress | None) -> list[Mesh]:
+    parts = {part.number: part for part in state.parts_of(shown.number) if part.visible and part.number}
+    if not parts:
+        return []
+    found = extract_label_masks(
+        shown.labels, numbers=sorted(parts), device=stage.device, memory=stage.memory, progress=progress
+    )
+    made = []
+    for number, mesh in found.items():
+        cut = mesh if state.clip is None else cut_mesh(mesh, state.clip)
+        if cut.triangle_count:
+            made.append(_named(cut, parts[number].name, parts[number].color))
+    return made
+
+
+def _named(mesh: Mesh, name: str, color: Color | None) -> Mesh:
+    report = {**mesh.report, "part_name": name}
+    if color is not None:
+        report["color"] = [float(value) for value in color]
+    return Mesh(mesh.vertices, mesh.triangles, mesh.normals, report, trusted=True)
+
+
+def clip_volume(volume: Volume, clip: Clip, iso_value: float) -> Volume:
+    """Return a volume whose surface at an iso value is cut by planes, flat and closed.
+
+    Each voxel gets at most the level plus its distance within the planes times a slope: between two voxels the values
+    then pass the level where the edge between them passes the plane.
+    """
+    level = choose_iso_rule(volume, iso_value).iso_level
+    voxels = volume.voxels.copy()
+    low = float(voxels.min())
+    _, nj, ni = voxels.shape
+    columns = volume.affine[:3, :2]
+    i, j = np.arange(ni, dtype=np.float32), np.arange(nj, dtype=np.float32)
+    for layer, origin in zip(voxels, volume.slice_origins(), strict=True):
+        for *normal, offset in clip.planes.tolist():
+            along_i, along_j = np.array(normal) @ columns
+            start = float(np.dot(normal, origin)) - offset
+            height = np.float32(start) + np.float32(along_j) * j[:, None] + np.float32(along_i) * i
+            most = np.maximum(np.float32(level) + np.float32(CUT_HU_PER_MM) * height, np.float32(low))
+            np.minimum(layer, most, out=most)
+            layer[...] = np.rint(most) if voxels.dtype.kind in "iu" else most
+    made = volume.with_voxels(voxels)
+    made.report = amend(made.report, clipped=clip.planes.tolist())
+    return made
+
+
+def number_vertices(mesh: Mesh, volume: Volume, iso_value: float, voxels: NDArray) -> NDArray:
+    """Return for each vertex of a surface the number of the voxel that is inside at its edge.
+
+    A vertex lies on an edge between two neighbouring voxels, one inside and one outside.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Extracted from `volume` at `iso_value`.
+    voxels : ndarray, shape (nk, nj, ni)
+        Numbers.
+    """
+    level = choose_iso_rule(volume, iso_value).iso_level
+    ijk = volume.lps_to_ijk(mesh.vertices)
+    near = np.rint(ijk)
+    axis = np.argmax(np.abs(ijk - near), axis=1)
+    rows = np.arange(len(ijk))
+    ends = np.stack([near, near]).astype(np.int64)
+    ends[0, rows, axis] = np.floor(ijk[rows, axis])
+    ends[1, rows, axis] = ends[0, rows, axis] + 1
+    last = np.array(volume.shape_ijk) - 1
+    found = np.zeros(len(ijk), voxels.dtype)
+    for end in ends:
+        within = ((end >= 0) & (end <= last)).all(axis=1)
+        i, j, k = np.clip(end, 0, last).T
+        inside = within & (volume.voxels[k, j, i] > level)
+        found[inside] = voxels[k, j, i][inside]
+    return found
