@@ -73,11 +73,15 @@ devices
 }
 """What the site's menus are made of: added to the end of a page, or a page."""
 
+_BESIDE_THE_GUIDE = ("devices", "limits")
+"""Pages of docs/ that stand in the menus beside those of docs/guide/, and not among the methods."""
+
 
 def site_pages(root: Path) -> dict[str, str]:
     """Return the page of the site for each file of the project, both as paths with ``/``, by the file's."""
     pages = {"README.md": "readme.md", "CHANGELOG.md": "changes.md", "CONTRIBUTING.md": "contributing.md"}
     pages |= {f"docs/{path.name}": f"methods/{path.name}" for path in sorted(root.glob("docs/*.md"))}
+    pages |= {f"docs/{name}.md": f"{name}.md" for name in _BESIDE_THE_GUIDE}
     for path in sorted(root.glob("docs/guide/**/*.md")):
         pages[path.relative_to(root).as_posix()] = path.relative_to(root / "docs" / "guide").as_posix()
     pages |= {f"docs/{path.name}": f"methods/{path.name}" for path in sorted(root.glob("docs/*.ipynb"))}  # to download

@@ -24,7 +24,7 @@ operation. Exit code 8 where a side has no corridor, with the reason.
 examples:
   clrecon corridor CT_FOLDER --labels spine.seg.nrrd --label L3
   clrecon corridor CT_FOLDER --labels spine.nii.gz --label L1 --label L2 --margin 1.5 --picture l.png --report l.json
-  clrecon corridor CT_FOLDER --labels spine.nii.gz --label L3 --screw 22,-110,-405,8,-150,-402,6.5
+  clrecon corridor CT_FOLDER --labels spine.nii.gz --label L3 --screw 15,-123,-448,7,-166,-446,4.5
   clrecon corridor CT_FOLDER --labels spine.nii.gz --label L3 --screws screws.csv -o l3.glb"""
 
 

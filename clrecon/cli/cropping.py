@@ -45,11 +45,11 @@ def parse_clip_box(text: str) -> tuple[float, ...]:
 
 
 def _parse_between(text: str) -> tuple[float, ...]:
-    return _read(text, 2, "are no two heights: Z0,Z1 in mm, one of them may be empty, such as -320,-80", ends=True)
+    return _read(text, 2, "are no two heights: Z0,Z1 in mm, one of them may be empty, such as -450,-400", ends=True)
 
 
 def _parse_around(text: str) -> tuple[float, ...]:
-    return _read(text, 4, "is no point and length: X,Y,Z,R in mm, such as 12,-80,-140,30", ends=False)
+    return _read(text, 4, "is no point and length: X,Y,Z,R in mm, such as 10,-124,-424,30", ends=False)
 
 
 def _read(text: str, count: int, fault: str, *, ends: bool) -> tuple[float, ...]:

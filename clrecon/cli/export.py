@@ -27,8 +27,8 @@ docs/export.md.
 
 examples:
   clrecon export CT_FOLDER -o ct.nii.gz
-  clrecon export CT_FOLDER -o loin.nrrd --between -320,-80
-  clrecon export CT_FOLDER -o l3.mha --around 12,-80,-140,40 --resample 0.5
+  clrecon export CT_FOLDER -o loin.nrrd --between -450,-400
+  clrecon export CT_FOLDER -o l3.mha --around 10,-124,-424,40 --resample 0.5
   clrecon export CT_FOLDER -o bone.nii.gz --region hu:200,"""
 
 

@@ -63,7 +63,7 @@ def _epilog() -> str:
             "  clrecon mesh CT_FOLDER -o bone.stl --hu 200,350 --min-volume 1 --split",
             "  clrecon mesh CT_FOLDER -o fat.stl --hu -150:-30 --remove-table",
             "  clrecon mesh CT_FOLDER -o lung.stl --below -400 --keep-largest 2",
-            "  clrecon mesh CT_FOLDER -o spine.stl --hu 226 --method i-mc --grow-from 0,-150,-600",
+            "  clrecon mesh CT_FOLDER -o spine.stl --hu 226 --method i-mc --grow-from -18,-126,-448",
             "  clrecon mesh CT_FOLDER -o bone.stl --labels spine.nii.gz --label T12 --label L1",
         )
     )
@@ -203,8 +203,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
     names = {own.name for own in fields(MeshSettings)} - {"purpose"}
     given = {**pick(options, names), **options.hu, "labels": label_choice(options)}
     given = {name: value for name, value in given.items() if value is not None}
-    if options.labels is not None and not any(map(is_label_seed, options.grow_from)):
-        given.pop("solid", None)  # it says how each label becomes a mesh
+    if options.solid and options.labels is not None and not any(map(is_label_seed, options.grow_from)):
+        given.pop("solid")  # it says how each label becomes a mesh
     settings = MeshSettings(**settings_for(options.purpose, given))
     report = make_mesh(
         options.input,

@@ -24,8 +24,8 @@ is needed.
 
 examples:
   clrecon vertebrae CT_FOLDER -o spine.nii.gz
-  clrecon vertebrae CT_FOLDER -o spine.dcm --name-at 2,-110,-420=L3
-  clrecon vertebrae CT_FOLDER -o spine.nii.gz --seed 2,-110,-420 --seed 1,-112,-385 --keep-unsure
+  clrecon vertebrae CT_FOLDER -o spine.dcm --name-at -2,-156,-449=L3
+  clrecon vertebrae CT_FOLDER -o spine.nii.gz --seed -2,-156,-449 --seed -2,-154,-412 --keep-unsure
   clrecon mesh CT_FOLDER -o l3.stl --labels spine.nii.gz --label L3"""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 from clrecon.errors import UsageError
@@ -28,7 +29,8 @@ def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
     dict
         The given fields, and ``purpose``.  If components are chosen in another way, the purpose leaves none out.  Bone
         is distinguished from other material only if all iso values are those of bone, from 100 to 1500 HU or
-        ``"auto"``; it is made solid if there is one of them, and ``solid`` is not given as False.
+        ``"auto"``; it is made solid if there is one of them, and ``solid`` is not given as False.  Labels whose surface
+        HU place are made solid one by one.
 
     Raises
     ------
@@ -50,10 +52,18 @@ def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
             del fields["keep"]
         if levels != 1 or given.get("solid") is False:
             del fields["solid"]
+        if given.get("solid") is not False and _are_hollow(given):
+            given = {**given, "labels": replace(given["labels"], solid=True)}
     elif given.get("region"):
         fields["preprocess"] += ",region"  # the paper's order
     taken = {field: value for field, value in fields.items() if not given.get(field)}
     return {**given, **taken, "purpose": name}
+
+
+def _are_hollow(given: dict[str, Any]) -> bool:
+    """True where these fields of `MeshSettings` ask for surfaces of labels in which marrow leaves walls inside."""
+    settings = MeshSettings(**given)
+    return settings.labels_pick and settings.labels is not None and settings.labels.surface == "hu"
 
 
 def _levels_of_bone(given: dict[str, Any]) -> int:

@@ -32,6 +32,16 @@ def test_what_is_given_wins() -> None:
         assert settings_for("print", {**other, "keep_largest": None})["keep_largest"] is None
 
 
+def test_labels_are_printed_solid() -> None:
+    assert settings_for("print", {"labels": LabelChoice("a")})["labels"] == LabelChoice("a", solid=True)
+    for left in (LabelChoice("a", surface="mask"), LabelChoice("a", solid=True)):  # a mask is solid by itself
+        assert settings_for("print", {"labels": left})["labels"] == left
+    hollow = settings_for("print", {"labels": LabelChoice("a"), "solid": False})
+    assert not hollow["labels"].solid and not MeshSettings(**hollow).solid
+    seeds = settings_for("print", {"labels": LabelChoice("a"), "grow_from": ("label:L1",)})
+    assert not seeds["labels"].solid
+
+
 @pytest.mark.parametrize(
     ("given", "keep"),
     [

@@ -1,0 +1,90 @@
+"""The Python examples of the pages of docs/ run as they stand, from top to bottom, on a small phantom."""
+
+from __future__ import annotations
+
+import os
+import re
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import pytest
+from house import ROOT
+
+import clrecon
+from clrecon.jobs.phantom import make_phantom
+
+FENCED = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+INDENTED = re.compile(r"(?:^ {4}\S.*\n(?:\n? {4,}\S.*\n)*)", re.MULTILINE)
+SHELL = re.compile(r"^(clrecon|python3?|pip) ", re.MULTILINE)
+ELSEWHERE = {"certificate", "python", "tour", "view"}
+"""Pages with tests of their own, and without Python that begins by itself."""
+
+SMALLER = {
+    '"CT_FOLDER"': '"ct"',
+    '"PHANTOM_FOLDER"': '"ct"',
+    '"twelve"': '"ct"',
+    '"spine.nii.gz"': '"ct/levels.nrrd"',
+    "size=(512, 512)": "size=(64, 64)",
+    "    TransferFunction.from_vtk(actor.prop, voxel_mm=0.8)    # any vtkVolumeProperty\n": "",
+}
+"""What the machine of a test has not, or what takes long, and what stands for it."""
+
+
+def find_python(text: str) -> list[str]:
+    """The Python blocks of a page, fenced or indented, in their order."""
+    fenced = {match.start(): match[1] for match in FENCED.finditer(text)}
+    bare = re.sub(r"^```.*?^```", lambda match: re.sub(r"[^\n]", ".", match[0]), text, flags=re.MULTILINE | re.DOTALL)
+    indented = {match.start(): textwrap.dedent(match[0]) for match in INDENTED.finditer(bare)}
+    python = {start: block for start, block in indented.items() if "clrecon" in block and not SHELL.search(block)}
+    return [block for _, block in sorted({**fenced, **python}.items())]
+
+
+PAGES = {
+    path.stem: blocks
+    for path in sorted((ROOT / "docs").glob("*.md"))
+    if path.stem not in ELSEWHERE and (blocks := find_python(path.read_text(encoding="utf-8")))
+}
+
+
+@pytest.fixture(scope="module")
+def series(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a small spine, and the meshes and the cloud that the pages read."""
+    folder = tmp_path_factory.mktemp("docs")
+    make_phantom(folder / "ct", levels="L2-L4", size=(72, 72), spacing=(2.5, 2.5, 2.5))
+    volume = clrecon.read_volume(folder / "ct")
+    mesh = clrecon.extract_isosurface(volume, 226)
+    for name in ("a.stl", "b.stl", "bone.stl", "l3.stl", "l4.stl"):
+        mesh.save(folder / name)
+    points = clrecon.cluster_points(volume, hu=(226, 3000)).cloud
+    for name in ("scan.ply", "cloud.ply"):
+        points.save(folder / name)
+    line = clrecon.find_spine_line(volume).points[::4]
+    points_of = ", ".join(f'{{"position": [{x}, {y}, {z}]}}' for x, y, z in line)
+    curve = f'{{"markups": [{{"type": "Curve", "coordinateSystem": "LPS", "controlPoints": [{points_of}]}}]}}'
+    (folder / "line.mrk.json").write_text(curve, encoding="utf-8")
+    return folder
+
+
+def test_the_blocks_of_a_page_are_found() -> None:
+    text = (
+        "x\n\n    clrecon mesh A -o b.stl\n\ny\n\n    a = clrecon.f()\n\n    b = 1\n\n```json\n    clrecon.g()\n```\n\n"
+        "```python\nimport clrecon\n```\n    P = S + X\n"
+    )
+    assert find_python(text) == ["a = clrecon.f()\n\nb = 1\n", "import clrecon\n"]
+    assert {"clouds", "export", "filters", "masks", "measures", "rendering", "slices", "solid"} <= set(PAGES)
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_the_python_of_a_page_runs(name: str, series: Path, device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(series)
+    monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
+    made: dict[str, Any] = {"clrecon": clrecon}
+    if name in ("rendering", "regions"):  # whose text says what `volume` is
+        made["volume"] = clrecon.read_volume("ct")
+    before, files = set(made), set(os.listdir())
+    for block in PAGES[name]:
+        for long, short in SMALLER.items():
+            block = block.replace(long, short)
+        exec(compile(block, f"docs/{name}.md", "exec"), made)
+    assert set(made) - before - {"__builtins__"} or set(os.listdir()) - files, f"docs/{name}.md makes nothing"
