@@ -52,6 +52,7 @@ class ChangingView:
         self.objects, self.state = objects, state
         self.version = 0
         self.aspect = 1.0
+        self._first_camera = state.camera
         self._clock, self._undo = clock, list[tuple[ViewState, str]]()
         self._last = ("", -math.inf)
 
@@ -61,6 +62,17 @@ class ChangingView:
         return self.state.camera
 
     # Camera
+
+    def set_aspect(self, aspect: float) -> None:
+        """Tell the width of the picture by its height; the view of the start, while it stays, fits it anew."""
+        if aspect == self.aspect:
+            return
+        self.aspect = aspect
+        if self.state.camera == self._first_camera:
+            corners = np.concatenate([each.corners for each in self.objects])
+            self._first_camera = fit_camera(corners, "anterior", aspect)
+            self.state = replace(self.state, camera=self._first_camera)
+            self.version += 1
 
     def turn(self, dx: float, dy: float) -> None:
         """Turn as if the pointer held what is seen; half a turn over the height of the picture."""

@@ -28,21 +28,24 @@ def first_parts(objects: Sequence[ShownObject]) -> list[ShownPart]:
             count = len(each.cloud)
         parts.append(ShownPart(key=str(each.number), name=each.name, kind=each.kind, object=each.number, count=count))
         if isinstance(each, ShownLabels):
-            colors = distinct_colors(len(each.labels.numbers))
-            voxel_ml = abs(float(np.linalg.det(each.labels.affine[:3, :3]))) / 1000.0
-            parts += [
-                ShownPart(
-                    key=f"{each.number}/{number}",
-                    name=each.labels.name(number),
-                    kind="label",
-                    object=each.number,
-                    number=number,
-                    ml=voxels * voxel_ml,
-                    count=voxels,
-                    color=as_point(color),
-                )  # fmt: skip
-                for (number, voxels), color in zip(each.labels.counts.items(), colors, strict=True)
-            ]
+            parts += _label_parts(each)
+    return parts
+
+
+def _label_parts(shown: ShownLabels) -> list[ShownPart]:
+    """Return a part for each label, and within a scan one for what has none."""
+    labels = shown.labels
+    voxel_ml = abs(float(np.linalg.det(labels.affine[:3, :3]))) / 1000.0
+    colors = distinct_colors(len(labels.numbers))
+    parts = [
+        ShownPart(
+            key=f"{shown.number}/{number}", name=labels.name(number), kind="label", object=shown.number,
+            number=number, ml=voxels * voxel_ml, count=voxels, color=as_point(color),
+        )
+        for (number, voxels), color in zip(labels.counts.items(), colors, strict=True)
+    ]  # fmt: skip
+    if shown.within is not None:
+        parts.append(ShownPart(key=f"{shown.number}/0", name="without a label", kind="rest", object=shown.number))
     return parts
 
 

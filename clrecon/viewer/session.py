@@ -130,7 +130,7 @@ class ViewSession(Closing):
         """
         width, height = checked_size(size)
         with self._lock:
-            self.model.aspect = width / height
+            self.model.set_aspect(width / height)
             state = self.model.snapshot()
 
         def take(job: Job) -> None:

@@ -1,0 +1,276 @@
+"""The model of a view, without a device: every change, its undo, and wrong values."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import view_scenes as scenes
+
+from clrecon.errors import UsageError
+from clrecon.labels.resample import ResampledLabels
+from clrecon.viewer.model import ViewModel
+from clrecon.viewer.objects import ShownLabels, ShownScan, show_objects
+from clrecon.viewer.parts import FoundParts
+from clrecon.viewer.state import ShownPart
+from clrecon.viewer.tools import Pick
+
+pytestmark = pytest.mark.unit
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        self.now += 10.0
+        return self.now
+
+
+def make_model(*subjects, **given) -> ViewModel:
+    return ViewModel(show_objects(subjects or [scenes.make_scan(), scenes.make_mesh()]), clock=Clock(), **given)
+
+
+def found(iso: float = 300.0) -> FoundParts:
+    volume, labels = scenes.make_scan(), scenes.make_labels()
+    parts = tuple(
+        ShownPart(
+            key=f"1/{n}", name=f"part {n}", kind="cluster" if n else "rest", object=1, number=n, count=5,
+            inside=tuple(volume.ijk_to_lps([(10 if n == 1 else 30, 20, 10)])[0]) if n else None,
+        )
+        for n in (1, 2, 0)
+    )  # fmt: skip
+    placed = ResampledLabels(labels.voxels, True, {}, ())
+    return FoundParts(
+        scan=1, iso_value=iso, table=True, volume=volume, labels=labels, placed=placed, parts=parts
+    )  # fmt: skip
+
+
+CHANGES = {
+    "turn": lambda m: m.turn(0.1, 0.2),
+    "pan": lambda m: m.pan(0.1, 0.2),
+    "zoom": lambda m: m.zoom(2.0, (0.1, 0.1)),
+    "roll": lambda m: m.roll(30.0),
+    "look": lambda m: m.look("left"),
+    "perspective": lambda m: m.set_perspective(True),
+    "iso": lambda m: m.set_iso(310.0),
+    "mode": lambda m: m.set_mode("muscle"),
+    "window": lambda m: m.set_window(-100.0, 300.0),
+    "table": lambda m: m.set_table(False),
+    "scroll": lambda m: m.scroll("axial", 3),
+    "cross": lambda m: m.set_cross((-40.0, -20.0, 210.0)),
+    "hide": lambda m: m.show("1/1", False),
+    "only": lambda m: m.only("1/2"),
+    "color": lambda m: m.set_color("2", (1.0, 0.5, 0.0)),
+    "colors": lambda m: m.color_parts(),
+    "opacity": lambda m: m.set_opacity("1/2", 0.4),
+    "tool": lambda m: m.start_tool("angle"),
+    "clip": lambda m: m.add_clip("left"),
+    "clip by the view": lambda m: m.add_clip("view"),
+    "box": lambda m: m.set_clip_box((-50.0, -40.0, 200.0), (-20.0, -20.0, 220.0)),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
+def test_every_change_grows_the_version_and_can_be_undone(change):
+    model = make_model()
+    model.take_parts([found()])
+    before, version = model.snapshot(), model.version
+    change(model)
+    assert model.snapshot() != before and model.version == version + 1
+    assert isinstance(model.undo(), str)
+    assert model.snapshot() == before and model.version == version + 2
+    assert model.undo() is None
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda m: m.turn("a", 0.0), "a turn is a finite number"),
+        (lambda m: m.zoom(0.0), "above 0"),
+        (lambda m: m.look("lft"), "left"),
+        (lambda m: m.set_iso(9e9), "runs from -800 to 1000 HU"),
+        (lambda m: m.set_iso(float("nan")), "finite"),
+        (lambda m: m.set_mode("bones"), "bone"),
+        (lambda m: m.set_window(5.0, 5.0), "lower HU first"),
+        (lambda m: m.set_window(5.0, 9.0, "picture"), "has no window"),
+        (lambda m: m.set_window(5.0, 9.0, "page"), "slices"),
+        (lambda m: m.scroll("axal", 1), "axial"),
+        (lambda m: m.set_cross((1.0, 2.0)), "three finite numbers"),
+        (lambda m: m.show("7", True), "unknown part"),
+        (lambda m: m.set_color("2", (2.0, 0.0, 0.0)), "from 0 to 1"),
+        (lambda m: m.set_opacity("2", 1.5), "from 0 to 1"),
+        (lambda m: m.color_parts(), "not found yet"),
+        (lambda m: m.start_tool("ruler"), "distance"),
+        (lambda m: m.add_point(Pick(point=(0.0, 0.0, 0.0))), "no tool"),
+        (lambda m: m.add_clip("up"), "side of the patient"),
+        (lambda m: m.add_clip((0.0, 0.0, 0.0)), "length"),
+        (lambda m: m.move_clip(0, 0.5), "there are 0"),
+        (lambda m: m.set_clip_box((1.0, 0.0, 0.0), (0.0, 1.0, 1.0)), "holds nothing"),
+        (lambda m: m.set_clip_box((1.0, 0.0, 0.0), None), "two corners"),
+    ],
+)
+def test_a_wrong_value_is_refused_and_changes_nothing(change, words):
+    model = make_model()
+    before, version = model.snapshot(), model.version
+    with pytest.raises(UsageError, match=words):
+        change(model)
+    assert model.snapshot() == before and model.version == version and model.undo() is None
+
+
+def test_moves_of_one_gesture_are_one_step_of_undo():
+    clock = iter([0.0, 0.1, 0.2, 5.0, 5.1])
+    model = ViewModel(show_objects([scenes.make_scan()]), clock=lambda: next(clock))
+    first = model.snapshot()
+    for _ in range(3):
+        model.turn(0.1, 0.0)
+    later = model.snapshot()
+    model.turn(0.1, 0.0)
+    model.pan(0.1, 0.0)
+    assert [model.undo() for _ in range(2)] == ["the shift", "the turn"] and model.snapshot() == later
+    model.undo()
+    assert model.snapshot() == first
+
+
+def test_facts_are_json_and_say_what_is_there():
+    model = make_model(scenes.make_scan(), scenes.make_mesh(), scenes.make_cloud(), scenes.make_labels(), space="ras")
+    model.add_clip("superior")
+    facts = json.loads(json.dumps(model.facts()))
+    assert [each["kind"] for each in facts["objects"]] == ["scan", "mesh", "cloud", "labels"]
+    assert [each["key"] for each in facts["parts"]] == ["1", "2", "3", "4", "4/1", "4/2", "4/0"]
+    assert facts["parts"][4]["name"] == "one" and facts["parts"][4]["ml"] == pytest.approx(22.3, abs=0.1)
+    assert facts["letters"]["left"].startswith("R") and facts["letters"]["top"] == "S"
+    assert facts["iso"] == {"hu": 200.0, "low": -800.0, "high": 1000.0}
+    assert facts["space"] == "RAS" and facts["cross_text"].endswith("mm RAS")
+    assert facts["cross"][0] == pytest.approx(-float(facts["cross_text"].split(",")[0]), abs=0.06)
+    assert {"surface", "bone", "mip", "minip", "drr", "slices", "labels"} <= {each["name"] for each in facts["modes"]}
+    model.set_mode("mip")
+    assert "mesh 2" in model.facts()["notes"][0]
+
+
+def test_without_a_scan_only_what_means_something_is_there():
+    meshes, labels = make_model(scenes.make_mesh()), make_model(scenes.make_labels())
+    assert list(meshes.modes) == ["surface"] and meshes.facts()["iso"] is None
+    assert list(labels.modes) == ["labels"] and labels.mode == "labels"
+    for change in (lambda m: m.set_iso(200.0), lambda m: m.set_table(False)):
+        with pytest.raises(UsageError, match="no scan"):
+            change(meshes)
+    with pytest.raises(UsageError, match="nothing to show"):
+        ViewModel([])
+
+
+def test_objects_are_numbered_named_and_checked():
+    scan, labels = show_objects([scenes.make_scan(), scenes.make_labels()], ["left knee"], [["a remark"]])
+    assert isinstance(scan, ShownScan) and scan.name == "left knee" and scan.said == ("a remark",)
+    assert isinstance(labels, ShownLabels) and labels.name == "labels 2" and labels.within == 1
+    (mesh,) = show_objects([scenes.make_mesh()])
+    assert mesh.mesh.normals is not None
+    for wrong, words in (([], "nothing"), ([3], "not int")):
+        with pytest.raises(UsageError, match=words):
+            show_objects(wrong)
+
+
+def test_measures_are_made_of_points_in_mm():
+    model = make_model()
+    model.start_tool("distance")
+    assert model.add_point(Pick(point=(0.0, 0.0, 0.0))) is None
+    made = model.add_point(Pick(point=(3.0, 4.0, 12.0)))
+    assert made is not None and made.value == pytest.approx(13.0) and made.text == "13.0 mm"
+    model.start_tool("angle")
+    for point in ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 2.0, 0.0)):
+        made = model.add_point(Pick(point=point))
+    assert made.value == pytest.approx(90.0) and made.unit == "degrees"
+    model.start_tool("curve")
+    for x in range(4):
+        assert model.add_point(Pick(point=(float(x), 0.0, 0.0))) is None
+    made = model.end_tool()
+    assert made.value == pytest.approx(3.0) and len(model.curve) == 4 and model.tool is None
+    model.start_tool("seed")
+    assert model.add_point(Pick(point=(1.0, 2.0, 3.0))).value is None
+    assert [each.kind for each in model.measures] == ["distance", "angle", "curve", "seed"]
+    assert model.facts()["measures"][3]["text"] == "1.0, 2.0, 3.0 mm LPS"
+    model.undo()
+    assert len(model.measures) == 3
+    model.clear_measures()
+    assert model.measures == [] and model.undo() == "the measures" and len(model.measures) == 3
+
+
+def test_an_angle_of_points_in_one_place_is_refused():
+    model = make_model()
+    model.start_tool("angle")
+    model.add_point(Pick(point=(0.0, 0.0, 0.0)))
+    model.add_point(Pick(point=(0.0, 0.0, 0.0)))
+    with pytest.raises(UsageError, match="one place"):
+        model.add_point(Pick(point=(1.0, 0.0, 0.0)))
+
+
+def test_clip_planes_keep_the_other_side_and_turn_round():
+    model = make_model(scenes.make_scan())
+    model.add_clip("left")
+    corners = model.objects[0].corners
+    low, high = corners[:, 0].min(), corners[:, 0].max()
+    inside, outside = (low + 1.0, 0.0, 0.0), (high - 1.0, 0.0, 0.0)
+    assert model.clip.contains([inside, outside]).tolist() == [True, False]
+    model.flip_clip(0)
+    assert model.clip.contains([inside, outside]).tolist() == [False, True]
+    model.flip_clip(0)
+    model.move_clip(0, 1.0)
+    assert model.clip.contains([inside, outside]).all()
+    model.remove_clip(0)
+    assert model.clip is None and model.clips == []
+
+
+def test_a_view_fits_what_is_shown():
+    model = make_model()
+    model.take_parts([found()])
+    whole = model.camera.parallel_scale
+    box = ((-50.0, -30.0, 205.0), (-45.0, -25.0, 210.0))
+    parts = tuple(
+        ShownPart(**{**vars(each), "box": box}) if each.kind == "cluster" else each for each in model.state.parts
+    )
+    model._change("test", "a test", parts=parts)
+    model.only("1/1")
+    model.look("anterior")
+    assert model.camera.parallel_scale < 0.5 * whole
+    assert model.camera.focal_point == pytest.approx((-47.5, -27.5, 207.5))
+
+
+def test_only_and_show_all_switch_every_part():
+    model = make_model(scenes.make_scan(), scenes.make_mesh())
+    model.take_parts([found()])
+    model.only("1/2")
+    assert {each.key for each in model.parts if each.visible} == {"1", "1/2"}
+    model.only("1")
+    assert {each.key for each in model.parts if each.visible} == {"1", "1/1", "1/2", "1/0"}
+    model.show_all()
+    assert all(each.visible for each in model.parts)
+
+
+def test_looks_of_parts_go_over_to_another_iso_value_by_their_place():
+    model = make_model(scenes.make_scan())
+    model.take_parts([found(300.0)])
+    model.show("1/2", False)
+    model.set_color("1/1", (1.0, 0.0, 0.0))
+    model.set_iso(310.0)
+    assert not model.parts_known
+    fresh = found(310.0)
+    swapped = {1: 2, 2: 1, 0: 0}
+    voxels = np.array([0, 2, 1], np.uint8)[fresh.labels.voxels]
+    labels = type(fresh.labels)(voxels, fresh.labels.affine.copy())
+    parts = tuple(
+        ShownPart(**{**vars(each), "number": swapped[each.number], "key": f"1/{swapped[each.number]}"})
+        for each in fresh.parts
+    )
+    model.take_parts([FoundParts(**{**vars(fresh), "labels": labels, "parts": parts})])
+    assert model.parts_known
+    assert model.state.part("1/1").visible is False and model.state.part("1/2").color == (1.0, 0.0, 0.0)
+    assert model.state.part("1/2").visible and model.state.part("1/1").color is None
+
+
+def test_slices_scroll_by_voxels_and_stay_within():
+    model = make_model(scenes.make_scan())
+    before = model.cross[2]
+    model.scroll("axial", 1)
+    assert model.cross[2] - before == pytest.approx(1.4, abs=0.01)
+    model.scroll("axial", 10_000)
+    assert model.cross[2] == pytest.approx(model.objects[0].corners[:, 2].max())

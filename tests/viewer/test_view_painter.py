@@ -1,0 +1,398 @@
+"""Pictures, picks, parts and meshes of a view's states, on a small scan of three balls."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import view_scenes as scenes
+
+from clrecon.errors import Cancelled, NoSurfaceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.mesh.compare.distances import SurfaceDistance
+from clrecon.operators.rays.render import render
+from clrecon.operators.surface.extract import extract_isosurface
+from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.viewer.model import ViewModel
+from clrecon.viewer.objects import show_objects
+from clrecon.viewer.painter import Painter
+from clrecon.viewer.parts import grow_labels
+from clrecon.viewer.tools import Pick
+
+pytestmark = pytest.mark.opencl
+
+SIZE = (96, 80)
+
+
+@pytest.fixture
+def view(device):
+    opened = []
+
+    def make(*subjects, **given) -> tuple[ViewModel, Painter]:
+        objects = show_objects(subjects or [scenes.make_scan()])
+        painter = Painter(objects, device=device)
+        opened.append(painter)
+        return ViewModel(objects, iso_value=scenes.ISO, **given), painter
+
+    yield make
+    for painter in opened:
+        painter.close()
+
+
+def find(model: ViewModel, painter: Painter) -> None:
+    model.take_parts(painter.find_parts(model.snapshot()))
+
+
+def shown_pixels(picture) -> int:
+    return int((picture.image[..., 3] > 0).sum())
+
+
+def test_every_mode_makes_a_picture_sharp_and_coarse(view):
+    model, painter = view(scenes.make_scan(), scenes.make_mesh(), scenes.make_cloud(), scenes.make_labels())
+    for mode in model.modes:
+        model.set_mode(mode)
+        sharp = painter.picture(model.snapshot(), SIZE)
+        coarse = painter.picture(model.snapshot(), SIZE, sharp=False, share=0.5)
+        assert sharp.size == SIZE and shown_pixels(sharp) > 100, mode
+        assert sharp.report["sharp"] and sharp.report["ms"] > 0.0
+        assert coarse.size == (77, 64) and not coarse.report["sharp"], mode  # the shorter side has 64 pixels at least
+        assert shown_pixels(coarse) > 50
+
+
+def test_a_surface_picture_is_that_of_render(view, device):
+    model, painter = view()
+    mine = painter.picture(model.snapshot(), SIZE)
+    other = render(
+        model.objects[0].volume, "surface", iso_value=scenes.ISO, camera=model.camera, size=SIZE,
+        background="transparent", device=device,
+    )  # fmt: skip
+    assert np.array_equal(mine.image, other.image)
+
+
+def test_a_cancelled_picture_raises(view):
+    model, painter = view()
+    asked = []
+    with pytest.raises(Cancelled):
+        painter.picture(model.snapshot(), SIZE, cancelled=lambda: bool(asked.append(1)) or len(asked) > 1)
+    assert len(asked) == 2  # before it begins, and when the device is about to work
+
+
+def test_nothing_shown_is_an_empty_picture(view):
+    model, painter = view()
+    model.show("1", False)
+    picture = painter.picture(model.snapshot(), SIZE)
+    assert shown_pixels(picture) == 0 and np.isnan(picture.depth).all()
+    with pytest.raises(NoSurfaceError, match="nothing"):
+        painter.mesh_of_shown(model.snapshot())
+
+
+def test_picks_lie_on_the_mesh(view):
+    model, painter = view()
+    (mesh,) = painter.mesh_of_shown(model.snapshot())
+    picture = painter.picture(model.snapshot(), SIZE)
+    rows, columns = np.nonzero(picture.image[..., 3])
+    picks = []
+    for place in np.random.default_rng(3).choice(len(rows), 60, replace=False):
+        pick = painter.pick(model.snapshot(), SIZE, columns[place] + 0.5, rows[place] + 0.5)
+        assert pick is not None and pick.object == 1 and pick.part == "1"
+        picks.append(pick.point)
+        depth = float(picture.depth[rows[place], columns[place]])
+        origins, directions = model.camera.rays(SIZE)
+        at = origins[rows[place], columns[place]] + depth * directions[rows[place], columns[place]]
+        assert pick.point == pytest.approx(at, abs=0.02)
+    away = SurfaceDistance(mesh.vertices, mesh.triangles)(np.array(picks))
+    assert away.max() <= 0.3 and np.median(away) <= 0.02
+
+
+def test_a_pick_takes_the_nearest_object_and_none_beside(view):
+    model, painter = view(scenes.make_scan(), scenes.make_mesh())
+    spots = {
+        number: model.camera.project([point], SIZE)[0][0]
+        for number, point in (
+            (1, scenes.middle(2)),
+            (2, scenes.middle(0) + (0.0, -25.0, 0.0)),
+        )
+    }
+    for number, (x, y) in spots.items():
+        pick = painter.pick(model.snapshot(), SIZE, x, y)
+        assert pick is not None and pick.object == number and pick.part == str(number)
+    assert painter.pick(model.snapshot(), SIZE, 0.5, 0.5) is None
+    model.set_perspective(True)
+    x, y = model.camera.project([scenes.middle(0) + (0.0, -25.0, 0.0)], SIZE)[0][0]
+    assert painter.pick(model.snapshot(), SIZE, x, y).object == 2
+    cloud = scenes.make_cloud()
+    model, painter = view(cloud)
+    nearest = cloud.points[np.argmin(cloud.points[:, 1])]
+    pick = painter.pick(model.snapshot(), SIZE, *model.camera.project([nearest], SIZE)[0][0])
+    assert pick.object == 1 and pick.point == pytest.approx(nearest, abs=0.2) and pick.hu is None
+
+
+def test_slices_map_pixels_to_the_patient_and_show_the_scan(view):
+    model, painter = view()
+    model.set_cross(tuple(scenes.middle(0)))
+    for plane, normal in (("axial", (0, 0, 1)), ("coronal", (0, 1, 0)), ("sagittal", (1, 0, 0))):
+        picture = painter.slice(model.snapshot(), plane, SIZE)
+        (pixel,), (depth,) = picture.camera.project([scenes.middle(0)], SIZE)
+        assert picture.values[int(pixel[1]), int(pixel[0])] > 900.0
+        assert abs(np.dot(np.subtract(picture.camera.focal_point, scenes.middle(0)), normal)) < 1e-6
+        assert depth > 0.0
+        pick = painter.pick_slice(model.snapshot(), plane, SIZE, *pixel)
+        assert pick.point == pytest.approx(scenes.middle(0), abs=1e-6) and pick.hu > 900.0
+        edge = painter.slice_camera(model.snapshot(), plane, SIZE)
+        assert edge.focal_point == pytest.approx(picture.camera.focal_point)
+    with pytest.raises(UsageError, match="axial"):
+        painter.slice(model.snapshot(), "oblique", SIZE)
+
+
+def test_a_slice_without_a_scan_is_empty_and_one_of_labels_is_not(view):
+    model, painter = view(scenes.make_mesh())
+    assert shown_pixels(painter.slice(model.snapshot(), "axial", SIZE)) == 0
+    model, painter = view(scenes.make_labels())
+    picture = painter.slice(model.snapshot(), "axial", SIZE)
+    assert np.ptp(picture.image[..., :3].astype(int), axis=2).max() > 20  # coloured
+
+
+def test_parts_are_the_balls_with_their_size(view):
+    model, painter = view()
+    find(model, painter)
+    parts = {each.key: each for each in model.parts}
+    assert list(parts) == ["1", "1/1", "1/2", "1/3", "1/0"]
+    for number, (_, radius) in enumerate(scenes.BALLS):
+        part = parts[f"1/{number + 1}"]
+        assert part.ml == pytest.approx(4 / 3 * np.pi * radius**3 / 1000.0, rel=0.12)
+        low, high = np.array(part.box)
+        assert (low <= scenes.middle(number) - radius + 1.5).all() and (
+            high >= scenes.middle(number) + radius - 1.5
+        ).all()
+        assert np.linalg.norm(np.subtract(part.inside, scenes.middle(number))) < radius
+    assert model.parts_known and painter.has_parts(model.snapshot())
+    assert painter.find_parts(model.snapshot())[0] is painter.find_parts(model.snapshot())[0]
+
+
+def test_many_parts_are_twenty_and_the_rest_together(view):
+    voxels = np.full((9, 30, 40), -500, np.int16)
+    voxels[1::3, 1::3, 1::3] = 700
+    voxels[1, 1, 1:3] = 700
+    model, painter = view(Volume(voxels, np.eye(4)))
+    find(model, painter)
+    clusters = [each for each in model.parts if each.kind == "cluster"]
+    count = 3 * 10 * 13
+    assert len(clusters) == 21 and clusters[0].count == 2
+    assert clusters[-1].name == f"{count - 20} smaller parts" and clusters[-1].count == count - 20
+    model.only("1/1")
+    (mesh,) = painter.mesh_of_shown(model.snapshot())
+    assert mesh.bounds[1] - mesh.bounds[0] == pytest.approx([2.0, 1.0, 1.0], abs=0.4)
+
+
+def test_no_voxel_at_the_iso_value_is_no_part(view):
+    model, painter = view(Volume(np.full((4, 5, 6), -900, np.int16), np.eye(4)))
+    find(model, painter)
+    assert [each.kind for each in model.parts] == ["scan", "rest"]
+
+
+@pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
+@pytest.mark.parametrize("hidden", [1, 2, 3])
+def test_hidden_parts_are_neither_in_the_picture_nor_in_the_mesh(view, device, hidden, uneven):
+    scan = scenes.make_scan()
+    if uneven:
+        heights = (
+            scan.affine[:3, 3] + (np.arange(22)[:, None] + 0.3 * (np.arange(22) % 2)[:, None]) * scan.affine[:3, 2]
+        )
+        scan = Volume(scan.voxels, scan.affine, slice_positions=heights)
+    model, painter = view(scan)
+    find(model, painter)
+    model.show(f"1/{hidden}", False)
+    state = model.snapshot()
+    (kept,) = painter.mesh_of_shown(state)
+    whole = extract_isosurface(scan, scenes.ISO, device=device)
+    pieces = sorted(whole.components(), key=lambda each: -each.area)
+    wanted = sum(each.triangle_count for number, each in enumerate(pieces, 1) if number != hidden)
+    assert kept.triangle_count == wanted
+    assert kept.quality()["closed"]
+    for view_name in ("anterior", "left", "superior"):
+        model.look(view_name)
+        picture = painter.picture(model.snapshot(), SIZE)
+        mesh = render([(kept, MeshLook())], camera=model.camera, size=SIZE, background="transparent", device=device)
+        both = (picture.image[..., 3] > 0) != (mesh.image[..., 3] > 0)
+        assert both.mean() < 0.004  # the edges of the silhouette
+        seen = (picture.image[..., 3] > 0) & (mesh.image[..., 3] > 0)
+        assert np.abs(picture.depth[seen] - mesh.depth[seen]).mean() < 0.05
+
+
+def test_volume_rendering_leaves_hidden_parts_out_with_their_edges(view):
+    model, painter = view()
+    find(model, painter)
+    model.set_mode("bone")
+    before = shown_pixels(painter.picture(model.snapshot(), SIZE))
+    model.only("1/3")
+    picture = painter.picture(model.snapshot(), SIZE)
+    rows, columns = np.nonzero(picture.image[..., 3] > 8)
+    spot = model.camera.project([scenes.middle(2)], SIZE)[0][0]
+    assert 0 < len(rows) < 0.3 * before
+    assert np.hypot(columns + 0.5 - spot[0], rows + 0.5 - spot[1]).max() * model.camera.pixel_mm(SIZE) < 6.5
+
+
+def test_a_colour_and_an_opacity_of_a_part_are_seen(view):
+    model, painter = view()
+    find(model, painter)
+    plain = painter.picture(model.snapshot(), SIZE)
+    model.set_color("1/1", (1.0, 0.0, 0.0))
+    red = painter.picture(model.snapshot(), SIZE)
+    x, y = model.camera.project([scenes.middle(0)], SIZE)[0][0].astype(int)
+    assert red.image[y, x, 0] > 60 and red.image[y, x, 1] < 70 < plain.image[y, x, 1]
+    model.set_opacity("1/1", 0.5)
+    assert 90 < painter.picture(model.snapshot(), SIZE).image[y, x, 3] < 240
+    parts = painter.mesh_of_shown(model.snapshot())
+    assert [each.report["part_name"] for each in parts] == ["part 1", "scan 1"]
+    assert parts[0].report["color"] == [1.0, 0.0, 0.0]
+    model.undo()
+    model.undo()
+    assert np.array_equal(painter.picture(model.snapshot(), SIZE).image, plain.image)
+
+
+def test_a_whole_scan_is_translucent_before_its_parts_are_known(view):
+    model, painter = view()
+    model.set_opacity("1", 0.4)
+    image = painter.picture(model.snapshot(), SIZE).image
+    assert 0 < image[..., 3][image[..., 3] > 0].min() < 200
+
+
+def test_a_label_map_divides_the_scan_that_it_lies_in(view):
+    model, painter = view(scenes.make_scan(), scenes.make_labels())
+    assert painter.find_parts(model.snapshot()) == [] and model.parts_known
+    left = model.camera.project([scenes.middle(0)], SIZE)[0][0]
+    right = model.camera.project([scenes.middle(1)], SIZE)[0][0]
+    assert painter.pick(model.snapshot(), SIZE, *left).part == "2/1"
+    assert painter.pick(model.snapshot(), SIZE, *right).part == "2/2"
+    model.show("2/2", False)
+    assert painter.pick(model.snapshot(), SIZE, *right) is None
+    meshes = painter.mesh_of_shown(model.snapshot())
+    assert [each.report["part_name"] for each in meshes] == ["one"]
+    model.set_mode("labels")
+    assert [each.report["part_name"] for each in painter.mesh_of_shown(model.snapshot())] == ["one"]
+
+
+def test_a_clip_cuts_picture_and_mesh_flat_and_closed(view, device):
+    model, painter = view()
+    model.add_clip("left")
+    model.move_clip(0, (scenes.middle(0)[0] - model.clips[0].low) / (model.clips[0].high - model.clips[0].low))
+    state = model.snapshot()
+    (mesh,) = painter.mesh_of_shown(state)
+    assert mesh.quality()["closed"] and mesh.bounds[1, 0] == pytest.approx(scenes.middle(0)[0], abs=0.02)
+    half = 2 / 3 * np.pi * scenes.BALLS[0][1] ** 3 / 1000.0
+    assert mesh.quality()["volume_ml"] == pytest.approx(half, rel=0.05)
+    picture = painter.picture(state, SIZE)
+    drawn = render([(mesh, MeshLook())], camera=model.camera, size=SIZE, background="transparent", device=device)
+    assert ((picture.image[..., 3] > 0) != (drawn.image[..., 3] > 0)).mean() < 0.005
+
+
+def test_an_oblique_clip_of_a_mesh_cuts_its_triangles_at_the_plane(view):
+    model, painter = view(scenes.make_mesh())
+    model.add_clip((1.0, 2.0, 0.5))
+    (mesh,) = painter.mesh_of_shown(model.snapshot())
+    (*normal, offset) = model.clip.planes[0]
+    heights = mesh.vertices @ normal - offset
+    assert heights.min() == pytest.approx(0.0, abs=1e-4) and mesh.triangle_count > 100
+    assert mesh.area == pytest.approx(0.5 * scenes.make_mesh().area, rel=0.02)
+
+
+def test_a_large_mesh_is_coarse_while_it_moves(view, monkeypatch):
+    from clrecon.viewer import painter as module
+
+    monkeypatch.setattr(module, "COARSE_TRIANGLES", 400)
+    model, painter = view(scenes.make_mesh())
+    full = painter.picture(model.snapshot(), SIZE)
+    painter.make_coarse()
+    coarse = painter.picture(model.snapshot(), SIZE, sharp=False)
+    assert 50 < coarse.report["triangles"] < 900 < full.report["triangles"]
+    assert np.array_equal(painter.picture(model.snapshot(), SIZE).image, full.image)
+    assert shown_pixels(coarse) == pytest.approx(shown_pixels(full), rel=0.2)
+
+
+def test_a_translucent_mesh_is_opaque_while_it_moves(view):
+    model, painter = view(scenes.make_mesh())
+    model.set_opacity("1", 0.3)
+    assert painter.picture(model.snapshot(), SIZE).image[..., 3].max() < 250
+    assert painter.picture(model.snapshot(), SIZE, sharp=False).image[..., 3].max() == 255
+
+
+def test_a_curve_straightens_the_scan(view):
+    model, painter = view()
+    with pytest.raises(UsageError, match="two points"):
+        painter.curve_picture(model.snapshot(), SIZE)
+    model.start_tool("curve")
+    for number in (0, 1):
+        model.add_point(Pick(point=tuple(scenes.middle(number))))
+    picture = painter.curve_picture(model.snapshot(), SIZE)
+    assert picture.size == SIZE and np.nanmax(picture.values) > 900.0
+
+
+def test_without_the_table_another_volume_is_shown(view, monkeypatch):
+    from clrecon.anatomy import body
+
+    model, painter = view()
+    bare = scenes.make_scan().voxels.copy()
+    bare[:, :, 24:] = -800
+
+    def remove(volume, progress=None):
+        made = volume.with_voxels(bare)
+        made.report = {**made.report, "remove_table": {"removed_share": 0.5, "dense_voxels_removed": 7}}
+        return made
+
+    monkeypatch.setattr(body, "remove_table", remove)
+    before = shown_pixels(painter.picture(model.snapshot(), SIZE))
+    assert not painter.knows_table
+    assert painter.remove_table()[1]["dense_voxels_removed"] == 7 and painter.knows_table
+    model.set_table(False)
+    assert 0 < shown_pixels(painter.picture(model.snapshot(), SIZE)) < before
+    model.undo()
+    assert shown_pixels(painter.picture(model.snapshot(), SIZE)) == before
+
+
+def test_two_views_share_a_painter_without_disturbing_each_other(view):
+    one, painter = view()
+    other = ViewModel(one.objects, iso_value=-200.0)
+    find(one, painter)
+    find(other, painter)
+    one.show("1/1", False)
+    other.set_color("1/1", (0.0, 0.0, 1.0))
+    pictures = [painter.picture(each.snapshot(), SIZE).image for each in (one, other)]
+    for _ in range(2):
+        for each, before in zip((one, other), pictures, strict=True):
+            assert np.array_equal(painter.picture(each.snapshot(), SIZE).image, before)
+    assert not np.array_equal(*pictures)
+
+
+def test_a_scan_in_slabs_is_shown_too(device):
+    objects = show_objects([scenes.make_scan()])
+    model = ViewModel(objects, iso_value=scenes.ISO)
+    with Painter(objects, device=device) as whole, Painter(objects, device=device, memory=80_000) as slabs:
+        pictures = [each.picture(model.snapshot(), (24, 20)) for each in (whole, slabs)]
+        assert pictures[1].report["slabs"] > 1
+        assert np.array_equal(pictures[0].image, pictures[1].image)
+
+
+def test_kernels_are_built_for_every_kind_of_voxels(device):
+    objects = show_objects([scenes.make_scan(), scenes.make_scan(dtype=np.float32), scenes.make_mesh()])
+    told = []
+    with Painter(objects, device=device) as painter:
+        painter.prepare(lambda stage, done, total: told.append(stage))
+    assert told.count("build") >= 14 and "parts" in told
+
+
+@pytest.mark.unit
+def test_labels_grow_by_one_voxel_to_all_sides():
+    voxels = np.zeros((5, 6, 7), np.uint8)
+    voxels[2, 2, 2], voxels[4, 5, 6] = 3, 9
+    grow_labels(voxels)
+    assert (voxels[1:4, 1:4, 1:4] == 3).all() and (voxels == 3).sum() == 27
+    assert (voxels[3:, 4:, 5:] == 9).all() and (voxels == 9).sum() == 8
+
+
+@pytest.mark.unit
+def test_a_coarse_mesh_is_near_the_fine_one():
+    from clrecon.viewer.coarse import coarsen_mesh
+
+    fine = scenes.make_mesh(radius=20.0)
+    coarse = coarsen_mesh(fine, 500)
+    assert 200 < coarse.triangle_count < 1200
+    assert coarse.area == pytest.approx(fine.area, rel=0.1) and coarse.normals is not None

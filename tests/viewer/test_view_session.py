@@ -1,0 +1,426 @@
+"""A session of a view: every command with right and wrong arguments, pictures from its threads, closing at any time."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+
+import numpy as np
+import pytest
+import view_scenes as scenes
+
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.mesh.reader import read_mesh
+from clrecon.points.reader import read_points
+from clrecon.reading import read_volume
+from clrecon.viewer.commands import COMMANDS
+from clrecon.viewer.objects import show_objects
+from clrecon.viewer.painter import Painter
+from clrecon.viewer.session import ViewSession
+
+SIZE = (96, 80)
+PATIENCE = 60.0
+AT = {"size": list(SIZE)}
+
+
+@pytest.fixture
+def session(device):
+    opened = []
+
+    def make(*subjects, **given) -> ViewSession:
+        objects = show_objects(subjects or [scenes.make_scan(), scenes.make_mesh()])
+        opened.append(
+            ViewSession(objects, iso_value=scenes.ISO, device=None if "painter" in given else device, **given)
+        )
+        return opened[-1]
+
+    yield make
+    for each in opened:
+        each.close()
+
+
+def pixel(session: ViewSession, number: int) -> dict:
+    """Arguments of a command at the middle of a ball."""
+    x, y = session.model.camera.project([scenes.middle(number)], SIZE)[0][0]
+    return {"x": float(x), "y": float(y), **AT}
+
+
+def picture(session: ViewSession, moving: bool = False):
+    found = []
+    session.picture(SIZE, moving, found.append)
+    assert session.wait(PATIENCE)
+    assert session.facts()["error"] is None
+    return found[-1]
+
+
+def settle(session: ViewSession) -> None:
+    """Let the parts be found again where that is needed."""
+    session.rest()
+    assert session.wait(PATIENCE)
+
+
+RIGHT = {
+    "turn": {"dx": 0.1, "dy": 0},
+    "pan": {"dx": 0.1, "dy": 0.1},
+    "zoom": {"factor": 2, "at": [0.1, 0.1]},
+    "roll": {"degrees": 20},
+    "look": {"view": "left"},
+    "set_perspective": {"on": True},
+    "set_iso": {"hu": 310},
+    "set_mode": {"name": "muscle"},
+    "set_window": {"low": -100, "high": 400, "of": "slices"},
+    "scroll": {"plane": "axial", "steps": 2},
+    "set_cross": {"point": [-40, -20, 210]},
+    "show": {"key": "2", "visible": False},
+    "only": {"key": "2"},
+    "show_all": {},
+    "set_color": {"key": "2", "rgb": [1, 0, 0]},
+    "color_parts": {"distinct": True},
+    "set_opacity": {"key": "2", "value": 0.5},
+    "start_tool": {"name": "seed"},
+    "add_clip": {"direction": [0, 1, 1]},
+    "move_clip": {"n": 0, "share": 0.7},
+    "flip_clip": {"n": 0},
+    "remove_clip": {"n": 0},
+    "set_clip_box": {"low": [-60, -40, 200], "high": [-20, -10, 220]},
+    "clear_measures": {},
+    "end_tool": {},
+    "undo": {},
+    "cancel": {},
+    "dismiss": {},
+    "find_parts": {},
+    "set_table": {"shown": True},
+    "pick": {"x": 3, "y": 3, **AT},
+    "hide_at": {"x": 3, "y": 3, **AT},
+    "only_at": {"x": 3, "y": 3, **AT},
+    "cross_at": {"x": 3, "y": 3, **AT},
+    "add_point": {"x": 3, "y": 3, **AT},
+}
+
+
+@pytest.mark.opencl
+def test_every_command_is_done_and_undone(session):
+    assert set(RIGHT) | {"save"} == set(COMMANDS)
+    view = session()
+    view.do({"do": "find_parts"})
+    assert view.wait(PATIENCE)
+    for name, arguments in RIGHT.items():
+        before = view.model.snapshot()
+        json.dumps(view.do({"do": name, **arguments}))
+        settle(view)
+        after = view.model.snapshot()
+        if after != before and name != "undo":
+            view.do({"do": "undo"})
+            assert view.model.snapshot() == before, name
+            view.do({"do": name, **arguments})
+            settle(view)
+        assert view.facts()["error"] is None
+    assert view.model.version > 20
+
+
+@pytest.mark.opencl
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (None, "mapping"),
+        ({}, "unknown command"),
+        ({"do": "set_isso"}, "set_iso"),
+        ({"do": ["set_iso"]}, "unknown command"),
+        ({"do": "set_iso"}, "needs hu"),
+        ({"do": "set_iso", "hu": "300"}, "hu of the command set_iso is a number"),
+        ({"do": "set_iso", "hu": True}, "is a number"),
+        ({"do": "set_iso", "hu": float("nan")}, "finite"),
+        ({"do": "set_iso", "hu": 300, "hv": 1}, "no argument 'hv'"),
+        ({"do": "undo", "times": 2}, "takes none"),
+        ({"do": "turn", "dx": 1, "dy": None}, "is a number"),
+        ({"do": "zoom", "factor": 2, "at": [1]}, "2 numbers"),
+        ({"do": "zoom", "factor": 2, "at": "ab"}, "2 numbers"),
+        ({"do": "look", "view": [0, 95]}, "-90"),
+        ({"do": "show", "key": 2, "visible": True}, "is a name"),
+        ({"do": "show", "key": "x" * 300, "visible": True}, "is a name"),
+        ({"do": "show", "key": "2", "visible": 1}, "true or false"),
+        ({"do": "move_clip", "n": 0.5, "share": 0.5}, "whole number"),
+        ({"do": "move_clip", "n": 3, "share": 0.5}, "no clip plane 3"),
+        ({"do": "set_color", "key": "2", "rgb": [1, 2]}, "3 numbers"),
+        ({"do": "pick", "x": 1, "y": 1, "size": [0, 10]}, "from 1 to"),
+        ({"do": "pick", "x": 1, "y": 1, "size": [10]}, "width and height"),
+        ({"do": "pick", "x": 99, "y": 1, "size": [10, 10]}, "outside of a picture"),
+        ({"do": "pick", "x": 1, "y": 1, "size": [10, 10], "plane": "oblique"}, "axial"),
+        ({"do": "add_clip", "direction": "up"}, "side"),
+        ({"do": "save", "path": "page.doc"}, "extension"),
+        ({"do": "save", "path": ""}, "extension"),
+    ],
+)
+def test_a_wrong_command_is_refused_and_changes_nothing(session, command, words):
+    view = session()
+    before, version = view.model.snapshot(), view.model.version
+    with pytest.raises(UsageError, match=words):
+        view.do(command)
+    assert view.model.snapshot() == before and view.model.version == version and view.facts()["error"] is None
+
+
+@pytest.mark.opencl
+def test_pictures_and_slices_come_from_its_threads(session):
+    view = session()
+    names = []
+    view.picture(SIZE, False, lambda made: names.append((threading.current_thread().name, made.size)))
+    for plane in ("axial", "coronal", "sagittal"):
+        view.slice(plane, (50, 40), lambda made: names.append((threading.current_thread().name, made.size)))
+    assert view.wait(PATIENCE)
+    assert sorted(size for _, size in names) == [(50, 40)] * 3 + [SIZE]
+    assert all(name == "view-pictures" for name, _ in names)
+    timing = view.facts()["timing"]
+    assert timing["sharp"] and timing["size"] == list(SIZE) and timing["ms"] > 0.0
+
+
+@pytest.mark.opencl
+def test_a_coarse_picture_is_steered_and_the_latest_state_is_drawn(session, monkeypatch):
+    from clrecon.viewer import session as module
+
+    view = session(scenes.make_scan())
+    monkeypatch.setattr(module, "MOVING_MS", 1e9)
+    picture(view, moving=True)
+    assert picture(view, moving=True).size == SIZE
+    monkeypatch.setattr(module, "MOVING_MS", 1e-9)
+    picture(view, moving=True)
+    assert picture(view, moving=True).size == (77, 64)
+    view.do({"do": "look", "view": "left"})
+    assert picture(view, moving=True).camera == view.model.camera
+
+
+@pytest.mark.opencl
+def test_a_part_at_a_pixel_is_hidden_once_the_parts_are_found(session):
+    view = session()
+    facts = view.do({"do": "hide_at", **pixel(view, 2)})
+    assert facts["pick"]["part"] == "1"
+    assert view.wait(PATIENCE)
+    assert view.model.state.part("1/3").visible is False and view.model.state.part("1/1").visible
+    view.do({"do": "only_at", **pixel(view, 1)})
+    assert [each.key for each in view.model.parts if each.visible] == ["1", "1/2"]
+    assert view.do({"do": "pick", **pixel(view, 0)})["pick"] is None
+    view.do({"do": "undo"})
+    view.do({"do": "undo"})
+    assert view.model.state.part("1/3").visible
+
+
+@pytest.mark.opencl
+def test_parts_are_found_again_at_another_iso_value_when_nothing_moves(session):
+    view = session(scenes.make_scan())
+    view.do({"do": "find_parts"})
+    assert view.wait(PATIENCE)
+    view.do({"do": "show", "key": "1/1", "visible": False})
+    view.do({"do": "set_iso", "hu": 600})
+    assert not view.facts()["parts_known"]
+    view.rest()
+    assert view.wait(PATIENCE)
+    assert view.facts()["parts_known"] and view.model.state.part("1/1").visible is False
+    view.do({"do": "undo"})
+    assert view.wait(PATIENCE) and view.facts()["parts_known"] and view.model.iso_value == scenes.ISO
+
+
+@pytest.mark.opencl
+def test_points_of_a_tool_are_picks_in_picture_and_slices(session):
+    view = session(scenes.make_scan())
+    view.do({"do": "set_cross", "point": scenes.middle(0).tolist()})
+    view.do({"do": "start_tool", "name": "distance"})
+    assert view.do({"do": "add_point", "x": 1, "y": 1, **AT})["measure"] is None
+    assert view.facts()["points"] == []
+    for number in (0, 1):
+        facts = view.do({"do": "add_point", **pixel(view, number)})
+    assert facts["measure"]["unit"] == "mm" and facts["measures"][0]["text"].endswith(" mm")
+    camera = view.painter.slice_camera(view.model.snapshot(), "axial", SIZE)
+    x, y = camera.project([scenes.middle(0)], SIZE)[0][0]
+    view.do({"do": "start_tool", "name": "seed"})
+    facts = view.do({"do": "add_point", "x": x, "y": y, **AT, "plane": "axial"})
+    assert facts["measure"]["points"][0] == pytest.approx(scenes.middle(0), abs=1e-3)
+    facts = view.do({"do": "cross_at", **pixel(view, 1)})
+    assert facts["cross"] == pytest.approx(facts["pick"]["point"], abs=1e-3)
+
+
+@pytest.mark.opencl
+def test_the_table_goes_in_the_background_and_it_is_said_how_much(session, monkeypatch):
+    from clrecon.anatomy import body
+
+    def remove(volume, progress=None):
+        made = volume.with_voxels(volume.voxels.copy())
+        made.report = {**made.report, "remove_table": {"removed_share": 0.25, "dense_voxels_removed": 1200}}
+        return made
+
+    monkeypatch.setattr(body, "remove_table", remove)
+    view = session(scenes.make_scan())
+    view.do({"do": "set_table", "shown": False})
+    assert view.wait(PATIENCE)
+    facts = view.facts()
+    assert facts["table"] is False and "25 % of the voxels" in facts["said"] and "1,200" in facts["said"]
+    view.do({"do": "undo"})
+    assert view.facts()["table"]
+
+    def refuse(volume, progress=None):
+        raise RefusedInputError("no body found")
+
+    monkeypatch.setattr(body, "remove_table", refuse)
+    other = session(scenes.make_scan())
+    other.do({"do": "set_table", "shown": False})
+    assert other.wait(PATIENCE)
+    assert other.facts()["error"] == "no body found" and other.facts()["table"]
+    assert other.do({"do": "dismiss"})["error"] is None
+
+
+@pytest.mark.opencl
+@pytest.mark.parametrize("name", ["a.stl", "a.ply", "a.glb", "a.3mf", "a.obj", "a.vtp", "a.html"])
+def test_what_is_shown_is_saved_to_every_mesh_format(session, tmp_path, name):
+    view = session()
+    view.do({"do": "find_parts"})
+    assert view.wait(PATIENCE)
+    view.do({"do": "show", "key": "1/1", "visible": False})
+    view.do({"do": "save", "path": str(tmp_path / name)})
+    assert view.wait(PATIENCE)
+    facts = view.facts()
+    assert facts["error"] is None and f"{name}: 2 meshes" in facts["said"]
+    assert (tmp_path / name).stat().st_size > 1000
+    if name.endswith((".stl", ".ply")):
+        shown = view.painter.mesh_of_shown(view.model.snapshot())
+        assert read_mesh(tmp_path / name).triangle_count == sum(each.triangle_count for each in shown)
+
+
+@pytest.mark.opencl
+@pytest.mark.parametrize("name", ["a.ply", "a.npz", "a.xyz", "a.vtp"])
+def test_clouds_are_saved_to_every_cloud_format(session, tmp_path, name):
+    view = session(scenes.make_cloud())
+    view.do({"do": "save", "path": str(tmp_path / name)})
+    assert view.wait(PATIENCE) and view.facts()["error"] is None
+    assert len(read_points(tmp_path / name)) == 200
+
+
+@pytest.mark.opencl
+def test_a_cloud_of_a_scan_is_the_vertices_of_its_surface(session, tmp_path):
+    view = session(scenes.make_scan())
+    view.do({"do": "save", "path": str(tmp_path / "a.npz")})
+    assert view.wait(PATIENCE) and view.facts()["error"] is None
+    (mesh,) = view.painter.mesh_of_shown(view.model.snapshot())
+    assert np.array_equal(read_points(tmp_path / "a.npz").points, mesh.vertices)
+
+
+@pytest.mark.opencl
+def test_a_volume_is_saved_without_hidden_parts_cut_and_cropped(session, tmp_path):
+    view = session(scenes.make_scan())
+    view.do({"do": "find_parts"})
+    assert view.wait(PATIENCE)
+    view.do({"do": "show", "key": "1/2", "visible": False})
+    low, high = (scenes.middle(0) - 12.0).tolist(), (scenes.middle(2) + 12.0).tolist()
+    view.do({"do": "set_clip_box", "low": np.minimum(low, high).tolist(), "high": np.maximum(low, high).tolist()})
+    view.do({"do": "save", "path": str(tmp_path / "a.nii.gz")})
+    assert view.wait(PATIENCE) and view.facts()["error"] is None
+    saved = read_volume(tmp_path / "a.nii.gz")
+    assert saved.voxels.size < 0.9 * scenes.make_scan().voxels.size
+    values = [saved.voxels[tuple(np.rint(saved.lps_to_ijk([scenes.middle(n)])[0]).astype(int)[::-1])] for n in range(3)]
+    assert values[0] == 1000 and values[1] < -800 and values[2] > 500
+
+
+@pytest.mark.opencl
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif"])
+def test_a_screenshot_is_as_large_as_asked_for(session, tmp_path, name):
+    from PIL import Image
+
+    view = session()
+    view.do({"do": "save", "path": str(tmp_path / name), "size": [120, 90]})
+    assert view.wait(PATIENCE) and view.facts()["error"] is None
+    assert Image.open(tmp_path / name).size == (120, 90)
+
+
+@pytest.mark.opencl
+def test_what_cannot_be_saved_is_said(session, tmp_path):
+    view = session(scenes.make_mesh())
+    with pytest.raises(UsageError, match="no scan"):
+        view.do({"do": "save", "path": str(tmp_path / "a.nii.gz")})
+    view.do({"do": "show", "key": "1", "visible": False})
+    with pytest.raises(UsageError, match="nothing that has a surface"):
+        view.do({"do": "save", "path": str(tmp_path / "a.stl")})
+    view.do({"do": "undo"})
+    view.do({"do": "save", "path": str(tmp_path / "none" / "a.stl")})
+    assert view.wait(PATIENCE)
+    assert "none" in view.facts()["error"] and not list(tmp_path.iterdir())
+
+
+@pytest.mark.opencl
+def test_it_closes_within_a_second_while_it_works(session, monkeypatch):
+    view = session()
+
+    def search(state, progress):
+        while True:
+            progress("parts", 0, 1)
+            time.sleep(0.002)
+
+    monkeypatch.setattr(view.painter, "find_parts", search)
+    view.do({"do": "find_parts"})
+    view.picture((600, 600), False, lambda made: None)
+    while "finding parts" not in view.facts()["busy"]:
+        time.sleep(0.001)
+    view.close()
+    assert not view._work._thread.is_alive() and not view._pictures._thread.is_alive()
+    view.picture(SIZE, False, lambda made: pytest.fail("a closed view draws nothing"))
+    view.close()
+
+
+@pytest.mark.opencl
+def test_work_is_cancelled_by_a_command(session, monkeypatch):
+    view = session()
+
+    def search(state, progress):
+        while True:
+            progress("parts", 0, 1)
+            time.sleep(0.002)
+
+    monkeypatch.setattr(view.painter, "find_parts", search)
+    view.do({"do": "find_parts"})
+    while view.facts()["busy"] != ["finding parts"]:
+        time.sleep(0.001)
+    view.do({"do": "cancel"})
+    assert view.wait(PATIENCE) and view.facts()["error"] is None
+
+
+@pytest.mark.opencl
+def test_several_sessions_share_a_painter_and_do_not_disturb_each_other(device):
+    objects = show_objects([scenes.make_scan(), scenes.make_mesh()])
+    with Painter(objects, device=device) as painter:
+        views = [ViewSession(objects, painter, iso_value=iso) for iso in (300.0, 0.0, 700.0)]
+        try:
+            for view in views:
+                picture(view)  # the view knows the size of its picture now
+                view.do({"do": "look", "view": "left"})
+            alone = [picture(view).image for view in views]
+            for view in views:
+                for _ in range(4):
+                    view.do({"do": "turn", "dx": 0.05, "dy": 0.02})
+                    view.picture(SIZE, True, lambda made: None)
+                view.do({"do": "look", "view": "left"})
+            for view, before in zip(views, alone, strict=True):
+                assert np.array_equal(picture(view).image, before)
+            views[0].close()
+            assert np.array_equal(picture(views[1]).image, alone[1])
+        finally:
+            for view in views:
+                view.close()
+
+
+@pytest.mark.opencl
+def test_the_first_view_fits_the_size_of_the_picture(session):
+    view = session()
+    wide, found = (200, 80), []
+    before = view.model.camera.parallel_scale
+    view.picture(wide, False, found.append)
+    assert view.wait(PATIENCE) and found[0].camera.parallel_scale < before and view.model.undo() is None
+    view.do({"do": "zoom", "factor": 2})
+    zoomed = view.model.camera
+    view.picture((80, 80), False, found.append)
+    assert view.wait(PATIENCE) and found[1].camera == zoomed
+
+
+@pytest.mark.opencl
+def test_news_of_the_background_are_told(session):
+    told = []
+    view = session(scenes.make_scan(), on_change=lambda: told.append(1))
+    view.prepare()
+    view.do({"do": "find_parts"})
+    assert view.wait(PATIENCE) and len(told) >= 4 and view.facts()["error"] is None
