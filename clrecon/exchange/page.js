@@ -1,13 +1,6 @@
-"use strict";
 (async () => {
-  const find = (id) => document.getElementById(id);
   const facts = JSON.parse(find("facts").textContent);
   const scene = find("scene"), over = find("over"), message = find("message");
-  const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-  const minus = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
-  const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-  const unit = (a) => { const size = Math.hypot(...a); return a.map((value) => value / size); };
-  const element = (kind, text, more) => Object.assign(document.createElement(kind), { textContent: text || "" }, more);
 
   // The surface: what clrecon/exchange/page_coding.py wrote.
 
@@ -105,7 +98,6 @@
   let measures = [], tool = "", picks = [], coarse = false, asked = false, shade, pick, pickTarget;
 
   const VIEWS = { A: [0, -1, 0], P: [0, 1, 0], L: [1, 0, 0], R: [-1, 0, 0], S: [0, 0, 1], I: [0, 0, -1] };
-  const VIEW_NAMES = { A: "anterior", P: "posterior", L: "left", R: "right", S: "superior", I: "inferior" };
 
   function look(letter) {
     camera.fits = letter;  // as long as nobody moves it
@@ -216,11 +208,6 @@
 
   // What lies over the picture: sides of the patient, scale, measures.
 
-  function sideOf(direction) {
-    const letters = ["RL", "AP", "IS"].map((pair, axis) => [Math.abs(direction[axis]), pair[+(direction[axis] > 0)]]);
-    return letters.filter(([size]) => size > 0.3).sort((a, b) => b[0] - a[0]).map(([, letter]) => letter).join("");
-  }
-
   function annotate(width, height, ratio) {
     const pen = over.getContext("2d"), style = getComputedStyle(document.body);
     const ink = style.color, ground = style.backgroundColor;
@@ -251,11 +238,10 @@
     write(sideOf(less(up)), width / 2, height - 14);
     write(sideOf(less(right)), 18, height / 2);
     write(sideOf(right), width - 18, height / 2);
-    const most = (width / 4) * camera.mm, power = 10 ** Math.floor(Math.log10(most));
-    const length = power * [5, 2, 1].find((factor) => factor * power <= most), end = 16 + length / camera.mm;
+    const length = roundLength((width / 4) * camera.mm), end = 16 + length / camera.mm;
     line([[16, height - 22], [16, height - 16], [end, height - 16], [end, height - 22]]);
     pen.textAlign = "left";
-    write(`${length >= 1 ? length : length.toPrecision(1)} mm`, 16, height - 32);
+    write(sayLength(length), 16, height - 32);
     for (const measure of [...measures, { points: picks }]) {
       const points = measure.points.map(project);
       line(points);
@@ -308,7 +294,6 @@
   function listParts() {
     find("parts").replaceChildren(...parts.map((part) => {
       const row = element("li"), name = element("span", part.name, { className: "name" });
-      const ml = part.ml === null ? "" : `${part.ml.toPrecision(part.ml < 1 ? 2 : 4)} ml`;
       const input = (type, label, more) => element("input", "", { type, ariaLabel: `${label} ${part.name}`, ...more });
       const shown = input("checkbox", "show", { checked: part.shown });
       const color = input("color", "colour of", { value: part.color });
@@ -316,7 +301,7 @@
       shown.onchange = () => { part.shown = shown.checked; redraw(); };
       color.oninput = () => { part.color = color.value; redraw(); };
       opacity.oninput = () => { part.opacity = Number(opacity.value); redraw(); };
-      row.append(shown, color, name, element("span", ml, { className: "ml" }), opacity);
+      row.append(shown, color, name, element("span", sayMl(part.ml), { className: "ml" }), opacity);
       return row;
     }));
   }

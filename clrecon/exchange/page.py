@@ -28,7 +28,17 @@ from clrecon.exchange.content import BONE_COLOR, Assembly, Content, parts_of, re
 from clrecon.exchange.page_coding import CodedSurface, decode_surface, encode_surface
 from clrecon.version import package_version
 
-__all__ = ["MOST_TRIANGLES", "compose_page", "estimate", "parse_page", "read_facts", "verify", "write"]
+__all__ = [
+    "MOST_TRIANGLES",
+    "compose_page",
+    "estimate",
+    "hash_code",
+    "parse_page",
+    "read_facts",
+    "read_page_code",
+    "verify",
+    "write",
+]
 
 MOST_TRIANGLES = 10_000_000
 """About 70 MB of page and 200 MB on the graphics card; more is slow to turn on most computers."""
@@ -41,7 +51,7 @@ _BLOCK = re.compile(r'<script id="(facts|surface)" type="[a-z/]+">([^<]*)</scrip
 
 def estimate(content: Content | Assembly) -> int:
     """Return the least bytes of the file."""
-    own = sum(len(_code(name)) for name in ("page.html", "page.css", "page.js"))
+    own = len(read_page_code("page.html")) + len(read_page_code("page.css")) + len(_script())
     return own + int(_LEAST_BYTES_A_TRIANGLE * sum(len(part.triangles) for part in parts_of(content)))
 
 
@@ -84,15 +94,15 @@ def compose_page(content: Content | Assembly) -> bytes:
     }
     # "<" would end the block: in JSON it can stand as an escape.
     text = json.dumps(facts, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    style, script = _code("page.css"), _code("page.js")
+    style, script = read_page_code("page.css"), _script()
     policy = (
-        f"default-src 'none'; script-src '{_hash(script)}'; style-src '{_hash(style)}'; base-uri 'none';"
+        f"default-src 'none'; script-src '{hash_code(script)}'; style-src '{hash_code(style)}'; base-uri 'none';"
         " form-action 'none'"
     )
     filled = {"POLICY": policy, "STYLE": style, "SCRIPT": script, "FACTS": text}
     before, after = (
         re.sub("@([A-Z]+)@", lambda place: filled[place[1]], half)  # at once: what is filled in is not looked at again
-        for half in (_code("page.html") + "\n").split("@SURFACE@")
+        for half in (read_page_code("page.html") + "\n").split("@SURFACE@")
     )
     return before.encode() + base64.b64encode(coded.data) + after.encode()
 
@@ -192,11 +202,16 @@ def _hexadecimal(color: Sequence[float]) -> str:
     return "#" + "".join(f"{round(255 * min(max(value, 0.0), 1.0)):02x}" for value in color)
 
 
-def _hash(text: str) -> str:
+def _script() -> str:
+    return "\n".join((read_page_code("page_shared.js"), read_page_code("page.js")))
+
+
+def hash_code(text: str) -> str:
     """Return the hash by which a Content-Security-Policy names an inline script or style."""
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
 
 
 @cache
-def _code(name: str) -> str:
+def read_page_code(name: str) -> str:
+    """Return a file of the page: ``page.html``, ``page.css``, ``page.js``, ``page_shared.js``."""
     return (files(__package__) / name).read_text(encoding="utf-8").strip()
