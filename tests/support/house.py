@@ -140,7 +140,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "operators": frozenset({"pyopencl", "SimpleITK", "skimage"}),
     # vtkmodules: peers of the bench and of the comparison, whose page has plots and pictures.
     "jobs": frozenset({"pyvista", "skimage", "vtkmodules", "matplotlib", "PIL"}),
-    "viewer": frozenset({"PIL", "pyvista", "vtk", "vtkmodules"}),
+    "viewer": frozenset({"aiohttp", "PIL", "pyvista", "vtk", "vtkmodules"}),
     "cli": frozenset({"rich"}),
 }
 

@@ -1,0 +1,338 @@
+"""One browser: its commands go to its own session, and pictures and facts come back, no more than it can take.
+
+A picture is drawn while the one before is on its way, and sent when the browser has shown that one.  So at most one
+picture is under way and one waits, however slow the connection is.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from clrecon.errors import ClreconError, UsageError
+from clrecon.system.log import get_logger
+from clrecon.viewer.web.downloads import Downloads
+from clrecon.viewer.web.pacing import SCENE, SLICES, VIEWS, Asked, Pace
+from clrecon.viewer.web.picture_coding import encode_picture
+
+if TYPE_CHECKING:
+    from aiohttp import web
+
+    from clrecon.rendering import Rendering
+    from clrecon.viewer.model import ViewModel
+
+__all__ = ["Connection", "Session"]
+
+log = get_logger(__name__)
+
+REST_SECONDS = 0.2
+"""After the last change until pictures are drawn sharp."""
+
+LARGEST_SIDE = 2048
+"""Pixels of a picture; larger views get one with fewer pixels."""
+
+_MOST_WAITING = 256
+"""Messages of a browser that wait; more are left in the connection."""
+
+_SAID_ONCE = ("pick", "measure", "undone")
+"""What the answer to a command holds beside the facts."""
+
+_NOT_FOR_BROWSERS = frozenset({"save"})
+"""Commands with a path on this computer: a browser gets a file as a download."""
+
+
+class Session(Protocol):
+    """What a connection needs of `clrecon.viewer.session.ViewSession`."""
+
+    model: ViewModel
+
+    def do(self, command: Mapping[str, Any]) -> dict[str, Any]: ...
+    def facts(self) -> dict[str, Any]: ...
+    def picture(self, size: tuple[int, int], moving: bool, then: Callable[[Rendering], None]) -> None: ...
+    def slice(self, plane: str, size: tuple[int, int], then: Callable[[Rendering], None]) -> None: ...
+    def curve_picture(self, size: tuple[int, int], then: Callable[[Rendering], None]) -> None: ...
+    def prepare(self) -> None: ...
+    def rest(self) -> None: ...
+    def save(self, path: Path, then: Callable[[list[str]], None], size: tuple[int, int]) -> None: ...
+    def dismiss(self) -> None: ...
+    def close(self) -> None: ...
+
+
+class Connection:
+    """One browser.
+
+    Parameters
+    ----------
+    open_session : callable
+        Makes its session; called with a function that the session calls, in any thread, when something happened.
+    socket : aiohttp.web.WebSocketResponse
+    folder : Path
+        For files that it asks for.
+    """
+
+    def __init__(
+        self, open_session: Callable[[Callable[[], None]], Session], socket: web.WebSocketResponse, folder: Path
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._socket = socket
+        self._session = open_session(lambda: self._later(self._hear))
+        self.downloads = Downloads(folder)
+        self._fixed = {"bounds": _bounds(self._session.model), "formats": _formats(self._session.model)}
+        self._pace = Pace()
+        self._keys: dict[str, Any] = {}
+        self._ground = (0, 0, 0)
+        self._number = 0
+        self._drawing: Asked | None = None
+        self._ready: bytes | None = None
+        self._under_way = False
+        self._notes: list[dict[str, Any]] = []
+        self._told = ""
+        self._resting: asyncio.TimerHandle | None = None
+        self._wake = asyncio.Event()
+        self._waiting: asyncio.Queue[Any] = asyncio.Queue(_MOST_WAITING)
+        # Commands wait for the device where they ask what is seen at a pixel: not in the thread of the server.
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="view-commands")
+        self._closed = False
+
+    async def serve(self) -> None:
+        """Serve the browser until it leaves."""
+        from aiohttp import WSMsgType
+
+        tasks = [asyncio.ensure_future(work()) for work in (self._write, self._command)]
+        try:
+            self._session.prepare()
+            self._look_again()
+            async for message in self._socket:
+                if message.type != WSMsgType.TEXT:
+                    break
+                try:
+                    await self._take(json.loads(message.data))
+                except (ValueError, TypeError, KeyError, AttributeError):
+                    self._say(error="this message cannot be read: load the page again")
+        finally:
+            for task in tasks:
+                task.cancel()
+
+    async def close(self) -> None:
+        """Close the session, whose work is cancelled, without waiting in the thread of the server."""
+        if self._closed:
+            return
+        self._closed = True
+        self.downloads.close()
+        self._thread.shutdown(wait=False, cancel_futures=True)
+        if self._resting is not None:
+            self._resting.cancel()
+        ended = asyncio.Event()
+
+        def end() -> None:
+            try:
+                self._session.close()
+            finally:
+                with contextlib.suppress(RuntimeError):  # the server has ended meanwhile
+                    self._loop.call_soon_threadsafe(ended.set)
+
+        threading.Thread(target=end, name="view-close", daemon=True).start()
+        await ended.wait()
+
+    # From the browser
+
+    async def _take(self, message: Mapping[str, Any]) -> None:
+        """Take a message: what concerns the connection at once, commands one after the other."""
+        if "shown" in message:
+            self._under_way = False
+            self._wake.set()
+            self._draw()
+        elif "sizes" in message:
+            red, green, blue = (min(255, max(0, int(value))) for value in message["ground"])
+            if (red, green, blue) != self._ground:
+                self._ground = (red, green, blue)
+                self._keys.clear()
+            self._pace.resize({view: _fit(size) for view, size in message["sizes"].items() if view in VIEWS})
+            self._look_again()
+        else:
+            await self._waiting.put(message)
+
+    async def _command(self) -> None:
+        """Do the commands, one after the other."""
+        while True:
+            message = await self._waiting.get()
+            try:
+                if "save" in message:
+                    self._save(message["save"], message.get("size"))
+                    continue
+                if message.get("do") in _NOT_FOR_BROWSERS:
+                    raise UsageError(f"the command {message['do']} is not for browsers")
+                said = await self._loop.run_in_executor(self._thread, self._session.do, message)
+            except ClreconError as error:
+                self._say(error=str(error))
+            except Exception as error:  # a fault of ours: the other browsers, and this one, go on
+                log.exception("a command failed")
+                self._say(error=f"{type(error).__name__}: a fault of clrecon, please report it")
+            else:
+                once = {name: said.pop(name) for name in _SAID_ONCE if name in said}
+                if once:
+                    self._say(**once)
+            self._look_again()
+
+    def _save(self, format: Any, size: Any) -> None:
+        """Let a file be made, and offer it when it is finished."""
+        if not isinstance(format, str) or not format.startswith(".") or not format[1:].replace(".", "").isalnum():
+            raise UsageError("a format is an extension such as .stl")
+        download = self.downloads.reserve(f"view{format}")
+
+        def finish(lines: list[str]) -> None:
+            self._later(self._offer, download)
+
+        try:
+            self._session.save(download.path, finish, _fit(size or (1024, 1024)))
+        except ClreconError:
+            self.downloads.drop(download)
+            raise
+
+    def _offer(self, download: Any) -> None:
+        self.downloads.offer(download)
+        self._say(saved={"ticket": download.ticket, "name": download.path.name, "bytes": download.size})
+
+    # To the browser
+
+    def _say(self, **note: Any) -> None:
+        """Send a note of its own, beside the facts."""
+        if len(self._notes) < _MOST_WAITING:
+            self._notes.append(note)
+        self._wake.set()
+
+    def _hear(self) -> None:
+        """Take the news of the session: work began or ended, parts were found, something failed."""
+        error = self._session.facts()["error"]
+        if error is not None:  # it may be that of a picture, which never comes then
+            self._session.dismiss()
+            self._drawing = None
+            self._say(error=error)
+        self._look_again()
+
+    def _look_again(self) -> None:
+        """Find out what is stale, and draw it."""
+        keys = {view: _key(self._session.model, view) for view in VIEWS}
+        changed = [view for view, key in keys.items() if self._keys.get(view, self) != key]
+        if changed:
+            self._keys = keys
+            self._pace.change(changed)
+            if self._resting is not None:
+                self._resting.cancel()
+            self._resting = self._loop.call_later(REST_SECONDS, self._rest)
+        self._wake.set()
+        self._draw()
+
+    def _rest(self) -> None:
+        self._pace.rest()
+        self._session.rest()
+        self._draw()
+
+    def _draw(self) -> None:
+        """Ask for the next picture, if none is being drawn or waits to be sent."""
+        if self._closed or self._ready is not None:
+            return
+        # Of one view the session gives a sharp picture up for the next one.
+        asked = self._pace.next() if self._drawing is None else self._pace.instead(self._drawing)
+        if asked is None:
+            return
+        self._drawing = asked
+
+        def then(picture: Rendering) -> None:
+            self._number += 1
+            facts = {"view": asked.view, "number": self._number, "ms": float(picture.report.get("ms", 0.0))}
+            made = encode_picture(picture, self._ground, not asked.moving, facts)
+            self._later(self._deliver, asked, made)
+
+        try:
+            if asked.view == SCENE:
+                self._session.picture(asked.size, asked.moving, then)
+            elif asked.view in SLICES:
+                self._session.slice(asked.view, asked.size, then)
+            else:
+                self._session.curve_picture(asked.size, then)
+        except ClreconError as error:
+            self._drawing = None
+            self._say(error=str(error))
+
+    def _deliver(self, asked: Asked, made: bytes) -> None:
+        if self._drawing is asked:
+            self._drawing = None
+        self._ready = made
+        self._wake.set()
+
+    async def _write(self) -> None:
+        """Send what there is to send; this is the only place that does."""
+        try:
+            while True:
+                await self._wake.wait()
+                self._wake.clear()
+                told = json.dumps(self._facts(), separators=(",", ":"))
+                if told != self._told:
+                    self._told = told
+                    await self._socket.send_str(f'{{"facts":{told}}}')
+                while self._notes:
+                    await self._socket.send_str(json.dumps(self._notes.pop(0)))
+                if self._ready is not None and not self._under_way:
+                    made, self._ready, self._under_way = self._ready, None, True
+                    await self._socket.send_bytes(made)
+                    self._draw()
+        except (ConnectionError, RuntimeError):  # the browser has left
+            await self._socket.close()
+
+    def _facts(self) -> dict[str, Any]:
+        """Return what the page shows: of the last picture the device alone, as the pictures say the rest themselves."""
+        facts = self._session.facts()
+        facts["device"] = facts.pop("timing").get("device")
+        return {**facts, **self._fixed}
+
+    def _later(self, function: Callable[..., None], *arguments: Any) -> None:
+        """Call a function in the thread of the server; from any thread."""
+        with contextlib.suppress(RuntimeError):  # it has ended meanwhile
+            self._loop.call_soon_threadsafe(self._if_open, function, *arguments)
+
+    def _if_open(self, function: Callable[..., None], *arguments: Any) -> None:
+        if not self._closed:
+            function(*arguments)
+
+
+def _key(model: ViewModel, view: str) -> Any:
+    """Return what the picture of a view depends on: equal keys, equal pictures."""
+    state = model.state
+    if view == SCENE:
+        sliced = (state.cross, state.window) if state.mode == "slices" else None
+        cut = (state.clips, state.clip_box)
+        shown = (state.mode, state.iso_value, state.picture_window, state.table, state.parts, state.parts_at)
+        return (state.camera, *shown, *cut, sliced)
+    if view in SLICES:
+        return (state.cross, state.window, state.table, state.parts, state.parts_at)
+    return (tuple(model.curve), state.window, state.table)
+
+
+def _bounds(model: ViewModel) -> list[list[float]]:
+    """Return the lowest and highest corner of all objects, LPS mm."""
+    corners = np.concatenate([each.corners for each in model.objects])
+    return [corners.min(axis=0).tolist(), corners.max(axis=0).tolist()]
+
+
+def _formats(model: ViewModel) -> dict[str, list[str]]:
+    """Return the extensions that can be saved, by what they hold; meshes first."""
+    from clrecon.viewer.saving import KINDS
+
+    kinds = ("mesh", "cloud", "volume", "picture") if model.scans else ("mesh", "cloud", "picture")
+    return {kind: list(KINDS[kind]) for kind in kinds}
+
+
+def _fit(size: Any) -> tuple[int, int]:
+    """Return a size that a picture may have, of the same shape."""
+    width, height = (max(1.0, float(value)) for value in size)
+    share = min(1.0, LARGEST_SIDE / max(width, height))
+    return max(1, round(share * width)), max(1, round(share * height))

@@ -1,0 +1,72 @@
+"""Which picture is drawn next."""
+
+from __future__ import annotations
+
+import pytest
+
+from clrecon.viewer.web.pacing import SCENE, Asked, Pace
+
+pytestmark = pytest.mark.unit
+
+SIZE = (400, 300)
+
+
+@pytest.fixture
+def pace() -> Pace:
+    made = Pace()
+    made.resize({SCENE: SIZE, "axial": (100, 100)})
+    return made
+
+
+def drain(pace: Pace) -> list[Asked]:
+    return list(iter(pace.next, None))
+
+
+def test_each_view_that_is_shown_is_drawn_once(pace: Pace) -> None:
+    assert drain(pace) == [Asked(SCENE, SIZE, False), Asked("axial", (100, 100), False)]
+    assert drain(pace) == []
+
+
+def test_what_changes_is_coarse_first_and_sharp_at_rest(pace: Pace) -> None:
+    drain(pace)
+    pace.change([SCENE])
+    assert drain(pace) == [Asked(SCENE, SIZE, True)]
+    pace.rest()
+    assert drain(pace) == [Asked(SCENE, SIZE, False)]
+    assert drain(pace) == []
+
+
+def test_views_take_turns_while_both_change_all_the_time(pace: Pace) -> None:
+    drain(pace)
+    order = []
+    for _ in range(6):
+        pace.change([SCENE, "axial"])
+        order.append(pace.next().view)
+    assert order == [SCENE, "axial"] * 3
+
+
+def test_views_that_are_not_shown_are_not_drawn(pace: Pace) -> None:
+    drain(pace)
+    pace.resize({SCENE: SIZE})
+    pace.change([SCENE, "axial", "sagittal"])
+    assert [asked.view for asked in drain(pace)] == [SCENE]
+    pace.rest()
+    assert [asked.view for asked in drain(pace)] == [SCENE]
+
+
+def test_only_a_new_size_is_drawn_again(pace: Pace) -> None:
+    drain(pace)
+    pace.resize({SCENE: SIZE, "axial": (120, 100)})
+    assert drain(pace) == [Asked("axial", (120, 100), False)]
+
+
+def test_a_sharp_picture_gives_way_to_a_moving_one_of_the_same_view(pace: Pace) -> None:
+    drain(pace)
+    sharp, slow = Asked(SCENE, SIZE, False), Asked(SCENE, SIZE, True)
+    assert pace.instead(sharp) is None  # nothing is stale
+    pace.change(["axial"])
+    assert pace.instead(sharp) is None  # another view waits until it is drawn
+    pace.change([SCENE])
+    assert pace.instead(slow) is None  # one that moves is finished
+    assert pace.instead(sharp) == slow
+    assert [asked.view for asked in drain(pace)] == ["axial"]
