@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes, pick, table
 from clrecon.cli.console import Console, printable
@@ -15,14 +15,22 @@ from clrecon.cli.mesh import add_levels, add_selection, add_solid, describe_volu
 from clrecon.cli.reading import add_reading
 from clrecon.errors import UsageError
 
+if TYPE_CHECKING:
+    from clrecon.jobs.view.settings import ViewSettings
+
 __all__ = ["add_arguments", "run"]
 
 _EPILOG = """\
-The page is one file: any browser from 2023 on shows it, without a server and offline. It asks for nothing from outside
+--web shows everything in a browser of this computer, drawn on the OpenCL device: a slider for the iso value, presets,
+slices, parts, measures, clips, and files of what is shown. It needs the package aiohttp, and no screen and no OpenGL:
+over a network use an ssh tunnel. Ctrl-C ends it.
+
+The page of --html is one file: any browser from 2023 on shows it, without a server and offline. It asks for nothing from outside
 and holds no patient data: files are numbered, not named, unless --name is given. It turns, clips and measures; parts
 (components, labels, files) are switched one by one. See docs/view.md. A window is not there yet.
 
 examples:
+  clrecon view CT_FOLDER --web
   clrecon view CT_FOLDER --html page.html
   clrecon view CT_FOLDER --html spine.html --labels spine.nii.gz
   clrecon view bone.stl implant.ply --html both.html --name bone --name implant"""
@@ -40,6 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     shown = parser.add_argument_group("what is shown")
     shown.add_argument("--html", metavar="FILE", help="write a page that shows the inputs: .html")
+    shown.add_argument("--web", action="store_true", help="show them in a browser of this computer, until Ctrl-C")
+    shown.add_argument("--port", type=int, metavar="N", help="of --web, on 127.0.0.1 (default: a free one)")
+    shown.add_argument("--open", action="store_true", help="with --web: open the browser too, not only say the address")
     shown.add_argument(
         "--name",
         dest="names",
@@ -74,8 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    if options.html is None:
-        raise UsageError("the page is all that view makes so far, there is no window: name it with --html page.html")
+    _check_faces(options)
     from clrecon.jobs.mesh.settings import MeshSettings
     from clrecon.jobs.view.job import write_view
     from clrecon.jobs.view.settings import ViewSettings
@@ -85,6 +95,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
         given.pop("solid", None)  # it says how each label becomes a mesh
     scan = MeshSettings(**{name: value for name, value in given.items() if value is not None})
     settings = ViewSettings(scan=scan, mesh_space=options.mesh_space, names=options.names)
+    if options.web:
+        return _serve(options, settings, console)
     report = write_view(
         options.inputs, options.html, settings, no_clobber=options.no_clobber, progress=console.progress
     )
@@ -93,6 +105,41 @@ def run(options: argparse.Namespace, console: Console) -> int:
         console.say(line)
     for warning in report["warnings"]:
         console.warn(warning)
+    return 0
+
+
+def _check_faces(options: argparse.Namespace) -> None:
+    """Refuse options that say two things, or nothing."""
+    if options.web and options.html is not None:
+        raise UsageError("--web shows a view and --html writes a page: ask for one of them")
+    for name in ("port", "open"):
+        if getattr(options, name) and not options.web:
+            raise UsageError(f"--{name} belongs to --web: ask for that too")
+    if options.web and options.quiet and not (options.open or options.json):
+        raise UsageError("-q hides the address that is to be opened: leave it out, or ask for --open too")
+    if options.web and options.no_clobber:
+        raise UsageError("--web writes no file by itself: leave --no-clobber out")
+    if options.html is None and not options.web:
+        raise UsageError("there is no window: show the inputs with --web, or write a page with --html page.html")
+
+
+def _serve(options: argparse.Namespace, settings: ViewSettings, console: Console) -> int:
+    """Serve until Ctrl-C, which is how it ends: exit code 0."""
+    from clrecon.viewer.web.serve import serve_view
+
+    def ready(server: Any, view: Any, warnings: list[str]) -> None:
+        device = view.painter.device.label
+        console.result({"address": server.address, "port": server.port, "device": device, "warnings": warnings})
+        for warning in warnings:
+            console.warn(warning)
+        console.say(f"device   {printable(device)}")
+        console.say(f"view     {server.address}", whole=True)
+        console.say(
+            "         open it in a browser of this computer; whoever has this address can see the scan; Ctrl-C ends"
+        )
+        console.finish()
+
+    serve_view(options.inputs, settings, port=options.port, opens=options.open, progress=console.progress, ready=ready)
     return 0
 
 

@@ -77,7 +77,7 @@ _layer(
     "operators",
     "jobs",
 )
-_layer("cli", "errors", "version", "system", "jobs")
+_layer("cli", "errors", "version", "system", "jobs", "viewer")
 _layer("__main__", "cli")
 _layer(
     "__init__",

@@ -1,6 +1,6 @@
 """A picture as one message to a browser: a line of facts as JSON, and a JPEG.
 
-The message begins with the length of the facts, 4 bytes, lowest first.  JPEG has no opacity: the picture is laid over the
+The message begins with the length of the facts, 4 bytes, lowest first.  JPEG has no opacity: the picture lies over the
 colour of the page's ground.
 """
 

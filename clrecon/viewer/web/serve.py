@@ -1,0 +1,65 @@
+"""Inputs in, a view in any number of browsers of this machine out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from clrecon.jobs.view.settings import ViewSettings
+from clrecon.system.progress import Progress
+from clrecon.viewer.opening import OpenedView, check_view_settings, open_view
+from clrecon.viewer.web.listening import has_screen, open_browser
+from clrecon.viewer.web.server import WebServer
+
+__all__ = ["serve_view"]
+
+
+def serve_view(
+    inputs: Sequence[str | Path],
+    settings: ViewSettings | None = None,
+    *,
+    port: int | None = None,
+    opens: bool = False,
+    progress: Progress | None = None,
+    ready: Callable[[WebServer, OpenedView, list[str]], object] = lambda server, view, warnings: None,
+) -> None:
+    """Show inputs in browsers, until SIGINT (Ctrl-C), SIGTERM or SIGHUP.
+
+    The server listens on 127.0.0.1 alone and lets in what knows its secret, see `clrecon.viewer.web.admission`.
+
+    Parameters
+    ----------
+    inputs : sequence of path
+        See `clrecon.jobs.view.inputs.open_inputs`.
+    settings : ViewSettings, optional
+    port : int, optional
+        Default: a free one.
+    opens : bool
+        True: open the user's browser.
+    progress : callable, optional
+        Of the reading.
+    ready : callable
+        Called with the server, what was read and warnings, once the address can be opened.
+
+    Raises
+    ------
+    UsageError
+        aiohttp is missing, the port is taken, or a setting has no meaning for a view; said before anything is read.
+    ClreconError
+        An input cannot be read, or there is no such device.
+    """
+    settings = settings or ViewSettings()
+    check_view_settings(settings)
+    with WebServer(port) as server, open_view(inputs, settings, progress=progress) as view:
+
+        def begin(folder: Path) -> None:
+            warnings = list(view.said)
+            if opens and has_screen():
+                open_browser(server.address, folder)
+            elif opens:
+                warnings.append(
+                    "no browser was opened: there is no screen; open the address on a computer that has one"
+                )
+            ready(server, view, warnings)
+
+        server.serve(view.session, begin)
