@@ -25,9 +25,9 @@ _EPILOG = """\
 slices, parts, measures, clips, and files of what is shown. It needs the package aiohttp, and no screen and no OpenGL:
 over a network use an ssh tunnel. Ctrl-C ends it.
 
-The page of --html is one file: any browser from 2023 on shows it, without a server and offline. It asks for nothing from outside
-and holds no patient data: files are numbered, not named, unless --name is given. It turns, clips and measures; parts
-(components, labels, files) are switched one by one. See docs/view.md. A window is not there yet.
+The page of --html is one file: any browser from 2023 on shows it, without a server and offline. It asks for nothing
+from outside and holds no patient data: files are numbered, not named, unless --name is given. It turns, clips and
+measures; parts (components, labels, files) are switched one by one. See docs/view.md.
 
 examples:
   clrecon view CT_FOLDER --web
