@@ -119,7 +119,7 @@ def check_view_settings(settings: ViewSettings) -> None:
         if own.name not in ignored and value != default and not (isinstance(value, Sequence) and not value):
             raise UsageError(
                 f"{name_parameter(own.name)} says how a mesh is made, and a view makes none: leave it out, or write a"
-                f" page with {name_parameter('html', 'FILE')}"
+                " page instead"
             )
     if isinstance(scan.iso_value, Sequence):
         raise UsageError("a view begins with one iso value: give one, and move the slider")

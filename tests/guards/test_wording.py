@@ -22,6 +22,7 @@ from clrecon.jobs.render.files import PictureFiles
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.jobs.shared.settings import InputSettings
 from clrecon.system.wording import in_python, name_parameter, spoken_by
+from clrecon.viewer.web.serve import serve_view
 
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 
@@ -113,6 +114,7 @@ def test_every_parameter_that_the_library_names_is_one_of_its_own() -> None:
         RenderSettings.of,
         LabelChoice,
         PictureFiles,
+        serve_view,
     )
     known = {name for own in (*functions, *settings) for name in inspect.signature(own).parameters}
     named = named_in_package()
