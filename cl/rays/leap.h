@@ -47,16 +47,17 @@ static inline void find_pace(ray_lanes *rays, const float4 slope)
 #endif
 }
 
-/* Samples along one axis to the face of the empty cube around `brick` that the ray runs to. */
+/* Samples along one axis to the face of the empty cube around `brick` that the ray runs to: that of the sign of `pace`,
+ * which a stride that rounding left below 0 does not have. */
 static inline floats count_to_face(
-    const floats place, const floats stride, const floats pace, const ints brick, const ints distance, const int cells)
+    const floats place, const floats pace, const ints brick, const ints distance, const int cells)
 {
 #ifdef UNEVEN
     const floats low = to_floats((brick - distance + 1) * cells);
     const floats high = to_floats((brick + distance) * cells);
     return lesser(place - low, high - place) * pace;
 #else
-    const ints face = choose(stride >= 0.0f, brick + distance, brick - distance + 1);
+    const ints face = choose(pace >= 0.0f, brick + distance, brick - distance + 1);
     return (to_floats(face * cells) - place) * pace;
 #endif
 }
@@ -88,9 +89,9 @@ static inline ints place_bricks(const leap_map *map, const slice_stack *stack, c
 static inline floats count_to_box(const leap_map *map, const ray_lanes *rays, const brick_lanes *b, const ints reach_i,
     const ints reach_j, const ints reach_k)
 {
-    return lesser(lesser(count_to_face(b->i, rays->stride_i, rays->pace_i, b->brick_i, reach_i, BRICK_CELLS),
-                      count_to_face(b->j, rays->stride_j, rays->pace_j, b->brick_j, reach_j, BRICK_CELLS)),
-        count_to_face(b->k, rays->stride_k, rays->pace_k, b->brick_k, reach_k, map->cells_k));
+    return lesser(lesser(count_to_face(b->i, rays->pace_i, b->brick_i, reach_i, BRICK_CELLS),
+                      count_to_face(b->j, rays->pace_j, b->brick_j, reach_j, BRICK_CELLS)),
+        count_to_face(b->k, rays->pace_k, b->brick_k, reach_k, map->cells_k));
 }
 
 /* Samples of each ray to the faces of the cube of empty bricks around it, a fraction; 0 in a visible brick. */

@@ -99,9 +99,9 @@ static inline floats count_useless(const leap_map *map, __global const VOXEL *li
     const ints at = 2 * ((brick_k * map->bj + brick_j) * map->bi + brick_i);
     const floats limit = sign * (floats)(GATHER(VOXEL, limits, at));
     const ints own = 1;
-    const floats to_i = count_to_face(i, course->stride_i, course->pace_i, brick_i, own, BRICK_CELLS);
-    const floats to_j = count_to_face(j, course->stride_j, course->pace_j, brick_j, own, BRICK_CELLS);
-    const floats to_k = count_to_face(k, course->stride_k, course->pace_k, brick_k, own, map->cells_k);
+    const floats to_i = count_to_face(i, course->pace_i, brick_i, own, BRICK_CELLS);
+    const floats to_j = count_to_face(j, course->pace_j, brick_j, own, BRICK_CELLS);
+    const floats to_k = count_to_face(k, course->pace_k, brick_k, own, map->cells_k);
     const floats steps = round_up(lesser(lesser(lesser(to_i, to_j), to_k), (floats)(1e6f)));
     return choose(limit <= best, greater(steps, (floats)(1.0f)), (floats)(0.0f));
 }

@@ -16,12 +16,12 @@ from clrecon.geometry.volume import Volume
 from clrecon.labels.grids import read_grid_labels
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.overlap import check_wanted
-from clrecon.labels.segmentation import read_segmentation, tell_pixel_bytes
+from clrecon.labels.segmentation import SEGMENTATION_CLASSES, read_segmentation, tell_pixel_bytes
 from clrecon.labels.structures import STRUCTURE_SET, read_structures
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
 
-__all__ = ["is_large_map", "read_labels"]
+__all__ = ["is_dicom_map", "is_large_map", "read_labels"]
 
 OTHER_OBJECTS = {
     "1.2.840.10008.5.1.4.1.1.481.2": "an RT dose",
@@ -126,6 +126,11 @@ def is_large_map(path: str | Path) -> bool:
         return kind is not None and _stored_bytes(open_grid(Path(path), kind, LABEL_MAP)) > LARGE_BYTES
     except (ClreconError, OSError):  # told by `read_labels`
         return False
+
+
+def is_dicom_map(path: str | Path) -> bool:
+    """True for a DICOM file whose meta header says that it holds labels: a segmentation or a structure set."""
+    return Path(path).is_file() and _tell_class(Path(path)) in (*SEGMENTATION_CLASSES, STRUCTURE_SET)
 
 
 def _tell_class(path: Path) -> str:

@@ -17,7 +17,7 @@ from clrecon.jobs.shared.masking import mask_volume
 from clrecon.jobs.view.settings import ViewSettings
 from clrecon.mesh import Mesh
 from clrecon.mesh.reader import MESH_INPUTS
-from clrecon.reading import read_selected
+from clrecon.reading import read_selected, tell_format
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
 
@@ -146,22 +146,23 @@ def _open_cloud(path: str | Path, space: str | None) -> OpenedInput:
     cloud = read_points(path)
     if space is not None and cloud.report["file"]["space_from"] == "assumed":
         cloud = read_points(path, space=space)
-    file = cloud.report["file"]
-    return OpenedInput(cloud, _describe_frame(escape_text(Path(path).name), file), dict(file))
+    file, name = cloud.report["file"], escape_text(Path(path).name)
+    assumed = file["space_from"] == "assumed"
+    said = (f"{name} names no patient frame: its coordinates are taken as LPS",) if assumed else ()
+    return OpenedInput(cloud, (*_describe_frame(name, file), *said), dict(file))
 
 
 def _open_scan(path: str | Path, settings: ViewSettings, progress: Progress) -> OpenedInput:
     """Read a scan, and mask and crop it; a file of whole numbers from 0 is a label map."""
-    scan = settings.scan
+    scan, name = settings.scan, escape_text(Path(path).name)
+    if tell_format(path) is None and _is_dicom_map(path):
+        labels = _read_labels(path)
+        return OpenedInput(labels, labels.warnings)
     volume = read_selected(path, scan, progress=progress)
-    if _holds_labels(volume):
-        from clrecon.labels import read_labels
-
-        labels = read_labels(path)
-        name = escape_text(Path(path).name)
-        return OpenedInput(
-            labels, (f"{name} is taken for a label map: its values are whole numbers from 0", *labels.warnings)
-        )
+    if tell_format(path) is not None and _holds_labels(volume):
+        labels = _read_labels(path)
+        said = f"{name} is taken for a label map: its values are whole numbers from 0"
+        return OpenedInput(labels, (said, *labels.warnings))
     volume = mask_volume(volume, scan, progress)
     if scan.crop is not None or scan.region or scan.preprocess is not None:
         from clrecon.jobs.shared.preprocess import preprocess_volume
@@ -174,9 +175,21 @@ def _open_scan(path: str | Path, settings: ViewSettings, progress: Progress) -> 
     return OpenedInput(volume, tuple(volume.report.get("warnings", ())), dict(volume.report))
 
 
+def _is_dicom_map(path: str | Path) -> bool:
+    from clrecon.labels.reader import is_dicom_map
+
+    return is_dicom_map(path)
+
+
+def _read_labels(path: str | Path) -> LabelMap:
+    from clrecon.labels import read_labels
+
+    return read_labels(path)
+
+
 def _holds_labels(volume: Volume) -> bool:
     """True for whole numbers from 0, many of them 0, as no scan in HU has."""
-    if volume.voxels.dtype.kind not in "iu" or volume.report.get("source") == "DICOM":
+    if volume.voxels.dtype.kind not in "iu":
         return False
     low, high = volume.hu_range or (0.0, 0.0)
     if low != 0.0 or not 1.0 <= high <= _MOST_LABELS:
