@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+import textwrap
 import traceback
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, NoReturn
@@ -49,11 +50,18 @@ exit codes: 0 done; 1 unexpected error; 2 no usable DICOM or no surface; 3 wrong
             "mesh --strict"; 130 interrupted"""
 
 
+class _Formatter(argparse.RawDescriptionHelpFormatter):
+    """Texts of options that are broken between words, never within one, and not at its hyphens either."""
+
+    def _split_lines(self, text: str, width: int) -> list[str]:
+        return textwrap.wrap(" ".join(text.split()), width, break_long_words=False, break_on_hyphens=False)
+
+
 class Parser(argparse.ArgumentParser):
     """An argparse parser whose errors are `UsageError`: one line, exit code 3."""
 
     def __init__(self, **options: object):
-        options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        options.setdefault("formatter_class", _Formatter)
         super().__init__(allow_abbrev=False, **options)  # type: ignore[arg-type]
 
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
@@ -136,8 +144,8 @@ def add_common(parser: argparse.ArgumentParser) -> None:
     streams = [option for option in ("-o", "--report") if option in parser._option_string_actions]
     if "-o" in streams and parser.prog.split()[-1] not in STREAMED:
         streams.remove("-o")
-    told = f"{' and '.join(f'{option} -' for option in streams)} write to standard output" if streams else None
-    group = parser.add_argument_group("output", told)
+    told = f"{' and '.join(f'{option} -' for option in streams)} write{'s' * (len(streams) == 1)} to standard output"
+    group = parser.add_argument_group("output", told if streams else None)
     group.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
     loudness = group.add_mutually_exclusive_group()
     loudness.add_argument("-q", "--quiet", action="store_true", help="print errors only")

@@ -9,10 +9,8 @@ __all__ = ["add_cropping", "parse_clip_box"]
 
 
 _RULES = """\
-Whole voxels outside of the box are left out, after
---remove-table and --fov and before --region. Surfaces end
-there as at the ends of a scan. Of several boxes, what is in
-all of them stays."""
+Whole voxels outside of the box are left out, after --remove-table and --fov and before --region.
+Surfaces end there as at the ends of a scan. Of several boxes, what is in all of them stays."""
 
 
 def add_cropping(parser: argparse.ArgumentParser, frame: str = "of the frame of --space") -> None:

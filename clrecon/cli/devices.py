@@ -14,8 +14,8 @@ __all__ = ["add_arguments", "run"]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = (
-        "The device marked * is the one that would be used: one that failed the check at its first use only when it is"
-        " named, as simulators (Oclgrind)."
+        "The device marked * is the one that would be used. One that failed the check at its first use, and a\n"
+        "simulator (Oclgrind), are used only when they are named."
     )
     add_device(parser, computes=False)
 

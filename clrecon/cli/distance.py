@@ -11,16 +11,13 @@ from clrecon.cli.console import Console, printable
 __all__ = ["add_arguments", "run"]
 
 _EPILOG = """\
-From points that cover each mesh evenly by area to the
-nearest triangle of the other, in mm. Where the other mesh
-is closed, distances have a sign: + is outside of it.
-See docs/distance.md. To compare methods on a scan, use
-clrecon compare.
+From points that cover each mesh evenly by area to the nearest triangle of the other, in mm. Where the other
+mesh is closed, distances have a sign: + is outside of it. See docs/distance.md. To compare methods on a scan,
+use clrecon compare.
 
 examples:
   clrecon distance printed.stl bone.stl
-  clrecon distance a.ply b.ply -o a_to_b.ply \\
-    --picture a_to_b.png --range 2 --report a_to_b.json"""
+  clrecon distance a.ply b.ply -o a_to_b.ply --picture a_to_b.png --range 2 --report a_to_b.json"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

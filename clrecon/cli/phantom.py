@@ -30,26 +30,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("output", metavar="OUT", help="folder for the series")
     parser.add_argument("--kind", type=str.lower, metavar="K", help="what to make, see below (default: spine)")
-    parser.add_argument("--size", metavar="N", help="columns and rows, like 256 or 256x192")
+    parser.add_argument("--size", metavar="N", help="columns and rows, like 256 or 256x192 (default: 256)")
     parser.add_argument(
         "--slices", type=int, metavar="N", help="default: as many as the levels need, 120 without levels"
     )
     parser.add_argument(
-        "--spacing", type=float, nargs=3, metavar=("DJ", "DI", "DK"), help="mm between rows, columns, slices"
+        "--spacing",
+        type=float,
+        nargs=3,
+        metavar=("DJ", "DI", "DK"),
+        help="mm between rows, columns, slices (default: by kind, of a spine 1 1 1.25)",
     )
-    parser.add_argument("--tilt", type=float, metavar="DEG", help="gantry tilt")
+    parser.add_argument("--tilt", type=float, metavar="DEG", help="gantry tilt (default: 0)")
     parser.add_argument(
         "--oblique", type=float, nargs=3, metavar=("X", "Y", "Z"), help="degrees about the patient's axes"
     )
-    parser.add_argument("--noise", type=float, metavar="HU", help="standard deviation of the noise")
     parser.add_argument(
-        "--point-spread", dest="point_spread_mm", type=float, metavar="MM", help="standard deviation of the blur"
+        "--noise",
+        type=float,
+        metavar="HU",
+        help="standard deviation of the noise (default: 12, of an analytic shape 0)",
+    )
+    parser.add_argument(
+        "--point-spread",
+        dest="point_spread_mm",
+        type=float,
+        metavar="MM",
+        help="standard deviation of the blur (default: 0.5, of an analytic shape 0)",
     )
     parser.add_argument("--radius", dest="radius_mm", type=float, metavar="MM", help="radius of an analytic shape")
     parser.add_argument(
         "--table", type=str.lower, metavar="T", help="what a body lies on: none, flat, curved or headrest"
     )
-    parser.add_argument("--table-gap", dest="table_gap_mm", type=float, metavar="MM", help="between body and table")
+    parser.add_argument(
+        "--table-gap",
+        dest="table_gap_mm",
+        type=float,
+        metavar="MM",
+        help="between body and table (default: 0, they touch)",
+    )
     parser.add_argument("--prone", action="store_true", default=None, help="the patient lies on the face")
     parser.add_argument(
         "--ghosts", action="store_true", default=None, help="of a spine: two foreign slices, and a localizer"
@@ -71,7 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--phases", type=int, metavar="N", help="series at the same places, with ever more contrast medium"
     )
     parser.add_argument("--missing", metavar="N,M-O", help="numbers of slices that are left out, like 20-22,40")
-    parser.add_argument("--seed", type=int, metavar="N")
+    parser.add_argument("--seed", type=int, metavar="N", help="place within a voxel, noise and texture (default: 0)")
     add_no_clobber(parser)
 
 

@@ -116,7 +116,7 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
         "--keep-air", action="store_true", help="of mode minip: count what lies outside of the body and of masks too"
     )
     group.add_argument(
-        "--ray-step", type=float, metavar="MM", help="way between samples (default: half the smallest spacing)"
+        "--ray-step", type=float, metavar="MM", help="mm between samples (default: half the smallest spacing)"
     )
     group.add_argument(
         "--light",
@@ -126,7 +126,10 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
         " none: colours as they are (default: what the preset says)",
     )
     group.add_argument(
-        "--depth-cue", type=float, metavar="SHARE", help="of its brightness, which a surface loses with the distance"
+        "--depth-cue",
+        type=float,
+        metavar="SHARE",
+        help="share of its brightness that a surface loses from its nearest to its farthest point",
     )
     group.add_argument("--shadows", action="store_true", help="shadows on a surface; wants a light beside the camera")
     group.add_argument(
@@ -187,8 +190,10 @@ def add_clipping(parser: argparse.ArgumentParser) -> None:
 def add_curve(parser: argparse.ArgumentParser) -> None:
     """Add the options of slices (in space or single) and of curved reformations."""
     group = parser.add_argument_group("slices and curved reformations")
-    group.add_argument("--thickness", type=float, metavar="MM", help="of the slab (default: 0, a plane)")
-    group.add_argument("--combine", type=str.lower, metavar="HOW", help="mean, max or min of a slab (default: mean)")
+    group.add_argument("--thickness", type=float, metavar="MM", help="of a thick slice (default: 0, a plane)")
+    group.add_argument(
+        "--combine", type=str.lower, metavar="HOW", help="mean, max or min of a thick slice (default: mean)"
+    )
     group.add_argument(
         "--offset", dest="offset_mm", type=float, metavar="MM", help="move the slice away from the camera by so much"
     )
@@ -206,7 +211,9 @@ def add_curve(parser: argparse.ArgumentParser) -> None:
         help=f"contact sheet of mode slice: N slices side by side (default: {SHEET_SLICES}), or one every so many mm,"
         " such as 5mm; --view says in which plane, --slices which planes of voxels",
     )
-    group.add_argument("--slice-opacity", type=float, metavar="SHARE", help="of each of them (default: 0.5)")
+    group.add_argument(
+        "--slice-opacity", type=float, metavar="SHARE", help="of each slice of mode slices (default: 0.5)"
+    )
     group.add_argument(
         "--curve",
         metavar="FILE|auto",
@@ -255,9 +262,11 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--turntable", metavar="OUT", help="turn round the patient: .mp4, .gif, .apng, or a folder of PNG files"
     )
-    group.add_argument("--frames", type=int, metavar="N", help=f"how many (default: {_FRAMES})")
+    group.add_argument("--frames", type=int, metavar="N", help=f"frames of the turn (default: {_FRAMES})")
     group.add_argument("--fps", type=float, metavar="N", help=f"frames a second (default: {_FPS:g})")
-    group.add_argument("--degrees", type=float, metavar="D", help=f"how far, to the left (default: {_DEGREES:g})")
+    group.add_argument(
+        "--degrees", type=float, metavar="D", help=f"how far it turns, to the patient's left (default: {_DEGREES:g})"
+    )
 
 
 def render_settings(options: argparse.Namespace) -> RenderSettings:

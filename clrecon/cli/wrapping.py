@@ -10,7 +10,7 @@ from typing import Any
 
 __all__ = ["fit", "fit_help", "is_terminal"]
 
-_LABEL = re.compile(r"\s*\S+\s{2,}|exit codes: |\s*")
+_LABEL = re.compile(r"\s*\S+(?: \S+){0,2}\s{2,}|exit codes: |\s*")
 _COMMAND = re.compile(r"\s*clrecon \S")
 
 FULL = 90
@@ -39,7 +39,7 @@ def _find_paragraphs(lines: list[str]) -> list[list[str]]:
     """Put lines together that are one text: broken because they were full, with the rest under the beginning."""
     found: list[list[str]] = []
     for line in lines:
-        if found and line.strip() and not _COMMAND.match(line):
+        if found and line.strip() and not _COMMAND.match(line) and not _has_label(line):
             last, indent, hang = found[-1][-1], _indent_of(line), _hang_of(found[-1][0])
             was_full = len(last) + 1 + len(line.split()[0]) > FULL
             if indent == hang > _indent_of(found[-1][0]) or was_full and indent in (_indent_of(last), hang):
@@ -50,11 +50,16 @@ def _find_paragraphs(lines: list[str]) -> list[list[str]]:
 
 
 def _fit_paragraph(lines: list[str], width: int) -> str:
-    if len(lines) == 1 or max(map(len, lines)) <= width:
+    if _COMMAND.match(lines[0]) or max(map(len, lines)) <= width:
         return "\n".join(part for line in lines for part in _fit_line(line, width))
     text = " ".join([lines[0].rstrip(), *(line.strip() for line in lines[1:])])
     hang = _hang_of(lines[0]) if _hang_of(lines[0]) <= width // 2 else _indent_of(lines[0])
     return "\n".join(_wrap(text, width, hang))
+
+
+def _has_label(line: str) -> bool:
+    """True for a row of a list: a word or a few, and its text after a gap."""
+    return _hang_of(line) > _indent_of(line)
 
 
 def _indent_of(line: str) -> int:

@@ -57,3 +57,29 @@ def test_texts_of_help_are_broken_anew_as_a_whole(narrow, capsys):
     codes = [line for line in lines[at:] if line]
     assert all(line.startswith(" " * 12) for line in codes[1:])
     assert all(len(line) + 1 + len(after.split()[0]) > 60 for line, after in zip(codes, codes[1:], strict=False))
+
+
+@pytest.mark.parametrize(
+    ("command", "rows"),
+    [
+        ("mesh", ["  bone  ", "  spongy-bone  ", "  cortical-bone  ", "  skin  "]),
+        ("cloud", ["  ghost slices  ", "  masks  ", "  preprocessing  ", "  outliers  ", "  normals  "]),
+        ("inside", ["  solid  ", "  dense  ", "  trabecular  ", "  canal  "]),
+    ],
+)
+def test_each_row_of_a_list_keeps_a_line_of_its_own(command, rows, narrow, capsys):
+    assert main([command, "--help"]) == 0
+    lines = capsys.readouterr().out.split("\n")
+    for row in rows:
+        assert len([line for line in lines if line.startswith(row)]) == 1, row
+
+
+def test_words_with_hyphens_stay_whole_and_prose_has_one_margin(narrow, capsys):
+    for command in ("mesh", "compare"):
+        assert main([command, "--help"]) == 0
+        lines = capsys.readouterr().out.split("\n")
+        assert not [line for line in lines if line.rstrip().endswith(("bilateral-", "soft-", "non-"))]
+    assert main(["inside", "--help"]) == 0
+    lines = capsys.readouterr().out.split("\n")
+    at = lines.index("take vertebrae apart: dense and trabecular bone, canal,")
+    assert lines[at + 1] == "volumes"
