@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from dataclasses import fields
 from typing import Any
 
@@ -16,7 +17,7 @@ from clrecon.cli.points import parse_point
 from clrecon.cli.reading import add_reading
 from clrecon.jobs.cloud.settings import DENOISERS, GHOSTS, KINDS, STEPS, CloudSettings
 from clrecon.jobs.shared.clouds import CLOUD_INPUTS
-from clrecon.system.text import count_of
+from clrecon.system.text import count_of, say_band
 
 __all__ = ["add_arguments", "describe_cloud_job", "run"]
 
@@ -249,11 +250,11 @@ def _describe_step(step: dict[str, Any]) -> str:
     if step["step"] == "points":
         band = step.get("band_hu")
         level = f" of {step['iso_value_hu']:g} HU" if step.get("iso_value_hu") is not None else ""
-        level = f" of {band[0]:g} to {band[1]:g} HU" if band and band[1] is not None else level
+        level = f" of {say_band(band[0], math.inf if band[1] is None else band[1])}" if band else level
         share = f", {100.0 * step['share']:.3g} % of {step['voxels']:,} voxels" if "share" in step else ""
         return f"{count_of(after, 'point')} ({step['kind']}{level}){share}"
     if "clusters" in step and "eps_mm" in step:
-        noise = f", {step['noise_points']:,} points are noise" if "noise_points" in step else ""
+        noise = f", {count_of(step['noise_points'], 'point')} of noise" if "noise_points" in step else ""
         return (
             f"{count_of(step['clusters'], 'cluster')} at eps {step['eps_mm']:.4g} mm, min {step['min_samples']}{noise}"
         )

@@ -132,6 +132,10 @@ def run(options: argparse.Namespace, console: Console) -> int:
     console.result(report)
     for line in describe_report(report):
         console.say(line)
+    for path, size in _name_files(report, options.output, options.picture):
+        console.say(f"wrote    {printable(path)}, {megabytes(size)}")
+    if options.report:
+        console.say(f"report   {printable(options.report)}")
     for warning in report["warnings"]:
         console.warn(warning)
     refused = [side for each in report["vertebrae"] for side in each["corridors"] if side["refused"]]
@@ -151,13 +155,25 @@ def describe_report(report: dict[str, Any]) -> list[str]:
             lines += _describe_screw(each["name"], screw)
     if report["grade_scale"]:
         lines.append(f"scale    {report['grade_scale']}")
-    lines += [f"wrote    {each['kind']} {each['name']}, {megabytes(each['bytes'])}" for each in report["outputs"]]
     return [
         *lines,
         f"level    {report['level_bias']}",
         f"notice   {report['notice']}",
         f"time     {report['seconds']['total']:.2f} s",
     ]
+
+
+def _name_files(report: dict[str, Any], output: str | None, picture: str | None) -> list[tuple[str, int]]:
+    """Return the path and the size of each picture and mesh."""
+    from clrecon.jobs.shared.outputs import name_outputs
+
+    files = []
+    for kind, path in (("picture", picture), ("mesh", output)):
+        made = [each for each in report["outputs"] if each["kind"] == kind]
+        if path is not None and made:
+            names = [each["name"] for each in made] if kind == "mesh" or len(made) > 1 else [""]
+            files += [(str(own), each["bytes"]) for own, each in zip(name_outputs(path, names), made, strict=True)]
+    return files
 
 
 def _point(values: list[float], space: str) -> str:

@@ -46,11 +46,11 @@ def _summary(outcome: dict[str, Any]) -> list[str]:
     spacing = " x ".join(f"{step:.3g}" for step in check["spacing_mm"])
     return [
         *describe_mesh(outcome["mesh"]),
-        f"affine   off by {outcome['affine_error_mm']:.1e} mm from the one that the series was made with",
+        f"affine   off by {outcome['affine_error_mm']:.2g} mm from the one that the series was made with",
         f"check    sphere in voxels of {spacing} mm, gantry tilted {check['tilt_deg']:+.3g} degrees:"
         f" {check['volume_ml']:.4f} ml of {check['true_volume_ml']:.4f} ml ({error:+.2f} %),"
         f" no vertex off by more than {check['radius_error_max_mm']:.3f} mm",
-        f"wrote    {folder}/ct, bone.png, bone.stl and report.json beside it in {seconds['total']:.1f} s",
+        f"wrote    {folder}/ct, and bone.png, bone.stl and report.json beside it, in {seconds['total']:.1f} s",
         f"picture  {folder}/bone.png: volume rendering, {width} x {height}, without OpenGL or a screen",
         f"next     clrecon mesh {folder}/ct -o bone.stl",
         f"         clrecon render {folder}/ct -o left.png --view left",

@@ -117,10 +117,10 @@ def _describe(report: dict[str, Any]) -> list[str]:
         lines.append(
             f"colours  {span} mm, beyond them {100.0 * report['colors']['beyond_share']:.1f} % of A's vertices"
         )
-    lines += [
+    lines.append(f"time     {report['seconds']['total']:.2f} s")
+    return lines + [
         f"wrote    {each['kind']} {printable(each['name'])}, {megabytes(each['bytes'])}" for each in report["outputs"]
     ]
-    return [*lines, f"time     {report['seconds']['total']:.2f} s"]
 
 
 def _describe_mesh(letter: str, entry: dict[str, Any]) -> list[str]:

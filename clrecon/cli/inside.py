@@ -11,7 +11,6 @@ from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.reading import add_reading
 from clrecon.jobs.inside.pictures import DEFAULT_VIEW
-from clrecon.system.text import count_of
 
 __all__ = ["add_arguments", "run"]
 
@@ -141,12 +140,9 @@ def run(options: argparse.Namespace, console: Console) -> int:
     files = [mesh for vertebra in report["vertebrae"] for mesh in vertebra["meshes"]]
     size = megabytes(sum(mesh["bytes"] for mesh in files))
     space = describe_space(options.output, report["space"])
-    console.say(
-        f"wrote    {count_of(len(files), 'mesh', 'meshes')} beside {printable(options.output)}, {size}, {space}"
-    )
+    console.say(f"wrote    {_name_files(options.output, report, 'meshes')}, {size}, {space}")
     if options.picture:
-        count = sum(len(vertebra["pictures"]) for vertebra in report["vertebrae"])
-        console.say(f"picture  {count_of(count, 'picture')} beside {printable(options.picture)}")
+        console.say(f"picture  {_name_files(options.picture, report, 'pictures')}")
     if options.report:
         console.say(f"report   {printable(options.report)}")
     for warning in report["warnings"]:
@@ -164,6 +160,21 @@ def describe_inside(report: dict[str, Any]) -> list[str]:
         f"{part} {seconds[part]:.2f}" for part in ("read", "inside", "render", "write") if part in seconds
     )
     return [*lines, f"device   {printable(report['device'])}", f"time     {seconds['total']:.2f} s ({times})"]
+
+
+def _name_files(path: str, report: dict[str, Any], kind: str) -> str:
+    """Name the files of a kind, ``meshes`` or ``pictures``: all of one vertebra, the first and the last of several."""
+    from clrecon.jobs.inside.job import name_part
+    from clrecon.jobs.shared.outputs import name_outputs
+
+    several = len(report["vertebrae"]) > 1
+    names = [
+        name_part(vertebra["name"], each["part"], several=several)
+        for vertebra in report["vertebrae"]
+        for each in vertebra[kind]
+    ]
+    paths = [printable(str(path)) for path in name_outputs(path, names)]
+    return f"{paths[0]} to {paths[-1]}, {len(paths)} files" if several else ", ".join(paths)
 
 
 def _describe_vertebra(vertebra: dict[str, Any]) -> list[str]:

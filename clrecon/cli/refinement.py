@@ -87,7 +87,7 @@ def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
         parts.append(_describe_decimation(worst["decimate"]))
     deviation, voxel = worst["deviation"], worst["voxel_mm"]
     if deviation["volume_change_percent"] is not None:
-        parts.append(f"volume {deviation['volume_change_percent']:+.2f} %")
+        parts.append(f"volume {round(deviation['volume_change_percent'], 2) + 0.0:+.2f} %")
     which = "refined " if len(found) == 1 else "refined (worst mesh)"
     lengths = ", ".join(
         f"{name} {deviation[key]:.3f} mm ({deviation[key] / voxel:.2f} voxel)"
@@ -145,7 +145,8 @@ def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
         f"{count_of(left_out['cavities'], 'closed cavity', 'closed cavities')} of"
         f" {say_digits(left_out['cavities_ml'])} ml"
     )
-    lines.append(f"         left out {pieces}, filled {cavities}")
+    if left_out["pieces"] or left_out["cavities"]:
+        lines.append(f"         left out {pieces}, filled {cavities}")
     if left_out["not_bone"] is not None:
         bone = left_out["pieces"] + facts["pieces"] - left_out["not_bone"]
         lines.append(

@@ -136,7 +136,7 @@ def _describe_input(report: dict[str, Any]) -> str:
         return f"mesh of {report['meshes'][0]['triangles']:,} triangles"
     if cloud is None:
         return describe_volume(report["volume"])
-    known = [name for name in ("normals", "hu", "labels") if cloud[name]]
+    known = [word for word, name in (("normals", "normals"), ("HU", "hu"), ("labels", "labels")) if cloud[name]]
     return f"{count_of(cloud['points'], 'point')}" + (f" with {', '.join(known)}" if known else "")
 
 
@@ -153,7 +153,7 @@ def _describe_legend(pictures: list[dict[str, Any]]) -> list[str]:
     lines = []
     for entry in points["legend"]:
         name = printable(entry["name"]) if entry["name"] else f"{points['color_by']} {entry['label']}"
-        lines.append(f"{entry['color']} {name}: {entry['points']:,} points")
+        lines.append(f"{entry['color']} {name}: {count_of(entry['points'], 'point')}")
     if points["legend_left_out"]:
         lines.append(f"and {points['legend_left_out']:,} more")
     return lines
@@ -192,7 +192,7 @@ def _describe_picture(picture: dict[str, Any]) -> str:
     width, height = picture["size"]
     scale = f"{picture['pixel_mm']:.4g} mm a pixel" if picture["pixel_mm"] else "perspective"
     window = picture["window_hu"]
-    shown = f", {window[0]:g} to {window[1]:g} HU" if window else ""
+    shown = f", {window[0]:.4g} to {window[1]:.4g} HU" if window else ""
     if picture["window_mm_water"]:
         low, high = picture["window_mm_water"]
         shown = f", {low:.4g} to {high:.4g} mm of water"
@@ -203,7 +203,7 @@ def _describe_picture(picture: dict[str, Any]) -> str:
     if picture["tiles"]:
         many = len(picture["tiles"])
         wide, high = picture["tile_size"]
-        shown += f", {many} slice{'s' * (many > 1)} of {wide} x {high} pixels"
+        shown += f", {count_of(many, 'slice')} of {wide} x {high} pixels"
     return f"{picture['view']}: {width} x {height}, {scale}{shown}"
 
 

@@ -204,7 +204,7 @@ def _make_table(columns: Sequence[_Column], entries: Sequence[dict[str, Any]], c
         following = entries[row + 1] if row + 1 < len(entries) else entry
         table.add_row(
             *(Text(column.cells[row]) for column in columns),
-            style="bold green" if entry["number"] == chosen else "dim" if entry["problems"] else "",
+            style="bold" if entry["number"] == chosen else "",  # no colours: they are not readable on every ground
             end_section=parted and following["patient"] != entry["patient"],
         )
     return table

@@ -69,6 +69,9 @@ def _stream_file(
         raise UsageError(f"{_FILES[option]} {value}: {command} writes several files, which one stream cannot hold")
     if option != "csv" and sys.stdout is not None and sys.stdout.isatty():
         raise UsageError(f"{_FILES[option]} {value}: standard output is a terminal: lead it into a file or a program")
+    if several := _find_several(command, options):
+        raise UsageError(f"{_FILES[option]} {value}: {several} make several files, and one stream holds one")
+    options.streams_output = option == "output"
     folder = tempfile.mkdtemp(prefix="clrecon-")
     try:
         path = Path(folder) / f"stream{extension if value == DASH else value[1:]}"
@@ -77,13 +80,25 @@ def _stream_file(
         code = run()
         made = sorted(os.listdir(folder))
         if made != [path.name]:
-            raise UsageError(
-                f"{_FILES[option]} {value}: {len(made)} files were made, and one stream holds one: name a file, or ask"
-                " for one surface"
-            )
+            raise UsageError(f"{_FILES[option]} {value}: {len(made)} files were made, and one stream holds one")
         with open(path, "rb") as stream:
             while piece := stream.read(_PIECE):
                 console.send(piece)
         return code
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _find_several(command: str, options: argparse.Namespace) -> str:
+    """Name the options that make several files of ``-o``; empty where it is one."""
+    if command == "render":
+        return "several views" if sum(map(len, options.view)) > 1 else ""
+    if command != "mesh" or options.one_file:
+        return ""
+    if options.split:
+        return "the components of --split"
+    levels = options.below or options.hu.get("iso_value", ())
+    if isinstance(levels, tuple) and len(levels) > 1:
+        return "several iso values"
+    picked = options.labels is not None and not any(str(seed).startswith("label:") for seed in options.grow_from)
+    return "labels (name one with --label)" if picked and len(options.label or ()) != 1 else ""

@@ -96,13 +96,14 @@ def run(options: argparse.Namespace, console: Console) -> int:
     console.say(f"input    {describe_volume(report['volume'])}")
     if report["resampled"]:
         console.say("labels   brought to the grid of the scan: the nearest label in mm")
+    console.say("figures  volume in ml, the rest in HU: mean, standard deviation, least, percentiles, largest")
     width = shutil.get_terminal_size().columns if is_terminal(sys.stdout) else None
     for line in _lay_out(report, width):
         console.say(line)
-    for what, path in (("table", options.csv), ("report", options.report)):
+    console.say(f"time     {report['seconds']['total']:.2f} s")
+    for what, path in (("wrote", options.csv), ("report", options.report)):
         if path is not None:
             console.say(f"{what:<8} {printable(path)}")
-    console.say(f"time     {report['seconds']['total']:.2f} s")
     for warning in report["warnings"]:
         console.warn(warning)
     return 0

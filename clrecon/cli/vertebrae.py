@@ -94,11 +94,13 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
     names = ("series", "phase", "allow_gaps", "force", "level", "seeds", "name_at", "keep_unsure", "keep_ids")
     settings = VertebraeSettings(**pick(options, names))
+    with_picture = options.picture is not None or not getattr(options, "streams_output", False)  # beside what?
     report = make_vertebrae(
         options.input,
         options.output,
         settings,
         picture_path=options.picture,
+        with_picture=with_picture,
         report_path=options.report,
         no_clobber=options.no_clobber,
         progress=console.progress,
@@ -107,7 +109,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
     for line in _describe(report):
         console.say(line)
     console.say(f"wrote    {printable(options.output)}, {megabytes(report['output']['bytes'])}")
-    console.say(f"picture  {printable(options.picture or picture_beside(options.output))}: look at it")
+    if with_picture:
+        console.say(f"picture  {printable(options.picture or picture_beside(options.output))}: look at it")
     if options.report:
         console.say(f"report   {printable(options.report)}")
     for warning in report["warnings"]:

@@ -22,6 +22,7 @@ from clrecon.sources.facts import PixelFacts
 from clrecon.sources.likeness import Likeness, judge_slices
 from clrecon.system.memory import allocate_voxels
 from clrecon.system.progress import Progress
+from clrecon.system.text import say_share
 from clrecon.system.wording import name_parameter
 
 __all__ = ["GridValues", "read_values"]
@@ -139,7 +140,7 @@ class _Filling:
         doubts, warnings = _doubts(voxels, low, high), []
         share = self._holes / voxels.size
         if self._holes:
-            warnings = [f"{self._holes:,} voxels ({share:.2%}) are NaN: {AIR_HU} HU, air, is taken for them"]
+            warnings = [f"{self._holes:,} voxels ({say_share(share, 2)}) are NaN: {AIR_HU} HU, air, is taken for them"]
             low, high = min(low, AIR_HU), max(high, AIR_HU)
         filled = float(AIR_HU) if self._holes else None
         facts = PixelFacts(share, float(low), float(high), filled)

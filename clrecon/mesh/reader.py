@@ -44,7 +44,7 @@ def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh
     Raises
     ------
     UsageError
-        The extension or ``space`` is unknown, or the file names another frame.
+        There is no such file, the extension or ``space`` is unknown, or the file names another frame.
     RefusedInputError
         The file cannot be read, is cut or corrupt, or has numbers that a mesh cannot have.
     """
@@ -56,6 +56,8 @@ def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh
     reader = _READERS.get(file.suffix.lower())
     if reader is None:
         raise UsageError(f"{name}: meshes are read from files {', '.join(MESH_INPUTS)}")
+    if not os.path.lexists(file):
+        raise UsageError(f"there is no mesh {name}")
     raw = reader(file)
     warnings = raw.warnings
     named = None if raw.space is None else raw.space.upper()

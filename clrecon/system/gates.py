@@ -48,13 +48,13 @@ def none_of(name: str, count: int, what: str, ok: bool | None = None) -> Gate:
 
 def is_true(name: str, flag: bool, what: str) -> Gate:
     """Gate: a statement must be true."""
-    says = what if flag else f"does not hold: {what}"
+    says = what if flag else f"this does not hold: {what}"
     return Gate(name, bool(flag), True, None, bool(flag), says)
 
 
 def at_most(name: str, measured: float, bound: float, unit: str | None, what: str) -> Gate:
     """Gate: a figure must not be larger than its bound."""
-    text = f"{what}: {measured:.3g}{' ' * bool(unit)}{unit or ''}, at most {bound:g}"
+    text = f"{what}: {measured:.3g}{' ' * bool(unit)}{unit or ''}, at most {bound:.3g}"
     return Gate(name, measured, bound, unit, measured <= bound, text)
 
 

@@ -76,6 +76,18 @@ def say_hu(value: float) -> str:
     return say_digits(value)
 
 
+def say_band(low: float, high: float, unit: str = "HU") -> str:
+    """Return what lies from `low` to `high`, an infinite end open: ``200 HU and more``, ``up to 40 HU``."""
+    if math.isinf(low):
+        return f"any {unit}" if math.isinf(high) else f"up to {high:g} {unit}"
+    return f"{low:g} {unit} and more" if math.isinf(high) else f"{low:g} to {high:g} {unit}"
+
+
+def say_share(share: float, places: int = 0) -> str:
+    """Return a share, 0 to 1, as ``31 %``, with so many digits behind the point."""
+    return f"{100.0 * share:.{places}f} %"
+
+
 @lru_cache(1024)
 def hash_uid(uid: str) -> str | None:
     """Return the first 16 hexadecimal digits of the SHA-256 of a UID: a name that does not reveal the UID.

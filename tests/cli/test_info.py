@@ -133,7 +133,7 @@ def test_equal_series_name_the_way_out(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["info", str(folder), "--series", uid_hash, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["chosen"] == 2
     assert main(["info", str(folder), "--series", "7"]) == 3
-    assert "no series matches series='7'; there are [1: CT" in capsys.readouterr().err
+    assert "no series matches --series '7'; there are [1: CT" in capsys.readouterr().err
     assert main(["info", str(folder), "--strict"]) == 4
     assert "choose one with --series" in capsys.readouterr().err
 

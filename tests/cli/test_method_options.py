@@ -92,7 +92,7 @@ def test_other_methods_write_the_mesh(method: str, bones: Path, tmp_path: Path, 
         (["--grow-from", "label:7"], "needs its label map: give its file with --labels"),
         (
             ["--grow-from", "500,0,0"],
-            "seed 500,0,0 lies outside of the volume: voxel (",
+            "seed 500,0,0 lies outside of the volume, which runs from x ",
         ),
         (["--vertex-rule", "midpoint"], "--vertex-rule is one of linear, golden, golden-search, not 'midpoint'"),
         (["--vertex-rule", "golden", "--topology", "trilinear"], "exclude each other"),

@@ -383,7 +383,7 @@ WRONG = {
     "sheet of a volume": (["--sheet", "4", "--mode", "dvr"], 3, "--sheet means nothing in mode dvr"),
     "sheet and offset": (["--sheet", "4", "--offset", "3"], 3, "leave --offset out"),
     "label 0": (["--labels", "a.nii", "--label-color", "0=red"], 3, "what has no label (0) keeps the colours"),
-    "air of a maximum": (["--mode", "mip", "--keep-air"], 3, "belongs to mode minip"),
+    "air of a maximum": (["--mode", "mip", "--keep-air"], 3, "belongs to minip"),
     "light": (["--light", "sun"], 3, "head, none, anterior"),
     "depth cue": (["--iso", "100", "--depth-cue", "2"], 3, "depth cue"),
     "shadows of the camera": (["--iso", "100", "--shadows"], 3, "--light"),

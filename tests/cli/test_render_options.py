@@ -48,3 +48,25 @@ def test_no_encoder_is_said_before_anything_is_read(
     assert "no encoder for MP4" in capsys.readouterr().err
     video.find_encoder.cache_clear()
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--keep-air"], "--keep-air means nothing in mode dvr: it belongs to minip"),
+        (["--view", "sheet"], "a contact sheet of slices is asked for with --sheet"),
+        (["--mode", "sheet"], "a contact sheet of slices is asked for with --sheet"),
+        (["-o", "a.gif"], "the extension '.gif' of moving pictures, for which there is --turntable: use one of .png"),
+    ],
+)
+def test_a_message_names_the_option_that_was_meant(
+    arguments: list[str],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["render", "ct", *([] if "-o" in arguments else ["-o", "a.png"]), *arguments]) == 3
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line

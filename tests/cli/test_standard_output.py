@@ -78,7 +78,11 @@ def test_other_commands_too(device, ct, capfdbinary, arguments):
         (("mesh", "-o", "-", "--report", "-"), 3, "-o and --report cannot share standard output"),
         (("mesh", "-o", "-", "--json"), 3, "-o and --json cannot share standard output"),
         (("mesh", "-o", "-.stp"), 3, "the extension '.stp'"),
-        (("mesh", "-o", "-", "--hu", "200,300"), 3, "2 files were made, and one stream holds one"),
+        (("mesh", "-o", "-", "--hu", "200,300"), 3, "-o -: several iso values make several files"),
+        (("mesh", "-o", "-", "--below", "-400,-300"), 3, "-o -: several iso values make several files"),
+        (("mesh", "-o", "-", "--split"), 3, "-o -: the components of --split make several files"),
+        (("mesh", "-o", "-.ply", "--labels", "gone.nii"), 3, "-o -.ply: labels (name one with --label) make several"),
+        (("render", "-o", "-", "--view", "left,right"), 3, "-o -: several views make several files"),
         (("compare", "-o", "-"), 3, "-o -: compare writes several files, which one stream cannot hold"),
         (("mesh", "-o", "-", "--hu", "5000"), 2, "the volume runs from"),
     ],
@@ -89,8 +93,51 @@ def test_what_one_stream_cannot_hold_is_refused_in_one_line(ct, capfdbinary, arg
     out, err = capfdbinary.readouterr()
     if "--json" not in rest:
         assert out == b""
+    assert b"input    " not in err  # refused before any work
     assert words in err.decode() and b"/stream" not in err
     assert len([line for line in err.decode().splitlines() if "error" in line]) == 1
+
+
+@pytest.fixture(scope="module")
+def spine(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stream") / "spine"
+    write_phantom(folder, PhantomSettings(size=(72, 72), spacing=(2.5, 2.5, 2.5), levels="L2-L4"))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("arguments", "entry"),
+    [
+        (("stats", "{ct}", "--labels", "{ct}/levels.nrrd"), "labels"),
+        (("inside", "{ct}", "-o", "{out}.stl", "--labels", "{ct}/levels.nrrd", "--label", "L3"), "vertebrae"),
+        (("corridor", "{ct}", "--labels", "{ct}/levels.nrrd", "--label", "L3"), "vertebrae"),
+        (("vertebrae", "{ct}", "-o", "{out}.nii.gz"), "vertebrae"),
+        (("cloud", "{ct}", "-o", "{out}.ply", "--hu", "200"), "points"),
+        (("export", "{ct}", "-o", "{out}.nii.gz"), "volume"),
+        (("render", "{ct}", "-o", "{out}.png", "--size", "40"), "pictures"),
+        (("distance", "{out}_a.stl", "{out}_a.stl"), "hausdorff_mm"),
+    ],
+)
+def test_the_report_of_each_command(device, spine, tmp_path, capsys, monkeypatch, arguments, entry):
+    monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
+    if arguments[0] == "distance":
+        assert run("mesh", spine, "-o", tmp_path / "out_a.stl", "-q") == 0
+    given = [word.format(ct=spine, out=tmp_path / "out") for word in arguments]
+    code = run(*given, "--report", "-")
+    said = capsys.readouterr()
+    assert code in (0, 8), said.err  # 8: a vertebra of coarse voxels may be unsure
+    assert json.loads(said.out)[entry] is not None
+    assert "time     " in said.err and not any(path.name == "-" for path in tmp_path.iterdir())
+
+
+def test_the_table_of_labels_and_a_label_map_go_to_standard_output(spine, capfdbinary):
+    assert run("stats", spine, "--labels", spine / "levels.nrrd", "--csv", "-") == 0
+    out, err = capfdbinary.readouterr()
+    assert out.startswith(b"number,name,") and out.count(b"\n") == 4
+    assert b"wrote    standard output" in err
+    assert run("vertebrae", spine, "-o", "-") in (0, 8)
+    out, err = capfdbinary.readouterr()
+    assert out[:2] == b"\x1f\x8b" and b"wrote    standard output" in err and b"picture" not in err
 
 
 def test_a_failed_job_streams_no_report_and_a_terminal_gets_no_bytes(ct, tmp_path, capsys, monkeypatch):

@@ -79,7 +79,7 @@ def test_an_unknown_name_lists_what_is_there(two_series, wanted):
     with pytest.raises(UsageError) as caught:
         read_volume(two_series, wanted)
     assert str(caught.value) == (
-        f"no series matches series={wanted!r}; there are [1: CT, 7 slices], [2: CT, 4 slices]"
+        f"no series matches series {wanted!r}; there are [1: CT, 7 slices], [2: CT, 4 slices]"
         ' ("clrecon info" describes them)'
     )
 
@@ -91,7 +91,7 @@ def test_a_vague_name_lists_those_that_match(two_series):
     with pytest.raises(UsageError) as caught:
         read_volume(two_series, "erie")
     assert str(caught.value) == (
-        "2 series match series='erie': [1: CT, 7 slices], [2: CT, 4 slices] (\"clrecon info\" describes them)"
+        "2 series match series 'erie': [1: CT, 7 slices], [2: CT, 4 slices] (\"clrecon info\" describes them)"
     )
 
 
@@ -100,7 +100,7 @@ def test_the_start_of_a_hash_or_uid_names_a_series(two_series):
         assert read_volume(two_series, wanted).report["series"]["number"] == 2
     with pytest.raises(UsageError, match="no series matches"):
         read_volume(two_series, hash_of(5)[:3])  # three characters are not enough
-    with pytest.raises(UsageError, match="2 series match series='"):
+    with pytest.raises(UsageError, match="2 series match series '"):
         read_volume(two_series, ROOT)  # the start of both UIDs
 
 

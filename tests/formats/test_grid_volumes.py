@@ -146,7 +146,7 @@ def test_nan_is_air_and_said(tmp_path):
     assert volume.voxels.dtype == np.int16
     assert np.array_equal(volume.voxels, np.where(np.isnan(voxels), AIR_HU, voxels))
     assert volume.report["padding_share"] == 43 / 168 and volume.report["hu_range"][0] == AIR_HU
-    assert "43 voxels (25.60%) are NaN: -1024 HU, air, is taken for them" in volume.report["warnings"]
+    assert "43 voxels (25.60 %) are NaN: -1024 HU, air, is taken for them" in volume.report["warnings"]
 
 
 @pytest.mark.parametrize(

@@ -63,9 +63,9 @@ def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> C
         return _take_best(ct)
     matches = _match_series(found, wanted)
     if not matches:
-        raise UsageError(f"no series matches series={wanted!r}; there are {_list_lines(found)}")
+        raise UsageError(f"no series matches {name_parameter('series')} {wanted!r}; there are {_list_lines(found)}")
     if len({series.identity for series in matches}) != 1:
-        raise UsageError(f"{len(matches)} series match series={wanted!r}: {_list_lines(matches)}")
+        raise UsageError(f"{len(matches)} series match {name_parameter('series')} {wanted!r}: {_list_lines(matches)}")
     chosen, why = Choice(matches[0], "") if len(matches) == 1 else _take_best(matches)
     if chosen.kind == "other":
         raise NoDicomError(f"series {chosen.number} is of modality {chosen.identity.modality}, not CT")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from clrecon.errors import RefusedInputError
+from clrecon.errors import RefusedInputError, UsageError
 from clrecon.exchange.clouds import las, npz, read_ply, read_vtp, xyz
 from clrecon.exchange.clouds.raw_cloud import RawCloud
 from clrecon.system.regular_files import open_regular
@@ -22,7 +22,7 @@ def read_raw_cloud(path: str | os.PathLike[str]) -> RawCloud:
     Raises
     ------
     UsageError
-        LAS, and laspy is not installed.
+        There is no such file; LAS, and laspy is not installed.
     RefusedInputError
         The file cannot be read, or is cut, corrupt or of another kind.
     """
@@ -31,6 +31,8 @@ def read_raw_cloud(path: str | os.PathLike[str]) -> RawCloud:
     try:
         with open_regular(file) as stream:
             start = stream.read(_START_BYTES)
+    except FileNotFoundError as error:
+        raise UsageError(f"there is no cloud {name}") from error
     except OSError as error:
         raise RefusedInputError(f"{name} cannot be read: {error.strerror or error}") from error
     if start[:3] == b"ply" and start[3:4] in (b"\n", b"\r", b" "):

@@ -94,7 +94,7 @@ def make_inside(
     volume, labels, device = _open(source, settings, progress)
     suffixes = _name_labels(labels, settings)
     if no_clobber:
-        names = [_join(suffix, part, suffixes) for suffix in suffixes for part in PARTS]
+        names = [name_part(suffix, part, several=len(suffixes) > 1) for suffix in suffixes for part in PARTS]
         refuse_files(name_outputs(output, names) + ([] if picture is None else name_outputs(picture, names)))
     watch.lap("read")
     found: list[_Found] = []
@@ -182,8 +182,9 @@ def _name_labels(labels: LabelMap, settings: InsideSettings) -> list[str]:
     return list(file_suffixes({number: labels.name(number) for number in _numbers(labels, settings)}).values())
 
 
-def _join(suffix: str, part: str, suffixes: list[str]) -> str:
-    return f"{suffix}_{part}" if len(suffixes) > 1 else part
+def name_part(suffix: str, part: str, *, several: bool) -> str:
+    """Return the name of a part in those of its files; of several vertebrae with that of its own."""
+    return f"{suffix}_{part}" if several else part
 
 
 def _look(volume: Volume, labels: LabelMap, number: int, settings: InsideSettings, device: Device) -> VertebraInside:
@@ -214,7 +215,7 @@ def _write(
         files: list[StagedFile] = []
         vertebrae: list[dict[str, Any]] = []
         for one in found:
-            names = [_join(one.suffix, part, suffixes) for part in one.meshes]
+            names = [name_part(one.suffix, part, several=len(suffixes) > 1) for part in one.meshes]
             paths = name_outputs(output, names, report_path)
             written = stage_meshes(
                 staged, list(one.meshes.values()), paths, settings.space, progress, keep_ids=settings.keep_ids
@@ -225,7 +226,7 @@ def _write(
             files += written
             for part, drawn in one.pictures.items():
                 assert picture is not None
-                (path,) = name_outputs(picture, [_join(one.suffix, part, suffixes)])
+                (path,) = name_outputs(picture, [name_part(one.suffix, part, several=len(suffixes) > 1)])
                 files.append(stage_picture(staged, drawn, path))
                 told["pictures"].append(describe_picture(part, drawn, path, files[-1].size))
                 told["warnings"] += drawn.report["warnings"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 
 from clrecon.errors import UsageError
@@ -36,7 +35,7 @@ def picture_beside(output: str | Path) -> str:
 
 
 def check_files(
-    source: str | Path, output: str | Path, picture: str | Path, report: str | Path | None
+    source: str | Path, output: str | Path, picture: str | Path | None, report: str | Path | None
 ) -> list[tuple[str, str | Path]]:
     """Refuse outputs that cannot be written, before any work is done; return what each is, and its path.
 
@@ -57,11 +56,12 @@ def check_files(
         load_nibabel()
     elif (found := tell_format(source)) is not None:
         raise UsageError(f"DICOM SEG belongs to a scan in DICOM, and this is {found}: write the label map as .nii.gz")
-    if not os.fspath(picture).lower().endswith(".png"):
+    if picture is not None and not os.fspath(picture).lower().endswith(".png"):
         raise UsageError(f"the picture of the discs is a .png file, not {os.path.basename(os.fspath(picture))[-40:]!r}")
-    load_pillow()
-    owned: Sequence[tuple[str, str | Path]] = [("the label map", output), ("the picture", picture)]
-    owned = [*owned, *([] if report is None else [("the report", report)])]
+    if picture is not None:
+        load_pillow()
+    named = (("the label map", output), ("the picture", picture), ("the report", report))
+    owned = [(what, path) for what, path in named if path is not None]
     check_distinct(owned)
     for _, path in owned:
         check_writable(path)

@@ -34,6 +34,7 @@ def make_vertebrae(
     settings: VertebraeSettings | None = None,
     *,
     picture_path: str | Path | None = None,
+    with_picture: bool = True,
     report_path: str | Path | None = None,
     no_clobber: bool = False,
     progress: Progress | None = None,
@@ -51,6 +52,8 @@ def make_vertebrae(
     settings : VertebraeSettings, optional
     picture_path : path, optional
         PNG; by default beside the label map, with its name.
+    with_picture : bool
+        False: without `picture_path` there is no picture.
     report_path : path, optional
         File for the report as JSON.
     no_clobber : bool
@@ -72,7 +75,7 @@ def make_vertebrae(
 
     settings = settings or VertebraeSettings()
     progress = progress or ignore_progress
-    picture = picture_beside(output) if picture_path is None else picture_path
+    picture = picture_beside(output) if picture_path is None and with_picture else picture_path
     watch = Laps()
     with keep_existing(no_clobber):
         check_files(source, output, picture, report_path)
@@ -89,9 +92,10 @@ def make_vertebrae(
     watch.lap("split")
     progress("write", 0, 0)
     content = _encode(split.labels, output, source, settings)
-    drawn = draw_vertebrae(split)
     with keep_existing(no_clobber), ExitStack() as staged:
-        files: list[Staged] = [_stage(staged, output, content), _stage(staged, picture, drawn)]
+        files: list[Staged] = [_stage(staged, output, content)]
+        if picture is not None:
+            files.append(_stage(staged, picture, draw_vertebrae(split)))
         watch.lap("write")
         seconds = {part: round(value, 4) for part, value in {**watch.seconds, "total": watch.total()}.items()}
         facts = {"format": map_format(output), "bytes": len(content)}

@@ -96,8 +96,10 @@ class MaskComponents(MaskShapes):
             if len(rows):
                 places = origin + rows[:, ::-1] @ self.volume.affine[:3, :2].T
                 least = min(least, float(np.linalg.norm(places - point, axis=1).min()))
-        near = "none is chosen" if not np.isfinite(least) else f"the nearest chosen one is {least:.1f} mm away"
-        return f"the point ({where}) mm {what} ({self.name}): {near}"
+        near = f"no voxel is chosen ({self.name})"
+        if np.isfinite(least):
+            near = f"the nearest voxel that is chosen ({self.name}) is {least:.1f} mm away"
+        return f"the point ({where}) mm {what}: {near}"
 
     def _write(self, found: Components, marks_d: object, mask_d: object, wanted: int) -> None:
         runs = found.runs

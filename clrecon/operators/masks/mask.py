@@ -19,6 +19,7 @@ from clrecon.operators.masks.regions import RowSpans, box_spans, checked_box, tu
 from clrecon.operators.masks.runs import write_runs
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.system.progress import Progress
+from clrecon.system.text import say_band
 
 if TYPE_CHECKING:  # label maps load pydicom, which others need not wait for
     from clrecon.labels import LabelMap
@@ -79,7 +80,7 @@ class Mask(MaskComponents):
             No device, not even the mask and one slice fit its memory, or it fails.
         """
         band = checked_band(hu)
-        name = f"{band[0]:g} to {band[1]:g} HU"
+        name = say_band(*band)
         with open_volume(volume, device, memory, "a mask") as resident:
 
             def make(told: list[str]) -> Mask:
@@ -192,7 +193,7 @@ class Mask(MaskComponents):
         sides = checked_box(box)
         with open_volume(volume, device, memory, "a mask") as resident:
             name = "box " + ", ".join(
-                f"{axis} {low:g} to {high:g} mm"
+                f"{axis} {say_band(low, high, 'mm')}"
                 for axis, (low, high) in zip("xyz", sides, strict=True)
                 if np.isfinite((low, high)).any()
             )

@@ -23,6 +23,7 @@ from clrecon.rendering.pictures.point_look import PointLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
+from clrecon.system.wording import name_parameter
 
 __all__ = ["PointPictures", "cloud_box"]
 
@@ -216,11 +217,11 @@ def _color_points(cloud: PointCloud, style: PointLook) -> _Colors:
             by = "hu"
     if by in ("label", "removed"):
         if cloud.labels is None:
-            raise UsageError(f"the cloud has no labels to colour it by: {by} needs them")
+            raise UsageError(f"the cloud has no labels, and {name_parameter('color_by', by)} needs them: leave it out")
         return _color_by_label(cloud, cloud.labels, by == "removed")
     if by == "hu":
         if cloud.hu is None:
-            raise UsageError("the cloud has no HU to colour it by")
+            raise UsageError(f"the cloud has no HU, and {name_parameter('color_by', by)} needs them: leave it out")
         window = _choose_window(cloud.hu) if style.window is None else checked_window(style.window)
         share = np.clip((cloud.hu - np.float32(window[0])) * np.float32(255.0 / (window[1] - window[0])), 0, 255)
         grey = np.rint(share).astype(np.uint8)

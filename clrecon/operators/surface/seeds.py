@@ -144,17 +144,18 @@ def check_points(volume: Volume, points: NDArray[np.float64]) -> None:
     Raises
     ------
     UsageError
-        The message has the point's place in voxels and the volume's size.
+        The message has the point and the box of the volume in mm.
     """
     if not len(points):
         return
     size = np.array(volume.shape_ijk)
     for point, ijk in zip(points, volume.lps_to_ijk(points), strict=True):
         if not ((ijk >= -0.5) & (ijk <= size - 0.5)).all():
-            at = ", ".join(f"{n:.1f}" for n in ijk)
+            low, high = volume.bounds
+            box = ", ".join(f"{axis} {a:.1f} to {b:.1f}" for axis, a, b in zip("xyz", low, high, strict=True))
             raise UsageError(
-                f"seed {_describe_point(point)} lies outside of the volume: voxel ({at}) of"
-                f" {' x '.join(map(str, size))}"
+                f"seed {_describe_point(point)} lies outside of the volume, which runs from {box} mm (LPS): check its"
+                " coordinates and their frame, LPS or RAS"
             )
 
 

@@ -24,6 +24,7 @@ from clrecon.operators.surface.label_masks import extract_label_masks
 from clrecon.operators.vertebrae.crop import LabelCrop, check_types, crop_label
 from clrecon.operators.vertebrae.solid import CLOSE_MM, label_margin, make_solid
 from clrecon.operators.vertebrae.thickness import ShellThickness, measure_thickness
+from clrecon.system.wording import name_parameter
 
 __all__ = ["DENSE_HU", "PARTS", "VertebraInside", "name_band", "vertebra_inside"]
 
@@ -325,6 +326,6 @@ def _warn_of_missed(in_band: Mask, dense: Mask, solid: Mask, others: Mask, band:
     if share < MISSED_SHARE:
         return []
     return [
-        f"{100 * share:.0f} % of the bone of {name_band(band)} lie in the next voxel outside of the label: masks end"
-        " before bone does; an iso value takes it in"
+        f"{100 * share:.0f} % of the bone of {name_band(band)} lies in the next voxel outside of the label:"
+        f" masks end before bone does; {name_parameter('iso_value', 'N')} takes it in"
     ]

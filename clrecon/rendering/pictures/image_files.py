@@ -14,6 +14,7 @@ from clrecon.rendering.pictures.picture_data import PictureData
 from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.system.files import replace_file
 from clrecon.system.text import guess_word
+from clrecon.system.wording import name_parameter
 from clrecon.version import package_version
 
 __all__ = [
@@ -144,6 +145,9 @@ def _extension(path: str | os.PathLike[str], known: tuple[str, ...], what: str) 
         raise UsageError(f"a {what} file is named by a string or a path, not {type(path).__name__}") from error
     if extension not in known:
         found = f"the extension {extension!r}{guess_word(extension, known)}" if extension else "no extension"
+        moving = what == "picture" and extension in (".gif", ".apng", ".mp4")
+        if moving:
+            found = f"the extension {extension!r} of moving pictures, for which there is {name_parameter('turntable')}"
         raise UsageError(f"the name of the {what} file has {found}: use one of {', '.join(known)}")
     return extension
 

@@ -19,6 +19,7 @@ from clrecon.rendering.pictures.styles import (
     SurfaceLook,
     VolumeLook,
 )
+from clrecon.rendering.views.directions import hint_at_sheet
 from clrecon.system.text import say_unknown
 from clrecon.system.wording import name_parameter
 
@@ -68,6 +69,10 @@ They place the camera, ask for further outputs, or set a look for several pictur
 using it."""
 
 
+_ALONE = {"keep_air": ("minip",)}
+"""Fields of a style of several modes that mean something in some of them only."""
+
+
 def keywords_of(mode: str) -> dict[str, str]:
     """Keywords of `render` for a mode, each with the field of the style that it sets.
 
@@ -93,6 +98,7 @@ def check_known(mode: str, keyword: str, called: str | None = None) -> None:
         The message names the modes that know the keyword.
     """
     modes = [name for name in MODES if keyword in keywords_of(name) or name in _BESIDE.get(keyword, ())]
+    modes = [name for name in modes if name in _ALONE.get(keyword, modes)]
     if mode not in modes:
         named = name_parameter(called or keyword)
         raise UsageError(f"{named} means nothing in mode {mode}: it belongs to {', '.join(modes)}")
@@ -112,7 +118,7 @@ def choose_mode(mode: str | None = None, preset: str | None = None, **look: obje
     """
     if mode is not None:
         if not isinstance(mode, str) or mode not in MODES:
-            raise UsageError(say_unknown("mode", mode, MODES))
+            raise UsageError(say_unknown("mode", mode, MODES) + hint_at_sheet(mode))
         return mode
     if look.get("iso_value") is not None:
         return "surface"

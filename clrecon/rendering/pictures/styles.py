@@ -212,8 +212,7 @@ class Projection(Style):
         super().__post_init__()
         if self.keep_air and self.kind != "minip":
             raise UsageError(
-                f"{name_parameter('keep_air')} belongs to mode minip: no other projection leaves air out, not"
-                f" {self.kind}"
+                f"{name_parameter('keep_air')} means nothing in mode {self.kind}: minip alone leaves air out"
             )
         if self.kind == "drr" and isinstance(named, str):
             raise UsageError(

@@ -10,8 +10,18 @@ from numpy.typing import ArrayLike
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.system.text import say_unknown
+from clrecon.system.wording import name_parameter
 
-__all__ = ["DEFAULT_SIZE", "DIRECTIONS", "LARGEST_SIDE", "checked_size", "checked_vector", "find_up", "find_view"]
+__all__ = [
+    "DEFAULT_SIZE",
+    "DIRECTIONS",
+    "LARGEST_SIDE",
+    "checked_size",
+    "checked_vector",
+    "find_up",
+    "find_view",
+    "hint_at_sheet",
+]
 
 DIRECTIONS: dict[str, tuple[float, float, float]] = {
     "anterior": (0.0, -1.0, 0.0),
@@ -113,6 +123,13 @@ def find_up(up: str | ArrayLike) -> Float64Array:
     return np.array(checked_vector("the up direction of a picture", up))
 
 
+def hint_at_sheet(word: object) -> str:
+    """Return the end of a message about a view or a mode that means a contact sheet; empty for others."""
+    if not isinstance(word, str) or word.strip().lower() not in ("sheet", "sheets", "contact-sheet"):
+        return ""
+    return f"; a contact sheet of slices is asked for with {name_parameter('sheet')}"
+
+
 def _turned_anterior(azimuth: float) -> Float64Array:
     """Return the anterior direction, turned by `azimuth` degrees to the left; exact at quarter turns."""
     quarters, rest = divmod(azimuth, 90.0)
@@ -131,6 +148,6 @@ def _find_angles(view: str | Sequence[float]) -> tuple[float, float]:
     if not (np.isfinite(azimuth) and abs(elevation) <= 90.0):
         raise UsageError(
             f"{say_unknown('view', view, DIRECTIONS)}, or AZIMUTH,ELEVATION in degrees,"
-            " elevation from -90 to 90, such as 30,15"
+            f" elevation from -90 to 90, such as 30,15{hint_at_sheet(view)}"
         )
     return azimuth, elevation

@@ -48,7 +48,7 @@ def test_the_command_draws_what_the_function_draws(
     files = ["-o", str(tmp_path / "a.png"), "--depth", str(tmp_path / "d.npy"), "--report", str(tmp_path / "r.json")]
     assert main(["render", str(file), *files, *given, "--view", "20,30", "--point-radius", "0.4"]) == 0
     said = capsys.readouterr().out
-    assert "6,000 points with normals, hu, labels" in said and "kept: 1," in said and "removed 1: 1," in said
+    assert "6,000 points with normals, HU, labels" in said and "kept: 1," in said and "removed 1: 1," in said
     cloud = clrecon.read_points(file)
     own = clrecon.render(
         cloud, color_by="removed", radius_mm=0.4, view=(20, 30), size=(80, 64), device=device

@@ -104,8 +104,11 @@ def test_points_that_nothing_grows_from_are_refused(device):
     volume = Volume(chosen.astype(np.int16), np.eye(4))
     mask = clrecon.Mask.from_band(volume, (1, 1), device=device)
     for points, words in (
-        ([[7, 4, 1]], r"\(7.0, 4.0, 1.0\) mm lies in a voxel that is not chosen \(1 to 1 HU\): .* is 3.0 mm away"),
-        ([[10, 4, 1], [10, 4, 90]], r"\(10.0, 4.0, 90.0\) mm lies outside of the volume .* is 89.0 mm away"),
+        (
+            [[7, 4, 1]],
+            r"\(7.0, 4.0, 1.0\) mm lies in a voxel that is not chosen: .*chosen \(1 to 1 HU\) is 3.0 mm away",
+        ),
+        ([[10, 4, 1], [10, 4, 90]], r"\(10.0, 4.0, 90.0\) mm lies outside of the volume: .* is 89.0 mm away"),
         ([[0, 0, np.nan]], "needs points that are numbers"),
         (np.zeros((0, 3)), "needs points that are numbers, these are 0 points"),
         ([1, 2, 3], "points have shape"),

@@ -133,7 +133,7 @@ def test_bad_input_is_refused(device):
     make = clrecon.Mask
     with pytest.raises(UsageError, match="a band is two numbers"):
         make.from_band(volume, (3, 1), device=device)
-    with pytest.raises(NoSurfaceError, match="no voxel can lie from"):
+    with pytest.raises(NoSurfaceError, match="no voxel can have"):
         make.from_band(volume, (0.2, 0.8), device=device)
     with pytest.raises(UsageError, match="has shape \\(3, 4, 39\\), the volume \\(3, 4, 40\\)"):
         make.from_array(volume, np.zeros((3, 4, 39), bool), device=device)

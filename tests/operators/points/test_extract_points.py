@@ -231,8 +231,8 @@ def test_a_resident_volume_is_uploaded_once(device):
     ("choice", "words"),
     [
         ({"hu": (2000, 3000)}, "no voxel of 2000 to 3000 HU: the volume runs from 0 to 99 HU"),
-        ({"hu": (40000, None)}, "no voxel can lie from 40000 to inf HU: voxels are int16"),
-        ({"hu": (50.2, 50.8)}, "no voxel can lie from 50.2 to 50.8 HU"),
+        ({"hu": (40000, None)}, "no voxel can have 40000 HU and more: voxels are int16"),
+        ({"hu": (50.2, 50.8)}, "no voxel can have 50.2 to 50.8 HU"),
         ({"iso_value": 2000}, "no surface at 2000 HU"),
     ],
 )

@@ -65,14 +65,14 @@ def test_noise_is_averaged(device):
 
 def test_a_leak_is_refused_or_mended(device):
     cloud = cube_cloud()
-    with pytest.raises(RefusedInputError, match=r"joined: [45]\d% of [\d,]+ votes .*\(bridge 1\.2 mm, .* tries 1\)"):
+    with pytest.raises(RefusedInputError, match=r"joined: [45]\d % of [\d,]+ votes .*\(bridge 1\.2 mm, .* tries 1\)"):
         reconstruct_surface(cloud, 0.64, bridge=1.2, widenings=0, device=device)
     mesh = reconstruct_surface(cloud, 0.64, bridge=1.2, device=device)
     check_closed(mesh)
     assert mesh.report["tries"] == 2
     assert mesh.report["bridge_mm"] == pytest.approx(1.5)
     assert mesh.report["reach_mm"] >= mesh.report["bridge_mm"]
-    assert "with a bridge of 1.2 mm 50% of the votes" in mesh.report["warnings"][0]
+    assert "with a bridge of 1.2 mm 50 % of the votes" in mesh.report["warnings"][0]
     assert rms(cube_distances(mesh.vertices)) < 0.1
 
 
@@ -92,7 +92,7 @@ def test_a_large_hole_is_refused_after_all_widenings(device):
 
 def test_normals_that_point_inward_are_refused(device):
     cloud = sphere_cloud(3000, 10.0)
-    with pytest.raises(RefusedInputError, match="point inward: 100% of"):
+    with pytest.raises(RefusedInputError, match="point inward: 100 % of"):
         reconstruct_surface(cloud.changed(normals=-cloud.normals), 0.65, device=device)
 
 

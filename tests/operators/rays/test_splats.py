@@ -202,9 +202,9 @@ def test_what_cannot_be_shown_is_refused(device: Any, monkeypatch: pytest.Monkey
     cloud = PointCloud(ball(50)[0])
     with pytest.raises(UsageError, match="no points: there is nothing to show"):
         clrecon.render(PointCloud(np.empty((0, 3))), device=device)
-    with pytest.raises(UsageError, match="no labels to colour it by"):
+    with pytest.raises(UsageError, match="no labels, and color_by='removed' needs them"):
         clrecon.render(cloud, color_by="removed", device=device)
-    with pytest.raises(UsageError, match="no HU to colour it by"):
+    with pytest.raises(UsageError, match="no HU, and color_by='hu' needs them"):
         clrecon.render(cloud, color_by="hu", device=device)
     with pytest.raises(UsageError, match="a point cloud is shown in mode points, not in mode mip"):
         clrecon.render(cloud, "mip", device=device)

@@ -200,7 +200,10 @@ def test_a_second_surface_of_a_volume_is_grown_with_its_bricks(device: Any) -> N
 @pytest.mark.parametrize(
     ("seeds", "words"),
     [
-        ((-250.0, -300.0, 900.0), r"seed -250,-300,900 lies outside of the volume: voxel \(.*\) of 70 x 18 x 16"),
+        (
+            (-250.0, -300.0, 900.0),
+            r"seed -250,-300,900 lies outside of the volume, which runs from x .* mm \(LPS\): check",
+        ),
         ("spine", "grow_from is 'auto', a point of three numbers in LPS mm, a label or a mask, not 'spine'"),
         ((1.0, 2.0), "a point of three numbers"),
         ((1.0, float("nan"), 2.0), "a point of three numbers"),
