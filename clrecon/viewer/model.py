@@ -316,6 +316,7 @@ class ViewModel(ChangingView):
                 {"number": each.number, "name": each.name, "kind": each.kind, "said": list(each.said)}
                 for each in self.objects
             ],
+            "bounds": [[round(float(value), 3) for value in corner] for corner in self._span(self.objects)],
             "modes": [{"name": each.name, "words": each.words} for each in self.modes.values()],
             "mode": state.mode,
             "iso": {"hu": state.iso_value, "low": self.iso_range[0], "high": self.iso_range[1]} if self.scans else None,
@@ -381,6 +382,7 @@ class ViewModel(ChangingView):
             raise UsageError(f"there is no clip plane {n!r}: there are {count}, numbered from 0")
         return self.state.clips[n]
 
-    def _span(self) -> tuple[Float64Array, Float64Array]:
-        corners = np.concatenate([each.corners for each in self.scans or self.objects])
+    def _span(self, objects: Sequence[ShownObject] = ()) -> tuple[Float64Array, Float64Array]:
+        """Return the lowest and highest corner of the box around objects; by default the scans, if there are any."""
+        corners = np.concatenate([each.corners for each in objects or self.scans or self.objects])
         return corners.min(axis=0), corners.max(axis=0)

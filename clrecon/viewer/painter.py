@@ -19,7 +19,7 @@ from clrecon.operators.rays.scene import ScenePictures
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
 from clrecon.rendering import Rendering
-from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, SlicesInSpace, Style, VolumeLook
+from clrecon.rendering.pictures.styles import CurveCut, Projection, SlicesInSpace, Style, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import checked_size
 from clrecon.rendering.views.plane import PLANES, find_plane
@@ -33,6 +33,7 @@ from clrecon.viewer.objects import ShownCloud, ShownLabels, ShownMesh, ShownObje
 from clrecon.viewer.shown_meshes import make_meshes
 from clrecon.viewer.stage import Stage
 from clrecon.viewer.state import ShownPart, ViewState
+from clrecon.viewer.strips import take_strips
 from clrecon.viewer.tools import Pick
 from clrecon.viewer.warming import warm_kernels
 
@@ -364,10 +365,14 @@ class Painter(Stage):
                 self.place(each.subject, each.labelled)
         first = drawn[0]
         if len(drawn) == 1 and isinstance(first.subject, DeviceVolume):
-            assert not isinstance(first.style, PlaneCut)
-            return self.renderer(first.subject).render(
-                first.style, camera=camera, size=size, background="transparent", progress=check
-            )
+            renderer, style = self.renderer(first.subject), first.style
+
+            def take(camera: Camera, size: tuple[int, int]) -> Rendering:
+                return renderer.render(style, camera=camera, size=size, background="transparent", progress=check)
+
+            # The window of a projection without one is chosen from all of the picture.
+            whole = isinstance(style, Projection) and style.window is None
+            return take(camera, size) if whole else take_strips(take, camera, size)
         return self._open_scene(drawn).take(camera, size, None, check)
 
     def _open_scene(self, drawn: Sequence[_Drawn]) -> ScenePictures:

@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import NoSurfaceError
+from clrecon.geometry.affine import Float64Array
 from clrecon.labels import LabelMap
 from clrecon.labels.resample import ResampledLabels
 from clrecon.opencl import download
@@ -39,6 +40,26 @@ SMALLER = MOST_CLUSTERS + 1
 
 STEPS = 5
 """Steps of the search, as progress counts them."""
+
+
+class ClusterMap(LabelMap):
+    """Numbers of clusters on the grid of a scan, whose slices may be uneven: other label maps have even ones.
+
+    Parameters
+    ----------
+    voxels : ndarray, shape (nk, nj, ni), uint8
+    volume : Volume
+    """
+
+    def __init__(self, voxels: NDArray[np.uint8], volume: Volume):
+        super().__init__(voxels, volume.affine.copy())
+        self._volume = volume
+
+    def ijk_to_lps(self, points: ArrayLike) -> Float64Array:
+        return self._volume.ijk_to_lps(points)
+
+    def lps_to_ijk(self, points: ArrayLike) -> Float64Array:
+        return self._volume.lps_to_ijk(points)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -136,7 +157,7 @@ def find_clusters(
     tell("parts", 3, STEPS)
     parts = _describe_parts(volume, scan, iso_value, runs, of_runs, sizes)
     tell("parts", 4, STEPS)
-    labels = LabelMap(voxels, volume.affine.copy())
+    labels = ClusterMap(voxels, volume)
     tell("parts", STEPS, STEPS)
     return FoundParts(
         scan=scan, iso_value=iso_value, table=table, volume=volume, labels=labels,

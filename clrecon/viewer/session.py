@@ -16,7 +16,7 @@ from clrecon.system.closing import Closing
 from clrecon.system.log import get_logger
 from clrecon.viewer.commands import check_command
 from clrecon.viewer.model import ViewModel
-from clrecon.viewer.objects import ShownObject
+from clrecon.viewer.objects import ShownMesh, ShownObject
 from clrecon.viewer.painter import Painter
 from clrecon.viewer.saving import check_target, save_shown
 from clrecon.viewer.tools import Pick
@@ -34,8 +34,8 @@ LEAST_SHARE = 0.15
 
 FIRST_SHARE = 0.5
 
-LARGE_VOXELS = 1 << 31
-"""Voxels above which pictures are said to be slow."""
+MANY_TRIANGLES = 2_000_000
+"""Triangles of a mesh above which it is said that pictures take their time."""
 
 _WORDS = {
     "prepare": "building kernels",
@@ -145,6 +145,8 @@ class ViewSession(Closing):
                     "size": list(made.size),
                     "sharp": not moving,
                     "device": self.painter.device.label,
+                    "slabs": made.report.get("slabs", 1),
+                    "warnings": list(made.report["warnings"]),
                 }
             if not job.cancelled():
                 then(made)
@@ -403,13 +405,16 @@ class ViewSession(Closing):
 
     def _warnings(self) -> list[str]:
         said = [text for each in self.model.objects for text in each.said]
-        for scan in self.model.scans:
-            voxels = scan.volume.voxels
-            if voxels.nbytes > self.painter.device.memory_bytes // 2:
+        if self._timing.get("slabs", 1) > 1:
+            said.append("the scan does not fit the device: every picture takes it through in slabs, which is slow")
+        for each in self.model.objects:
+            if isinstance(each, ShownMesh) and each.mesh.triangle_count > MANY_TRIANGLES:
                 said.append(
-                    f"{scan.name} has {voxels.nbytes / 1e9:.3g} GB: it may go through the device in slabs, slowly"
+                    f"{each.name} has {each.mesh.triangle_count:,} triangles: a sharp picture takes a while, and a"
+                    " coarse mesh is shown while anything moves"
                 )
-        return said
+        said += self._timing.get("warnings", [])
+        return list(dict.fromkeys(said))
 
     def _failed(self, kind: str, words: str) -> None:
         log.warning("%s: %s", kind, words)

@@ -68,6 +68,29 @@ def test_a_surface_picture_is_that_of_render(view, device):
     assert np.array_equal(mine.image, other.image)
 
 
+@pytest.mark.parametrize("mode", ["surface", "bone", "mip", "drr", "slices"])
+def test_a_large_picture_in_strips_is_the_same(view, monkeypatch, mode):
+    from clrecon.viewer import strips
+
+    model, painter = view()
+    model.set_mode(mode)
+    model.turn(0.1, 0.05)
+    whole = painter.picture(model.snapshot(), SIZE)
+    monkeypatch.setattr(strips, "STRIP_PIXELS", 96 * 32)
+    parts = painter.picture(model.snapshot(), SIZE)
+    assert parts.report.get("strips", 1) == (1 if mode == "drr" else 3) and parts.camera == whole.camera
+    apart = np.abs(parts.image.astype(int) - whole.image.astype(int)).max(axis=2)
+    assert (apart > 3).mean() < (0.3 if mode == "bone" else 0.002)  # samples of volume rendering lie at random places
+    both = ~np.isnan(parts.depth) & ~np.isnan(whole.depth)
+    assert both.any() == (mode != "drr")  # a radiograph has no depth
+    if both.any():
+        assert np.median(np.abs(parts.depth[both] - whole.depth[both])) < (0.3 if mode == "bone" else 1e-3)
+    if mode != "drr":
+        asked = []
+        with pytest.raises(Cancelled):
+            painter.picture(model.snapshot(), SIZE, cancelled=lambda: bool(asked.append(1)) or len(asked) > 3)
+
+
 def test_a_cancelled_picture_raises(view):
     model, painter = view()
     asked = []
@@ -141,6 +164,22 @@ def test_slices_map_pixels_to_the_patient_and_show_the_scan(view):
         assert edge.focal_point == pytest.approx(picture.camera.focal_point)
     with pytest.raises(UsageError, match="axial"):
         painter.slice(model.snapshot(), "oblique", SIZE)
+
+
+@pytest.mark.parametrize("plane", ["coronal", "sagittal"])
+def test_parts_lie_over_their_bone_in_slices_of_an_uneven_scan(view, plane):
+    scan = scenes.make_scan()
+    steps = 0.4 + 1.2 * np.arange(22) / 21
+    heights = scan.affine[:3, 3] + np.cumsum(steps)[:, None] * scan.affine[:3, 2]
+    model, painter = view(Volume(scan.voxels, scan.affine, slice_positions=heights))
+    find(model, painter)
+    model.set_color("1/1", (1.0, 0.0, 0.0))
+    at = painter.objects[0].volume.ijk_to_lps([scenes.BALLS[0][0]])[0]
+    model.set_cross(tuple(at))
+    picture = painter.slice(model.snapshot(), plane, (200, 200))
+    tinted = picture.image[..., 0].astype(int) - picture.image[..., 1] > 30
+    bone = np.nan_to_num(picture.values, nan=-1000.0) >= scenes.ISO
+    assert tinted[bone].mean() > 0.97 and bone[tinted].mean() > 0.6  # parts are grown by a voxel
 
 
 def test_a_slice_without_a_scan_is_empty_and_one_of_labels_is_not(view):

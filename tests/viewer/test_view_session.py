@@ -405,6 +405,23 @@ def test_several_sessions_share_a_painter_and_do_not_disturb_each_other(device):
 
 
 @pytest.mark.opencl
+def test_what_makes_pictures_slow_is_said(session, monkeypatch):
+    from clrecon.viewer import session as module
+
+    monkeypatch.setattr(module, "MANY_TRIANGLES", 100)
+    view = session(scenes.make_mesh())
+    assert "mesh 1 has" in view.facts()["warnings"][0] and "coarse" in view.facts()["warnings"][0]
+    view = session(scenes.make_scan(), memory=80_000)
+    found = []
+    view.picture((24, 20), False, found.append)
+    assert view.wait(PATIENCE) and found and view.facts()["error"] is None
+    assert any("in slabs, which is slow" in text for text in view.facts()["warnings"])
+    view.picture((800, 800), False, found.append)
+    assert view.wait(PATIENCE) and len(found) == 1
+    assert "80,000 bytes are allowed" in view.facts()["error"]
+
+
+@pytest.mark.opencl
 def test_the_first_view_fits_the_size_of_the_picture(session):
     view = session()
     wide, found = (200, 80), []
