@@ -7,6 +7,7 @@ from typing import Any
 
 from clrecon.cli.common import add_device, add_no_clobber, table
 from clrecon.cli.console import Console, printable
+from clrecon.system.text import say_digits
 
 __all__ = ["add_arguments", "run"]
 
@@ -68,7 +69,7 @@ def _describe(result: dict[str, Any]) -> list[str]:
         f"surface  {result['iso_value_hu']:g} HU, open at the border of the volume",
         f"system   {printable(result['processor'])}, {result['cores']} cores ({result['free_cores']:.1f} free),"
         f" {result['platform']}",
-        f"{read:<8} {_seconds(result['seconds'][read])} ({rate:,.0f} Mvoxel/s)",
+        f"{read:<8} {_seconds(result['seconds'][read])} ({say_digits(rate, 2)} Mvoxel/s)",
     ]
     for entry in result["devices"]:
         lines += ["", *_describe_device(entry)]
@@ -98,7 +99,7 @@ def _describe_device(entry: dict[str, Any]) -> list[str]:
         threads = f"{peer['threads']} thread{'s' * (peer['threads'] != 1)}"
         rows.append(("flying edges", _seconds(peer["seconds"]["median"]), f"{_range(peer['seconds'])}, {threads}"))
         rows.append(("ratio", f"{entry['ratio']['median']:.2f}", _ratio_range(entry["ratio"])))
-    rates = f"{entry['mvoxels_per_s']:,.0f} Mvoxel/s, {entry['mtriangles_per_s']:,.1f} Mtriangle/s"
+    rates = f"{say_digits(entry['mvoxels_per_s'], 2)} Mvoxel/s, {say_digits(entry['mtriangles_per_s'], 2)} Mtriangle/s"
     counts = f"{entry['vertices']:,} vertices, {entry['triangles']:,} triangles"
     return [head, *(f"  {line}" for line in table(rows, right=(1,))), f"  {counts}, {rates}"]
 

@@ -86,7 +86,12 @@ def describe_job(
     """
     certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
     told = [*certificate.pop("warnings", []), *device.warnings]
-    told += [warning for vertebra in vertebrae for warning in vertebra["warnings"]]
+    several = len(vertebrae) > 1
+    told += [
+        f"{vertebra['name']}: {warning}" if several else warning
+        for vertebra in vertebrae
+        for warning in vertebra["warnings"]
+    ]
     return InsideReport(
         affine_ijk_to_lps_mm=volume.affine.tolist(),
         vertebrae=[dict(vertebra) for vertebra in vertebrae],

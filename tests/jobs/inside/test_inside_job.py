@@ -68,6 +68,10 @@ def test_several_vertebrae_have_names_of_their_own(
     assert [vertebra["label"] for vertebra in report["vertebrae"]] == [20, 21]
     assert {vertebra["iso_value_hu"] for vertebra in report["vertebrae"]} == {300.0}
     assert report["vertebrae"][0]["dense_hu"] == [350.0, 900.0]
+    assert inside("--label", "L1", "--label", "L2", "--dense", "0", "--json", output="b.ply") == 0
+    warnings = json.loads(capsys.readouterr().out)["warnings"]  # tissue beside the labels is in that band
+    for name in ("L1", "L2"):
+        assert [line for line in warnings if line.startswith(f"{name}: ") and "next voxel outside" in line]
 
 
 def test_what_is_there_stays_with_no_clobber(inside: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
