@@ -10,7 +10,7 @@ from typing import Any
 from clrecon.cli.wrapping import fit, is_terminal
 from clrecon.errors import OutputError
 
-__all__ = ["Console", "is_terminal", "printable"]
+__all__ = ["Console", "describe_stage", "is_terminal", "printable"]
 
 _STAGES = {
     "device": "choosing a device",
@@ -47,6 +47,11 @@ _STAGES = {
 _HIDDEN = {*range(0x202A, 0x202F), *range(0x2066, 0x206A), 0x200E, 0x200F, 0x061C}
 _BAR_WIDTH, _LEAST_BAR = 24, 6
 _REDRAW_SECONDS = 0.1
+
+
+def describe_stage(stage: str) -> str:
+    """Return the words for a stage of the progress."""
+    return _STAGES.get(stage, stage)
 
 
 def printable(text: object) -> str:
@@ -142,7 +147,7 @@ class Console:
         """Show the progress of a job, see `clrecon.system.progress`."""
         if self.verbose and stage != self._stage:
             elapsed = time.perf_counter() - self._start
-            self._to_stderr(f"clrecon: {elapsed:6.2f} s  {_STAGES.get(stage, stage)}")
+            self._to_stderr(f"clrecon: {elapsed:6.2f} s  {describe_stage(stage)}")
         elif self._moving:
             now = time.perf_counter()
             if stage != self._stage or done == total or now - self._last_draw >= _REDRAW_SECONDS:

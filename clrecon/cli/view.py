@@ -7,7 +7,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes, pick, table
-from clrecon.cli.console import Console, printable
+from clrecon.cli.console import Console, describe_stage, printable
 from clrecon.cli.cropping import add_cropping
 from clrecon.cli.labels import add_label_arguments, label_choice
 from clrecon.cli.masking import add_masking
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 __all__ = ["add_arguments", "run"]
 
 _EPILOG = """\
+Without --web and --html a window opens: turn with the mouse, move the slider, h shows all keys; q closes it. It needs a
+display with OpenGL. What is saved gets a name that no file has.
+
 --web shows everything in a browser of this computer, drawn on the OpenCL device: a slider for the iso value, presets,
 slices, parts, measures, clips, and files of what is shown. It needs the package aiohttp, and no screen and no OpenGL:
 over a network use an ssh tunnel. Ctrl-C ends it.
@@ -30,6 +33,8 @@ from outside and holds no patient data: files are numbered, not named, unless --
 measures; parts (components, labels, files) are switched one by one. See docs/view.md.
 
 examples:
+  clrecon view CT_FOLDER
+  clrecon view CT_FOLDER bone.stl cloud.ply --labels spine.nii.gz --save-as shown.3mf
   clrecon view CT_FOLDER --web
   clrecon view CT_FOLDER --html page.html
   clrecon view CT_FOLDER --html spine.html --labels spine.nii.gz
@@ -47,6 +52,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="mesh file (.stl, .ply), or a scan: DICOM folder or file, NIfTI, NRRD or MetaImage file",
     )
     shown = parser.add_argument_group("what is shown")
+    shown.add_argument(
+        "--save-as",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="what the key s of the window writes: a mesh, cloud, volume or picture by its extension; numbered where it"
+        " exists; repeat it for several (default: clrecon-view.stl)",
+    )
     shown.add_argument("--html", metavar="FILE", help="write a page that shows the inputs: .html")
     shown.add_argument("--web", action="store_true", help="show them in a browser of this computer, until Ctrl-C")
     shown.add_argument("--port", type=int, metavar="N", help="of --web, on 127.0.0.1 (default: a free one)")
@@ -97,6 +110,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
     settings = ViewSettings(scan=scan, mesh_space=options.mesh_space, names=options.names)
     if options.web:
         return _serve(options, settings, console)
+    if options.html is None:
+        return _show(options, settings, console)
     report = write_view(
         options.inputs, options.html, settings, no_clobber=options.no_clobber, progress=console.progress
     )
@@ -119,8 +134,42 @@ def _check_faces(options: argparse.Namespace) -> None:
         raise UsageError("-q hides the address that is to be opened: leave it out, or ask for --open too")
     if options.web and options.no_clobber:
         raise UsageError("--web writes no file by itself: leave --no-clobber out")
-    if options.html is None and not options.web:
-        raise UsageError("there is no window: show the inputs with --web, or write a page with --html page.html")
+    if options.save_as and (options.web or options.html is not None):
+        raise UsageError("--save-as says what the window writes: leave out --web and --html, or it")
+    if options.html is None and not options.web and options.no_clobber:
+        raise UsageError("a window replaces no file: leave --no-clobber out")
+
+
+def _show(options: argparse.Namespace, settings: ViewSettings, console: Console) -> int:
+    """Show a window until it is closed."""
+    from clrecon.system.display import NoDisplayError
+    from clrecon.viewer.open_window import open_window
+
+    facts: dict[str, Any] = {"device": None, "warnings": []}
+
+    def ready(view: Any) -> None:
+        facts.update(device=view.painter.device.label, warnings=list(view.said))
+        for warning in view.said:
+            console.warn(warning)
+        console.say(f"device   {printable(facts['device'])}")
+
+    try:
+        saved = open_window(
+            options.inputs,
+            settings,
+            save_as=options.save_as,
+            progress=console.progress,
+            ready=ready,
+            say=lambda line: console.say(f"wrote    {printable(line)}"),
+            describe=describe_stage,
+        )
+    except NoDisplayError as error:
+        raise NoDisplayError(
+            f"{error}; without one: --web shows this in a browser, --html page.html writes a page, and clrecon render"
+            " draws pictures"
+        ) from error
+    console.result({**facts, "saved": saved})
+    return 0
 
 
 def _serve(options: argparse.Namespace, settings: ViewSettings, console: Console) -> int:

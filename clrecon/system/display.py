@@ -12,7 +12,9 @@ import subprocess
 import sys
 from dataclasses import dataclass
 
-__all__ = ["Display", "DisplayProbe"]
+from clrecon.errors import UsageError
+
+__all__ = ["Display", "DisplayProbe", "NoDisplayError"]
 
 SECONDS = 30.0
 """Until the child is given up; it takes half a second where nothing else runs."""
@@ -20,8 +22,11 @@ SECONDS = 30.0
 SOFTWARE = ("llvmpipe", "softpipe", "swiftshader", "swr", "software")
 """Words of drivers that draw with the processor."""
 
+TRIES = 4
+"""Attempts to reach the display, a tenth of a second apart."""
+
 _CHILD = """\
-import ctypes, json, os, sys
+import ctypes, json, os, sys, time
 def tell(**facts):
     print(json.dumps(facts), flush=True)
 if sys.platform.startswith("linux"):
@@ -31,7 +36,11 @@ if sys.platform.startswith("linux"):
         x11 = None
     if x11 is not None:
         x11.XOpenDisplay.restype = ctypes.c_void_p
-        if not x11.XOpenDisplay(None):
+        for attempt in range(TRIES):  # a server that has just lost its last client begins anew, and is deaf meanwhile
+            if x11.XOpenDisplay(None):
+                break
+            time.sleep(0.1)
+        else:
             tell(display=False)
             sys.exit()
 try:
@@ -55,6 +64,10 @@ driver = [line.split(":", 1)[1].strip() for line in words.splitlines() if "rende
 red, green, blue = pixels.GetTuple(9)
 tell(display=True, window=window.GetClassName(), drawn=red > 250 and 100 < green < 160 and blue < 5, driver=driver[:1])
 """
+
+
+class NoDisplayError(UsageError):
+    """No window can be opened here."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +111,7 @@ class DisplayProbe:
         else:
             try:
                 self._child = subprocess.Popen(
-                    [sys.executable, "-c", _CHILD],
+                    [sys.executable, "-c", _CHILD.replace("TRIES", str(TRIES))],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.PIPE,
                     stderr=subprocess.DEVNULL,

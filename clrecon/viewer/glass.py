@@ -16,8 +16,14 @@ if TYPE_CHECKING:
 
 __all__ = ["Glass"]
 
+COVER = "cover"
+"""Name of what lies over the picture."""
+
 BETWEEN = (0.10, 0.11, 0.12)
 """Colour of the gaps between the boxes."""
+
+PICTURE_BACK = (0.055, 0.06, 0.07)
+"""Colour behind the picture."""
 
 
 class Glass:
@@ -49,6 +55,7 @@ class Glass:
         self._renderers: dict[str, Any] = {}
         self._textures: dict[str, Any] = {}
         self._dirty: set[str] = set()
+        self._covered = False
         self.layout = layout
         self.is_software = display.is_software
         self.interactor = vtkRenderWindowInteractor()
@@ -69,7 +76,7 @@ class Glass:
         made = self._renderers.get(name)
         if made is None:
             made = self._renderers[name] = self._make()
-            made.SetBackground(0.0, 0.0, 0.0)
+            made.SetBackground(*(PICTURE_BACK if name == "picture" else (0.0, 0.0, 0.0)))
             made.GetCullers().RemoveAllItems()  # a picture is drawn wherever its rectangle lies
             self.window.AddRenderer(made)
         return made
@@ -89,6 +96,14 @@ class Glass:
         texture.SetInputData(image_data(np.ascontiguousarray(image[::-1])))
         self._dirty.add(name)
 
+    def cover(self, image: NDArray[np.uint8] | None) -> None:
+        """Lay an image over the picture; None takes it away."""
+        self._covered = image is not None
+        if image is not None:
+            self.renderer(COVER).SetViewport(*self.box("picture").viewport(self.layout.size))
+            self.show(COVER, image)
+        self._dirty.add("picture")
+
     def touch(self, name: str) -> None:
         """Draw a box anew at the next `draw`."""
         self._dirty.add(name)
@@ -103,7 +118,9 @@ class Glass:
             return False
         self._back.SetDraw("" in self._dirty)
         for name, renderer in self._renderers.items():
-            renderer.SetDraw(name in self._dirty and name in self.layout.boxes)
+            here = self._covered if name == COVER else name in self.layout.boxes
+            hidden = self._covered and name == "picture"
+            renderer.SetDraw(name in self._dirty and here and not hidden)
         self._dirty.clear()
         self.window.Render()
         return True

@@ -4,26 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, fields
 from pathlib import Path
 
-from clrecon.errors import UsageError
 from clrecon.jobs.mesh.levels import choose_level
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.shared.settings import InputSettings
 from clrecon.jobs.view.inputs import open_inputs
 from clrecon.jobs.view.settings import ViewSettings
+from clrecon.jobs.view.view_settings import check_view_settings
 from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.wording import name_parameter
 from clrecon.viewer.objects import ShownScan, wrap_inputs
 from clrecon.viewer.painter import Painter
 from clrecon.viewer.session import ViewSession
 
-__all__ = ["OpenedView", "check_view_settings", "open_view"]
-
-_OF_A_VIEW = {"iso_value", "preset", "half_way", "space", "labels", "one_file"}
-"""Settings of meshes that a view has a meaning for; a label map sets the last one by itself."""
+__all__ = ["OpenedView", "open_view"]
 
 
 class OpenedView(Closing):
@@ -102,24 +96,3 @@ def open_view(
     settings = settings or ViewSettings()
     check_view_settings(settings)
     return OpenedView(inputs, settings, progress or ignore_progress)
-
-
-def check_view_settings(settings: ViewSettings) -> None:
-    """Refuse settings that a view has no meaning for, before anything is read.
-
-    Raises
-    ------
-    UsageError
-    """
-    scan = settings.scan
-    ignored = {own.name for own in fields(InputSettings)} | _OF_A_VIEW
-    for own in fields(scan):
-        default = own.default if own.default_factory is MISSING else own.default_factory()
-        value = getattr(scan, own.name)
-        if own.name not in ignored and value != default and not (isinstance(value, Sequence) and not value):
-            raise UsageError(
-                f"{name_parameter(own.name)} says how a mesh is made, and a view makes none: leave it out, or write a"
-                " page instead"
-            )
-    if isinstance(scan.iso_value, Sequence):
-        raise UsageError("a view begins with one iso value: give one, and move the slider")

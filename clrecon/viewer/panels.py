@@ -184,20 +184,24 @@ def draw_words(size: tuple[int, int], lines: Sequence[str]) -> Panel:
 def draw_help(size: tuple[int, int], sections: Sequence[tuple[str, Sequence[tuple[str, str]]]]) -> Panel:
     """Draw the keys and gestures, in as many columns as are needed."""
     pen = _Pen(size, (18, 20, 23))
-    lines: list[tuple[str, str] | str] = []
+    pitch, top = 19, 26
+    room = max((size[1] - 2 * top) // pitch, 6)
+    columns: list[list[tuple[str, str] | str]] = [[]]
     for title, rows in sections:
-        lines += ["", title, *rows] if lines else [title, *rows]
-    pitch = 19
-    column = max((size[1] - 40) // pitch, 6)
-    count = -(-len(lines) // column)
-    width = max((size[0] - 2 * MARGIN) // max(count, 1), 120)
-    for n, line in enumerate(lines):
-        x, y = MARGIN + 6 + n // column * width, 26 + n % column * pitch
-        if isinstance(line, str):
-            pen.text(x, y, line, ACCENT)
-        else:
-            pen.text(x, y, line[0], width=112)
-            pen.text(x + 118, y, line[1], FAINT, width=width - 128)
+        if columns[-1] and len(columns[-1]) + len(rows) + 2 > room:
+            columns.append([])
+        columns[-1] += [*([""] if columns[-1] else []), title, *rows]
+    width = max((size[0] - 2 * MARGIN) // len(columns), 120)
+    for place, lines in enumerate(columns):
+        names = max((_font(TEXT_PIXELS).getlength(line[0]) for line in lines if not isinstance(line, str)), default=0.0)
+        x = MARGIN + 6 + place * width
+        for n, line in enumerate(lines):
+            y = top + n * pitch
+            if isinstance(line, str):
+                pen.text(x, y, line, ACCENT)
+            else:
+                pen.text(x, y, line[0])
+                pen.text(x + names + 14, y, line[1], FAINT, width=width - names - 24)
     return pen.finish()
 
 
@@ -309,15 +313,19 @@ def describe_size(part: Mapping[str, Any]) -> str:
 
 
 def _clips_height(facts: Mapping[str, Any]) -> int:
-    clips = facts.get("clips", ())
-    return (len(clips) + 1) * ROW if clips else 0
+    rows = len(facts.get("clips", ())) + (len(_AXES) if facts.get("clip_box") else 0)
+    return (rows + 1) * ROW if rows else 0
+
+
+_AXES = ("R - L", "A - P", "I - S")
+"""The axes of LPS, from their lower to their higher end."""
 
 
 def _draw_clips(pen: _Pen, facts: Mapping[str, Any], y: int) -> int:
-    clips = facts.get("clips", ())
-    if not clips:
+    clips, box = facts.get("clips", ()), facts.get("clip_box")
+    if not clips and not box:
         return y
-    _title(pen, y, "clip planes")
+    _title(pen, y, "clip")
     y += ROW
     width = pen.size[0]
     for n, clip in enumerate(clips):
@@ -325,13 +333,28 @@ def _draw_clips(pen: _Pen, facts: Mapping[str, Any], y: int) -> int:
         pen.text(MARGIN, middle, clip["name"], width=70, pixels=12)
         bar = Box(MARGIN + 74, y + 5, width - MARGIN - 74 - 62, 9)
         pen.box(bar, RAISED, LINE)
-        at = bar.left + round(clip["share"] * (bar.width - 1))
-        pen.box(Box(at - 4, y + 2, 8, 15), ACCENT)
+        _handle(pen, bar, clip["share"])
         pen.hit(Box(bar.left, y, bar.width, ROW), {"do": "move_clip", "n": n}, "share")
         for words, left, action in (("flip", width - 58, "flip_clip"), ("x", width - 24, "remove_clip")):
-            box = Box(left, y + 1, 30 if action == "flip_clip" else 14, ROW - 4)
-            pen.box(box, RAISED)
-            pen.text(left + box.width / 2, middle, words, anchor="mm", pixels=12)
-            pen.hit(box, {"do": action, "n": n})
+            button = Box(left, y + 1, 30 if action == "flip_clip" else 14, ROW - 4)
+            pen.box(button, RAISED)
+            pen.text(left + button.width / 2, middle, words, anchor="mm", pixels=12)
+            pen.hit(button, {"do": action, "n": n})
         y += ROW
+    if box:
+        for axis, (words, (low, high)) in enumerate(zip(_AXES, facts["clip_box_shares"], strict=True)):
+            pen.text(MARGIN, y + ROW / 2 - 1, words, width=70, pixels=12)
+            bar = Box(MARGIN + 74, y + 5, width - 2 * MARGIN - 74, 9)
+            pen.box(bar, RAISED, LINE)
+            inner = Box(round(bar.left + low * bar.width), bar.top, max(round((high - low) * bar.width), 1), bar.height)
+            pen.box(inner, FAINT)
+            _handle(pen, bar, low)
+            _handle(pen, bar, high)
+            pen.hit(Box(bar.left, y, bar.width, ROW), {"clip_box": axis}, "share")
+            y += ROW
     return y
+
+
+def _handle(pen: _Pen, bar: Box, share: float) -> None:
+    at = bar.left + round(min(max(share, 0.0), 1.0) * (bar.width - 1))
+    pen.box(Box(at - 4, bar.top - 3, 8, 15), ACCENT)

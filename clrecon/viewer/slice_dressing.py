@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.errors import UsageError
+from clrecon.rendering.pictures.annotations import bar_length, edge_letters
 from clrecon.viewer.picture_overlay import MEASURE_COLOR, PLANE_COLORS, marked_lines
 
 if TYPE_CHECKING:
@@ -22,6 +22,9 @@ NORMALS = {"axial": 2, "coronal": 1, "sagittal": 0}
 
 NEAR_MM = 2.0
 """Points of measures are drawn in slices that pass them so near."""
+
+TEXT_PIXELS = 13
+WHITE = (255, 255, 255, 255)
 
 GAP = 7
 """Pixels around the cross that stay free."""
@@ -51,12 +54,7 @@ def dress_slice(rendering: Rendering, plane: str, facts: Mapping[str, Any]) -> N
     load_pillow()
     camera, (width, height) = rendering.camera, rendering.size
     assert camera is not None
-    shown = rendering.with_background((0.0, 0.0, 0.0))
-    try:
-        shown = shown.annotated(letters=True, scale_bar=True)
-    except UsageError:  # a small window has no room for them
-        pass
-    page = Image.fromarray(np.ascontiguousarray(shown.image))
+    page = Image.fromarray(rendering.with_background((0.0, 0.0, 0.0)).image)
     pen = ImageDraw.Draw(page)
     (x, y), _ = _pixel(camera, rendering.size, facts["cross"])
     for other, axis in NORMALS.items():
@@ -72,7 +70,21 @@ def dress_slice(rendering: Rendering, plane: str, facts: Mapping[str, Any]) -> N
     _draw_measures(pen, camera, rendering.size, facts, NORMALS[plane])
     ink = _ink(PLANE_COLORS[plane])
     pen.rectangle((0, 0, width - 1, height - 1), outline=ink)
-    pen.text((6, 5), plane, ink, load_font(13))
+    font = load_font(TEXT_PIXELS)
+    pen.text((6, 5), plane, ink, font)
+    places = {
+        "left": ((6, height / 2), "lm"),
+        "right": ((width - 6, height / 2), "rm"),
+        "top": ((width / 2, 5), "mt"),
+        "bottom": ((width / 2, height - 6), "ms"),
+    }
+    for edge, letters in edge_letters(camera).items():
+        _write(pen, *places[edge], letters, font)
+    pixel = camera.pixel_mm(rendering.size)
+    length = bar_length(0.7 * pixel * width)
+    bottom = height - 7
+    pen.line([(7, bottom - 4), (7, bottom), (7 + length / pixel, bottom), (7 + length / pixel, bottom - 4)], WHITE, 2)
+    _write(pen, (7, bottom - 6), "ls", f"{length:g} mm", font)
     return np.array(page)
 
 
@@ -102,7 +114,14 @@ def slice_place(
     return x, y, z
 
 
+def _write(pen: Any, at: tuple[float, float], anchor: str, words: str, font: Any) -> None:
+    """Write in white with a dark rim, so that it is read over lines and bone."""
+    pen.text(at, words, WHITE, font, anchor, stroke_width=2, stroke_fill=(0, 0, 0, 255))
+
+
 def _draw_measures(pen: Any, camera: Camera, size: tuple[int, int], facts: Mapping[str, Any], axis: int) -> None:
+    from clrecon.rendering.pictures.pillow import load_font
+
     for points, words, is_line in marked_lines(facts):
         near = np.abs(points[:, axis] - facts["cross"][axis]) <= NEAR_MM
         places = [_pixel(camera, size, point)[0] for point in points]
@@ -110,7 +129,7 @@ def _draw_measures(pen: Any, camera: Camera, size: tuple[int, int], facts: Mappi
         if is_line and near.all():
             pen.line(places, color, 2)
             if words:
-                pen.text((places[-1][0] + 6, places[-1][1] - 6), words, color, anchor="ls")
+                pen.text((places[-1][0] + 6, places[-1][1] - 6), words, color, load_font(TEXT_PIXELS), "ls")
         for (x, y), is_near in zip(places, near, strict=True):
             if is_near:
                 pen.ellipse((x - 3, y - 3, x + 3, y + 3), color)

@@ -28,7 +28,11 @@ def need_off_screen() -> None:
 
 
 def ball(
-    camera: Camera, size: tuple[int, int], center=CENTRE, radius: float = RADIUS, color=(250, 40, 10)
+    camera: Camera,
+    size: tuple[int, int],
+    center: np.ndarray = CENTRE,
+    radius: float = RADIUS,
+    color: tuple[int, int, int] = (250, 40, 10),
 ) -> Rendering:
     """What a raycaster makes of an opaque ball: its colour, and depths from analysis."""
     origins, directions = camera.rays(size)

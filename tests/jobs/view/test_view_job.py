@@ -112,7 +112,10 @@ def test_the_mesh_job_writes_pages_too(tmp_path, device):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["{a}"], "there is no window: name it with --html page.html"),
+        (["{a}", "--keep-largest", "1"], "--keep-largest says how a mesh is made"),
+        (["{a}", "--save-as", "bone.abc"], "bone.abc: the extension says as what it is written, one of .png"),
+        (["{a}", "--save-as", "a.stl", "--html", "{page}"], "--save-as says what the window writes"),
+        (["{a}", "--no-clobber"], "a window replaces no file"),
         (["{a}", "--html", "page.png"], "a page is a file .html, not 'page.png'"),
         (["{a}", "--html", "{page}", "--hu", "300"], "--hu says what is made of a scan, and all inputs are mesh files"),
         (["{a}", "--html", "{page}", "--keep-largest", "1"], "--keep-largest says what is made of a scan"),

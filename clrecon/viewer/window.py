@@ -1,0 +1,269 @@
+"""`ViewWindow`: the window of a view.  It opens at once, reads in a thread, and draws what the session delivers.
+
+The loop of VTK handles events and, by a timer, looks whether there is something new; nothing that takes long is done in
+it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from clrecon.errors import Cancelled, UsageError
+from clrecon.system.display import DisplayProbe, NoDisplayError
+from clrecon.system.progress import Progress
+from clrecon.viewer.glass import Glass
+from clrecon.viewer.layout import lay_out
+from clrecon.viewer.pointer import Pointer
+from clrecon.viewer.window_actions import WindowActions
+from clrecon.viewer.window_content import WindowContent
+
+if TYPE_CHECKING:
+    from clrecon.viewer.session import ViewSession
+
+__all__ = ["Load", "ViewWindow", "show_window"]
+
+SIZE = (1280, 860)
+SMALLEST = (320, 240)
+SCREEN_SHARE = 0.92
+"""Of the screen, that the window has at most."""
+
+TICK_MS = 8
+
+Load = Callable[[Progress], "ViewSession"]
+"""Reads the inputs; called in a thread, with a progress function that raises `Cancelled` when the window is closed."""
+
+
+def show_window(
+    load: Load,
+    *,
+    title: str = "clrecon view",
+    size: tuple[int, int] = SIZE,
+    save_as: Sequence[str] = (),
+    say: Callable[[str], None] = lambda words: None,
+    describe: Callable[[str], str] = str,
+    probe: DisplayProbe | None = None,
+) -> None:
+    """Show a view in a window until it is closed.
+
+    Parameters
+    ----------
+    load : callable
+        See `Load`.  The session is closed with the window.
+    title : str
+    size : (width, height)
+        Pixels, at most; on a smaller screen the window is smaller.
+    save_as : sequence of str
+        Files that a save writes; numbers are added where they exist.
+    say : callable
+        Gets lines for the console: what was saved.
+    describe : callable
+        Returns words for a stage of the progress.
+    probe : DisplayProbe, optional
+        One that has been started.
+
+    Raises
+    ------
+    NoDisplayError
+        There is no display, or OpenGL does not work on it: the message says which.
+    ClreconError
+        Whatever `load` raises.
+    """
+    found = (probe or DisplayProbe()).wait()
+    if found.fault is not None:
+        raise NoDisplayError(f"no window can be opened: {found.fault}")
+    glass = Glass(title, lay_out(size), found)
+    try:
+        ViewWindow(glass, save_as=save_as, say=say, describe=describe).run(load, size)
+    finally:
+        glass.close()
+
+
+class ViewWindow:
+    """The window; see `show_window`, which makes one.
+
+    Parameters
+    ----------
+    glass : Glass
+    save_as, say, describe
+        See `show_window`.
+    """
+
+    def __init__(
+        self,
+        glass: Glass,
+        *,
+        save_as: Sequence[str] = (),
+        say: Callable[[str], None] = lambda words: None,
+        describe: Callable[[str], str] = str,
+    ):
+        self.glass = glass
+        self.content = WindowContent(glass)
+        self.pointer = Pointer()
+        self.actions = WindowActions(self.content, end=self.end, save_as=save_as, say=say)
+        self._describe = describe
+        self._moved = False
+        self._failure: BaseException | None = None
+        self._ended = threading.Event()
+        self._loader: threading.Thread | None = None
+
+    def run(self, load: Load, size: tuple[int, int] = SIZE) -> None:
+        """Open the window, load, and return when it is closed."""
+        glass, interactor = self.glass, self.glass.interactor
+        screen = glass.window.GetScreenSize()
+        fitting = [
+            max(least, min(wish, round(SCREEN_SHARE * most)))
+            for least, wish, most in zip(SMALLEST, size, screen, strict=True)
+        ]
+        glass.window.SetSize(*fitting)
+        interactor.Initialize()
+        self.content.lay_out()
+        self.content.tick(False, False)
+        self._observe()
+        self._loader = threading.Thread(target=self._load, args=(load,), name="view-load", daemon=True)
+        with self._interruptible():
+            self._loader.start()
+            interactor.CreateRepeatingTimer(TICK_MS)
+            interactor.Start()
+        self._close()
+        if self._failure is not None:
+            raise self._failure
+
+    def end(self) -> None:
+        """Leave the loop; what is running is cancelled."""
+        self._ended.set()
+        self.glass.interactor.TerminateApp()
+
+    # Loading
+
+    def _load(self, load: Load) -> None:
+        """Read in a thread, and hand the session to the thread of the window."""
+        session: ViewSession | None = None
+        try:
+            session = load(self._progress)
+            if self._ended.is_set():
+                raise Cancelled
+        except BaseException as error:  # raised again by the thread of the window
+            if session is not None:
+                session.close()
+            failure = error
+            self.content.call(lambda: self._fail(failure))
+            return
+        ready = session
+        self.content.call(lambda: self._attach(ready))
+
+    def _progress(self, stage: str, done: int, total: int) -> None:
+        if self._ended.is_set():
+            raise Cancelled
+        words = self._describe(stage) + (f" {done} of {total}" if total > 1 else "")
+        self.content.call(lambda: self.content.say_lines("clrecon", words))
+
+    def _attach(self, session: ViewSession) -> None:
+        if self._ended.is_set():
+            session.close()
+            return
+        self.content.attach(session)
+
+    def _fail(self, error: BaseException) -> None:
+        if not (isinstance(error, Cancelled) and self._ended.is_set()):
+            self._failure = self._failure or error
+        self.end()
+
+    def _close(self) -> None:
+        """Cancel what runs, and wait for it."""
+        self._ended.set()
+        self.actions.close()
+        if self._loader is not None:
+            self._loader.join(CLOSE_S)
+        if self.content.session is not None:
+            self.content.session.close()
+
+    @contextlib.contextmanager
+    def _interruptible(self) -> Iterator[None]:
+        """Let Ctrl-C end the loop: an exception within it would only be printed by VTK."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def interrupt(*_: object) -> None:
+            self._failure = KeyboardInterrupt()
+            self.end()
+
+        before = signal.signal(signal.SIGINT, interrupt)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    # Events
+
+    def _observe(self) -> None:
+        events: dict[str, Callable[[], None]] = {
+            "TimerEvent": self._tick,
+            "ExitEvent": self.end,
+            "ExposeEvent": self.glass.touch_all,
+            "MouseMoveEvent": self._move,
+            "MouseWheelForwardEvent": lambda: self._wheel(1),
+            "MouseWheelBackwardEvent": lambda: self._wheel(-1),
+            "KeyPressEvent": self._key,
+        }
+        for button in ("Left", "Middle", "Right"):
+            events[f"{button}ButtonPressEvent"] = lambda button=button: self._press(button.lower())  # type: ignore[misc]
+            events[f"{button}ButtonDoubleClickEvent"] = events[f"{button}ButtonPressEvent"]
+            events[f"{button}ButtonReleaseEvent"] = self._release
+        for name, action in events.items():
+            self.glass.interactor.AddObserver(name, lambda *_, action=action: self._guarded(action))
+
+    def _guarded(self, action: Callable[[], None]) -> None:
+        """Do something in an event of VTK, which would only print an exception: wrong commands are said, faults end."""
+        if self._ended.is_set():
+            return
+        try:
+            action()
+        except UsageError as error:
+            self.content.say(str(error), warning=True)
+        except BaseException as error:
+            self._failure = error
+            self.end()
+
+    def _tick(self) -> None:
+        if tuple(self.glass.window.GetSize()) != self.glass.layout.size:
+            self.content.lay_out()
+        if self._moved:
+            self._moved = False
+            self.actions.apply(self.pointer.move(self.glass.layout, self.glass.place()))
+        self.content.tick(self.actions.is_busy, self.pointer.is_busy)
+        self.actions.tick()
+
+    def _press(self, button: str) -> None:
+        interactor = self.glass.interactor
+        self.content.touch()
+        held = {"shift": bool(interactor.GetShiftKey()), "control": bool(interactor.GetControlKey())}
+        self.actions.apply(
+            self.pointer.press(button, self.glass.layout, self.content.panels, self.glass.place(), **held)
+        )
+
+    def _move(self) -> None:
+        self._moved = True  # moves are many: `_tick` takes the last of them
+
+    def _release(self) -> None:
+        at = self.glass.place()
+        self._moved = False
+        self.actions.apply(self.pointer.move(self.glass.layout, at))
+        self.actions.apply(self.pointer.release(self.glass.layout, at))
+        self.actions.let_go()
+
+    def _wheel(self, steps: int) -> None:
+        self.content.touch()
+        self.actions.apply(self.pointer.wheel(self.glass.layout, self.glass.place(), steps))
+
+    def _key(self) -> None:
+        self.content.touch()
+        self.actions.press(self.glass.interactor.GetKeySym() or "", self.glass.place())
+
+
+CLOSE_S = 5.0
+"""Longest wait for reading that is cancelled: it looks at each slice whether it is to go on."""
