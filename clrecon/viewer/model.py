@@ -75,7 +75,8 @@ class ViewModel(ChangingView):
         self.iso_range = find_iso_range(scans)
         low, high = self.iso_range
         corners = np.concatenate([each.corners for each in objects])
-        middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+        sliced = scans[0].corners if scans else corners
+        middle = 0.5 * (sliced.min(axis=0) + sliced.max(axis=0))
         only_labels = not scans and any(isinstance(each, ShownLabels) for each in objects)
         first = ViewState(
             camera=fit_camera(corners, "anterior", 1.0),

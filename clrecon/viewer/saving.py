@@ -19,6 +19,7 @@ from clrecon.operators.masks.mask import Mask
 from clrecon.points import PointCloud
 from clrecon.rendering.pictures.image_files import IMAGE_FORMATS
 from clrecon.system.progress import Progress
+from clrecon.system.targets import keep_existing
 from clrecon.system.text import count_of, escape_text
 from clrecon.viewer.objects import ShownCloud, ShownScan
 from clrecon.viewer.painter import Painter
@@ -67,6 +68,7 @@ def save_shown(
     size: Sequence[int] = (1024, 1024),
     space: str = "lps",
     keep_ids: bool = False,
+    no_clobber: bool = False,
     progress: Progress | None = None,
 ) -> list[str]:
     """Write what is shown; returns lines that say what was written.
@@ -81,25 +83,25 @@ def save_shown(
     if kind == "picture":
         made = painter.picture(state, size, sharp=True)
         made = made.with_background("black").annotated(letters=True, scale_bar=True)
-        written = made.save(path)
+        written = made.save(path, no_clobber=no_clobber)
         return [f"{name}: picture of {made.size[0]} x {made.size[1]} pixels, {_megabytes(written)}"]
     if kind == "volume":
         volume = shown_volume(painter, state, progress)
         ni, nj, nk = volume.shape_ijk
-        written = volume.save(path, keep_ids=keep_ids, progress=progress)
+        written = volume.save(path, keep_ids=keep_ids, no_clobber=no_clobber, progress=progress)
         return [f"{name}: volume of {ni} x {nj} x {nk} voxels, {_megabytes(written)}"]
     if kind == "cloud":
         cloud = shown_cloud(painter, state, progress)
-        written = cloud.save(path, space, keep_ids=keep_ids)
+        written = cloud.save(path, space, keep_ids=keep_ids, no_clobber=no_clobber)
         return [f"{name}: {count_of(len(cloud), 'point')}, {_megabytes(written)}"]
     meshes = painter.mesh_of_shown(state, progress)
     triangles = sum(mesh.triangle_count for mesh in meshes)
     if Path(path).suffix.lower() in ASSEMBLIES and len(meshes) > 1:
-        with stage_assembly(meshes, path, space, keep_ids=keep_ids) as staged:
+        with keep_existing(no_clobber), stage_assembly(meshes, path, space, keep_ids=keep_ids) as staged:
             staged.commit()
         written = staged.size
     else:
-        written = _join(meshes).save(path, space, keep_ids=keep_ids)
+        written = _join(meshes).save(path, space, keep_ids=keep_ids, no_clobber=no_clobber)
     return [f"{name}: {count_of(len(meshes), 'mesh', 'meshes')}, {triangles:,} triangles, {_megabytes(written)}"]
 
 

@@ -6,6 +6,7 @@ import math
 import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from time import monotonic
 from typing import Any
 
 from clrecon.errors import ClreconError, UsageError
@@ -20,7 +21,7 @@ from clrecon.viewer.objects import ShownMesh, ShownObject
 from clrecon.viewer.painter import Painter
 from clrecon.viewer.saving import check_target, save_shown
 from clrecon.viewer.tools import Pick
-from clrecon.viewer.worker import Job, Worker
+from clrecon.viewer.worker import CLOSE_S, Job, Worker
 
 __all__ = ["ViewSession"]
 
@@ -64,6 +65,8 @@ class ViewSession(Closing):
         HU at the start.
     keep_ids : bool
         Write hashes of UIDs into files.
+    no_clobber : bool
+        Files that exist stay, and to save over one is an error.
     on_change : callable, optional
         Called, in any thread, when something happened that was not asked for by the caller just now: work began or
         ended, parts were found, an error came.
@@ -89,12 +92,13 @@ class ViewSession(Closing):
         space: str = "lps",
         iso_value: float | None = None,
         keep_ids: bool = False,
+        no_clobber: bool = False,
         on_change: Callable[[], None] | None = None,
     ):
         self.model = ViewModel(objects, space=space, iso_value=iso_value)
         self._owns = painter is None
         self.painter = Painter(objects, device=device, memory=memory) if painter is None else painter
-        self.keep_ids = keep_ids
+        self.keep_ids, self.no_clobber = keep_ids, no_clobber
         self._lock = threading.RLock()
         self._on_change = on_change
         self._share = FIRST_SHARE
@@ -110,7 +114,10 @@ class ViewSession(Closing):
         if self._closed:
             return
         self._closed = True
-        ended = [self._work.close(), self._pictures.close()]
+        workers, end = (self._work, self._pictures), monotonic() + CLOSE_S
+        for worker in workers:
+            worker.stop()
+        ended = [worker.close(max(0.0, end - monotonic())) for worker in workers]
         if self._owns and all(ended):
             self.painter.close()
 
@@ -336,7 +343,7 @@ class ViewSession(Closing):
         def write(job: Job) -> None:
             lines = save_shown(
                 path, self.painter, state, size=checked, space=self.model.space, keep_ids=self.keep_ids,
-                progress=job.progress,
+                no_clobber=self.no_clobber, progress=job.progress,
             )  # fmt: skip
             with self._lock:
                 self._said = "; ".join(lines)

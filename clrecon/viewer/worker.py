@@ -122,8 +122,8 @@ class Worker:
         with self._wake:
             return self._wake.wait_for(lambda: not self._waiting and self._running is None, timeout)
 
-    def close(self, timeout: float = CLOSE_S) -> bool:
-        """Cancel everything and wait for the thread to end; False where it still runs after `timeout` seconds."""
+    def stop(self) -> None:
+        """Cancel everything, and take nothing more."""
         with self._wake:
             self._closed = True
             for job in (*self._waiting.values(), self._running):
@@ -131,6 +131,10 @@ class Worker:
                     job.cancel()
             self._waiting.clear()
             self._wake.notify_all()
+
+    def close(self, timeout: float = CLOSE_S) -> bool:
+        """Cancel everything and wait for the thread to end; False where it still runs after `timeout` seconds."""
+        self.stop()
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout)
         return not self._thread.is_alive()

@@ -267,6 +267,13 @@ def test_looks_of_parts_go_over_to_another_iso_value_by_their_place():
     assert model.state.part("1/2").visible and model.state.part("1/1").color is None
 
 
+def test_slices_begin_in_the_middle_of_the_scan_whatever_lies_beside_it():
+    far = scenes.make_mesh(np.array([500.0, 0.0, 0.0]))
+    corners = make_model(scenes.make_scan(), far).objects[0].corners
+    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    assert make_model(far, scenes.make_scan()).cross == pytest.approx(middle)
+
+
 def test_slices_scroll_by_voxels_and_stay_within():
     model = make_model(scenes.make_scan())
     before = model.cross[2]

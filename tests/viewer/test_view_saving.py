@@ -1,0 +1,119 @@
+"""What a view shows, saved to each format of meshes, clouds, volumes and pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import view_scenes as scenes
+
+from clrecon.errors import UsageError
+from clrecon.mesh.reader import read_mesh
+from clrecon.points.reader import read_points
+from clrecon.reading import read_volume
+from clrecon.viewer.objects import show_objects
+from clrecon.viewer.session import ViewSession
+
+PATIENCE = 60.0
+
+
+@pytest.fixture
+def session(device):
+    opened = []
+
+    def make(*subjects, **given) -> ViewSession:
+        objects = show_objects(subjects or [scenes.make_scan(), scenes.make_mesh()])
+        opened.append(
+            ViewSession(objects, iso_value=scenes.ISO, device=None if "painter" in given else device, **given)
+        )
+        return opened[-1]
+
+    yield make
+    for each in opened:
+        each.close()
+
+
+@pytest.mark.opencl
+@pytest.mark.parametrize("name", ["a.stl", "a.ply", "a.glb", "a.3mf", "a.obj", "a.vtp", "a.html"])
+def test_what_is_shown_is_saved_to_every_mesh_format(session, tmp_path, name):
+    view = session()
+    view.do({"do": "find_parts"})
+    assert view.wait(PATIENCE)
+    view.do({"do": "show", "key": "1/1", "visible": False})
+    view.do({"do": "save", "path": str(tmp_path / name)})
+    assert view.wait(PATIENCE)
+    facts = view.facts()
+    assert facts["error"] is None and f"{name}: 2 meshes" in facts["said"]
+    assert (tmp_path / name).stat().st_size > 1000
+    if name.endswith((".stl", ".ply")):
+        shown = view.painter.mesh_of_shown(view.model.snapshot())
+        assert read_mesh(tmp_path / name).triangle_count == sum(each.triangle_count for each in shown)
+
+
+@pytest.mark.opencl
+@pytest.mark.parametrize("name", ["a.ply", "a.npz", "a.xyz", "a.vtp"])
+def test_clouds_are_saved_to_every_cloud_format(session, tmp_path, name):
+    view = session(scenes.make_cloud())
+    view.do({"do": "save", "path": str(tmp_path / name)})
+    assert view.wait(PATIENCE) and view.facts()["error"] is None
+    assert len(read_points(tmp_path / name)) == 200
+
+
+@pytest.mark.opencl
+def test_a_cloud_of_a_scan_is_the_vertices_of_its_surface(session, tmp_path):
+    view = session(scenes.make_scan())
+    view.do({"do": "save", "path": str(tmp_path / "a.npz")})
+    assert view.wait(PATIENCE) and view.facts()["error"] is None
+    (mesh,) = view.painter.mesh_of_shown(view.model.snapshot())
+    assert np.array_equal(read_points(tmp_path / "a.npz").points, mesh.vertices)
+
+
+@pytest.mark.opencl
+def test_a_volume_is_saved_without_hidden_parts_cut_and_cropped(session, tmp_path):
+    view = session(scenes.make_scan())
+    view.do({"do": "find_parts"})
+    assert view.wait(PATIENCE)
+    view.do({"do": "show", "key": "1/2", "visible": False})
+    low, high = (scenes.middle(0) - 12.0).tolist(), (scenes.middle(2) + 12.0).tolist()
+    view.do({"do": "set_clip_box", "low": np.minimum(low, high).tolist(), "high": np.maximum(low, high).tolist()})
+    view.do({"do": "save", "path": str(tmp_path / "a.nii.gz")})
+    assert view.wait(PATIENCE) and view.facts()["error"] is None
+    saved = read_volume(tmp_path / "a.nii.gz")
+    assert saved.voxels.size < 0.9 * scenes.make_scan().voxels.size
+    values = [saved.voxels[tuple(np.rint(saved.lps_to_ijk([scenes.middle(n)])[0]).astype(int)[::-1])] for n in range(3)]
+    assert values[0] == 1000 and values[1] < -800 and values[2] > 500
+
+
+@pytest.mark.opencl
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif"])
+def test_a_screenshot_is_as_large_as_asked_for(session, tmp_path, name):
+    from PIL import Image
+
+    view = session()
+    view.do({"do": "save", "path": str(tmp_path / name), "size": [120, 90]})
+    assert view.wait(PATIENCE) and view.facts()["error"] is None
+    assert Image.open(tmp_path / name).size == (120, 90)
+
+
+@pytest.mark.opencl
+def test_what_cannot_be_saved_is_said(session, tmp_path):
+    view = session(scenes.make_mesh())
+    with pytest.raises(UsageError, match="no scan"):
+        view.do({"do": "save", "path": str(tmp_path / "a.nii.gz")})
+    view.do({"do": "show", "key": "1", "visible": False})
+    with pytest.raises(UsageError, match="nothing that has a surface"):
+        view.do({"do": "save", "path": str(tmp_path / "a.stl")})
+    view.do({"do": "undo"})
+    view.do({"do": "save", "path": str(tmp_path / "none" / "a.stl")})
+    assert view.wait(PATIENCE)
+    assert "none" in view.facts()["error"] and not list(tmp_path.iterdir())
+
+
+@pytest.mark.opencl
+def test_a_file_that_exists_stays_where_that_is_asked_for(session, tmp_path):
+    view = session(scenes.make_mesh(), no_clobber=True)
+    (tmp_path / "a.stl").write_text("mine")
+    for name in ("a.stl", "b.stl"):
+        view.do({"do": "save", "path": str(tmp_path / name)})
+        assert view.wait(PATIENCE)
+    assert (tmp_path / "a.stl").read_text() == "mine" and (tmp_path / "b.stl").exists()
+    assert "a.stl" in view.facts()["error"] and "exists" in view.facts()["error"]
