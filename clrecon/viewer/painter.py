@@ -201,7 +201,7 @@ class Painter(Stage):
         camera = pixel_camera(state.camera, checked_size(size), x, y)
         nearest: tuple[float, _Drawn] | None = None
         with self.lock:
-            for drawn in self._drawn(state, sharp=True):
+            for drawn in self._drawn(state, sharp=True, opaque=True):
                 made = self._take([drawn], state, (1, 1), never, camera)
                 hazy = isinstance(drawn.style, VolumeLook | SlicesInSpace)
                 depth = float((made.expected_depth if hazy else made.depth)[0, 0])
@@ -280,8 +280,8 @@ class Painter(Stage):
                     _stop(cancelled)
                     self._coarse[each.number] = coarsen_mesh(each.mesh, COARSE_TRIANGLES)
 
-    def _drawn(self, state: ViewState, sharp: bool) -> list[_Drawn]:
-        """Return what a state shows, with looks; the first scan first."""
+    def _drawn(self, state: ViewState, sharp: bool, opaque: bool = False) -> list[_Drawn]:
+        """Return what a state shows, with looks, in the order of the objects; meshes opaque where that is enough."""
         mode = find_modes()[state.mode]
         made: list[_Drawn] = []
         for each in self.objects:
@@ -298,7 +298,7 @@ class Painter(Stage):
             elif isinstance(each, ShownMesh):
                 if whole.opacity >= LEAST_OPACITY:
                     mesh = each.mesh if sharp else self._coarse.get(each.number, each.mesh)
-                    made.append(_Drawn(each.number, mesh, self._looks.mesh(state, whole, opaque=not sharp)))
+                    made.append(_Drawn(each.number, mesh, self._looks.mesh(state, whole, opaque or not sharp)))
             elif isinstance(each, ShownCloud):
                 made.append(_Drawn(each.number, each.cloud, self._looks.cloud(state, whole)))
             elif isinstance(each, ShownLabels) and (mode.kind == "labels" or each.within is None):

@@ -352,6 +352,10 @@ def test_a_translucent_mesh_is_opaque_while_it_moves(view):
     model.set_opacity("1", 0.3)
     assert painter.picture(model.snapshot(), SIZE).image[..., 3].max() < 250
     assert painter.picture(model.snapshot(), SIZE, sharp=False).image[..., 3].max() == 255
+    asked = []
+    with pytest.raises(Cancelled):  # between its layers
+        painter.picture(model.snapshot(), SIZE, cancelled=lambda: bool(asked.append(1)) or len(asked) > 4)
+    assert painter.pick(model.snapshot(), SIZE, 48, 40).point[1] < scenes.middle(0)[1] - 28.0
 
 
 def test_a_curve_straightens_the_scan(view):

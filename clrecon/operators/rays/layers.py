@@ -27,6 +27,7 @@ from clrecon.operators.rays.triangles import LayerKeys, MeshPart, Triangles
 from clrecon.rendering import Lighting
 from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.views.camera import Camera
+from clrecon.system.progress import Progress, ignore_progress
 
 __all__ = ["LAYERS", "PIXEL_BYTES", "LayeredPicture", "Still", "draw_layers"]
 
@@ -80,6 +81,7 @@ def draw_layers(
     background: str | Sequence[float] | None = None,
     memory: int | None = None,
     stopwatch: Stopwatch | None = None,
+    progress: Progress | None = None,
 ) -> LayeredPicture:
     """Draw triangles, with what lies before, between and behind them.
 
@@ -103,6 +105,8 @@ def draw_layers(
     memory : int, optional
         Bytes that may be taken on the device.
     stopwatch : Stopwatch, optional
+    progress : callable, optional
+        Called as ``progress("layers", done, most)`` before each layer.
 
     Returns
     -------
@@ -118,7 +122,7 @@ def draw_layers(
     needs = {"picture": PIXEL_BYTES * size[0] * size[1], "triangles": sum(part.device_bytes for part in parts)}
     check_budget(device, needs, memory)
     job = _Layers(device, parts, camera, size, still, near_mm, stopwatch or Stopwatch())
-    return job.run(volume, most, background)
+    return job.run(volume, most, background, progress or ignore_progress)
 
 
 class _Layers:
@@ -157,7 +161,11 @@ class _Layers:
         self.states_d, self.marks_d = allocate(device, 32 * self.pixels), allocate(device, 16 * self.pixels)
 
     def run(
-        self, volume: Callable[[Between], None] | None, most: int, background: str | Sequence[float] | None
+        self,
+        volume: Callable[[Between], None] | None,
+        most: int,
+        background: str | Sequence[float] | None,
+        progress: Progress,
     ) -> LayeredPicture:
         device, (width, height) = self.device, self.size
         with self.stopwatch.running(device):
@@ -165,6 +173,7 @@ class _Layers:
         open_pixels, drawn = self.pixels if self.triangles or self.has_still else 0, 0
         is_first = True
         while open_pixels and drawn < most:
+            progress("layers", drawn, most)
             self._draw_layer()
             open_pixels = 0 if self.is_single else self._count_open()
             if volume is not None:

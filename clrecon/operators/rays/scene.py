@@ -155,7 +155,7 @@ class ScenePictures(Closing):
         background : str or (float, float, float), optional
             None: transparent.
         progress : callable, optional
-            Called as ``progress("render", objects drawn, all objects)``.
+            Called as ``progress("render", objects drawn, all objects)``, and as `draw_layers` says.
 
         Raises
         ------
@@ -176,7 +176,7 @@ class ScenePictures(Closing):
                 renderer = self._taker(place)
                 assert isinstance(renderer, VolumeRenderer)
                 translucent = renderer, style
-        finish = partial(self._finish, drawn, camera, size, background)
+        finish = partial(self._finish, drawn, camera, size, background, tell)
         if translucent is None:
             made = work_on(self._device, lambda device, told: finish(device, Stopwatch(), told, None))
         else:
@@ -227,6 +227,7 @@ class ScenePictures(Closing):
         camera: Camera,
         size: tuple[int, int],
         background: str | Sequence[float] | None,
+        progress: Progress,
         device: Device,
         stopwatch: Stopwatch,
         told: list[str],
@@ -237,7 +238,7 @@ class ScenePictures(Closing):
             device, self._parts, camera, size, still=_join_stills(drawn),
             volume=None if volume is None else volume.sample,
             near_mm=0.0 if volume is None else volume.near_mm, background=background, memory=self.memory,
-            stopwatch=stopwatch,
+            stopwatch=stopwatch, progress=progress,
         )  # fmt: skip
         warnings = [*device.warnings, *told]
         for each in drawn:
