@@ -144,8 +144,10 @@ class Connection:
 
     # From the browser
 
-    async def _take(self, message: Mapping[str, Any]) -> None:
+    async def _take(self, message: Any) -> None:
         """Take a message: what concerns the connection at once, commands one after the other."""
+        if not isinstance(message, Mapping):
+            raise TypeError("a message is a mapping")
         if "shown" in message:
             self._under_way = False
             self._wake.set()

@@ -74,6 +74,7 @@ class WebServer:
         self.address = f"http://{LOOPBACK}:{self.port}/?secret={self._secret}"
         self._connections: dict[Connection, Any] = {}
         self._downloads: Path = Path()
+        self._end: Callable[[], object] | None = None
 
     def __enter__(self) -> WebServer:
         return self
@@ -82,7 +83,7 @@ class WebServer:
         self._listener.close()
 
     def serve(self, open_session: OpenSession, ready: Callable[[Path], object] = lambda folder: None) -> None:
-        """Serve until SIGINT (Ctrl-C), SIGTERM or SIGHUP, which end it within a second.
+        """Serve until `stop`, or SIGINT (Ctrl-C), SIGTERM or SIGHUP, which end it within a second.
 
         Parameters
         ----------
@@ -94,6 +95,12 @@ class WebServer:
         with tempfile.TemporaryDirectory(prefix="clrecon-") as folder, contextlib.suppress(KeyboardInterrupt):
             self._downloads = Path(folder)
             asyncio.run(self._serve(open_session, ready))
+
+    def stop(self) -> None:
+        """End `serve`, from any thread."""
+        with contextlib.suppress(RuntimeError):  # it has ended by itself
+            if self._end is not None:
+                self._end()
 
     async def _serve(self, open_session: OpenSession, ready: Callable[[Path], object]) -> None:
         from aiohttp import web
@@ -117,6 +124,8 @@ class WebServer:
         )
         await runner.setup()
         with _ended_by_signals() as ended:
+            loop = asyncio.get_running_loop()
+            self._end = lambda: loop.call_soon_threadsafe(ended.set)
             await web.SockSite(runner, self._listener).start()
             ready(self._downloads)
             await ended.wait()

@@ -1,0 +1,170 @@
+"""Views in a browser without a browser and without a device: a painter that paints its state, and a client."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import json
+import threading
+from collections.abc import AsyncIterator, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import view_scenes as scenes
+from PIL import Image
+
+from clrecon.rendering import Rendering
+from clrecon.viewer.objects import show_objects
+from clrecon.viewer.session import ViewSession
+from clrecon.viewer.tools import Pick
+from clrecon.viewer.web.server import WebServer
+
+PATIENCE = 30.0
+"""Seconds until something has to have happened that takes a moment."""
+
+
+class FakePainter:
+    """Pictures of one grey, which is the iso value; `drawn` has the view and the sharpness of each."""
+
+    device = SimpleNamespace(label="no device", memory_bytes=1 << 40)
+    knows_table = True
+
+    def __init__(self) -> None:
+        self.drawn: list[tuple[str, bool]] = []
+        self.fault: Exception | None = None
+
+    def _paint(self, state: Any, size: Any, view: str, sharp: bool) -> Rendering:
+        self.drawn.append((view, sharp))
+        if self.fault is not None:
+            fault, self.fault = self.fault, None
+            raise fault
+        width, height = size
+        image = np.full((height, width, 4), 255, np.uint8)
+        image[..., :3] = round(state.iso_value) % 256
+        empty = np.full((height, width), np.nan, np.float32)
+        return Rendering(image, empty, empty, state.camera, None, view, {"ms": 1.0, "sharp": sharp})
+
+    def picture(self, state: Any, size: Any, *, sharp: bool = True, share: float = 1.0, cancelled: Any = None) -> Any:
+        return self._paint(state, size, "scene", sharp)
+
+    def slice(self, state: Any, plane: str, size: Any) -> Rendering:
+        return self._paint(state, size, plane, True)
+
+    def curve_picture(self, state: Any, size: Any) -> Rendering:
+        return self._paint(state, size, "curve", True)
+
+    def pick(self, state: Any, size: Any, x: float, y: float) -> Pick:
+        return Pick(point=(x, y, 0.0), object=1, part="1", hu=50.0)
+
+    def pick_slice(self, state: Any, plane: str, size: Any, x: float, y: float) -> Pick:
+        return Pick(point=(x, y, 1.0), hu=60.0)
+
+    def has_parts(self, state: Any) -> bool:
+        return True
+
+    def prepare(self, progress: Any = None) -> None:
+        pass
+
+    def make_coarse(self, cancelled: Any = None) -> None:
+        pass
+
+    def find_parts(self, state: Any, progress: Any = None) -> list[Any]:
+        return []
+
+
+class Views:
+    """The views of a server: one painter, and the sessions that were opened."""
+
+    def __init__(self) -> None:
+        self.painter = FakePainter()
+        self.objects = show_objects([scenes.make_scan()])
+        self.sessions: list[Any] = []
+
+    def open(self, on_change: Any) -> ViewSession:
+        session = ViewSession(self.objects, self.painter, iso_value=200.0, on_change=on_change)  # type: ignore[arg-type]
+        self.sessions.append(session)
+        return session
+
+
+@contextlib.contextmanager
+def serving(open_session: Any, port: int | None = None) -> Iterator[WebServer]:
+    """A server in a thread; it has ended when the block is left."""
+    with WebServer(port) as server:
+        ready = threading.Event()
+        thread = threading.Thread(target=server.serve, args=(open_session, lambda folder: ready.set()))
+        thread.start()
+        try:
+            assert ready.wait(PATIENCE)
+            yield server
+        finally:
+            server.stop()
+            thread.join(PATIENCE)
+            assert not thread.is_alive()
+
+
+class Client:
+    """A browser that keeps what it was told.
+
+    Attributes
+    ----------
+    facts : dict or None
+        The latest.
+    notes : list of dict
+    pictures : list of (dict, Image)
+    shows : bool
+        True: it says that it has shown each picture.
+    """
+
+    def __init__(self, socket: Any) -> None:
+        self.socket = socket
+        self.facts: dict[str, Any] = {}
+        self.notes: list[dict[str, Any]] = []
+        self.pictures: list[tuple[dict[str, Any], Image.Image]] = []
+        self.shows = True
+        self.close_code: int | None = None
+        self._news = asyncio.Event()
+        self._reader = asyncio.ensure_future(self._read())
+
+    async def tell(self, **message: Any) -> None:
+        await self.socket.send_str(json.dumps(message))
+
+    async def lay_out(self, **sizes: Any) -> None:
+        await self.tell(sizes=sizes or {"scene": [120, 90]}, ground=[10, 20, 30])
+
+    async def until(self, holds: Any) -> None:
+        """Wait until something holds."""
+        while not holds():
+            self._news.clear()
+            await asyncio.wait_for(self._news.wait(), PATIENCE)
+
+    async def _read(self) -> None:
+        async for message in self.socket:
+            if isinstance(message.data, bytes):
+                length = int.from_bytes(message.data[:4], "little")
+                head = json.loads(message.data[4 : 4 + length])
+                self.pictures.append((head, Image.open(io.BytesIO(message.data[4 + length :])).convert("RGB")))
+                if self.shows:
+                    await self.tell(shown=head["number"])
+            else:
+                told = json.loads(message.data)
+                self.facts = told.pop("facts", self.facts)
+                self.notes += [told] if told else []
+            self._news.set()
+        self.close_code = self.socket.close_code
+        self._news.set()
+
+
+@contextlib.asynccontextmanager
+async def browsing(server: WebServer) -> AsyncIterator[Client]:
+    """A client that is connected as the page is."""
+    import aiohttp
+
+    base = f"http://127.0.0.1:{server.port}"
+    secret = server.address.partition("?")[2]
+    async with (
+        aiohttp.ClientSession() as web,
+        web.ws_connect(f"{base}/socket?{secret}", headers={"Origin": base}) as socket,
+    ):
+        yield Client(socket)

@@ -1,0 +1,135 @@
+"""`clrecon view --web` as a process: without VTK and without a screen, ended by Ctrl-C, and wrong arguments."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import view_scenes as scenes
+from web_views import browsing
+
+from clrecon.cli.main import main
+from clrecon.formats.write_volume import write_volume
+from clrecon.viewer.web.listening import bind_port
+
+SECONDS_TO_END = 10.0
+"""Of patience; it takes milliseconds where nothing else runs."""
+
+WITHOUT = """
+import sys
+for name in ("pyvista", "vtk", "vtkmodules"):
+    sys.modules[name] = None
+from clrecon.cli.main import run
+run()
+"""
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("view") / "scan.nii.gz"
+    write_volume(scenes.make_scan(), path)
+    return path
+
+
+@contextmanager
+def running(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, Any]]]:
+    """A process whose server is ready, with what it printed; without VTK and without a screen."""
+    screens = ("DISPLAY", "WAYLAND_DISPLAY")
+    environment = {name: value for name, value in os.environ.items() if name not in screens}
+    process = subprocess.Popen(
+        [sys.executable, "-c", WITHOUT, "view", *arguments, "--web", "--json"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+    )  # fmt: skip
+    try:
+        text = ""
+        while not text.endswith("}\n"):
+            line = process.stdout.readline()
+            assert line, process.stderr.read()
+            text += line
+        yield process, json.loads(text)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.opencl
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_while_pictures_are_drawn(device, scan: Path, number: int) -> None:
+    with running(str(scan), "--device", str(device.index)) as (process, said):
+        server = SimpleNamespace(port=said["port"], address=said["address"])
+
+        async def look() -> None:
+            async with browsing(server) as client:
+                await client.lay_out(scene=[300, 200], axial=[100, 100])
+                await client.until(lambda: client.pictures)
+                await client.tell(do="turn", dx=0.1, dy=0.1)
+                process.send_signal(number)
+                await client.until(lambda: client.close_code is not None)
+
+        asyncio.run(look())
+        assert process.wait(SECONDS_TO_END) == 0
+        assert process.stderr.read() == ""
+
+
+@pytest.mark.opencl
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+def test_it_leaves_no_file_behind_and_opens_no_browser_without_a_screen(device, scan: Path, tmp_path: Path) -> None:
+    os.environ["TMPDIR"], before = str(tmp_path), os.environ.get("TMPDIR")
+    try:
+        with running(str(scan), "--device", str(device.index), "--open") as (process, said):
+            assert any("there is no screen" in warning for warning in said["warnings"])
+            assert len(list(tmp_path.glob("clrecon-*"))) == 1
+            process.send_signal(signal.SIGINT)
+            assert process.wait(SECONDS_TO_END) == 0
+        assert list(tmp_path.glob("clrecon-*")) == []
+    finally:
+        os.environ.pop("TMPDIR")
+        if before is not None:
+            os.environ["TMPDIR"] = before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--web", "--port", "0"], "a port is a whole number from 1 to 65535, not 0"),
+        (["--web", "--port", "x"], "'x' is no whole number"),
+        (["--port", "8000"], "--port belongs to --web"),
+        (["--html", "page.html", "--open"], "--open belongs to --web"),
+        (["--web", "--html", "page.html"], "ask for one of them"),
+        (["--web", "-q"], "-q hides the address"),
+        (["--web", "--no-clobber"], "leave --no-clobber out"),
+        (["--web", "--solid"], "--solid says how a mesh is made"),
+        (["--web", "--hu", "100,200"], "a view begins with one iso value"),
+    ],
+)
+def test_wrong_arguments_are_said_before_anything_is_read(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
+) -> None:
+    assert main(["view", "no_such_folder", *arguments]) == 3
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
+
+
+def test_a_port_that_is_taken_is_said_before_anything_is_read(capsys: pytest.CaptureFixture[str]) -> None:
+    with bind_port() as listener:
+        port = listener.getsockname()[1]
+        assert main(["view", "no_such_folder", "--web", "--port", str(port)]) == 3
+    assert (
+        f"port {port} of 127.0.0.1 is taken by another program: name another with --port N" in capsys.readouterr().err
+    )
+
+
+def test_an_input_that_is_not_there_ends_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["view", "no_such_folder", "--web"]) in (2, 3)
+    assert "no_such_folder" in capsys.readouterr().err
