@@ -289,7 +289,7 @@
   }
 
   function picked(pick) {
-    if (!pick) { hint("There is nothing.", true); return; }
+    if (!pick) { hint("Nothing is shown there.", true); return; }
     const part = facts.parts.find(({ key }) => key === pick.part), ras = facts.space === "RAS";
     const place = pick.point.map((value, axis) => (ras && axis < 2 ? -value : value).toFixed(1)).join(", ");
     hint([part && part.name, `${place} mm ${facts.space}`, pick.hu !== null && `${pick.hu.toFixed(0)} HU`].filter(Boolean).join(", "));
@@ -338,6 +338,10 @@
     find("undo").title = now.undo ? `take back ${now.undo} (u)` : "nothing to take back (u)";
     if (told("window")) showWindow();
     if (told("parts") && !held) showParts();
+    const clusters = now.parts.filter(({ kind }) => kind === "cluster");
+    find("find").hidden = !now.iso || now.parts_known;
+    find("colors").hidden = !clusters.length;
+    find("colors").setAttribute("aria-pressed", String(clusters.some(({ color }) => color)));
     if (told("measures")) showMeasures();
     if ((told("clips") || told("clip_box")) && !held) showClips();
     if (told("notes") || told("objects")) showAbout();
@@ -414,7 +418,7 @@
       hold(place, () => last("move_clip", { n, share: Number(place.value) }, `clip ${n}`));
       flip.onclick = () => run("flip_clip", { n });
       drop.onclick = () => run("remove_clip", { n });
-      row.append(element("span", `from ${clip.name}`), flip, drop, place);
+      row.append(element("span", `${clip.name} side`), flip, drop, place);
       return row;
     }));
     const box = facts.clip_box, ends = facts.bounds;
@@ -490,6 +494,8 @@
   find("end").onclick = () => choose("");
   find("clear").onclick = () => run("clear_measures");
   find("all").onclick = () => run("show_all");
+  find("find").onclick = () => run("find_parts");
+  find("colors").onclick = () => run("color_parts", { distinct: find("colors").getAttribute("aria-pressed") === "false" });
   find("cut").onclick = () => run("add_clip", { direction: find("direction").value });
   find("boxed").onclick = () => run("set_clip_box", facts.clip_box ? { low: null, high: null } : { low: facts.bounds[0], high: facts.bounds[1] });
   find("save").onclick = () => save(find("format").value);
