@@ -141,9 +141,9 @@
     view.over.replaceChildren(...drawn);
   }
 
-  // Texts of measures stand in a column at the nearer side, with a thin line to what they belong to: bone stays free.
+  // Texts of measures stand in the nearer upper corner, with a thin line to what they belong to: bone stays free.
   function annotateMeasures(view, line, write, width, height) {
-    const placed = { start: [], end: [] };
+    const placed = { start: 0, end: 0 };
     const unfinished = facts.points.length ? [{ points: facts.points.map(({ point }) => point), text: "" }] : [];
     for (const measure of [...facts.measures, ...unfinished]) {
       const points = measure.points.map((point) => project(view, point)).filter(Boolean);
@@ -155,12 +155,9 @@
       if (!measure.text) continue;
       const middle = points.length === 3 && measure.kind === "angle" ? points[1]
         : [0, 1].map((axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length);
-      const side = middle[0] < width / 2 ? "start" : "end", x = side === "start" ? 42 : width - 42;
-      let y = Math.max(36, Math.min(height - 64, middle[1]));
-      while (placed[side].some((other) => Math.abs(other - y) < 20)) y += 20;
-      placed[side].push(y);
-      const from = x + (side === "start" ? 1 : -1) * (9 * measure.text.length);
-      line([[from, y], middle], "lead");
+      const side = middle[0] < width / 2 ? "start" : "end", x = side === "start" ? 12 : width - 12;
+      const y = 18 + 20 * placed[side]++;
+      line([[x + (side === "start" ? 1 : -1) * (4 + 8 * measure.text.length), y], middle], "lead");
       write(measure.text, x, y, "measure", side);
     }
   }

@@ -51,9 +51,14 @@ def serve_view(
     """
     settings = settings or ViewSettings()
     check_view_settings(settings)
-    with WebServer(port) as server, open_view(inputs, settings, progress=progress) as view:
+    with (
+        WebServer(port) as server,
+        open_view(inputs, settings, progress=progress) as view,
+        view.session() as first,  # nobody looks through it: it builds kernels while the address is being opened
+    ):
 
         def begin(folder: Path) -> None:
+            first.prepare()
             warnings = list(view.said)
             if opens and has_screen():
                 open_browser(server.address, folder)

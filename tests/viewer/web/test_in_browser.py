@@ -196,6 +196,9 @@ def test_the_wheel_scrolls_a_slice_and_a_right_drag_is_its_window(page) -> None:
     )
     low, high = before["window"]
     wait_for(page, f"return clrecon.facts.window[1] - clrecon.facts.window[0] > {1.1 * (high - low)}")
+    after = facts(page)
+    assert sum(after["window"]) == pytest.approx(low + high, abs=1.0)  # a drag to the side leaves the level
+    assert after["cross"][:2] == pytest.approx(before["cross"][:2])
 
 
 def test_clip_planes_and_a_box_cut(page) -> None:

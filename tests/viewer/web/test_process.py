@@ -66,13 +66,14 @@ def running(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_while_pictures_are_drawn(device, scan: Path, number: int) -> None:
-    with running(str(scan), "--device", str(device.index)) as (process, said):
+    with running(str(scan), "--device", str(device.index), "--hu", "321") as (process, said):
         server = SimpleNamespace(port=said["port"], address=said["address"])
 
         async def look() -> None:
             async with browsing(server) as client:
                 await client.lay_out(scene=[300, 200], axial=[100, 100])
                 await client.until(lambda: client.pictures)
+                assert client.facts["iso"]["hu"] == 321.0
                 await client.tell(do="turn", dx=0.1, dy=0.1)
                 process.send_signal(number)
                 await client.until(lambda: client.close_code is not None)
