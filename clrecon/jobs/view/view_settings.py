@@ -33,5 +33,5 @@ def check_view_settings(settings: ViewSettings) -> None:
                 f"{name_parameter(own.name)} says how a mesh is made, and a view makes none: leave it out, or write a"
                 " page instead"
             )
-    if isinstance(scan.iso_value, Sequence):
+    if isinstance(scan.iso_value, Sequence) and (len(scan.levels) != 1 or isinstance(scan.levels[0], tuple)):
         raise UsageError("a view begins with one iso value: give one, and move the slider")
