@@ -157,7 +157,7 @@ def _wait(page: Any, script: str) -> None:
 
 def _settle(page: Any) -> None:
     time.sleep(0.6)
-    _wait(page, "return document.documentElement.dataset.scene === 'sharp'")
+    _wait(page, "return clrecon.facts && clrecon.facts.settled")
 
 
 def _gesture(page: Any, script: str, *arguments: Any) -> dict[str, Any]:

@@ -44,7 +44,7 @@ class FakePainter:
         image = np.full((height, width, 4), 255, np.uint8)
         image[..., :3] = round(state.iso_value) % 256
         empty = np.full((height, width), np.nan, np.float32)
-        return Rendering(image, empty, empty, state.camera, None, view, {"ms": 1.0, "sharp": sharp})
+        return Rendering(image, empty, empty, state.camera, None, view, {"ms": 1.0, "sharp": sharp, "warnings": []})
 
     def picture(self, state: Any, size: Any, *, sharp: bool = True, share: float = 1.0, cancelled: Any = None) -> Any:
         return self._paint(state, size, "scene", sharp)

@@ -234,6 +234,7 @@ class Connection:
     def _rest(self) -> None:
         self._pace.rest()
         self._session.rest()
+        self._wake.set()
         self._draw()
 
     def _draw(self) -> None:
@@ -292,6 +293,7 @@ class Connection:
         """Return what the page shows: of the last picture the device alone, as the pictures say the rest themselves."""
         facts = self._session.facts()
         facts["device"] = facts.pop("timing").get("device")
+        facts["settled"] = self._pace.is_done and not (self._drawing or self._ready or self._under_way)
         return {**facts, **self._fixed}
 
     def _later(self, function: Callable[..., None], *arguments: Any) -> None:

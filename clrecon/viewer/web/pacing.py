@@ -71,6 +71,11 @@ class Pace:
             return self._take(next(iter(self._coarse)))
         return None
 
+    @property
+    def is_done(self) -> bool:
+        """True where nothing is left to draw."""
+        return not (self._stale or self._coarse or self.moving)
+
     def instead(self, drawn: Asked) -> Asked | None:
         """Return what to draw in place of a picture that is being drawn: only of a sharp one that is stale again."""
         return self._take(drawn.view) if not drawn.moving and self.moving and drawn.view in self._stale else None

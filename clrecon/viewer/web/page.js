@@ -471,15 +471,19 @@
     find("presets").append(button);
   }
   for (const [id, name] of Object.entries(TOOLS)) find(id).onclick = () => choose(choosing === name ? "" : name);
-  const setIso = (input) => {
-    const value = Number(input.value);
-    if (!facts.iso || !(value >= facts.iso.low && value <= facts.iso.high)) return;
-    find(input.id === "hu" ? "exact" : "hu").value = value;
-    last("set_iso", { hu: value });
+  hold(find("hu"), () => {
+    find("exact").value = find("hu").value;
+    last("set_iso", { hu: Number(find("hu").value) });
+  });
+  find("exact").onchange = () => {
+    const hu = Number(find("exact").value), { low, high } = facts.iso;
+    if (find("exact").value !== "" && hu >= low && hu <= high) find("hu").value = hu;
+    else find("exact").value = find("hu").value;
+    if (hu >= low && hu <= high) last("set_iso", { hu: Number(find("hu").value) });
+    else hint(`The iso value runs from ${low} to ${high} HU here.`, true);
   };
-  hold(find("hu"), setIso);
-  find("exact").onchange = () => setIso(find("exact"));
   const setWindow = () => {
+    if (find("level").value === "" || find("width").value === "") { document.activeElement.blur(); showWindow(); return; }
     const level = Number(find("level").value), half = Math.max(1, Number(find("width").value)) / 2;
     run("set_window", { low: level - half, high: level + half });
   };

@@ -20,10 +20,7 @@ from clrecon.viewer.session import ViewSession
 
 pytestmark = [pytest.mark.slow, pytest.mark.opencl]
 
-SHARP = """
-const told = document.documentElement.dataset;
-return ["scene", "axial", "coronal", "sagittal"].every((name) => told[name] === "sharp");
-"""
+SETTLED = "return clrecon.facts && clrecon.facts.settled && clrecon.pictures > 0"
 ISO = scenes.ISO
 
 
@@ -54,7 +51,7 @@ def page(browser, served):
     """The page, just opened and drawn; after the test it has logged no error and asked nobody else for anything."""
     severe_lines(browser), outside_requests(browser)
     browser.get(served.address)
-    wait_for(browser, SHARP)
+    wait_for(browser, SETTLED)
     yield browser
     assert severe_lines(browser) == []
     own = (f"http://127.0.0.1:{served.port}/", f"ws://127.0.0.1:{served.port}/")
@@ -78,9 +75,9 @@ def facts(page) -> dict:
 
 
 def settle(page) -> None:
-    """Wait until everything is sharp after what was done."""
-    time.sleep(0.5)  # a change needs a frame and the way to the server
-    wait_for(page, SHARP)
+    """Wait until everything is shown as it is after what was done."""
+    time.sleep(0.3)  # a change needs a frame and the way to the server
+    wait_for(page, SETTLED)
 
 
 def drag(page, element, x: int, y: int, dx: int, dy: int, steps: int = 15) -> None:
@@ -124,6 +121,22 @@ def test_the_slider_sets_the_iso_value_and_the_picture_follows(page) -> None:
     assert hu != ISO and page.find_element("id", "exact").get_attribute("value") == f"{hu:g}"
     assert changed_share(before, picture(page)) > 0.001
     assert f"{hu:g} HU" in page.find_element("id", "status").text
+
+
+def test_an_iso_value_that_is_none_changes_nothing(page) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    exact = page.find_element("id", "exact")
+    for wrong in ("", "99999", "-5000"):
+        exact.send_keys(Keys.CONTROL, "a")
+        exact.send_keys(wrong or Keys.DELETE, Keys.ENTER)
+        wait_for(page, f"return document.getElementById('exact').value === '{ISO:g}'")
+    assert "The iso value runs from" in page.find_element("id", "hint").text
+    assert facts(page)["iso"]["hu"] == ISO
+    exact.send_keys(Keys.CONTROL, "a")
+    exact.send_keys("321", Keys.ENTER)
+    wait_for(page, "return clrecon.facts.iso.hu === 321")
+    assert page.find_element("id", "hu").get_attribute("value") == "321"
 
 
 def test_keys_look_from_the_sides_with_their_letters(page) -> None:
@@ -238,7 +251,7 @@ def test_another_browser_has_a_view_of_its_own(page, served) -> None:
     first = page.current_window_handle
     page.switch_to.new_window("tab")
     page.get(served.address)
-    wait_for(page, SHARP)
+    wait_for(page, SETTLED)
     assert facts(page)["iso"]["hu"] == ISO
     page.close()
     page.switch_to.window(first)

@@ -29,11 +29,14 @@ def test_each_view_that_is_shown_is_drawn_once(pace: Pace) -> None:
 
 def test_what_changes_is_coarse_first_and_sharp_at_rest(pace: Pace) -> None:
     drain(pace)
+    assert pace.is_done
     pace.change([SCENE])
     assert drain(pace) == [Asked(SCENE, SIZE, True)]
+    assert not pace.is_done
     pace.rest()
+    assert not pace.is_done
     assert drain(pace) == [Asked(SCENE, SIZE, False)]
-    assert drain(pace) == []
+    assert drain(pace) == [] and pace.is_done
 
 
 def test_views_take_turns_while_both_change_all_the_time(pace: Pace) -> None:
