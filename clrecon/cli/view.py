@@ -128,7 +128,7 @@ def _check_faces(options: argparse.Namespace) -> None:
     if options.web and options.html is not None:
         raise UsageError("--web shows a view and --html writes a page: ask for one of them")
     for name in ("port", "open"):
-        if getattr(options, name) and not options.web:
+        if getattr(options, name) not in (None, False) and not options.web:
             raise UsageError(f"--{name} belongs to --web: ask for that too")
     if options.web and options.quiet and not (options.open or options.json):
         raise UsageError("-q hides the address that is to be opened: leave it out, or ask for --open too")

@@ -1,13 +1,17 @@
 (() => {
   const SLICES = ["axial", "coronal", "sagittal"];
   const PRESETS = { bone: [300, 1500], soft: [40, 400], lung: [-600, 1500], brain: [40, 80] };
+  // As far as there are both, the keys of the window (clrecon/viewer/window_keys.py).
   const KEYS = {
-    "1 to 6": "view from anterior, posterior, left, right, superior, inferior", m: "measure a distance", a: "an angle",
-    "Esc": "put the tool away, end a curve", x: "hide the part under the pointer", X: "show only that part",
-    v: "show all parts", b: "table on or off", c: "clip plane", s: "save what is shown", p: "save the picture",
-    u: "undo", "drag": "turn; with Shift or another button move; with Ctrl roll", "wheel": "zoom; scroll a slice",
-    "right drag on a slice": "window: to the side width, up and down level",
-    "touch": "one finger turns or scrolls, two move and zoom",
+    "1 to 6": "view from anterior, posterior, left, right, superior, inferior", f: "parallel or perspective",
+    "o, O": "next mode, the one before", b: "table and blankets away, or shown",
+    m: "distance by two clicks", a: "angle by three clicks", k: "curve by clicks; again: its picture",
+    e: "a place by a click", "M": "drop all measures", x: "hide the part under the pointer", X: "show only that part",
+    A: "show all parts", l: "a colour for each part", "c, C": "clip plane, clip box", u: "undo",
+    "s, p": "save what is shown, save the picture", Esc: "put the tool away",
+    drag: "turn; with Shift or another button move; with Ctrl roll", wheel: "zoom; scroll a slice",
+    "right drag on a slice": "window: right wider, down higher",
+    touch: "one finger turns or scrolls, two move and zoom; in a slice two are the window",
   };
   const HINTS = {
     distance: "Click two points.", angle: "Click three points, the angle is at the second.",
@@ -200,7 +204,7 @@
 
   function windowBy(x, y) {
     const [low, high] = waiting.has("set_window") ? Object.values(waiting.get("set_window").more) : facts.window;
-    const width = Math.max(1, (high - low) * Math.exp(x / 200)), level = (low + high) / 2 - (y * (high - low)) / 300;
+    const width = Math.max(1, (high - low) * Math.exp(x / 200)), level = (low + high) / 2 + (y * (high - low)) / 300;
     facts.window = [level - width / 2, level + width / 2];
     last("set_window", { low: facts.window[0], high: facts.window[1] });
     showWindow();
@@ -515,11 +519,18 @@
     if (view && view.name === "scene") run(use, pixel(view, view.pointer));
   }
 
+  function nextMode(step) {
+    const names = facts.modes.map(({ name }) => name), at = names.indexOf(facts.mode) + step;
+    run("set_mode", { name: names[(at + names.length) % names.length] });
+  }
+
+  const press = (id) => () => { if (!find(id).hidden) find(id).click(); };
   const ACTIONS = {
-    m: () => choose("distance"), a: () => choose("angle"), Escape: () => choose(""), x: () => usePart("hide_at"),
-    X: () => usePart("only_at"), v: () => run("show_all"), b: () => facts.iso && run("set_table", { shown: !facts.table }),
-    c: () => find("cut").click(), s: () => find("save").click(), p: () => save(".png"), u: () => run("undo"),
-    h: () => find("help").click(),
+    f: press("perspective"), o: () => nextMode(1), O: () => nextMode(-1), b: () => facts.iso && find("table").click(),
+    m: press("distance"), a: press("angle"), k: press("trace"), e: press("seed"), M: press("clear"),
+    x: () => usePart("hide_at"), X: () => usePart("only_at"), A: press("all"), l: press("colors"),
+    c: press("cut"), C: press("boxed"), s: press("save"), p: press("photo"), u: press("undo"), h: press("help"),
+    Escape: () => choose(""),
   };
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || !facts) return;
