@@ -320,7 +320,8 @@
     facts = now;
     const told = (name) => !before || JSON.stringify(before[name]) !== JSON.stringify(now[name]);
     if (now.tool !== choosing && !["only", "hide"].includes(choosing)) choosing = now.tool || "";
-    find("iso").hidden = find("tabled").hidden = find("windows").hidden = !now.iso;
+    for (const id of ["iso", "tabled", "slicing", "windows"]) find(id).hidden = !now.iso;
+    find("mode").hidden = now.modes.length < 2;
     if (told("iso") && now.iso) showIso();
     if (told("modes")) {
       find("mode").replaceChildren(...now.modes.map(({ name, words }) => element("option", `${name}: ${words}`, { value: name })));
