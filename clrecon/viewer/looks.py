@@ -22,7 +22,8 @@ __all__ = ["LEAST_OPACITY", "LabelledLook", "Looks", "label_level", "to_voxels"]
 LEAST_OPACITY = 0.01
 """Meshes that are more translucent are not drawn."""
 
-MOST_KEPT = 64
+MOST_KEPT, MOST_LABELLED = 64, 6
+"""Styles that are kept, and those of them that keep a label map in memory."""
 
 label_level = 0.5
 """Iso value of label maps that are shown alone, whose voxels are 0 and 1."""
@@ -114,6 +115,9 @@ class Looks:
 
     def _keep(self, key: Hashable, style: Style) -> Style:
         self._kept[key] = style
+        labelled = [each for each, kept in self._kept.items() if getattr(kept, "labels", None) is not None]
+        for each in labelled[: max(0, len(labelled) - MOST_LABELLED)]:
+            del self._kept[each]
         while len(self._kept) > MOST_KEPT:
             self._kept.popitem(last=False)
         return style

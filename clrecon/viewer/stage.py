@@ -26,8 +26,9 @@ from clrecon.viewer.state import Point, ViewState
 
 __all__ = ["Stage"]
 
-MOST_FOUND = 6
-"""Sets of parts that are kept, of all views together."""
+MOST_FOUND, MOST_FOUND_BYTES = 6, 1 << 29
+"""Sets of parts that are kept, of all views together, and the bytes of their label maps; two are kept whatever their
+size."""
 
 
 class Stage(Closing):
@@ -92,10 +93,19 @@ class Stage(Closing):
             with self.lock:
                 self._found[key] = known
                 self._found.move_to_end(key)
-                while len(self._found) > MOST_FOUND:
-                    self._found.popitem(last=False)
+                self._drop_found()
             made.append(known)
         return made
+
+    def _drop_found(self) -> None:
+        """Drop the parts that were asked for longest ago, where there are many."""
+
+        def too_many() -> bool:
+            taken = sum(each.labels.voxels.nbytes for each in self._found.values())
+            return len(self._found) > MOST_FOUND or taken > MOST_FOUND_BYTES
+
+        while len(self._found) > 2 and too_many():
+            self._found.popitem(last=False)
 
     def has_parts(self, state: ViewState) -> bool:
         """True where the label maps of the parts that the state knows are there."""

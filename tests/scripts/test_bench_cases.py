@@ -222,6 +222,16 @@ def test_the_mapper_on_opengl_is_measured(device: Any, tmp_path: Path, monkeypat
     assert all(found["same_box"] > tolerances.BENCH_LIKENESS for found in result["ssim"].values())
 
 
+@pytest.mark.opencl
+@pytest.mark.slow
+def test_steps_of_a_view_are_measured(device: Any, tmp_path: Path) -> None:
+    kept = run_cases(["view", "view-picks"], "cube32", device, tmp_path)
+    steps = kept["view"]["steps"]
+    assert {"slider", "release", "sharp surface", "sharp dvr", "parts", "moving with a part hidden"} <= set(steps)
+    assert all(step["cpu_ms"]["median"] > 0.0 for step in steps.values())
+    assert kept["view-picks"]["distance_mm"]["most"] < 0.3 and kept["view-picks"]["picks"] > 1000
+
+
 def test_a_peer_that_dies_is_an_error(tmp_path: Path) -> None:
     from peers.vtk_gpu import GpuPeer
 

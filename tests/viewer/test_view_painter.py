@@ -7,15 +7,12 @@ import pytest
 import view_scenes as scenes
 
 from clrecon.errors import Cancelled, NoSurfaceError, UsageError
-from clrecon.geometry import Volume
 from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.operators.rays.render import render
-from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.viewer.model import ViewModel
 from clrecon.viewer.objects import show_objects
 from clrecon.viewer.painter import Painter
-from clrecon.viewer.parts import grow_labels
 from clrecon.viewer.tools import Pick
 
 pytestmark = pytest.mark.opencl
@@ -166,22 +163,6 @@ def test_slices_map_pixels_to_the_patient_and_show_the_scan(view):
         painter.slice(model.snapshot(), "oblique", SIZE)
 
 
-@pytest.mark.parametrize("plane", ["coronal", "sagittal"])
-def test_parts_lie_over_their_bone_in_slices_of_an_uneven_scan(view, plane):
-    scan = scenes.make_scan()
-    steps = 0.4 + 1.2 * np.arange(22) / 21
-    heights = scan.affine[:3, 3] + np.cumsum(steps)[:, None] * scan.affine[:3, 2]
-    model, painter = view(Volume(scan.voxels, scan.affine, slice_positions=heights))
-    find(model, painter)
-    model.set_color("1/1", (1.0, 0.0, 0.0))
-    at = painter.objects[0].volume.ijk_to_lps([scenes.BALLS[0][0]])[0]
-    model.set_cross(tuple(at))
-    picture = painter.slice(model.snapshot(), plane, (200, 200))
-    tinted = picture.image[..., 0].astype(int) - picture.image[..., 1] > 30
-    bone = np.nan_to_num(picture.values, nan=-1000.0) >= scenes.ISO
-    assert tinted[bone].mean() > 0.97 and bone[tinted].mean() > 0.6  # parts are grown by a voxel
-
-
 def test_a_slice_without_a_scan_is_empty_and_one_of_labels_is_not(view):
     model, painter = view(scenes.make_mesh())
     assert shown_pixels(painter.slice(model.snapshot(), "axial", SIZE)) == 0
@@ -190,124 +171,11 @@ def test_a_slice_without_a_scan_is_empty_and_one_of_labels_is_not(view):
     assert np.ptp(picture.image[..., :3].astype(int), axis=2).max() > 20  # coloured
 
 
-def test_parts_are_the_balls_with_their_size(view):
-    model, painter = view()
-    find(model, painter)
-    parts = {each.key: each for each in model.parts}
-    assert list(parts) == ["1", "1/1", "1/2", "1/3", "1/0"]
-    for number, (_, radius) in enumerate(scenes.BALLS):
-        part = parts[f"1/{number + 1}"]
-        assert part.ml == pytest.approx(4 / 3 * np.pi * radius**3 / 1000.0, rel=0.12)
-        low, high = np.array(part.box)
-        assert (low <= scenes.middle(number) - radius + 1.5).all() and (
-            high >= scenes.middle(number) + radius - 1.5
-        ).all()
-        assert np.linalg.norm(np.subtract(part.inside, scenes.middle(number))) < radius
-    assert model.parts_known and painter.has_parts(model.snapshot())
-    assert painter.find_parts(model.snapshot())[0] is painter.find_parts(model.snapshot())[0]
-
-
-def test_many_parts_are_twenty_and_the_rest_together(view):
-    voxels = np.full((9, 30, 40), -500, np.int16)
-    voxels[1::3, 1::3, 1::3] = 700
-    voxels[1, 1, 1:3] = 700
-    model, painter = view(Volume(voxels, np.eye(4)))
-    find(model, painter)
-    clusters = [each for each in model.parts if each.kind == "cluster"]
-    count = 3 * 10 * 13
-    assert len(clusters) == 21 and clusters[0].count == 2
-    assert clusters[-1].name == f"{count - 20} smaller parts" and clusters[-1].count == count - 20
-    model.only("1/1")
-    (mesh,) = painter.mesh_of_shown(model.snapshot())
-    assert mesh.bounds[1] - mesh.bounds[0] == pytest.approx([2.0, 1.0, 1.0], abs=0.4)
-
-
-def test_no_voxel_at_the_iso_value_is_no_part(view):
-    model, painter = view(Volume(np.full((4, 5, 6), -900, np.int16), np.eye(4)))
-    find(model, painter)
-    assert [each.kind for each in model.parts] == ["scan", "rest"]
-
-
-@pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
-@pytest.mark.parametrize("hidden", [1, 2, 3])
-def test_hidden_parts_are_neither_in_the_picture_nor_in_the_mesh(view, device, hidden, uneven):
-    scan = scenes.make_scan()
-    if uneven:
-        heights = (
-            scan.affine[:3, 3] + (np.arange(22)[:, None] + 0.3 * (np.arange(22) % 2)[:, None]) * scan.affine[:3, 2]
-        )
-        scan = Volume(scan.voxels, scan.affine, slice_positions=heights)
-    model, painter = view(scan)
-    find(model, painter)
-    model.show(f"1/{hidden}", False)
-    state = model.snapshot()
-    (kept,) = painter.mesh_of_shown(state)
-    whole = extract_isosurface(scan, scenes.ISO, device=device)
-    pieces = sorted(whole.components(), key=lambda each: -each.area)
-    wanted = sum(each.triangle_count for number, each in enumerate(pieces, 1) if number != hidden)
-    assert kept.triangle_count == wanted
-    assert kept.quality()["closed"]
-    for view_name in ("anterior", "left", "superior"):
-        model.look(view_name)
-        picture = painter.picture(model.snapshot(), SIZE)
-        mesh = render([(kept, MeshLook())], camera=model.camera, size=SIZE, background="transparent", device=device)
-        both = (picture.image[..., 3] > 0) != (mesh.image[..., 3] > 0)
-        assert both.mean() < 0.004  # the edges of the silhouette
-        seen = (picture.image[..., 3] > 0) & (mesh.image[..., 3] > 0)
-        assert np.abs(picture.depth[seen] - mesh.depth[seen]).mean() < 0.05
-
-
-def test_volume_rendering_leaves_hidden_parts_out_with_their_edges(view):
-    model, painter = view()
-    find(model, painter)
-    model.set_mode("bone")
-    before = shown_pixels(painter.picture(model.snapshot(), SIZE))
-    model.only("1/3")
-    picture = painter.picture(model.snapshot(), SIZE)
-    rows, columns = np.nonzero(picture.image[..., 3] > 8)
-    spot = model.camera.project([scenes.middle(2)], SIZE)[0][0]
-    assert 0 < len(rows) < 0.3 * before
-    assert np.hypot(columns + 0.5 - spot[0], rows + 0.5 - spot[1]).max() * model.camera.pixel_mm(SIZE) < 6.5
-
-
-def test_a_colour_and_an_opacity_of_a_part_are_seen(view):
-    model, painter = view()
-    find(model, painter)
-    plain = painter.picture(model.snapshot(), SIZE)
-    model.set_color("1/1", (1.0, 0.0, 0.0))
-    red = painter.picture(model.snapshot(), SIZE)
-    x, y = model.camera.project([scenes.middle(0)], SIZE)[0][0].astype(int)
-    assert red.image[y, x, 0] > 60 and red.image[y, x, 1] < 70 < plain.image[y, x, 1]
-    model.set_opacity("1/1", 0.5)
-    assert 90 < painter.picture(model.snapshot(), SIZE).image[y, x, 3] < 240
-    parts = painter.mesh_of_shown(model.snapshot())
-    assert [each.report["part_name"] for each in parts] == ["part 1", "scan 1"]
-    assert parts[0].report["color"] == [1.0, 0.0, 0.0]
-    model.undo()
-    model.undo()
-    assert np.array_equal(painter.picture(model.snapshot(), SIZE).image, plain.image)
-
-
 def test_a_whole_scan_is_translucent_before_its_parts_are_known(view):
     model, painter = view()
     model.set_opacity("1", 0.4)
     image = painter.picture(model.snapshot(), SIZE).image
     assert 0 < image[..., 3][image[..., 3] > 0].min() < 200
-
-
-def test_a_label_map_divides_the_scan_that_it_lies_in(view):
-    model, painter = view(scenes.make_scan(), scenes.make_labels())
-    assert painter.find_parts(model.snapshot()) == [] and model.parts_known
-    left = model.camera.project([scenes.middle(0)], SIZE)[0][0]
-    right = model.camera.project([scenes.middle(1)], SIZE)[0][0]
-    assert painter.pick(model.snapshot(), SIZE, *left).part == "2/1"
-    assert painter.pick(model.snapshot(), SIZE, *right).part == "2/2"
-    model.show("2/2", False)
-    assert painter.pick(model.snapshot(), SIZE, *right) is None
-    meshes = painter.mesh_of_shown(model.snapshot())
-    assert [each.report["part_name"] for each in meshes] == ["one"]
-    model.set_mode("labels")
-    assert [each.report["part_name"] for each in painter.mesh_of_shown(model.snapshot())] == ["one"]
 
 
 def test_a_clip_cuts_picture_and_mesh_flat_and_closed(view, device):
@@ -420,15 +288,6 @@ def test_kernels_are_built_for_every_kind_of_voxels(device):
     with Painter(objects, device=device) as painter:
         painter.prepare(lambda stage, done, total: told.append(stage))
     assert told.count("build") >= 14 and "parts" in told
-
-
-@pytest.mark.unit
-def test_labels_grow_by_one_voxel_to_all_sides():
-    voxels = np.zeros((5, 6, 7), np.uint8)
-    voxels[2, 2, 2], voxels[4, 5, 6] = 3, 9
-    grow_labels(voxels)
-    assert (voxels[1:4, 1:4, 1:4] == 3).all() and (voxels == 3).sum() == 27
-    assert (voxels[3:, 4:, 5:] == 9).all() and (voxels == 9).sum() == 8
 
 
 @pytest.mark.unit
