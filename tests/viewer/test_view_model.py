@@ -11,7 +11,7 @@ import view_scenes as scenes
 from clrecon.errors import UsageError
 from clrecon.labels.resample import ResampledLabels
 from clrecon.viewer.model import ViewModel
-from clrecon.viewer.objects import ShownLabels, ShownScan, show_objects
+from clrecon.viewer.objects import ShownLabels, ShownMesh, ShownScan, show_objects
 from clrecon.viewer.parts import FoundParts
 from clrecon.viewer.state import ShownPart
 from clrecon.viewer.tools import Pick
@@ -164,7 +164,7 @@ def test_objects_are_numbered_named_and_checked():
     assert isinstance(scan, ShownScan) and scan.name == "left knee" and scan.said == ("a remark",)
     assert isinstance(labels, ShownLabels) and labels.name == "labels 2" and labels.within == 1
     (mesh,) = show_objects([scenes.make_mesh()])
-    assert mesh.mesh.normals is not None
+    assert isinstance(mesh, ShownMesh) and mesh.mesh.normals is not None
     for wrong, words in (([], "nothing"), ([3], "not int")):
         with pytest.raises(UsageError, match=words):
             show_objects(wrong)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,7 +45,7 @@ def pixel(session: ViewSession, number: int) -> dict:
 
 
 def picture(session: ViewSession, moving: bool = False):
-    found = []
+    found: list[Any] = []
     session.picture(SIZE, moving, found.append)
     assert session.wait(PATIENCE)
     assert session.facts()["error"] is None
@@ -57,7 +58,7 @@ def settle(session: ViewSession) -> None:
     assert session.wait(PATIENCE)
 
 
-RIGHT = {
+RIGHT: dict[str, dict[str, Any]] = {
     "turn": {"dx": 0.1, "dy": 0},
     "pan": {"dx": 0.1, "dy": 0.1},
     "zoom": {"factor": 2, "at": [0.1, 0.1]},
@@ -333,7 +334,7 @@ def test_what_makes_pictures_slow_is_said(session, monkeypatch):
     view = session(scenes.make_mesh())
     assert "mesh 1 has" in view.facts()["warnings"][0] and "coarse" in view.facts()["warnings"][0]
     view = session(scenes.make_scan(), memory=80_000)
-    found = []
+    found: list[Any] = []
     view.picture((24, 20), False, found.append)
     assert view.wait(PATIENCE) and found and view.facts()["error"] is None
     assert any("in slabs, which is slow" in text for text in view.facts()["warnings"])
@@ -345,7 +346,8 @@ def test_what_makes_pictures_slow_is_said(session, monkeypatch):
 @pytest.mark.opencl
 def test_the_first_view_fits_the_size_of_the_picture(session):
     view = session()
-    wide, found = (200, 80), []
+    wide = (200, 80)
+    found: list[Any] = []
     before = view.model.camera.parallel_scale
     view.picture(wide, False, found.append)
     assert view.wait(PATIENCE) and found[0].camera.parallel_scale < before and view.model.undo() is None

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.unit
 def worker():
     errors: list[tuple[str, str]] = []
     made = Worker("test", lambda kind, words: errors.append((kind, words)))
-    made.errors = errors
+    made.errors = errors  # type: ignore[attr-defined]
     yield made
     made.close()
 

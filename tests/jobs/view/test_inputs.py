@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from clrecon.jobs.view.settings import ViewSettings
 from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
 from clrecon.points import PointCloud
-from clrecon.viewer.objects import wrap_inputs
+from clrecon.viewer.objects import ShownLabels, wrap_inputs
 
 pytestmark = pytest.mark.unit
 
@@ -40,7 +41,8 @@ def test_each_kind_is_told_by_its_file_and_lies_in_its_place(files):
     names = ["scan.nii.gz", "lps.stl", "ras.ply", "cloud.ply", "cloud.xyz", "labels.nii.gz"]
     opened = open_inputs([files / name for name in names])
     assert [type(each.subject) for each in opened] == [Volume, Mesh, Mesh, PointCloud, PointCloud, LabelMap]
-    scan, lps, ras, cloud, plain, labels = (each.subject for each in opened)
+    subjects: list[Any] = [each.subject for each in opened]
+    scan, lps, ras, cloud, plain, labels = subjects
     assert np.allclose(scan.affine, scenes.AFFINE, atol=1e-4)
     assert np.allclose(lps.bounds, ras.bounds, atol=1e-4)
     assert np.allclose(cloud.points, plain.points, atol=1e-3)
@@ -50,11 +52,12 @@ def test_each_kind_is_told_by_its_file_and_lies_in_its_place(files):
     assert "turned" not in said[1] and "taken for a label map" in said[5]
     shown = wrap_inputs(opened, ["knee"])
     assert [each.name for each in shown] == ["knee", "mesh 2", "mesh 3", "cloud 4", "cloud 5", "labels 6"]
-    assert shown[5].within == 1 and shown[2].said == opened[2].said
+    assert isinstance(shown[5], ShownLabels) and shown[5].within == 1 and shown[2].said == opened[2].said
 
 
 def test_a_frame_is_said_by_the_caller_where_the_file_names_none(files):
     opened = open_inputs([files / "plain.xyz"], ViewSettings(mesh_space="ras"))
+    assert isinstance(opened[0].subject, PointCloud)
     assert np.allclose(opened[0].subject.points[:, :2], -scenes.make_cloud().points[:, :2], atol=1e-4)
     assert "plain.xyz was turned from RAS to LPS" in opened[0].said
     (assumed,) = open_inputs([files / "plain.xyz"])
@@ -82,7 +85,7 @@ def test_dicom_labels_are_an_input_too(real_data):
 def test_a_scan_is_cropped_and_masked_as_it_is_asked_for(files):
     settings = ViewSettings(scan=MeshSettings(between=(205.0, 215.0), field_of_view=15.0))
     (opened,) = open_inputs([files / "scan.nii.gz"], settings)
-    assert opened.subject.shape_ijk[2] < scenes.SHAPE[0]
+    assert isinstance(opened.subject, Volume) and opened.subject.shape_ijk[2] < scenes.SHAPE[0]
     assert any("is air now" in text for text in opened.said)
 
 

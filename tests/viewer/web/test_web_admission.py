@@ -8,7 +8,7 @@ from clrecon.viewer.web.admission import make_secret, refuse_request
 
 pytestmark = pytest.mark.unit
 
-SECRET = make_secret()
+SECRET = "a-SECRET_of-43-characters-as-they-are-made-0"
 
 
 def test_a_secret_is_long_and_never_the_same() -> None:
