@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.rendering.pictures.annotations import orientation_letters
 from clrecon.viewer.layout import Box
 
 if TYPE_CHECKING:
@@ -25,6 +26,8 @@ TEXT, FAINT, ACCENT, WARNING = (226, 228, 232), (152, 157, 166), (82, 158, 255),
 TEXT_PIXELS, ROW = 13, 21
 MARGIN = 10
 OPACITY_WIDTH = 34
+SAID_SHARE = 0.72
+"""Of the line at the bottom, that what was said may take."""
 PLAIN = (0.90, 0.86, 0.78)
 """Swatch of a part that has no colour of its own: that of bone by itself."""
 
@@ -164,8 +167,9 @@ def scale_marks(low: float, high: float, width: float, pixels: float = 90.0) -> 
 def draw_status(size: tuple[int, int], said: str, facts: str, *, warning: bool = False) -> Panel:
     """Draw the line at the bottom: what was said last, and what the picture is."""
     pen, middle = _Pen(size, RAISED), size[1] / 2
-    used = pen.text(size[0] - MARGIN, middle, facts, FAINT, anchor="rm", width=max(size[0] - 2 * MARGIN, 20) * 0.6)
-    pen.text(MARGIN, middle, said, WARNING if warning else TEXT, width=size[0] - used - 4 * MARGIN)
+    room = max(size[0] - 2 * MARGIN, 20)
+    used = pen.text(MARGIN, middle, said, WARNING if warning else TEXT, width=SAID_SHARE * room)
+    pen.text(size[0] - MARGIN, middle, facts, FAINT, anchor="rm", width=room - used - 2 * MARGIN)
     return pen.finish()
 
 
@@ -330,7 +334,7 @@ def _draw_clips(pen: _Pen, facts: Mapping[str, Any], y: int) -> int:
     width = pen.size[0]
     for n, clip in enumerate(clips):
         middle = y + ROW / 2 - 1
-        pen.text(MARGIN, middle, clip["name"], width=70, pixels=12)
+        pen.text(MARGIN, middle, clip_words(clip), width=70, pixels=12)
         bar = Box(MARGIN + 74, y + 5, width - MARGIN - 74 - 62, 9)
         pen.box(bar, RAISED, LINE)
         _handle(pen, bar, clip["share"])
@@ -353,6 +357,12 @@ def _draw_clips(pen: _Pen, facts: Mapping[str, Any], y: int) -> int:
             pen.hit(Box(bar.left, y, bar.width, ROW), {"clip_box": axis}, "share")
             y += ROW
     return y
+
+
+def clip_words(clip: Mapping[str, Any]) -> str:
+    """Return the side that a clip plane takes away: its name, or the letters of an oblique one."""
+    name = str(clip["name"])
+    return name if name.isalpha() else f"side {orientation_letters(np.array(clip['direction'], dtype=np.float64))}"
 
 
 def _handle(pen: _Pen, bar: Box, share: float) -> None:

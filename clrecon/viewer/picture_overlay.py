@@ -27,6 +27,7 @@ MEASURE_COLOR = (1.0, 0.86, 0.25)
 CROSS_PIXELS = 11
 MARGIN = 12
 LETTER_PIXELS, LABEL_PIXELS = 17, 15
+LABEL_WIDTH, LABEL_HEIGHT = 74, 22
 
 
 def marked_lines(facts: Mapping[str, Any]) -> list[tuple[NDArray[np.float64], str, bool]]:
@@ -123,6 +124,7 @@ class PictureOverlay:
         lines = [(points, MEASURE_COLOR) for points, _, is_line in marked if is_line]
         self._in_space.set(lines)
         flat, dots, used = [], [], 0
+        taken: list[tuple[float, float]] = []
         for points, words, is_line in marked:
             places = _viewport(camera, size, points)
             if np.isnan(places).any():
@@ -134,7 +136,11 @@ class PictureOverlay:
                 self._label(used).SetInput(words)
                 # Beside the middle of the line, where it hides neither its ends nor itself.
                 x, y = places[len(places) // 2] if len(places) != 2 else places.mean(axis=0)
-                self._label(used).SetPosition(min(max(x + 10, 2), size[0] - 60), min(max(y + 8, 2), size[1] - 20))
+                x, y = min(max(x + 10, 2), size[0] - LABEL_WIDTH), min(max(y + 8, 2), size[1] - LABEL_HEIGHT)
+                while any(abs(x - left) < LABEL_WIDTH and abs(y - low) < LABEL_HEIGHT for left, low in taken):
+                    y -= LABEL_HEIGHT
+                taken.append((x, y))
+                self._label(used).SetPosition(x, y)
                 self._label(used).VisibilityOn()
                 used += 1
         for label in self._labels[used:]:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from clrecon.rendering import Rendering
     from clrecon.rendering.views.camera import Camera
 
-__all__ = ["dress_slice", "slice_place"]
+__all__ = ["dress_curve", "dress_slice", "slice_place"]
 
 NORMALS = {"axial": 2, "coronal": 1, "sagittal": 0}
 """Axis of the patient across each slice."""
@@ -85,6 +85,21 @@ def dress_slice(rendering: Rendering, plane: str, facts: Mapping[str, Any]) -> N
     bottom = height - 7
     pen.line([(7, bottom - 4), (7, bottom), (7 + length / pixel, bottom), (7 + length / pixel, bottom - 4)], WHITE, 2)
     _write(pen, (7, bottom - 6), "ls", f"{length:g} mm", font)
+    return np.array(page)
+
+
+def dress_curve(rendering: Rendering) -> NDArray[np.uint8]:
+    """Return the image of a picture along a curve, with its name and a frame, (h, w, 4) uint8, opaque."""
+    from PIL import Image, ImageDraw
+
+    from clrecon.rendering.pictures.pillow import load_font, load_pillow
+
+    load_pillow()
+    page = Image.fromarray(rendering.with_background((0.0, 0.0, 0.0)).image)
+    pen = ImageDraw.Draw(page)
+    color = _ink(MEASURE_COLOR)
+    pen.rectangle((0, 0, page.width - 1, page.height - 1), outline=color)
+    pen.text((6, 5), "along the curve", color, load_font(TEXT_PIXELS))
     return np.array(page)
 
 

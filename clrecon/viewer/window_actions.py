@@ -196,6 +196,7 @@ class WindowActions:
             if enough and content.facts.get("iso"):
                 content.curve_shown = True
                 content.say("right below: along the curve; k takes it away")
+                content.wait_at(PLANES[-1], "along the curve")
                 content.ask_slices()
         elif content.curve_shown:
             content.curve_shown = False

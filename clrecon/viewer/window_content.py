@@ -19,7 +19,7 @@ from clrecon.viewer.layout import PLANES, lay_out
 from clrecon.viewer.panels import Panel
 from clrecon.viewer.picture_actor import PictureActor
 from clrecon.viewer.picture_overlay import PictureOverlay
-from clrecon.viewer.slice_dressing import dress_slice
+from clrecon.viewer.slice_dressing import dress_curve, dress_slice
 from clrecon.viewer.window_keys import help_sections, side_buttons
 
 if TYPE_CHECKING:
@@ -105,8 +105,7 @@ class WindowContent:
         self._draw_cover()
         if self.session is None:
             for plane in PLANES:
-                if plane in self.glass.layout.boxes:
-                    self.glass.show(plane, panels.draw_words(self.glass.box(plane).size, ["", plane]).image)
+                self.wait_at(plane, plane)
             return
         self.ask_slices()
         if not self._first_slices:
@@ -161,7 +160,7 @@ class WindowContent:
                 continue
             size = self.glass.box(plane).size
             if self.curve_shown and plane == PLANES[-1]:
-                self.session.curve_picture(size, lambda made: self._queue.put(("curve", made)))
+                self.session.curve_picture(size, lambda made: self._queue.put(("curve", dress_curve(made))))
                 continue
 
             def then(made: Rendering, plane: str = plane) -> None:
@@ -212,7 +211,7 @@ class WindowContent:
                 self._show_picture(made)
             elif kind == "curve":
                 if self.curve_shown:
-                    self._show_slice(PLANES[-1], made.with_background((0.0, 0.0, 0.0)).image)
+                    self._show_slice(PLANES[-1], made)
             elif not (self.curve_shown and kind == PLANES[-1]):
                 self.slice_cameras[kind] = made[0]
                 self._show_slice(kind, made[1])
@@ -268,6 +267,11 @@ class WindowContent:
         if [title, words] != self._lines:
             self._lines = [title, words]
             self._draw_cover()
+
+    def wait_at(self, plane: str, words: str) -> None:
+        """Show words where a slice will be replaced."""
+        if plane in self.glass.layout.boxes:
+            self.glass.show(plane, panels.draw_words(self.glass.box(plane).size, ["", words]).image)
 
     def stale(self, panel: str) -> None:
         """Draw a panel anew at the next tick."""
@@ -325,6 +329,8 @@ class WindowContent:
     def _status(self) -> tuple[str, bool]:
         facts = self.facts
         busy = ", ".join(facts.get("busy", ()))
+        if self._said and busy and not facts.get("error"):
+            return f"{self._said}   ({busy} ...)", self._warns
         for words, warns in (
             (facts.get("error"), True),
             (self._said, self._warns),
