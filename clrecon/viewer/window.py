@@ -1,7 +1,7 @@
 """`ViewWindow`: the window of a view.  It opens at once, reads in a thread, and draws what the session delivers.
 
-The loop of VTK handles events and, by a timer, looks whether there is something new; nothing that takes long is done in
-it.
+The loop is ours: VTK's own holds Python's lock while it waits, and the threads that read and draw would stand still.
+Nothing that takes long is done in it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ SMALLEST = (320, 240)
 SCREEN_SHARE = 0.92
 """Of the screen, that the window has at most."""
 
-TICK_MS = 8
+TICK_S = 0.008
+"""Longest wait for a picture between two looks at the events."""
 
 Load = Callable[[Progress], "ViewSession"]
 """Reads the inputs; called in a thread, with a progress function that raises `Cancelled` when the window is closed."""
@@ -126,8 +127,10 @@ class ViewWindow:
         self._loader = threading.Thread(target=self._load, args=(load,), name="view-load", daemon=True)
         with self._interruptible():
             self._loader.start()
-            interactor.CreateRepeatingTimer(TICK_MS)
-            interactor.Start()
+            while not self._ended.is_set():
+                interactor.ProcessEvents()
+                self._guarded(self._tick)
+                self.content.wait(TICK_S)
         self._close()
         if self._failure is not None:
             raise self._failure
@@ -202,7 +205,6 @@ class ViewWindow:
 
     def _observe(self) -> None:
         events: dict[str, Callable[[], None]] = {
-            "TimerEvent": self._tick,
             "ExitEvent": self.end,
             "ExposeEvent": self.glass.touch_all,
             "MouseMoveEvent": self._move,

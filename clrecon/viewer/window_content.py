@@ -6,6 +6,7 @@ Pictures come from the session's thread through a queue; everything of VTK is do
 from __future__ import annotations
 
 import queue
+import threading
 import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -76,6 +77,7 @@ class WindowContent:
         self.help_shown = self.curve_shown = False
         self.slider_hu: float | None = None
         self._queue: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        self._came = threading.Event()
         self._actor = PictureActor(glass.renderer("picture"))
         self._overlay = PictureOverlay(glass.renderer("picture"))
         self._shown: Rendering | None = None
@@ -148,7 +150,7 @@ class WindowContent:
         if self.session is None or min(box.size) < 1:
             return
         self._sharp_wanted = moving
-        self.session.picture(box.size, moving, lambda made: self._queue.put(("picture", made)))
+        self.session.picture(box.size, moving, lambda made: self._put(("picture", made)))
 
     def ask_slices(self) -> None:
         """Ask for the slices that there is room for."""
@@ -160,12 +162,12 @@ class WindowContent:
                 continue
             size = self.glass.box(plane).size
             if self.curve_shown and plane == PLANES[-1]:
-                self.session.curve_picture(size, lambda made: self._queue.put(("curve", dress_curve(made))))
+                self.session.curve_picture(size, lambda made: self._put(("curve", dress_curve(made))))
                 continue
 
             def then(made: Rendering, plane: str = plane) -> None:
                 camera = made.camera
-                self._queue.put((plane, (camera, dress_slice(made, plane, facts))))
+                self._put((plane, (camera, dress_slice(made, plane, facts))))
 
             self.session.slice(plane, size, then)
 
@@ -193,6 +195,16 @@ class WindowContent:
             self._stale.add("status")
         self._draw_panels()
         self.glass.draw()
+
+    def wait(self, seconds: float) -> None:
+        """Wait until something comes, at most for some seconds."""
+        self._came.wait(seconds)
+        self._came.clear()
+
+    def _put(self, come: tuple[str, Any]) -> None:
+        """Hand something to the thread of the window."""
+        self._queue.put(come)
+        self._came.set()
 
     def _take_queue(self) -> None:
         """Show what the session has delivered; of several pictures the last."""
@@ -223,7 +235,7 @@ class WindowContent:
 
     def call(self, action: Any) -> None:
         """Let the thread of the window call something; for other threads."""
-        self._queue.put(("call", action))
+        self._put(("call", action))
 
     def _show_slice(self, plane: str, image: Any) -> None:
         box = self.glass.box(plane)
@@ -266,7 +278,7 @@ class WindowContent:
         """Say what is done before there is a picture."""
         if [title, words] != self._lines:
             self._lines = [title, words]
-            self._draw_cover()
+            self._stale |= {"cover", "status"}  # drawn at the next tick: a scan has hundreds of slices
 
     def wait_at(self, plane: str, words: str) -> None:
         """Show words where a slice will be replaced."""
@@ -294,6 +306,8 @@ class WindowContent:
 
     def _draw_panels(self) -> None:
         boxes = self.glass.layout.boxes
+        if "cover" in self._stale:
+            self._draw_cover()
         for name in self._stale & set(boxes):
             panel = self._draw_panel(name, boxes[name].size)
             self.panels[name] = panel
