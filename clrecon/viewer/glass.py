@@ -55,7 +55,7 @@ class Glass:
         self._renderers: dict[str, Any] = {}
         self._textures: dict[str, Any] = {}
         self._dirty: set[str] = set()
-        self._covered = False
+        self._covered = self._closed = False
         self.layout = layout
         self.is_software = display.is_software
         self.interactor = vtkRenderWindowInteractor()
@@ -135,6 +135,8 @@ class Glass:
         return x, self.layout.size[1] - 1 - y
 
     def close(self) -> None:
-        """Close the window."""
-        self.interactor.TerminateApp()
-        self.window.Finalize()
+        """Close the window; again does nothing."""
+        if not self._closed:
+            self._closed = True
+            self.interactor.TerminateApp()
+            self.window.Finalize()

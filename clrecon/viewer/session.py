@@ -109,12 +109,12 @@ class ViewSession(Closing):
         self._pictures = Worker("view-pictures", self._failed)
         self._work = Worker("view-work", self._failed, self._changed)
 
-    def close(self) -> None:
-        """Cancel everything; within about a second."""
+    def close(self, timeout: float = CLOSE_S) -> None:
+        """Cancel everything, and wait for at most `timeout` seconds: a driver that builds a kernel does not stop."""
         if self._closed:
             return
         self._closed = True
-        workers, end = (self._work, self._pictures), monotonic() + CLOSE_S
+        workers, end = (self._work, self._pictures), monotonic() + timeout
         for worker in workers:
             worker.stop()
         ended = [worker.close(max(0.0, end - monotonic())) for worker in workers]

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING
 
 from clrecon.errors import Cancelled, UsageError
 from clrecon.system.display import DisplayProbe, NoDisplayError
+from clrecon.system.foreign_words import hush
 from clrecon.system.progress import Progress
 from clrecon.viewer.glass import Glass
 from clrecon.viewer.layout import lay_out
 from clrecon.viewer.pointer import Pointer
-from clrecon.viewer.window_actions import WindowActions
+from clrecon.viewer.window_actions import WindowActions, leave_interrupts
 from clrecon.viewer.window_content import WindowContent
 
 if TYPE_CHECKING:
@@ -30,6 +31,10 @@ SIZE = (1280, 860)
 SMALLEST = (320, 240)
 SCREEN_SHARE = 0.92
 """Of the screen, that the window has at most."""
+
+CLOSE_S = 10.0
+"""Longest wait for work that was cancelled.  Reading looks at each slice whether it is to go on; a kernel that is being
+built is built to its end: a driver does not like to end in the middle of it."""
 
 TICK_S = 0.008
 """Longest wait for a picture between two looks at the events."""
@@ -145,6 +150,7 @@ class ViewWindow:
     def _load(self, load: Load) -> None:
         """Read in a thread, and hand the session to the thread of the window."""
         session: ViewSession | None = None
+        leave_interrupts()
         try:
             session = load(self._progress)
             if self._ended.is_set():
@@ -178,11 +184,13 @@ class ViewWindow:
     def _close(self) -> None:
         """Cancel what runs, and wait for it."""
         self._ended.set()
-        self.actions.close()
-        if self._loader is not None:
-            self._loader.join(CLOSE_S)
-        if self.content.session is not None:
-            self.content.session.close()
+        self.glass.close()  # at once: what is running may need a moment
+        with hush():  # Ctrl-C takes files from under the compiler of PoCL, which says so
+            self.actions.close()
+            if self._loader is not None:
+                self._loader.join(CLOSE_S)
+            if self.content.session is not None:
+                self.content.session.close(CLOSE_S)
 
     @contextlib.contextmanager
     def _interruptible(self) -> Iterator[None]:
@@ -265,7 +273,3 @@ class ViewWindow:
     def _key(self) -> None:
         self.content.touch()
         self.actions.press(self.glass.interactor.GetKeySym() or "", self.glass.place())
-
-
-CLOSE_S = 5.0
-"""Longest wait for reading that is cancelled: it looks at each slice whether it is to go on."""

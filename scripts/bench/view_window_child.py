@@ -13,7 +13,7 @@ __all__: list[str] = []
 
 def main(arguments: list[str]) -> None:
     """Show a file: ``view_window_child.py STARTED DEVICE HU FILE``, with the wall clock at the start of the process."""
-    started, device, hu, path = float(arguments[0]), int(arguments[1]), float(arguments[2]), arguments[3]
+    started, device, hu, path = float(arguments[0]), arguments[1], float(arguments[2]), arguments[3]
     marks: dict[str, Any] = {"started": started, "draw_ms": []}
 
     def mark(name: str) -> None:
@@ -48,9 +48,9 @@ def main(arguments: list[str]) -> None:
         report = made.report
         pictures.append([time.time(), report["ms"], report["sharp"], made.size[0], self.facts["mode"]])
 
-    glass.Glass.draw = timed_draw  # type: ignore[method-assign]
-    window_content.WindowContent._show_slice = timed_slice  # type: ignore[method-assign]
-    window_content.WindowContent._show_picture = timed_picture  # type: ignore[method-assign]
+    setattr(glass.Glass, "draw", timed_draw)  # noqa: B010
+    setattr(window_content.WindowContent, "_show_slice", timed_slice)  # noqa: B010
+    setattr(window_content.WindowContent, "_show_picture", timed_picture)  # noqa: B010
     settings = ViewSettings(scan=MeshSettings(device=device, iso_value=hu))
     open_window([path], settings, ready=lambda view: mark("read_s"))
     print(json.dumps({**marks, "pictures": pictures}))
