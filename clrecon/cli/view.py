@@ -17,6 +17,7 @@ from clrecon.errors import UsageError
 
 if TYPE_CHECKING:
     from clrecon.jobs.view.settings import ViewSettings
+    from clrecon.system.display import DisplayProbe
 
 __all__ = ["add_arguments", "run"]
 
@@ -99,19 +100,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
     _check_faces(options)
-    from clrecon.jobs.mesh.settings import MeshSettings
-    from clrecon.jobs.view.job import write_view
-    from clrecon.jobs.view.settings import ViewSettings
-
-    given = {**pick(options, {own.name for own in fields(MeshSettings)}), **options.hu, "labels": label_choice(options)}
-    if options.labels is not None:
-        given.pop("solid", None)  # it says how each label becomes a mesh
-    scan = MeshSettings(**{name: value for name, value in given.items() if value is not None})
-    settings = ViewSettings(scan=scan, mesh_space=options.mesh_space, names=options.names)
     if options.web:
-        return _serve(options, settings, console)
+        return _serve(options, _settings(options), console)
     if options.html is None:
-        return _show(options, settings, console)
+        from clrecon.system.display import DisplayProbe
+        from clrecon.system.interrupts import held_interrupts
+
+        # Both before numpy is loaded: the probe takes half a second, and numpy's threads hold Ctrl-C back too.
+        with held_interrupts(), DisplayProbe() as probe:
+            return _show(options, _settings(options), probe, console)
+    from clrecon.jobs.view.job import write_view
+
+    settings = _settings(options)
     report = write_view(
         options.inputs, options.html, settings, no_clobber=options.no_clobber, progress=console.progress
     )
@@ -121,6 +121,17 @@ def run(options: argparse.Namespace, console: Console) -> int:
     for warning in report["warnings"]:
         console.warn(warning)
     return 0
+
+
+def _settings(options: argparse.Namespace) -> ViewSettings:
+    from clrecon.jobs.mesh.settings import MeshSettings
+    from clrecon.jobs.view.settings import ViewSettings
+
+    given = {**pick(options, {own.name for own in fields(MeshSettings)}), **options.hu, "labels": label_choice(options)}
+    if options.labels is not None:
+        given.pop("solid", None)  # it says how each label becomes a mesh
+    scan = MeshSettings(**{name: value for name, value in given.items() if value is not None})
+    return ViewSettings(scan=scan, mesh_space=options.mesh_space, names=options.names)
 
 
 def _check_faces(options: argparse.Namespace) -> None:
@@ -140,7 +151,7 @@ def _check_faces(options: argparse.Namespace) -> None:
         raise UsageError("a window replaces no file: leave --no-clobber out")
 
 
-def _show(options: argparse.Namespace, settings: ViewSettings, console: Console) -> int:
+def _show(options: argparse.Namespace, settings: ViewSettings, probe: DisplayProbe, console: Console) -> int:
     """Show a window until it is closed."""
     from clrecon.system.display import NoDisplayError
     from clrecon.viewer.open_window import open_window
@@ -162,6 +173,7 @@ def _show(options: argparse.Namespace, settings: ViewSettings, console: Console)
             ready=ready,
             say=lambda line: console.say(f"wrote    {printable(line)}"),
             describe=describe_stage,
+            probe=probe,
         )
     except NoDisplayError as error:
         raise NoDisplayError(

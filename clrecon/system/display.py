@@ -120,6 +120,14 @@ class DisplayProbe:
             except OSError as error:
                 self._fault = f"no process can be started to try the display: {error.strerror or error}"
 
+    def __enter__(self) -> DisplayProbe:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._child is not None:  # nobody asked
+            self._child.kill()
+            self._child.communicate()
+
     def wait(self, seconds: float = SECONDS) -> Display:
         """Return what was found, when the child has ended."""
         if self._child is None:

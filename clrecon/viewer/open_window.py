@@ -31,6 +31,7 @@ def open_window(
     ready: Callable[[OpenedView], None] = lambda view: None,
     say: Callable[[str], None] = lambda words: None,
     describe: Callable[[str], str] = str,
+    probe: DisplayProbe | None = None,
 ) -> list[str]:
     """Show inputs in a window until it is closed.
 
@@ -49,6 +50,8 @@ def open_window(
         Gets a line for each file that was written.
     describe : callable
         Returns the words for a stage of the progress.
+    probe : DisplayProbe, optional
+        One that was started before.
 
     Returns
     -------
@@ -62,7 +65,7 @@ def open_window(
     ClreconError
         An input cannot be read, or there is no such device.
     """
-    probe = DisplayProbe()  # it takes half a second, in which VTK is imported
+    probe = probe or DisplayProbe()  # it takes half a second, in which VTK is imported
     settings, tell = settings or ViewSettings(), progress or ignore_progress
     check_view_settings(settings)
     _check_names(save_as)

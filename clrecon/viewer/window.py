@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 
 from clrecon.errors import Cancelled, UsageError
 from clrecon.system.display import DisplayProbe, NoDisplayError
-from clrecon.system.foreign_words import hush
+from clrecon.system.interrupts import take_interrupt
 from clrecon.system.progress import Progress
 from clrecon.viewer.glass import Glass
 from clrecon.viewer.layout import lay_out
 from clrecon.viewer.pointer import Pointer
-from clrecon.viewer.window_actions import WindowActions, leave_interrupts
+from clrecon.viewer.window_actions import WindowActions
 from clrecon.viewer.window_content import WindowContent
 
 if TYPE_CHECKING:
@@ -134,6 +134,8 @@ class ViewWindow:
             self._loader.start()
             while not self._ended.is_set():
                 interactor.ProcessEvents()
+                if take_interrupt():
+                    self._interrupt()
                 self._guarded(self._tick)
                 self.content.wait(TICK_S)
         self._close()
@@ -150,7 +152,6 @@ class ViewWindow:
     def _load(self, load: Load) -> None:
         """Read in a thread, and hand the session to the thread of the window."""
         session: ViewSession | None = None
-        leave_interrupts()
         try:
             session = load(self._progress)
             if self._ended.is_set():
@@ -184,26 +185,25 @@ class ViewWindow:
     def _close(self) -> None:
         """Cancel what runs, and wait for it."""
         self._ended.set()
-        self.glass.close()  # at once: what is running may need a moment
-        with hush():  # Ctrl-C takes files from under the compiler of PoCL, which says so
-            self.actions.close()
-            if self._loader is not None:
-                self._loader.join(CLOSE_S)
-            if self.content.session is not None:
-                self.content.session.close(CLOSE_S)
+        self.glass.close()  # first: what is running may need a moment
+        self.actions.close()
+        if self._loader is not None:
+            self._loader.join(CLOSE_S)
+        if self.content.session is not None:
+            self.content.session.close(CLOSE_S)
+
+    def _interrupt(self) -> None:
+        self._failure = KeyboardInterrupt()
+        self.end()
 
     @contextlib.contextmanager
     def _interruptible(self) -> Iterator[None]:
-        """Let Ctrl-C end the loop: an exception within it would only be printed by VTK."""
+        """Let Ctrl-C end the loop where it is not held back: an exception in an event would only be printed by VTK."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
 
-        def interrupt(*_: object) -> None:
-            self._failure = KeyboardInterrupt()
-            self.end()
-
-        before = signal.signal(signal.SIGINT, interrupt)
+        before = signal.signal(signal.SIGINT, lambda *_: self._interrupt())
         try:
             yield
         finally:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import queue
-import signal
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -20,7 +19,7 @@ from clrecon.viewer.slice_dressing import slice_place
 from clrecon.viewer.window_content import WindowContent
 from clrecon.viewer.window_keys import find_key
 
-__all__ = ["WindowActions", "leave_interrupts"]
+__all__ = ["WindowActions"]
 
 ISO_STEP = 5.0
 LEAST_BOX = 0.02
@@ -394,7 +393,6 @@ class WindowActions:
         then(facts)
 
     def _work(self) -> None:
-        leave_interrupts()
         while (work := self._hand.get()) is not None:
             try:
                 work()
@@ -406,12 +404,3 @@ class WindowActions:
 
 
 _AT_POINTER = ("seed", "hide", "only")
-
-
-def leave_interrupts() -> None:
-    """Leave Ctrl-C to the main thread: in a thread that builds a kernel it would be an error of the compiler.
-
-    Threads that are started by this one do as it does.
-    """
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
