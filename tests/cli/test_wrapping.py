@@ -49,7 +49,7 @@ def test_texts_of_help_are_broken_anew_as_a_whole(narrow, capsys):
     """Lines that were full are one text: no short rest of a line before the next."""
     assert main(["view", "--help"]) == 0
     lines = capsys.readouterr().out.split("\n")
-    at = next(place for place, line in enumerate(lines) if line.startswith("The page is one file"))
+    at = next(place for place, line in enumerate(lines) if line.startswith("The page of --html is one file"))
     text = lines[at : lines.index("", at)]
     assert len(text) > 3 and all(line[0] != " " for line in text)
     assert all(len(line) + 1 + len(after.split()[0]) > 60 for line, after in zip(text, text[1:], strict=False))

@@ -142,7 +142,7 @@ def test_the_example_of_the_document_is_read(tmp_path: Path) -> None:
 
 def test_the_python_of_the_document_runs() -> None:
     text = (ROOT / "docs" / "transfer_functions.md").read_text(encoding="utf-8")
-    code = text.split("    from clrecon import", 1)[1].split("    picture = ")[0]
+    code = text.split("    from clrecon import", 1)[1].split("    volume = ")[0]
     names: dict[str, Any] = {}
     exec("from clrecon import" + code.replace("\n    ", "\n"), names)
     assert names["glass_bone"]([300])[0].tolist() == [0.9, 0.8, 0.6, 0.02]
