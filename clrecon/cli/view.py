@@ -154,7 +154,7 @@ def _check_faces(options: argparse.Namespace) -> None:
 def _show(options: argparse.Namespace, settings: ViewSettings, probe: DisplayProbe, console: Console) -> int:
     """Show a window until it is closed."""
     from clrecon.system.display import NoDisplayError
-    from clrecon.viewer.open_window import open_window
+    from clrecon.viewer.window.open_window import open_window
 
     facts: dict[str, Any] = {"device": None, "warnings": []}
 

@@ -26,8 +26,8 @@ BARS = {
 @case("view", "steps of a view: slider, sharp pictures, slices, parts, the mesh on release; it has no peer")
 def measure_view(job: Job) -> dict[str, Any]:
     """Time each step from a command to its result, through the threads of a session."""
-    from clrecon.viewer.objects import show_objects
-    from clrecon.viewer.session import ViewSession
+    from clrecon.viewer.model.objects import show_objects
+    from clrecon.viewer.session.session import ViewSession
 
     volume = job.input.volume()
     with ViewSession(show_objects([volume]), device=job.device, iso_value=job.hu) as view:
@@ -109,9 +109,9 @@ def measure_picks(job: Job) -> dict[str, Any]:
     import numpy as np
 
     from clrecon.mesh.compare.distances import SurfaceDistance
-    from clrecon.viewer.model import ViewModel
-    from clrecon.viewer.objects import show_objects
-    from clrecon.viewer.painter import Painter
+    from clrecon.viewer.drawing.painter import Painter
+    from clrecon.viewer.model.model import ViewModel
+    from clrecon.viewer.model.objects import show_objects
 
     objects = show_objects([job.input.volume()])
     model = ViewModel(objects, iso_value=job.hu)
@@ -144,8 +144,8 @@ _FIRST = """
 import sys, time
 start = time.perf_counter()
 import clrecon
-from clrecon.viewer.objects import show_objects
-from clrecon.viewer.session import ViewSession
+from clrecon.viewer.model.objects import show_objects
+from clrecon.viewer.session.session import ViewSession
 volume = clrecon.read_volume(sys.argv[1])
 read = time.perf_counter()
 done = []

@@ -21,8 +21,8 @@ def main(arguments: list[str]) -> None:
 
     from clrecon.jobs.mesh.settings import MeshSettings
     from clrecon.jobs.view.settings import ViewSettings
-    from clrecon.viewer import glass, window_content
-    from clrecon.viewer.open_window import open_window
+    from clrecon.viewer.window import glass, window_content
+    from clrecon.viewer.window.open_window import open_window
 
     draw: Callable[..., bool] = glass.Glass.draw
     show_slice: Callable[..., None] = window_content.WindowContent._show_slice

@@ -16,9 +16,9 @@ import view_scenes as scenes
 from PIL import Image
 
 from clrecon.rendering import Rendering
-from clrecon.viewer.objects import show_objects
-from clrecon.viewer.session import ViewSession
-from clrecon.viewer.tools import Pick
+from clrecon.viewer.model.objects import show_objects
+from clrecon.viewer.model.tools import Pick
+from clrecon.viewer.session.session import ViewSession
 from clrecon.viewer.web.server import WebServer
 
 PATIENCE = 30.0

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from clrecon.mesh import Mesh
 from clrecon.rendering.views.clip import Clip
-from clrecon.viewer.coarse import select_triangles
+from clrecon.viewer.drawing.coarse import select_triangles
 
 __all__ = ["cut_mesh"]
 

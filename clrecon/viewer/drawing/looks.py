@@ -14,8 +14,8 @@ from clrecon.labels.resample import ResampledLabels
 from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.point_look import PointLook
 from clrecon.rendering.pictures.styles import PlaneCut, Projection, SlicesInSpace, Style, SurfaceLook, VolumeLook
-from clrecon.viewer.modes import ViewMode
-from clrecon.viewer.state import ShownPart, ViewState
+from clrecon.viewer.model.modes import ViewMode
+from clrecon.viewer.model.state import ShownPart, ViewState
 
 __all__ = ["LEAST_OPACITY", "LabelledLook", "Looks", "label_level", "to_voxels"]
 

@@ -25,17 +25,17 @@ from clrecon.rendering.views.directions import checked_size
 from clrecon.rendering.views.plane import PLANES, find_plane
 from clrecon.system.progress import Progress
 from clrecon.system.text import say_unknown
-from clrecon.viewer.coarse import coarsen_mesh
-from clrecon.viewer.gestures import pixel_camera
-from clrecon.viewer.looks import LEAST_OPACITY, LabelledLook, Looks, to_voxels
-from clrecon.viewer.modes import ViewMode, find_modes
-from clrecon.viewer.objects import ShownCloud, ShownLabels, ShownMesh, ShownObject, ShownScan
-from clrecon.viewer.shown_meshes import make_meshes
-from clrecon.viewer.stage import Stage
-from clrecon.viewer.state import ShownPart, ViewState
-from clrecon.viewer.strips import take_strips
-from clrecon.viewer.tools import Pick
-from clrecon.viewer.warming import warm_kernels
+from clrecon.viewer.drawing.coarse import coarsen_mesh
+from clrecon.viewer.drawing.looks import LEAST_OPACITY, LabelledLook, Looks, to_voxels
+from clrecon.viewer.drawing.shown_meshes import make_meshes
+from clrecon.viewer.drawing.stage import Stage
+from clrecon.viewer.drawing.strips import take_strips
+from clrecon.viewer.drawing.warming import warm_kernels
+from clrecon.viewer.model.gestures import pixel_camera
+from clrecon.viewer.model.modes import ViewMode, find_modes
+from clrecon.viewer.model.objects import ShownCloud, ShownLabels, ShownMesh, ShownObject, ShownScan
+from clrecon.viewer.model.state import ShownPart, ViewState
+from clrecon.viewer.model.tools import Pick
 
 __all__ = ["Painter", "never"]
 
@@ -245,7 +245,7 @@ class Painter(Stage):
         return int(voxels[k, j, i])
 
     def mesh_of_shown(self, state: ViewState, progress: Progress | None = None) -> list[Mesh]:
-        """Make the meshes of what is shown, see `clrecon.viewer.saving`."""
+        """Make the meshes of what is shown, see `clrecon.viewer.drawing.saving`."""
         return make_meshes(self, state, progress)
 
     def curve_picture(self, state: ViewState, size: Sequence[int]) -> Rendering:

@@ -21,9 +21,9 @@ from clrecon.rendering.pictures.image_files import IMAGE_FORMATS
 from clrecon.system.progress import Progress
 from clrecon.system.targets import keep_existing
 from clrecon.system.text import count_of, escape_text
-from clrecon.viewer.objects import ShownCloud, ShownScan
-from clrecon.viewer.painter import Painter
-from clrecon.viewer.state import ViewState
+from clrecon.viewer.drawing.painter import Painter
+from clrecon.viewer.model.objects import ShownCloud, ShownScan
+from clrecon.viewer.model.state import ViewState
 
 __all__ = ["KINDS", "check_target", "save_shown", "shown_volume"]
 

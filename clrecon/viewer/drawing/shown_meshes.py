@@ -14,12 +14,12 @@ from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.label_masks import extract_label_masks
 from clrecon.rendering.views.clip import Clip
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.viewer.coarse import select_triangles
-from clrecon.viewer.cutting import cut_mesh
-from clrecon.viewer.modes import find_modes
-from clrecon.viewer.objects import ShownLabels, ShownMesh, ShownScan
-from clrecon.viewer.stage import Stage
-from clrecon.viewer.state import Color, ShownPart, ViewState
+from clrecon.viewer.drawing.coarse import select_triangles
+from clrecon.viewer.drawing.cutting import cut_mesh
+from clrecon.viewer.drawing.stage import Stage
+from clrecon.viewer.model.modes import find_modes
+from clrecon.viewer.model.objects import ShownLabels, ShownMesh, ShownScan
+from clrecon.viewer.model.state import Color, ShownPart, ViewState
 
 __all__ = ["clip_volume", "make_meshes", "number_vertices"]
 

@@ -19,10 +19,10 @@ from clrecon.operators.rays.volume_renderer import VolumeRenderer
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
-from clrecon.viewer.looks import LabelledLook
-from clrecon.viewer.objects import ShownLabels, ShownObject, ShownScan
-from clrecon.viewer.parts import FoundParts, find_clusters
-from clrecon.viewer.state import Point, ViewState
+from clrecon.viewer.drawing.looks import LabelledLook
+from clrecon.viewer.model.objects import ShownLabels, ShownObject, ShownScan
+from clrecon.viewer.model.parts import FoundParts, find_clusters
+from clrecon.viewer.model.state import Point, ViewState
 
 __all__ = ["Stage"]
 
@@ -37,7 +37,7 @@ class Stage(Closing):
     Parameters
     ----------
     objects, device, memory
-        See `clrecon.viewer.painter.Painter`.
+        See `clrecon.viewer.drawing.painter.Painter`.
 
     Attributes
     ----------

@@ -19,8 +19,8 @@ from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.styles import PlaneCut, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.viewer.objects import ShownMesh, ShownObject, ShownScan
-from clrecon.viewer.parts import find_clusters
+from clrecon.viewer.model.objects import ShownMesh, ShownObject, ShownScan
+from clrecon.viewer.model.parts import find_clusters
 
 __all__ = ["warm_kernels"]
 

@@ -16,11 +16,11 @@ from clrecon.rendering.looks.label_style import distinct_colors
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import checked_vector
 from clrecon.system.text import say_unknown
-from clrecon.viewer.framing import fit_camera
-from clrecon.viewer.gestures import pan_camera, roll_camera, turn_camera, zoom_camera
-from clrecon.viewer.objects import ShownObject
-from clrecon.viewer.parts import FoundParts, carry_looks
-from clrecon.viewer.state import Color, ShownPart, ViewState, as_point
+from clrecon.viewer.model.framing import fit_camera
+from clrecon.viewer.model.gestures import pan_camera, roll_camera, turn_camera, zoom_camera
+from clrecon.viewer.model.objects import ShownObject
+from clrecon.viewer.model.parts import FoundParts, carry_looks
+from clrecon.viewer.model.state import Color, ShownPart, ViewState, as_point
 
 __all__ = ["ChangingView", "checked_numbers"]
 
@@ -37,7 +37,7 @@ _GESTURES = frozenset(
 
 
 class ChangingView:
-    """What `clrecon.viewer.model.ViewModel` is made of.
+    """What `clrecon.viewer.model.model.ViewModel` is made of.
 
     Parameters
     ----------

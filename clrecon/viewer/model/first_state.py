@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from clrecon.rendering.looks.label_style import distinct_colors
-from clrecon.viewer.objects import ShownCloud, ShownLabels, ShownMesh, ShownObject, ShownScan
-from clrecon.viewer.state import ShownPart, as_point
+from clrecon.viewer.model.objects import ShownCloud, ShownLabels, ShownMesh, ShownObject, ShownScan
+from clrecon.viewer.model.state import ShownPart, as_point
 
 __all__ = ["find_iso_range", "first_parts"]
 

@@ -11,7 +11,7 @@ from clrecon.operators.rays.mesh_pictures import box_around
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import DIRECTIONS
 from clrecon.rendering.views.plane import PLANES
-from clrecon.viewer.objects import ShownScan
+from clrecon.viewer.model.objects import ShownScan
 
 __all__ = ["fit_camera", "plane_step"]
 

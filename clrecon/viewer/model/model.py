@@ -18,13 +18,13 @@ from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import checked_vector
 from clrecon.rendering.views.plane import PLANES
 from clrecon.system.text import say_hu, say_unknown
-from clrecon.viewer.changes import ChangingView, checked_numbers
-from clrecon.viewer.first_state import find_iso_range, first_parts
-from clrecon.viewer.framing import fit_camera, plane_step
-from clrecon.viewer.modes import SLICE_WINDOW, ViewMode, find_modes
-from clrecon.viewer.objects import ShownLabels, ShownObject, ShownScan
-from clrecon.viewer.state import Box, Point, ShownPart, ViewState, as_point
-from clrecon.viewer.tools import POINTS_OF, TOOLS, ClipPlane, Measure, Pick, clip_direction, measure_points
+from clrecon.viewer.model.changes import ChangingView, checked_numbers
+from clrecon.viewer.model.first_state import find_iso_range, first_parts
+from clrecon.viewer.model.framing import fit_camera, plane_step
+from clrecon.viewer.model.modes import SLICE_WINDOW, ViewMode, find_modes
+from clrecon.viewer.model.objects import ShownLabels, ShownObject, ShownScan
+from clrecon.viewer.model.state import Box, Point, ShownPart, ViewState, as_point
+from clrecon.viewer.model.tools import POINTS_OF, TOOLS, ClipPlane, Measure, Pick, clip_direction, measure_points
 
 __all__ = ["ViewModel"]
 

@@ -25,7 +25,7 @@ from clrecon.operators.masks.runs import find_components
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import say_hu
-from clrecon.viewer.state import Box, Point, ShownPart
+from clrecon.viewer.model.state import Box, Point, ShownPart
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

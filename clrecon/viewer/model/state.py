@@ -9,7 +9,7 @@ import numpy as np
 
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
-from clrecon.viewer.tools import ClipPlane, Measure, Pick
+from clrecon.viewer.model.tools import ClipPlane, Measure, Pick
 
 __all__ = ["Box", "Color", "Point", "ShownPart", "ViewState", "as_point"]
 
@@ -99,7 +99,7 @@ class ViewState:
     camera : Camera
         LPS mm.
     mode : str
-        One of `clrecon.viewer.model.view_modes`.
+        One of `clrecon.viewer.model.model.view_modes`.
     iso_value : float
         HU, of all scans.
     window : (float, float)

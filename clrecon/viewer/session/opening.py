@@ -13,9 +13,9 @@ from clrecon.jobs.view.settings import ViewSettings
 from clrecon.jobs.view.view_settings import check_view_settings
 from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.viewer.objects import ShownScan, wrap_inputs
-from clrecon.viewer.painter import Painter
-from clrecon.viewer.session import ViewSession
+from clrecon.viewer.drawing.painter import Painter
+from clrecon.viewer.model.objects import ShownScan, wrap_inputs
+from clrecon.viewer.session.session import ViewSession
 
 __all__ = ["OpenedView", "open_view"]
 

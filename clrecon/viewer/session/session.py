@@ -15,13 +15,13 @@ from clrecon.rendering import Rendering
 from clrecon.rendering.views.directions import checked_size
 from clrecon.system.closing import Closing
 from clrecon.system.log import get_logger
-from clrecon.viewer.commands import check_command
-from clrecon.viewer.model import ViewModel
-from clrecon.viewer.objects import ShownMesh, ShownObject
-from clrecon.viewer.painter import Painter
-from clrecon.viewer.saving import check_target, save_shown
-from clrecon.viewer.tools import Pick
-from clrecon.viewer.worker import CLOSE_S, Job, Worker
+from clrecon.viewer.drawing.painter import Painter
+from clrecon.viewer.drawing.saving import check_target, save_shown
+from clrecon.viewer.model.model import ViewModel
+from clrecon.viewer.model.objects import ShownMesh, ShownObject
+from clrecon.viewer.model.tools import Pick
+from clrecon.viewer.session.commands import check_command
+from clrecon.viewer.session.worker import CLOSE_S, Job, Worker
 
 __all__ = ["ViewSession"]
 
@@ -190,7 +190,7 @@ class ViewSession(Closing):
     # Commands
 
     def do(self, command: Mapping[str, Any]) -> dict[str, Any]:
-        """Do a command, such as ``{"do": "set_iso", "hu": 250}``; see `clrecon.viewer.commands.COMMANDS`.
+        """Do a command, such as ``{"do": "set_iso", "hu": 250}``; see `clrecon.viewer.session.commands.COMMANDS`.
 
         Returns
         -------
@@ -324,7 +324,7 @@ class ViewSession(Closing):
         Parameters
         ----------
         path : path
-            See `clrecon.viewer.saving.KINDS`.
+            See `clrecon.viewer.drawing.saving.KINDS`.
         then : callable, optional
             Called with lines that say what was written.
         size : (width, height)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from aiohttp import web
 
     from clrecon.rendering import Rendering
-    from clrecon.viewer.model import ViewModel
+    from clrecon.viewer.model.model import ViewModel
 
 __all__ = ["Connection", "Session"]
 
@@ -50,7 +50,7 @@ _NOT_FOR_BROWSERS = frozenset({"save"})
 
 
 class Session(Protocol):
-    """What a connection needs of `clrecon.viewer.session.ViewSession`."""
+    """What a connection needs of `clrecon.viewer.session.session.ViewSession`."""
 
     model: ViewModel
 
@@ -327,7 +327,7 @@ def _bounds(model: ViewModel) -> list[list[float]]:
 
 def _formats(model: ViewModel) -> dict[str, list[str]]:
     """Return the extensions that can be saved, by what they hold; meshes first."""
-    from clrecon.viewer.saving import KINDS
+    from clrecon.viewer.drawing.saving import KINDS
 
     kinds = ("mesh", "cloud", "volume", "picture") if model.scans else ("mesh", "cloud", "picture")
     return {kind: list(KINDS[kind]) for kind in kinds}

@@ -1,7 +1,7 @@
 (() => {
   const SLICES = ["axial", "coronal", "sagittal"];
   const PRESETS = { bone: [300, 1500], soft: [40, 400], lung: [-600, 1500], brain: [40, 80] };
-  // As far as there are both, the keys of the window (clrecon/viewer/window_keys.py).
+  // As far as there are both, the keys of the window (clrecon/viewer/window/window_keys.py).
   const KEYS = {
     "1 to 6": "view from anterior, posterior, left, right, superior, inferior", f: "parallel or perspective",
     "o, O": "next mode, the one before", b: "table and blankets away, or shown",

@@ -8,7 +8,7 @@ from pathlib import Path
 from clrecon.jobs.view.settings import ViewSettings
 from clrecon.jobs.view.view_settings import check_view_settings
 from clrecon.system.progress import Progress
-from clrecon.viewer.opening import OpenedView, open_view
+from clrecon.viewer.session.opening import OpenedView, open_view
 from clrecon.viewer.web.listening import has_screen, open_browser
 from clrecon.viewer.web.server import WebServer
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.viewer.layout import Box, Layout
-from clrecon.viewer.picture_actor import image_data
+from clrecon.viewer.window.layout import Box, Layout
+from clrecon.viewer.window.picture_actor import image_data
 
 if TYPE_CHECKING:
     from clrecon.system.display import Display

@@ -13,11 +13,11 @@ from clrecon.system.display import DisplayProbe
 from clrecon.system.files import check_writable
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
-from clrecon.viewer.file_names import free_name
+from clrecon.viewer.window.file_names import free_name
 
 if TYPE_CHECKING:
-    from clrecon.viewer.opening import OpenedView
-    from clrecon.viewer.session import ViewSession
+    from clrecon.viewer.session.opening import OpenedView
+    from clrecon.viewer.session.session import ViewSession
 
 __all__ = ["open_window"]
 
@@ -71,7 +71,7 @@ def open_window(
     _check_names(save_as)
     if not all(Path(path).exists() for path in inputs):  # this is said without a window
         _open(inputs, settings, tell).close()
-    from clrecon.viewer.window import show_window
+    from clrecon.viewer.window.window import show_window
 
     opened: list[OpenedView] = []
     said: list[str] = []
@@ -99,7 +99,7 @@ def open_window(
 
 
 def _open(inputs: Sequence[str | Path], settings: ViewSettings, progress: Progress) -> OpenedView:
-    from clrecon.viewer.opening import open_view  # which loads OpenCL: the window is there by then
+    from clrecon.viewer.session.opening import open_view  # which loads OpenCL: the window is there by then
 
     return open_view(inputs, settings, progress=progress)
 
@@ -108,7 +108,7 @@ def _check_names(names: Sequence[str]) -> None:
     """Refuse names of files that cannot be written, before anything is read."""
     if not names:
         return
-    from clrecon.viewer.saving import KINDS
+    from clrecon.viewer.drawing.saving import KINDS
 
     known = [ending for endings in KINDS.values() for ending in endings]
     for name in names:

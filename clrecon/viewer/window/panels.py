@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.rendering.pictures.annotations import orientation_letters
-from clrecon.viewer.layout import Box
+from clrecon.viewer.window.layout import Box
 
 if TYPE_CHECKING:
     from PIL import ImageFont

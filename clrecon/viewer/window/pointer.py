@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from clrecon.viewer.layout import PLANES, Box, Layout
-from clrecon.viewer.panels import Hit, Panel
+from clrecon.viewer.window.layout import PLANES, Box, Layout
+from clrecon.viewer.window.panels import Hit, Panel
 
 __all__ = ["Pointer"]
 

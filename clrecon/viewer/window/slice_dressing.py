@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.rendering.pictures.annotations import bar_length, edge_letters
-from clrecon.viewer.picture_overlay import MEASURE_COLOR, PLANE_COLORS, marked_lines
+from clrecon.viewer.window.picture_overlay import MEASURE_COLOR, PLANE_COLORS, marked_lines
 
 if TYPE_CHECKING:
     from clrecon.rendering import Rendering

@@ -16,14 +16,14 @@ from clrecon.errors import Cancelled, UsageError
 from clrecon.system.display import DisplayProbe, NoDisplayError
 from clrecon.system.interrupts import take_interrupt
 from clrecon.system.progress import Progress
-from clrecon.viewer.glass import Glass
-from clrecon.viewer.layout import lay_out
-from clrecon.viewer.pointer import Pointer
-from clrecon.viewer.window_actions import WindowActions
-from clrecon.viewer.window_content import WindowContent
+from clrecon.viewer.window.glass import Glass
+from clrecon.viewer.window.layout import lay_out
+from clrecon.viewer.window.pointer import Pointer
+from clrecon.viewer.window.window_actions import WindowActions
+from clrecon.viewer.window.window_content import WindowContent
 
 if TYPE_CHECKING:
-    from clrecon.viewer.session import ViewSession
+    from clrecon.viewer.session.session import ViewSession
 
 __all__ = ["Load", "ViewWindow", "show_window"]
 

@@ -12,12 +12,12 @@ import numpy as np
 from clrecon.errors import ClreconError
 from clrecon.geometry import frame_from_lps
 from clrecon.rendering.looks.label_style import distinct_colors
-from clrecon.viewer.file_names import DEFAULT_MESH, DEFAULT_PICTURE, free_name
-from clrecon.viewer.layout import PLANES
-from clrecon.viewer.panels import slider_value
-from clrecon.viewer.slice_dressing import slice_place
-from clrecon.viewer.window_content import WindowContent
-from clrecon.viewer.window_keys import find_key
+from clrecon.viewer.window.file_names import DEFAULT_MESH, DEFAULT_PICTURE, free_name
+from clrecon.viewer.window.layout import PLANES
+from clrecon.viewer.window.panels import slider_value
+from clrecon.viewer.window.slice_dressing import slice_place
+from clrecon.viewer.window.window_content import WindowContent
+from clrecon.viewer.window.window_keys import find_key
 
 __all__ = ["WindowActions"]
 

@@ -15,20 +15,20 @@ import numpy as np
 
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.log import get_logger
-from clrecon.viewer import panels
-from clrecon.viewer.layout import PLANES, lay_out
-from clrecon.viewer.panels import Panel
-from clrecon.viewer.picture_actor import PictureActor
-from clrecon.viewer.picture_overlay import PictureOverlay
-from clrecon.viewer.slice_dressing import dress_curve, dress_slice
-from clrecon.viewer.window_keys import help_sections, side_buttons
+from clrecon.viewer.window import panels
+from clrecon.viewer.window.layout import PLANES, lay_out
+from clrecon.viewer.window.panels import Panel
+from clrecon.viewer.window.picture_actor import PictureActor
+from clrecon.viewer.window.picture_overlay import PictureOverlay
+from clrecon.viewer.window.slice_dressing import dress_curve, dress_slice
+from clrecon.viewer.window.window_keys import help_sections, side_buttons
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from clrecon.rendering import Rendering
-    from clrecon.viewer.glass import Glass
-    from clrecon.viewer.session import ViewSession
+    from clrecon.viewer.session.session import ViewSession
+    from clrecon.viewer.window.glass import Glass
 
 __all__ = ["WindowContent"]
 

@@ -18,7 +18,7 @@ from clrecon.jobs.view.settings import ViewSettings
 from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
 from clrecon.points import PointCloud
-from clrecon.viewer.objects import ShownLabels, wrap_inputs
+from clrecon.viewer.model.objects import ShownLabels, wrap_inputs
 
 pytestmark = pytest.mark.unit
 

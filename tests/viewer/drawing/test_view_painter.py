@@ -10,10 +10,10 @@ from clrecon.errors import Cancelled, NoSurfaceError, UsageError
 from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.operators.rays.render import render
 from clrecon.rendering.pictures.mesh_look import MeshLook
-from clrecon.viewer.model import ViewModel
-from clrecon.viewer.objects import show_objects
-from clrecon.viewer.painter import Painter
-from clrecon.viewer.tools import Pick
+from clrecon.viewer.drawing.painter import Painter
+from clrecon.viewer.model.model import ViewModel
+from clrecon.viewer.model.objects import show_objects
+from clrecon.viewer.model.tools import Pick
 
 pytestmark = pytest.mark.opencl
 
@@ -67,7 +67,7 @@ def test_a_surface_picture_is_that_of_render(view, device):
 
 @pytest.mark.parametrize("mode", ["surface", "bone", "mip", "drr", "slices"])
 def test_a_large_picture_in_strips_is_the_same(view, monkeypatch, mode):
-    from clrecon.viewer import strips
+    from clrecon.viewer.drawing import strips
 
     model, painter = view()
     model.set_mode(mode)
@@ -203,7 +203,7 @@ def test_an_oblique_clip_of_a_mesh_cuts_its_triangles_at_the_plane(view):
 
 
 def test_a_large_mesh_is_coarse_while_it_moves(view, monkeypatch):
-    from clrecon.viewer import painter as module
+    from clrecon.viewer.drawing import painter as module
 
     monkeypatch.setattr(module, "COARSE_TRIANGLES", 400)
     model, painter = view(scenes.make_mesh())
@@ -292,7 +292,7 @@ def test_kernels_are_built_for_every_kind_of_voxels(device):
 
 @pytest.mark.unit
 def test_a_coarse_mesh_is_near_the_fine_one():
-    from clrecon.viewer.coarse import coarsen_mesh
+    from clrecon.viewer.drawing.coarse import coarsen_mesh
 
     fine = scenes.make_mesh(radius=20.0)
     coarse = coarsen_mesh(fine, 500)

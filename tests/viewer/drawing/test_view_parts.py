@@ -10,10 +10,10 @@ from clrecon.geometry import Volume
 from clrecon.operators.rays.render import render
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.rendering.pictures.mesh_look import MeshLook
-from clrecon.viewer.model import ViewModel
-from clrecon.viewer.objects import show_objects
-from clrecon.viewer.painter import Painter
-from clrecon.viewer.parts import grow_labels
+from clrecon.viewer.drawing.painter import Painter
+from clrecon.viewer.model.model import ViewModel
+from clrecon.viewer.model.objects import show_objects
+from clrecon.viewer.model.parts import grow_labels
 
 pytestmark = pytest.mark.opencl
 
@@ -92,7 +92,7 @@ def test_many_parts_are_twenty_and_the_rest_together(view):
 
 
 def test_parts_and_looks_of_long_ago_are_dropped(view, monkeypatch):
-    from clrecon.viewer import looks, stage
+    from clrecon.viewer.drawing import looks, stage
 
     monkeypatch.setattr(stage, "MOST_FOUND", 3)
     monkeypatch.setattr(looks, "MOST_LABELLED", 2)

@@ -10,8 +10,8 @@ from clrecon.errors import UsageError
 from clrecon.mesh.reader import read_mesh
 from clrecon.points.reader import read_points
 from clrecon.reading import read_volume
-from clrecon.viewer.objects import show_objects
-from clrecon.viewer.session import ViewSession
+from clrecon.viewer.model.objects import show_objects
+from clrecon.viewer.session.session import ViewSession
 
 PATIENCE = 60.0
 

@@ -10,11 +10,11 @@ import view_scenes as scenes
 
 from clrecon.errors import UsageError
 from clrecon.labels.resample import ResampledLabels
-from clrecon.viewer.model import ViewModel
-from clrecon.viewer.objects import ShownLabels, ShownMesh, ShownScan, show_objects
-from clrecon.viewer.parts import FoundParts
-from clrecon.viewer.state import ShownPart
-from clrecon.viewer.tools import Pick
+from clrecon.viewer.model.model import ViewModel
+from clrecon.viewer.model.objects import ShownLabels, ShownMesh, ShownScan, show_objects
+from clrecon.viewer.model.parts import FoundParts
+from clrecon.viewer.model.state import ShownPart
+from clrecon.viewer.model.tools import Pick
 
 pytestmark = pytest.mark.unit
 

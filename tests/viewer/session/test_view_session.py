@@ -12,10 +12,10 @@ import pytest
 import view_scenes as scenes
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.viewer.commands import COMMANDS
-from clrecon.viewer.objects import show_objects
-from clrecon.viewer.painter import Painter
-from clrecon.viewer.session import ViewSession
+from clrecon.viewer.drawing.painter import Painter
+from clrecon.viewer.model.objects import show_objects
+from clrecon.viewer.session.commands import COMMANDS
+from clrecon.viewer.session.session import ViewSession
 
 SIZE = (96, 80)
 PATIENCE = 60.0
@@ -174,7 +174,7 @@ def test_pictures_and_slices_come_from_its_threads(session):
 
 @pytest.mark.opencl
 def test_a_coarse_picture_is_steered_and_the_latest_state_is_drawn(session, monkeypatch):
-    from clrecon.viewer import session as module
+    from clrecon.viewer.session import session as module
 
     view = session(scenes.make_scan())
     monkeypatch.setattr(module, "MOVING_MS", 1e9)
@@ -328,7 +328,7 @@ def test_several_sessions_share_a_painter_and_do_not_disturb_each_other(device):
 
 @pytest.mark.opencl
 def test_what_makes_pictures_slow_is_said(session, monkeypatch):
-    from clrecon.viewer import session as module
+    from clrecon.viewer.session import session as module
 
     monkeypatch.setattr(module, "MANY_TRIANGLES", 100)
     view = session(scenes.make_mesh())

@@ -14,9 +14,9 @@ import view_scenes as scenes
 from browser import open_browser, outside_requests, severe_lines, wait_for
 from web_views import PATIENCE, serving
 
-from clrecon.viewer.objects import show_objects
-from clrecon.viewer.painter import Painter
-from clrecon.viewer.session import ViewSession
+from clrecon.viewer.drawing.painter import Painter
+from clrecon.viewer.model.objects import show_objects
+from clrecon.viewer.session.session import ViewSession
 
 pytestmark = [pytest.mark.slow, pytest.mark.opencl]
 

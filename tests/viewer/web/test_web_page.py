@@ -7,9 +7,9 @@ from importlib.resources import files
 
 import pytest
 
-from clrecon.viewer.commands import COMMANDS
+from clrecon.viewer.session.commands import COMMANDS
 from clrecon.viewer.web.page import compose_page
-from clrecon.viewer.window_keys import KEYS
+from clrecon.viewer.window.window_keys import KEYS
 
 pytestmark = pytest.mark.unit
 

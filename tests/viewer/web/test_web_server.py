@@ -278,7 +278,7 @@ def test_a_file_is_fetched_once_with_its_ticket(views: Views, monkeypatch: pytes
         written.append(path)
         then(["written"])
 
-    monkeypatch.setattr("clrecon.viewer.session.ViewSession.save", save)
+    monkeypatch.setattr("clrecon.viewer.session.session.ViewSession.save", save)
 
     async def look(running: WebServer) -> None:
         async with browsing(running) as client:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from clrecon.viewer.file_names import free_name
+from clrecon.viewer.window.file_names import free_name
 
 
 @pytest.mark.parametrize(

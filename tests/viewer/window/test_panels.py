@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from clrecon.viewer.layout import PLANES, lay_out
-from clrecon.viewer.panels import (
+from clrecon.viewer.window.layout import PLANES, lay_out
+from clrecon.viewer.window.panels import (
     ACCENT,
     describe_size,
     draw_help,
@@ -18,7 +18,7 @@ from clrecon.viewer.panels import (
     slider_track,
     slider_value,
 )
-from clrecon.viewer.window_keys import KEYS, help_sections, side_buttons
+from clrecon.viewer.window.window_keys import KEYS, help_sections, side_buttons
 
 PARTS = [
     {"key": f"1/{n}", "name": f"part {n}", "kind": "cluster", "ml": 100.0 / n, "count": 5, "color": None,

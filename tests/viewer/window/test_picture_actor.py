@@ -9,7 +9,7 @@ from drawn_balls import CAMERAS, CENTRE, RADIUS, ball, need_off_screen
 
 from clrecon.rendering import Rendering
 from clrecon.viewer import merge_scene
-from clrecon.viewer.picture_actor import PictureActor
+from clrecon.viewer.window.picture_actor import PictureActor
 
 pyvista = pytest.importorskip("pyvista")
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from clrecon.viewer.layout import lay_out
-from clrecon.viewer.panels import draw_slider
-from clrecon.viewer.pointer import WHEEL_FACTOR, Pointer
+from clrecon.viewer.window.layout import lay_out
+from clrecon.viewer.window.panels import draw_slider
+from clrecon.viewer.window.pointer import WHEEL_FACTOR, Pointer
 
 LAYOUT = lay_out((1280, 860))
 PANELS = {"slider": draw_slider(LAYOUT.boxes["slider"].size, 200.0, (-100.0, 900.0))}

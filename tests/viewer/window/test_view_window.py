@@ -17,9 +17,9 @@ from screens import SIZE, Window, changed_share, need_screen, open_screen, open_
 from view_scenes import make_cloud, make_mesh, make_scan
 
 import clrecon
-from clrecon.viewer.layout import Layout, lay_out
-from clrecon.viewer.window import SCREEN_SHARE
-from clrecon.viewer.window import SIZE as WISHED
+from clrecon.viewer.window.layout import Layout, lay_out
+from clrecon.viewer.window.window import SCREEN_SHARE
+from clrecon.viewer.window.window import SIZE as WISHED
 
 pytestmark = pytest.mark.xdist_group("screen")
 

@@ -1,0 +1,1 @@
+"""Pictures, parts and meshes of what a view shows, on the device."""

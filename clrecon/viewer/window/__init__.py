@@ -1,0 +1,1 @@
+"""The window of a view, drawn with VTK."""
