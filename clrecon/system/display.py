@@ -120,6 +120,11 @@ class DisplayProbe:
             except OSError as error:
                 self._fault = f"no process can be started to try the display: {error.strerror or error}"
 
+    @property
+    def is_running(self) -> bool:
+        """True until `wait` has its answer; False at once where no display can be there."""
+        return self._child is not None
+
     def __enter__(self) -> DisplayProbe:
         return self
 

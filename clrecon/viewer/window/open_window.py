@@ -45,7 +45,7 @@ def open_window(
     progress : callable, optional
         Of the reading; called in a thread.
     ready : callable
-        Called in that thread with what was read.
+        Called with what was read, when it is shown.
     say : callable
         Gets a line for each file that was written.
     describe : callable
@@ -61,7 +61,7 @@ def open_window(
     Raises
     ------
     UsageError
-        There is no display, OpenGL does not work, or a setting has no meaning for a view; said before anything is read.
+        There is no display, OpenGL does not work, or a setting has no meaning for a view; said before the inputs are.
     ClreconError
         An input cannot be read, or there is no such device.
     """
@@ -83,7 +83,6 @@ def open_window(
 
         view = _open(inputs, settings, both)
         opened.append(view)
-        ready(view)
         return view.session()
 
     def note(line: str) -> None:
@@ -91,7 +90,14 @@ def open_window(
         say(line)
 
     try:
-        show_window(load, save_as=save_as, say=note, describe=describe, probe=probe)
+        show_window(
+            load,
+            save_as=save_as,
+            say=note,
+            describe=describe,
+            loaded=lambda: ready(opened[0]),
+            probe=probe,
+        )
     finally:
         for view in opened:
             view.close()

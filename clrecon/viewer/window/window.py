@@ -10,20 +10,16 @@ import contextlib
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING
 
-from clrecon.errors import Cancelled, UsageError
+from clrecon.errors import UsageError
 from clrecon.system.display import DisplayProbe, NoDisplayError
 from clrecon.system.interrupts import take_interrupt
-from clrecon.system.progress import Progress
 from clrecon.viewer.window.glass import Glass
 from clrecon.viewer.window.layout import lay_out
+from clrecon.viewer.window.loading import Load, Loading
 from clrecon.viewer.window.pointer import Pointer
 from clrecon.viewer.window.window_actions import WindowActions
 from clrecon.viewer.window.window_content import WindowContent
-
-if TYPE_CHECKING:
-    from clrecon.viewer.session.session import ViewSession
 
 __all__ = ["Load", "ViewWindow", "show_window"]
 
@@ -39,9 +35,6 @@ built is built to its end: a driver does not like to end in the middle of it."""
 TICK_S = 0.008
 """Longest wait for a picture between two looks at the events."""
 
-Load = Callable[[Progress], "ViewSession"]
-"""Reads the inputs; called in a thread, with a progress function that raises `Cancelled` when the window is closed."""
-
 
 def show_window(
     load: Load,
@@ -51,6 +44,7 @@ def show_window(
     save_as: Sequence[str] = (),
     say: Callable[[str], None] = lambda words: None,
     describe: Callable[[str], str] = str,
+    loaded: Callable[[], None] = lambda: None,
     probe: DisplayProbe | None = None,
 ) -> None:
     """Show a view in a window until it is closed.
@@ -68,6 +62,8 @@ def show_window(
         Gets lines for the console: what was saved.
     describe : callable
         Returns words for a stage of the progress.
+    loaded : callable
+        Called when what was loaded is shown.
     probe : DisplayProbe, optional
         One that has been started.
 
@@ -78,14 +74,21 @@ def show_window(
     ClreconError
         Whatever `load` raises.
     """
-    found = (probe or DisplayProbe()).wait()
-    if found.fault is not None:
-        raise NoDisplayError(f"no window can be opened: {found.fault}")
-    glass = Glass(title, lay_out(size), found)
+    probe = probe or DisplayProbe()
+    # While the display is still tried, reading begins.
+    loading = Loading(load, describe) if probe.is_running else None
     try:
-        ViewWindow(glass, save_as=save_as, say=say, describe=describe).run(load, size)
+        found = probe.wait()
+        if found.fault is not None or loading is None:
+            raise NoDisplayError(f"no window can be opened: {found.fault}")
+        glass = Glass(title, lay_out(size), found)
+        try:
+            ViewWindow(glass, save_as=save_as, say=say, loaded=loaded).run(loading, size)
+        finally:
+            glass.close()
     finally:
-        glass.close()
+        if loading is not None:
+            loading.close(CLOSE_S)
 
 
 class ViewWindow:
@@ -94,7 +97,7 @@ class ViewWindow:
     Parameters
     ----------
     glass : Glass
-    save_as, say, describe
+    save_as, say, loaded
         See `show_window`.
     """
 
@@ -104,20 +107,18 @@ class ViewWindow:
         *,
         save_as: Sequence[str] = (),
         say: Callable[[str], None] = lambda words: None,
-        describe: Callable[[str], str] = str,
+        loaded: Callable[[], None] = lambda: None,
     ):
-        self.glass = glass
+        self.glass, self._loaded = glass, loaded
         self.content = WindowContent(glass)
         self.pointer = Pointer()
         self.actions = WindowActions(self.content, end=self.end, save_as=save_as, say=say)
-        self._describe = describe
         self._moved = False
         self._failure: BaseException | None = None
         self._ended = threading.Event()
-        self._loader: threading.Thread | None = None
 
-    def run(self, load: Load, size: tuple[int, int] = SIZE) -> None:
-        """Open the window, load, and return when it is closed."""
+    def run(self, loading: Loading, size: tuple[int, int] = SIZE) -> None:
+        """Open the window, show what is loaded, and return when it is closed."""
         glass, interactor = self.glass, self.glass.interactor
         screen = glass.window.GetScreenSize()
         fitting = [
@@ -129,14 +130,12 @@ class ViewWindow:
         self.content.lay_out()
         self.content.tick(False, False)
         self._observe()
-        self._loader = threading.Thread(target=self._load, args=(load,), name="view-load", daemon=True)
         with self._interruptible():
-            self._loader.start()
             while not self._ended.is_set():
                 interactor.ProcessEvents()
                 if take_interrupt():
                     self._interrupt()
-                self._guarded(self._tick)
+                self._guarded(lambda: self._tick(loading))
                 self.content.wait(TICK_S)
         self._close()
         if self._failure is not None:
@@ -147,48 +146,11 @@ class ViewWindow:
         self._ended.set()
         self.glass.interactor.TerminateApp()
 
-    # Loading
-
-    def _load(self, load: Load) -> None:
-        """Read in a thread, and hand the session to the thread of the window."""
-        session: ViewSession | None = None
-        try:
-            session = load(self._progress)
-            if self._ended.is_set():
-                raise Cancelled
-        except BaseException as error:  # raised again by the thread of the window
-            if session is not None:
-                session.close()
-            failure = error
-            self.content.call(lambda: self._fail(failure))
-            return
-        ready = session
-        self.content.call(lambda: self._attach(ready))
-
-    def _progress(self, stage: str, done: int, total: int) -> None:
-        if self._ended.is_set():
-            raise Cancelled
-        words = self._describe(stage) + (f" {done} of {total}" if total > 1 else "")
-        self.content.call(lambda: self.content.say_lines("clrecon", words))
-
-    def _attach(self, session: ViewSession) -> None:
-        if self._ended.is_set():
-            session.close()
-            return
-        self.content.attach(session)
-
-    def _fail(self, error: BaseException) -> None:
-        if not (isinstance(error, Cancelled) and self._ended.is_set()):
-            self._failure = self._failure or error
-        self.end()
-
     def _close(self) -> None:
         """Cancel what runs, and wait for it."""
         self._ended.set()
         self.glass.close()  # first: what is running may need a moment
         self.actions.close()
-        if self._loader is not None:
-            self._loader.join(CLOSE_S)
         if self.content.session is not None:
             self.content.session.close(CLOSE_S)
 
@@ -239,7 +201,14 @@ class ViewWindow:
             self._failure = error
             self.end()
 
-    def _tick(self) -> None:
+    def _tick(self, loading: Loading) -> None:
+        if self.content.session is None:
+            session = loading.take()
+            if session is None:
+                self.content.say_lines("clrecon", loading.words)
+            else:
+                self._loaded()
+                self.content.attach(session)
         if tuple(self.glass.window.GetSize()) != self.glass.layout.size:
             self.content.lay_out()
         if self._moved:
