@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import view_scenes as scenes
+from open_views import find, open_painters, shown_pixels
 
 from clrecon.errors import Cancelled, NoSurfaceError, UsageError
 from clrecon.mesh.compare.distances import SurfaceDistance
@@ -22,25 +23,8 @@ SIZE = (96, 80)
 
 @pytest.fixture
 def view(device):
-    opened = []
-
-    def make(*subjects, **given) -> tuple[ViewModel, Painter]:
-        objects = show_objects(subjects or [scenes.make_scan()])
-        painter = Painter(objects, device=device)
-        opened.append(painter)
-        return ViewModel(objects, iso_value=scenes.ISO, **given), painter
-
-    yield make
-    for painter in opened:
-        painter.close()
-
-
-def find(model: ViewModel, painter: Painter) -> None:
-    model.take_parts(painter.find_parts(model.snapshot()))
-
-
-def shown_pixels(picture) -> int:
-    return int((picture.image[..., 3] > 0).sum())
+    with open_painters(device) as make:
+        yield make
 
 
 def test_every_mode_makes_a_picture_sharp_and_coarse(view):

@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import view_scenes as scenes
+from open_views import find, open_painters, shown_pixels
 
 from clrecon.geometry import Volume
 from clrecon.operators.rays.render import render
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.rendering.pictures.mesh_look import MeshLook
-from clrecon.viewer.drawing.painter import Painter
-from clrecon.viewer.model.model import ViewModel
-from clrecon.viewer.model.objects import show_objects
 from clrecon.viewer.model.parts import grow_labels
 
 pytestmark = pytest.mark.opencl
@@ -22,25 +20,8 @@ SIZE = (96, 80)
 
 @pytest.fixture
 def view(device):
-    opened = []
-
-    def make(*subjects, **given) -> tuple[ViewModel, Painter]:
-        objects = show_objects(subjects or [scenes.make_scan()])
-        painter = Painter(objects, device=device)
-        opened.append(painter)
-        return ViewModel(objects, iso_value=scenes.ISO, **given), painter
-
-    yield make
-    for painter in opened:
-        painter.close()
-
-
-def find(model: ViewModel, painter: Painter) -> None:
-    model.take_parts(painter.find_parts(model.snapshot()))
-
-
-def shown_pixels(picture) -> int:
-    return int((picture.image[..., 3] > 0).sum())
+    with open_painters(device) as make:
+        yield make
 
 
 @pytest.mark.parametrize("plane", ["coronal", "sagittal"])

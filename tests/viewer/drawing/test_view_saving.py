@@ -5,31 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import view_scenes as scenes
+from open_views import open_sessions
 
 from clrecon.errors import UsageError
 from clrecon.mesh.reader import read_mesh
 from clrecon.points.reader import read_points
 from clrecon.reading import read_volume
-from clrecon.viewer.model.objects import show_objects
-from clrecon.viewer.session.session import ViewSession
 
 PATIENCE = 60.0
 
 
 @pytest.fixture
 def session(device):
-    opened = []
-
-    def make(*subjects, **given) -> ViewSession:
-        objects = show_objects(subjects or [scenes.make_scan(), scenes.make_mesh()])
-        opened.append(
-            ViewSession(objects, iso_value=scenes.ISO, device=None if "painter" in given else device, **given)
-        )
-        return opened[-1]
-
-    yield make
-    for each in opened:
-        each.close()
+    with open_sessions(device) as make:
+        yield make
 
 
 @pytest.mark.opencl

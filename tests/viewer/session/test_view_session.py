@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import view_scenes as scenes
+from open_views import open_sessions, search_for_ever
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.viewer.drawing.painter import Painter
@@ -24,18 +25,8 @@ AT = {"size": list(SIZE)}
 
 @pytest.fixture
 def session(device):
-    opened = []
-
-    def make(*subjects, **given) -> ViewSession:
-        objects = show_objects(subjects or [scenes.make_scan(), scenes.make_mesh()])
-        opened.append(
-            ViewSession(objects, iso_value=scenes.ISO, device=None if "painter" in given else device, **given)
-        )
-        return opened[-1]
-
-    yield make
-    for each in opened:
-        each.close()
+    with open_sessions(device) as make:
+        yield make
 
 
 def pixel(session: ViewSession, number: int) -> dict:
@@ -269,12 +260,7 @@ def test_the_table_goes_in_the_background_and_it_is_said_how_much(session, monke
 def test_it_closes_within_a_second_while_it_works(session, monkeypatch):
     view = session()
 
-    def search(state, progress):
-        while True:
-            progress("parts", 0, 1)
-            time.sleep(0.002)
-
-    monkeypatch.setattr(view.painter, "find_parts", search)
+    monkeypatch.setattr(view.painter, "find_parts", search_for_ever)
     view.do({"do": "find_parts"})
     view.picture((600, 600), False, lambda made: None)
     while "finding parts" not in view.facts()["busy"]:
@@ -289,12 +275,7 @@ def test_it_closes_within_a_second_while_it_works(session, monkeypatch):
 def test_work_is_cancelled_by_a_command(session, monkeypatch):
     view = session()
 
-    def search(state, progress):
-        while True:
-            progress("parts", 0, 1)
-            time.sleep(0.002)
-
-    monkeypatch.setattr(view.painter, "find_parts", search)
+    monkeypatch.setattr(view.painter, "find_parts", search_for_ever)
     view.do({"do": "find_parts"})
     while view.facts()["busy"] != ["finding parts"]:
         time.sleep(0.001)
