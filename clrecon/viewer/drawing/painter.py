@@ -34,7 +34,7 @@ from clrecon.viewer.drawing.warming import warm_kernels
 from clrecon.viewer.model.gestures import pixel_camera
 from clrecon.viewer.model.modes import ViewMode, find_modes
 from clrecon.viewer.model.objects import ShownCloud, ShownLabels, ShownMesh, ShownObject, ShownScan
-from clrecon.viewer.model.state import ShownPart, ViewState
+from clrecon.viewer.model.state import ShownPart, ViewState, as_point
 from clrecon.viewer.model.tools import Pick
 
 __all__ = ["Painter", "never"]
@@ -181,8 +181,8 @@ class Painter(Stage):
         shift = float(forward @ np.subtract(state.cross, camera.focal_point)) * forward
         return replace(
             camera,
-            position=_triple(np.add(camera.position, shift)),
-            focal_point=_triple(np.add(camera.focal_point, shift)),
+            position=as_point(np.add(camera.position, shift)),
+            focal_point=as_point(np.add(camera.focal_point, shift)),
         )
 
     # Places
@@ -211,7 +211,7 @@ class Painter(Stage):
                 return None
             depth, drawn = nearest
             origins, directions = camera.rays((1, 1))
-            point = _triple(origins[0, 0] + depth * directions[0, 0])
+            point = as_point(origins[0, 0] + depth * directions[0, 0])
             part = self._part_at(drawn, point)
             return Pick(point=point, object=drawn.number, part=part, hu=self.hu_at(point))
 
@@ -409,8 +409,3 @@ def _box_grid(objects: Sequence[ShownObject]) -> Any:
     from clrecon.operators.rays.mesh_pictures import box_around
 
     return box_around([each.corners for each in objects])
-
-
-def _triple(vector: Any) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in vector)
-    return x, y, z

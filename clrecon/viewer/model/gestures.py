@@ -6,11 +6,11 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.rendering.views.camera import Camera
+from clrecon.viewer.model.state import as_point
 
 __all__ = ["pan_camera", "pixel_camera", "roll_camera", "turn_camera", "zoom_camera"]
 
@@ -26,13 +26,13 @@ def turn_camera(camera: Camera, dx: float, dy: float) -> Camera:
     right, up, _ = camera.basis()
     turn = _rotation(up, -dx * TURN_DEGREES) @ _rotation(right, -dy * TURN_DEGREES)
     away = turn @ np.subtract(camera.position, camera.focal_point)
-    return replace(camera, position=_triple(np.add(camera.focal_point, away)), up=_triple(turn @ up))
+    return replace(camera, position=as_point(np.add(camera.focal_point, away)), up=as_point(turn @ up))
 
 
 def roll_camera(camera: Camera, degrees: float) -> Camera:
     """Turn about the view; positive degrees turn the picture clockwise."""
     _, up, forward = camera.basis()
-    return replace(camera, up=_triple(_rotation(forward, -degrees) @ up))
+    return replace(camera, up=as_point(_rotation(forward, -degrees) @ up))
 
 
 def pan_camera(camera: Camera, dx: float, dy: float) -> Camera:
@@ -42,8 +42,8 @@ def pan_camera(camera: Camera, dx: float, dy: float) -> Camera:
     shift = height * (dy * up - dx * right)
     return replace(
         camera,
-        position=_triple(np.add(camera.position, shift)),
-        focal_point=_triple(np.add(camera.focal_point, shift)),
+        position=as_point(np.add(camera.position, shift)),
+        focal_point=as_point(np.add(camera.focal_point, shift)),
     )
 
 
@@ -68,7 +68,7 @@ def zoom_camera(camera: Camera, factor: float, at: tuple[float, float] = (0.0, 0
         nearer = replace(camera, parallel_scale=0.5 * height)
     else:
         offset = np.subtract(camera.position, camera.focal_point) * (height / before)
-        nearer = replace(camera, position=_triple(np.add(camera.focal_point, offset)))
+        nearer = replace(camera, position=as_point(np.add(camera.focal_point, offset)))
     lost = 1.0 - before / height
     return pan_camera(nearer, at[0] * lost, at[1] * lost)
 
@@ -89,14 +89,14 @@ def pixel_camera(camera: Camera, size: tuple[int, int], x: float, y: float) -> C
     if camera.is_parallel:
         return replace(
             camera,
-            position=_triple(np.add(camera.position, offset)),
-            focal_point=_triple(np.add(camera.focal_point, offset)),
+            position=as_point(np.add(camera.position, offset)),
+            focal_point=as_point(np.add(camera.focal_point, offset)),
             parallel_scale=0.5 * pixel,
         )
     along = forward + offset
     along /= np.linalg.norm(along)
     angle = max(1e-3, math.degrees(pixel))
-    return replace(camera, focal_point=_triple(camera.position + camera.distance * along), view_angle=angle)
+    return replace(camera, focal_point=as_point(camera.position + camera.distance * along), view_angle=angle)
 
 
 def _height_mm(camera: Camera) -> float:
@@ -109,8 +109,3 @@ def _rotation(axis: Float64Array, degrees: float) -> Float64Array:
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     radians = math.radians(degrees)
     return np.asarray(np.eye(3) + math.sin(radians) * cross + (1.0 - math.cos(radians)) * cross @ cross)
-
-
-def _triple(vector: NDArray[np.float64]) -> tuple[float, float, float]:
-    x, y, z = vector.tolist()
-    return x, y, z
