@@ -38,8 +38,8 @@ class Cells:
     ----------
     mean : ndarray, shape (ck, cj, ci), float32
         Mean HU; cells at the far ends may hold fewer voxels.
-    dense, hard : ndarray, shape (ck, cj, ci), uint16
-        Number of voxels above `DENSE_HU` and above `HARD_HU`.
+    dense, hard : ndarray, shape (ck, cj, ci), uint16 or wider
+        Number of voxels above `DENSE_HU` and above `HARD_HU`; the type holds the number of voxels of a full cell.
     step : (int, int, int)
         Number of voxels of a cell along i, j, k.
     size_mm : (float, float, float)
@@ -47,8 +47,8 @@ class Cells:
     """
 
     mean: NDArray[np.float32]
-    dense: NDArray[np.uint16]
-    hard: NDArray[np.uint16]
+    dense: NDArray[np.unsignedinteger[Any]]
+    hard: NDArray[np.unsignedinteger[Any]]
     step: tuple[int, int, int]
     size_mm: tuple[float, float, float]
 
@@ -90,7 +90,9 @@ def measure_cells(volume: Volume, done: Callable[[slice], None] | None = None) -
     si, sj, sk = _voxels_of_a_cell(volume)
     shape = count_cells(volume)
     mean = np.empty(shape, dtype=np.float32)
-    dense, hard = np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.uint16)
+    # A cell of micro-CT has more voxels than 16 bits count.
+    counts = np.promote_types(np.uint16, np.min_scalar_type(si * sj * sk))
+    dense, hard = np.zeros(shape, dtype=counts), np.zeros(shape, dtype=counts)
 
     def measure(where: slice) -> None:
         for place in range(where.start, where.stop):
@@ -125,7 +127,7 @@ def _sum_blocks(slab: NDArray[Any], sj: int, si: int) -> NDArray[np.float32]:
     return blocks
 
 
-def _count_dense(slab: NDArray[Any], dense: NDArray[np.uint16], hard: NDArray[np.uint16], sj: int, si: int) -> None:
+def _count_dense(slab: NDArray[Any], dense: NDArray[Any], hard: NDArray[Any], sj: int, si: int) -> None:
     """Count the voxels of a slab above `DENSE_HU` and `HARD_HU` in each cell, into zeros."""
     # Few voxels are dense: counting them one by one costs less than sums over all voxels.
     _, nj, ni = slab.shape

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,8 @@ Field = NDArray[np.float32]
 
 CELL_MM = (2.5, 2.5, 4.0)
 """Size along x, y, z of the cells in which the canal is searched."""
+HU_RANGE = (-1024, 1500)
+"""Values beyond these count as these in the means."""
 
 
 @dataclass(frozen=True)
@@ -126,11 +129,13 @@ def _average_blocks(volume: Volume, lattice: Lattice, done: Callable[[slice], No
     whole = size // lattice.block * lattice.block
     fi, fj, fk = (int(n) for n in lattice.block)
     means = np.empty((whole // lattice.block)[::-1], np.float32)
-    add = np.float32 if volume.voxels.dtype.kind == "f" else np.int32
+    add: np.dtype[Any] = np.dtype(np.float32)
+    if volume.voxels.dtype.kind != "f":  # a type that holds the largest sum of a block, which grows with its voxels
+        add = np.promote_types(np.int32, np.min_scalar_type(-HU_RANGE[1] * fi * fj * fk))
 
     def average(where: slice) -> None:
         for k in range(where.start, where.stop):
-            part = np.clip(volume.voxels[fk * k : fk * (k + 1), : whole[1], : whole[0]], -1024, 1500)
+            part = np.clip(volume.voxels[fk * k : fk * (k + 1), : whole[1], : whole[0]], *HU_RANGE)
             # Sums of few long arrays: numpy is slow where it adds a few values at a time.
             plane = part[0].astype(add)
             for layer in part[1:]:

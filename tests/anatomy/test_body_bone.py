@@ -52,6 +52,16 @@ def test_foam_of_a_trough_that_fits_closely_is_no_lung() -> None:
     assert cleaned.report["remove_table"]["bone_kept"] == 1.0
 
 
+def test_a_block_of_micro_ct_is_kept_whole() -> None:
+    """Cells of 64 voxels a side: their counts of dense voxels wrapped to 0, and half of the block became air."""
+    voxels = np.full((192, 192, 192), -1000, np.int16)
+    voxels[:, :, 64:] = 1200
+    cleaned = remove_table(Volume(voxels, np.diag((1 / 32, 1 / 32, 1 / 32, 1.0))))
+    facts = cleaned.report["remove_table"]
+    assert np.array_equal(cleaned.voxels > 300, voxels > 300)
+    assert (facts["bone_voxels"], facts["bone_voxels_removed"], facts["bone_kept"]) == (128 * 192 * 192, 0, 1.0)
+
+
 def test_a_table_alone_is_no_body(odd: OddBodies) -> None:
     for name in ("empty", "empty-curved"):
         voxels = np.array(odd["empty"].volume.voxels)

@@ -50,6 +50,17 @@ def test_cells_hold_mean_and_counts_of_their_voxels(shape, dtype):
         assert (cells.dense[k, j, i], cells.hard[k, j, i]) == ((part > 300).sum(), (part > 600).sum())
 
 
+@pytest.mark.parametrize(("mm", "n"), [(2.0 / 41, 41), (1.0 / 32, 64)])
+def test_counts_of_cells_hold_every_voxel_of_micro_ct(mm, n):
+    """From 41 voxels a side on, 16 bits do not hold the number of voxels of a cell."""
+    voxels = np.full((n, n, n + 3), 601, np.int16)
+    voxels[0, 0, 0] = 600
+    cells = measure_cells(Volume(voxels, np.diag((mm, mm, mm, 1.0))))
+    assert cells.step == (n, n, n)
+    assert cells.dense.ravel().tolist() == [n**3, 3 * n * n]
+    assert cells.hard.ravel().tolist() == [n**3 - 1, 3 * n * n]
+
+
 def test_holes_are_those_of_each_slice():
     from scipy.ndimage import binary_fill_holes
 

@@ -157,6 +157,13 @@ def test_cells_are_means_of_blocks(dtype):
     assert cells.origin.tolist() == pytest.approx([0.625, 2.5 / 3.0, 1.0])
 
 
+def test_sums_of_blocks_of_micro_ct_do_not_overflow():
+    """A block of 125 voxels a side sums up to 2.9e9, more than 32 bits with a sign hold."""
+    volume = Volume(np.full((125, 125, 125), 1500, np.int16), np.diag((0.02, 0.02, 0.02, 1.0)))
+    assert plan_cells(volume).block.tolist() == [125, 125, 125]
+    assert average_cells(volume, plan_cells(volume), lambda _: None).values.ravel().tolist() == [1500.0]
+
+
 @pytest.mark.parametrize("shape", [(9, 21, 18), (1, 1, 1)])
 @pytest.mark.parametrize("signs", [(1, 1, 1), (-1, 1, -1)])
 def test_cells_between_blocks_are_interpolated_the_same_way_along_all_axes(shape, signs):
