@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tolerances
-from ct_files import ORIGIN, PATIENT, RADIUS_MM, SPACING, write_series
+from ct_files import ORIGIN, RADIUS_MM, SPACING, find_words, write_series
 
 from clrecon.cli.main import COMMANDS, main
 
@@ -79,8 +79,7 @@ def test_mesh_says_nothing_of_the_patient(
     assert main(arguments) == 0
     captured = capsys.readouterr()
     written = output.read_bytes() + report.read_bytes() + (captured.out + captured.err).encode()
-    for secret in (*PATIENT.split("^"), "ID-4711", "19500102", "Scan von", "1.2.826.0.1"):
-        assert secret.encode() not in written
+    assert find_words(written) == []
 
 
 def test_mesh_json_is_the_report(device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

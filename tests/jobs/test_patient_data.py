@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import ct_files
 import pydicom
 import pytest
 from ct_files import write_series
@@ -16,19 +17,20 @@ from ct_files import write_series
 from clrecon.cli.main import main
 
 SECRETS = {
-    "PatientName": "Geheim^Jolanthe^Maria", "PatientID": "ID-4711-QX", "PatientBirthDate": "19500102",
+    "PatientName": "Geheim^Jolanthe^Maria", "PatientID": "ID-471147114711-QX", "PatientBirthDate": "19500102",
     "PatientAddress": "Rosengasse 7", "OtherPatientIDs": "OTHER-99-QX", "PatientComments": "weint nachts",
     "AccessionNumber": "ACC-556-QX", "ReferringPhysicianName": "Zauber^Ignaz", "InstitutionName": "Klinik Nimmerland",
     "StudyDescription": "Wirbel von Jolanthe", "SeriesDescription": "Knochen von Jolanthe", "StudyID": "STUDY-QX",
     "ProtocolName": "Protokoll Jolanthe", "StationName": "ROEHRE-QX", "DeviceSerialNumber": "SERIAL-QX",
     "StudyDate": "20190304", "SeriesDate": "20190305", "AcquisitionDate": "20190306", "ContentDate": "20190307",
-    "StudyInstanceUID": "1.2.276.4711.1", "FrameOfReferenceUID": "1.2.276.4711.3", "ImageComments": "Kommentar-QX",
-    "OperatorsName": "Knall^Olga",
+    "StudyInstanceUID": "1.2.276.47114711.1", "FrameOfReferenceUID": "1.2.276.47114711.3",
+    "ImageComments": "Kommentar-QX", "OperatorsName": "Knall^Olga",
 }  # fmt: skip
-SERIES_UID = "1.2.276.4711.2"
+SERIES_UID = "1.2.276.47114711.2"
 WORDS = [
-    *(part for text in SECRETS.values() for part in re.split(r"\^", text)), "Jolanthe", "1.2.276.4711", "4711",
+    *(part for text in SECRETS.values() for part in re.split(r"\^", text)), "Jolanthe", "1.2.276.47114711",
 ]  # fmt: skip
+"""Words so long that no picture or figure has them by chance."""
 HASHES = [hashlib.sha256(uid.encode()).hexdigest()[:16] for uid in (SERIES_UID, SECRETS["FrameOfReferenceUID"])]
 
 
@@ -54,7 +56,7 @@ def find_words(folder: Path, *said: str) -> list[str]:
     files = [path for path in folder.rglob("*") if path.is_file()]
     assert files or said
     written = b"\n".join([path.name.encode() for path in files] + [path.read_bytes() for path in files])
-    return [word for word in (*WORDS, *HASHES) if word.encode() in written or any(word in text for text in said)]
+    return ct_files.find_words(written + "\n".join(("", *said)).encode(), (*WORDS, *HASHES))
 
 
 COMMANDS = {

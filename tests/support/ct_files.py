@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,20 @@ SPACING = (0.8, 1.1, 1.5)
 ORIGIN = (-31.0, 17.5, 240.25)
 RADIUS_MM = 9.0
 INSIDE_HU, OUTSIDE_HU = 700, -1000
-PATIENT = "Doe^Jane^Secret"
+PATIENT = "Geheimnis^Jolanthe^Vertraulich"
+PATIENT_WORDS = (*PATIENT.split("^"), "ID-471147114711", "19500102", "scan of Jolanthe", "1.2.826.0.1.47114711")
+"""What names the patient of a series: words so long that no picture or figure has them by chance."""
+
+
+def find_words(content: bytes | str, words: Iterable[str] = PATIENT_WORDS) -> list[str]:
+    """Return the words that stand in a content; a date counts alone, not as digits of a longer number."""
+    content = content.encode() if isinstance(content, str) else content
+
+    def stands(word: str) -> bool:
+        alone = rb"(?<![\d.])%s(?!\d)" if word.isdigit() else b"%s"
+        return re.search(alone % re.escape(word.encode()), content) is not None
+
+    return [word for word in words if stands(word)]
 
 
 def sphere_voxels(shape_kji: tuple[int, int, int] = (17, 25, 31)) -> NDArray[np.int16]:
@@ -43,16 +58,16 @@ def _slice(pixels: NDArray[np.int16], k: int, number: int, modality: str) -> Dat
     storage = MRImageStorage if modality == "MR" else CTImageStorage
     meta = FileMetaDataset()
     meta.MediaStorageSOPClassUID = storage
-    meta.MediaStorageSOPInstanceUID = f"1.2.826.0.1.{number}.{k + 1}"
+    meta.MediaStorageSOPInstanceUID = f"1.2.826.0.1.47114711.{number}.{k + 1}"
     meta.TransferSyntaxUID = ExplicitVRLittleEndian
     dataset = Dataset()
     dataset.file_meta = meta
     dataset.SOPClassUID, dataset.SOPInstanceUID = storage, meta.MediaStorageSOPInstanceUID
-    dataset.PatientName, dataset.PatientID, dataset.PatientBirthDate = PATIENT, "ID-4711", "19500102"
-    dataset.StudyInstanceUID, dataset.SeriesInstanceUID = "1.2.826.0.1", f"1.2.826.0.1.{number}"
+    dataset.PatientName, dataset.PatientID, dataset.PatientBirthDate = PATIENT, "ID-471147114711", "19500102"
+    dataset.StudyInstanceUID, dataset.SeriesInstanceUID = "1.2.826.0.1.47114711", f"1.2.826.0.1.47114711.{number}"
     dataset.FrameOfReferenceUID = "1.2.826.0.2"
     dataset.SeriesNumber, dataset.InstanceNumber, dataset.Modality = number, k + 1, modality
-    dataset.SeriesDescription = f"scan {number} of Jane"
+    dataset.SeriesDescription = f"{number}: scan of Jolanthe"
     dataset.ImageType = ["ORIGINAL", "PRIMARY", "AXIAL"]
     dataset.Rows, dataset.Columns = pixels.shape
     dataset.PixelSpacing = [SPACING[1], SPACING[0]]

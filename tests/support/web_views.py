@@ -134,10 +134,13 @@ class Client:
         await self.tell(sizes=sizes or {"scene": [120, 90]}, ground=[10, 20, 30])
 
     async def until(self, holds: Any) -> None:
-        """Wait until something holds."""
+        """Wait until something holds, of the messages or of what the server does without one."""
+        end = asyncio.get_running_loop().time() + PATIENCE
         while not holds():
+            assert asyncio.get_running_loop().time() < end, "what a test waits for has not happened"
             self._news.clear()
-            await asyncio.wait_for(self._news.wait(), PATIENCE)
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._news.wait(), 0.05)
 
     async def _read(self) -> None:
         async for message in self.socket:

@@ -21,7 +21,7 @@ pytest.importorskip("nrrd")
 
 pytestmark = pytest.mark.first_device
 
-NAME = "Doe^Jane"
+NAME = "Geheimnis^Jolanthe"
 
 
 def series(folder: Path, **plan: object) -> Path:
@@ -57,7 +57,7 @@ def test_a_crop_lies_where_it_lay(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert report["output"]["space"] == "ras" and report["output"]["type"] == "int16" and report["device"] is None
     assert report["volume"]["gates"] and report["volume"]["series"]["uid_hash"] is None
     for content in (gzip.decompress((tmp_path / "a.nii.gz").read_bytes()), (tmp_path / "a.json").read_bytes()):
-        assert b"Doe" not in content
+        assert b"Geheimnis" not in content
 
 
 def test_outside_of_a_region_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -293,7 +293,7 @@ def test_a_file_is_fetched_once_with_its_ticket(views: Views, monkeypatch: pytes
             assert status == 200 and content == "x" * 700_000
             assert headers["Content-Disposition"] == 'attachment; filename="view.stl"'
             assert (await asyncio.to_thread(get, running, path))[0] == 404
-            assert not written[0].exists()
+            await client.until(lambda: not written[0].exists())
             await client.tell(save=".ply")
             await client.until(lambda: len(client.notes) == 2)
 
