@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import tolerances
 from box_vertebra import BODY_HALF, CANAL_Y, HALF_HU, PLATE_HALF, PLATE_Y, BoxVertebra, grid_around, turned
 
 from clrecon.corridors.corridor import find_corridors, measure_corridors, screw_diameter
+from clrecon.corridors.measures import canal_wall
 from clrecon.corridors.search import BODY_SHARE, segment_distances
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.labels import LabelMap
@@ -167,3 +170,20 @@ def test_a_label_map_by_name_gives_the_same() -> None:
     assert found.name == "L3"
     with pytest.raises(UsageError, match="L4"):
         find_corridors(volume, LabelMap(labels, volume.affine, {3: "L3"}), "L4", HALF_HU)
+
+
+def test_the_canal_wall_ends_three_quarters_of_a_body_from_its_middle() -> None:
+    heights = np.array((-31.0, -30.0, -29.9, 0.0, 29.9, 30.0, 31.0))
+    wall = np.stack((np.full(7, 5.0), np.zeros(7), heights), axis=1)
+    frame = SimpleNamespace(
+        body_height=40.0,
+        to_frame=lambda points: points,
+        to_lps=lambda points: points,
+        canal_at=lambda z: np.stack((np.zeros_like(z), np.zeros_like(z), z), axis=1),
+    )
+    bone = SimpleNamespace(
+        surface=wall, lattice=SimpleNamespace(step=0.5), is_solid=lambda points: np.zeros(len(points), bool)
+    )
+    assert heights[canal_wall(bone, frame)].tolist() == [-30.0, -29.9, 0.0, 29.9, 30.0]
+    bone.is_solid = lambda points: points[:, 2] > 29.95  # what stands before the wall hides it
+    assert heights[canal_wall(bone, frame)].tolist() == [-30.0, -29.9, 0.0, 29.9]

@@ -205,3 +205,13 @@ def test_a_bent_spine_has_the_angles_asked_and_rigid_vertebrae() -> None:
         assert other.axes @ other.axes.T == pytest.approx(np.eye(3), abs=1e-12)
         assert (one.width, one.depth, one.height, one.room) == (other.width, other.depth, other.height, other.room)
     assert min(gaps(turned[5:8])) > 1.5
+
+
+def test_a_bent_spine_stays_in_the_middle_and_no_level_goes_back() -> None:
+    straight, bent = (
+        planned("T1-L5", centred=False),
+        planned("T1-L5", centred=False, kyphosis_deg=30.0, scoliosis_deg=35.0),
+    )
+    moved = np.array([other.center for other in bent]) - np.array([one.center for one in straight])
+    assert moved[:, 0].max() == pytest.approx(-moved[:, 0].min()) and moved[:, 0].max() > 5.0
+    assert moved[:, 1].max() == pytest.approx(0.0, abs=1e-9) and moved[:, 1].min() < -5.0

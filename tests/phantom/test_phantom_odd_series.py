@@ -10,6 +10,7 @@ import pytest
 from clrecon.dicom import list_series, read_volume
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.phantom import PhantomSettings, apply_point_spread, make_phantom, parse_missing, write_phantom
+from clrecon.phantom.ghosts import TEXT_HU, draw_ghosts
 from clrecon.phantom.placement import place_slices
 from clrecon.phantom.spine import draw_spine
 
@@ -114,3 +115,10 @@ def test_other_numbers_of_slices_are_refused(text: str) -> None:
 def test_impossible_series_are_refused_with_their_numbers(given: dict, says: str) -> None:
     with pytest.raises(UsageError, match=says):
         PhantomSettings(**{**SMALL, **given})
+
+
+def test_the_lines_of_a_screen_capture_are_a_24th_of_it_high_and_as_far_apart() -> None:
+    voxels = np.zeros((12, 96, 128), np.int16)
+    (capture, _) = [each["slice"] for each in draw_ghosts(voxels, 0)["slices"]]
+    lines = np.flatnonzero((voxels[capture][8:-8, 8:-8] == TEXT_HU).any(axis=1)) + 8
+    assert lines.tolist() == [row for top in range(12, 88, 8) for row in range(top, top + 4)]

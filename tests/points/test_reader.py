@@ -231,3 +231,11 @@ def test_harmed_files_are_read_or_refused(extension, tmp_path):
             refused += 1
             assert "\n" not in str(error) and len(str(error)) < 400
     assert 50 < refused <= 200
+
+
+def test_a_binary_ply_is_read_to_its_last_byte_and_refused_without_it(tmp_path):
+    rows = np.arange(9, dtype="<f4")
+    content = ply(f"element vertex 3\n{AXES}", "binary_little_endian").encode() + rows.tobytes()
+    assert np.array_equal(read_points(write(tmp_path / "a.ply", content)).points, rows.reshape(3, 3))
+    with pytest.raises(RefusedInputError, match="3 vertices of 12 bytes or more cannot come from 35 bytes"):
+        read_points(write(tmp_path / "b.ply", content[:-1]))

@@ -12,7 +12,7 @@ from uneven_volume import uneven
 import clrecon
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.operators.filters.denoisers import DENOISERS
+from clrecon.operators.filters.denoisers import DENOISERS, ITK_TIME_STEP
 
 SPACING = np.diag((0.7, 0.7, 1.0, 1.0))
 
@@ -101,3 +101,17 @@ def test_nan_and_missing_packages_are_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "SimpleITK", None)
     with pytest.raises(UsageError, match=r"median needs the package SimpleITK: .* install .*SimpleITK"):
         clrecon.filter_volume(noisy()[0], "median")
+
+
+@pytest.mark.parametrize(("radius_mm", "window"), [(0.35, [3, 3, 1]), (0.5, [3, 3, 3]), (1.05, [5, 5, 3])])
+def test_a_median_takes_the_voxels_nearest_to_its_radius(radius_mm, window):
+    made = clrecon.filter_volume(noisy()[0], "median", radius_mm=radius_mm)
+    (step,) = made.report["filtered"]["steps"]
+    assert step["window"] == window and step["radius_mm"] == radius_mm
+
+
+@pytest.mark.parametrize(("spacing", "share"), [((0.7, 0.7, 1.0), 0.49), ((2.0, 3.0, 2.5), 1.0)])
+def test_curvature_flow_takes_the_longest_stable_step(spacing, share):
+    volume = Volume(noisy()[0].voxels, np.diag((*spacing, 1.0)))
+    (step,) = clrecon.filter_volume(volume, "curvature-flow", iterations=1).report["filtered"]["steps"]
+    assert step["time_step"] == pytest.approx(share * ITK_TIME_STEP, rel=1e-12)

@@ -213,3 +213,14 @@ def test_what_cannot_be_filled_is_refused(device):
     for options in ({"below": True}, {}):
         with pytest.raises(UsageError, match="solid=True goes with one iso value"):
             clrecon.extract_isosurface(volume, 400 if options else (100, 300), solid=True, **options, device=device)
+
+
+@pytest.mark.parametrize(
+    ("bone", "level", "filled"), [(800, 400, 800.0), (400, 400, 401.0)], ids=["mean", "at the level"]
+)
+def test_spaces_are_filled_with_the_mean_of_the_bone_or_just_over_the_level(device, bone, level, filled):
+    distance = distances((25, 25, 25))
+    volume = whole(np.where((distance < 10) & (distance > 6), bone, 0))
+    made = clrecon.fill_enclosed(volume, level, device=device)
+    assert made.report["solid"]["filled_hu"] == filled
+    assert set(np.unique(made.voxels[distance <= 6])) == {filled}
