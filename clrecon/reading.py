@@ -39,12 +39,15 @@ class Selection:
         Read a stack with missing slices.
     force : bool
         Read data sets without preamble or meta header.
+    follow_links : bool
+        Read the files and folders that symbolic links out of the folder lead to.
     """
 
     series: int | str | None = None
     phase: int | None = None
     allow_gaps: bool = False
     force: bool = False
+    follow_links: bool = False
 
 
 def read_selected(path: str | os.PathLike[str], selection: Selection, *, progress: Progress | None = None) -> Volume:
@@ -60,6 +63,7 @@ def read_volume(
     phase: int | None = None,
     allow_gaps: bool = False,
     force: bool = False,
+    follow_links: bool = False,
     progress: Progress | None = None,
 ) -> Volume:
     """Read a volume in HU and LPS mm, from DICOM or from a NIfTI, NRRD or MetaImage file.
@@ -81,6 +85,9 @@ def read_volume(
     force : bool
         True: also read data sets without preamble or meta header, with a guessed encoding, and ignore surplus bytes
         after the pixels; each gives a warning.
+    follow_links : bool
+        True: also read the files and folders that symbolic links out of the folder lead to, as in a git-annex or
+        DataLad repository.  False: a series beside which such links stand is refused, because they may be its slices.
     progress : callable, optional
         Called as ``progress(stage, done, total)`` with stage "scan" or "read", or "no answer yet from NAME" where the
         disk hangs.
@@ -107,8 +114,16 @@ def read_volume(
     if kind is None:
         from clrecon.dicom import read_volume as read_dicom
 
-        return read_dicom(path, series, phase=phase, allow_gaps=allow_gaps, force=force, progress=progress)
-    _refuse_options(kind, series=series, phase=phase, allow_gaps=allow_gaps, force=force)
+        return read_dicom(
+            path,
+            series,
+            phase=phase,
+            allow_gaps=allow_gaps,
+            force=force,
+            follow_links=follow_links,
+            progress=progress,
+        )
+    _refuse_options(kind, series=series, phase=phase, allow_gaps=allow_gaps, force=force, follow_links=follow_links)
     from clrecon.formats import read_grid
 
     return read_grid(Path(path), kind, progress=progress)
@@ -121,6 +136,7 @@ def list_series(
     phase: int | None = None,
     allow_gaps: bool = False,
     force: bool = False,
+    follow_links: bool = False,
     pixels: bool = False,
     progress: Progress | None = None,
 ) -> SeriesListing:
@@ -128,7 +144,7 @@ def list_series(
 
     Parameters
     ----------
-    path, series, phase, allow_gaps, force, progress
+    path, series, phase, allow_gaps, force, follow_links, progress
         As in `read_volume`.
     pixels : bool
         True: also read the voxels, for entries that depend on them.  False: read only headers.
@@ -141,17 +157,24 @@ def list_series(
     Raises
     ------
     NoDicomError, RefusedInputError, UsageError
-        As `list_series`; a file of another format is corrupt, its package is missing, or an option for
-        DICOM is given with it.
+        There is nothing to list; all DICOM files, or a file of another format, are corrupt; `series` or `phase` names
+        nothing or several; a package is missing; or an option for DICOM is given with another format.
     """
     kind = tell_format(path)
     if kind is None:
         from clrecon.dicom import list_series as list_dicom
 
         return list_dicom(
-            path, series, phase=phase, allow_gaps=allow_gaps, force=force, pixels=pixels, progress=progress
+            path,
+            series,
+            phase=phase,
+            allow_gaps=allow_gaps,
+            force=force,
+            follow_links=follow_links,
+            pixels=pixels,
+            progress=progress,
         )
-    _refuse_options(kind, series=series, phase=phase, allow_gaps=allow_gaps, force=force)
+    _refuse_options(kind, series=series, phase=phase, allow_gaps=allow_gaps, force=force, follow_links=follow_links)
     from clrecon.formats import list_grid
 
     return list_grid(Path(path), kind, pixels=pixels, progress=progress)

@@ -117,6 +117,7 @@ def _settings(options: argparse.Namespace) -> Any:
         phase=options.phase,
         allow_gaps=options.allow_gaps,
         force=options.force,
+        follow_links=options.follow_links,
     )
 
 

@@ -8,7 +8,7 @@ __all__ = ["add_reading"]
 
 
 def add_reading(parser: argparse.ArgumentParser) -> None:
-    """Add --series, --phase, --allow-gaps and --force."""
+    """Add --series, --phase, --allow-gaps, --force and --follow-links."""
     group = parser.add_argument_group("reading")
     group.add_argument(
         "--series",
@@ -29,4 +29,9 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="read data sets without preamble or meta header too, their encoding guessed; leave out what is left"
         " over behind the pixels",
+    )
+    group.add_argument(
+        "--follow-links",
+        action="store_true",
+        help="read the files and folders that symbolic links out of the folder lead to (git-annex, DataLad)",
     )

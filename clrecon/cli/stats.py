@@ -82,6 +82,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         phase=options.phase,
         allow_gaps=options.allow_gaps,
         force=options.force,
+        follow_links=options.follow_links,
         **given,
     )
     report = measure_stats(

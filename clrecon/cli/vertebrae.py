@@ -92,8 +92,9 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.vertebrae.job import make_vertebrae
     from clrecon.jobs.vertebrae.settings import VertebraeSettings
 
-    names = ("series", "phase", "allow_gaps", "force", "level", "seeds", "name_at", "keep_unsure", "keep_ids")
-    settings = VertebraeSettings(**pick(options, names))
+    reading = ("series", "phase", "allow_gaps", "force", "follow_links")
+    names = ("level", "seeds", "name_at", "keep_unsure", "keep_ids")
+    settings = VertebraeSettings(**pick(options, (*reading, *names)))
     with_picture = options.picture is not None or not getattr(options, "streams_output", False)  # beside what?
     report = make_vertebrae(
         options.input,

@@ -15,7 +15,7 @@ from clrecon.dicom.pixels.voxels import read_voxels
 from clrecon.dicom.series.certificate import certify, collect_scan_warnings, collect_series_warnings
 from clrecon.dicom.series.choice import choose_series, describe_left
 from clrecon.dicom.series.listing import describe_series
-from clrecon.dicom.series.scan import BARE_DATA_SET, Scan, scan_path
+from clrecon.dicom.series.scan import BARE_DATA_SET, LINK_OUT, Scan, advise_on_links, scan_path
 from clrecon.dicom.series.series import Series, group_series
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.geometry import Volume
@@ -40,6 +40,7 @@ def read_volume(
     phase: int | None = None,
     allow_gaps: bool = False,
     force: bool = False,
+    follow_links: bool = False,
     progress: Progress | None = None,
 ) -> Volume:
     """Read one CT series as a volume in HU and LPS mm.
@@ -48,7 +49,7 @@ def read_volume(
     ----------
     path : str or path-like
         A folder, searched with its subfolders (any file names; DICOMDIR not needed), or one file.
-    series, phase, allow_gaps, force, progress
+    series, phase, allow_gaps, force, follow_links, progress
         As in `clrecon.read_volume`.
 
     Returns
@@ -73,7 +74,7 @@ def read_volume(
     Source: DICOM PS3.3 C.7.6.2 (Image Plane), C.7.5.1 (padding), C.8.2.1 (CT image, rescale).
     """
     with _quiet_warnings():
-        scan, found = _scan_and_group(path, progress, force)
+        scan, found = _scan_and_group(path, progress, force, follow_links)
         choice = choose_series(found, series)
         left = describe_left(found, choice, series)
         chosen = choice.series.choose(_checked_phase(phase), allow_gaps)
@@ -102,12 +103,13 @@ def list_slices(
     phase: int | None = None,
     allow_gaps: bool = False,
     force: bool = False,
+    follow_links: bool = False,
 ) -> list[tuple[Path, int, int]]:
     """List the slices of which `read_volume` makes a volume, slice k at place k.
 
     Parameters
     ----------
-    path, series, phase, allow_gaps, force
+    path, series, phase, allow_gaps, force, follow_links
         As in `read_volume`.
 
     Returns
@@ -121,7 +123,7 @@ def list_slices(
         As `read_volume`, as far as headers tell.
     """
     with _quiet_warnings():
-        _, found = _scan_and_group(path, None, force)
+        _, found = _scan_and_group(path, None, force, follow_links)
         chosen = choose_series(found, series).series.choose(_checked_phase(phase), allow_gaps)
         if chosen.problems or chosen.stack is None:
             raise RefusedInputError(_describe_refusal(chosen))
@@ -141,6 +143,7 @@ def list_series(
     phase: int | None = None,
     allow_gaps: bool = False,
     force: bool = False,
+    follow_links: bool = False,
     pixels: bool = False,
     progress: Progress | None = None,
 ) -> SeriesListing:
@@ -148,7 +151,7 @@ def list_series(
 
     Parameters
     ----------
-    path, series, phase, allow_gaps, force, progress
+    path, series, phase, allow_gaps, force, follow_links, progress
         As in `read_volume`, which would read the series chosen here.
     pixels : bool
         True: also read the pixels of the chosen series, for padding, range of HU and saturation.  False: read only
@@ -169,7 +172,7 @@ def list_series(
     """
     phase = _checked_phase(phase)
     with _quiet_warnings():
-        scan, found = _scan_and_group(path, progress, force)
+        scan, found = _scan_and_group(path, progress, force, follow_links)
         warnings = collect_scan_warnings(scan)
         number, certificate, refusal = None, None, None
         try:
@@ -219,7 +222,9 @@ def _quiet_warnings() -> Iterator[None]:
         yield
 
 
-def _scan_and_group(path: str | os.PathLike[str], progress: Progress | None, force: bool) -> tuple[Scan, list[Series]]:
+def _scan_and_group(
+    path: str | os.PathLike[str], progress: Progress | None, force: bool, follow_links: bool
+) -> tuple[Scan, list[Series]]:
     try:
         folder = Path(path)
         empty = not os.fspath(path).strip()  # Path("") is the current folder
@@ -227,7 +232,7 @@ def _scan_and_group(path: str | os.PathLike[str], progress: Progress | None, for
         raise UsageError(f"a path is a string or a path object, not {type(path).__name__}") from error
     if empty:
         raise UsageError("the input path is empty")
-    scan = scan_path(folder, progress, force)
+    scan = scan_path(folder, progress, force, follow_links)
     if not scan.slices and not scan.others:
         shown = escape_text(str(path), 256)
         if scan.skipped["corrupt"]:
@@ -239,6 +244,7 @@ def _scan_and_group(path: str | os.PathLike[str], progress: Progress | None, for
         hint += f"; {packed}" if packed else ""
         bare = sum(suspect.reason.startswith(BARE_DATA_SET) for suspect in scan.suspects)
         hint += f"; {bare} like {BARE_DATA_SET} ({describe_way_out()})" if bare else ""
+        hint += f"; {advise_on_links()}" if scan.skipped[LINK_OUT] else ""
         raise NoDicomError(f"no DICOM images in {shown}: {looked}{hint}")
     found = group_series(scan)
     log.debug("%d files: %d slices in %d series, skipped %s", scan.files, len(scan.slices), len(found), scan.skipped)

@@ -41,6 +41,7 @@ def describe_input(
     phase: int | None = None,
     allow_gaps: bool = False,
     force: bool = False,
+    follow_links: bool = False,
     pixels: bool = False,
     strict: bool = False,
     progress: Progress | None = None,
@@ -56,7 +57,7 @@ def describe_input(
         reader, and any usable series is enough then.
     phase, allow_gaps
         As in `clrecon.read_volume`, of the series that is judged.
-    force
+    force, follow_links
         As in `clrecon.read_volume`.
     pixels : bool
         Read the pixels of the series that is judged.
@@ -77,7 +78,14 @@ def describe_input(
     from clrecon.reading import list_series
 
     found = list_series(
-        source, series, phase=phase, allow_gaps=allow_gaps, force=force, pixels=pixels, progress=progress
+        source,
+        series,
+        phase=phase,
+        allow_gaps=allow_gaps,
+        force=force,
+        follow_links=follow_links,
+        pixels=pixels,
+        progress=progress,
     )
     entries = [entry.as_dict() for entry in found.series]
     listing: dict[str, Any] = {"series": entries, "chosen": found.chosen, "certificate": found.certificate}

@@ -47,7 +47,7 @@ def collect_scan_warnings(scan: Scan) -> list[str]:
     if scan.skipped["corrupt"]:
         warnings.append(f"{scan.skipped['corrupt']} corrupt file{'s' * (scan.skipped['corrupt'] > 1)} skipped")
     warnings += [f"{count} skipped: {reason}" for reason, count in Counter(s.reason for s in scan.suspects).items()]
-    for reason in ("not readable", "folder not readable", "link out of the folder"):
+    for reason in ("not readable", "folder not readable"):
         if scan.skipped[reason]:
             warnings.append(f"{scan.skipped[reason]} skipped: {reason}")
     return warnings

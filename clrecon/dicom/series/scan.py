@@ -1,14 +1,16 @@
 """Scan of a folder or file: the header of every DICOM file in it is read.
 
 Names, extensions and DICOMDIR files do not decide what is read.  They only make a file that is not DICOM a suspect of
-being the remains of a slice (`remains`). Only regular files inside the folder are opened.  Devices, pipes and links are
-skipped and counted: the target of a link into the folder is found at its own place, and a link out of it is not
-followed.
+being the remains of a slice (`remains`). Only regular files are opened; devices and pipes are skipped and counted.  A
+link into the folder is skipped too, because its target is found at its own place.  A link out of the folder is followed
+only on request: in an archive from a stranger it may lead to any file of the machine.  A link that is not followed may
+stand for a slice, as an unreadable file may.
 """
 
 from __future__ import annotations
 
 import os
+import stat
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,12 +25,18 @@ from clrecon.dicom.series.remains import Stranger, describe_start, find_remains
 from clrecon.errors import NoDicomError
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text
+from clrecon.system.wording import name_parameter
 
-__all__ = ["CorruptFile", "Scan", "scan_path"]
+__all__ = ["LINK_OUT", "CorruptFile", "Scan", "advise_on_links", "scan_path"]
 
 DICOM_SUFFIXES = (".dcm", ".dic", ".dicom", ".ima")
 PROGRESS_STEPS = 1000
 BLANK_START = bytes(128) + b"DICM"
+LINK_INSIDE, LINK_OUT, LINK_LOST = (
+    "link inside the folder",
+    "link out of the folder",
+    "link to a file that is not there",
+)
 BARE_DATA_SET = "a data set without preamble"
 APPLE_DOUBLE = b"\x00\x05\x16\x07"
 """Start of the "._NAME" files that macOS creates beside files on foreign disks."""
@@ -60,7 +68,8 @@ class Scan:
     corrupt : list of CorruptFile
         Files that claim to be DICOM but cannot be parsed; files and folders that cannot be read at all.
     suspects : list of CorruptFile
-        Files that are not DICOM by their content, but look like remains of a slice.
+        Files that are not DICOM by their content, but look like remains of a slice; links that are not followed or lead
+        nowhere.
     strangers : list of Stranger
         All other files that are not DICOM.
     files : int
@@ -79,7 +88,7 @@ class Scan:
     is_file: bool = False
 
 
-def scan_path(path: Path, progress: Progress | None = None, force: bool = False) -> Scan:
+def scan_path(path: Path, progress: Progress | None = None, force: bool = False, follow_links: bool = False) -> Scan:
     """Read the headers of all DICOM files at `path`.
 
     Parameters
@@ -91,6 +100,8 @@ def scan_path(path: Path, progress: Progress | None = None, force: bool = False)
         ``progress("no answer yet from NAME", done, total)`` where the disk hangs.
     force : bool
         True: also accept data sets without preamble or meta header.
+    follow_links : bool
+        True: also read the files and folders that links out of the folder lead to.
 
     Raises
     ------
@@ -101,7 +112,7 @@ def scan_path(path: Path, progress: Progress | None = None, force: bool = False)
     """
     scan = Scan()
     with DiskReader(progress) as disk:
-        files = disk.run(lambda: _list_files(path, scan, disk))
+        files = disk.run(lambda: _list_files(path, scan, disk, follow_links))
         total = scan.files = len(files)
         step = max(1, total // PROGRESS_STEPS)
         for done, (file, start) in enumerate(zip(files, disk.read_starts(files), strict=True), start=1):
@@ -162,7 +173,7 @@ def _suspect(file: str, start: bytes) -> str:
     return "named like DICOM but is none" if os.path.splitext(name)[1].lower() in DICOM_SUFFIXES else ""
 
 
-def _list_files(path: Path, scan: Scan, disk: DiskReader) -> list[str]:
+def _list_files(path: Path, scan: Scan, disk: DiskReader, follow_links: bool) -> list[str]:
     """List the regular files at `path`, sorted, and count those that are passed over."""
     disk.touched = str(path)
     try:
@@ -178,32 +189,69 @@ def _list_files(path: Path, scan: Scan, disk: DiskReader) -> list[str]:
         reason = getattr(error, "strerror", None) or str(error)
         raise NoDicomError(f"{escape_text(str(path), 256)} cannot be read: {reason}") from error
 
-    root = os.path.realpath(path)
-    files: list[str] = []
-    folders = [str(path)]
-    while folders:
-        disk.touched = folder = folders.pop()
+    found = _Found(os.path.realpath(path), follow_links, [str(path)])
+    visited: set[str] = set()
+    while found.folders:
+        disk.touched = folder = found.folders.pop()
+        place = os.path.realpath(folder) if follow_links else folder
+        if place in visited:
+            continue
+        visited.add(place)
         try:
             with os.scandir(folder) as entries:
                 for entry in entries:
-                    _sort_entry(entry, root, files, folders, scan.skipped)
+                    _sort_entry(entry, found, scan)
         except OSError:
             scan.skipped["folder not readable"] += 1
             scan.corrupt.append(CorruptFile(Path(folder), "folder not readable"))
-    files.sort()
+    for left in (scan.corrupt, scan.suspects):
+        left.sort(key=lambda entry: entry.file)  # a folder is listed in any order
+    files = sorted(found.files)
+    if follow_links:  # a file may be reached at its own place and through links
+        files = sorted({os.path.realpath(file): file for file in reversed(files)}.values())
     return files
 
 
-def _sort_entry(
-    entry: os.DirEntry[str], root: str, files: list[str], folders: list[str], skipped: Counter[str]
-) -> None:
+@dataclass
+class _Found:
+    """The regular files found so far in the folder `root`, and the folders that are still to be listed."""
+
+    root: str
+    follow_links: bool
+    folders: list[str]
+    files: list[str] = field(default_factory=list)
+
+
+def _sort_entry(entry: os.DirEntry[str], found: _Found, scan: Scan) -> None:
     if entry.is_symlink():
-        target = os.path.realpath(entry.path)
-        inside = target == root or target.startswith(root.rstrip(os.sep) + os.sep)
-        skipped["link inside the folder" if inside else "link out of the folder"] += 1
+        _sort_link(entry, found, scan)
     elif entry.is_file(follow_symlinks=False):
-        files.append(entry.path)
+        found.files.append(entry.path)
     elif entry.is_dir(follow_symlinks=False):
-        folders.append(entry.path)
+        found.folders.append(entry.path)
     else:
-        skipped["not a regular file"] += 1
+        scan.skipped["not a regular file"] += 1
+
+
+def _sort_link(entry: os.DirEntry[str], found: _Found, scan: Scan) -> None:
+    try:
+        mode = entry.stat().st_mode
+    except OSError:
+        scan.skipped[LINK_LOST] += 1
+        scan.suspects.append(CorruptFile(Path(entry.path), LINK_LOST))
+        return
+    target = os.path.realpath(entry.path)
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        scan.skipped["not a regular file"] += 1
+    elif target == found.root or target.startswith(found.root.rstrip(os.sep) + os.sep):
+        scan.skipped[LINK_INSIDE] += 1
+    elif found.follow_links:
+        (found.files if stat.S_ISREG(mode) else found.folders).append(entry.path)
+    else:
+        scan.skipped[LINK_OUT] += 1
+        scan.suspects.append(CorruptFile(Path(entry.path), LINK_OUT))
+
+
+def advise_on_links() -> str:
+    """Say how links are followed."""
+    return f"{name_parameter('follow_links', True)} follows links"

@@ -21,7 +21,7 @@ from clrecon.dicom.series.phases import (
     part_alternating,
     sort_places,
 )
-from clrecon.dicom.series.scan import CorruptFile, Scan
+from clrecon.dicom.series.scan import LINK_OUT, CorruptFile, Scan, advise_on_links
 from clrecon.dicom.stack.attributes import alternate_places, find_alternation
 from clrecon.dicom.stack.fit import Stack, group_places, measure_stack
 from clrecon.dicom.stack.planes import Planes
@@ -189,8 +189,10 @@ class Series:
         if self.kind == "localizer":
             problems.append("localizer images, not a stack")
         if self.corrupt:
+            linked = any(entry.reason == LINK_OUT for entry in self.corrupt)
+            ways = "restore or remove them" + (f"; {advise_on_links()}" if linked else "")
             problems.append(
-                "files or folders that are cut, corrupt or not readable may belong to it (restore or remove them): "
+                f"files or folders that are cut, corrupt or not readable may belong to it ({ways}): "
                 + join_names(self.corrupt)
             )
         if not texts:
