@@ -1,18 +1,29 @@
-"""Closed contours rasterised on slices: a voxel is inside where its centre is, by the even-odd rule.
+"""Closed contours rasterised on slices: a voxel is inside where its centre is.
 
-The rule counts the sides of all contours of a slice that a line from the centre crosses: a contour within another is a
-hole, and one within that is filled again.  A centre on a side belongs to one of both neighbours, never to both: the
-lower end of an interval is inside, the upper end is not.
+`fill_contours` has the even-odd rule, which counts the sides of all contours of a slice that a line from the centre
+crosses.  `unite_contours` has the rule of CLOSED_PLANAR contours: equal ones count once, those that cross are united,
+and one within another is a hole (one within that is filled again).  A centre on a side belongs to one of both
+neighbours, never to both: the lower end of an interval is inside, the upper end is not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["fill_contours"]
+__all__ = ["United", "fill_contours", "unite_contours"]
+
+MOST_OVER_EACH_OTHER = 20_000
+"""Most pairs of contours of one ROI that lie over each other on one slice."""
+
+ROUNDED_MM = 0.01
+"""Contours that are equal in these units are one contour written twice."""
+
+NOISE_MM = 0.05
+"""Contours of which one goes this little beyond the other do not cross: writers round to 0.01 mm."""
 
 
 def fill_contours(contours: Iterable[NDArray[np.float64]], shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -58,3 +69,168 @@ def _cross_rows(corners: NDArray[np.float64], nj: int) -> tuple[NDArray[np.int64
     rise = high[side, 1] - low[side, 1]
     share = (rows - low[side, 1]) / rise
     return rows, low[side, 0] + share * (high[side, 0] - low[side, 0])
+
+
+@dataclass(frozen=True)
+class United:
+    """The pixels inside of the contours of a slice, and what was done to find them.
+
+    Attributes
+    ----------
+    inside : ndarray, shape (nj, ni), bool
+    repeated : int
+        Contours that equal another and do not count.
+    crossing : int
+        Pairs of contours that cross.
+    """
+
+    inside: NDArray[np.bool_]
+    repeated: int = 0
+    crossing: int = 0
+
+
+@dataclass(frozen=True)
+class _Patch:
+    """One contour and the pixels inside of it, within its bounding box.
+
+    `surely` are the pixels that stay inside where the contour is moved by `NOISE_MM`, `maybe` those that come inside.
+    """
+
+    box: tuple[slice, slice]
+    inside: NDArray[np.bool_]
+    surely: NDArray[np.bool_]
+    maybe: NDArray[np.bool_]
+    area: float
+
+    def common(self, other: _Patch) -> tuple[slice, slice]:
+        """Return the part of the own pixels that lies in the box of another contour, which overlaps."""
+        return tuple(  # type: ignore[return-value]
+            slice(max(own.start, its.start) - own.start, min(own.stop, its.stop) - own.start)
+            for own, its in zip(self.box, other.box, strict=True)
+        )
+
+
+def unite_contours(
+    contours: Sequence[NDArray[np.float64]], shape: tuple[int, int], pixel_mm: tuple[float, float]
+) -> United:
+    """Return the pixels inside of the CLOSED_PLANAR contours of one slice.
+
+    Two contours cross if both hold some pixel centre, and each holds one that is beyond the other.
+
+    Parameters
+    ----------
+    contours : sequence of ndarray, shape (n, 2), float64
+        As of `fill_contours`.
+    shape : (int, int)
+        (nj, ni).
+    pixel_mm : (float, float)
+        Spacing (di, dj).
+
+    Raises
+    ------
+    ValueError
+        There are too many contours that lie over each other.
+    """
+    unique = list({_canonical(corners, pixel_mm): corners for corners in contours}.values())
+    repeated = len(contours) - len(unique)
+    near = _find_near(unique, shape)
+    patches = {n: _fill_patch(unique[n], shape, pixel_mm) for n in sorted({n for pair in near for n in pair})}
+    crossing, nested = [], []
+    for a, b in near:
+        one, other = patches[a], patches[b]
+        if not (one.inside[one.common(other)] & other.inside[other.common(one)]).any():
+            continue
+        if _goes_beyond(one, other) and _goes_beyond(other, one):
+            crossing.append((a, b))
+        else:
+            nested.append((a, b) if one.area >= other.area else (b, a))
+    if not crossing:
+        return United(fill_contours(unique, shape), repeated)
+    return United(_paint(unique, crossing, nested, shape), repeated, len(crossing))
+
+
+def _paint(
+    contours: Sequence[NDArray[np.float64]],
+    crossing: Sequence[tuple[int, int]],
+    nested: Sequence[tuple[int, int]],
+    shape: tuple[int, int],
+) -> NDArray[np.bool_]:
+    """Fill contours from the outer to the inner ones: one within an odd number of regions is a hole.
+
+    Contours that cross are one region.
+    """
+    region = _join(len(contours), crossing)
+    around: list[set[int]] = [set() for _ in contours]
+    for outer, inner in nested:
+        around[inner].add(region[outer])
+    inside = np.zeros(shape, dtype=bool)
+    for depth in range(max(map(len, around)) + 1):
+        for n in (n for n, regions in enumerate(around) if len(regions) == depth):
+            inside[fill_contours([contours[n]], shape)] = depth % 2 == 0
+    return inside
+
+
+def _canonical(corners: NDArray[np.float64], pixel_mm: tuple[float, float]) -> bytes:
+    """Return bytes that are equal for equal contours, whichever their first corner and direction."""
+    points = np.rint(corners * pixel_mm / ROUNDED_MM).astype(np.int64)
+    points = points[np.any(points != np.roll(points, -1, axis=0), axis=1)]
+    turns = []
+    for way in (points, points[::-1]):
+        first = int(np.lexsort(way.T)[0]) if len(way) else 0
+        turns.append(np.roll(way, -first, axis=0).tobytes())
+    return min(turns)
+
+
+def _find_near(contours: Sequence[NDArray[np.float64]], shape: tuple[int, int]) -> list[tuple[int, int]]:
+    """Return the pairs of contours whose bounding boxes overlap within the slice."""
+    if len(contours) < 2:
+        return []
+    boxes = np.array([_box_of(corners, shape) for corners in contours])
+    low, high = boxes[:, 0], boxes[:, 1]
+    pairs: list[tuple[int, int]] = []
+    for a in range(len(contours) - 1):
+        size = np.minimum(high[a], high[a + 1 :]) - np.maximum(low[a], low[a + 1 :])
+        pairs += [(a, int(b) + a + 1) for b in np.flatnonzero(np.all(size > 0, axis=1))]
+        if len(pairs) > MOST_OVER_EACH_OTHER:
+            raise ValueError(f"more than {MOST_OVER_EACH_OTHER:,} pairs of contours lie over each other")
+    return pairs
+
+
+def _box_of(corners: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.int64]:
+    """Return the box of a contour within the slice, (i, j) of its first pixel and of the one after its last."""
+    size = shape[::-1]
+    low = np.clip(np.floor(corners.min(axis=0)) - 1, 0, size)
+    return np.array((low, np.clip(np.ceil(corners.max(axis=0)) + 2, low, size)), dtype=np.int64)
+
+
+def _fill_patch(corners: NDArray[np.float64], shape: tuple[int, int], pixel_mm: tuple[float, float]) -> _Patch:
+    low, high = _box_of(corners, shape)
+    size = (int(high[1] - low[1]), int(high[0] - low[0]))
+    noise = NOISE_MM / np.asarray(pixel_mm)
+    moved = [fill_contours([corners - low + noise * step], size) for step in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    inside = fill_contours([corners - low], size)
+    i, j = corners.T
+    return _Patch(
+        (slice(low[1], high[1]), slice(low[0], high[0])),
+        inside,
+        inside & np.all(moved, axis=0),
+        inside | np.any(moved, axis=0),
+        abs(float(i @ np.roll(j, -1) - j @ np.roll(i, -1))) / 2.0,
+    )
+
+
+def _goes_beyond(one: _Patch, other: _Patch) -> bool:
+    """True if `one` surely holds a pixel that `other` does not hold."""
+    left = one.surely.copy()
+    left[one.common(other)] &= ~other.maybe[other.common(one)]
+    return bool(left.any())
+
+
+def _join(count: int, pairs: Iterable[tuple[int, int]]) -> list[int]:
+    """Return for each of `count` members the number of its region; pairs are of one region."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    ends = np.array(list(pairs)).T
+    _, regions = connected_components(coo_array((np.ones(ends.shape[1]), ends), shape=(count, count)), directed=False)
+    return [int(region) for region in regions]

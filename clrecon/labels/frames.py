@@ -25,6 +25,8 @@ OFF_GRID_MM = 0.05
 
 MOST_SLICES = 100_000
 
+_UNSAID = "says neither SpacingBetweenSlices nor SliceThickness"
+
 
 @dataclass(frozen=True)
 class FrameStack:
@@ -37,11 +39,14 @@ class FrameStack:
     places : list of int
         Slice index k of each frame.
     slices : int
+    warnings : tuple of str
+        What the header leaves open about the step between slices.
     """
 
     affine: Float64Array
     places: list[int]
     slices: int
+    warnings: tuple[str, ...] = ()
 
 
 def _numbers(value: Any, count: int) -> NDArray[np.float64]:
@@ -90,30 +95,61 @@ def place_frames(shared: Any, groups: list[Any], name: str) -> FrameStack:
     if max(abs(np.linalg.norm(v) - 1) for v in (row, column, normal)) > 1e-3 or spacings.min() <= 0:
         raise RefusedInputError(f"the frames of {name} cannot be placed: direction {directions[0].tolist()}, spacing"
                                 f" {spacings[0].tolist()}")  # fmt: skip
-    stated = [float(m.SpacingBetweenSlices) for m in measures[:1] if m.get("SpacingBetweenSlices")]
-    step, places, origin = _fit_stack(positions, normal, stated[0] if stated else None, name)
+    stated = (_stated_mm(measures[0], keyword) for keyword in ("SpacingBetweenSlices", "SliceThickness"))
+    gap, warnings = _choose_gap(positions @ normal, *stated)
+    step, places, origin = _fit_stack(positions, normal, gap, name)
     (dj, di) = spacings[0]
     try:
         affine = checked_affine(compose_affine(row * di, column * dj, step, origin))
     except UsageError as error:
         raise RefusedInputError(f"the frames of {name} cannot be placed: {error}") from error
-    return FrameStack(affine, places, max(places) + 1)
+    return FrameStack(affine, places, max(places) + 1, warnings)
+
+
+def _stated_mm(measures: Any, keyword: str) -> float | None:
+    """Return a length of the pixel measures, None where there is none."""
+    value = measures.get(keyword)
+    length = float("nan") if value in (None, "") else float(value)
+    return length if np.isfinite(length) and length > SAME_PLACE_MM else None
+
+
+def _choose_gap(
+    along: NDArray[np.float64], spacing: float | None, thickness: float | None
+) -> tuple[float, tuple[str, ...]]:
+    """Return the step between slices in mm, and warnings about it.
+
+    The step is the smallest gap between frames, divided by a whole number where no two frames are neighbours: by
+    SpacingBetweenSlices, or where that is absent by SliceThickness.
+    """
+    stated = thickness if spacing is None else spacing
+    gaps = np.diff(np.sort(along))
+    gaps = gaps[gaps > SAME_PLACE_MM]
+    if not len(gaps):
+        return (1.0, (f"its one slice {_UNSAID}: a thickness of 1 mm is assumed",)) if stated is None else (stated, ())
+    gap = float(gaps.min())
+    if stated is None:
+        return gap, (f"its header {_UNSAID}: the smallest distance of two frames, {gap:g} mm, is taken as the step",)
+    parts = max(1, round(gap / stated))
+    even = abs(gap - parts * stated) <= OFF_GRID_MM
+    step = gap / parts if even else gap
+    if spacing is None and (gap < stated or (even and parts == 1)):
+        return step, ()  # slices may overlap
+    if spacing is not None and even:
+        return step, ()
+    keyword = "SpacingBetweenSlices" if spacing is not None else "SliceThickness, and there is no SpacingBetweenSlices"
+    return step, (
+        f"its frames are {gap:g} mm apart, its header says {stated:g} mm ({keyword}): the step is {step:g} mm",
+    )
 
 
 def _fit_stack(
-    positions: NDArray[np.float64], normal: NDArray[np.float64], stated_mm: float | None, name: str
+    positions: NDArray[np.float64], normal: NDArray[np.float64], gap: float, name: str
 ) -> tuple[NDArray[np.float64], list[int], NDArray[np.float64]]:
     """Return the slice step, the slice index of each frame, and the position of slice 0."""
     along = positions @ normal
     heights = np.sort(along)
-    gaps = np.diff(heights)
-    gaps = gaps[gaps > SAME_PLACE_MM]
-    usable = stated_mm is not None and np.isfinite(stated_mm) and stated_mm > SAME_PLACE_MM
-    if not len(gaps):
-        return normal * (stated_mm if usable and stated_mm else 1.0), [0] * len(positions), positions[0]
-    gap = float(gaps.min())
-    if usable and stated_mm and abs(gap / stated_mm - round(gap / stated_mm)) * stated_mm <= OFF_GRID_MM:
-        gap = gap / max(1, round(gap / stated_mm))  # no two frames are neighbours
+    if np.diff(heights).max(initial=0.0) <= SAME_PLACE_MM:
+        return normal * gap, [0] * len(positions), positions[0]
     if (heights[-1] - heights[0]) / gap > MOST_SLICES:
         raise RefusedInputError(
             f"the frames of {name} lie {gap:g} mm apart over {np.ptp(heights):g} mm: too many slices"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError
 from clrecon.formats.grid_file import GridFile
 from clrecon.labels.label_map import LabelMap
-from clrecon.labels.overlap import Painter
+from clrecon.labels.overlap import Painter, Wanted
 from clrecon.labels.stream import empty_labels, iterate_labels
 from clrecon.system.progress import Progress, ignore_progress
 
@@ -37,16 +37,14 @@ class _Segment:
     value: int
 
 
-def read_grid_labels(
-    grid: GridFile, only: tuple[str | int, ...] | None = None, progress: Progress = ignore_progress
-) -> LabelMap:
+def read_grid_labels(grid: GridFile, wanted: Wanted, progress: Progress = ignore_progress) -> LabelMap:
     """Read a label map or a segmentation.
 
     Parameters
     ----------
     grid : GridFile
-    only : tuple of str or int, optional
-        The labels that are wanted; only the other labels may overlap.
+    wanted : Wanted
+        Of segments in layers only the others may overlap.
     progress : callable
         Called as ``progress("read", slices done, all slices)``.
 
@@ -63,7 +61,7 @@ def read_grid_labels(
     ni, nj, nk = grid.shape_ijk
     voxels = empty_labels(grid.name, (nk, nj, ni))
     if grid.layers > 1:
-        return _merge_layers(grid, voxels, segments, only, progress)
+        return _merge_layers(grid, voxels, segments, wanted, progress)
     for k, plane in enumerate(iterate_labels(grid)):
         if plane.any():
             voxels[k] = plane
@@ -76,18 +74,18 @@ def _merge_layers(
     grid: GridFile,
     voxels: NDArray[Any],
     segments: Iterable[_Segment],
-    only: tuple[str | int, ...] | None,
+    wanted: Wanted,
     progress: Progress,
 ) -> LabelMap:
     """Merge segments that are stored in layers into one map; numbers that several layers use are renumbered."""
     segments = list(segments)
     if len({segment.number for segment in segments}) < len(segments):
         segments = [_Segment(n, s.name, s.layer, s.value) for n, s in enumerate(segments, start=1)]
-    painter = Painter(grid.name, voxels, {s.number: s.name for s in segments}, only)
-    in_order = {number: place for place, number in enumerate(painter.order)}
+    painter = Painter(grid.name, voxels, {s.number: s.name for s in segments}, wanted)
+    by_number = {segment.number: segment for segment in segments}
     for k, stack in enumerate(iterate_labels(grid)):
-        for segment in sorted(segments, key=lambda s: in_order[s.number]):
-            painter.paint(k, segment.number, stack[..., segment.layer] == segment.value)
+        for number in painter.order:
+            painter.paint(k, number, stack[..., by_number[number].layer] == by_number[number].value)
         progress("read", k + 1, len(voxels))
     return painter.finish(grid.affine, warnings=grid.warnings)
 

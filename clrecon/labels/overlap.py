@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,24 @@ from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap
 from clrecon.labels.names import check_name, find_number
 from clrecon.system.wording import name_parameter
 
-__all__ = ["Painter", "check_wanted"]
+__all__ = ["Painter", "Wanted", "check_wanted"]
+
+
+class Wanted(NamedTuple):
+    """The labels that are wanted, None for all, and whether the others are read too.
+
+    The others tell a surface where its label ends.
+    """
+
+    labels: tuple[str | int, ...] | None = None
+    others: bool = True
 
 
 class Painter:
     """Writes segments into one map.
 
-    Without `only` no two segments may overlap.  With `only`, the wanted segments may not overlap each other.  A voxel
-    of a wanted and another segment goes to the wanted one; a voxel of several others goes to the lowest number.
+    No two wanted segments may overlap.  A voxel of a wanted and another segment goes to the wanted one; a voxel of
+    several others goes to the lowest number.
 
     Parameters
     ----------
@@ -31,8 +41,7 @@ class Painter:
         Zeros, to be written.
     names : mapping of int to str
         The segments.
-    only : tuple of str or int, optional
-        Labels that are wanted.
+    wanted : Wanted
 
     Raises
     ------
@@ -42,15 +51,16 @@ class Painter:
         A number is not a possible label number.
     """
 
-    def __init__(self, file: str, voxels: NDArray[Any], names: Mapping[int, str], only: tuple[str | int, ...] | None):
+    def __init__(self, file: str, voxels: NDArray[Any], names: Mapping[int, str], wanted: Wanted):
         wrong = [number for number in names if not 0 < number <= LARGEST_NUMBER]
         if wrong:
             raise RefusedInputError(f"{file} numbers a segment {wrong[0]}: 1 to {LARGEST_NUMBER:,} are possible")
         self._file, self._voxels = file, voxels
         self._names = {number: check_name(name) for number, name in names.items()}
         shown = {number: name or f"label_{number}" for number, name in self._names.items()}
-        self._wanted = sorted(names if only is None else {find_number(label, shown, names) for label in only})
-        others = sorted(set(names) - set(self._wanted), reverse=True)
+        chosen = names if wanted.labels is None else {find_number(label, shown, names) for label in wanted.labels}
+        self._wanted = sorted(chosen)
+        others = sorted(set(names) - set(self._wanted), reverse=True) if wanted.others else []
         self.order = [*others, *self._wanted]
         """Segment numbers in the order in which they have to be painted."""
         self._is_wanted = np.zeros(LARGEST_NUMBER + 1, dtype=bool)

@@ -8,20 +8,22 @@ from functools import partial
 from math import prod
 from pathlib import Path
 
+import numpy as np
+
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
 from clrecon.formats.grid_file import LABEL_MAP, GridFile
 from clrecon.formats.kinds import open_grid, tell_kind
 from clrecon.geometry.grid import Grid
 from clrecon.geometry.volume import Volume
 from clrecon.labels.grids import read_grid_labels
-from clrecon.labels.label_map import LabelMap
-from clrecon.labels.overlap import check_wanted
+from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap
+from clrecon.labels.overlap import Wanted, check_wanted
 from clrecon.labels.segmentation import SEGMENTATION_CLASSES, read_segmentation, tell_pixel_bytes
 from clrecon.labels.structures import STRUCTURE_SET, read_structures
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
 
-__all__ = ["is_dicom_map", "is_large_map", "read_labels"]
+__all__ = ["is_dicom_map", "is_large_map", "read_all_labels", "read_labels"]
 
 OTHER_OBJECTS = {
     "1.2.840.10008.5.1.4.1.1.481.2": "an RT dose",
@@ -36,6 +38,10 @@ LARGE_BYTES = 2**29
 
 MOST_TIMES = 8
 """Most voxels of a large map for each voxel of its scan: twice as fine along each axis."""
+
+
+WARNINGS_SHOWN = 3
+"""Warnings that a refusal quotes."""
 
 
 def read_labels(
@@ -54,9 +60,8 @@ def read_labels(
     ----------
     path : path
     only : sequence of str or int, optional
-        The labels that are wanted, as `LabelMap.find` takes them.  This matters for files whose segments overlap:
-        wanted segments may not overlap each other, and voxels that they share with other segments go to the wanted
-        ones.
+        The labels to read, as `LabelMap.find` takes them; the map has no others.  They may overlap other labels, but
+        not each other.
     volume : Volume, optional
         The scan of the labels.  An RTSTRUCT needs it: its contours become labels on the slices of the scan.  A map that
         takes long to unpack is refused if it has many times as many voxels.
@@ -76,8 +81,39 @@ def read_labels(
         The file is not a label map (CT images, probabilities, negative numbers, four axes), is cut off or corrupt, does
         not say where it lies in space, or has segments that overlap.
     """
-    wanted = check_wanted(only)
-    path = Path(path)
+    labels = _read(Path(path), Wanted(check_wanted(only), others=False), volume, progress)
+    return labels if only is None else _keep(labels, [labels.find(label) for label in check_wanted(only) or ()])
+
+
+def read_all_labels(
+    path: str | Path,
+    first: Sequence[str | int] | None = None,
+    *,
+    volume: Grid | None = None,
+    progress: Progress | None = None,
+) -> LabelMap:
+    """Read a label map as `read_labels` does, with all its labels: those of `first` get the voxels that they share with
+    others, which tell a surface where its label ends.
+    """
+    return _read(Path(path), Wanted(check_wanted(first)), volume, progress)
+
+
+def _keep(labels: LabelMap, numbers: Sequence[int]) -> LabelMap:
+    """Return a map with these labels alone."""
+    if {*labels.numbers, *labels.names} <= set(numbers):
+        return labels
+    table = np.zeros(LARGEST_NUMBER + 1, labels.voxels.dtype)
+    table[list(numbers)] = numbers
+    return LabelMap(
+        np.stack([table[plane] for plane in labels.voxels]),
+        labels.affine,
+        {number: labels.name(number) for number in numbers},
+        frame_of_reference_hash=labels.frame_of_reference_hash,
+        warnings=labels.warnings,
+    )
+
+
+def _read(path: Path, wanted: Wanted, volume: Grid | None, progress: Progress | None) -> LabelMap:
     try:
         if path.is_dir():
             raise UsageError(f"{escape_text(path.name)} is a folder: give the file with the labels")
@@ -107,8 +143,9 @@ def read_labels(
     except OSError as error:
         raise RefusedInputError(f"{escape_text(path.name)} cannot be read: {error.strerror or error}") from error
     if not labels.numbers:
-        raise RefusedInputError(f"{name} is empty: no voxel has a label")
-    for label in wanted or ():
+        why = "".join(f"; {warning}" for warning in labels.warnings[:WARNINGS_SHOWN])
+        raise RefusedInputError(f"{name} is empty: no voxel has a label{why}")
+    for label in wanted.labels or ():
         labels.find(label)
     return labels
 

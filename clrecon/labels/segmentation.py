@@ -7,7 +7,7 @@ pixels are packed without a gap between frames, lowest bit first).
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from clrecon.errors import ClreconError, RefusedInputError
 from clrecon.formats.stream import check_size
 from clrecon.labels.frames import FrameStack, place_frames
 from clrecon.labels.label_map import LabelMap
-from clrecon.labels.overlap import Painter
+from clrecon.labels.overlap import Painter, Wanted
 from clrecon.labels.stream import empty_labels
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.regular_files import open_regular
@@ -71,7 +71,7 @@ class _Layout:
 
 def read_segmentation(
     path: Path,
-    only: tuple[str | int, ...] | None = None,
+    wanted: Wanted,
     progress: Progress = ignore_progress,
     check: Check | None = None,
 ) -> LabelMap:
@@ -80,8 +80,8 @@ def read_segmentation(
     Parameters
     ----------
     path : Path
-    only : tuple of str or int, optional
-        The segments that are wanted; only the other segments may overlap.
+    wanted : Wanted
+        Only the other segments may overlap.
     progress : callable
         Called as ``progress("read", frames done, all frames)``.
     check : callable, optional
@@ -97,7 +97,7 @@ def read_segmentation(
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # pydicom's messages quote the file unescaped
-        return _read(path, escape_text(path.name), only, progress, check)
+        return _read(path, escape_text(path.name), wanted, progress, check)
 
 
 def tell_pixel_bytes(path: Path) -> int:
@@ -118,9 +118,7 @@ def tell_pixel_bytes(path: Path) -> int:
     return layout.pixel_bytes
 
 
-def _read(
-    path: Path, name: str, only: tuple[str | int, ...] | None, progress: Progress, check: Check | None
-) -> LabelMap:
+def _read(path: Path, name: str, wanted: Wanted, progress: Progress, check: Check | None) -> LabelMap:
     dataset = _parse(path, name)
     try:
         layout = _read_layout(dataset, name, path.stat().st_size)
@@ -142,16 +140,47 @@ def _read(
     frame_hash = hash_uid(frame_of_reference)
     voxels = empty_labels(name, (stack.slices, layout.rows, layout.columns))
     if numbers is None:
-        for frame, k in enumerate(stack.places):
-            voxels[k] = pixels.read(frame)
-            progress("read", frame + 1, layout.frames)
-        return LabelMap(voxels, stack.affine, segments, frame_of_reference_hash=frame_hash)
-    painter = Painter(name, voxels, segments, only)
-    order = {number: place for place, number in enumerate(painter.order)}
-    for done, (frame, k) in enumerate(_frames_in_order(numbers, stack, order, pixels), start=1):
-        painter.paint(k, numbers[frame], pixels.read(frame).astype(bool))
-        progress("read", done, layout.frames)
-    return painter.finish(stack.affine, frame_of_reference_hash=frame_hash)
+        _join_maps(voxels, stack, pixels, progress)
+        return LabelMap(voxels, stack.affine, segments, frame_of_reference_hash=frame_hash, warnings=stack.warnings)
+    painter = Painter(name, voxels, segments, wanted)
+    painted: set[tuple[int, int]] = set()
+    frames = _frames_in_order(numbers, painter.order, segments, name)
+    for done, frame in enumerate(frames, start=1):
+        k, number, mask = stack.places[frame], numbers[frame], pixels.read(frame).astype(bool)
+        if (k, number) in painted and not np.array_equal(voxels[k] == number, mask):
+            raise _contradiction(name, stack, k, f"segment {number} different voxels")
+        painter.paint(k, number, mask)
+        painted.add((k, number))
+        progress("read", done, len(frames))
+    return painter.finish(stack.affine, frame_of_reference_hash=frame_hash, warnings=stack.warnings)
+
+
+def _join_maps(voxels: NDArray[Any], stack: FrameStack, pixels: _FramePixels, progress: Progress) -> None:
+    """Read the frames of a label map; frames at one place may each hold some of its segments.
+
+    Raises
+    ------
+    RefusedInputError
+        Two frames give one voxel two segments.
+    """
+    written: set[int] = set()
+    for frame, k in enumerate(stack.places):
+        plane = pixels.read_map(frame)
+        if k in written:
+            clash = (voxels[k] != 0) & (plane != 0) & (voxels[k] != plane)
+            if clash.any():
+                pair = f"{voxels[k][clash][0]} and {plane[clash][0]}"
+                raise _contradiction(pixels.name, stack, k, f"{np.count_nonzero(clash):,} voxels two segments, {pair}")
+        np.copyto(voxels[k], plane, where=plane != 0)
+        written.add(k)
+        progress("read", frame + 1, len(stack.places))
+
+
+def _contradiction(name: str, stack: FrameStack, k: int, what: str) -> RefusedInputError:
+    return RefusedInputError(
+        f"{name} contradicts itself: two of its frames lie at one place, slice {k + 1} of {stack.slices}, and give"
+        f" {what}"
+    )
 
 
 def _first_line(error: Exception) -> str:
@@ -233,7 +262,8 @@ class _FramePixels:
     """Reads the pixels of the frames one after the other."""
 
     def __init__(self, dataset: Any, layout: _Layout, name: str):
-        self._layout, self._name = layout, name
+        self._layout, self.name = layout, name
+        self._background = int(dataset.get("PixelPaddingValue", 0))
         self._items = layout.rows * layout.columns
         self._data = bytes(dataset.PixelData)
         self._fragments: list[bytes] | None = None
@@ -264,6 +294,23 @@ class _FramePixels:
             )
         return plane.reshape(layout.rows, layout.columns)
 
+    def read_map(self, frame: int) -> NDArray[Any]:
+        """Return frame `frame` of a label map, its background 0.
+
+        Raises
+        ------
+        RefusedInputError
+            The background has another number, and 0 is a segment.
+        """
+        plane = self.read(frame)
+        if not self._background:
+            return plane
+        if not plane.all():
+            raise RefusedInputError(
+                f"{self.name} numbers a segment 0 and its background {self._background}: segments from 1 are read"
+            )
+        return np.where(plane == self._background, 0, plane)
+
     def _decode(self, fragment: bytes) -> NDArray[Any]:
         from pydicom.pixels.decoders.rle import _rle_decode_frame
 
@@ -272,16 +319,14 @@ class _FramePixels:
             planes = _rle_decode_frame(fragment, layout.rows, layout.columns, 1, layout.bits, "<")
             return np.frombuffer(bytes(planes), f"<u{layout.bits // 8}", self._items)
         except Exception as error:
-            raise RefusedInputError(f"{self._name} has a corrupt RLE frame: {_first_line(error)}") from error
+            raise RefusedInputError(f"{self.name} has a corrupt RLE frame: {_first_line(error)}") from error
 
 
-def _frames_in_order(
-    numbers: list[int], stack: FrameStack, order: dict[int, int], pixels: _FramePixels
-) -> Iterator[tuple[int, int]]:
-    unknown = sorted(set(numbers) - set(order))
+def _frames_in_order(numbers: list[int], order: Sequence[int], segments: Collection[int], name: str) -> list[int]:
+    """Return the frames of the segments in `order`."""
+    unknown = sorted(set(numbers) - set(segments))
     if unknown:
-        raise RefusedInputError(
-            f"{pixels._name} is corrupt: a frame belongs to segment {unknown[0]}, which it does not list"
-        )
-    for frame in sorted(range(len(numbers)), key=lambda n: order[numbers[n]]):
-        yield frame, stack.places[frame]
+        raise RefusedInputError(f"{name} is corrupt: a frame belongs to segment {unknown[0]}, which it does not list")
+    turn = {number: place for place, number in enumerate(order)}
+    frames = [frame for frame, number in enumerate(numbers) if number in turn]
+    return sorted(frames, key=lambda frame: turn[numbers[frame]])

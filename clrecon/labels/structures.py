@@ -5,7 +5,7 @@ Source: DICOM PS3.3 C.8.8.5 (Structure Set) and C.8.8.6 (ROI Contour).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,11 +18,11 @@ from clrecon.dicom.parse.values import ValueProblem
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
 from clrecon.geometry.affine import slice_normal
 from clrecon.geometry.volume import Volume
-from clrecon.labels.contours import fill_contours
+from clrecon.labels.contours import fill_contours, unite_contours
 from clrecon.labels.fine_slices import label_slices
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.names import find_number
-from clrecon.labels.overlap import Painter
+from clrecon.labels.overlap import Painter, Wanted
 from clrecon.labels.stream import empty_labels
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.regular_files import open_regular
@@ -35,12 +35,21 @@ IMPLICIT_LITTLE, EXPLICIT_LITTLE = "1.2.840.10008.1.2", "1.2.840.10008.1.2.1"
 LARGEST_BYTES = 2**30
 MOST_CONTOURS = 1_000_000
 
-ON_SLICE_MM = 0.1
-"""Largest distance of a contour's points from their slice; writers round to 0.01 mm."""
+ON_SLICE_MM, ON_SLICE_STEPS = 0.1, 0.1
+"""Largest distance of a contour's points from their slice, in mm and in steps to the next slice; writers round to
+0.01 mm, and some take the places of slices from even steps."""
 
-NAMES_SHOWN = 5
+LEAST_POINTS = 3
+"""Points that enclose something; rt_utils and others write contours of one and two as well."""
 
-_CLOSED = ("CLOSED_PLANAR", "CLOSED_PLANAR_XOR", "CLOSEDPLANAR_XOR")
+ON_CENTRE = 0.01
+"""Largest distance of corners from voxel centres, in voxels, at which contours run through voxel centres."""
+
+Corners = NDArray[np.float64]
+"""Corners (i, j) of a contour, shape (n, 2)."""
+
+_XOR = ("CLOSEDPLANAR_XOR", "CLOSED_PLANAR_XOR")
+_CLOSED = ("CLOSED_PLANAR", *_XOR)
 _CHARACTERS, _ROIS, _CONTOURS_OF = 0x00080005, 0x30060020, 0x30060039
 _NUMBER, _FRAME, _NAME = 0x30060022, 0x30060024, 0x30060026
 _OWNER, _CONTOURS = 0x30060084, 0x30060040
@@ -52,27 +61,35 @@ _SCHEMA: Schema = {
 }
 
 
+@dataclass(frozen=True)
+class _Contour:
+    """A closed contour as it stands in the file: its points, how many the file says they are, and its rule."""
+
+    data: bytes
+    count: int | None
+    exclusive: bool
+
+
 @dataclass
 class _Structure:
-    """One ROI: its name, the hash of its frame of reference, and its contours as they stand in the file."""
+    """One ROI: its name, the hash of its frame of reference, its closed contours, and the kinds of all others."""
 
     name: str
     frame_hash: str | None
-    contours: list[bytes] = field(default_factory=list)
+    contours: list[_Contour] = field(default_factory=list)
     others: dict[str, int] = field(default_factory=dict)
-    counts: list[int | None] = field(default_factory=list)
 
 
 def read_structures(
     path: Path,
     volume: Volume | None,
-    only: tuple[str | int, ...] | None = None,
+    wanted: Wanted,
     progress: Progress = ignore_progress,
 ) -> LabelMap:
     """Read the ROIs of an RTSTRUCT as labels on the slices of its scan.
 
-    A voxel has the label of an ROI where its centre is inside of the closed contours of its slice (even-odd: a contour
-    within another is a hole).  The label's number is the ROI's.  Of an uneven scan the map has thinner slices, see
+    A voxel has the label of an ROI where its centre is inside of the closed contours of its slice, see
+    `clrecon.labels.contours`.  The label's number is the ROI's.  Of an uneven scan the map has thinner slices, see
     `clrecon.labels.fine_slices`.
 
     Parameters
@@ -80,8 +97,8 @@ def read_structures(
     path : Path
     volume : Volume or None
         The scan.
-    only : tuple of str or int, optional
-        The ROIs that are wanted; only the others may overlap, and only the wanted ones have to fit the scan.
+    wanted : Wanted
+        Only the other ROIs may overlap, and only the wanted ones have to fit the scan.
     progress : callable
         Called as ``progress("read", ROIs done, all ROIs)``.
 
@@ -100,21 +117,25 @@ def read_structures(
     structures = _parse(path, name)
     names = {number: one.name for number, one in structures.items()}
     shown = {number: text or f"label_{number}" for number, text in names.items()}
-    wanted = set(structures) if only is None else {find_number(label, shown, structures) for label in only}
+    chosen = set(structures)
+    if wanted.labels is not None:
+        chosen = {find_number(label, shown, structures) for label in wanted.labels}
     warnings: list[str] = []
-    _check_frames(name, {number: structures[number] for number in wanted}, volume)
+    _check_frames(name, {number: structures[number] for number in chosen}, volume)
     ni, nj, _ = volume.shape_ijk
     voxels = empty_labels(name, (len(grid.nearest), nj, ni))
-    painter = Painter(name, voxels, names, only)
+    painter = Painter(name, voxels, names, wanted)
     for done, number in enumerate(painter.order):
         found = _Raster(name, structures[number], shown[number], volume)
-        if number in wanted:
+        if number in chosen:
             found.refuse_misplaced()
-            warnings += found.describe()
-        for k, contours in sorted(found.slices.items()):
-            mask = fill_contours(contours, (nj, ni))
+        for k, mask in found.fill():
             for place in np.flatnonzero(grid.nearest == k):
                 painter.paint(int(place), number, mask)
+        if number in chosen:
+            warnings += found.describe()
+            if wanted.labels is not None:
+                found.refuse_empty()
         progress("read", done + 1, len(painter.order))
     frame = volume.report.get("frame_of_reference_hash")
     return painter.finish(grid.affine, frame_of_reference_hash=frame, warnings=warnings)
@@ -138,34 +159,60 @@ def _check_frames(name: str, structures: dict[int, _Structure], volume: Volume) 
 
 
 class _Raster:
-    """The contours of one ROI on the slices of a scan.
-
-    Attributes
-    ----------
-    slices : dict of int to list of ndarray (n, 2)
-        Corners (i, j) of the contours of each slice.
-    """
+    """The contours of one ROI on the slices of a scan."""
 
     def __init__(self, file: str, structure: _Structure, shown: str, volume: Volume):
         self._file, self._structure = file, structure
         self._shown = f"ROI {escape_text(shown, 60)}"
-        self.slices: dict[int, list[NDArray[np.float64]]] = {}
-        self._beyond = self._misplaced = 0
+        self._short = self._beyond = self._misplaced = self._repeated = self._crossed = 0
         self._off_mm = 0.0
+        self._voxels = 0
+        self._on_centres = bool(structure.contours)
+        ni, nj, _ = volume.shape_ijk
+        self._shape, self._pixel_mm = (nj, ni), volume.spacing[:2]
+        self._slices = self._place(volume)
+
+    def _place(self, volume: Volume) -> dict[int, tuple[list[Corners], list[Corners]]]:
+        """Return the corners of the united and of the exclusive contours of each slice."""
+        slices: dict[int, tuple[list[Corners], list[Corners]]] = {}
         normal = slice_normal(volume.affine)
         heights = volume.slice_origins() @ normal
-        for value, count in zip(structure.contours, structure.counts, strict=True):
-            points = _points_of(value, count, file, self._shown)
+        allowed = _allowed_mm(volume.slice_origins(border=1) @ normal)
+        for contour in self._structure.contours:
+            points = _points_of(contour, self._file, self._shown)
+            if len(points) < LEAST_POINTS:
+                self._short += 1
+                continue
             ijk = volume.lps_to_ijk(points)
             k = int(np.rint(ijk[:, 2].mean()))
             if not 0 <= k < len(heights):
                 self._beyond += 1
                 continue
             off = float(np.abs(points @ normal - heights[k]).max())
-            if off > ON_SLICE_MM:
-                self._misplaced += 1
-                self._off_mm = max(self._off_mm, off)
-            self.slices.setdefault(k, []).append(ijk[:, :2])
+            self._off_mm = max(self._off_mm, off)
+            self._misplaced += off > allowed[k]
+            corners = ijk[:, :2]
+            self._on_centres &= bool(np.abs(corners - np.rint(corners)).max() <= ON_CENTRE)
+            slices.setdefault(k, ([], []))[contour.exclusive].append(corners)
+        return slices
+
+    def fill(self) -> Iterator[tuple[int, NDArray[np.bool_]]]:
+        """Yield the slices that have contours, and their voxels, shape (nj, ni)."""
+        for k, (united, exclusive) in sorted(self._slices.items()):
+            mask = self._unite(united, exclusive)
+            self._voxels += np.count_nonzero(mask)
+            yield k, mask
+
+    def _unite(self, united: list[Corners], exclusive: list[Corners]) -> NDArray[np.bool_]:
+        try:
+            found = unite_contours(united, self._shape, self._pixel_mm)
+        except ValueError as error:
+            raise RefusedInputError(
+                f"{self._file}: {self._shown} has a slice that cannot be filled: {error}"
+            ) from error
+        self._repeated += found.repeated
+        self._crossed += found.crossing > 0
+        return found.inside | fill_contours(exclusive, self._shape)
 
     def refuse_misplaced(self) -> None:
         """Refuse an ROI whose contours do not lie on the slices.
@@ -177,47 +224,85 @@ class _Raster:
         if self._misplaced:
             raise RefusedInputError(
                 f"{self._file}: {self._misplaced} of {len(self._structure.contours)} contours of {self._shown} lie"
-                f" between the slices of the scan, or not parallel to them (up to {self._off_mm:.2f} mm off): they were"
-                " drawn on another series, choose that one"
+                f" between the slices of the scan, or not parallel to them (up to {self._off_mm:.2f} mm off; allowed:"
+                f" {ON_SLICE_MM:g} mm or a tenth of the step): they were drawn on another series, choose that one"
             )
 
+    def refuse_empty(self) -> None:
+        """Refuse an ROI without any voxel, when all of it was filled.
+
+        Raises
+        ------
+        RefusedInputError
+        """
+        if not self._voxels:
+            why = "; ".join(self.describe()) or f"{self._shown}: its contours hold no voxel centre"
+            raise RefusedInputError(f"{self._file} has no voxel for the label that was chosen: {why}")
+
     def describe(self) -> list[str]:
-        """Return warnings about what is not in the label map."""
+        """Return warnings about what is not in the label map, and about what was decided."""
+        return [f"{self._shown}{said}" for said in (*self._describe_omissions(), *self._describe_rules())]
+
+    def _describe_omissions(self) -> list[str]:
         said = []
         if self._structure.others:
             kinds = ", ".join(f"{count} {escape_text(kind, 30)}" for kind, count in self._structure.others.items())
-            said.append(f"{self._shown}: {kinds} left out, only closed planar contours enclose voxels")
+            said.append(f": {kinds} left out, only closed planar contours enclose voxels")
+        if self._short:
+            said.append(f": {count_of(self._short, 'contour')} of fewer than {LEAST_POINTS} points left out")
         if self._beyond:
-            said.append(f"{self._shown}: {count_of(self._beyond, 'contour')} beyond the slices of the scan left out")
+            said.append(f": {count_of(self._beyond, 'contour')} beyond the slices of the scan left out")
         if not self._structure.contours:
-            said.append(f"{self._shown} has no closed contour and no voxel")
-        elif self.slices:
-            span = max(self.slices) - min(self.slices) + 1
-            if span > len(self.slices):
+            said.append(" has no closed contour and no voxel")
+        elif self._slices:
+            span = max(self._slices) - min(self._slices) + 1
+            if span > len(self._slices):
                 said.append(
-                    f"{self._shown}: {span - len(self.slices)} of {span} slices from its first to its last have no"
-                    " contour and stay empty"
+                    f": {span - len(self._slices)} of {span} slices from its first to its last have no contour and stay"
+                    " empty"
                 )
         return said
 
+    def _describe_rules(self) -> list[str]:
+        said = []
+        if self._repeated:
+            said.append(f": {count_of(self._repeated, 'contour')} written twice, each counts once")
+        if self._crossed:
+            said.append(f": contours cross on {count_of(self._crossed, 'slice')} and were united")
+        if self._off_mm > ON_SLICE_MM:
+            said.append(f": contours lie up to {self._off_mm:.2f} mm off their slices, a tenth of the step is allowed")
+        if self._slices and self._on_centres:
+            said.append(
+                ": the contours run through voxel centres, as rt_utils writes them: only about half of the voxels on"
+                " the outline belong to the label"
+            )
+        return said
 
-def _points_of(value: bytes, count: int | None, file: str, shown: str) -> NDArray[np.float64]:
+
+def _allowed_mm(heights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far off each slice contours may lie, from the heights of the slices and of one beyond each end."""
+    gaps = np.abs(np.diff(heights))
+    return np.maximum(ON_SLICE_MM, ON_SLICE_STEPS * np.minimum(gaps[1:], gaps[:-1]))
+
+
+def _points_of(contour: _Contour, file: str, shown: str) -> NDArray[np.float64]:
     """Return the points (n, 3) of a contour, LPS mm.
 
     Raises
     ------
     RefusedInputError
-        They are no numbers, not three for each point, fewer than three points, or not as many as the file says.
+        They are no numbers, not three for each point, or not as many as the file says.
     """
+    words = contour.data.rstrip(b" \0")
     try:
-        numbers = np.array([float(word) for word in value.rstrip(b" \0").split(b"\\")])
+        numbers = np.array([float(word) for word in words.split(b"\\")] if words else [])
     except ValueError:
         numbers = np.array([np.nan])
-    points = len(numbers) // 3
-    if not np.isfinite(numbers).all() or len(numbers) % 3 or points < 3 or (count is not None and count != points):
+    points, count = len(numbers) // 3, contour.count
+    if not np.isfinite(numbers).all() or len(numbers) % 3 or (count is not None and count != points):
         raise RefusedInputError(
             f"{file} is corrupt: a contour of {shown} has {len(numbers)} numbers"
-            f"{'' if count is None else f' for {count} points'}, three finite ones each are needed, and three points"
+            f"{'' if count is None else f' for {count} points'}, three finite ones each are needed"
         )
     return numbers.reshape(-1, 3)
 
@@ -291,8 +376,8 @@ def _take(structure: _Structure, contours: Iterable[Item], name: str) -> None:
         kind = item.values.get(_TYPE, b"").decode("ascii", "replace").strip(" \0").upper() or "contours of no type"
         if kind in _CLOSED:
             count = item.values.get(_COUNT)
-            structure.contours.append(item.values.get(_DATA, b""))
-            structure.counts.append(None if count is None else _whole(count, name))
+            number = None if count is None else _whole(count, name)
+            structure.contours.append(_Contour(item.values.get(_DATA, b""), number, kind in _XOR))
         else:
             structure.others[kind] = structure.others.get(kind, 0) + 1
 

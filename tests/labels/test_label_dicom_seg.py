@@ -14,7 +14,7 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.certificate import amend
 from clrecon.labels import read_labels, resample_labels
-from clrecon.labels.reader import is_large_map
+from clrecon.labels.reader import is_large_map, read_all_labels
 
 pytest.importorskip("highdicom")
 
@@ -115,8 +115,9 @@ def test_overlapping_segments_are_refused_unless_one_is_chosen(tmp_path):
     with pytest.raises(RefusedInputError, match=r"1 T12 and 2 L1 body share 8 voxels; choose labels .*only"):
         read_labels(path)
     first, second = (int(mask.sum()) for _, mask in masks(overlap=True))
-    assert read_labels(path, ["t12"]).counts == {1: first, 2: second - 8}
-    assert read_labels(path, [2]).counts == {1: first - 8, 2: second}
+    assert read_labels(path, ["t12"]).counts == {1: first}
+    assert read_all_labels(path, ["t12"]).counts == {1: first, 2: second - 8}
+    assert read_all_labels(path, [2]).counts == {1: first - 8, 2: second}
     with pytest.raises(UsageError, match="label 'L9' is not in the label map; there are: 1 T12, 2 L1 body"):
         read_labels(path, ["L9"])
 
@@ -241,3 +242,64 @@ def test_real_segmentation_and_nrrd_agree(real_data):
     with pytest.raises(RefusedInputError, match="1 GREEN and 2 ORANGE share 3,017 voxels, and 2 more pairs"):
         read_labels(folder / "partial_overlaps.dcm")
     assert read_labels(folder / "partial_overlaps.dcm", ["green"]).find("GREEN") == 1
+
+
+def edit_frames(path, change):
+    """Change the frames (pixels of 8 bits, group) of a label map."""
+    ds = pydicom.dcmread(path)
+    frames = list(zip(ds.pixel_array.copy(), ds.PerFrameFunctionalGroupsSequence, strict=True))
+    frames = change(frames)
+    ds.PixelData = np.stack([pixels for pixels, _ in frames]).tobytes()
+    ds.PerFrameFunctionalGroupsSequence = [group for _, group in frames]
+    ds.NumberOfFrames = len(frames)
+    ds.save_as(path)
+    return path
+
+
+def test_frames_of_a_label_map_at_one_place_are_joined(tmp_path):
+    segments = masks()
+    path = write_seg(tmp_path / "a.dcm", segments, ct_slices(), kind="LABELMAP")
+    edit_frames(path, lambda frames: [(px * (px == n), group) for n in (1, 2) for px, group in frames])
+    taken = resample_labels(read_labels(path), ct_volume(tmp_path))
+    for number, (_, mask) in enumerate(segments, start=1):
+        assert np.array_equal(taken.voxels == number, mask)
+
+
+def test_frames_of_a_label_map_that_contradict_each_other_are_refused(tmp_path):
+    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices(), kind="LABELMAP")
+    edit_frames(
+        path,
+        lambda frames: [*frames, *((2 * (px == 1).astype(np.uint8), group) for px, group in frames if (px == 1).any())],
+    )
+    words = "two of its frames lie at one place, slice . of 5, and give 15 voxels two segments, 1 and 2$"
+    with pytest.raises(RefusedInputError, match=words):
+        read_labels(path)
+
+
+def test_a_background_of_its_own_is_no_label(tmp_path):
+    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices(), kind="LABELMAP")
+    before = read_labels(path)
+    edit_frames(path, lambda frames: [(np.where(px == 0, 9, px).astype(np.uint8), group) for px, group in frames])
+    spoil(path, PixelPaddingValue=9)
+    assert np.array_equal(read_labels(path).voxels, before.voxels)
+    edit_frames(path, lambda frames: [(np.where(px == 1, 0, px).astype(np.uint8), group) for px, group in frames])
+    with pytest.raises(RefusedInputError, match="numbers a segment 0 and its background 9"):
+        read_labels(path)
+
+
+def test_a_binary_segment_twice_at_one_place(tmp_path):
+    """Equal frames are one; with other pixels they are two states of one segment, as in several points in time."""
+    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices())
+    before = read_labels(path)
+    ds = pydicom.dcmread(path)
+    groups, bits = list(ds.PerFrameFunctionalGroupsSequence), ds.pixel_array.astype(np.uint8)
+    for extra, equal in ((bits[1], True), (bits[1] * 0, False)):
+        ds.NumberOfFrames = len(groups) + 1
+        ds.PerFrameFunctionalGroupsSequence = [*groups, groups[1]]
+        ds.PixelData = np.packbits(np.concatenate([bits, extra[None]]).ravel(), bitorder="little").tobytes() + b"\0"
+        ds.save_as(path)
+        if equal:
+            assert np.array_equal(read_labels(path).voxels, before.voxels)
+            continue
+        with pytest.raises(RefusedInputError, match="slice 1 of 5, and give segment 1 different voxels"):
+            read_labels(path)

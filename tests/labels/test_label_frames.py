@@ -151,3 +151,29 @@ def test_a_position_is_three_finite_numbers(values, words):
 
     with pytest.raises(ValueError, match=words):
         place_frames(shared(), [*frames(0.0), {"PlanePositionSequence": [Place]}], "a.dcm")
+
+
+@pytest.mark.parametrize(
+    ("positions", "measures", "step", "words"),
+    [
+        ((0.0, 2.5, 5.0), {"SliceThickness": 1.25}, 1.25, "2.5 mm apart, its header says 1.25 mm (SliceThickness, and"),
+        ((0.0, 2.5, 5.0), {"SliceThickness": 1.25, "SpacingBetweenSlices": 2.5}, 2.5, None),
+        ((0.0, 2.5, 5.0), {"SliceThickness": 2.5, "SpacingBetweenSlices": 1.25}, 1.25, None),
+        ((0.0, 2.5, 5.0), {"SliceThickness": 2.48}, 2.5, None),
+        ((0.0, 2.5, 5.0), {"SliceThickness": 5.0}, 2.5, None),  # slices that overlap
+        ((0.0, 2.5, 5.0), {"SliceThickness": 2.0}, 2.5, "says 2 mm (SliceThickness, and there is no SpacingBetweenSli"),
+        ((0.0, 2.5, 5.0), {"SpacingBetweenSlices": 2.0}, 2.5, "says 2 mm (SpacingBetweenSlices): the step is 2.5 mm"),
+        (
+            (0.0, 2.5, 5.0),
+            {},
+            2.5,
+            "says neither SpacingBetweenSlices nor SliceThickness: the smallest distance of two",
+        ),
+        ((7.0, 7.0), {"SliceThickness": 1.25}, 1.25, None),
+        ((7.0, 7.0), {}, 1.0, "one slice says neither SpacingBetweenSlices nor SliceThickness: a thickness of 1 mm"),
+    ],
+)
+def test_the_step_is_bounded_by_the_thickness(positions, measures, step, words):
+    stack = place_frames(shared(**measures), frames(*positions), "a.dcm")
+    assert stack.affine[2, 2] == pytest.approx(step, rel=1e-12)
+    assert [words in warning for warning in stack.warnings] == [True] * (words is not None)

@@ -8,7 +8,7 @@ from label_files import OBLIQUE, make_labels, write_nrrd
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.labels import read_labels
-from clrecon.labels.reader import is_large_map
+from clrecon.labels.reader import is_large_map, read_all_labels
 
 pytest.importorskip("nrrd")
 SPACES = ["left-posterior-superior", "right-anterior-superior", "left-anterior-superior"]
@@ -83,9 +83,11 @@ def test_layers_that_overlap_are_refused_unless_one_is_chosen(tmp_path):
     path = write_nrrd(tmp_path / "a.seg.nrrd", voxels, **fields)
     with pytest.raises(RefusedInputError, match="1 one and 2 two share 1 voxels"):
         read_labels(path)
-    assert read_labels(path, ["one"]).counts == {1: 3, 3: 1}
-    assert read_labels(path, ["two", 3]).counts == {1: 2, 2: 1, 3: 1}
-    assert read_labels(path, [3]).counts == {1: 3, 3: 1}  # among those not wanted the lowest number
+    assert read_labels(path, ["one"]).counts == {1: 3}
+    assert read_labels(path, ["two", 3]).counts == {2: 1, 3: 1}
+    assert read_all_labels(path, ["one"]).counts == {1: 3, 3: 1}
+    assert read_all_labels(path, ["two", 3]).counts == {1: 2, 2: 1, 3: 1}
+    assert read_all_labels(path, [3]).counts == {1: 3, 3: 1}  # among the others the lowest number
     with pytest.raises(UsageError, match="label 'four' is not in the label map; there are: 1 one, 2 two, 3 three"):
         read_labels(path, ["four"])
 

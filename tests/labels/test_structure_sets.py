@@ -14,7 +14,8 @@ from clrecon import Volume, read_labels
 from clrecon.cli.main import main
 from clrecon.dicom import read_volume
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.labels.contours import fill_contours
+from clrecon.labels.contours import fill_contours, unite_contours
+from clrecon.labels.reader import read_all_labels
 from clrecon.labels.resample import resample_labels
 from clrecon.labels.volumes import label_ml, slice_voxel_ml
 
@@ -116,6 +117,96 @@ def test_what_is_left_out_is_said(volume, tmp_path):
     )
 
 
+def test_equal_contours_count_once(volume, tmp_path):
+    kind, points = rectangle(volume, 2, (3, 3), (12, 12))
+    again = np.roll(points[::-1], 1, axis=0) + 0.002  # another corner first, the other way round, and rounded
+    rois = {"x": [(kind, points), (kind, again), (kind, [*points, points[0]]), rectangle(volume, 3, (3, 3), (5, 5))]}
+    labels = read_labels(write_structures(tmp_path / "rt.dcm", rois), volume=volume)
+    assert labels.counts == {1: 100 + 9}
+    assert labels.warnings == ("ROI x: 2 contours written twice, each counts once",)
+
+
+def test_contours_that_cross_are_united(volume, tmp_path):
+    plus = [rectangle(volume, 2, (5, 1), (7, 15)), rectangle(volume, 2, (1, 5), (18, 8))]
+    labels = read_labels(write_structures(tmp_path / "rt.dcm", {"x": plus}), volume=volume)
+    assert labels.counts == {1: 3 * 15 + 18 * 4 - 3 * 4}
+    assert labels.warnings == ("ROI x: contours cross on 1 slice and were united",)
+
+
+def test_a_hole_of_contours_that_cross_is_a_hole(volume, tmp_path):
+    """A hole within what both share lies within one region, not two."""
+    parts = [((1, 1), (12, 12)), ((4, 4), (18, 18)), ((6, 6), (9, 9)), ((7, 7), (8, 8))]
+    rois = {"x": [rectangle(volume, 2, *part) for part in parts]}
+    labels = read_labels(write_structures(tmp_path / "rt.dcm", rois), volume=volume)
+    assert labels.counts == {1: 12 * 12 + 15 * 15 - 9 * 9 - 4 * 4 + 2 * 2}
+
+
+def test_contours_to_combine_by_xor(volume, tmp_path):
+    kind = "CLOSEDPLANAR_XOR"
+    plus = [(kind, rectangle(volume, 2, *part)[1]) for part in (((5, 1), (7, 15)), ((1, 5), (18, 8)))]
+    path = write_structures(
+        tmp_path / "rt.dcm", {"x": plus, "y": [plus[0], plus[0], rectangle(volume, 4, (1, 1), (2, 2))]}
+    )
+    labels = read_labels(path, ["x"], volume=volume)
+    assert labels.counts == {1: 3 * 15 + 18 * 4 - 2 * 3 * 4} and labels.warnings == ()
+    assert read_labels(path, ["y"], volume=volume).counts == {2: 4}
+
+
+@pytest.mark.parametrize(("off_mm", "crossing"), [(0.04, 0), (0.06, 1)])
+def test_a_hole_may_touch_the_outline_within_rounding(off_mm, crossing):
+    """The hole has the centres of column 2 and the outline has not: by rounding alone, or by more."""
+    off = off_mm / 0.5
+    outer = np.array([(2 + off, 1.6), (11.4, 1.6), (11.4, 11.4), (2 + off, 11.4)])
+    hole = np.array([(2 - off, 4.6), (5.4, 4.6), (5.4, 7.4), (2 - off, 7.4)])
+    united = unite_contours([outer, hole], (16, 16), (0.5, 0.5))
+    assert united.crossing == crossing
+    assert united.inside[:, 3:].sum() == 9 * 10 - (0 if crossing else 3 * 3)
+
+
+def test_contours_of_one_and_two_points_are_left_out(volume, tmp_path):
+    kind, points = rectangle(volume, 2, (2, 2), (4, 4))
+    rois = {"x": [(kind, points), (kind, points[:2]), (kind, points[:1])], "y": [(kind, points[:2])]}
+    path = write_structures(tmp_path / "rt.dcm", rois)
+    labels = read_labels(path, volume=volume)
+    assert labels.counts == {1: 9}
+    assert labels.warnings == (
+        "ROI x: 2 contours of fewer than 3 points left out",
+        "ROI y: 1 contour of fewer than 3 points left out",
+    )
+    assert read_labels(path, ["x"], volume=volume).counts == {1: 9}
+    with pytest.raises(RefusedInputError, match=r"rt.dcm has no voxel for .*: ROI y: 1 contour of fewer than 3 points"):
+        read_labels(path, ["y"], volume=volume)
+
+
+def test_an_roi_of_points_is_said_to_be_one(volume, tmp_path):
+    rois = {"iso": [("POINT", volume.ijk_to_lps([(4, 4, 4)]))]}
+    path = write_structures(tmp_path / "rt.dcm", rois)
+    for only in (None, ["iso"]):
+        with pytest.raises(RefusedInputError, match="ROI iso: 1 POINT left out, only closed planar contours enclose"):
+            read_labels(path, only, volume=volume)
+
+
+def test_contours_may_be_a_tenth_of_the_step_off(tmp_path):
+    volume = Volume(np.zeros((4, 20, 24), np.int16), np.diag((1.0, 1.0, 3.0, 1.0)))
+    for off, words in ((0.09, None), (0.29, "up to 0.29 mm off their slices"), (0.31, None)):
+        kind, points = rectangle(volume, 2, (2, 2), (4, 4))
+        path = write_structures(tmp_path / "rt.dcm", {"x": [(kind, points + (0.0, 0.0, off))]})
+        if off > 0.3:
+            with pytest.raises(RefusedInputError, match=r"0.31 mm off; allowed: 0.1 mm or a tenth of the step"):
+                read_labels(path, volume=volume)
+            continue
+        labels = read_labels(path, volume=volume)
+        assert labels.counts == {1: 9} and [words in warning for warning in labels.warnings] == [True] * bool(words)
+
+
+def test_contours_through_voxel_centres_are_said(volume, tmp_path):
+    """As rt_utils writes them, which takes the outermost pixels of a mask as corners."""
+    ijk = [(3, 4, 2), (9, 4, 2), (9, 12, 2), (3, 12, 2)]
+    path = write_structures(tmp_path / "rt.dcm", {"x": [(CLOSED, volume.ijk_to_lps(ijk))]})
+    (said,) = read_labels(path, volume=volume).warnings
+    assert said.startswith("ROI x: the contours run through voxel centres, as rt_utils writes them")
+
+
 @pytest.mark.parametrize("off", [0.4, 0.2])
 def test_contours_between_slices_are_refused(volume, tmp_path, off):
     rois = {"x": [rectangle(volume, 2, (2, 2), (4, 4)), rectangle(volume, 3 + off, (2, 2), (4, 4))]}
@@ -153,7 +244,10 @@ def test_overlapping_structures_are_chosen_by_name(volume, tmp_path):
     path = write_structures(tmp_path / "rt.dcm", rois)
     with pytest.raises(RefusedInputError, match="1 BODY and 2 L3 share 9 voxels.*choose labels"):
         read_labels(path, volume=volume)
-    assert read_labels(path, ["L3"], volume=volume).counts == {1: 7 * 480 - 9, 2: 9}
+    alone = read_labels(path, ["L3"], volume=volume)
+    assert alone.counts == {2: 9} and alone.names == {2: "L3"}
+    assert read_labels(path, [1], volume=volume).counts == {1: 7 * 480}
+    assert read_all_labels(path, ["L3"], volume=volume).counts == {1: 7 * 480 - 9, 2: 9}
 
 
 def test_numbers_from_0_are_moved(volume, tmp_path):
@@ -198,11 +292,11 @@ def test_other_objects_are_no_label_maps(volume, tmp_path):
         read_labels(path, volume=volume)
 
 
-@pytest.mark.parametrize("harm", ["two points", "nan", "cut", "none", "words", "twice"])
+@pytest.mark.parametrize("harm", ["half a point", "nan", "cut", "none", "words", "twice"])
 def test_corrupt_files_are_one_line(volume, tmp_path, harm):
     kind, points = rectangle(volume, 2, (2, 2), (4, 4))
-    rois = {"x": [(kind, points[:2] if harm == "two points" else points)]}
-    path = write_structures(tmp_path / "rt.dcm", {} if harm == "none" else rois)
+    rois = {"x": [(kind, points.ravel()[:-1] if harm == "half a point" else points)]}
+    path = write_structures(tmp_path / "rt.dcm", {} if harm == "none" else rois, counts=harm != "half a point")
     data = path.read_bytes()
     number = f"{points[1, 0]:.6f}"[:16].encode()
     if harm == "nan":

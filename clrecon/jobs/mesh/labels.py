@@ -38,13 +38,13 @@ def open_labels(choice: LabelChoice | None, volume: Volume | None = None) -> Lab
     Raises
     ------
     UsageError, RefusedInputError
-        As `clrecon.labels.read_labels`.
+        As `clrecon.read_labels`.
     """
     if choice is None:
         return None
-    from clrecon.labels import read_labels
+    from clrecon.labels.reader import read_all_labels
 
-    return read_labels(choice.path, choice.wanted or None, volume=volume)
+    return read_all_labels(choice.path, choice.wanted or None, volume=volume)
 
 
 def name_label_files(labels: LabelMap, choice: LabelChoice, surfaces: Sequence[Surface]) -> list[str]:

@@ -83,11 +83,11 @@ def read_look(look: LabelLook | None, volume: Volume | None = None) -> LabelMap 
     """
     if look is None:
         return None
-    from clrecon.labels import read_labels
+    from clrecon.labels.reader import read_all_labels
 
     opacities = [label for label in look.opacities if label.strip() != str(NO_LABEL)]
     named = [*look.colors, *opacities]  # they get the voxels that they share with others
-    labels = read_labels(look.path, named or None, volume=volume)
+    labels = read_all_labels(look.path, named or None, volume=volume)
     for label in named:
         labels.find(label)
     return labels
