@@ -50,6 +50,10 @@ exit codes: 0 done; 1 unexpected error; 2 no usable DICOM or no surface; 3 wrong
             "mesh --strict"; 130 interrupted"""
 
 
+_MEANT = {"--spacing": "--resample", "--threshold": "--hu", "--iso": "--hu"}
+"""Options of other programs, or of other commands, and that which does the same where it exists."""
+
+
 class _Formatter(argparse.RawDescriptionHelpFormatter):
     """Texts of options that are broken between words, never within one, and not at its hyphens either."""
 
@@ -79,7 +83,8 @@ class Parser(argparse.ArgumentParser):
         """Raise `UsageError` for the first word that is no option of this parser, with the one that is most like it."""
         for word in words:
             if word not in self._option_string_actions:
-                self.error(f"unrecognized arguments: {word}{guess_word(word, self._option_string_actions)}")
+                meant = _MEANT.get(word, word)
+                self.error(f"unrecognized arguments: {word}{guess_word(meant, self._option_string_actions)}")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """Refuse a command that there is not, with the one that is most like it."""
@@ -268,8 +273,9 @@ def guard(action: Callable[[], int], console: Console, debug: bool) -> int:
     try:
         console.finish()
     except OutputError as error:
-        console.error(str(error))
-        return error.exit_code
+        if code == 0:
+            console.error(str(error))
+            return error.exit_code
     return code
 
 

@@ -84,7 +84,7 @@ class Console:
         self.has_result = False
         self._streams_result, self._said_on_stderr = False, False
         self._hidden_name, self._shown_name = "", ""
-        self._stdout_closed = sys.stdout is None
+        self._stdout_closed, self._lacks_stdout = sys.stdout is None, False
         self._stage = ""
         self._drawn = 0
         self._last_draw = 0.0
@@ -167,9 +167,11 @@ class Console:
         Raises
         ------
         OutputError
-            stdout cannot take the result (a full disk).
+            stdout cannot take the result: a full disk, or it was closed before the command began.
         """
         self.clear()
+        if self._lacks_stdout:
+            raise OutputError("cannot write to standard output: it is closed; add -q if the words are not needed")
         self._guard_stdout(lambda: sys.stdout.flush())
 
     def _draw(self, stage: str, done: int, total: int) -> None:
@@ -199,6 +201,7 @@ class Console:
         self._guard_stdout(lambda: sys.stdout.write(text + "\n"))
 
     def _guard_stdout(self, action: Any) -> None:
+        self._lacks_stdout = self._lacks_stdout or sys.stdout is None
         if self._stdout_closed:
             return
         try:

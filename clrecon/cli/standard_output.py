@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from clrecon.cli.console import Console
-from clrecon.errors import UsageError
+from clrecon.errors import OutputError, UsageError
 
 __all__ = ["DASH", "STREAMED", "run_with_streams"]
 
@@ -53,6 +53,8 @@ def run_with_streams(command: str, run: Callable[[], int], options: argparse.Nam
     if len(takers) > 1 or (wanted and options.json):
         both = " and ".join([*takers, *(["--json"] * bool(wanted and options.json))])
         raise UsageError(f"{both} cannot share standard output: name a file for one of them")
+    if sys.stdout is None:
+        raise OutputError(f"{takers[0]} -: standard output is closed")
     if has_report:
         console.stream_result()
         options.report, options.json = None, True  # measured and made as with --json
@@ -67,7 +69,7 @@ def _stream_file(
     extension = ".csv" if option == "csv" else STREAMED.get(command)
     if extension is None:
         raise UsageError(f"{_FILES[option]} {value}: {command} writes several files, which one stream cannot hold")
-    if option != "csv" and sys.stdout is not None and sys.stdout.isatty():
+    if option != "csv" and sys.stdout.isatty():
         raise UsageError(f"{_FILES[option]} {value}: standard output is a terminal: lead it into a file or a program")
     if several := _find_several(command, options):
         raise UsageError(f"{_FILES[option]} {value}: {several} make several files, and one stream holds one")

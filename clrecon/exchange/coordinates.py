@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry.precision import float32_step, is_far
 
-__all__ = ["as_stored", "find_coincident", "rounded_apart", "rounding_step"]
+__all__ = ["as_stored", "find_coincident", "find_places", "rounded_apart", "rounding_step"]
 
 
 _MOST_STEPS_APART = 64
@@ -67,12 +67,7 @@ def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
     ndarray, shape (k,), int64
         All vertices of each such place, in order of the place's coordinates.
     """
-    # Sums of scrambled coordinates, as in count_duplicate_faces: only vertices with equal sums are compared in full.
-    mixed = np.zeros(len(vertices), dtype=np.uint64)
-    for column in vertices.T:
-        bits = (column + column.dtype.type(0)).view(f"u{column.dtype.itemsize}")  # + 0 turns -0 into 0
-        mixed = (mixed ^ bits) * np.uint64(0x9E3779B97F4A7C15)
-        mixed ^= mixed >> np.uint64(29)
+    mixed = _scramble(vertices)
     ordered = np.sort(mixed)
     repeated = ordered[1:][ordered[1:] == ordered[:-1]]
     if len(repeated) == 0:
@@ -81,6 +76,40 @@ def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
     suspects = suspects[np.lexsort(vertices[suspects].T[::-1])]
     same = (vertices[suspects[1:]] == vertices[suspects[:-1]]).all(axis=1)
     return suspects[np.concatenate([same, [False]]) | np.concatenate([[False], same])]
+
+
+def find_places(vertices: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Number the places at which vertices lie, in the order in which they occur first.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (n, 3), float32 or float64
+
+    Returns
+    -------
+    first : ndarray, shape (p,), int64
+        The first vertex at each place.
+    place : ndarray, shape (n,), int64
+        The place of each vertex.
+    """
+    mixed = _scramble(vertices)
+    _, first, place = np.unique(mixed, return_index=True, return_inverse=True)
+    if not np.array_equal(vertices[first][place], vertices):  # two places with one sum, or NaN
+        _, first, place = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first, kind="stable")
+    number = np.empty(len(first), np.int64)
+    number[order] = np.arange(len(first))
+    return first[order], number[place.reshape(-1)]
+
+
+def _scramble(vertices: NDArray[np.floating]) -> NDArray[np.uint64]:
+    """Return a sum of scrambled coordinates: only vertices with equal sums have to be compared in full."""
+    mixed = np.zeros(len(vertices), dtype=np.uint64)
+    for column in vertices.T:
+        bits = (column + column.dtype.type(0)).view(f"u{column.dtype.itemsize}")  # + 0 turns -0 into 0
+        mixed = (mixed ^ bits) * np.uint64(0x9E3779B97F4A7C15)
+        mixed ^= mixed >> np.uint64(29)
+    return mixed
 
 
 def rounded_apart(vertices: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -93,20 +122,20 @@ def rounded_apart(vertices: NDArray[np.floating]) -> NDArray[np.float32]:
     Returns
     -------
     ndarray, shape (n, 3), float32
-        The nearest values; where several vertices round to one place, all but the first are moved by steps of float32.
+        The nearest values; where several places round to one, all but the first are moved by steps of float32, each
+        with all of its vertices.  That keeps about 1,000 places apart that round to one; of more some may coincide.
     """
     rounded = vertices.astype(np.float32)
     if vertices.dtype == np.float32:
         return rounded
-    together = np.zeros(len(vertices), dtype=bool)
-    together[find_coincident(vertices)] = True
+    first, place = find_places(vertices)
+    apart = rounded[first]
     for turn in range(_MOST_STEPS_APART):
-        meeting = find_coincident(rounded)
-        meeting = meeting[~together[meeting]]
-        again = np.concatenate([[False], (rounded[meeting[1:]] == rounded[meeting[:-1]]).all(axis=1)])
+        meeting = find_coincident(apart)
+        again = np.concatenate([[False], (apart[meeting[1:]] == apart[meeting[:-1]]).all(axis=1)])
         going = meeting[again[: len(meeting)]]
         if len(going) == 0:
             break
         axis = (turn + np.arange(len(going))) % 3
-        rounded[going, axis] = np.nextafter(rounded[going, axis], np.float32(np.inf))
-    return rounded
+        apart[going, axis] = np.nextafter(apart[going, axis], np.float32(np.inf))
+    return apart[place]

@@ -57,7 +57,7 @@ def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh
     if reader is None:
         raise UsageError(f"{name}: meshes are read from files {', '.join(MESH_INPUTS)}")
     if not os.path.lexists(file):
-        raise UsageError(f"there is no mesh {name}")
+        raise UsageError(f"there is no mesh {escape_text(str(path), 200)}")
     raw = reader(file)
     warnings = raw.warnings
     named = None if raw.space is None else raw.space.upper()

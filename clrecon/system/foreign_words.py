@@ -34,6 +34,7 @@ def own_streams(show: bool = False) -> Iterator[None]:
     foreign words come out there.
     """
     global _owned
+    _fill_closed_descriptors()
     with contextlib.ExitStack() as stack:
         if not show:
             stack.enter_context(warnings.catch_warnings())
@@ -54,6 +55,13 @@ def _log() -> logging.Logger:
     from clrecon.system.log import get_logger  # which loads logging
 
     return get_logger(__name__)
+
+
+def _fill_closed_descriptors() -> None:
+    """Open the null device where a standard stream is closed: else the next file would get what is written to it."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
 
 
 def _move_stdout(stack: contextlib.ExitStack) -> None:

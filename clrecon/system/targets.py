@@ -53,7 +53,6 @@ _ADVICE = {
     errno.EPERM: "the system does not permit it: choose another folder",
     errno.ENAMETOOLONG: "the name is too long: choose a shorter one",
     errno.ELOOP: "it is a symbolic link that leads back to itself",
-    errno.ENOENT: "the folder vanished while the file was written",
     errno.EMFILE: "too many files are open at once: write fewer, or raise the limit (ulimit -n)",
 }
 
@@ -107,8 +106,16 @@ def system_errors(path: str | os.PathLike[str]) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = _ADVICE.get(error.errno or 0) or error.strerror or str(error) or type(error).__name__
+        advice = _missing_advice(path) if error.errno == errno.ENOENT else _ADVICE.get(error.errno or 0)
+        reason = advice or error.strerror or str(error) or type(error).__name__
         raise OutputError(f"cannot write {shown_path(path)}: {reason}") from error
+
+
+def _missing_advice(path: str | os.PathLike[str]) -> str:
+    """Say why nothing can be made at a path: its folder is gone, or is one of the system's that takes no files."""
+    if os.path.isdir(os.path.dirname(os.path.realpath(path))):
+        return "files cannot be made in this folder: choose another folder"
+    return "the folder vanished while the file was written"
 
 
 def resolve_target(path: str | os.PathLike[str]) -> Path:

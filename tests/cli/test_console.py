@@ -139,7 +139,9 @@ def test_a_full_disk_behind_stdout_is_an_error(
 def test_no_stdout_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdout", None)
     console = Console()
-    assert guard(lambda: console.say("nobody hears") or 0, console, debug=False) == 0
+    assert guard(lambda: 0, console, debug=False) == 0
+    assert guard(lambda: console.say("nobody hears") or 0, console, debug=False) == 6
+    assert guard(lambda: console.say("nobody hears") or 8, console, debug=False) == 8
 
 
 def test_progress_is_silent_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:

@@ -43,6 +43,8 @@ def test_version_has_a_short_option(option: str, capsys: pytest.CaptureFixture[s
         ("--verison", "did you mean --version?"),
         ("mesh ct --kep-largest 1 -o a.stl", "unrecognized arguments: --kep-largest (did you mean --keep-largest?)"),
         ("mesh ct --ouput=a.stl", "--ouput (did you mean --output?) (see: clrecon mesh --help)"),
+        ("export ct -o a.nii --spacing 2", "--spacing (did you mean --resample?)"),
+        ("mesh ct -o a.stl --threshold 200", "--threshold (did you mean --hu?)"),
         ("mesh ct -o a.stl --preset bon", "did you mean bone?"),
         ("mesh ct -o a.slt", "'.slt' (did you mean .stl?)"),
         ("mesh ct -o a.stl --for prnt", "did you mean print?"),

@@ -14,6 +14,7 @@ import tolerances
 
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
 from clrecon.exchange import formats as writers
+from clrecon.exchange.coordinates import rounded_apart
 from clrecon.exchange.file_format import FileFormat
 from clrecon.exchange.formats import FORMATS
 from clrecon.mesh import Mesh
@@ -387,3 +388,13 @@ def test_stl_keeps_vertices_apart_that_float32_would_bring_together(tmp_path):
     by_place = Mesh(places, number.reshape(-1, 3)).quality()
     assert (by_place["closed"], by_place["boundary_edges"], by_place["manifold"]) == (True, 0, True)
     assert np.abs(corners - mesh.vertices[mesh.triangles].reshape(-1, 3)).max() < 0.05
+
+
+def test_rounding_brings_no_vertex_to_a_place_of_others():
+    """1 km from the origin: 500 pairs of vertices at one place each stay pairs, and no third vertex joins them."""
+    rng = np.random.default_rng(3)
+    points = 1e6 + rng.uniform(0.0, 2.0, (10_000, 3))
+    points[-500:] = points[:500]
+    rounded = rounded_apart(points)
+    assert np.array_equal(rounded[-500:], rounded[:500])
+    assert len(np.unique(rounded, axis=0)) == len(np.unique(points, axis=0)) == 9_500

@@ -99,7 +99,7 @@ def test_harmed_files_are_refused_in_one_line(tmp_path: Path) -> None:
         assert "\n" not in str(error.value) and name in str(error.value)
     with pytest.raises(UsageError, match=r"\.stl, \.ply"):
         clrecon.read_mesh(tmp_path / "a.obj")
-    with pytest.raises(UsageError, match="there is no mesh missing.stl"):
+    with pytest.raises(UsageError, match=f"there is no mesh {tmp_path}/missing.stl"):
         clrecon.read_mesh(tmp_path / "missing.stl")
 
 

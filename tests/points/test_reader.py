@@ -191,7 +191,7 @@ def test_bad_files_are_refused_in_one_line(name, content, words, tmp_path):
 
 
 def test_missing_files_folders_and_archives_of_something_else(tmp_path):
-    with pytest.raises(UsageError, match="there is no cloud none.ply"):
+    with pytest.raises(UsageError, match=r"there is no cloud .*/none\.ply"):
         read_points(tmp_path / "none.ply")
     with pytest.raises(RefusedInputError, match="cannot be read"):
         read_points(tmp_path)

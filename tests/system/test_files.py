@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import signal
 import socket
 import stat
@@ -17,7 +18,7 @@ import pytest
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.system import files
-from clrecon.system.files import check_writable, replace_file
+from clrecon.system.files import check_writable, replace_file, stage_file
 
 pytestmark = [
     pytest.mark.unit,
@@ -107,6 +108,22 @@ def test_system_errors(older, code, words):
     assert "\n" not in str(caught.value) and str(older) in str(caught.value)
     assert caught.value.exit_code == 6
     check_untouched(older)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
+def test_a_folder_of_the_system_takes_no_files():
+    with pytest.raises(
+        OutputError, match="cannot write /proc/a.stl: files cannot be made in this folder: choose another"
+    ):
+        check_writable("/proc/a.stl")
+
+
+def test_a_folder_that_vanishes_is_said(tmp_path):
+    target = tmp_path / "folder" / "a.stl"
+    target.parent.mkdir()
+    with pytest.raises(OutputError, match="vanished"), stage_file(target, lambda stream: stream.write(b"1")) as staged:
+        shutil.rmtree(target.parent)
+        staged.commit()
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), UsageError("no"), RuntimeError("no"), SystemExit(3)])

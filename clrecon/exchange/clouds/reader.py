@@ -32,7 +32,7 @@ def read_raw_cloud(path: str | os.PathLike[str]) -> RawCloud:
         with open_regular(file) as stream:
             start = stream.read(_START_BYTES)
     except FileNotFoundError as error:
-        raise UsageError(f"there is no cloud {name}") from error
+        raise UsageError(f"there is no cloud {escape_text(str(path), 200)}") from error
     except OSError as error:
         raise RefusedInputError(f"{name} cannot be read: {error.strerror or error}") from error
     if start[:3] == b"ply" and start[3:4] in (b"\n", b"\r", b" "):

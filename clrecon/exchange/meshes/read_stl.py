@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
 from clrecon.exchange.clouds.raw_cloud import say_cut
+from clrecon.exchange.coordinates import find_places
 from clrecon.exchange.meshes.raw_mesh import RawMesh
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
@@ -84,16 +85,5 @@ def join_corners(corners: NDArray[np.floating]) -> tuple[NDArray[np.floating], N
         In the order in which they occur first.
     triangles : ndarray, shape (m, 3), int64
     """
-    mixed = np.zeros(len(corners), np.uint64)
-    for column in corners.T:
-        mixed = (mixed ^ (column + column.dtype.type(0)).view(f"u{column.dtype.itemsize}")) * np.uint64(
-            0x9E3779B97F4A7C15
-        )
-        mixed ^= mixed >> np.uint64(29)
-    _, first, place = np.unique(mixed, return_index=True, return_inverse=True)
-    if not np.array_equal(corners[first][place], corners):  # two places with one sum, or NaN
-        _, first, place = np.unique(corners, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first, kind="stable")
-    number = np.empty(len(first), np.int64)
-    number[order] = np.arange(len(first))
-    return corners[first[order]], number[place.reshape(-1)].reshape(-1, 3)
+    first, place = find_places(corners)
+    return corners[first], place.reshape(-1, 3)

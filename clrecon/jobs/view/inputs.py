@@ -117,7 +117,7 @@ def _tell_kind(path: str | Path) -> str:
     if suffix not in MESH_INPUTS and not is_cloud_file(file):
         return "scan"
     if not file.is_file():
-        raise UsageError(f"{escape_text(file.name)}: there is no file of that name")
+        raise UsageError(f"{escape_text(str(path), 200)}: there is no file of that name")
     if suffix == ".ply":
         from clrecon.exchange.clouds.read_ply import read_header
 

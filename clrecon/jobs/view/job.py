@@ -145,7 +145,7 @@ def _check_inputs(inputs: Sequence[str | Path], output: str | Path, settings: Vi
     scans = [path for path in inputs if not is_mesh_file(path)]
     for path in inputs:
         if is_mesh_file(path) and not Path(path).is_file():
-            raise UsageError(f"{escape_text(Path(path).name)}: there is no file of that name")
+            raise UsageError(f"{escape_text(str(path), 200)}: there is no file of that name")
     changed = [
         own.name
         for own in fields(MeshSettings)

@@ -24,6 +24,7 @@ from clrecon.rendering.looks.slicer_files import (
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.looks.transfer_text import FORMAT, VERSION
 from clrecon.system.regular_files import read_regular
+from clrecon.system.text import escape_text
 
 __all__ = ["load_transfer_function"]
 
@@ -85,7 +86,7 @@ def _read(path: Path, shown: str) -> bytes:
     try:
         status = path.stat()
     except FileNotFoundError:
-        raise _Choice(f"there is no file {shown} with a transfer function") from None
+        raise _Choice(f"there is no file {escape_text(str(path), 200)} with a transfer function") from None
     except (OSError, ValueError) as error:
         raise RefusedInputError(f"it cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if stat.S_ISDIR(status.st_mode):

@@ -76,7 +76,7 @@ def _read_text(file: Path, shown: str) -> str:
     try:
         return read_regular(file, LARGEST_BYTES).decode("utf-8-sig")
     except FileNotFoundError as error:
-        raise UsageError(f"there is no file {shown} with the points of a centre line") from error
+        raise UsageError(f"there is no file {escape_text(str(file), 200)} with the points of a centre line") from error
     except OSError as error:
         raise RefusedInputError(f"the points cannot be read from {shown}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:

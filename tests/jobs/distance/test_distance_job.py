@@ -122,7 +122,7 @@ def test_the_picture_shows_red_ends_and_its_scale(device: Any, files: dict[str, 
     ("extra", "code", "words"),
     [
         ([], 3, "required"),
-        (["no.stl"], 3, "there is no mesh no.stl"),
+        (["folder/no.stl"], 3, "there is no mesh folder/no.stl"),
         (["B", "-o", "x.stl"], 3, ".ply"),
         (["B", "--picture", "x.gif"], 3, ".png"),
         (["B", "-o", "no/x.ply"], 6, "no"),

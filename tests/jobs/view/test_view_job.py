@@ -122,7 +122,7 @@ def test_the_mesh_job_writes_pages_too(tmp_path, device):
         (["{a}", "--html", "{page}", "--name", "a", "--name", "b"], "2 names for 1 input"),
         (["{a}", "--html", "{page}", "--name", " "], "a name has 1 to 80 printable characters"),
         (["{a}", "--html", "{page}", "--mesh-space", "abc"], "unknown space"),
-        (["gone.stl", "--html", "{page}"], "gone.stl: there is no file of that name"),
+        (["folder/gone.stl", "--html", "{page}"], "folder/gone.stl: there is no file of that name"),
         (["{a}", "--html", "{page}", "--label", "L1"], "--labels FILE"),
     ],
 )

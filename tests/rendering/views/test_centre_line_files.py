@@ -92,5 +92,5 @@ def test_files_that_cannot_be_read_are_refused(tmp_path):
     for name, says in [("bytes.txt", "no text"), (".", "cannot be read")]:
         with pytest.raises(RefusedInputError, match=says):
             read_curve_points(tmp_path / name)
-    with pytest.raises(UsageError, match="there is no file"):
+    with pytest.raises(UsageError, match=r"there is no file .*/"):
         read_curve_points(tmp_path / "absent.txt")
