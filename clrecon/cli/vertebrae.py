@@ -15,6 +15,7 @@ from clrecon.system.text import count_of
 __all__ = ["add_arguments", "run"]
 
 PARTLY = 8
+_NAMING = "numbers, counted from the head. Look at the picture and name levels with --first T1 or --name-at X,Y,Z=L3"
 
 _EPILOG = """\
 A first guess for the chest and the loin of an adult: look at the picture, and correct the map before it is used, for
@@ -24,9 +25,11 @@ is needed.
 
 examples:
   clrecon vertebrae CT_FOLDER -o spine.nii.gz
+  clrecon vertebrae CT_FOLDER -o spine.nii.gz --first T12
   clrecon vertebrae CT_FOLDER -o spine.dcm --name-at -2,-156,-449=L3
   clrecon vertebrae CT_FOLDER -o spine.nii.gz --seed -2,-156,-449 --seed -2,-154,-412 --keep-unsure
-  clrecon mesh CT_FOLDER -o l3.stl --labels spine.nii.gz --label L3"""
+  clrecon mesh CT_FOLDER -o l3.stl --labels spine.nii.gz --label L3
+  (a label has the name of a level after --first or --name-at; without them it is --label vertebra_4)"""
 
 
 def _parse_name(text: str) -> tuple[tuple[float, ...], str]:
@@ -75,7 +78,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--name-at",
         type=_parse_name,
         metavar="X,Y,Z=L3",
-        help="the level of the vertebra at this point (LPS mm); without it they are numbered from the head",
+        help="name the level of the vertebra at this point (LPS mm), and from it all others",
+    )
+    group.add_argument(
+        "--first",
+        metavar="LEVEL",
+        help="name the level of the uppermost vertebra that is found (T1), and from it all others; without --first and"
+        " --name-at they are numbered from the head",
     )
     group.add_argument(
         "--keep-unsure", action="store_true", help="write vertebrae of which the search is not sure, too"
@@ -93,7 +102,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.vertebrae.settings import VertebraeSettings
 
     reading = ("series", "phase", "allow_gaps", "force", "follow_links")
-    names = ("level", "seeds", "name_at", "keep_unsure", "keep_ids")
+    names = ("level", "seeds", "name_at", "first", "keep_unsure", "keep_ids")
     settings = VertebraeSettings(**pick(options, (*reading, *names)))
     with_picture = options.picture is not None or not getattr(options, "streams_output", False)  # beside what?
     report = make_vertebrae(
@@ -109,6 +118,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
     console.result(report)
     for line in _describe(report):
         console.say(line)
+    if settings.name_at is None and settings.first is None:
+        console.say(f"names    {_NAMING}")
     console.say(f"wrote    {printable(options.output)}, {megabytes(report['output']['bytes'])}")
     if with_picture:
         console.say(f"picture  {printable(options.picture or picture_beside(options.output))}: look at it")

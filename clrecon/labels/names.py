@@ -93,7 +93,10 @@ def find_number(label: str | int, names: Mapping[int, str], present: Collection[
         )
     if not named or named[0] not in present:
         what = "is not in the label map" if not named or named[0] not in names else "has no voxel in the label map"
-        raise UsageError(f"label '{escape_text(text)}' {what}; there are: {list_labels(names, present)}")
+        advice = ""
+        if _level(text) is not None and any(re.fullmatch(r"vertebra_[0-9]+", name) for name in names.values()):
+            advice = ". These are numbers and no levels: give clrecon vertebrae the level of one of them"
+        raise UsageError(f"label '{escape_text(text)}' {what}; there are: {list_labels(names, present)}{advice}")
     return named[0]
 
 

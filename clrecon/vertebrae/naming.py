@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 from clrecon.errors import UsageError
+from clrecon.system.wording import name_parameter
 
-__all__ = ["LEVELS", "check_level", "name_levels"]
+__all__ = ["LEVELS", "check_landmark", "name_levels"]
 
 LEVELS = (
     *(f"C{n}" for n in range(1, 8)), *(f"T{n}" for n in range(1, 13)), *(f"L{n}" for n in range(1, 7))
@@ -28,6 +30,22 @@ def check_level(name: str) -> str:
     return level
 
 
+def check_landmark(name_at: tuple[Sequence[float], str] | None, first: str | None) -> str | None:
+    """Return the level of the landmark as `LEVELS` has it, None without one.
+
+    Raises
+    ------
+    UsageError
+        There is no such level, or there are two landmarks.
+    """
+    if name_at is not None and first is not None:
+        raise UsageError(
+            f"{name_parameter('first')} and {name_parameter('name_at')} both name levels: give one of them"
+        )
+    level = first if name_at is None else name_at[1]
+    return None if level is None else check_level(level)
+
+
 def name_levels(count: int, given: tuple[int, str] | None) -> dict[int, str]:
     """Return the number in the label map and the name of each of `count` vertebrae, from the head downwards.
 
@@ -46,9 +64,15 @@ def name_levels(count: int, given: tuple[int, str] | None) -> dict[int, str]:
         return {n: f"vertebra_{n}" for n in range(1, count + 1)}
     place, level = given
     first = LEVELS.index(level) - place
-    if first < 0 or first + count > len(LEVELS):
+    if first < 0:
         raise UsageError(
-            f"with {level} at that point, {place} vertebrae above it and {count - 1 - place} below it need names,"
-            " and C1 to L6 are not enough: look at the picture of the discs and name another"
+            f"{place} vertebrae were found above {level}, and there are only {place + first} levels above {level}:"
+            " look at the picture and name another level"
+        )
+    if first + count > len(LEVELS):
+        raise UsageError(
+            f"{count - place} vertebrae were found from {level} downwards, and there are only"
+            f" {len(LEVELS) - first - place} levels from {level} to {LEVELS[-1]}: look at the picture and name another"
+            " level"
         )
     return {first + n + 1: LEVELS[first + n] for n in range(count)}

@@ -30,7 +30,7 @@ from clrecon.vertebrae.discs import (
     look_at_bodies,
 )  # fmt: skip
 from clrecon.vertebrae.judge import SURE, Piece, beside_share, judge, weigh
-from clrecon.vertebrae.naming import check_level, name_levels
+from clrecon.vertebrae.naming import check_landmark, name_levels
 from clrecon.vertebrae.regions import cut_part, divide, fill_bone, planes_of
 from clrecon.vertebrae.result import MiddlePlane, Vertebra, VertebraSplit
 
@@ -66,6 +66,7 @@ def split_vertebrae(
     level: float | None = None,
     seeds: ArrayLike | None = None,
     name_at: tuple[Sequence[float], str] | None = None,
+    first: str | None = None,
     keep_unsure: bool = False,
     progress: Progress | None = None,
 ) -> VertebraSplit:
@@ -85,7 +86,10 @@ def split_vertebrae(
         one disc between each two.
     name_at : ((x, y, z), str), optional
         A point in LPS mm in a vertebra, and its level (``"L3"``): the others are named from there, and numbered as in
-        the VerSe data set (C1 is 1, T1 is 8, L1 is 20).  Without it they are numbered from the head.
+        the VerSe data set (C1 is 1, T1 is 8, L1 is 20).
+    first : str, optional
+        The level of the uppermost vertebra that is found (``"T1"``), cut or not: the others are named from there, as
+        with ``name_at``.  Without both they are numbered from the head.
     keep_unsure : bool
         True: the label map has vertebrae of which the search is not sure, too.
     progress : callable, optional
@@ -98,14 +102,15 @@ def split_vertebrae(
     Raises
     ------
     UsageError
-        A parameter is impossible, or ``name_at`` is in no vertebra.
+        A parameter is impossible, ``name_at`` is in no vertebra, or there are more vertebrae than levels to name.
     RefusedInputError
         No spine, fewer than two discs, or no vertebra of which the search is sure.
     """
     progress = progress or ignore_progress
     _check(volume, level)
     points = None if seeds is None else _checked_seeds(seeds)
-    named = None if name_at is None else (checked_points([name_at[0]])[0], check_level(name_at[1]))
+    level_name = check_landmark(name_at, first)
+    landmark = None if name_at is None else checked_points([name_at[0]])[0]
     progress("canal", 0, 1)
     line = _canal_points(volume, points, progress)
     progress("vertebrae", 0, 4)
@@ -122,8 +127,8 @@ def split_vertebrae(
     behind = pieces[(part.ahead < -ARCH_BEHIND_MM) & (np.abs(part.aside) < ARCH_ASIDE_MM)]
     arches = np.asarray(voxel_ml * np.bincount(behind, minlength=len(found.bounds) + 2), dtype=np.float64)
     spans, left_out = _spans(found, pieces, doubtful, arches, voxel_ml, hu)
-    place = None if named is None else _place_of(named[0], spans, found, volume, part.first, pieces)
-    names = name_levels(len(spans), None if named is None or place is None else (place, named[1]))
+    place = 0 if landmark is None else _place_of(landmark, spans, found, volume, part.first, pieces)
+    names = name_levels(len(spans), None if level_name is None else (place, level_name))
     vertebrae = _judge_all(spans, names, found)
     kept = {one.number: one.name for one in vertebrae if one.is_sure or keep_unsure}
     if not kept:

@@ -13,6 +13,7 @@ from house import ROOT
 from label_files import write_nrrd
 
 import clrecon
+from clrecon.cli.main import main
 from clrecon.jobs.phantom import make_phantom
 
 SMALLER = {
@@ -51,6 +52,22 @@ def test_the_example_of_the_readme_runs(folder, device, monkeypatch):
     exec(compile(block_of("README.md").replace('"CT_FOLDER"', '"ct"'), "README.md", "exec"), made)
     assert made["mesh"].quality()["closed"] and made["choice"].method == "auto"
     assert {"bone.stl", "spine.png"} <= {path.name for path in folder.iterdir()}
+
+
+def test_vertebrae_of_the_readme_are_named_so_that_the_next_command_finds_l3(folder, device, monkeypatch):
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    chain = re.search(r"^    (clrecon vertebrae .*)\n    (clrecon mesh .* --label L3)$", text, re.MULTILINE)
+    assert chain is not None
+    make_phantom(folder / "loin", levels="T12-L3", facet_gap_mm=0.0, size="112", spacing=(2.0, 2.0, 2.5))
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
+    for command in chain.groups():
+        assert main([*command.replace("CT_FOLDER", "loin").split()[1:], "-q"]) == 0
+    truth = clrecon.read_labels("loin/levels.nrrd")
+    l3 = truth.ijk_to_lps(np.argwhere(truth.voxels == truth.find("L3"))[:, ::-1])
+    found = clrecon.read_mesh("l3.stl").vertices
+    assert np.abs(found.mean(axis=0) - l3.mean(axis=0)).max() < 5.0
+    assert found[:, 2].min() > l3[:, 2].min() - 5.0 and found[:, 2].max() < l3[:, 2].max() + 5.0
 
 
 def test_the_tour_runs(folder, device, monkeypatch):

@@ -86,13 +86,22 @@ def test_a_named_point_names_all_and_numbers_them_as_verse_does() -> None:
     assert np.array_equal(named.labels.voxels, same)
 
 
+def test_the_level_of_the_uppermost_vertebra_names_all() -> None:
+    named = clrecon.split_vertebrae(phantom("T12-L3")[0], first="t12")
+    assert named.labels.names == {19: "T12", 20: "L1", 21: "L2", 22: "L3"}
+    assert [one.name for one in named.vertebrae] == ["T12", "L1", "L2", "L3"]
+
+
 @pytest.mark.parametrize(
     ("choice", "words"),
     [
         ({"name_at": ((0.0, -100.0, 5000.0), "L1")}, "no vertebra at"),
         ({"name_at": ((0.0, -100.0, -400.0), "L9")}, "no vertebra 'L9'"),
-        ({"name_at": ("seed", "C1")}, "above it"),
-        ({"name_at": ("seed", "L6")}, "below it"),
+        ({"name_at": ("seed", "C1")}, "^1 vertebrae were found above C1, and there are only 0 levels above C1"),
+        ({"name_at": ("seed", "L5")}, "^3 vertebrae were found from L5 .*, and there are only 2 levels from L5 to L6"),
+        ({"first": "L4"}, "^4 vertebrae were found from L4 .*, and there are only 3 levels from L4 to L6"),
+        ({"first": "S1"}, "no vertebra 'S1': they are C1 to C7"),
+        ({"first": "T12", "name_at": ((0.0, -150.0, -400.0), "L1")}, "^first and name_at both name levels"),
         ({"level": float("nan")}, "number of HU"),
         ({"seeds": [(0.0, -150.0, -400.0)]}, "at least two"),
         ({"seeds": [(0.0, -150.0, -400.0), (3.0, -150.0, -400.0)]}, "same height"),

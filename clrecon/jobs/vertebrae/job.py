@@ -86,6 +86,7 @@ def make_vertebrae(
         level=settings.level,
         seeds=list(settings.seeds) or None,
         name_at=settings.name_at,
+        first=settings.first,
         keep_unsure=settings.keep_unsure,
         progress=progress,
     )

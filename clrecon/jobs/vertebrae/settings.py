@@ -26,6 +26,8 @@ class VertebraeSettings(Selection):
         Points in LPS mm, one in the body of each vertebra, in place of the search for discs.
     name_at : ((x, y, z), str), optional
         A point in LPS mm and the level of the vertebra there.
+    first : str, optional
+        Level of the uppermost vertebra that is found; not together with `name_at`.
     keep_unsure : bool
         Write vertebrae of which the search is not sure, too.
     keep_ids : bool
@@ -40,11 +42,12 @@ class VertebraeSettings(Selection):
     level: float | None = None
     seeds: Sequence[Sequence[float]] = ()
     name_at: tuple[Sequence[float], str] | None = None
+    first: str | None = None
     keep_unsure: bool = False
     keep_ids: bool = False
 
     def __post_init__(self) -> None:
-        from clrecon.vertebrae.naming import check_level
+        from clrecon.vertebrae.naming import check_landmark
 
         if self.level is not None and not math.isfinite(self.level):
             raise UsageError(f"the level of bone is a number of HU, not {self.level!r}")
@@ -54,5 +57,4 @@ class VertebraeSettings(Selection):
                 raise UsageError(f"a point is three numbers in mm, not {list(point)!r}")
         if len(self.seeds) == 1:
             raise UsageError("one seed is too few: give a point in each vertebra, two at least")
-        if self.name_at is not None:
-            check_level(self.name_at[1])
+        check_landmark(self.name_at, self.first)

@@ -56,6 +56,23 @@ def test_a_run_writes_map_picture_and_report(written: Path) -> None:
     assert len(np.split(rows, np.flatnonzero(np.diff(rows) > 20) + 1)) >= 2  # one line a disc at least
 
 
+def test_without_a_landmark_the_command_says_how_to_name_levels(
+    scan: Path, written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.nii.gz"
+    assert main(["vertebrae", str(scan), "-o", str(path)]) == 0
+    assert "numbers, counted from the head" in capsys.readouterr().out
+    mesh = ["mesh", str(scan), "-o", str(tmp_path / "a.stl"), "--labels"]
+    assert main([*mesh, str(path), "--label", "L3"]) == 3
+    assert "1 vertebra_1, 2 vertebra_2, 3 vertebra_3. These are numbers and no levels" in capsys.readouterr().err
+    assert main(["vertebrae", str(scan), "-o", str(path), "--first", "l1"]) == 0
+    assert "numbers, counted from the head" not in capsys.readouterr().out
+    assert read_labels(path).names == {20: "L1", 21: "L2", 22: "L3"}
+    assert np.array_equal(
+        np.where(read_labels(path).voxels, read_labels(path).voxels - 19, 0), read_labels(written / "a.nii.gz").voxels
+    )
+
+
 def test_the_segmentation_is_the_same_map(scan: Path, written: Path, tmp_path: Path) -> None:
     report = json.loads((written / "a.json").read_text())
     point = ",".join(str(value) for value in report["vertebrae"][1]["centre_mm"])
@@ -107,6 +124,9 @@ def test_unsure_vertebrae_are_left_out_with_exit_code_8(
         (["-o", "a.nii.gz", "--name-at", "1,2,3=S7"], 3, "no vertebra"),
         (["-o", "a.nii.gz", "--name-at", "1,2,3000=L1"], 3, "no vertebra at"),
         (["-o", "a.nii.gz", "--hu", "nan"], 3, "HU"),
+        (["-o", "a.nii.gz", "--first", "S1"], 3, "no vertebra 'S1'"),
+        (["-o", "a.nii.gz", "--first", "L5"], 3, "3 vertebrae were found from L5"),
+        (["-o", "a.nii.gz", "--first", "T1", "--name-at", "1,2,3=L1"], 3, "--first and --name-at both name levels"),
     ],
 )
 def test_wrong_usage_is_one_line_and_writes_nothing(
