@@ -17,14 +17,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.anatomy.body_cells import PIECE, Cells, Mask, count_cells, grow, measure_cells
-from clrecon.anatomy.dense_pieces import BONE_KEPT, DensePieces, find_dense_pieces, judge_bone, judge_circle
+from clrecon.anatomy.dense_pieces import (
+    BONE_KEPT,
+    DensePieces,
+    Piece,
+    find_boneless,
+    find_dense_pieces,
+    find_removed,
+    judge_bone,
+    judge_circle,
+)
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.volume import AIR_HU, Volume
 from clrecon.system.pieces import in_threads
 from clrecon.system.progress import Progress, Steps
+from clrecon.system.text import say_ml
+from clrecon.system.wording import name_parameter
 
-__all__ = ["BODY_STEPS", "find_body", "find_unmeasured", "mask_field_of_view", "remove_table"]
+__all__ = ["BODY_STEPS", "describe_pieces", "find_body", "find_unmeasured", "mask_field_of_view", "remove_table"]
 
 TISSUE_HU = -300.0
 """Cells above this are tissue: the value lies between that of blankets or foam and that of fat."""
@@ -75,7 +86,10 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Pro
     Volume
         A volume with the same places; ``report["remove_table"]`` has ``voxels_removed``, ``dense_voxels_removed``
         (above -300 HU), ``removed_share`` (of all voxels), ``body_share``, ``air_hu`` and the facts of ``judge_bone``;
-        ``report["gates"]`` has the gate ``bone_kept`` too.
+        ``bone_removed`` lists the largest pieces of bone that were removed, each with its ``voxels`` above 300 HU,
+        ``ml`` and ``at_mm``, LPS mm of its middle.  ``kept_without_bone`` lists pieces apart from the body that were
+        kept and hold no bone, such as paddles of a fixation mask, in the same way.  ``report["gates"]`` has the gate
+        ``bone_kept`` too.
 
     Raises
     ------
@@ -87,11 +101,13 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Pro
     cells = measure_cells(volume, steps.take_slice)
     body, pieces = _find_body(cells, steps)
     bone, gate = judge_bone(cells, pieces, body)
+    removed = _place_pieces(volume, cells, find_removed(cells, pieces, body))
     if gate["ok"] is False and not allow_bone_loss:
         raise RefusedInputError(
             f"the table cannot be told from the body: of {bone['bone_voxels']:,} voxels of bone above 300 HU"
-            f" {bone['bone_voxels_removed']:,} would go with it, bone_kept {bone['bone_kept']:.3f} and at least"
-            f" {BONE_KEPT:g} is needed; leave the table in, or allow the loss of bone"
+            f" {bone['bone_voxels_removed']:,} would be removed with it (bone_kept {bone['bone_kept']:.3f}, at least"
+            f" {BONE_KEPT:g} is needed): {describe_pieces(removed)}; leave the table in, or, where this is no bone,"
+            f" use {name_parameter('allow_bone_loss', True)}"
         )
     step = cells.step
 
@@ -99,10 +115,29 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Pro
         nk, nj, ni = volume.voxels.shape
         return np.asarray(~np.repeat(np.repeat(body[k // step[2]], step[1], 0), step[0], 1)[:nj, :ni])
 
-    said = {"body_share": round(float(body.mean()), 4), **bone}
+    said = {"body_share": round(float(body.mean()), 4), **bone, "bone_removed": removed}
+    boneless = [] if pieces.specimen else find_boneless(cells, body, cells.mean > TISSUE_HU)
+    said["kept_without_bone"] = _place_pieces(volume, cells, boneless)
     masked = _turn_into_air(volume, outside, "remove_table", said, steps)
     masked.report = amend(masked.report, gates=[*masked.report.get("gates", []), gate])
     return masked
+
+
+def _place_pieces(volume: Volume, cells: Cells, pieces: list[Piece]) -> list[dict[str, Any]]:
+    return [
+        {
+            "voxels": voxels,
+            "ml": round(voxels * cells.voxel_ml, 4),
+            "at_mm": [round(float(x), 1) for x in volume.ijk_to_lps([ijk])[0]],
+        }
+        for voxels, ijk in pieces
+    ]
+
+
+def describe_pieces(pieces: list[dict[str, Any]]) -> str:
+    """Say how large pieces are and where: ``8.2 ml around (140, 10, -4) mm LPS``."""
+    places = (", ".join(f"{x:.0f}" for x in piece["at_mm"]) for piece in pieces)
+    return ", ".join(f"{say_ml(piece['ml'])} around ({at}) mm LPS" for piece, at in zip(pieces, places, strict=True))
 
 
 def mask_field_of_view(volume: Volume, radius_mm: float | None = None, *, progress: Progress | None = None) -> Volume:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from clrecon.geometry.volume import Volume
 from clrecon.system.pieces import in_threads
 
-__all__ = ["DENSE_HU", "HARD_HU", "PIECE", "Cells", "Mask", "count_cells", "grow", "measure_cells"]
+__all__ = ["DENSE_HU", "HARD_HU", "METAL_HU", "PIECE", "Cells", "Mask", "count_cells", "grow", "measure_cells"]
 
 Mask = NDArray[np.bool_]
 
@@ -25,6 +25,8 @@ DENSE_HU = 300.0
 """Bone has voxels above this; plastic and carbon fibre may have them too."""
 HARD_HU = 600.0
 """Compact bone, teeth and metal have voxels above this; plastic and carbon fibre have none (560 HU at most)."""
+METAL_HU = 2200.0
+"""Metal has voxels above this; of bone only the enamel of teeth and a few voxels of the densest cortex."""
 
 PIECE = 4
 """Slices that a thread works out together."""
@@ -38,8 +40,8 @@ class Cells:
     ----------
     mean : ndarray, shape (ck, cj, ci), float32
         Mean HU; cells at the far ends may hold fewer voxels.
-    dense, hard : ndarray, shape (ck, cj, ci), uint16 or wider
-        Number of voxels above `DENSE_HU` and above `HARD_HU`; the type holds the number of voxels of a full cell.
+    dense, hard, metal : ndarray, shape (ck, cj, ci), uint16 or wider
+        Number of voxels above `DENSE_HU`, `HARD_HU` and `METAL_HU`; the type holds the number of voxels of a full cell.
     step : (int, int, int)
         Number of voxels of a cell along i, j, k.
     size_mm : (float, float, float)
@@ -49,6 +51,7 @@ class Cells:
     mean: NDArray[np.float32]
     dense: NDArray[np.unsignedinteger[Any]]
     hard: NDArray[np.unsignedinteger[Any]]
+    metal: NDArray[np.unsignedinteger[Any]]
     step: tuple[int, int, int]
     size_mm: tuple[float, float, float]
 
@@ -91,15 +94,15 @@ def measure_cells(volume: Volume, done: Callable[[slice], None] | None = None) -
     shape = count_cells(volume)
     mean = np.empty(shape, dtype=np.float32)
     # A cell of micro-CT has more voxels than 16 bits count.
-    counts = np.promote_types(np.uint16, np.min_scalar_type(si * sj * sk))
-    dense, hard = np.zeros(shape, dtype=counts), np.zeros(shape, dtype=counts)
+    dtype = np.promote_types(np.uint16, np.min_scalar_type(si * sj * sk))
+    dense, hard, metal = (np.zeros(shape, dtype=dtype) for _ in range(3))
 
     def measure(where: slice) -> None:
         for place in range(where.start, where.stop):
             first, end = place * sk, min((place + 1) * sk, nk)
             slab = volume.voxels[first:end]
             mean[place] = _sum_blocks(slab, sj, si) / (end - first)
-            _count_dense(slab, dense[place], hard[place], sj, si)
+            _count_dense(slab, {DENSE_HU: dense[place], HARD_HU: hard[place], METAL_HU: metal[place]}, sj, si)
             volume.release_slices(first, end)
 
     in_threads(measure, shape[0], PIECE, done)
@@ -107,7 +110,7 @@ def measure_cells(volume: Volume, done: Callable[[slice], None] | None = None) -
         widths = np.diff(np.append(np.arange(0, size, step), size)).astype(np.float32)
         mean /= widths.reshape([-1 if place == axis else 1 for place in range(3)])
     di, dj, dk = volume.spacing
-    return Cells(mean, dense, hard, (si, sj, sk), (si * di, sj * dj, sk * dk))
+    return Cells(mean, dense, hard, metal, (si, sj, sk), (si * di, sj * dj, sk * dk))
 
 
 def _sum_blocks(slab: NDArray[Any], sj: int, si: int) -> NDArray[np.float32]:
@@ -127,17 +130,18 @@ def _sum_blocks(slab: NDArray[Any], sj: int, si: int) -> NDArray[np.float32]:
     return blocks
 
 
-def _count_dense(slab: NDArray[Any], dense: NDArray[Any], hard: NDArray[Any], sj: int, si: int) -> None:
-    """Count the voxels of a slab above `DENSE_HU` and `HARD_HU` in each cell, into zeros."""
+def _count_dense(slab: NDArray[Any], counts: dict[float, NDArray[Any]], sj: int, si: int) -> None:
+    """Count the voxels of a slab above each bound in each cell, into zeros; `DENSE_HU` is the lowest bound."""
     # Few voxels are dense: counting them one by one costs less than sums over all voxels.
     _, nj, ni = slab.shape
     place = np.flatnonzero(slab > DENSE_HU)
     if not len(place):
         return
-    cell = (place // ni % nj // sj) * dense.shape[1] + place % ni // si
-    is_hard = slab.reshape(-1)[place] > HARD_HU
-    for counts, chosen in ((dense, cell), (hard, cell[is_hard])):
-        counts[...] = np.bincount(chosen, minlength=counts.size).reshape(counts.shape)
+    columns = counts[DENSE_HU].shape[1]
+    cell = (place // ni % nj // sj) * columns + place % ni // si
+    values = slab.reshape(-1)[place]
+    for bound, count in counts.items():
+        count[...] = np.bincount(cell[values > bound], minlength=count.size).reshape(count.shape)
 
 
 def grow(mask: Mask, cells: float) -> Mask:

@@ -22,11 +22,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.anatomy.body_cells import DENSE_HU, Cells, Mask
+from clrecon.anatomy.equipment import find_equipment
 from clrecon.system.gates import Gate, at_least, unmeasured
 
-__all__ = ["BONE_KEPT", "DensePieces", "find_dense_pieces", "judge_bone", "judge_circle"]
+__all__ = [
+    "BONE_KEPT",
+    "DensePieces",
+    "find_boneless",
+    "find_dense_pieces",
+    "find_removed",
+    "judge_bone",
+    "judge_circle",
+]
 
 Float64Array = NDArray[np.float64]
+Piece = tuple[int, tuple[float, ...]]
+"""Number of voxels of a piece, and its middle, ijk."""
 
 BONE_KEPT = 0.98
 """Least share of the bone that must stay; if less stays, the body was not found."""
@@ -57,6 +68,10 @@ LONG_MM = 150.0
 """Thin pieces without hard voxels beside a specimen, and wide thin plates, are equipment from this length on."""
 GROWTH_MM = 6.0
 """Less dense tissue that touches a bone of a specimen belongs to the bone up to this distance."""
+MOST_SAID = 3
+"""Most pieces that are named."""
+BONELESS_ML = 3.0
+"""Smaller pieces of the body without bone are not named."""
 INSIDE, HARD_INSIDE = 0.5, 0.25
 """Least share of a piece that lies within the body if the piece belongs to the patient; for hard pieces the second,
 lower value."""
@@ -146,7 +161,7 @@ def _of_patient(cells: Cells, tissue: Mask, body: Mask) -> DensePieces:
 
     Pieces that lie mostly within the body are added.  Hard pieces that partly reach into it count as bone.  A hard
     piece apart from the body counts too, unless it is a cable or as straight as a table.  A large piece of this kind is
-    also added, as a second body.
+    also added, as a second body.  Bars and metal beside the body are neither, see `clrecon.anatomy.equipment`.
     """
     pieces = _label(cells, cells.dense > 0)
     hard = pieces.is_hard
@@ -154,6 +169,7 @@ def _of_patient(cells: Cells, tissue: Mask, body: Mask) -> DensePieces:
     added = (inside >= INSIDE) | (hard & (inside >= HARD_INSIDE))
     straight = np.broadcast_to((tissue & ~body).mean(axis=0) >= STRAIGHT_SHARE, body.shape)
     loose = hard & ~added & (pieces.share_in(cells, straight) < 0.5)
+    loose &= ~find_equipment(cells, pieces.labels, loose, tissue)
     apart = loose & (inside == 0.0)
     if apart.any():
         apart &= (_thickness(cells, pieces, apart) > CABLE_MM) | (pieces.dense * cells.voxel_ml > CABLE_ML)
@@ -290,6 +306,51 @@ def judge_bone(cells: Cells, pieces: DensePieces, kept: Mask) -> tuple[dict[str,
     if share is None:
         return facts, unmeasured("bone_kept", BONE_KEPT, None, f"no bone above {DENSE_HU:g} HU")
     return facts, at_least("bone_kept", share, BONE_KEPT, None, what)
+
+
+def find_removed(cells: Cells, pieces: DensePieces, kept: Mask) -> list[Piece]:
+    """Return the largest pieces of bone that are removed.
+
+    Parameters
+    ----------
+    cells, pieces, kept
+        As for `judge_bone`.
+    """
+    lost = _label(cells, pieces.counted & ~kept)
+    return _list_largest(cells, lost.labels, lost.dense, cells.dense)
+
+
+def find_boneless(cells: Cells, kept: Mask, tissue: Mask) -> list[Piece]:
+    """Return the largest pieces of the body that hold no bone, beside others that do.
+
+    Parameters
+    ----------
+    cells : Cells
+    kept : ndarray, shape (ck, cj, ci), bool
+        The body with its margin.
+    tissue : ndarray, shape (ck, cj, ci), bool
+        Cells that are not air.
+    """
+    parts = _label(cells, kept)
+    has_bone = parts.is_hard & (parts.hard > 0.0)
+    if not has_bone.any():
+        return []
+    voxels = _sum_by(parts.labels, math.prod(cells.step) * tissue, len(has_bone) - 1)
+    voxels[has_bone | (voxels * cells.voxel_ml < BONELESS_ML)] = 0.0
+    return _list_largest(cells, parts.labels, voxels, tissue)
+
+
+def _list_largest(cells: Cells, labels: NDArray[np.int32], voxels: Float64Array, weights: NDArray[Any]) -> list[Piece]:
+    """Return the pieces with the most voxels, at most `MOST_SAID`, with their middles."""
+    from scipy import ndimage
+
+    found = []
+    for number in np.argsort(-voxels, kind="stable")[:MOST_SAID]:
+        if voxels[number]:
+            middle = ndimage.center_of_mass(weights, labels, int(number))[::-1]
+            ijk = tuple((place + 0.5) * step - 0.5 for place, step in zip(middle, cells.step, strict=True))
+            found.append((int(voxels[number]), ijk))
+    return found
 
 
 def judge_circle(cells: Cells, inside: Mask) -> tuple[dict[str, Any], Gate]:

@@ -7,7 +7,17 @@ import math
 from collections.abc import Iterable
 from functools import lru_cache
 
-__all__ = ["count_of", "escape_text", "guess_word", "hash_uid", "join_names", "say_digits", "say_hu", "say_unknown"]
+__all__ = [
+    "count_of",
+    "escape_text",
+    "guess_word",
+    "hash_uid",
+    "join_names",
+    "say_digits",
+    "say_hu",
+    "say_ml",
+    "say_unknown",
+]
 
 TEXT_LIMIT = 64
 NAMES_SHOWN = 5
@@ -74,6 +84,11 @@ def say_hu(value: float) -> str:
     if math.isfinite(value) and value == round(value) and abs(value) < LARGEST_HU:
         return str(round(value))
     return say_digits(value)
+
+
+def say_ml(ml: float, digits: int = 3) -> str:
+    """Return a volume with its unit: ml, and mm3 below 0.1 ml."""
+    return f"{say_digits(ml, digits)} ml" if abs(ml) >= 0.1 or ml == 0.0 else f"{say_digits(1000.0 * ml, digits)} mm3"
 
 
 def say_band(low: float, high: float, unit: str = "HU") -> str:

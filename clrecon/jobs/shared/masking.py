@@ -26,7 +26,7 @@ def mask_volume(volume: Volume, settings: InputSettings, progress: Progress) -> 
     """
     if settings.field_of_view is None and not settings.remove_table:
         return volume
-    from clrecon.anatomy.body import mask_field_of_view, remove_table
+    from clrecon.anatomy.body import describe_pieces, mask_field_of_view, remove_table
     from clrecon.geometry.certificate import amend
 
     warnings = list(volume.report.get("warnings", ()))
@@ -47,15 +47,25 @@ def mask_volume(volume: Volume, settings: InputSettings, progress: Progress) -> 
             f" {facts['dense_voxels_removed']:,} of them dense (table, blankets);{_describe_bone(facts)}"
             " look whether the body is whole"
         )
+        if facts["kept_without_bone"]:
+            warnings.append(
+                f"kept beside the body: pieces without bone, {describe_pieces(facts['kept_without_bone'])}; they may be"
+                " equipment as thick as a limb, such as paddles of a fixation mask"
+            )
     volume.report = amend(volume.report, warnings=warnings)
     return volume
 
 
 def _describe_bone(facts: dict[str, Any]) -> str:
+    from clrecon.anatomy.body import describe_pieces
+
     if facts["bone_kept"] is None:
         return " no bone above 300 HU;"
     what = "the dry bone" if facts["specimen"] else "the bone"
-    return f" of {what} {100.0 * facts['bone_kept']:.4g} % stay ({facts['bone_voxels_removed']:,} voxels go);"
+    removed = f"{facts['bone_voxels_removed']:,} voxels removed"
+    if facts["bone_removed"]:
+        removed += f": {describe_pieces(facts['bone_removed'])}"
+    return f" of {what} {100.0 * facts['bone_kept']:.4g} % stay ({removed});"
 
 
 def _describe_cut(facts: dict[str, Any]) -> str:
