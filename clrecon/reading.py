@@ -72,7 +72,7 @@ def read_volume(
     ----------
     path : str or path-like
         A folder of DICOM files, searched with its subfolders; one DICOM file; or a file with a grid and its affine:
-        NIfTI (.nii, .nii.gz, .hdr with .img), NRRD (.nrrd), MetaImage (.mha, .mhd), which needs the
+        NIfTI (.nii, .nii.gz, .hdr with .img), NRRD (.nrrd, .nhdr), MetaImage (.mha, .mhd), which needs the
         package SimpleITK.  Told from the content.
     series : int or str, optional
         Which series of a DICOM folder: its number in the listing (from 1), SeriesInstanceUID, its hash, the start of

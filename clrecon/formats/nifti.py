@@ -80,7 +80,7 @@ def open_nifti(path: Path, purpose: Purpose) -> GridFile:
         slope, intercept = header.parsed.get_slope_inter()
         with np.errstate(over="ignore", invalid="ignore"):  # forms that are not finite are refused
             affine, warnings = nifti_affine(header.parsed, shape, name)
-    except (ValueError, TypeError, KeyError, OverflowError, _header_errors(purpose)) as error:
+    except (ValueError, TypeError, KeyError, OverflowError, _header_error()) as error:
         if isinstance(error, UsageError):
             raise
         raise RefusedInputError(f"{name} has a corrupt NIfTI header: {escape_text(str(error))}") from error
@@ -105,9 +105,11 @@ def _is_gzip(file: BinaryIO) -> bool:
     return start == b"\x1f\x8b"
 
 
-def _header_errors(purpose: Purpose) -> type[Exception]:
-    """Turn errors that nibabel raises about headers into refusals."""
-    return import_extra("nibabel", purpose).spatialimages.HeaderDataError  # type: ignore[no-any-return]
+def _header_error() -> type[Exception]:
+    """Return the error that nibabel raises about headers; a header is there, and so is nibabel."""
+    from nibabel.spatialimages import HeaderDataError
+
+    return cast("type[Exception]", HeaderDataError)
 
 
 def _read_header(stream: BinaryIO, name: str, purpose: Purpose) -> _Header:
@@ -192,7 +194,15 @@ def nifti_affine(header: Any, shape: tuple[int, int, int], name: str) -> tuple[F
     RefusedInputError
         The header has neither form, or the form is not an affine.
     """
-    sform, qform = (_coded(header, which) for which in ("sform", "qform"))
+    warnings = []
+    sform = header.get_sform(coded=True)[0]
+    try:
+        qform = _qform(header)
+    except (ValueError, _header_error()) as error:
+        if sform is None:
+            raise
+        qform = None
+        warnings.append(f"its qform cannot be read ({escape_text(str(error))}): the sform is used")
     chosen = sform if sform is not None else qform
     if chosen is None:
         raise RefusedInputError(
@@ -209,7 +219,6 @@ def nifti_affine(header: Any, shape: tuple[int, int, int], name: str) -> tuple[F
         affine = checked_affine(lps_affine_from_ras(scale @ chosen))
     except UsageError as error:
         raise RefusedInputError(f"{name} cannot be placed: {error}") from error
-    warnings = []
     sides, stated = np.linalg.norm(chosen[:3, :3], axis=0), np.abs(header["pixdim"][1:4]).astype(np.float64)
     if not np.abs(sides - stated).max() <= SPACINGS_DIFFER * sides.max():
         shown = [" x ".join(f"{unit * step:.4g}" for step in steps) for steps in (stated, sides)]
@@ -222,6 +231,9 @@ def nifti_affine(header: Any, shape: tuple[int, int, int], name: str) -> tuple[F
     return affine, warnings
 
 
-def _coded(header: Any, which: str) -> Any:
-    """Return the sform or qform, None where its code is 0."""
-    return getattr(header, f"get_{which}")(coded=True)[0]
+def _qform(header: Any) -> Any:
+    """Return the qform, None where its code is 0; pixdim[0] = 0 means 1, as the definition of NIfTI says."""
+    if header["pixdim"][0] == 0:
+        header = header.copy()
+        header["pixdim"][0] = 1
+    return header.get_qform(coded=True)[0]

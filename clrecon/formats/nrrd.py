@@ -1,7 +1,7 @@
-"""NRRD (.nrrd), header and voxels in one file.
+"""NRRD: .nrrd, and .nhdr with the voxels in one file beside it.
 
-pynrrd parses the header; the voxels are read slice by slice.  A header that points to data in other files is refused: a
-path in a header could name any file.
+pynrrd parses the header; the voxels are read slice by slice.  A path in a header could name any file: only one in the
+folder of the header is read.
 
 Source: the NRRD format definition (teem.sourceforge.net/nrrd/format.html).
 """
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import LABEL_MAP, GridFile, Purpose
-from clrecon.formats.stream import VoxelBytes
+from clrecon.formats.stream import VoxelBytes, file_beside
 from clrecon.geometry.affine import Float64Array, checked_affine, compose_affine
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
@@ -42,6 +42,9 @@ MM_PER_UNIT = {
     **dict.fromkeys(("um", "\u00b5m", "\u03bcm", "micron", "microns", "micrometer", "micrometers"), 0.001),
 }
 """Millimetres of each value of "space units"; mm where it is missing, as other programs read it."""
+
+_DETACHED = re.compile(rb"^data ?file:[ \t]*(.*?)[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
+"""The field of a header whose voxels are in another file."""
 
 TYPES = {
     **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
@@ -77,12 +80,17 @@ def open_nrrd(path: Path, purpose: Purpose) -> GridFile:
     with open_regular(path) as file:
         start = file.read(LARGEST_HEADER)
     end = re.search(rb"\r?\n\r?\n", start)
-    if end is None:
+    text = start if end is None else start[: end.start()]
+    detached = _DETACHED.search(text)
+    if end is None and (detached is None or len(start) == LARGEST_HEADER):
         raise RefusedInputError(f"{name} has no voxels: its NRRD header does not end within {LARGEST_HEADER:,} bytes")
-    header = _parse(start[: end.start()], name, purpose)
+    beside = None if detached is None else _voxel_file(path, detached[1].decode("utf-8", "replace"))
+    header = _parse(text, name, purpose)
     encoding = str(header.get("encoding", "")).lower()
     if encoding not in ("raw", "gzip", "gz"):
         raise RefusedInputError(f"{name} is stored as '{escape_text(encoding)}': raw and gzip are read, write it so")
+    packing = "raw" if encoding == "raw" else "gzip"
+    inside = 0 if end is None else end.end()
     layers, shape = _sizes(header, name, purpose)
     dtype = _dtype(header, name, purpose)
     return GridFile(
@@ -93,7 +101,7 @@ def open_nrrd(path: Path, purpose: Purpose) -> GridFile:
         layers=layers,
         dtype=dtype,
         affine=nrrd_affine(header, name),
-        voxel_bytes=VoxelBytes(path, offset=end.end(), packing="raw" if encoding == "raw" else "gzip"),
+        voxel_bytes=VoxelBytes(path, inside, packing) if beside is None else VoxelBytes(beside, 0, packing),
         warnings=_warnings(header),
         fields=header,
     )
@@ -108,12 +116,25 @@ def _parse(text: bytes, name: str, purpose: Purpose) -> dict[str, Any]:
             header = dict(nrrd.read_header([*lines, "\n"]))
     except (nrrd.NRRDError, ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
         raise RefusedInputError(f"{name} has a corrupt NRRD header: {escape_text(str(error))}") from error
-    for field in ("data file", "datafile", "line skip", "lineskip", "byte skip", "byteskip"):
+    for field in ("line skip", "lineskip", "byte skip", "byteskip"):
         if header.get(field) not in (None, 0):
-            raise RefusedInputError(
-                f"{name} says '{field}': NRRD files with header and voxels in one file, without a gap, are read"
-            )
+            raise RefusedInputError(f"{name} says '{field}': NRRD files without a gap before their voxels are read")
     return header
+
+
+def _voxel_file(path: Path, named: str) -> Path:
+    """Return the one file beside a detached header that holds the voxels.
+
+    Raises
+    ------
+    RefusedInputError
+        The header names several files, or one that is not there or not beside it.
+    """
+    if not named or named.split()[0].upper() == "LIST" or "%" in named:
+        raise RefusedInputError(
+            f"{escape_text(path.name)} has its voxels in several files ('data file: {escape_text(named)}'): one is read"
+        )
+    return file_beside(path, named)
 
 
 def _warnings(header: dict[str, Any]) -> tuple[str, ...]:

@@ -37,8 +37,8 @@ def test_cut_anywhere_it_is_refused(tmp_path, name):
     beside = [other for other in tmp_path.iterdir() if other != path]
     for part in (path, *beside):
         content = part.read_bytes()
-        # without its last line break the header of an .mhd still says everything
-        for length in {*range(0, len(content), 29), len(content) - (4 if part.suffix == ".mhd" else 1)}:
+        # without its last line breaks the header of an .mhd or .nhdr still says everything
+        for length in {*range(0, len(content), 29), len(content) - (4 if part.suffix in (".mhd", ".nhdr") else 1)}:
             part.write_bytes(content[:length])
             with pytest.raises(ClreconError) as caught:
                 clrecon.read_volume(path)

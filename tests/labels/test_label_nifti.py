@@ -16,7 +16,7 @@ from clrecon.labels import read_labels
 
 nibabel = pytest.importorskip("nibabel")
 HEADER = {"dim": (40, "h", 8), "datatype": (70, "h", 1), "vox_offset": (108, "f", 1), "slope": (112, "f", 1),
-          "sform": (280, "f", 12), "sform_code": (254, "h", 1)}  # fmt: skip
+          "pixdim": (76, "f", 8), "sform": (280, "f", 12), "sform_code": (254, "h", 1)}  # fmt: skip
 
 
 def forge(path, field, *values):
@@ -247,3 +247,32 @@ def test_marks_of_xml_are_read_outside_of_cdata_alone(tmp_path):
     )
     labels = read_labels(write_nifti(tmp_path / "a.nii", make_labels(), extension=table))
     assert labels.names == {2: "a & b", 5: "c &amp; d"}
+
+
+def test_label_tables_may_have_single_quotes(tmp_path):
+    table = b"<Label Key='2' Red='0'>two</Label><Label Red='0' Key=\"5\"><![CDATA[it's five]]></Label>"
+    labels = read_labels(write_nifti(tmp_path / "a.nii", make_labels(), extension=table))
+    assert labels.names == {2: "two", 5: "it's five"}
+
+
+RIGID = np.array([[0.7, 0.0, 0.0, -10.0], [0.0, 0.5, 0.0, 20.0], [0.0, 0.0, -2.5, -30.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize("sform", [True, False])
+def test_pixdim_0_of_0_means_1(tmp_path, sform):
+    affine = RIGID @ np.diag((1.0, 1.0, -1.0, 1.0))
+    path = write_nifti(tmp_path / "a.nii", make_labels(), affine, sform=sform, qform=True)
+    before = read_labels(path)
+    labels = read_labels(forge(path, "pixdim", 0.0))
+    assert np.array_equal(labels.affine, before.affine) and labels.warnings == ()
+
+
+def test_a_qform_that_is_corrupt_is_said_beside_a_sform(tmp_path):
+    path = write_nifti(tmp_path / "a.nii", make_labels(), RIGID, qform=True)
+    before = read_labels(path)
+    labels = read_labels(forge(path, "pixdim", 3.0))
+    assert np.array_equal(labels.affine, before.affine)
+    (said,) = labels.warnings
+    assert said == "its qform cannot be read (qfac (pixdim[0]) should be 1 or -1): the sform is used"
+    with pytest.raises(RefusedInputError, match=r"corrupt NIfTI header: qfac \(pixdim\[0\]\) should be 1 or -1"):
+        read_labels(forge(path, "sform_code", 0))

@@ -104,7 +104,7 @@ def test_layers_that_overlap_are_refused_unless_one_is_chosen(tmp_path):
         (b"dimension: 3", b"dimension: 2", "has 3 axes"),
         (b"type: uint8", b"type: block", "is not a label map: its voxels are 'block'"),
         (b"encoding: raw", b"encoding: hex", "is stored as 'hex'"),
-        (b"encoding: raw", b"encoding: raw\ndata file: /etc/passwd", "says 'data file'"),
+        (b"encoding: raw", b"encoding: raw\ndata file: /etc/passwd", "only files beside it are read"),
         (b"encoding: raw", b"encoding: raw\nbyte skip: -1", "says 'byte skip'"),
         (b"encoding: raw", b"encoding: gzip", "cut or corrupt in slice 1 of 4"),
         (b"space origin: (", b"space origin: (1e999,", "cannot be placed|corrupt NRRD"),
@@ -115,6 +115,84 @@ def test_hostile_headers_are_refused(tmp_path, old, new, message):
     path = edit(write_nrrd(tmp_path / "a.nrrd", make_labels(), encoding="raw"), (old, new))
     with pytest.raises(RefusedInputError, match=message):
         read_labels(path)
+
+
+def test_voxels_of_a_detached_header_are_beside_it(tmp_path):
+    voxels, fields = layered(False)
+    path = write_nrrd(tmp_path / "in" / "a.nhdr", voxels, **fields)
+    assert {file.name for file in path.parent.iterdir()} == {"a.nhdr", "a.raw.gz"}
+    labels = read_labels(path)
+    assert labels.counts == {1: 3, 2: 1, 3: 1} and np.allclose(labels.affine, OBLIQUE, atol=1e-12)
+    header = path.read_bytes()
+    (tmp_path / "other.gz").write_bytes((path.parent / "a.raw.gz").read_bytes())
+    (path.parent / "link.gz").symlink_to(tmp_path / "other.gz")
+    for named, words in (
+        (b"../other.gz", "only files beside it are read"),
+        (str(tmp_path / "other.gz").encode(), "only files beside it are read"),
+        (b"link.gz", "a link to another folder: not read"),
+        (b"none.gz", "which is not there"),
+        (b"LIST\na.raw.gz", "has its voxels in several files"),
+        (b"a.%03d.gz 0 3 1", "has its voxels in several files"),
+        (b"", "has its voxels in several files|corrupt NRRD header"),
+    ):
+        path.write_bytes(header.replace(b"data file: a.raw.gz", b"data file: " + named))
+        with pytest.raises(RefusedInputError, match=words):
+            read_labels(path)
+
+
+def bare_layers(*segments):
+    """Two layers with values of their own, 1 and 2, one voxel each."""
+    voxels = np.zeros((3, 4, 5, 2), np.uint8)
+    voxels[0, 0, 0, 0], voxels[1, 1, 1, 1] = 1, 2
+    return voxels, {key: value for fields in segments for key, value in fields.items()}
+
+
+@pytest.mark.parametrize(
+    ("segments", "words"),
+    [
+        ([segment(0, "one", 1), segment(1, "two", 2)], "2 layers, and 2 of its 2 segments have no Layer"),
+        ([segment(0, "one", 1, 0), segment(1, "two", 2)], "2 layers, and 1 of its 2 segments have no Layer"),
+        (
+            [segment(0, "one", 1, 0), {"Segment1_Name": "two", "Segment1_Layer": "1"}],
+            "1 of its 2 .* have no LabelValue",
+        ),
+        ([segment(0, "one", 1, 0), segment(1, "two", 2, 2)], "has 2 layers, and a segment is in layer 2"),
+        ([segment(0, "one", 1, 0), segment(1, "two", 2, -1)], "has 2 layers, and a segment is in layer -1"),
+        ([segment(0, "one", 1, "x")], "corrupt NRRD header: Layer of a segment is no number"),
+        ([], "has 2 layers and does not say which segments they hold"),
+    ],
+)
+def test_layers_whose_segments_are_not_known_are_refused(tmp_path, segments, words):
+    voxels, fields = bare_layers(*segments)
+    with pytest.raises(RefusedInputError, match=words):
+        read_labels(write_nrrd(tmp_path / "a.seg.nrrd", voxels, **fields))
+
+
+def test_what_no_segment_of_a_layer_has_is_said(tmp_path):
+    voxels, fields = bare_layers(segment(0, "one", 1, 0), segment(1, "air", 0, 1), segment(2, "three", 3, 1))
+    labels = read_labels(write_nrrd(tmp_path / "a.seg.nrrd", voxels, **fields))
+    assert labels.counts == {1: 1} and "air" not in labels.names.values()
+    assert labels.warnings == (
+        "1 of 3 segments have LabelValue 0, which is no label: left out",
+        "1 voxels hold values that no segment of their layer has (LabelValue): left out",
+    )
+
+
+def test_segments_of_old_versions_of_slicer_are_layers(tmp_path):
+    """Before 4.11 it wrote neither layers nor values: segment n is what layer n holds."""
+    voxels, fields = bare_layers({"Segment0_Name": "one"}, {"Segment1_Name": "two"})
+    labels = read_labels(write_nrrd(tmp_path / "a.seg.nrrd", (voxels > 0).astype(np.uint8), **fields))
+    assert labels.counts == {1: 1, 2: 1} and labels.names == {1: "one", 2: "two"} and labels.voxels[1, 1, 1] == 2
+    assert labels.warnings == ("its 2 segments name no layer: segment n is taken from layer n",)
+    alone = read_labels(write_nrrd(tmp_path / "b.seg.nrrd", (voxels[..., 0] > 0).astype(np.uint8), Segment0_Name="x"))
+    assert alone.names == {1: "x"} and alone.warnings == ()
+
+
+def test_names_that_belong_to_no_value_are_said(tmp_path):
+    fields = {**segment(0, "two", 2), "Segment1_Name": "lost", "Segment1_ID": "x"}
+    labels = read_labels(write_nrrd(tmp_path / "a.seg.nrrd", make_labels(numbers=(0, 2, 5)), **fields))
+    assert labels.names == {2: "two", 5: "label_5"}
+    assert labels.warnings == ("1 of 2 segments have no LabelValue: their names are not known",)
 
 
 def test_a_header_without_end_is_refused(tmp_path):

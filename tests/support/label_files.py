@@ -76,6 +76,7 @@ def write_nrrd(
         "kinds": ["list"] * layered + ["domain"] * 3,
         **header,
     }
+    path.parent.mkdir(exist_ok=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         nrrd.write(str(path), voxels.transpose(range(voxels.ndim)[::-1]), fields)

@@ -77,6 +77,8 @@ WRITERS: dict[str, Callable[..., Path]] = {
     "a.hdr": lambda *args: write_nifti(*args, kind="Nifti1Pair"),
     "raw.nrrd": lambda *args: write_nrrd(*args, encoding="raw"),
     "gzip.nrrd": lambda *args: write_nrrd(*args, encoding="gzip", space="right-anterior-superior"),
+    "raw.nhdr": lambda *args: write_nrrd(*args, encoding="raw"),
+    "gzip.nhdr": lambda *args: write_nrrd(*args, encoding="gzip", space="left-anterior-superior"),
     "a.mha": write_metaimage,
     "packed.mha": lambda *args: write_metaimage(*args, packed=True),
     "a.mhd": write_metaimage,
