@@ -20,6 +20,10 @@
 /* Squares of a cross product's length, with a trace of 1, up to which there is no plane: rounding gives 1e-14. */
 #define NO_PLANE 1e-10f
 
+/* Sum of the products of two eigenvalues, with a trace of 1, up to which points lie in a line: there the smallest root
+ * is a double one, found to the root of float32's precision only.  Rounding gives up to 8e-7 (128 points). */
+#define NO_WIDTH 4e-6f
+
 #define DOUBTFUL_COSINE 0.2f
 
 #define ORIENT_NOT 0
@@ -109,7 +113,7 @@ __kernel void fit_planes(
     nx = choose(third > longest, vx, nx);
     ny = choose(third > longest, vy, ny);
     nz = choose(third > longest, vz, nz);
-    longest = greater(third, longest);
+    longest = choose(b > NO_WIDTH, greater(third, longest), (floats)(0.0f));
     const floats size = choose(longest > NO_PLANE, 1.0f / sqrt(longest), (floats)(0.0f));
     store_rows(nx * size, normals, row, place_count);
     store_rows(ny * size, normals + place_count, row, place_count);

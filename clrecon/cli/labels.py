@@ -111,8 +111,7 @@ def _describe_volumes(labels: list[dict[str, Any]]) -> list[str]:
     surfaces = {(mesh["label_number"], mesh["iso_value_hu"]): mesh for mesh in labels}.values()
     if any(mesh["label_mesh_ml"] is None for mesh in surfaces):
         return []
-    by_hu = labels[0]["surface"] == "hu"  # the surface of such a label continues beyond the CT
-    label_ml = sum(mesh["label_ml"] * (mesh["label_inside_share"] if by_hu else 1.0) for mesh in surfaces)
+    label_ml = sum(mesh["label_compared_ml"] for mesh in surfaces)
     mesh_ml = sum(mesh["label_mesh_ml"] for mesh in surfaces)
     change = 100.0 * (mesh_ml / label_ml - 1.0)
     return [f"         {mesh_ml:,.2f} ml of mesh for {label_ml:,.2f} ml of labels ({change:+.1f} %)"]

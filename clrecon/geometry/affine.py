@@ -70,7 +70,7 @@ def checked_affine(affine: ArrayLike) -> Float64Array:
         if np.iscomplexobj(affine):
             raise TypeError("complex numbers")
         checked = np.array(affine, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise UsageError(f"an affine is a 4x4 array of numbers: {error}") from error
     if checked.shape != (4, 4):
         raise UsageError(f"an affine is a 4x4 array, this one has shape {checked.shape}")
@@ -116,7 +116,7 @@ def checked_points(points: ArrayLike) -> Float64Array:
     """
     try:
         checked = np.asarray(points, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise UsageError(f"points are an array of numbers of shape (n, 3): {error}") from error
     if checked.ndim != 2 or checked.shape[1] != 3:
         raise UsageError(f"points have shape (n, 3), these have {checked.shape}")

@@ -72,7 +72,7 @@ def _box_of(name: str, given: Sequence[float | None]) -> Box:
     open_side = (-everywhere, everywhere) if name != "around" else (math.nan, math.nan)
     try:
         values = [open_side[place % 2] if value is None else float(value) for place, value in enumerate(given)]
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise UsageError(f"{named} takes {form}, not {str(given)[:60]}") from error
     if len(values) != count:
         raise UsageError(f"{named} takes {form}, not {len(values)}")

@@ -47,7 +47,7 @@ def crop_volume(volume: Own, low: ArrayLike, high: ArrayLike, *, margin: int = 0
     """
     try:
         box = np.array([low, high], dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         box = np.empty(0)
     if box.shape != (2, 3) or np.isnan(box).any():
         raise UsageError(f"a box has two corners of three numbers in mm, not {low!r} and {high!r}")

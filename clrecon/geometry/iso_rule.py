@@ -329,7 +329,7 @@ def checked_iso_value(iso_value: float) -> float:
     """An iso value as float; a `UsageError` where it is no finite number that float32 holds."""
     try:
         number = float(iso_value)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise UsageError(f"the iso value is {iso_value!r}: give a number of HU") from error
     if not math.isfinite(number):
         raise UsageError(f"the iso value is {number}: give a finite number of HU")

@@ -65,7 +65,7 @@ class Growth:
 def _checked(grow_mm: float, volume: Volume) -> float:
     try:
         number = float(grow_mm)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise UsageError(f"labels grow by a number of mm, not {grow_mm!r}") from error
     if not (math.isfinite(number) and number >= 0.0):
         raise UsageError(f"labels grow by 0 mm or more, not {number:g}")

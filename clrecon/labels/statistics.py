@@ -106,7 +106,7 @@ def check_percentiles(percentiles: Sequence[float]) -> tuple[float, ...]:
     """
     try:
         numbers = [float(percent) for percent in percentiles]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise UsageError(f"percentiles are numbers from 0 to 100, not {percentiles!r:.80}") from None
     wrong = [percent for percent in numbers if not (math.isfinite(percent) and 0.0 <= percent <= 100.0)]
     if wrong:

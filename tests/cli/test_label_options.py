@@ -317,3 +317,20 @@ def test_a_label_map_that_cannot_be_read_ends_the_job(
     assert run(ct, "-o", tmp_path / "b.stl", "--labels", tmp_path / "a.nii.gz", device=device) == code
     assert words in capsys.readouterr().err
     assert not (tmp_path / "b.stl").exists()
+
+
+def test_a_label_none_of_whose_centres_lies_in_the_ct_is_compared_with_what_was_taken(
+    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The centre of the large voxel of label 2 lies a millimetre beside the scan, and half of it in the scan."""
+    extent = (np.array(sphere_voxels().shape[::-1]) - 1) * SPACING
+    affine = np.diag([14.0, 90.0, 90.0, 1.0])
+    affine[:3, 3] = ORIGIN + 0.5 * extent
+    affine[0, 3] = ORIGIN[0] + extent[0] + 1.0 - 14.0
+    map_file = write_nifti(tmp_path / "a.nii.gz", np.array([[[1, 2]]], np.uint8), affine)
+    options = ("--labels", map_file, "--label", 2, "--hu", -150, "--report", tmp_path / "r.json")
+    assert run(ct, "-o", tmp_path / "b.stl", *options, device=device) == 0
+    (mesh,) = json.loads((tmp_path / "r.json").read_text())["meshes"]
+    assert mesh["label_inside_share"] == 0.0
+    assert mesh["label_compared_ml"] == mesh["label_taken_ml"] > 0.0
+    assert f"ml of mesh for {mesh['label_taken_ml']:,.2f} ml of labels" in capsys.readouterr().out

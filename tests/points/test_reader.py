@@ -239,3 +239,29 @@ def test_a_binary_ply_is_read_to_its_last_byte_and_refused_without_it(tmp_path):
     assert np.array_equal(read_points(write(tmp_path / "a.ply", content)).points, rows.reshape(3, 3))
     with pytest.raises(RefusedInputError, match="3 vertices of 12 bytes or more cannot come from 35 bytes"):
         read_points(write(tmp_path / "b.ply", content[:-1]))
+
+
+@pytest.mark.parametrize("line", [b"1;2;3\n4;5;6\n", b"# x y z\n1 2 3\n4 5 6\n", b"x,y,z\n1,2,3\n4,5,6\n"])
+def test_a_byte_order_mark_costs_no_point(tmp_path, line):
+    file = tmp_path / "a.xyz"
+    file.write_bytes(b"\xef\xbb\xbf" + line)
+    cloud = read_points(file)
+    assert cloud.points.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert cloud.report["file"]["warnings"] == []
+
+
+@pytest.mark.parametrize(("line", "wrong"), [("1;2;abc", "abc"), ("1,2x,3", "2x"), ("  1 - 3", "-")])
+def test_a_first_point_that_holds_words_is_refused(tmp_path, line, wrong):
+    file = tmp_path / "a.xyz"
+    file.write_text(f"# made by hand\n{line}\n4 5 6\n7 8 9\n")
+    with pytest.raises(RefusedInputError, match=f"a.xyz has '{wrong}' in place of a number in line 2"):
+        read_points(file)
+
+
+def test_a_line_of_words_and_numbers_before_the_points_is_said(tmp_path):
+    file = tmp_path / "a.xyz"
+    file.write_text("# 3 points\nX1 2 3\n4 5 6\n7 8 9\n")
+    cloud = read_points(file)
+    assert len(cloud) == 2
+    (warning,) = cloud.report["file"]["warnings"]
+    assert warning.startswith("line 2 holds words and numbers and is left out, 'X1 2 3'")

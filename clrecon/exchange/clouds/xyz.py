@@ -5,6 +5,7 @@ Every program reads such a table; the lines of the head begin with ``#``.  Norma
 
 from __future__ import annotations
 
+import codecs
 import io
 import re
 from pathlib import Path
@@ -27,6 +28,10 @@ _LONGEST_HEAD = 1 << 10
 """Most lines before the first point."""
 _LONGEST_LINE = 1 << 14
 """Most characters of a line of the head, and of the first point."""
+_MOST_WARNINGS = 3
+"""Most lines that are warned of."""
+_BYTE_ORDER_MARK = codecs.BOM_UTF8.decode("latin-1")
+_COMMENTS = ("#", "//", "%")
 
 
 def _header(content: PointContent) -> bytes:
@@ -72,7 +77,8 @@ def read(path: Path) -> RawCloud:
 
     Lines that begin with ``#``, ``//`` or ``%`` are comments.  The last line before the first point names the columns
     if it has a word for each of them, with or without a mark of a comment: ``//X Y Z scalar_HU``.  Columns
-    without names beyond the third are left out.
+    without names beyond the third are left out.  Another line there with words and numbers is refused if a number comes
+    first, else warned of.
 
     Raises
     ------
@@ -83,8 +89,9 @@ def read(path: Path) -> RawCloud:
     head: list[str] = []
     try:
         with open_regular(path) as binary, io.TextIOWrapper(binary, encoding="latin-1", newline=None) as stream:
-            first = stream.readline(_LONGEST_LINE)
+            first = stream.readline(_LONGEST_LINE).removeprefix(_BYTE_ORDER_MARK)
             while first and not _numbers_in(first):
+                _check_head(first, len(head), name)
                 head.append(first)
                 if len(head) > _LONGEST_HEAD:
                     raise RefusedInputError(f"{name} is no table of points: {_LONGEST_HEAD:,} lines hold no numbers")
@@ -99,7 +106,12 @@ def read(path: Path) -> RawCloud:
             table = np.loadtxt(rest, comments="#", delimiter=mark, ndmin=2, dtype=np.float64)
     except (ValueError, OSError, OverflowError, MemoryError) as error:
         raise say_cut(name, error) from error
-    warnings = []
+    warnings = [
+        f"line {number} holds words and numbers and is left out, {escape_text(' '.join(_words(line)))!r}: if it is a"
+        " point, correct it; if not, mark it as a comment with #"
+        for number, line in enumerate(head, start=1)
+        if not _is_comment(line) and any(map(_is_number, _words(line)))
+    ][:_MOST_WARNINGS]
     names = _column_names(head, count)
     if names is None and count > 3:
         warnings.append(f"columns 4 to {count} have no names in a line before the first point and are left out")
@@ -113,6 +125,21 @@ def read(path: Path) -> RawCloud:
     )
 
 
+def _check_head(line: str, number: int, name: str) -> None:
+    """Refuse a line before the first point that begins with a number and is no point."""
+    words = _words(line)
+    if words and not _is_comment(line) and _is_number(words[0]):
+        wrong = next(word for word in words if not _is_number(word))
+        raise RefusedInputError(
+            f"{name} has {escape_text(wrong)!r} in place of a number in line {number + 1}: correct the point, or mark"
+            " the line as a comment with #"
+        )
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith(_COMMENTS)
+
+
 def _delimiter(line: str) -> str | None:
     return next((mark for mark in ";," if mark in line), None)
 
@@ -124,12 +151,15 @@ def _words(line: str) -> list[str]:
 def _numbers_in(line: str) -> int:
     """Return the count of numbers in a line; 0 if one of its words is not a number."""
     words = _words(line)
+    return len(words) if all(map(_is_number, words)) else 0
+
+
+def _is_number(word: str) -> bool:
     try:
-        for word in words:
-            float(word)
+        float(word)
     except ValueError:
-        return 0
-    return len(words)
+        return False
+    return True
 
 
 def _column_names(head: list[str], count: int) -> list[str] | None:

@@ -26,6 +26,9 @@ PIXELS = 400
 CORRIDOR, LIMIT, GIVEN = (90, 230, 120), (255, 190, 60), (255, 90, 90)
 """Colours of corridor, largest screw and given screws."""
 
+LEAST_RISE = 1e-6
+"""Rise of an axis over a plane, as a share of its length, below which the axis lies in the plane."""
+
 
 def _slice(volume: Volume, centre: Float64Array, right: Float64Array, down: Float64Array) -> NDArray[np.float32]:
     """Return HU (trilinear) of a plane of `WIDTH_MM`, shape (`PIXELS`, `PIXELS`); air beyond the scan."""
@@ -47,6 +50,19 @@ def _along(
     across = radius * np.array((-way[1], way[0]))
     frame = np.stack((flat[0] + across, flat[1] + across, flat[1] - across, flat[0] - across, flat[0] + across))
     return [Stroke(frame, color), Stroke(flat, color)]
+
+
+def _across(
+    centre: Float64Array, right: Float64Array, down: Float64Array, ends: Float64Array, radius: float, color: Any
+) -> list[Stroke]:
+    """Return the circle where a cylinder's axis meets the plane; of one that lies in the plane, its section."""
+    normal = np.cross(right, down)
+    height, other = (ends - centre) @ normal
+    if abs(other - height) > LEAST_RISE * float(np.linalg.norm(ends[1] - ends[0])):
+        crossing = ends[0] + height / (height - other) * (ends[1] - ends[0])
+        return [Stroke(_flat(crossing[None], centre, right, down), color, radius)]
+    half_width = np.sqrt(max(radius**2 - height**2, 0.0))
+    return _along(centre, right, down, ends, float(half_width), color) if half_width > 0.0 else []
 
 
 def draw_corridors(
@@ -112,9 +128,7 @@ def _row(
             if number < 2:
                 strokes += _along(centre, right, down, pair, radius, color)
             else:
-                way = pair[1] - pair[0]
-                share = ((centre - pair[0]) @ back) / (way @ back)
-                strokes.append(Stroke(_flat((pair[0] + share * way)[None], centre, right, down), color, radius))
+                strokes += _across(centre, right, down, pair, radius, color)
         edges = tuple(orientation_letters(way)[:1] for way in (-right, right, -down, down))
         panels.append(
             Panel(

@@ -73,7 +73,7 @@ def read_screws(path: str | Path, space: str) -> tuple[Screw, ...]:
     for number, row in enumerate(rows, start=1):
         try:
             numbers = [float(value) for value in row["numbers"]]
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             numbers = []
         if len(numbers) != 7:
             raise UsageError(f"screw {number} of {shown} has no three numbers of entry and of tip, and a diameter")

@@ -171,8 +171,8 @@ def describe_label(origin: dict[str, Any]) -> dict[str, Any]:
 def judge_label_volumes(parts: Sequence[Part], closed: bool) -> list[dict[str, Any]]:
     """Compare the meshes of each label, all components together, with the volume of its voxels in the CT.
 
-    `closed` says that surfaces are closed at the border of the scan.  Each part of a label gets ``label_mesh_ml`` among
-    its `facts`.
+    `closed` says that surfaces are closed at the border of the scan.  Each part of a label gets ``label_mesh_ml`` and
+    ``label_compared_ml`` among its `facts`.
 
     Returns
     -------
@@ -196,7 +196,7 @@ def judge_label_volumes(parts: Sequence[Part], closed: bool) -> list[dict[str, A
         gate = judge_label_volume(mesh_ml, label_ml, advice, by_hu=by_hu)
         gates.append({"mesh": surface.name or None, **gate})
         for part in own:
-            part.facts["label_mesh_ml"] = mesh_ml
+            part.facts |= {"label_mesh_ml": mesh_ml, "label_compared_ml": label_ml}
     return gates
 
 

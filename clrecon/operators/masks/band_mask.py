@@ -89,7 +89,7 @@ def checked_band(hu: ArrayLike) -> tuple[float, float]:
     """
     try:
         low, high = np.asarray(hu, dtype=np.float64).tolist()
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         low = high = math.nan
     if not low <= high:
         raise UsageError(f"{name_parameter('hu')}: a band is two numbers in HU, the lower one first, not {hu!r}")

@@ -73,7 +73,7 @@ def checked_box(box: Sequence[float | None] | ArrayLike) -> Float64Array:
     try:
         sides = np.array([np.nan if side is None else side for side in box], dtype=np.float64)  # type: ignore[union-attr]
         low, high = sides.reshape(3, 2).T
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise UsageError(f"a box is six numbers of mm, X0,X1,Y0,Y1,Z0,Z1, open sides None, not {box!r}") from None
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
     for axis, first, last in zip("xyz", low, high, strict=True):

@@ -12,17 +12,26 @@ from clrecon.geometry.volume import AIR_HU, Volume
 from clrecon.labels import resample_labels
 from clrecon.operators.rays.slices import choose_slices
 from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.rendering.looks.label_style import LabelStyle
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.pictures.styles import Projection, SlicesInSpace, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.seen import ShownLabels, find_seen_box
 
-__all__ = ["shown_box"]
+__all__ = ["framing_key", "shown_box"]
 
 MASKED_BY = ("field_of_view", "remove_table", "region", LEFT_OUT)
 """Entries of the report of a volume of which a part was turned into air, or left out."""
 
 AIR_ROOM_HU = 100.0
 """Projections and slices show nothing of interest less than this above the air that a mask leaves."""
+
+
+def framing_key(volume: Volume, style: Style) -> tuple[object, ...]:
+    """Return what of a style decides about `shown_box`; styles with equal keys have the same box."""
+    look = _hiding_look(style)
+    hidden = None if look is None else (look.labels, look.table[:, 3].tobytes())  # a label map equals only itself
+    slices = style.slices if isinstance(style, SlicesInSpace) else None
+    return type(style), getattr(style, "clip", None), _band(style, volume), slices, hidden
 
 
 def shown_box(shown: Volume | DeviceVolume, style: Style) -> Grid:
@@ -49,10 +58,16 @@ def shown_box(shown: Volume | DeviceVolume, style: Style) -> Grid:
     return volume if box is None else box
 
 
+def _hiding_look(style: Style) -> LabelStyle | None:
+    """Return the look of the labels if some of them are hidden."""
+    look = style.label_style if isinstance(style, VolumeLook | SurfaceLook) else None
+    return None if look is None or (look.table[:, 3] > 0.0).all() else look
+
+
 def _shown_labels(volume: Volume | DeviceVolume, style: Style) -> ShownLabels | None:
     """Return the labels on the grid of the volume if some of them are hidden."""
-    look = style.label_style if isinstance(style, VolumeLook | SurfaceLook) else None
-    if look is None or (look.table[:, 3] > 0.0).all():
+    look = _hiding_look(style)
+    if look is None:
         return None
     taken = volume.bring(look.labels) if isinstance(volume, DeviceVolume) else resample_labels(look.labels, volume)
     return ShownLabels(taken.voxels, look.table[:, 3] > 0.0)

@@ -14,7 +14,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.grid import Grid
 from clrecon.opencl import Device
 from clrecon.operators.rays.buffers import DrawnVolume
-from clrecon.operators.rays.framing import shown_box
+from clrecon.operators.rays.framing import framing_key, shown_box
 from clrecon.operators.rays.ray_pictures import take_picture, take_with_layers
 from clrecon.operators.rays.slices import overlay_slices, overlay_with_layers
 from clrecon.operators.rays.surface import cast_surface
@@ -83,7 +83,7 @@ class VolumeRenderer(Closing):
     ):
         self._resident, self._is_own = take_volume(volume, device, memory, "a picture")
         self.volume = self._resident.volume
-        self._framed: tuple[Style, Grid] | None = None
+        self._framed: tuple[tuple[object, ...], Grid] | None = None
         self._inner: VolumeRenderer | None = None
         voxels = self.volume.voxels
         if voxels.dtype.kind == "f" and not np.isfinite(voxels).all():
@@ -157,12 +157,13 @@ class VolumeRenderer(Closing):
     def frame(self, style: Style) -> Grid:
         """Return what cameras fit: the volume, or the box of what is left of it where a part is masked, cut or hidden.
 
-        See ``clrecon.operators.rays.framing``; that of the last style is kept.
+        See ``clrecon.operators.rays.framing``; the last box is kept for styles that show the same part of the volume.
         """
         if isinstance(style, Projection) and style.leaves_out and LEFT_OUT not in self.volume.report:
             return self._within(None).frame(style)
-        if self._framed is None or self._framed[0] is not style:
-            self._framed = style, shown_box(self._resident, style)
+        key = framing_key(self.volume, style)
+        if self._framed is None or self._framed[0] != key:
+            self._framed = key, shown_box(self._resident, style)
         return self._framed[1]
 
     def render_with_layers(

@@ -124,7 +124,7 @@ def _read_voxels(item: Any, resident: DeviceVolume) -> tuple[NDArray[np.bool_] |
 def _read_point(item: Any) -> NDArray[np.float64]:
     try:
         point = np.asarray(item, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         point = np.empty(0)
     if point.shape != (3,) or not np.isfinite(point).all():
         raise UsageError(

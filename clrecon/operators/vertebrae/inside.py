@@ -274,7 +274,7 @@ def _checked_dense(dense: Sequence[float | None]) -> tuple[float, float]:
     try:
         low, high = dense
         ends = (-math.inf if low is None else float(low), math.inf if high is None else float(high))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         ends = (math.nan, math.nan)
     if not ends[0] <= ends[1] or all(map(math.isinf, ends)):
         raise UsageError(

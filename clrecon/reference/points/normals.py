@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 __all__ = ["orient_by_gradients", "orient_from", "principal_axes"]
 
+NO_WIDTH = 4e-6
+"""Sum of the products of two eigenvalues, as a share of the squared trace, up to which points lie in a line."""
+
 DOUBTFUL_COSINE = 0.2
 """Below this cosine between normal and gradient, the gradient itself is taken."""
 
@@ -27,7 +30,7 @@ def principal_axes(
     Returns
     -------
     axes : ndarray, shape (m, 3), float64
-        Unit vectors; which of both directions is not defined.
+        Unit vectors, which of both directions is not defined; zero for points in a line or at one place.
     eigenvalues : ndarray, shape (m, 3), float64
         Of the covariance (population), ascending, mm2.
     """
@@ -35,7 +38,10 @@ def principal_axes(
     away = near - near.mean(axis=1, keepdims=True)
     covariance = np.einsum("nki,nkj->nij", away, away) / indices.shape[1]
     eigenvalues, axes = np.linalg.eigh(covariance)
-    return axes[:, :, 0], np.maximum(eigenvalues, 0.0)
+    eigenvalues = np.maximum(eigenvalues, 0.0)
+    low, middle, high = eigenvalues.T
+    has_plane = low * middle + low * high + middle * high > NO_WIDTH * eigenvalues.sum(axis=1) ** 2
+    return np.where(has_plane[:, None], axes[:, :, 0], 0.0), eigenvalues
 
 
 def orient_by_gradients(

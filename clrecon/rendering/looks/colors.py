@@ -65,7 +65,7 @@ def find_color(color: str | Sequence[float]) -> Float64Array:
     else:
         try:
             numbers = np.array(color, dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             numbers = np.empty(0)
         if numbers.shape == (3,) and (numbers >= 0.0).all() and (numbers <= 1.0).all():
             return numbers

@@ -127,7 +127,7 @@ def _by_number(labels: LabelMap, what: str, mapping: Mapping | None) -> dict:
 def _check_opacity(name: str, factor: float) -> float:
     try:
         number = float(factor)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = float("nan")
     if not 0.0 <= number <= 1.0:
         raise UsageError(f"the opacity of label {name} is a number from 0 to 1, not {factor!r}")

@@ -19,7 +19,7 @@ LEAST_SOFT_GRADIENT = 0.01
 def _number(name: str, value: Any, low: float, high: float) -> float:
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not low <= number <= high:
         raise UsageError(f"the {name} of lighting lies between {low:g} and {high:g}, not at {value!r}")
@@ -75,7 +75,7 @@ class Lighting:
     def _unit(direction: Any) -> tuple[float, float, float]:
         try:
             vector = np.asarray(direction, dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             vector = np.empty(0)
         if vector.shape != (3,) or not np.isfinite(vector).all() or not vector.any():
             raise UsageError(

@@ -34,7 +34,7 @@ COLUMNS = ("red", "green", "blue", "opacity")
 def _numbers(what: str, form: str, rows: ArrayLike, width: int) -> Float64Array:
     try:
         array = np.array(rows, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise UsageError(f"{what} is made of points {form}, each of {width} numbers: these are not") from None
     if array.ndim != 2 or array.shape[0] < 1 or array.shape[1] != width:
         raise UsageError(f"{what} is made of points {form}, not of an array of shape {array.shape}")

@@ -61,7 +61,7 @@ def checked_window(window: Sequence[float] | str) -> tuple[float, float]:
         return named
     try:
         low, high = (float(end) for end in window)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         low = high = np.nan
     if not (-np.inf < low < high < np.inf):
         raise UsageError(f"a window is its lowest and highest HU, such as (-450, 1050), not {window!r}")

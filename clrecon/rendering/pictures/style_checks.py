@@ -110,7 +110,7 @@ def slices(value: Any) -> int | tuple[int, ...]:
         return int(value)
     try:
         numbers = np.asarray(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.empty(0)
     if numbers.ndim != 1 or not len(numbers) or numbers.dtype.kind not in "iu":
         raise UsageError(f"slices are a number (every n-th) or a list of whole numbers k, not {value!r:.60}")

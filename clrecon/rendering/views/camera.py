@@ -12,7 +12,14 @@ from numpy.typing import ArrayLike
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, checked_points
 from clrecon.geometry.grid import Grid
-from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size, checked_vector, find_up, find_view
+from clrecon.rendering.views.directions import (
+    DEFAULT_SIZE,
+    checked_size,
+    checked_vector,
+    find_up,
+    find_view,
+    number_or_nan,
+)
 
 __all__ = ["Camera", "CameraBasis", "box_corners"]
 
@@ -103,14 +110,14 @@ class Camera:
         if self.view_angle is not None and self.parallel_scale is not None:
             raise UsageError("a camera has a view angle (perspective) or a parallel scale, not both")
         if self.parallel_scale is None:
-            angle = DEFAULT_VIEW_ANGLE if self.view_angle is None else _number(self.view_angle)
+            angle = DEFAULT_VIEW_ANGLE if self.view_angle is None else number_or_nan(self.view_angle)
             if not 1e-3 <= angle <= 179.0:
                 raise UsageError(
                     f"the view angle of a camera lies between 0.001 and 179 degrees, not at {self.view_angle!r}"
                 )
             object.__setattr__(self, "view_angle", angle)
         else:
-            scale = _number(self.parallel_scale)
+            scale = number_or_nan(self.parallel_scale)
             if not 0.0 < scale <= FARTHEST_MM:
                 raise UsageError(
                     "the parallel scale of a camera is a length in mm, above 0 to a thousand kilometres, not"
@@ -335,7 +342,7 @@ class Camera:
         Camera
             At the same distance from the focal point; ``up`` has turned with it.
         """
-        if not np.isfinite([_number(azimuth), _number(elevation)]).all():
+        if not np.isfinite([number_or_nan(azimuth), number_or_nan(elevation)]).all():
             raise UsageError(f"a camera orbits by finite angles in degrees, not by {azimuth!r} and {elevation!r}")
         turn = _rotation((0.0, 0.0, 1.0), azimuth) @ _rotation(self.basis().right, -elevation)
         offset = turn @ np.subtract(self.position, self.focal_point)
@@ -349,7 +356,7 @@ class Camera:
         UsageError
             ``zoom`` is not positive, or gives an angle out of range.
         """
-        factor = _number(zoom)
+        factor = number_or_nan(zoom)
         if not (0.0 < factor < np.inf):
             raise UsageError(f"zoom is a positive number, 2 shows everything twice as large, not {zoom!r}")
         if factor == 1.0:
@@ -362,14 +369,6 @@ class Camera:
 def _triple(vector: Float64Array) -> tuple[float, float, float]:
     x, y, z = vector.tolist()
     return x, y, z
-
-
-def _number(value: Any) -> float:
-    """Return `value` as a float, NaN if it is not a number."""
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        return float("nan")
 
 
 def _rotation(axis: ArrayLike, degrees: float) -> Float64Array:

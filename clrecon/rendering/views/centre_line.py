@@ -53,7 +53,7 @@ class Curve(Message):
     def __init__(self, points: ArrayLike):
         try:
             given = np.array(points, dtype=np.float64)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise UsageError(f"a centre line is an array of points (n, 3) in LPS mm: {error}") from error
         if given.ndim != 2 or given.shape[1] != 3:
             raise UsageError(f"a centre line is an array of points (n, 3) in LPS mm, not of shape {given.shape}")

@@ -33,7 +33,7 @@ class Clip(Message):
     def __init__(self, planes: ArrayLike = ()):
         try:
             table = np.array(planes, dtype=np.float64)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise UsageError(f"clip planes are (normal, offset), four numbers each: {error}") from error
         table = table.reshape(0, 4) if table.size == 0 else table
         if table.ndim != 2 or table.shape[1] != 4:
@@ -63,7 +63,7 @@ class Clip(Message):
         """
         try:
             corners = np.array([low, high], dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             corners = np.empty(0)
         if corners.shape != (2, 3) or np.isnan(corners).any():
             raise UsageError(f"a clip box has two corners of three numbers in LPS mm, not {low!r} and {high!r}")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,6 +23,7 @@ __all__ = [
     "find_up",
     "find_view",
     "hint_at_sheet",
+    "number_or_nan",
 ]
 
 DIRECTIONS: dict[str, tuple[float, float, float]] = {
@@ -40,6 +43,14 @@ LARGEST_SIDE = 16384
 """Largest number of pixels along a side of a picture; more is a typing error."""
 
 
+def number_or_nan(value: Any) -> float:
+    """Return `value` as a float, NaN if it is not a number or has no float."""
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
 def checked_vector(what: str, value: ArrayLike) -> tuple[float, float, float]:
     """Return three finite numbers as floats.
 
@@ -50,7 +61,7 @@ def checked_vector(what: str, value: ArrayLike) -> tuple[float, float, float]:
     """
     try:
         array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.empty(0)
     if array.shape != (3,) or not np.isfinite(array).all():
         raise UsageError(f"{what} is three finite numbers in LPS mm, not {value!r}")
@@ -143,7 +154,7 @@ def _find_angles(view: str | Sequence[float]) -> tuple[float, float]:
     parts: Sequence[str | float] = view.split(",") if isinstance(view, str) else view
     try:
         azimuth, elevation = (float(part) for part in parts)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         azimuth = elevation = float("nan")
     if not (np.isfinite(azimuth) and abs(elevation) <= 90.0):
         raise UsageError(

@@ -18,7 +18,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import Grid
 from clrecon.geometry.volume import Volume
 from clrecon.rendering.views.camera import Camera, box_corners
-from clrecon.rendering.views.directions import DIRECTIONS, checked_size
+from clrecon.rendering.views.directions import DIRECTIONS, checked_size, number_or_nan
 from clrecon.system.text import say_unknown
 
 __all__ = [
@@ -192,13 +192,6 @@ def _triple(vector: Float64Array) -> tuple[float, float, float]:
     return float(vector[0]), float(vector[1]), float(vector[2])
 
 
-def _number(value: float) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError, OverflowError):
-        return np.nan
-
-
 def checked_thickness(thickness: float) -> float:
     """Check the thickness of a slice in mm and return it as a float.
 
@@ -207,7 +200,7 @@ def checked_thickness(thickness: float) -> float:
     UsageError
         It is negative or not finite.
     """
-    size = _number(thickness)
+    size = number_or_nan(thickness)
     if not 0.0 <= size < np.inf:
         raise UsageError(f"the thickness of a slice is a length in mm, 0 for a plane without one, not {thickness!r}")
     return size
@@ -221,7 +214,7 @@ def checked_offset(offset_mm: float) -> float:
     UsageError
         It is not finite.
     """
-    offset = _number(offset_mm)
+    offset = number_or_nan(offset_mm)
     if not np.isfinite(offset):
         raise UsageError(f"the offset of a slice is a length in mm, not {offset_mm!r}")
     return offset
@@ -235,7 +228,7 @@ def positive_mm(what: str, value: float) -> float:
     UsageError
         It is not a length above 0; the message begins with `what`.
     """
-    number = _number(value)
+    number = number_or_nan(value)
     if not 0.0 < number < np.inf:
         raise UsageError(f"{what} is a length in mm, not {value!r}")
     return number

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,12 @@ import tolerances
 from made_once import make_once
 
 from clrecon.cli.main import main
+from clrecon.corridors.corridor import Corridor
+from clrecon.corridors.frame import VertebraFrame
+from clrecon.corridors.grades import Screw
 from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.jobs.corridor.pictures import GIVEN, draw_corridors
 from clrecon.jobs.corridor.screws import parse_screw, read_screws
 from clrecon.jobs.corridor.solids import cylinder_mesh
 from clrecon.phantom import PhantomSettings, phantom_truth, write_phantom
@@ -94,6 +100,22 @@ def test_files_are_written_and_screws_graded(
     assert written == sorted([*(f"l2_{name}.ply" for name in names), "l2.png", "l2.json", "first.json", "screws.json"])
     assert run(*options, *outputs, "--no-clobber") == 6
     assert "exists" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("height", "rise"), [(0.0, 0.0), (1.0, 0.0), (0.0, 1e-12), (3.0, 0.0), (1.0, 5.0)])
+def test_a_screw_across_its_corridor_is_drawn_where_it_meets_the_section(height: float, rise: float) -> None:
+    """Its section in the plane square to the corridor is a circle, or two lines; none if the plane misses it."""
+    volume = Volume(np.zeros((100, 100, 100), np.int16), np.eye(4))
+    frame = VertebraFrame(np.full(3, 50.0), np.eye(3), (0.0, 20.0), (0.0, 0.0), 9.0, (-15.0, 15.0), 25.0)
+    none = Corridor("left", "no room")
+    found: Any = SimpleNamespace(name="L2", frame=frame, corridors=(none,))
+    entry = np.array((56.0, 65.0 + height, 50.0))  # the section lies at y = 65
+    screw = Screw(entry, entry + (20.0, -rise, 0.0), 4.0, "given")
+    pixels = draw_corridors(volume, found, [screw], 1.0, []).image.astype(int)
+    red = np.asarray((np.abs(pixels[..., :3] - GIVEN) <= 40).all(axis=2))
+    third = pixels.shape[1] // 3
+    assert red[:, :third].any()
+    assert red[:, 2 * third :].any() == (height < 2.0)
 
 
 def test_a_cylinder_is_closed_and_as_large_as_it_should_be() -> None:

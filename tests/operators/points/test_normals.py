@@ -186,6 +186,34 @@ def test_points_in_a_line_have_no_normal(device):
     assert "in a line or at one place" in step.warnings[0]
 
 
+@pytest.mark.every_device
+@pytest.mark.parametrize("k", [3, 5, 16, 64])
+def test_points_on_lines_of_any_direction_have_no_normal(device, k):
+    """The smallest eigenvalue of a line is a double one."""
+    rng = np.random.default_rng(k)
+    directions = np.r_[rng.normal(size=(20, 3)), np.eye(3), [[1.0, 1.0, 0.0]]]
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    steps = np.arange(80.0)[None, :, None] + np.stack((np.zeros((80, 1)), rng.uniform(0.0, 0.4, (80, 1))))
+    lines = [300.0 * np.array([line, 0, 0]) + steps[line % 2] * way for line, way in enumerate(directions)]
+    points = np.concatenate(lines)
+    step = estimate_normals(PointCloud(points), k, device=device)
+    assert not step.cloud.normals.any()
+    assert step.facts["without_plane"] == len(points)
+    axes, _ = principal_axes(points, find_neighbours(points, k)[0])
+    assert not axes.any()
+
+
+@pytest.mark.parametrize("width", [0.02, 0.3])
+def test_points_of_a_narrow_strip_have_its_normal(device, width):
+    """A fiftieth as wide as the neighbours are long."""
+    along, across = np.arange(200.0), width * np.tile((0.0, 1.0), 100)
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    points = np.column_stack((0.1 * along, across, np.zeros(200))) @ turn.T
+    step = estimate_normals(PointCloud(points), 10, device=device)
+    assert step.facts["without_plane"] == 0
+    assert np.abs(step.cloud.normals @ turn[:, 2]).min() > 0.999
+
+
 def test_parts_give_the_same(device, monkeypatch):
     cloud = PointCloud(sphere(6.0).points)
     whole = estimate_normals(cloud, 8, viewpoint=(0, 0, 0), device=device).cloud.normals

@@ -9,6 +9,7 @@ import clrecon
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
+from clrecon.operators.rays import volume_renderer
 from clrecon.operators.rays.framing import shown_box
 from clrecon.operators.rays.scene import _box_of
 from clrecon.rendering.views.camera import Camera
@@ -102,3 +103,41 @@ def test_transfer_functions_show_bands(two_blocks):
     nothing = clrecon.VolumeLook(clrecon.TransferFunction([(0.0, 1, 1, 1, 0.0), (9.0, 1, 1, 1, 0.0)]), clip=cut)
     assert np.diag(shown_box(volume, between).affine)[0] == pytest.approx(37 * MM)  # from voxel 1 to voxel 38
     assert np.diag(shown_box(volume, nothing).affine)[0] == pytest.approx(40 * MM)
+
+
+@pytest.mark.parametrize(
+    ("style", "look"),
+    [
+        ("dvr", {"preset": "bone"}),
+        ("surface", {"iso_value": 300, "color": (1.0, 0.5, 0.0)}),
+        ("surface", {"iso_value": 300, "clip": Clip.box((0, 0, 0), (30, 30, 30))}),
+        ("slices", {"slices": [3, 9]}),
+        ("surface", {"label_opacity": {1: 0.0}}),
+    ],
+)
+def test_the_box_of_equal_styles_is_found_once(two_blocks, device, monkeypatch, style, look):
+    """Keywords make a new style for each picture."""
+    volume, labels = two_blocks
+    found = []
+    monkeypatch.setattr(volume_renderer, "shown_box", lambda *given: found.append(given) or shown_box(*given))
+    look = look | ({"labels": labels} if "label_opacity" in look else {})
+    with clrecon.VolumeRenderer(volume, device=device) as renderer:
+        pictures = [renderer.render(style, size=(20, 20), **look) for _ in range(3)]
+    assert len(found) == 1
+    assert pictures[0].camera == pictures[1].camera == pictures[2].camera
+
+
+def test_another_part_of_the_volume_gets_another_box(two_blocks, device):
+    volume, labels = two_blocks
+    looks = [
+        {"clip": Clip.box((0, 0, 0), (30, 30, 30))},
+        {"clip": Clip.box((0, 0, 0), (60, 60, 60))},
+        {"labels": labels, "label_opacity": {1: 0.0}},
+        {"labels": labels, "label_opacity": {2: 0.0}},
+        {"labels": labels, "label_opacity": {0: 0.0}},
+        {},
+    ]
+    with clrecon.VolumeRenderer(volume, device=device) as renderer:
+        for look in looks:
+            style = clrecon.SurfaceLook(300, **look)
+            assert (renderer.frame(style).affine == shown_box(volume, style).affine).all()

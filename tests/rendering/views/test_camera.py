@@ -246,3 +246,41 @@ def test_impossible_cameras_are_refused(arguments):
 def test_orbits_are_finite():
     with pytest.raises(UsageError, match="finite angles"):
         Camera.fit(box()).orbit(np.nan)
+
+
+HUGE = 10**400
+"""A whole number that no float holds."""
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda camera: Camera((0, -9, 0), (0, 0, 0), (0, 0, 1), view_angle=HUGE), "view angle"),
+        (lambda camera: Camera((0, -9, 0), (0, 0, 0), (0, 0, 1), parallel_scale=HUGE), "parallel scale"),
+        (lambda camera: Camera((0, -HUGE, 0), (0, 0, 0), (0, 0, 1)), "position of a camera"),
+        (lambda camera: camera.zoomed(HUGE), "zoom"),
+        (lambda camera: camera.orbit(HUGE), "orbits by"),
+        (lambda camera: camera.project([(HUGE, 0, 0)], SIZE), "points"),
+        (lambda camera: Camera.fit(box(), (HUGE, 0)), "view"),
+        (lambda camera: Camera.fit(box(), center=(0, 0, HUGE)), "centre"),
+    ],
+)
+def test_a_number_too_large_for_a_float_is_refused(make, words):
+    with pytest.raises(UsageError, match=words):
+        make(Camera.fit(box()))
+
+
+@pytest.mark.parametrize("view", [*DIRECTIONS, "30,40"])
+def test_a_parallel_camera_with_a_centre_stays_outside_of_the_volume(view):
+    """Wherever in the volume the centre is, and beyond it."""
+    volume = sheared()
+    corners = box_corners(volume)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    middle = corners[[0, 1, 2, 3, -4, -3, -2, -1]].mean(axis=0)
+    radius = np.linalg.norm(corners - middle, axis=1).max()
+    for center in (low, high, 3.0 * low - 2.0 * high, 3.0 * high - 2.0 * low):
+        camera = Camera.fit(volume, view, center=center)
+        depths = (corners - camera.position) @ camera.basis().forward
+        assert depths.min() >= radius - 1e-6
+        pixel, _ = camera.project([center], SIZE)
+        np.testing.assert_allclose(pixel[0], (200.0, 150.0), atol=1e-6)
