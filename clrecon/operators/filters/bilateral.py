@@ -102,8 +102,8 @@ def filter_bilateral(
         2: slice by slice.
     near : float, optional
         An iso value: only voxels near its surface are filtered, in a fraction of the time.  Each voxel is on the same
-        side of it as after the whole filter, and the positions of the surface are the same bit for bit.  All else stays
-        as it was.
+        side of it as after the whole filter, and the positions of the surface are the same bit for bit, but for those
+        where a closed surface ends at the ends of the volume: see ``exact_at_ends``.  All else stays as it was.
     normals : bool
         With ``near``: the voxels that decide the normals at the vertices are filtered too.
     taps : int, optional
@@ -122,8 +122,9 @@ def filter_bilateral(
         As it was given; in the type of the voxels, whole numbers rounded.  ``report["filtered"]["steps"]`` has an entry
         for each filter: ``filter``, ``dimensions``, ``sigma_mm``, ``sigma_hu``, ``noise_hu`` where it was measured,
         ``taps``, ``window`` (voxels along i, j, k), ``whole_window_taps`` and ``window_share`` (of the weight of the
-        whole window), ``near_hu``, ``rings``, ``filtered_share`` (of all voxels) and ``slabs``.  A certificate stays
-        one.
+        whole window), ``near_hu``, ``rings``, ``exact_at_ends`` (with ``near``: False where voxels at the ends of the
+        volume lie at ``near_hu`` or above, so that a surface that is closed there has other positions in its ends than
+        after the whole filter), ``filtered_share`` (of all voxels) and ``slabs``.  A certificate stays one.
 
     Raises
     ------
@@ -149,9 +150,19 @@ def _filter(
     resident: DeviceVolume, settings: BilateralSettings, told: list[str], progress: Progress | None, *, keep: bool
 ) -> Volume | DeviceVolume:
     found = run_bilateral(resident, settings, progress=progress)
-    facts = {**settings.as_report(), "filtered_share": round(found.share, 6), "slabs": found.slabs}
+    facts = {
+        **settings.as_report(),
+        "exact_at_ends": None if settings.near is None else not _reach_ends(found.voxels, settings.near),
+        "filtered_share": round(found.share, 6),
+        "slabs": found.slabs,
+    }
     warnings = [*told, *settings.warnings, *found.warnings]
     return finish_result(resident, found.voxels, found.voxels_d, facts, warnings, keep=keep)
+
+
+def _reach_ends(voxels: NDArray[Any], level: float) -> bool:
+    """Return whether voxels of a level and above lie in the outermost layers."""
+    return any(bool((np.take(voxels, (0, -1), axis) >= level).any()) for axis in range(3))
 
 
 @dataclass(frozen=True)

@@ -200,6 +200,26 @@ def test_surfaces_of_a_near_filter_are_those_of_the_whole_one(device, normals):
         np.testing.assert_array_equal(meshes[0].normals, meshes[1].normals)
 
 
+@pytest.mark.parametrize("closed", [True, False])
+def test_where_the_volume_ends_a_closed_surface_differs_and_the_report_says_so(device, closed):
+    """A bar through the volume: its open surface is the same, its closed ends are not."""
+    bar = np.repeat(ball(noise=10.0).voxels[10:11], 12, axis=0) + np.arange(12, dtype=np.int16)[:, None, None]
+    volume = Volume(bar, np.eye(4))
+    made = [clrecon.filter_bilateral(volume, sigma_hu=30.0, near=near, device=device) for near in (None, 100)]
+    assert [each.report["filtered"]["steps"][-1]["exact_at_ends"] for each in made] == [None, False]
+    whole, near = (clrecon.extract_isosurface(each, 100, closed=closed, device=device) for each in made)
+    np.testing.assert_array_equal(whole.triangles, near.triangles)
+    moved = (whole.vertices != near.vertices).any(axis=1)
+    assert moved.any() == closed
+    heights = whole.vertices[moved, 2]
+    assert ((heights < 0.0) | (heights > 11.0)).all()  # beyond the outermost centres alone
+
+
+def test_a_surface_within_the_volume_is_exact_at_its_ends(device):
+    (step,) = clrecon.filter_bilateral(ball(), sigma_hu=30.0, near=100, device=device).report["filtered"]["steps"]
+    assert step["exact_at_ends"] is True
+
+
 @pytest.mark.every_device
 @pytest.mark.parametrize("reach", [(1, 1, 1), (2, 3, 0), (16, 2, 5)])
 def test_groups_near_a_level_equal_the_twin(device, reach):
