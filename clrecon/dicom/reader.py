@@ -14,6 +14,7 @@ from clrecon.dicom.parse.forced import describe_way_out
 from clrecon.dicom.pixels.voxels import read_voxels
 from clrecon.dicom.series.certificate import certify, collect_scan_warnings, collect_series_warnings
 from clrecon.dicom.series.choice import choose_series, describe_left
+from clrecon.dicom.series.gates import count_unknown
 from clrecon.dicom.series.listing import describe_series
 from clrecon.dicom.series.scan import BARE_DATA_SET, LINK_OUT, Scan, advise_on_links, scan_path
 from clrecon.dicom.series.series import Series, group_series
@@ -22,7 +23,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.certificate import Certificate
 from clrecon.sources.likeness import Likeness, judge_slices
 from clrecon.sources.listing import SeriesListing
-from clrecon.sources.plausibility import collect_voxel_warnings
+from clrecon.sources.plausibility import examine_voxels
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text, join_names
@@ -83,14 +84,15 @@ def read_volume(
             raise RefusedInputError(_describe_refusal(chosen))
         voxels, facts = read_voxels(stack.slices, progress)
         likeness = judge_slices(voxels, stack.tilt_deg, uneven=stack.line.uneven)
+        findings = examine_voxels(voxels, facts, stack.slices, known=not count_unknown(stack.slices))
     warnings = [
         *collect_series_warnings(chosen),
         *_describe_likeness(likeness),
-        *collect_voxel_warnings(voxels, facts, stack.slices),
+        *findings.warnings,
         *collect_scan_warnings(scan),
         *left,
     ]
-    report = certify(chosen, stack, facts, scan, stack.affine, warnings, likeness)
+    report = certify(chosen, stack, facts, scan, stack.affine, warnings, likeness, findings.gates)
     log.info("series %d of %d read: %s voxels %s", chosen.number, len(found), voxels.shape[::-1], voxels.dtype)
     log_warnings(log, report.warnings)
     return Volume(voxels, stack.affine, report, stack.slice_positions, hu_range=(facts.hu_min, facts.hu_max))
@@ -201,13 +203,15 @@ def _certify_chosen(
     stack = series.stack
     if stack is None or series.kind == "other":
         return None
-    facts, likeness, warnings = None, None, collect_series_warnings(series)
+    facts, likeness, gates, warnings = None, None, None, collect_series_warnings(series)
     affine = None if series.problems else stack.affine
     if pixels and affine is not None:
         voxels, facts = read_voxels(stack.slices, progress)
         likeness = judge_slices(voxels, stack.tilt_deg, uneven=stack.line.uneven)
-        warnings += [*_describe_likeness(likeness), *collect_voxel_warnings(voxels, facts, stack.slices)]
-    return certify(series, stack, facts, scan, affine, [*warnings, *notes], likeness)
+        findings = examine_voxels(voxels, facts, stack.slices, known=not count_unknown(stack.slices))
+        gates = findings.gates
+        warnings += [*_describe_likeness(likeness), *findings.warnings]
+    return certify(series, stack, facts, scan, affine, [*warnings, *notes], likeness, gates)
 
 
 def _describe_likeness(likeness: Likeness | None) -> list[str]:

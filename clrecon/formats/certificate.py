@@ -12,6 +12,7 @@ from clrecon.geometry.affine import column_spacing, signed_tilt, slice_normal
 from clrecon.geometry.certificate import Certificate
 from clrecon.geometry.orientation import describe_orientation
 from clrecon.sources.gates import PADDING_SHARE, judge_figures, judge_steps, list_odd_values
+from clrecon.sources.plausibility import leave_unexamined
 from clrecon.system.gates import Gate, at_most, none_of, unmeasured
 
 __all__ = ["MODALITY", "certify_grid", "collect_header_warnings", "collect_value_warnings"]
@@ -43,7 +44,9 @@ def judge_spacing(grid: GridFile) -> Gate:
     return judge_steps(pixels, gap)
 
 
-def certify_grid(grid: GridFile, values: GridValues | None, warnings: Sequence[str]) -> Certificate:
+def certify_grid(
+    grid: GridFile, values: GridValues | None, warnings: Sequence[str], value_gates: Sequence[Gate] | None = None
+) -> Certificate:
     """Build the report of a volume.
 
     Parameters
@@ -52,6 +55,8 @@ def certify_grid(grid: GridFile, values: GridValues | None, warnings: Sequence[s
     values : GridValues or None
         None: the voxels were not read, and entries that depend on them are None.
     warnings : sequence of str
+    value_gates : sequence of Gate or None
+        Gates of the values of the voxels; None: they were not read.
 
     Returns
     -------
@@ -78,12 +83,12 @@ def certify_grid(grid: GridFile, values: GridValues | None, warnings: Sequence[s
         padding_hu=None if facts is None else facts.padding_hu,
         hu_range=None if facts is None else [facts.hu_min, facts.hu_max],
         files={"found": 1, "used": 1, "skipped": {}},
-        gates=judge_grid(grid, values),
+        gates=judge_grid(grid, values, value_gates),
         warnings=list(warnings),
     )
 
 
-def judge_grid(grid: GridFile, values: GridValues | None) -> list[Gate]:
+def judge_grid(grid: GridFile, values: GridValues | None, value_gates: Sequence[Gate] | None) -> list[Gate]:
     """Judge a grid by the gates of a DICOM volume that apply to it, and by its own header.
 
     No file of this kind says that its values are HU. So the gate ``hu_known`` fails where they surely are not, and else
@@ -109,6 +114,7 @@ def judge_grid(grid: GridFile, values: GridValues | None) -> list[Gate]:
         gates.append(unmeasured("plausible_hu", 0, None, "figures of HU that no CT has: not read, or hardly HU"))
     else:
         gates.append(judge_figures(list_odd_values(values.facts)))
+    gates += leave_unexamined() if value_gates is None else value_gates
     if values is None:
         gates.append(unmeasured("padding_share", PADDING_SHARE, None, f"{share}: the voxels were not read"))
     else:

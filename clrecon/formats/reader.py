@@ -11,7 +11,8 @@ from clrecon.formats.kinds import open_grid
 from clrecon.formats.values import GridValues, read_values
 from clrecon.geometry import Volume
 from clrecon.sources.listing import SeriesEntry, SeriesListing
-from clrecon.sources.plausibility import collect_voxel_warnings
+from clrecon.sources.plausibility import VoxelFindings, examine_voxels
+from clrecon.sources.stored_values import StoredRange
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text
@@ -41,16 +42,26 @@ def read_grid(path: Path, kind: str, *, progress: Progress | None = None) -> Vol
     """
     grid = _open(path, kind)
     values = read_values(grid, progress)
-    report = certify_grid(grid, values, _collect_warnings(grid, values))
+    findings = _examine(grid, values)
+    report = certify_grid(grid, values, _collect_warnings(grid, values, findings), findings.gates)
     log.info("%s file read: %s voxels %s", grid.kind, grid.shape_ijk, values.voxels.dtype)
     log_warnings(log, report.warnings)
     return Volume(values.voxels, grid.affine, report, hu_range=(values.facts.hu_min, values.facts.hu_max))
 
 
-def _collect_warnings(grid: GridFile, values: GridValues | None) -> list[str]:
+def _examine(grid: GridFile, values: GridValues) -> VoxelFindings:
+    stored: list[StoredRange] = []
+    if grid.dtype.kind in "iu":
+        one = StoredRange(8 * grid.dtype.itemsize, grid.dtype.kind == "i", grid.slope, grid.intercept)
+        stored = [one] * len(values.voxels)
+    return examine_voxels(values.voxels, values.facts, (), known=not values.doubts, stored=stored)
+
+
+def _collect_warnings(grid: GridFile, values: GridValues | None, findings: VoxelFindings | None) -> list[str]:
     warnings = collect_header_warnings(grid)
-    if values is not None:
-        warnings += [*collect_value_warnings(values), *collect_voxel_warnings(values.voxels, values.facts, ())]
+    if values is not None and findings is not None:
+        failed = [gate.text for gate in findings.gates if gate.ok is False]
+        warnings += [*collect_value_warnings(values), *findings.warnings, *failed]
     return warnings
 
 
@@ -71,8 +82,9 @@ def list_grid(path: Path, kind: str, *, pixels: bool = False, progress: Progress
     """
     grid = _open(path, kind)
     values = read_values(grid, progress) if pixels else None
-    warnings = _collect_warnings(grid, values)
-    certificate = certify_grid(grid, values, warnings)
+    findings = None if values is None else _examine(grid, values)
+    warnings = _collect_warnings(grid, values, findings)
+    certificate = certify_grid(grid, values, warnings, None if findings is None else findings.gates)
     copied = ("slices", "shape_ijk", "spacing_mm", "affine_ijk_to_lps_mm", "tilt_deg", "grid_residual_max_mm", "gap_mm",
               "uneven", "extent_mm", "slice_thickness_mm")  # fmt: skip
     entry = SeriesEntry(

@@ -57,7 +57,14 @@ def test_headers_alone_say_nothing_of_pixels(tmp_path, monkeypatch):
     monkeypatch.setattr(reader, "read_voxels", refuse)
     certificate = certify(tmp_path)
     assert (certificate["padding_share"], certificate["hu_range"]) == (None, None)
-    assert unmeasured(certificate) == {"stated_gap", "padding_share", "stored_bits", "one_volume"}
+    assert unmeasured(certificate) == {
+        "stated_gap",
+        "padding_share",
+        "stored_bits",
+        "one_volume",
+        "hu_scale",
+        "stored_sign",
+    }
     with pytest.raises(AssertionError, match="pixels were read"):
         certify(tmp_path, pixels=True)
 

@@ -33,11 +33,20 @@ from clrecon.geometry.certificate import Certificate
 from clrecon.geometry.orientation import describe_orientation
 from clrecon.sources.facts import PixelFacts
 from clrecon.sources.likeness import Likeness
+from clrecon.system.gates import Gate
 from clrecon.system.text import count_of, hash_uid
 
 __all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]
 
-SAID_BY_GATES = ("padding_share", "stored_bits", "plausible_spacing", "gap_thickness", "plausible_hu")
+SAID_BY_GATES = (
+    "padding_share",
+    "stored_bits",
+    "plausible_spacing",
+    "gap_thickness",
+    "plausible_hu",
+    "hu_scale",
+    "stored_sign",
+)
 """Gates whose text becomes a warning when they fail; for the other gates a separate warning says more."""
 
 
@@ -137,6 +146,7 @@ def certify(
     affine: NDArray[np.float64] | None,
     warnings: Sequence[str],
     likeness: Likeness | None = None,
+    value_gates: Sequence[Gate] | None = None,
 ) -> Certificate:
     """Build the certificate of a series: the report of its volume, and what ``clrecon info`` shows.
 
@@ -152,6 +162,8 @@ def certify(
     warnings : sequence of str
     likeness : Likeness or None
         Likeness of the slices; None: the pixels were not read, or there are too few slices.
+    value_gates : sequence of Gate or None
+        Gates of the values of the voxels; None: the pixels were not read.
 
     Returns
     -------
@@ -161,7 +173,7 @@ def certify(
     stated = next((h.stated_gap_mm for h in headers if h.stated_gap_mm is not None), None)
     lay = {h.patient_position for h in headers}
     slopes, intercepts = [h.slope for h in headers], [h.intercept for h in headers]
-    gates = judge_series(series, stack, facts, likeness)
+    gates = judge_series(series, stack, facts, likeness, value_gates)
     unsaid = [gate.text for gate in gates if gate.name in SAID_BY_GATES and gate.ok is False]
     identity = {"number": series.number, "uid_hash": hash_uid(series.identity.uid)}
     return Certificate(

@@ -28,9 +28,10 @@ from clrecon.errors import RefusedInputError
 from clrecon.sources.facts import PixelFacts
 from clrecon.sources.gates import PADDING_SHARE, judge_figures, judge_steps, list_odd_values
 from clrecon.sources.likeness import Likeness
+from clrecon.sources.plausibility import leave_unexamined
 from clrecon.system.gates import Gate, at_most, none_of, unmeasured
 
-__all__ = ["judge_series"]
+__all__ = ["count_unknown", "judge_series"]
 
 GAP_THICKNESSES = 2.0
 """Largest gap in units of the slice thickness.  Beyond it more is left out than measured: a high-resolution lung scan
@@ -42,7 +43,11 @@ STRAY = "values beyond the stored bits"
 
 
 def judge_series(
-    series: Series, stack: Stack | None, facts: PixelFacts | None = None, likeness: Likeness | None = None
+    series: Series,
+    stack: Stack | None,
+    facts: PixelFacts | None = None,
+    likeness: Likeness | None = None,
+    value_gates: Sequence[Gate] | None = None,
 ) -> list[Gate]:
     """Judge a series by the gates.
 
@@ -55,6 +60,8 @@ def judge_series(
         Figures of its pixels; without them the gates on pixels are not measured.
     likeness : Likeness, optional
         Likeness of its slices; also None where they are too few or too small.
+    value_gates : sequence of Gate, optional
+        Gates of the values of the voxels, see `clrecon.sources.plausibility.examine_voxels`.
 
     Returns
     -------
@@ -75,6 +82,7 @@ def judge_series(
     gates.append(_judge_one_volume(series, likeness))
     gates += _gates_of_values(stack.slices)
     gates.append(_judge_hu(stack.slices, facts))
+    gates += leave_unexamined() if value_gates is None else value_gates
     share = "share of voxels without a measurement (padding)"
     if facts is None:
         gates.append(unmeasured("padding_share", PADDING_SHARE, None, f"{share}: the pixels were not read"))
@@ -132,7 +140,7 @@ def _judge_hu(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> Gate:
         ("RescaleIntercept", [header.intercept for header in headers], INTERCEPTS),
     ):
         odd += [f"{name} {value:g}" for value in (min(values), max(values)) if not low <= value <= high][:1]
-    if facts is not None and facts.hu_min <= facts.hu_max and not _count_unknown(headers):
+    if facts is not None and facts.hu_min <= facts.hu_max and not count_unknown(headers):
         odd += list_odd_values(facts)
     return judge_figures(odd)
 
@@ -165,11 +173,12 @@ def _judge_stated_gap(stack: Stack) -> Gate:
     return at_most("stated_gap", 100.0 * found[2], bound, "%", what)
 
 
-def _count_unknown(headers: Sequence[SliceHeader]) -> int:
+def count_unknown(headers: Sequence[SliceHeader]) -> int:
+    """Count slices whose values are not known to be HU."""
     return sum(not (h.has_slope and h.has_intercept) or h.rescale_type not in ("", "HU") for h in headers)
 
 
 def _gates_of_values(headers: Sequence[SliceHeader]) -> Iterator[Gate]:
-    yield none_of("hu_known", _count_unknown(headers), "slices whose values are not known to be HU")
+    yield none_of("hu_known", count_unknown(headers), "slices whose values are not known to be HU")
     yield none_of("lossless", sum(h.lossy for h in headers), "slices with lossy compression")
     yield none_of("measured_images", sum(bool(h.derived) for h in headers), "slices that were computed from others")
