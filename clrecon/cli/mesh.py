@@ -104,6 +104,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_methods(parser)
     components = parser.add_argument_group("components")
     add_selection(components)
+    components.add_argument(
+        "--all-parts",
+        action="store_true",
+        help="with --for print: keep all bones, not the largest alone; named objects of a .3mf, one mesh in other"
+        " formats",
+    )
     components.add_argument("--split", action="store_true", help="write one file a component, the largest first")
     components.add_argument(
         "--one-file",
@@ -197,7 +203,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
     from clrecon.jobs.mesh.for_purpose import settings_for
     from clrecon.jobs.mesh.growing import is_label_seed
-    from clrecon.jobs.mesh.job import make_mesh
+    from clrecon.jobs.mesh.job import make_mesh, makes_objects
     from clrecon.jobs.mesh.settings import MeshSettings
 
     names = {own.name for own in fields(MeshSettings)} - {"purpose"}
@@ -218,7 +224,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
     console.result(report)
     for line in describe_mesh(report):
         console.say(line)
-    console.say(f"wrote    {_describe_files(options.output, report, together=options.one_file)}")
+    together = options.one_file or (options.all_parts and makes_objects(options.output))
+    console.say(f"wrote    {_describe_files(options.output, report, together=together)}")
     if options.report:
         console.say(f"report   {printable(options.report)}")
     return finish_with_gates(report, console, settings.strict)

@@ -32,6 +32,9 @@ SEED_REACH_MM = 20.0
 50 x 35 x 30 mm) lies 15 mm from its wall."""
 
 
+_CRUMB_ML = 0.1
+"""Components below this volume are counted where there are too many."""
+
 _ROUNDING_OF_AREA = 4.0
 """Two components have equal area when they differ by less than this factor times the rounding step of the coordinates
 times the square root of the area.  Rounding moves each vertex independently and changes the area by about 0.3 of that
@@ -149,9 +152,14 @@ def split_components(
     chosen = _choose(mesh, keep_largest, min_volume_ml, seeds, labelled, among, rank=True)
     kept = np.flatnonzero(chosen.keep)
     if most is not None and len(kept) > most:
+        _, volumes = measure_components(
+            mesh.vertices, mesh.triangles, chosen.label_of_triangle, len(chosen.keep), areas=False, volumes=True
+        )
+        small = int(np.count_nonzero(volumes[kept] < _CRUMB_ML))
+        least = name_parameter("min_volume_ml", _CRUMB_ML if small < len(kept) else "ML")
         raise UsageError(
-            f"the surface has {len(kept):,} components, at most {most:,} are written one by one:"
-            f" leave the small ones out ({name_parameter('min_volume_ml', 'ML')},"
+            f"the surface has {len(kept):,} components, {small:,} of them below {_CRUMB_ML:g} ml; at most {most:,} are"
+            f" written one by one: leave the small ones out ({least},"
             f" {name_parameter('keep_largest', 'N')})"
         )
     rank = np.full(len(chosen.keep) + 1, len(kept))  # the last entry is for unused vertices, whose label is -1

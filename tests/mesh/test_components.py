@@ -168,7 +168,7 @@ def test_split_of_equal_sizes_keeps_their_order():
 
 def test_split_refuses_more_than_most():
     assert len(split_components(three_boxes(), most=3)) == 3
-    with pytest.raises(UsageError, match="3 components, at most 2 are written one by one: leave the small ones out"):
+    with pytest.raises(UsageError, match="3 components, 3 of them below 0.1 ml; at most 2 .*min_volume_ml=ML"):
         split_components(three_boxes(), most=2)
 
 

@@ -44,11 +44,11 @@ def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
     if purpose.is_for_print:
         if not given.get("closed", True):
             raise UsageError(f"a surface for {name} is closed: leave {name_parameter('closed', False)} out")
-        if any(given.get(other) for other in ("seeds", "min_volume_ml", "split", "labels")):
+        if any(given.get(other) for other in ("seeds", "min_volume_ml", "split", "labels", "all_parts")):
             del fields["keep_largest"]
         chosen = any(given.get(other) for other in ("keep_largest", "seeds", "min_volume_ml"))
         levels = _levels_of_bone(given)
-        if chosen or not levels:
+        if (chosen and not given.get("all_parts")) or not levels:
             del fields["keep"]
         if levels != 1 or given.get("solid") is False:
             del fields["solid"]
@@ -60,15 +60,20 @@ def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
     return {**given, **taken, "purpose": name}
 
 
+def _without_parts(given: dict[str, Any]) -> MeshSettings:
+    """Return the settings of these fields without those that a purpose alone makes valid."""
+    return MeshSettings(**{name: value for name, value in given.items() if name not in ("all_parts", "seal_mm")})
+
+
 def _are_hollow(given: dict[str, Any]) -> bool:
     """True where these fields of `MeshSettings` ask for surfaces of labels in which marrow leaves walls inside."""
-    settings = MeshSettings(**given)
+    settings = _without_parts(given)
     return settings.labels_pick and settings.labels is not None and settings.labels.surface == "hu"
 
 
 def _levels_of_bone(given: dict[str, Any]) -> int:
     """Return the number of iso surfaces that these fields of `MeshSettings` ask for, 0 if one is not of bone."""
-    settings = MeshSettings(**given)
+    settings = _without_parts(given)
     if settings.labels is not None or settings.inside != "above":
         return 0
     levels = [float(level) for level in settings.levels if not isinstance(level, tuple)]

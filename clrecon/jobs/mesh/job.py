@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import judge_label_volumes, name_label_files
 from clrecon.jobs.mesh.make import make_parts
-from clrecon.jobs.mesh.parts import first_names
+from clrecon.jobs.mesh.parts import first_names, warn_of_crumbs
 from clrecon.jobs.mesh.refinement import describe_purposes, judge_parts, measure_parts, refine_surface, warn_of_gates
 from clrecon.jobs.mesh.report import MeshReport, describe_job, describe_part
 from clrecon.jobs.mesh.settings import MeshSettings
@@ -38,7 +40,7 @@ if TYPE_CHECKING:
     from clrecon.labels import LabelMap
     from clrecon.opencl import Device
 
-__all__ = ["make_mesh"]
+__all__ = ["make_mesh", "makes_objects"]
 
 log = get_logger(__name__)
 
@@ -89,7 +91,7 @@ def make_mesh(
     UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError, NoSurfaceError
         After an error nothing is written, and older files are intact.
     """
-    settings, progress = settings or MeshSettings(), progress or ignore_progress
+    settings, progress = _combine_parts(settings or MeshSettings(), output), progress or ignore_progress
     measure = report_path is not None if measure is None else measure
     watch = Laps()
     surfaces = plan_surfaces(settings.levels, below=settings.below is not None)
@@ -111,7 +113,12 @@ def make_mesh(
 
     def compose(meshes: Sequence[dict[str, Any]]) -> MeshReport:
         warnings = _warn_of_leftovers(output, paths) if settings.split else []
-        warnings += warn_of_walls(parts, settings, choice) + purpose_warnings + warn_of_gates(gates)
+        warnings += (
+            warn_of_walls(parts, settings, choice)
+            + warn_of_crumbs(parts, settings)
+            + purpose_warnings
+            + warn_of_gates(gates)
+        )
         seconds = _seconds(watch, made.origins)
         return describe_job(
             solid, parts, meshes, settings, device.current, choice, gates=gates, warnings=warnings, seconds=seconds
@@ -121,6 +128,18 @@ def make_mesh(
         report = _write(parts, paths, report_path, settings, compose, watch, progress)
     _log(report, volume)
     return report
+
+
+def _combine_parts(settings: MeshSettings, output: str | Path) -> MeshSettings:
+    """Return the settings by which all parts of a print become objects of one file, where its format has objects."""
+    if not (settings.all_parts and makes_objects(output)):
+        return settings
+    return replace(settings, split=True, one_file=True)
+
+
+def makes_objects(output: str | Path) -> bool:
+    """Tell whether all parts of a print become objects of a file of this name."""
+    return os.path.splitext(output)[1].lower() == ".3mf"
 
 
 def _check_files(

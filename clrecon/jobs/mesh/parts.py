@@ -13,13 +13,17 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface
 from clrecon.jobs.shared.outputs import MOST_FILES
 from clrecon.system.progress import Progress, Steps
-from clrecon.system.text import say_hu
+from clrecon.system.text import say_hu, say_ml
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
+    from clrecon.mesh.components import Labelled
     from clrecon.opencl import Device
 
 __all__ = [
@@ -28,7 +32,11 @@ __all__ = [
     "extract_surfaces",
     "first_names",
     "select_parts",
+    "warn_of_crumbs",
 ]
+
+CRUMB_ML, MANY_COMPONENTS = 0.1, 100
+"""A mesh of more components than this below this volume gets a warning."""
 
 SELECT_STEPS = 4
 """Steps of the selection from a surface, as progress counts them: pieces, components, bone, and what is kept."""
@@ -154,6 +162,9 @@ def _select_parts(
             other = mesh.triangles[~among[labelled[1][mesh.triangles[:, 0]]]]
             no_bone = measure_pieces(mesh.vertices, other)
             mesh.report.update(not_bone=no_bone["pieces"], not_bone_ml=no_bone["pieces_ml"])
+    if settings.all_parts:
+        labelled = labelled or find_labels(mesh.triangles, mesh.vertex_count)
+        among = _without_cavities(mesh, labelled, among)
     steps.take()
     try:
         if not settings.split:
@@ -164,6 +175,43 @@ def _select_parts(
         label = "" if surface.label is None else f"{surface.label} "  # one of several is too small, or too far
         raise type(error)(f"{label}{surface.place}: {error}") from error
     return [Part(surface, _name_piece(surface, place), piece) for place, piece in enumerate(pieces, start=1)]
+
+
+def _without_cavities(mesh: Mesh, labelled: Labelled, among: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    """Return the components, of `among` if given, that are no walls of cavities; what is left is filled there."""
+    import numpy as np
+
+    from clrecon.mesh.refine.shifts import measure_volumes
+    from clrecon.system.pieces import local_origin
+
+    found = measure_volumes(mesh.vertices - local_origin(mesh.vertices), mesh.triangles)
+    is_wall = np.zeros(labelled[0], dtype=bool)
+    used = labelled[1] >= 0
+    is_wall[labelled[1][used]] = found.mm3[found.labels[used]] < 0.0
+    return ~is_wall if among is None else among & ~is_wall
+
+
+def warn_of_crumbs(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
+    """Return a warning for each measured mesh of many small components, which names the option that drops them."""
+    import numpy as np
+
+    from clrecon.mesh.refine.shifts import measure_volumes
+    from clrecon.system.pieces import local_origin
+
+    warnings = []
+    for part in parts:
+        if part.quality is None or part.quality.components <= MANY_COMPONENTS or settings.min_volume_ml is not None:
+            continue
+        mesh = part.mesh
+        ml = np.abs(measure_volumes(mesh.vertices - local_origin(mesh.vertices), mesh.triangles).mm3) / 1000.0
+        small = ml[ml < CRUMB_ML]
+        if len(small) > MANY_COMPONENTS:
+            warnings.append(
+                f"{f'{part.name}: ' if part.name else ''}{len(small):,} of {len(ml):,} components enclose less than"
+                f" {CRUMB_ML:g} ml each, {say_ml(float(small.sum()))} together:"
+                f" {name_parameter('min_volume_ml', CRUMB_ML)} drops them"
+            )
+    return warnings
 
 
 def _advice(settings: MeshSettings) -> str:

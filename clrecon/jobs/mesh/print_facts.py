@@ -103,7 +103,6 @@ def warn_of_print(facts: dict[str, Any]) -> list[str]:
         warnings.append(
             f"{'bone that' if bone_told else 'what'} was left out encloses {say_digits(other_ml)} ml, beside the"
             f" {say_digits(facts['pieces_ml'])} ml that were kept: is it the right piece?{table}"
-            f" {seed} keeps the one at a"
-            " point"
+            f" {seed} keeps the one at a point, {name_parameter('all_parts', True)} keeps all"
         )
     return warnings

@@ -91,7 +91,7 @@ class MeshReport(RunReport):
     area_mm2, volume_ml : float or None
     bounds_mm : [[x, y, z], [x, y, z]] or None
     closed_at_border, topology, method, grow_from, vertex_rule
-    keep, keep_largest, min_volume_ml, seeds_mm, split, purpose
+    keep, keep_largest, min_volume_ml, seeds_mm, all_parts, split, purpose
         The settings.
     slabs : int
         Largest number for a surface.
@@ -140,6 +140,7 @@ class MeshReport(RunReport):
     keep_largest: int | None
     min_volume_ml: float | None
     seeds_mm: list[list[float]]
+    all_parts: bool
     split: bool
     purpose: str | None
     device: str
@@ -219,6 +220,7 @@ def describe_job(
         keep_largest=settings.keep_largest,
         min_volume_ml=settings.min_volume_ml,
         seeds_mm=[[float(value) for value in seed] for seed in settings.seeds],
+        all_parts=settings.all_parts,
         split=settings.split,
         purpose=settings.purpose,
         device=device.label,

@@ -65,6 +65,9 @@ class MeshSettings(InputSettings):
         Fill what the surface encloses, such as marrow, see `clrecon.fill_enclosed`.
     seal_mm : float, optional
         With `solid`: radius of the balls that close pores, mm; None: 2.5 to 3, by the voxels.
+    all_parts : bool
+        With the purpose ``"print"``: keep all components that look like bone, not the largest alone.  They are named
+        objects of a .3mf, and one mesh in other formats.
     split : bool
         Write one mesh for each component, the largest first.
     one_file : bool
@@ -108,6 +111,7 @@ class MeshSettings(InputSettings):
     seeds: Sequence[Sequence[float]] = ()
     solid: bool = False
     seal_mm: float | None = None
+    all_parts: bool = False
     split: bool = False
     one_file: bool = False
     labels: LabelChoice | None = None
@@ -129,6 +133,7 @@ class MeshSettings(InputSettings):
             find_preset(self.preset)
         self._check_levels()
         self._check_keep()
+        self._check_all_parts()
         if self.keep_largest is not None and self.keep_largest < 1:
             raise UsageError(f"the number of components to keep must be 1 or more, not {self.keep_largest}")
         if self.min_volume_ml is not None and not (math.isfinite(self.min_volume_ml) and self.min_volume_ml > 0):
@@ -194,6 +199,20 @@ class MeshSettings(InputSettings):
             raise UsageError("labels say what is kept: leave keep bone out")
         if self.inside != "above":
             raise UsageError("bone lies above an iso value: keep bone goes with neither below nor a range")
+
+    def _check_all_parts(self) -> None:
+        if not self.all_parts:
+            return
+        option = name_parameter("all_parts", True)
+        if not self.is_for_print:
+            raise UsageError(
+                f"{option} belongs to {name_parameter('purpose', 'print')}, which else keeps the largest bone alone;"
+                " other meshes have all components unless an option leaves some out"
+            )
+        if self.keep_largest is not None or self.seeds or self.labels_pick:
+            raise UsageError(
+                f"{option} keeps all bones: leave out what chooses some (seeds, labels, a number of parts)"
+            )
 
     def _check_below(self) -> None:
         if self.below is None:

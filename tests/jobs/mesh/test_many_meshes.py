@@ -184,7 +184,9 @@ def test_too_many_components_are_refused_with_advice(
     device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(parts, "MOST_FILES", 2)
-    with pytest.raises(UsageError, match="3 components, at most 2 are written one by one: .*min_volume_ml=ML"):
+    with pytest.raises(
+        UsageError, match="3 components, 2 of them below 0.1 ml; at most 2 are written one by one: .*min_volume_ml=0.1"
+    ):
         run(tmp_path, device, iso_value=200.0, split=True)
     assert list(tmp_path.iterdir()) == []
     assert len(run(tmp_path, device, iso_value=200.0, split=True, keep_largest=2)["meshes"]) == 2
