@@ -7,16 +7,40 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["BLOCK_MM", "find_open_places", "measure_width"]
+__all__ = ["BLOCK_MM", "find_open_places", "holds_ball", "measure_width"]
 
-BLOCK_MM = 2.0
-"""Side of the blocks by which the width of a space is measured."""
+BLOCK_MM, FINE_MM = 2.0, 1.0
+"""Side of the blocks by which the width of a space is measured, and near the limit."""
+BLOCKS_OFF, FINE_BLOCKS_OFF = 2.0, 0.75
+"""Blocks by which the width can be wrong, and by which that of a ball can be too low: its middle need not be that of a
+block."""
+
+
+def holds_ball(
+    body: NDArray[np.bool_], ends: tuple[tuple[bool, bool], ...], steps: tuple[float, float, float], radius_mm: float
+) -> bool:
+    """Tell whether a ball fits into a body: true for every ball of this radius, for a smaller one by a voxel or 1 mm.
+
+    Parameters
+    ----------
+    body, ends, steps
+        As for `measure_width`.
+    radius_mm : float
+    """
+    width = measure_width(body, ends, steps)
+    if abs(width - radius_mm) > BLOCKS_OFF * max(BLOCK_MM, *steps):
+        return width > radius_mm
+    width = measure_width(body, ends, steps, FINE_MM)
+    return width + FINE_BLOCKS_OFF * max(FINE_MM, *steps) >= radius_mm
 
 
 def measure_width(
-    body: NDArray[np.bool_], ends: tuple[tuple[bool, bool], ...], steps: tuple[float, float, float]
+    body: NDArray[np.bool_],
+    ends: tuple[tuple[bool, bool], ...],
+    steps: tuple[float, float, float],
+    block_mm: float = BLOCK_MM,
 ) -> float:
-    """Return the radius of the largest ball that fits into a body, mm, right to about `BLOCK_MM`.
+    """Return the radius of the largest ball that fits into a body, mm, right to about `block_mm`.
 
     Where an end of the volume cuts the body, a disc in that end counts as a ball: of a skull only the cap may be there.
 
@@ -32,7 +56,7 @@ def measure_width(
     """
     from scipy.ndimage import distance_transform_edt
 
-    blocks = [max(1, round(BLOCK_MM / step)) for step in steps]
+    blocks = [max(1, round(block_mm / step)) for step in steps]
     counts = body.astype(np.int32)
     for axis, (block, (first, last)) in enumerate(zip(blocks, ends, strict=True)):
         rest = [(0, -counts.shape[axis] % block if a == axis else 0) for a in range(3)]

@@ -108,17 +108,12 @@ def make_mesh(
     judge_surfaces(parts, volume, settings)
     watch.lap("select")
     gates = _refine_and_measure(parts, solid, settings, device, measure or settings.strict, progress, watch)
-    purpose_warnings = describe_purposes(parts)
+    more_warnings = warn_of_crumbs(parts, settings) + describe_purposes(parts)
     watch.lap("measure")
 
     def compose(meshes: Sequence[dict[str, Any]]) -> MeshReport:
         warnings = _warn_of_leftovers(output, paths) if settings.split else []
-        warnings += (
-            warn_of_walls(parts, settings, choice)
-            + warn_of_crumbs(parts, settings)
-            + purpose_warnings
-            + warn_of_gates(gates)
-        )
+        warnings += warn_of_walls(parts, settings, choice) + more_warnings + warn_of_gates(gates)
         seconds = _seconds(watch, made.origins)
         return describe_job(
             solid, parts, meshes, settings, device.current, choice, gates=gates, warnings=warnings, seconds=seconds

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.anatomy.marrow import find_open_places, measure_width
+from clrecon.anatomy.marrow import find_open_places, holds_ball
 from clrecon.geometry import Volume
 from clrecon.opencl import download, upload
 from clrecon.operators.masks.band_mask import mask_bytes, zero_words
@@ -62,13 +62,13 @@ class Spaces:
         return Mask(mask.volume, words_d, f"spaces in ({mask.name})", device=mask.device, memory=mask.memory)
 
     def are_wide(self, radius_mm: float) -> NDArray[np.bool_]:
-        """Tell of each space whether a ball of this radius fits into it, right to about 2 mm, shape (n,).
+        """Tell of each space whether a ball of this radius fits into it, see `holds_ball`, shape (n,).
 
         What lies beyond the ends of the volume counts as part of a space that they cut.
         """
         wide = np.zeros(self.count, bool)
         for place in np.flatnonzero(self.ml >= WIDE_ML) if np.isfinite(radius_mm) else ():
-            wide[place] = self._runs.of(self.numbers[place]).width(self.volume) >= radius_mm
+            wide[place] = self._runs.of(self.numbers[place]).holds_ball(self.volume, radius_mm)
         return wide
 
     def describe(self, which: NDArray[np.bool_]) -> dict[str, Any]:
@@ -130,8 +130,8 @@ class _Runs:
         one = at[len(at) // 2]
         return int(self.first[one] + self.last[one]) // 2, int(self.j[one]), int(self.k[one])
 
-    def width(self, volume: Volume) -> float:
-        """Return the radius of the largest ball that fits into these voxels, mm."""
+    def holds_ball(self, volume: Volume, radius_mm: float) -> bool:
+        """Tell whether a ball fits into these voxels."""
         lows = [int(low.min()) for low in (self.k, self.j, self.first)]
         highs = [int(high.max()) + 1 for high in (self.k, self.j, self.last)]
         steps = np.zeros([high - low for low, high in zip(lows, highs, strict=True)] + np.array([0, 0, 1]), np.int8)
@@ -140,7 +140,7 @@ class _Runs:
         body = np.cumsum(steps, axis=2, dtype=np.int8)[:, :, :-1] > 0
         ends = tuple((low == 0, high == n) for low, high, n in zip(lows, highs, volume.voxels.shape, strict=True))
         di, dj, dk = volume.spacing
-        return measure_width(body, ends, (dk, dj, di))
+        return holds_ball(body, ends, (dk, dj, di), radius_mm)
 
 
 def find_spaces(mask: Mask) -> Spaces:
