@@ -158,7 +158,7 @@ def add_solid(surface: argparse._ArgumentGroup) -> None:
         dest="seal_mm",
         type=float,
         metavar="MM",
-        help="with --solid: pores up to twice as wide are no way in (default: 2.5 to 3, by the voxels)",
+        help="with --solid: close pores up to twice as wide, less one voxel (default: 2.5 to 3, by the voxels)",
     )
 
 

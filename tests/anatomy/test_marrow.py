@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from clrecon.anatomy.marrow import find_open_places, measure_width
+from clrecon.anatomy.marrow import find_open_places, holds_ball, measure_width
 
 FREE = ((False, False),) * 3
 
@@ -22,6 +22,27 @@ def ball(radius: float, steps: tuple[float, float, float]) -> np.ndarray:
 @pytest.mark.parametrize("radius", [12.0, 20.0])
 def test_a_ball_has_its_radius(radius, steps):
     assert measure_width(ball(radius, steps), FREE, steps) == pytest.approx(radius, abs=max(2.5, steps[0]))
+
+
+def ball_beside_voxels(radius: float, steps: tuple[float, float, float], shift: np.ndarray) -> np.ndarray:
+    """A ball whose middle lies `shift`, in mm, from a voxel."""
+    reach = [int(radius / step) + 2 for step in steps]
+    axes = [(np.arange(-n, n + 1) * step - s).reshape([-1 if a == b else 1 for b in range(3)])
+            for a, (n, step, s) in enumerate(zip(reach, steps, shift, strict=True))]  # fmt: skip
+    inside = np.asarray(sum(axis**2 for axis in axes) <= radius**2)
+    where = tuple(slice(at.min(), at.max() + 1) for at in np.nonzero(inside))
+    return inside[where]
+
+
+@pytest.mark.parametrize("steps", [(1.0, 1.0, 1.0), (1.3, 1.3, 1.3), (1.4, 0.7, 0.7), (5.0, 1.0, 1.0)])
+def test_a_ball_of_the_limit_fits_wherever_its_middle_lies_and_a_smaller_one_does_not(steps):
+    random = np.random.default_rng(7)
+    for _ in range(3):
+        shift = random.uniform(-0.5, 0.5, 3) * steps
+        for radius in (35.0, 35.4, 36.0, 37.0):
+            assert holds_ball(ball_beside_voxels(radius, steps, shift), FREE, steps, 35.0)
+        smaller = 35.0 - 1.25 * max(steps)
+        assert not holds_ball(ball_beside_voxels(smaller, steps, shift), FREE, steps, 35.0)
 
 
 def test_a_body_goes_on_beyond_the_ends_of_the_volume_and_a_disc_there_counts():

@@ -26,7 +26,8 @@ __all__ = ["AIR_LIMIT_HU", "LARGEST_MARROW_MM", "SEAL_MM", "fill_enclosed"]
 
 SEAL_MM, LARGEST_SEAL_MM = 2.5, 3.0
 """Radius of the balls that close pores and vessels of the cortex, and the largest, for coarse voxels: at levels of bone
-the thin cortex of vertebrae has openings of up to 5 mm."""
+the thin cortex of vertebrae has openings of up to 5 mm.  Between centres of voxels the ball closes every pore up to
+twice its radius less one step."""
 
 SEAL_STEPS = 1.25
 """The same radius in largest steps of the voxels: below one it would close nothing along that axis."""
@@ -55,7 +56,8 @@ def fill_enclosed(
 ) -> Any:
     """Return a volume in which what the voxels at a level and above enclose, as marrow, is above the level too.
 
-    The voxels at the level and above are closed by a ball, so that pores of the cortex are no way in.  A space is
+    The voxels at the level and above are closed by a ball, so that pores of the cortex are no way in.  The ball acts
+    between the centres of voxels: every pore up to twice its radius less one step of the voxels is closed.  A space is
     enclosed where no way over faces of voxels leads from it to the border of the volume, or only to places of an end
     of the volume that are enclosed in that end's own slice: the canal of a long bone that the scan cuts.  From outside
     voxels become free again as deep as the ball's radius, so that grooves, and pores at their mouth, keep their shape.
@@ -74,8 +76,8 @@ def fill_enclosed(
         Radius of the ball, mm.  Below every step of the voxels it closes nothing.  None: 1.25 of the largest step, from
         2.5 to 3 mm.
     largest_mm : float, optional
-        A space into which a ball of this radius fits stays open: no marrow is so thick, but the skull, the chest and
-        the pelvis are.  None fills all.
+        A space into which a ball of this radius fits, or one smaller by up to a step of the voxels (at least 1 mm),
+        stays open: no marrow is so thick, but the skull, the chest and the pelvis are.  None fills all.
     keep_air : bool
         True: a space that holds air stays open (sinuses, airways), unless what surrounds the bone is air too.
     device, memory
@@ -86,7 +88,8 @@ def fill_enclosed(
     Returns
     -------
     Volume or DeviceVolume
-        As ``volume``.  ``report["solid"]``: ``seal_mm``, ``bone_ml``, ``filled_ml``, ``filled_share`` (of both
+        As ``volume``.  ``report["solid"]``: ``seal_mm``, ``closes_mm`` (width up to which every pore is closed),
+        ``bone_ml``, ``filled_ml``, ``filled_share`` (of both
         together), ``filled_air_ml`` (cells with air that the ball closed), ``filled_hu`` (the value of what was filled:
         the mean of the bone), ``spaces`` (number of spaces filled that are wider than the ball), ``at_ends`` (of these,
         how many the ends of the volume cut), ``largest_ml``, and ``open``: for each kind (``wide``, ``air``)
@@ -156,6 +159,7 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
     filled_ml = float(_count_by_slice(marked) @ ml)
     facts = {
         "seal_mm": seal_mm,
+        "closes_mm": max(0.0, 2.0 * seal_mm - max(volume.spacing)),
         "bone_ml": bone_ml,
         "filled_ml": filled_ml,
         "filled_share": filled_ml / (filled_ml + bone_ml),

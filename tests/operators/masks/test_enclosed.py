@@ -68,6 +68,28 @@ def test_a_hollow_sphere_with_a_pore_becomes_solid_and_keeps_the_vertices_of_its
     assert np.array_equal(filled.voxels[unchanged], volume.voxels[unchanged])
 
 
+@pytest.mark.parametrize("spacing", [(1.3, 1.3, 1.3), (0.9, 0.9, 1.4)])
+def test_every_pore_of_the_promised_width_is_closed_wherever_it_lies(device, spacing):
+    shape, closes = [int(46 / step) for step in spacing[::-1]], 5.0 - max(spacing)
+    for shift in np.random.default_rng(3).random((4, 3)):
+        z, y, x = (
+            (axis - n / 2 + part) * step
+            for axis, n, part, step in zip(np.indices(shape), shape, shift, spacing[::-1], strict=True)
+        )
+        away = np.sqrt(x**2 + y**2 + z**2)
+        values = np.where((away < 20) & (away > 15), 800, 0)
+        values[(np.hypot(y, z) <= closes / 2) & (x > 0)] = 0
+        facts = clrecon.fill_enclosed(whole(values, spacing), 400, seal_mm=2.5, device=device).report["solid"]
+        assert facts["closes_mm"] == pytest.approx(closes)
+        assert facts["filled_ml"] == pytest.approx(4 / 3 * np.pi * 15**3 / 1000, rel=0.05)
+
+
+def test_a_ball_of_the_promised_radius_stays_open(device):
+    for inner in (35.0, 36.0, 37.0):
+        values = whole(np.where(abs(distances((85, 85, 85)) - inner - 2) < 2, 800, 50))
+        assert clrecon.fill_enclosed(values, 400, device=device).report["solid"]["filled_ml"] == 0.0
+
+
 def test_a_canal_that_the_ends_of_the_scan_cut_is_filled_and_one_that_ends_in_the_scan_is_not(device):
     nk = 24
     _, j, i = np.indices((nk, 41, 41))
