@@ -7,6 +7,7 @@ from typing import Any
 
 from clrecon.cli.common import add_device, add_memory, add_no_clobber, megabytes, table
 from clrecon.cli.console import Console, printable
+from clrecon.jobs.shared.clouds import MESH_INPUTS
 
 __all__ = ["add_arguments", "run"]
 
@@ -17,14 +18,15 @@ use clrecon compare.
 
 examples:
   clrecon distance printed.stl bone.stl
+  clrecon distance bone.3mf bone.glb
   clrecon distance a.ply b.ply -o a_to_b.ply --picture a_to_b.png --range 2 --report a_to_b.json"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = _EPILOG
-    parser.add_argument("mesh", metavar="A", help="mesh: .stl or .ply")
-    parser.add_argument("reference", metavar="B", help="mesh that it is measured against: .stl or .ply")
+    parser.add_argument("mesh", metavar="A", help=f"mesh: {', '.join(MESH_INPUTS)}")
+    parser.add_argument("reference", metavar="B", help="mesh that it is measured against")
     parser.add_argument(
         "--mesh-space",
         type=str.lower,

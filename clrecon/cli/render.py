@@ -21,7 +21,8 @@ from clrecon.cli.render_options import (
     add_motion,
     render_settings,
 )
-from clrecon.jobs.render.settings import describe_modes, describe_presets
+from clrecon.errors import UsageError
+from clrecon.jobs.render.settings import MeshFile, color_apart, describe_modes, describe_presets
 from clrecon.jobs.shared.clouds import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file, is_mesh_file
 from clrecon.system.text import count_of
 
@@ -42,6 +43,7 @@ examples:
   clrecon render CT_FOLDER --turntable bone.mp4
   clrecon render cloud.ply -o cloud.png --color label --point-radius 0.5
   clrecon render bone.stl -o bone.png --color orange --view left
+  clrecon render --mesh l3.stl=orange --mesh l4.3mf -o both.png
   clrecon render CT_FOLDER -o both.png --preset muscle --mesh l3.stl=orange --mesh l4.stl=,0.4"""
 
 
@@ -69,8 +71,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "input",
         metavar="INPUT",
+        nargs="?",
         help="DICOM folder (subfolders and any file names are fine) or file; a NIfTI, NRRD or MetaImage file; a"
-        f" cloud of points ({', '.join(CLOUD_INPUTS)}); or a mesh ({', '.join(MESH_INPUTS)}; of .ply say --mode mesh)",
+        f" cloud of points ({', '.join(CLOUD_INPUTS)}); or a mesh ({', '.join(MESH_INPUTS)}; of .ply and .vtp say"
+        " --mode mesh); may be left out with --mesh",
     )
     parser.add_argument(
         "-o", "--output", metavar="OUT", help="picture: .png, .jpg or .tif; may be left out with --turntable"
@@ -98,6 +102,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.render.files import PictureFiles
     from clrecon.jobs.render.job import make_pictures
 
+    if options.input is None:
+        _show_meshes_alone(options)
     files = PictureFiles(options.output, options.depth, options.values, options.turntable, options.report)
     if options.mode is None and is_cloud_file(options.input):
         options.mode = "points"
@@ -114,6 +120,27 @@ def run(options: argparse.Namespace, console: Console) -> int:
     for warning in report["warnings"]:
         console.warn(warning)
     return 0
+
+
+def _show_meshes_alone(options: argparse.Namespace) -> None:
+    """Make the first of the meshes the input; of several without a colour each gets one of its own.
+
+    Raises
+    ------
+    UsageError
+        There is no mesh, or the mode shows something else.
+    """
+    if not options.meshes:
+        raise UsageError("there is nothing to show: name a scan, a cloud or a mesh as INPUT, or meshes with --mesh")
+    if options.mode not in (None, "mesh") or options.preset is not None:
+        raise UsageError("without INPUT there are only meshes, which mode mesh shows: name a scan for other modes")
+    first, *options.meshes = [
+        (mesh.path, mesh.color, mesh.opacity) for mesh in color_apart([MeshFile(*given) for given in options.meshes])
+    ]
+    options.input, color, opacity = first
+    options.mode = "mesh"
+    options.color = options.color or color
+    options.opacity = opacity if options.opacity is None else options.opacity
 
 
 def describe_report(report: dict[str, Any]) -> list[str]:

@@ -23,7 +23,10 @@ import numpy as np
 from clrecon.exchange.content import BONE_COLOR, Assembly, Content, parts_of, refuse_file
 from clrecon.system.pieces import local_origin
 
-__all__ = ["estimate", "verify", "write"]
+__all__ = ["NAMELESS", "estimate", "verify", "write"]
+
+NAMELESS = "surface"
+"""Name of a node and mesh that have no other."""
 
 _METRES_PER_MM = 0.001
 _FLOAT, _UINT32 = 5126, 5125
@@ -63,7 +66,7 @@ def _document(content: Content | Assembly) -> dict[str, Any]:
     for number, part in enumerate(parts):
         primitive, start = _describe_part(part, number, start, views, accessors)
         rotation = _SCENE_FROM_LPS @ part.to_lps
-        name = part.name or "surface"
+        name = part.name or NAMELESS
         nodes.append({"name": name, "mesh": number, "matrix": _column_major(rotation, _METRES_PER_MM, _origin(part))})
         meshes.append({"name": name, "primitives": [primitive]})
         color = [*BONE_COLOR, 1.0] if part.color is None else [_linear(value) for value in part.color] + [1.0]

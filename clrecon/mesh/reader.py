@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.exchange.meshes import read_ply_mesh, read_stl
+from clrecon.exchange.meshes import read_3mf, read_glb, read_obj, read_ply_mesh, read_stl, read_vtp_mesh
+from clrecon.exchange.meshes.raw_mesh import RawMesh
 from clrecon.geometry import SPACES, frame_from_lps
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.log import get_logger, log_warnings
@@ -19,7 +20,14 @@ __all__ = ["MESH_INPUTS", "read_mesh"]
 
 log = get_logger(__name__)
 
-_READERS = {".stl": read_stl.read, ".ply": read_ply_mesh.read}
+_READERS = {
+    ".stl": read_stl.read,
+    ".ply": read_ply_mesh.read,
+    ".obj": read_obj.read,
+    ".glb": read_glb.read,
+    ".3mf": read_3mf.read,
+    ".vtp": read_vtp_mesh.read,
+}
 
 MESH_INPUTS = tuple(_READERS)
 """Extensions of files that are read as meshes."""
@@ -31,7 +39,10 @@ def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh
     Parameters
     ----------
     path : str or path
-        STL (binary or text; corners that coincide are joined) or PLY with triangles, by the extension.  Units are mm.
+        By the extension: STL (binary or text; corners that coincide are joined), PLY, OBJ and VTP with triangles in
+        mm; 3MF in its own unit, with the transforms and components of its build; GLB, by the matrices of its nodes:
+        ours in the patient's frame, those of others from metres with Y up, where (L, P, S) = 1000 (X, -Z, Y) mm and
+        corners that coincide are joined.
     space : {"lps", "ras"}, optional
         Patient frame of coordinates that do not name theirs; None: LPS, which the report then calls assumed.
 
@@ -39,7 +50,9 @@ def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh
     -------
     Mesh
         In LPS mm.  Entries of ``report["file"]``: ``kind``, ``space``, ``space_from`` ("file", "argument" or
-        "assumed"), ``triangles`` and ``warnings``.
+        "assumed"), ``unit`` (of the file), ``triangles``, ``parts`` (``name``, ``triangles`` and ``color`` of each
+        object, whose triangles follow one another) and ``warnings``.  The name and the colour of a file's only object
+        are the mesh's own: ``report["part_name"]``, ``report["color"]``.
 
     Raises
     ------
@@ -76,18 +89,8 @@ def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh
         normals = None if normals is None else normals * signs.astype(np.float32) + np.float32(0)
     if named is None and asked is None:
         warnings.append(f"{name} names no patient frame: its coordinates are taken as LPS")
-    facts: dict[str, Any] = {
-        "kind": raw.kind,
-        "space": used,
-        "space_from": "file" if named else "argument" if asked else "assumed",
-        "triangles": len(raw.triangles),
-        "warnings": warnings,
-    }
-    report: dict[str, Any] = {"file": facts}
-    if raw.iso_value_hu is not None and np.isfinite(raw.iso_value_hu):
-        report["iso_value_hu"] = raw.iso_value_hu
-    if raw.certificate:
-        report["certificate_lines"] = list(raw.certificate)
+    source = "file" if named else "argument" if asked else "assumed"
+    report = _describe(raw, used, source)
     try:
         mesh = Mesh(vertices, raw.triangles, normals, report)
     except UsageError as error:
@@ -95,3 +98,28 @@ def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh
     log.info("%s file read: %d triangles", raw.kind, mesh.triangle_count)
     log_warnings(log, warnings)
     return mesh
+
+
+def _describe(raw: RawMesh, space: str, source: str) -> dict[str, Any]:
+    """Return the report of a mesh: what the file says of it, and where its frame is known from."""
+    facts: dict[str, Any] = {
+        "kind": raw.kind,
+        "space": space,
+        "space_from": source,
+        "unit": raw.unit,
+        "triangles": len(raw.triangles),
+        "parts": [
+            {"name": escape_text(part.name) or None, "triangles": part.triangles, "color": part.color}
+            for part in raw.parts
+        ],
+        "warnings": raw.warnings,
+    }
+    report: dict[str, Any] = {"file": facts}
+    if len(raw.parts) == 1:
+        own = {"part_name": facts["parts"][0]["name"], "color": facts["parts"][0]["color"]}
+        report |= {name: value for name, value in own.items() if value is not None}
+    if raw.iso_value_hu is not None and np.isfinite(raw.iso_value_hu):
+        report["iso_value_hu"] = raw.iso_value_hu
+    if raw.certificate:
+        report["certificate_lines"] = list(raw.certificate)
+    return report

@@ -15,6 +15,7 @@ from dicom_series import Plan, write_series
 from clrecon.dicom import read_volume
 from clrecon.dicom.parse.containers import advise_on, describe_container
 from clrecon.errors import NoDicomError
+from clrecon.mesh import Mesh
 
 
 def make_zip(data):
@@ -74,6 +75,14 @@ def test_row_48_an_archive_beside_the_slices_is_counted(tmp_path):
 )
 def test_kinds(start, kind):
     assert describe_container(start) == kind
+
+
+def test_a_mesh_in_place_of_a_scan_is_called_one(tmp_path):
+    mesh = Mesh([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
+    for extension, kind in ((".3mf", "3MF mesh"), (".glb", "GLB mesh")):
+        mesh.save(tmp_path / f"a{extension}")
+        with pytest.raises(NoDicomError, match=rf"\({kind}: 1\); a mesh is shown with clrecon render"):
+            read_volume(tmp_path / f"a{extension}")
 
 
 def test_advice_is_for_what_can_be_unpacked():

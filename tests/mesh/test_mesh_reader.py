@@ -18,7 +18,7 @@ BALL = Mesh(*ball(8.0, 12))
 
 
 @pytest.mark.parametrize("space", ["lps", "ras"])
-@pytest.mark.parametrize("extension", [".stl", ".ply"])
+@pytest.mark.parametrize("extension", MESH_INPUTS)
 def test_what_is_written_comes_back(tmp_path: Path, extension: str, space: str) -> None:
     mesh = Mesh(BALL.vertices, BALL.triangles, BALL.vertices / 8.0, {"iso_value_hu": 250.0})
     path = tmp_path / f"ball{extension}"
@@ -98,7 +98,7 @@ def test_harmed_files_are_refused_in_one_line(tmp_path: Path) -> None:
             clrecon.read_mesh(path)
         assert "\n" not in str(error.value) and name in str(error.value)
     with pytest.raises(UsageError, match=r"\.stl, \.ply"):
-        clrecon.read_mesh(tmp_path / "a.obj")
+        clrecon.read_mesh(tmp_path / "a.off")
     with pytest.raises(UsageError, match=f"there is no mesh {tmp_path}/missing.stl"):
         clrecon.read_mesh(tmp_path / "missing.stl")
 

@@ -28,9 +28,16 @@ _STARTS = (
     (b"\x5c\x01\0\0", "NIfTI volume"),
     (b"\0\0\x01\x5c", "NIfTI volume"),
     (b"\x1c\x02\0\0n+2", "NIfTI volume"),
+    (b"glTF", "GLB mesh"),
+    (b"ply\n", "PLY mesh or cloud"),
+    (b"ply\r", "PLY mesh or cloud"),
+    (b'<?xml version="1.0"?>\n<VTKFile', "VTK file"),
+    (b"<VTKFile", "VTK file"),
     (b"\x7fELF", "program"),
     (b"MZ", "program"),
 )
+_THREEMF_ENTRIES = (b"3D/3dmodel.model", b"[Content_Types].xml")
+"""Names of the first entry of a zip archive that is a 3MF file."""
 _TAR_MARK = slice(257, 262), b"ustar"
 
 _PACKED = frozenset(
@@ -41,6 +48,8 @@ _GRIDS = frozenset(("NRRD volume", "MetaImage volume", "NIfTI volume"))
 
 def describe_container(start: bytes) -> str:
     """Name the type of a file by its first bytes (262 bytes suffice for all); empty if they are unknown."""
+    if start.startswith(b"PK\x03\x04") and start[30:].startswith(_THREEMF_ENTRIES):
+        return "3MF mesh"
     for mark, kind in _STARTS:
         if start.startswith(mark):
             return kind
@@ -56,4 +65,6 @@ def advise_on(kinds: Iterable[str]) -> str:
     if grids or "gzip file" in kinds:
         what = " or ".join(grids) or "NIfTI volume (.nii.gz)"
         advice.append(f"a {what} is read when the file itself is named")
+    if any("mesh" in kind for kind in kinds):
+        advice.append("a mesh is shown with clrecon render and measured with clrecon distance")
     return "; ".join(advice)

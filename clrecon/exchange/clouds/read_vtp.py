@@ -23,7 +23,7 @@ from clrecon.exchange.clouds.raw_cloud import RawCloud, columns_of, say_cut
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["read"]
+__all__ = ["Document", "has_polygons", "parse_document", "read", "read_count", "read_fields", "read_numbers"]
 
 _TYPES = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4", "Int64": "i8",
@@ -36,7 +36,9 @@ _LONGEST_TEXT = 1 << 20
 
 
 @dataclass
-class _Document:
+class Document:
+    """A file's XML, and the data behind it."""
+
     root: ElementTree.Element
     appended: bytes
     base64: bool
@@ -56,13 +58,21 @@ def read(path: Path) -> RawCloud:
     name = escape_text(path.name)
     try:
         with open_regular(path) as stream:
-            document = _parse(stream.read(), name)
+            document = parse_document(stream.read(), name)
         return _collect(document, name)
     except (OSError, ValueError, OverflowError, MemoryError, ElementTree.ParseError, zlib.error) as error:
         raise say_cut(name, error) from error
 
 
-def _parse(data: bytes, name: str) -> _Document:
+def has_polygons(path: Path) -> bool:
+    """True for a file whose XML counts polygons; its arrays are not looked at."""
+    with open_regular(path) as stream:
+        start = stream.read(_LONGEST_TEXT)
+    return any(int(count) for count in re.findall(rb'NumberOfPolys="(\d{1,15})"', start))
+
+
+def parse_document(data: bytes, name: str) -> Document:
+    """Return the parts of a file of PolyData."""
     head, mark, tail = data.partition(b"<AppendedData")
     if b"<!DOCTYPE" in head or b"<!ENTITY" in head:
         raise ValueError("it declares a document type, which VTP has not")
@@ -74,7 +84,7 @@ def _parse(data: bytes, name: str) -> _Document:
     compressor = root.get("compressor")
     if compressor not in (None, _ZLIB):
         raise RefusedInputError(f"{name} is packed by {escape_text(str(compressor))}: write it with {_ZLIB}, or plain")
-    return _Document(
+    return Document(
         root,
         tail[start:] if mark else b"",
         b"base64" in tail[:start],
@@ -84,25 +94,25 @@ def _parse(data: bytes, name: str) -> _Document:
     )
 
 
-def _collect(document: _Document, name: str) -> RawCloud:
+def _collect(document: Document, name: str) -> RawCloud:
     points, columns, left_out, normals = [], [], 0, None
     for piece in document.root.iterfind("PolyData/Piece"):
-        count = _count(piece, "NumberOfPoints")
+        count = read_count(piece, "NumberOfPoints")
         array = piece.find("Points/DataArray")
         if count == 0 or array is None:
             continue
-        points.append(_numbers(document, array, count, 3))
+        points.append(read_numbers(document, array, count, 3))
         data = piece.find("PointData")
         own = {}
         for each in () if data is None else data.iterfind("DataArray"):
             if each.get("type") in _TYPES:
-                own[each.get("Name", "")] = _numbers(document, each, count)
+                own[each.get("Name", "")] = read_numbers(document, each, count)
         normals = normals or (None if data is None else data.get("Normals"))
         columns.append(own)
-        left_out += sum(_count(piece, f"NumberOf{kind}") for kind in ("Lines", "Strips", "Polys"))
+        left_out += sum(read_count(piece, f"NumberOf{kind}") for kind in ("Lines", "Strips", "Polys"))
     if not points:
         raise RefusedInputError(f"{name} has no points")
-    texts, numbers = _fields(document)
+    texts, numbers = read_fields(document)
     affine, iso_value = numbers.get("AFFINE_IJK_TO_LPS_MM"), numbers.get("ISO_VALUE_HU")
     return RawCloud(
         "VTP",
@@ -133,30 +143,32 @@ def _named(pieces: Sequence[dict[str, NDArray[Any]]], normals: str | None) -> di
     return columns
 
 
-def _fields(document: _Document) -> tuple[dict[str, tuple[str, ...]], dict[str, NDArray[Any]]]:
+def read_fields(document: Document) -> tuple[dict[str, tuple[str, ...]], dict[str, NDArray[Any]]]:
+    """Return the field arrays: texts, and numbers."""
     texts: dict[str, tuple[str, ...]] = {}
     numbers: dict[str, NDArray[Any]] = {}
     for array in document.root.iterfind("PolyData/FieldData/*"):
         own = array.get("Name", "")
-        count = _count(array, "NumberOfTuples")
+        count = read_count(array, "NumberOfTuples")
         if array.get("type") == "String":
             data = _bytes(document, array)[:_LONGEST_TEXT]
             texts[own] = tuple(text.decode("utf-8", "replace") for text in data.split(b"\0")[:count])
         elif array.get("type") in _TYPES:
-            numbers[own] = _numbers(document, array, count).ravel()
+            numbers[own] = read_numbers(document, array, count).ravel()
     return texts, numbers
 
 
-def _count(element: ElementTree.Element, attribute: str) -> int:
+def read_count(element: ElementTree.Element, attribute: str) -> int:
+    """Return a whole number of an element, 0 where it is not given."""
     value = element.get(attribute, "0")
     if not re.fullmatch(r"\d{1,15}", value):
         raise ValueError(f"{attribute} is '{value}'")
     return int(value)
 
 
-def _numbers(document: _Document, array: ElementTree.Element, count: int, width: int | None = None) -> NDArray[Any]:
+def read_numbers(document: Document, array: ElementTree.Element, count: int, width: int | None = None) -> NDArray[Any]:
     """Return the values of a DataArray, shape (count, components)."""
-    components = _count(array, "NumberOfComponents") or 1
+    components = read_count(array, "NumberOfComponents") or 1
     kind = _TYPES.get(array.get("type", ""))
     if kind is None or components > _MOST_COMPONENTS or width not in (None, components):
         raise ValueError(f"an array of {components} components of type '{array.get('type')}'")
@@ -170,7 +182,7 @@ def _numbers(document: _Document, array: ElementTree.Element, count: int, width:
     return values.reshape(count, components)
 
 
-def _bytes(document: _Document, array: ElementTree.Element) -> bytes:
+def _bytes(document: Document, array: ElementTree.Element) -> bytes:
     """Return the bytes of an array."""
     form = array.get("format")
     if form == "ascii":
@@ -178,7 +190,7 @@ def _bytes(document: _Document, array: ElementTree.Element) -> bytes:
     if form == "binary":
         return _unpack(document, _From64((array.text or "").strip().encode("ascii")))
     if form == "appended":
-        rest = memoryview(document.appended)[_count(array, "offset") :]
+        rest = memoryview(document.appended)[read_count(array, "offset") :]
         return _unpack(document, _From64(bytes(rest)) if document.base64 else _Raw(rest))
     raise ValueError(f"an array of format '{form}'")
 
@@ -224,7 +236,7 @@ class _From64:
         self._taken = 0
 
 
-def _unpack(document: _Document, source: _Raw | _From64) -> bytes:
+def _unpack(document: Document, source: _Raw | _From64) -> bytes:
     """Return an array's bytes: after their number, or packed in blocks after the numbers of their bytes."""
     size = document.header.itemsize
     if not document.packed:

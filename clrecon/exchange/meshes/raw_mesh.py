@@ -9,7 +9,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["RawMesh"]
+__all__ = ["Part", "RawMesh"]
+
+
+@dataclass(frozen=True)
+class Part:
+    """An object of a file: its triangles follow those of the part before it.
+
+    Attributes
+    ----------
+    name : str
+        Empty where the file gives none.
+    triangles : int
+    color : (float, float, float) or None
+        Red, green and blue, 0 to 1, as on a screen (sRGB).
+    """
+
+    name: str
+    triangles: int
+    color: tuple[float, float, float] | None = None
 
 
 @dataclass
@@ -19,9 +37,9 @@ class RawMesh:
     Attributes
     ----------
     kind : str
-        "STL" or "PLY".
+        "STL", "PLY", "OBJ", "GLB", "3MF" or "VTP".
     vertices : ndarray, shape (n, 3), of any real type
-        mm; perhaps not finite.
+        mm, placed as the file says; perhaps not finite.
     triangles : ndarray, shape (m, 3), integer
         Perhaps of vertices that are not there.
     normals : ndarray, shape (n, 3), float32, or None
@@ -30,6 +48,10 @@ class RawMesh:
     iso_value_hu : float or None
     certificate : sequence of str
     warnings : list of str
+    unit : str
+        Unit of the lengths in the file.
+    parts : sequence of Part
+        Empty where the file has no objects.
     """
 
     kind: str
@@ -40,3 +62,5 @@ class RawMesh:
     iso_value_hu: float | None = None
     certificate: Sequence[str] = ()
     warnings: list[str] = field(default_factory=list)
+    unit: str = "mm"
+    parts: Sequence[Part] = ()

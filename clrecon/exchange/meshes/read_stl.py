@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError
 from clrecon.exchange.clouds.raw_cloud import say_cut
 from clrecon.exchange.coordinates import find_places
+from clrecon.exchange.meshes.plain_lines import MARK, plain_lines
 from clrecon.exchange.meshes.raw_mesh import RawMesh
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
@@ -25,7 +26,8 @@ _FACET = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("unused
 _PIECE = 1 << 16
 """Facets that are read at a time."""
 
-_VERTEX = re.compile(rb"^[ \t]*vertex[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)[ \t\r]*$", re.MULTILINE)
+_VERTEX = re.compile(rb"^[ \t]*vertex[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)[ \t]*$", re.MULTILINE | re.IGNORECASE)
+_END = re.compile(rb"^[ \t]*end[ \t]?facet\b", re.MULTILINE | re.IGNORECASE)
 
 
 def read(path: Path) -> RawMesh:
@@ -49,16 +51,16 @@ def read(path: Path) -> RawMesh:
                     corners[start : start + len(rows)] = rows["corners"]
                 said = re.search(rb"SPACE=(\w+)", head[:80])
                 return _make(corners, said)
-            if head.lstrip()[:5].lower() != b"solid":
+            if head.removeprefix(MARK).lstrip()[:5].lower() != b"solid":
                 raise RefusedInputError(
                     f"{name} is cut or corrupt: {count:,} triangles take {_HEAD + _FACET.itemsize * count:,} bytes, it"
                     f" has {size:,}"
                 )
-            text = head + stream.read()
+            text = plain_lines(head + stream.read())
     except (OSError, ValueError, OverflowError, MemoryError) as error:
         raise say_cut(name, error) from error
     found = _VERTEX.findall(text)
-    if len(found) % 3 or len(found) != 3 * len(re.findall(rb"(?m)^[ \t]*endfacet\b", text)):
+    if len(found) % 3 or len(found) != 3 * len(_END.findall(text)):
         raise RefusedInputError(f"{name} is cut or corrupt: {len(found):,} vertices are not those of whole facets")
     try:
         numbers = np.array(found, dtype="S40").astype(np.float64).reshape(-1, 3, 3)

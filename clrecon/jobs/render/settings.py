@@ -54,6 +54,7 @@ __all__ = [
     "Turntable",
     "VIEWS",
     "WINDOWS",
+    "color_apart",
     "describe_modes",
     "describe_presets",
 ]
@@ -123,13 +124,13 @@ class MeshFile:
     ----------
     path : path
         See `clrecon.read_mesh`.
-    color : str, optional
+    color : str or (float, float, float), optional
         See `clrecon.rendering.looks.colors.find_color`; default: "bone" for one mesh, a colour for each of several.
     opacity : float
     """
 
     path: str
-    color: str | None = None
+    color: str | Sequence[float] | None = None
     opacity: float = 1.0
 
     def __post_init__(self) -> None:
@@ -139,6 +140,14 @@ class MeshFile:
     def look(self) -> MeshLook:
         """The style that it is shown in."""
         return MeshLook(self.color, opacity=self.opacity)
+
+
+def color_apart(meshes: Sequence[MeshFile]) -> list[MeshFile]:
+    """Return meshes of which each of several without a colour has one of its own."""
+    if len(meshes) < 2:
+        return list(meshes)
+    colors = distinct_colors(len(meshes)).tolist()
+    return [replace(mesh, color=mesh.color or color) for mesh, color in zip(meshes, colors, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -367,13 +376,10 @@ class RenderSettings(InputSettings):
 
     def mesh_looks(self) -> list[MeshLook]:
         """Return the styles of the meshes: with the light, and a colour for each of several that have none."""
-        colors = distinct_colors(len(self.meshes)) if len(self.meshes) > 1 else [None]
-        looks = []
-        for mesh, own in zip(self.meshes, colors, strict=False):
-            look = mesh.look
-            if mesh.color is None and own is not None:
-                look = replace(look, color=tuple(own.tolist()))
-            looks.append(look if self.light is None else replace(look, lighting=_turn_light(self.light, Lighting())))
+        looks = [mesh.look for mesh in color_apart(self.meshes)]
+        if self.light is not None:
+            lighting = _turn_light(self.light, Lighting())
+            looks = [replace(look, lighting=lighting) for look in looks]
         return looks
 
     def camera(self, volume: Grid, view: str, turning: bool = False) -> Camera:

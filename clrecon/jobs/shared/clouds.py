@@ -28,7 +28,7 @@ __all__ = [
 CLOUD_INPUTS = (".ply", ".vtp", ".npz", ".xyz", ".las", ".csv", ".txt")
 """Extensions of files that are read as clouds, see `clrecon.read_points`."""
 
-MESH_INPUTS = (".stl", ".ply")
+MESH_INPUTS = (".stl", ".ply", ".obj", ".glb", ".3mf", ".vtp")
 """Extensions of files that are read as meshes, see `clrecon.read_mesh`."""
 
 MESH_ONLY = tuple(extension for extension in MESH_INPUTS if extension not in CLOUD_INPUTS)

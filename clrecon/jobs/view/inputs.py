@@ -110,7 +110,7 @@ def _is_scan(opened: OpenedInput) -> bool:
 
 
 def _tell_kind(path: str | Path) -> str:
-    """Return "mesh", "cloud" or "scan" by the extension; a PLY file with faces is a mesh."""
+    """Return "mesh", "cloud" or "scan" by the extension; a PLY or VTP file with faces is a mesh."""
     file = Path(path)
     refuse_other_clouds(file)
     suffix = file.suffix.lower()
@@ -118,6 +118,10 @@ def _tell_kind(path: str | Path) -> str:
         return "scan"
     if not file.is_file():
         raise UsageError(f"{escape_text(str(path), 200)}: there is no file of that name")
+    if suffix == ".vtp":
+        from clrecon.exchange.clouds.read_vtp import has_polygons
+
+        return "mesh" if has_polygons(file) else "cloud"
     if suffix == ".ply":
         from clrecon.exchange.clouds.read_ply import read_header
 

@@ -18,8 +18,8 @@ class ViewReport(Record):
     Attributes
     ----------
     inputs : list of mapping
-        Each input: ``name`` of the file or folder without those above it, ``kind`` ("scan", "STL", "PLY"), ``space``
-        and ``space_from`` of a mesh (None for a scan), ``triangles``; of a scan ``volume``, its certificate, and
+        Each input: ``name`` of the file or folder without those above it, ``kind`` ("scan", "STL" ...), ``space`` and
+        ``space_from`` of a mesh (None for a scan), ``triangles``; of a scan ``volume``, its certificate, and
         ``surface``, the values that it encloses.
     parts : list of mapping
         ``name``, ``triangles``, ``ml`` and ``color`` of each part that can be switched.

@@ -50,7 +50,8 @@ class SignedDistance:
     ----------
     vertices : ndarray, shape (n, 3), mm
     triangles : ndarray, shape (m, 3), uint32
-        Every edge in two triangles, which run along it in opposite directions.
+        Every edge in two triangles, which run along it in opposite directions; triangles with a corner twice, which
+        are no surface, are left out.
     outward : bool
         False: the triangles face inward, and the sign is turned.
 
@@ -61,6 +62,8 @@ class SignedDistance:
     """
 
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], *, outward: bool = True):
+        a, b, c = triangles.T
+        triangles = triangles[(a != b) & (b != c) & (c != a)]  # one with a corner twice is no surface
         opposite = opposite_half_edges(triangles, find_edges(triangles, len(vertices)))
         if opposite is None:
             raise UsageError("distances have a sign where the surface is closed and its triangles agree on the outside")

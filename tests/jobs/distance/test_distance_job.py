@@ -132,7 +132,7 @@ def test_the_picture_shows_red_ends_and_its_scale(device: Any, files: dict[str, 
         (["B", "--samples", "0"], 3, "samples"),
         (["B", "--mesh-space", "xyz"], 3, "xyz"),
         (["B", "--view", "sideways"], 3, "sideways"),
-        (["x.obj"], 3, ".stl"),
+        (["x.off"], 3, ".stl"),
     ],
 )
 def test_wrong_usage_is_one_line_and_writes_nothing(

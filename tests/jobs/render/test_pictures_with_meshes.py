@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,25 @@ def test_a_mesh_is_an_input(device: Any, files: dict[str, Path], tmp_path: Path,
     assert report.cloud is None and report.mode == "mesh"
 
 
+def test_meshes_without_a_scan(device: Any, files: dict[str, Path], tmp_path: Path, capsys: Any) -> None:
+    glb = tmp_path / "other.glb"
+    clrecon.read_mesh(files["ras.ply"]).save(glb)
+    report = tmp_path / "report.json"
+    words = ["render", "--mesh", str(glb), "--mesh", f"{files['lps.stl']}=red,0.5", "--size", "64x48"]
+    assert main([*words, "-o", str(tmp_path / "out.png"), "--report", str(report)]) == 0, capsys.readouterr().err
+    first, second = json.loads(report.read_text())["meshes"]
+    assert (first["file"]["kind"], first["opacity"], second["file"]["kind"], second["opacity"]) == (
+        "GLB",
+        1,
+        "STL",
+        0.5,
+    )
+    assert second["color"] == [1.0, 0.0, 0.0] and first["color"] != second["color"]
+    for wrong in (["render", "-o", "a.png"], [*words, "--mode", "mip", "-o", "a.png"]):
+        assert main(wrong) == 3
+        assert len(capsys.readouterr().err.splitlines()) == 1
+
+
 @pytest.mark.parametrize("mode", ["dvr", "slices", "surface"])
 def test_meshes_lie_in_a_scan(device: Any, files: dict[str, Path], tmp_path: Path, mode: str) -> None:
     out = tmp_path / "out.png"
@@ -83,7 +103,7 @@ def test_what_has_no_meaning_is_refused(files: dict[str, Path], tmp_path: Path, 
         ([str(files["scan.nii"]), "--mesh", ball_file + "=octarine"], "unknown colour 'octarine'"),
         ([str(files["scan.nii"]), "--mesh", ball_file + "=red,2"], "opacity of a mesh"),
         ([str(files["scan.nii"]), "--mesh", ball_file + "=red,x"], "FILE[=COLOUR[,OPACITY]]"),
-        ([str(files["scan.nii"]), "--mesh", str(tmp_path / "a.obj")], ".stl, .ply"),
+        ([str(files["scan.nii"]), "--mesh", str(tmp_path / "a.off")], ".stl, .ply"),
         ([ball_file, "--mode", "dvr"], "mode mesh shows, and not mode dvr"),
         ([ball_file, "--fov"], "the input is a mesh"),
         ([ball_file, "--mesh-space", "ras"], "leave the space out"),
