@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import Volume, apply_affine
 from clrecon.labels.label_map import LabelMap
+from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["LEAST_SHARE_INSIDE", "ResampledLabels", "check_together", "resample_labels"]
+__all__ = ["LEAST_SHARE_INSIDE", "ResampledLabels", "check_together", "resample_labels", "warn_of_place"]
+
+log = get_logger(__name__)
 
 LEAST_SHARE_INSIDE = 0.01
 """Least share of the labelled voxels inside the volume.  The labels of a whole body have a larger share in a scan of
@@ -22,6 +25,9 @@ one joint; labels of another scan have less."""
 
 ON_GRID = 0.01
 """Tolerance in index steps: grids are the same when no voxel is further off than this."""
+
+BONE_HU = 200.0
+"""Voxels of this and above count as bone where a map may be misplaced."""
 
 TIES = 1e-6
 """Tolerance in index steps: half-way between two labels the lower index wins, independent of rounding."""
@@ -81,12 +87,70 @@ def resample_labels(labels: LabelMap, volume: Volume, *, progress: Progress | No
             f" ({type(labels).__name__}, {type(volume).__name__})"
         )
     shares = check_together(labels, volume)
+    voxels, exact = _take(labels, volume, progress or ignore_progress)
+    misplaced = warn_of_place(labels, volume, voxels)
+    log_warnings(log, misplaced)
+    return ResampledLabels(voxels, exact, shares, (*labels.warnings, *misplaced))
+
+
+def warn_of_place(labels: LabelMap, volume: Volume, voxels: NDArray[Any] | None = None) -> list[str]:
+    """Return a warning where a map has the shape of the scan and another affine, which its array may not fit.
+
+    Where only the order or direction of the axes differs, as after a careful turn, there is none unless the labels lie
+    better in bone at the same indices.
+
+    Parameters
+    ----------
+    labels : LabelMap
+    volume : Volume
+    voxels : ndarray, shape (nk, nj, ni), optional
+        The map on the grid of the volume; None: it is brought there if it is needed.
+    """
+    if labels.shape_ijk != volume.shape_ijk:
+        return []
+    corners = np.array(_corners(volume), dtype=np.float64)
+    places = apply_affine(np.linalg.inv(volume.affine) @ labels.affine, corners)  # in steps of the scan
+    if np.abs(places - corners).max() <= ON_GRID:
+        return []
+    placed = _take(labels, volume, ignore_progress)[0] if voxels is None else voxels
+    by_affine, by_index = _shares_of_bone(volume, placed, labels.voxels)
+    box, scan = (np.stack((each.min(axis=0), each.max(axis=0))) for each in (places, corners))
+    if by_affine >= by_index and np.abs(box - scan).max() <= ON_GRID:
+        return []
+    names = ("step along i", "step along j", "step along k", "first voxel")
+    differing = [
+        f"{name} {_triple(one)} and {_triple(other)}"
+        for name, one, other in zip(names, labels.affine[:3].T, volume.affine[:3].T, strict=True)
+        if _triple(one) != _triple(other)
+    ]
+    return [
+        "the label map has the shape of the scan and another affine (of the map and of the scan:"
+        f" {', '.join(differing)} mm): {100 * by_affine:.0f} % of its voxels in the scan have {BONE_HU:g} HU or more"
+        f" where its affine puts them, {100 * by_index:.0f} % at the same indices of the scan; if it was drawn on this"
+        " scan, save it with the scan's affine"
+    ]
+
+
+def _triple(vector: NDArray[np.float64]) -> str:
+    return f"({', '.join(f'{value + 0.0:.4g}' for value in vector)})"
+
+
+def _shares_of_bone(volume: Volume, *maps: NDArray[Any]) -> list[float]:
+    """Return the share of the labelled voxels of each map, on the grid of the volume, that are as dense as bone."""
+    counts = np.zeros((len(maps), 2), dtype=np.int64)
+    for k, layer in enumerate(volume.voxels):
+        dense = layer >= BONE_HU
+        for number, voxels in enumerate(maps):
+            labelled = voxels[k] > 0
+            counts[number] += np.count_nonzero(labelled & dense), np.count_nonzero(labelled)
+        volume.release_slices(k, k + 1)
+    return [float(dense) / max(int(labelled), 1) for dense, labelled in counts]
+
+
+def _take(labels: LabelMap, volume: Volume, progress: Progress) -> tuple[NDArray[Any], bool]:
+    """Return the labels on the grid of the volume, and whether each voxel coincides with one of the map."""
     aligned = _take_aligned(labels, volume)
-    if aligned is not None:
-        voxels, exact = aligned, True
-    else:
-        voxels, exact = _take_nearest(labels, volume, progress or ignore_progress)
-    return ResampledLabels(voxels, exact, shares, labels.warnings)
+    return (aligned, True) if aligned is not None else _take_nearest(labels, volume, progress)
 
 
 def check_together(labels: LabelMap, volume: Volume) -> dict[int, float]:

@@ -130,10 +130,10 @@ def _extract_masks(
 ) -> dict[int, Mesh]:
     """Extract each label's own surface, on the map's own grid; the map must still lie on the scan."""
     from clrecon.anatomy.head import warn_of_skin
-    from clrecon.labels.resample import check_together
-    from clrecon.operators.surface.label_masks import extract_label_masks
+    from clrecon.labels.resample import check_together, warn_of_place
+    from clrecon.operators.surface.label_masks import extract_label_masks, warn_of_volume
 
-    shares = check_together(labels, volume)
+    shares, misplaced = check_together(labels, volume), warn_of_place(labels, volume)
     if settings.crop is not None:
         labels = crop_labels(labels, settings.crop, settings.space)
         numbers = None if numbers is None else [number for number in numbers if number in labels.counts]
@@ -154,7 +154,9 @@ def _extract_masks(
             "grow_mm": None,
             "solid": False,
         }
-        mesh.report["warnings"] += warn_of_skin(volume, mesh.vertices, mesh.triangles)
+        for warning in warn_of_volume(mesh.report):  # the gate says so
+            mesh.report["warnings"].remove(warning)
+        mesh.report["warnings"] += [*misplaced, *warn_of_skin(volume, mesh.vertices, mesh.triangles)]
         if shares[number] < 1.0:
             share = f"{100 * (1 - shares[number]):.3g} %"
             mesh.report["warnings"].append(f"{share} of label {number} lie outside the CT: its surface goes on there")

@@ -84,7 +84,7 @@ def measure_stats(
     watch.lap("measure")
     seconds = {part: round(value, 4) for part, value in {**watch.seconds, "total": watch.total()}.items()}
     report = describe_stats(
-        volume, figures, settings, resampled=not taken.exact, warnings=labels.warnings, seconds=seconds
+        volume, figures, settings, resampled=not taken.exact, warnings=taken.warnings, seconds=seconds
     )  # fmt: skip
     with keep_existing(no_clobber), ExitStack() as staged:
         files: list[Staged] = []

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.labels.resample import check_together
+from clrecon.labels.resample import check_together, warn_of_place
 from clrecon.opencl import Stopwatch
 from clrecon.operators.reformat.sample import Reformation, sample_sheet
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -42,7 +42,7 @@ class CutJob:
         self.look = style.label_style
         if self.look is not None:
             check_together(self.look.labels, resident.volume)
-            self.warnings += self.look.labels.warnings
+            self.warnings += [*self.look.labels.warnings, *warn_of_place(self.look.labels, resident.volume)]
 
     def sample(self, sheet: Sheet) -> Reformation:
         """Return the values of a sheet."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.labels import LabelMap
@@ -11,6 +12,8 @@ from clrecon.labels.occupancy import FULL
 from clrecon.labels.solid import Box
 from clrecon.labels.volumes import label_ml
 from clrecon.mesh import Mesh
+from clrecon.mesh.compare.gates import judge_label_volume
+from clrecon.mesh.triangles import enclosed_ml
 from clrecon.opencl import (
     Device,
     Stopwatch,
@@ -24,7 +27,7 @@ from clrecon.operators.surface.label_survey import survey_labels
 from clrecon.operators.surface.mask_extraction import HeldMap, MaskExtraction, prepare_label_masks
 from clrecon.system.progress import Progress
 
-__all__ = ["extract_label_masks", "prepare_label_masks"]
+__all__ = ["extract_label_masks", "prepare_label_masks", "warn_of_volume"]
 
 
 def extract_label_masks(
@@ -65,8 +68,11 @@ def extract_label_masks(
     -------
     dict of int to Mesh
         In the order asked for, else ascending.  Each mesh is closed and manifold.  ``Mesh.report`` has ``surface``
-        ("mask"), ``label``, ``label_name``, ``label_ml`` (the volume of its voxels), ``mask_level`` (the share of
-        occupancy at which it lies), ``closed_at_border``, the affine, the device and the seconds.
+        ("mask"), ``label``, ``label_name``, ``label_ml`` (the volume of its voxels), ``label_mesh_ml`` (what the mesh
+        encloses, None where it is open), ``mask_level`` (the share of occupancy at which it lies),
+        ``closed_at_border``, the affine, the device, the seconds, and ``warnings``, among them one where the mesh is
+        more than 1 % larger or smaller than its label: labels that fill the map, or touch at its ends, cannot all keep
+        their volume.
 
     Raises
     ------
@@ -97,6 +103,14 @@ def extract_label_masks(
     return work_on(take_device(device), make)
 
 
+def warn_of_volume(report: Mapping[str, Any]) -> list[str]:
+    """Return a warning where the mesh of a label has not its volume, from the mesh's own report."""
+    gate = judge_label_volume(report["label_mesh_ml"], report["label_ml"], by_hu=False)
+    if gate.ok is not False:
+        return []
+    return [f"label {report['label']}: {gate['text']}; labels that fill the map or touch at its ends lose volume there"]
+
+
 def _make_meshes(run: MaskExtraction, chosen: Sequence[int], progress: Progress | None) -> dict[int, Mesh]:
     labels = run.labels
     everywhere, faces = survey_labels(labels, run.device, run.memory, run.stopwatch)
@@ -114,7 +128,10 @@ def _make_meshes(run: MaskExtraction, chosen: Sequence[int], progress: Progress 
 
     for number, ((positions, normals, triangles), level) in each_label(groups, run.hold, extract, run.warnings):
         own = {"label": number, "label_name": labels.name(number), "label_ml": label_ml(labels, number)}
-        report = {**run.describe(), **own, "mask_level": level / FULL}
-        meshes[number] = Mesh(run.placement.to_lps(positions), triangles, normals, report, trusted=True)
+        mesh = Mesh(run.placement.to_lps(positions), triangles, normals, {**run.describe(), **own}, trusted=True)
+        mesh_ml = enclosed_ml(mesh.vertices, triangles) if run.grid.rule.closed else None
+        mesh.report |= {"mask_level": level / FULL, "label_mesh_ml": mesh_ml}
+        mesh.report["warnings"] += warn_of_volume(mesh.report)
+        meshes[number] = mesh
         run.stopwatch = Stopwatch()  # the time of common work counts for the first label
     return meshes

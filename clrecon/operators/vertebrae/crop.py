@@ -11,7 +11,7 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import Volume, column_spacing
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels import LabelMap
-from clrecon.labels.resample import check_together
+from clrecon.labels.resample import check_together, warn_of_place
 from clrecon.labels.solid import find_boxes
 
 __all__ = ["LabelCrop", "check_types", "crop_label"]
@@ -90,7 +90,7 @@ def crop_label(volume: Volume, labels: LabelMap, label: int | str, margin_mm: fl
     )
     cut_map = _cut_map(labels, *_window(labels, around, 0.0))
     cut, axial = _cut_volume(volume, first, end)
-    warnings = [*labels.warnings]
+    warnings = [*labels.warnings, *warn_of_place(labels, volume)]
     if share < 1.0:
         warnings.append(
             f"{100 * (1 - share):.3g} % of {called} lie outside the CT: the vertebra ends where the CT does"

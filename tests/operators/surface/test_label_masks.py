@@ -306,6 +306,23 @@ def test_cells_that_fill_a_map_lack_the_same_share(device):
     assert np.ptp(shares) <= tolerances.MASK_VOLUME
 
 
+def test_labels_that_lack_volume_are_warned_of(device):
+    """A voxel and what fills the rest of the map; a body amid the map keeps its volume."""
+    voxels = np.ones((4, 5, 6), np.uint8)
+    voxels[0, 0, 0] = 2
+    labels = LabelMap(voxels, np.eye(4))
+    for number, mesh in extract_label_masks(labels, device=device).items():
+        (warning,) = mesh.report["warnings"]
+        assert mesh.report["label_mesh_ml"] == pytest.approx(enclosed_ml(mesh.vertices, mesh.triangles))
+        change = 100.0 * (mesh.report["label_mesh_ml"] / mesh.report["label_ml"] - 1.0)
+        assert change < -5.0
+        assert warning.startswith(f"label {number}: the mesh has ") and f"({change:+.3g} %, at most 1 %" in warning
+    for mesh in extract_label_masks(labels, device=device, closed=False).values():
+        assert mesh.report["label_mesh_ml"] is None and mesh.report["warnings"] == []
+    alone = LabelMap(np.pad(np.ones((6, 6, 6), np.uint8), 3), np.eye(4))
+    assert extract_label_masks(alone, device=device)[1].report["warnings"] == []
+
+
 def test_no_groove_runs_along_the_border_and_gaps_stay_open(device):
     shape = (16, 30, 40)
     labels = np.zeros(shape, np.uint8)
