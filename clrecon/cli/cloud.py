@@ -113,7 +113,9 @@ def _add_points(parser: argparse.ArgumentParser) -> None:
         help="iso value, inside is N and above; or a band, both ends included (default: that of bone)",
     )
     group.add_argument(
-        "--labels", metavar="FILE", help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG or RTSTRUCT"
+        "--labels",
+        metavar="FILE|FOLDER",
+        help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
     )
     group.add_argument("--label", metavar="NAME|N", help="points of this label only (default: of all)")
     group.add_argument(

@@ -38,9 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--labels",
-        metavar="FILE",
+        metavar="FILE|FOLDER",
         required=True,
-        help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG or RTSTRUCT",
+        help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
     )
     parser.add_argument(
         "--label",

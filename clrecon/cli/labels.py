@@ -24,7 +24,9 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options for label maps; without `files` all labels go into one."""
     group = parser.add_argument_group("labels", "one mesh a label: the label picks the cells, HU place the vertices")
     group.add_argument(
-        "--labels", metavar="FILE", help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG or RTSTRUCT"
+        "--labels",
+        metavar="FILE|FOLDER",
+        help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
     )
     group.add_argument(
         "--label", metavar="NAME|N", action="append", help="this label only; may be given again (default: all)"

@@ -229,7 +229,9 @@ def add_labels(parser: argparse.ArgumentParser) -> None:
     """Add the options for labels with a look of their own."""
     group = parser.add_argument_group("labels")
     group.add_argument(
-        "--labels", metavar="FILE", help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG or RTSTRUCT"
+        "--labels",
+        metavar="FILE|FOLDER",
+        help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
     )
     _add_repeated(group, "--label-color", parse_label_color, "LABEL=COLOUR", "colour of a label, by name or number")
     _add_repeated(

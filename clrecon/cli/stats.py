@@ -47,9 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("input", metavar="INPUT", help="DICOM folder or file; or a NIfTI, NRRD or MetaImage file")
     parser.add_argument(
         "--labels",
-        metavar="FILE",
+        metavar="FILE|FOLDER",
         required=True,
-        help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG or RTSTRUCT",
+        help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
     )
     parser.add_argument(
         "--label", metavar="NAME|N", action="append", default=[], help="this label only; may be given again"

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from clrecon.dicom.parse.containers import advise_on
+from clrecon.dicom.parse.containers import advise_on, is_text
 from clrecon.dicom.parse.forced import describe_way_out
 from clrecon.dicom.pixels.voxels import read_voxels
 from clrecon.dicom.series.certificate import certify, collect_scan_warnings, collect_series_warnings
@@ -26,12 +26,16 @@ from clrecon.sources.listing import SeriesListing
 from clrecon.sources.plausibility import examine_voxels
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress
+from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text, join_names
 from clrecon.system.wording import name_parameter
 
 __all__ = ["list_series", "list_slices", "read_volume"]
 
 log = get_logger(__name__)
+
+_START_BYTES = 512
+_UNKNOWN = {"not DICOM", "NumPy array"}
 
 
 def read_volume(
@@ -226,6 +230,13 @@ def _quiet_warnings() -> Iterator[None]:
         yield
 
 
+def _describe_single(path: Path) -> str:
+    """Say what a file is that was named as a scan, and what is read as one."""
+    with open_regular(path) as file:
+        kind = "it is text, not a scan; " if is_text(file.read(_START_BYTES)) else ""
+    return f"{kind}scans are folders or files of DICOM, and NIfTI, NRRD and MetaImage files"
+
+
 def _scan_and_group(
     path: str | os.PathLike[str], progress: Progress | None, force: bool, follow_links: bool
 ) -> tuple[Scan, list[Series]]:
@@ -249,6 +260,7 @@ def _scan_and_group(
         bare = sum(suspect.reason.startswith(BARE_DATA_SET) for suspect in scan.suspects)
         hint += f"; {bare} like {BARE_DATA_SET} ({describe_way_out()})" if bare else ""
         hint += f"; {advise_on_links()}" if scan.skipped[LINK_OUT] else ""
+        hint += f"; {_describe_single(folder)}" if folder.is_file() and _UNKNOWN & set(scan.skipped) else ""
         raise NoDicomError(f"no DICOM images in {shown}: {looked}{hint}")
     found = group_series(scan)
     log.debug("%d files: %d slices in %d series, skipped %s", scan.files, len(scan.slices), len(found), scan.skipped)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from clrecon.formats.nifti import is_nifti, open_nifti
 from clrecon.formats.nrrd import is_nrrd, open_nrrd
 from clrecon.system.regular_files import open_regular
 
-__all__ = ["open_grid", "tell_kind"]
+__all__ = ["name_of_grid", "open_grid", "tell_kind"]
 
 _START_BYTES = 512
 
@@ -43,6 +44,11 @@ def _inflate(start: bytes) -> bytes:
         return zlib.decompressobj(wbits=31).decompress(start, 64)
     except zlib.error:
         return b""
+
+
+def name_of_grid(path: Path) -> str:
+    """Return the name of a grid file without its file extension, with which structures are named."""
+    return re.sub(r"(\.seg)?\.(nii|hdr|nrrd|nhdr|mha|mhd)(\.gz)?$", "", path.name, flags=re.IGNORECASE) or path.name
 
 
 def open_grid(path: Path, kind: str, purpose: Purpose) -> GridFile:

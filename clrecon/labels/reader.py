@@ -12,9 +12,10 @@ import numpy as np
 
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
 from clrecon.formats.grid_file import LABEL_MAP, GridFile
-from clrecon.formats.kinds import open_grid, tell_kind
+from clrecon.formats.kinds import name_of_grid, open_grid, tell_kind
 from clrecon.geometry.grid import Grid
 from clrecon.geometry.volume import Volume
+from clrecon.labels.folder import open_masks, read_masks
 from clrecon.labels.grids import read_grid_labels
 from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap
 from clrecon.labels.overlap import Wanted, check_wanted
@@ -40,6 +41,9 @@ MOST_TIMES = 8
 """Most voxels of a large map for each voxel of its scan: twice as fine along each axis."""
 
 
+MASK_NUMBERS = ((1,), (255,))
+"""The numbers of a mask of one structure."""
+
 WARNINGS_SHOWN = 3
 """Warnings that a refusal quotes."""
 
@@ -51,10 +55,13 @@ def read_labels(
     volume: Grid | None = None,
     progress: Progress | None = None,
 ) -> LabelMap:
-    """Read a label map: NIfTI (.nii, .nii.gz), NRRD and 3D Slicer's .seg.nrrd, MetaImage, DICOM SEG,
-    or RTSTRUCT.
+    """Read a label map: NIfTI (.nii, .nii.gz), NRRD and 3D Slicer's .seg.nrrd, MetaImage, DICOM SEG, RTSTRUCT, or a
+    folder of masks.
 
-    The kind is told from the content.  MetaImage needs the package SimpleITK.
+    The kind is told from the content.  MetaImage needs the package SimpleITK.  A folder holds one mask a structure on
+    one grid, as TotalSegmentator writes them: labels are numbered from 1 in the alphabetical order of the files and
+    named by them, and a voxel of several masks belongs to the first of them (in ``warnings``: how many).  A file with
+    one mask (0 and 1, or 0 and 255) that holds no name is named by the file too.
 
     Parameters
     ----------
@@ -115,33 +122,21 @@ def _keep(labels: LabelMap, numbers: Sequence[int]) -> LabelMap:
 
 def _read(path: Path, wanted: Wanted, volume: Grid | None, progress: Progress | None) -> LabelMap:
     try:
-        if path.is_dir():
-            raise UsageError(f"{escape_text(path.name)} is a folder: give the file with the labels")
         if not path.exists():
             raise UsageError(f"there is no label map {escape_text(str(path), 200)}")
-        if not path.is_file():
+        if not path.is_file() and not path.is_dir():
             raise RefusedInputError(f"{escape_text(path.name)} is no regular file")
-        name, kind = escape_text(path.name), tell_kind(path)
+        name, kind = escape_text(path.name), "folder" if path.is_dir() else tell_kind(path)
         if kind is None:
             raise RefusedInputError(
                 f"{name} is no label map that can be read: NIfTI, NRRD, MetaImage, DICOM SEG and RTSTRUCT are"
             )
-        check = None if volume is None else partial(_check_proportion, name, volume)
-        if kind == "DICOM" and (sop_class := _tell_class(path)) in OTHER_OBJECTS:
-            raise RefusedInputError(f"{name} is {OTHER_OBJECTS[sop_class]}, no label map: give a SEG or an RTSTRUCT")
-        if kind == "DICOM" and sop_class == STRUCTURE_SET:
-            labels = read_structures(
-                path, volume if isinstance(volume, Volume) else None, wanted, progress or ignore_progress
-            )
-        elif kind == "DICOM":
-            labels = read_segmentation(path, wanted, progress or ignore_progress, check)
-        else:
-            grid = open_grid(path, kind, LABEL_MAP)
-            if check is not None:
-                check(grid.shape_ijk, _stored_bytes(grid))
-            labels = read_grid_labels(grid, wanted, progress or ignore_progress)
+        reader = {"DICOM": _read_dicom, "folder": _read_folder}.get(kind, partial(_read_grid, kind))
+        labels = reader(path, wanted, volume, progress or ignore_progress)
     except OSError as error:
         raise RefusedInputError(f"{escape_text(path.name)} cannot be read: {error.strerror or error}") from error
+    if not labels.numbers and wanted.labels is not None:
+        raise UsageError(f"no voxel of {name} has the label '{escape_text(str(wanted.labels[0]), 60)}'")
     if not labels.numbers:
         why = "".join(f"; {warning}" for warning in labels.warnings[:WARNINGS_SHOWN])
         raise RefusedInputError(f"{name} is empty: no voxel has a label{why}")
@@ -150,11 +145,43 @@ def _read(path: Path, wanted: Wanted, volume: Grid | None, progress: Progress | 
     return labels
 
 
+def _read_dicom(path: Path, wanted: Wanted, volume: Grid | None, progress: Progress) -> LabelMap:
+    name, sop_class = escape_text(path.name), _tell_class(path)
+    if sop_class in OTHER_OBJECTS:
+        raise RefusedInputError(f"{name} is {OTHER_OBJECTS[sop_class]}, no label map: give a SEG or an RTSTRUCT")
+    if sop_class == STRUCTURE_SET:
+        return read_structures(path, volume if isinstance(volume, Volume) else None, wanted, progress)
+    return read_segmentation(path, wanted, progress, partial(_check_proportion, name, volume))
+
+
+def _read_grid(kind: str, path: Path, wanted: Wanted, volume: Grid | None, progress: Progress) -> LabelMap:
+    grid = open_grid(path, kind, LABEL_MAP)
+    _check_proportion(grid.name, volume, grid.shape_ijk, _stored_bytes(grid))
+    return _name_mask(read_grid_labels(grid, wanted, progress), path)
+
+
+def _read_folder(path: Path, wanted: Wanted, volume: Grid | None, progress: Progress) -> LabelMap:
+    masks = open_masks(path)
+    for grid in masks.values():
+        _check_proportion(grid.name, volume, grid.shape_ijk, _stored_bytes(grid))
+    return read_masks(path, masks, wanted, progress)
+
+
+def _name_mask(labels: LabelMap, path: Path) -> LabelMap:
+    """Return the map; a mask of one structure that its file does not name has the name of the file."""
+    if labels.numbers not in MASK_NUMBERS or labels.names != {n: f"label_{n}" for n in labels.numbers}:
+        return labels
+    names = {labels.numbers[0]: name_of_grid(path)}
+    return LabelMap(labels.voxels, labels.affine, names, warnings=labels.warnings)
+
+
 def is_large_map(path: str | Path) -> bool:
     """Tell from its header whether a label map is read after its scan: contours of an RTSTRUCT need its slices, and one
     that takes long to unpack is better held against its grid first.
     """
     try:
+        if Path(path).is_dir():
+            return max(map(_stored_bytes, open_masks(Path(path)).values())) > LARGE_BYTES
         kind = tell_kind(Path(path))
         if kind == "DICOM" and _tell_class(Path(path)) == STRUCTURE_SET:
             return True
@@ -186,8 +213,10 @@ def _stored_bytes(grid: GridFile) -> int:
     return prod(grid.shape_ijk) * grid.layers * grid.dtype.itemsize
 
 
-def _check_proportion(name: str, volume: Grid, shape_ijk: tuple[int, int, int], stored_bytes: int) -> None:
-    """Refuse a large map with many times the voxels of its scan, before it is unpacked."""
+def _check_proportion(name: str, volume: Grid | None, shape_ijk: tuple[int, int, int], stored_bytes: int) -> None:
+    """Refuse a large map with many times the voxels of its scan, before it is unpacked; without the scan none is."""
+    if volume is None:
+        return
     times = prod(shape_ijk) / prod(volume.shape_ijk)
     if stored_bytes <= LARGE_BYTES or times <= MOST_TIMES:
         return

@@ -94,3 +94,27 @@ def test_advice_is_for_what_can_be_unpacked():
         "a MetaImage volume or NRRD volume is read when the file itself is named"
     )
     assert advise_on(["gzip file"]).endswith("; a NIfTI volume (.nii.gz) is read when the file itself is named")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (
+            b"1 2 3\n4 5 6\n",
+            r"\(not DICOM: 1\); it is text, not a scan; scans are folders or files of DICOM, and NIfTI",
+        ),
+        (b"\xef\xbb\xbf1;2;3\r\n", "it is text, not a scan"),
+        (
+            b"\x93NUMPY\1\0v\0",
+            r"\(NumPy array: 1\); a NumPy array says no place in space.*; scans are folders or files",
+        ),
+        (
+            bytes(range(256)),
+            r"\(not DICOM: 1\); scans are folders or files of DICOM, and NIfTI, NRRD and MetaImage files$",
+        ),
+    ],
+)
+def test_a_single_file_is_named_as_what_it_is(tmp_path, content, words):
+    (tmp_path / "a.asc").write_bytes(content)
+    with pytest.raises(NoDicomError, match=words):
+        read_volume(tmp_path / "a.asc")

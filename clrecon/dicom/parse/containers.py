@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-__all__ = ["advise_on", "describe_container"]
+__all__ = ["advise_on", "describe_container", "is_text"]
 
 # First bytes of each type, the longest and surest first.
 _STARTS = (
@@ -33,6 +33,7 @@ _STARTS = (
     (b"ply\r", "PLY mesh or cloud"),
     (b'<?xml version="1.0"?>\n<VTKFile', "VTK file"),
     (b"<VTKFile", "VTK file"),
+    (b"\x93NUMPY", "NumPy array"),
     (b"\x7fELF", "program"),
     (b"MZ", "program"),
 )
@@ -57,6 +58,12 @@ def describe_container(start: bytes) -> str:
     return "tar archive" if start[where] == mark else ""
 
 
+def is_text(start: bytes) -> bool:
+    """True where the first bytes of a file are printable ASCII, or a mark of the order of bytes and such."""
+    start = start.removeprefix(b"\xef\xbb\xbf")
+    return bool(start) and all(32 <= byte < 127 or byte in b"\t\r\n" for byte in start)
+
+
 def advise_on(kinds: Iterable[str]) -> str:
     """Return advice about files of these types; empty if there is none."""
     kinds = set(kinds)
@@ -67,4 +74,6 @@ def advise_on(kinds: Iterable[str]) -> str:
         advice.append(f"a {what} is read when the file itself is named")
     if any("mesh" in kind for kind in kinds):
         advice.append("a mesh is shown with clrecon render and measured with clrecon distance")
+    if "NumPy array" in kinds:
+        advice.append("a NumPy array says no place in space: from Python make a volume of it, Volume(array, affine)")
     return "; ".join(advice)

@@ -34,7 +34,7 @@ MESH_INPUTS = (".stl", ".ply", ".obj", ".glb", ".3mf", ".vtp")
 MESH_ONLY = tuple(extension for extension in MESH_INPUTS if extension not in CLOUD_INPUTS)
 """Those of them that are not read as clouds."""
 
-OTHER_CLOUDS = (".pcd", ".e57", ".laz", ".pts", ".ptx")
+OTHER_CLOUDS = (".pcd", ".e57", ".laz", ".pts", ".ptx", ".asc")
 """Extensions of clouds that are not read."""
 
 _OF_BOTH = ("keep_ids", "device", "memory")
@@ -62,7 +62,8 @@ def refuse_other_clouds(source: str | Path) -> None:
     extension = os.path.splitext(os.fspath(source))[1].lower()
     if extension in OTHER_CLOUDS and os.path.isfile(source):
         raise UsageError(
-            f"clouds in files {extension} are not read: convert it to one of {', '.join(CLOUD_INPUTS)} first"
+            f"clouds in files {extension} are not read: convert it to one of {', '.join(CLOUD_INPUTS)} first; text of"
+            " X Y Z only needs the extension .xyz"
         )
 
 
