@@ -109,4 +109,6 @@ def check_wanted(only: str | int | Iterable[str | int] | None) -> tuple[str | in
     wanted = (only,) if isinstance(only, str | int) else tuple(only)
     if not all(isinstance(label, str | int) for label in wanted):
         raise UsageError("labels are chosen by number or name")
+    if not wanted:
+        raise UsageError("no label is chosen: name one, or leave the choice out for all")
     return wanted

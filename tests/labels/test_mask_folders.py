@@ -58,6 +58,8 @@ def test_chosen_masks_come_before_others(tmp_path):
     assert read_all_labels(folder, ["liver"]).counts == {1: 42, 2: 84, 4: 42}
     with pytest.raises(UsageError, match="label 'rib' is not in the label map; there are: 1 aorta, 2 liver"):
         read_labels(folder, ["rib"])
+    with pytest.raises(UsageError, match="no label is chosen: name one"):
+        read_labels(folder, [])
     with pytest.raises(UsageError, match="^no voxel of masks has the label 'spleen'$"):
         read_labels(folder, ["spleen"])
 
