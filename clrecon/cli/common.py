@@ -46,8 +46,9 @@ _NEGATIVE_LIST = re.compile(r"-[0-9.]+(?:[eE][+-]?[0-9]+)?[,:]")
 EXIT_CODES = """\
 exit codes: 0 done; 1 unexpected error; 2 no usable DICOM or no surface; 3 wrong usage;
             4 corrupt or refused input, or "info --strict" found a failed gate; 5 no device or
-            device failure; 6 output cannot be written; 8 partly done, or a gate failed with
-            "mesh --strict"; 130 interrupted"""
+            device failure; 6 output cannot be written; 7 and 8 all is written, but with "mesh
+            --strict" a gate failed, of the scan (7) or of a mesh (8); 8 also partly done;
+            130 interrupted"""
 
 
 _MEANT = {"--spacing": "--resample", "--threshold": "--hu", "--iso": "--hu"}

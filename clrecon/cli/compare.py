@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -31,9 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "Each method runs in a process of its own, one after another: first, then warm. OUT/index.html is one page",
             "without script or network, OUT/report.json has its numbers, and the pictures lie beside it as PNG. A"
             " method",
-            "that fails, or whose library is not installed, is a row that says so (exit code 8). The folder appears as"
-            " a",
-            "whole or not at all; that of an earlier comparison is replaced. No name, ID or path of the scan is in it.",
+            "that declines the scan, or whose library is not installed, is a row that says so. Exit code 8: one that",
+            "--methods names did not run, or one failed. The folder appears as a whole or not at all; that of an",
+            "earlier comparison is replaced. No name, ID or path of the scan is in it.",
             "How far two meshes lie apart is what clrecon distance measures.",
             "",
             "examples:",
@@ -129,7 +130,12 @@ def run(options: argparse.Namespace, console: Console) -> int:
     console.say(f"wrote    {printable(options.output)}: index.html, report.json and {_count_pictures(report)} pictures")
     for warning in report["warnings"]:
         console.warn(warning)
-    return PARTLY_DONE if any(method["state"] != "done" for method in report["methods"]) else 0
+    return PARTLY_DONE if any(_is_missed(method, options.methods) for method in report["methods"]) else 0
+
+
+def _is_missed(method: dict[str, Any], asked: Sequence[str]) -> bool:
+    """True for a method that failed, or that was asked for by name and did not run."""
+    return method["state"] == "failed" or (method["state"] != "done" and method["name"] in asked)
 
 
 def _count_pictures(report: dict[str, Any]) -> int:

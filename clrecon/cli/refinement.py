@@ -12,6 +12,7 @@ from clrecon.system.text import count_of, say_digits
 
 __all__ = [
     "GATE_FAILED",
+    "SCAN_GATE_FAILED",
     "add_purpose",
     "add_refinement",
     "add_strict",
@@ -20,7 +21,7 @@ __all__ = [
     "finish_with_gates",
 ]
 
-GATE_FAILED = 8
+SCAN_GATE_FAILED, GATE_FAILED = 7, 8
 """Exit code for a failed gate with ``--strict``; everything is written."""
 
 _ITERATIONS = 20
@@ -57,8 +58,8 @@ def add_strict(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--strict",
         action="store_true",
-        help=f'exit with {GATE_FAILED} when a gate fails, of the scan (see "clrecon info") or of a mesh: closed,'
-        " manifold, no cuts, close to the scan ...",
+        help=f"exit with {GATE_FAILED} when a gate of a mesh fails (closed, manifold, no cuts, close to the scan ...),"
+        f' with {SCAN_GATE_FAILED} when only gates of the scan do (see "clrecon info")',
     )
 
 
@@ -164,16 +165,21 @@ def finish_with_gates(report: dict[str, Any], console: Console, strict: bool) ->
     """Print the warnings of a report; returns the exit code.
 
     With `strict` a failed gate of the volume or of a mesh is an error, which is printed even with ``--quiet`` and
-    ``--json``.  Exception: a failed gate of `GATES_OF_AFFINE` (uneven slices) stays a warning.
+    ``--json``; that of a mesh decides the code.  Exception: a failed gate of `GATES_OF_AFFINE` (uneven slices) stays a
+    warning.
     """
     from clrecon.jobs.mesh.refinement import warn_of_gates
 
     gates = [gate for gate in report["volume"].get("gates", ()) if gate["name"] not in GATES_OF_AFFINE]
     of_volume = [{"mesh": "volume", **gate} for gate in gates]
-    failed = warn_of_gates([*of_volume, *report["gates"]]) if strict else []
+    failed_scan = warn_of_gates(of_volume) if strict else []
+    failed_mesh = warn_of_gates(report["gates"]) if strict else []
+    failed = failed_scan + failed_mesh
     for warning in report["warnings"]:
         if warning not in failed:
             console.warn(warning)
     for line in failed:
         console.error(line)
-    return GATE_FAILED if failed else 0
+    if failed_mesh:
+        return GATE_FAILED
+    return SCAN_GATE_FAILED if failed_scan else 0

@@ -89,7 +89,7 @@ class Device:
     Attributes
     ----------
     index : int
-        Index in `list_devices`; this number chooses the device.
+        Index in ``clrecon.devices()``; this number chooses the device.
     name, platform, type, version, driver : str
         `type` is "gpu", "accelerator", "cpu" or "custom"; `platform` is the platform's name.
     memory_bytes, max_allocation_bytes : int

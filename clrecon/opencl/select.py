@@ -156,7 +156,7 @@ def choose_device(name: str | int | Device | None = None) -> Device:
     Parameters
     ----------
     name : str, int or Device, optional
-        Index as ``list_devices`` counts, "cpu" or "gpu", or a part of the name of a device or platform; if several
+        Index as ``clrecon.devices()`` counts, "cpu" or "gpu", or a part of the name of a device or platform; if several
         match, the best is used.  None or "auto": the device named by CLRECON_DEVICE, else by PYOPENCL_CTX, else the
         best of all: GPUs before accelerators before CPUs before software rasterisers, then by memory.  A simulator is
         used only when it is named.

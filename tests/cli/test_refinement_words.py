@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from clrecon.cli.refinement import describe_refinement
+from clrecon.cli.console import Console
+from clrecon.cli.refinement import describe_refinement, finish_with_gates
 
 pytestmark = pytest.mark.unit
 
@@ -30,3 +31,27 @@ def test_the_euler_number_is_said_before_and_after() -> None:
     # Changes of two components can cancel out.
     assert "changed in 2 of 932 components" in told(components_changed=2)
     assert "changed in 0 of 932 components, 3 lost)" in told(components_lost=3, euler_number_after=1448)
+
+
+@pytest.mark.parametrize(
+    ("scan", "mesh", "strict", "code"),
+    [
+        (True, True, True, 0),
+        (False, True, True, 7),
+        (True, False, True, 8),
+        (False, False, True, 8),
+        (False, False, False, 0),
+    ],
+)
+def test_a_gate_of_the_scan_and_one_of_the_mesh_have_codes_of_their_own(
+    scan: bool, mesh: bool, strict: bool, code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gate = {"name": "closed", "measured": 1, "bound": 0, "unit": None, "text": "text"}
+    uneven = {**gate, "name": "grid_residual", "ok": False}
+    report = {
+        "volume": {"gates": [{**gate, "name": "hu_scale", "ok": scan}, uneven]},
+        "gates": [{**gate, "mesh": None, "ok": mesh}],
+        "warnings": [],
+    }
+    assert finish_with_gates(report, Console(), strict) == code
+    assert len(capsys.readouterr().err.splitlines()) == strict * ((not scan) + (not mesh))

@@ -18,7 +18,6 @@ from clrecon.jobs.phantom import make_phantom
 
 SMALLER = {
     '"CT_FOLDER"': '"ct"',
-    "clrecon.device(\"gpu\")": "clrecon.device()",
     "size=(800, 800)": "size=(80, 80)",
     "clrecon.Camera.fit(volume), 120)": "clrecon.Camera.fit(volume, size=(64, 64)), 2)",
     "renderer.render(camera=camera)": "renderer.render(camera=camera, size=(64, 64))",

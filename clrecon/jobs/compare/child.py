@@ -9,7 +9,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from clrecon.errors import ClreconError
+from clrecon.errors import ClreconError, DeviceError
 from clrecon.jobs.compare.makers import Scene, draw, make, time_small
 from clrecon.jobs.compare.methods import COMPARED
 from clrecon.jobs.compare.request import Request, load_volume, save_arrays, save_mesh
@@ -28,8 +28,8 @@ def run_method(request: Request) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``state`` ("done", "failed" or "missing"), and with "done" the figures, see `_measure`; else ``error``, what
-        kind it is of, and why.
+        ``state`` ("done", "failed", "declined" or "missing"), and with "done" the figures, see `_measure`; else
+        ``error``, what kind it is of, and why.
     """
     from clrecon.opencl import has_hung_commands
 
@@ -40,7 +40,8 @@ def run_method(request: Request) -> dict[str, Any]:
         name = error.name or COMPARED[request.method].peer or "a library"
         return {"state": "missing", "kind": "ImportError", "error": f"{name.partition('.')[0]} is not installed"}
     except ClreconError as error:
-        return {"state": "failed", "kind": type(error).__name__, "error": str(error), "hung": has_hung_commands()}
+        state = "failed" if isinstance(error, DeviceError) else "declined"  # it works, and not on this scan
+        return {"state": state, "kind": type(error).__name__, "error": str(error), "hung": has_hung_commands()}
     except MemoryError:
         return {"state": "failed", "kind": "MemoryError", "error": "out of memory"}
     except Exception as error:  # a library's own: one row of the table, and no end of the others

@@ -23,7 +23,7 @@ class MethodRecord(Record):
     makes : {"mesh", "cloud", "picture"}
     peer : str
         Library of somebody else; empty for clrecon's own.
-    state : {"done", "failed", "missing"}
+    state : {"done", "failed", "declined", "missing"}
     error : str or None
     triangles, vertices, points : int or None
     first_s, warm_s : float or None

@@ -183,7 +183,7 @@ def _row(
     swatch = f'<span class="swatch" style="background:{colors[record.name]}"></span>'
     name = f'<th scope="row">{swatch}{escape(record.title)}<small>{escape(record.what)}</small></th>'
     if not record.is_done:
-        said = "not installed" if record.state == "missing" else "failed"
+        said = "not installed" if record.state == "missing" else record.state
         words = f"{said}: {escape(record.error or '')}"
         return f'<tr class="failed">{name}<td colspan="{len(columns) + 1}">{words}</td></tr>'
     cells = []

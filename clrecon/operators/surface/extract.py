@@ -230,7 +230,7 @@ def extract_isosurface(
     below : bool
         True: enclose the voxels below the iso value: the same vertices and triangles, turned round, and closed too.
     grow_from : "auto", (3,) float, LabelMap, (LabelMap, label), Mask, or a list of these, optional
-        Make only what hangs together with a seed, cell by cell: see ``clrecon.operators.surface.seeds.Seeds.read``.
+        Make only parts connected to a seed: a point in LPS mm, voxels of a label or mask, or "auto", the large parts.
     vertex_rule : {"linear", "golden", "golden-search"}
         Where on an edge a vertex lies, see ``docs/methods.md``.  "golden" misses the surface by up to 0.6 voxels.
     solid : bool

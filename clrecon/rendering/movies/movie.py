@@ -150,7 +150,8 @@ def write_animation(
     frames : iterable of Rendering or of ndarray, shape (h, w, 3) or (h, w, 4), uint8
         Frames of one size.  The next frame is requested after the one before has been written.
     path : str or path
-        See ``check_animation``. MP4 is H.264 (BT.709, quality 18), an odd side made even by repeating its last row or
+        ``.mp4``, ``.gif``, ``.apng``, or a folder: a name without extension, a name that ends with a slash, or an
+        existing folder.  MP4 is H.264 (BT.709, quality 18), an odd side made even by repeating its last row or
         column.  GIF has a palette for each frame, dithered after Floyd and Steinberg, and repeats.  APNG repeats too,
         and keeps every colour and the opacity.  A folder gets frame_0000.png, frame_0001.png, ...
     fps : float
@@ -170,7 +171,8 @@ def write_animation(
     Raises
     ------
     UsageError
-        As in ``check_animation``; or there is no frame, frames differ in size, or have opacity that the format would
+        The extension is unknown, there is no encoder, the folder contains other files, or `fps` is out of range; or
+        there is no frame, frames differ in size, or have opacity that the format would
         lose.
     OutputError
         The file cannot be written; an older one is intact.

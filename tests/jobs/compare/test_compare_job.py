@@ -6,14 +6,17 @@ import json
 import os
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from html_check import PageCheck, find_faults
 from made_once import make_once
 
+from clrecon.cli.compare import _is_missed
 from clrecon.cli.main import main
 from clrecon.errors import DeviceError, NoSurfaceError, OutputError, UsageError
+from clrecon.jobs.compare import child
 from clrecon.jobs.compare import run as processes
 from clrecon.jobs.compare.job import make_comparison
 from clrecon.jobs.compare.methods import COMPARED
@@ -164,6 +167,26 @@ def test_only_times_and_memory_differ_between_runs(device: Any, ball: Path, tmp_
     assert len(pictures) == 3 + 2 + 4
     for name in pictures:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("state", "asked", "code"),
+    [
+        ("done", (), 0), ("declined", (), 0), ("missing", (), 0), ("failed", (), 8),
+        ("declined", ("vtk-mc",), 8), ("missing", ("vtk-mc",), 8), ("declined", ("skimage",), 0),
+    ],
+)  # fmt: skip
+def test_a_method_that_nobody_named_may_decline(state: str, asked: tuple[str, ...], code: int) -> None:
+    assert 8 * _is_missed({"name": "vtk-mc", "state": state}, asked) == code
+
+
+@pytest.mark.parametrize(("error", "state"), [(UsageError("no"), "declined"), (DeviceError("no"), "failed")])
+def test_a_refusal_is_no_failure(error: Exception, state: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(request: Any) -> dict[str, Any]:
+        raise error
+
+    monkeypatch.setattr(child, "_measure", refuse)
+    assert child.run_method(SimpleNamespace(timeout=10.0, method="t-mc"))["state"] == state  # type: ignore[arg-type]
 
 
 def test_a_crash_and_a_missing_library_are_rows(
