@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.sources.rescale import check_rescale
 from clrecon.system.text import escape_text
 
 if TYPE_CHECKING:
@@ -41,6 +42,8 @@ class Selection:
         Read data sets without preamble or meta header.
     follow_links : bool
         Read the files and folders that symbolic links out of the folder lead to.
+    rescale : (slope, intercept), optional
+        In place of what the files say.
     """
 
     series: int | str | None = None
@@ -48,6 +51,7 @@ class Selection:
     allow_gaps: bool = False
     force: bool = False
     follow_links: bool = False
+    rescale: tuple[float, float] | None = None
 
 
 def read_selected(path: str | os.PathLike[str], selection: Selection, *, progress: Progress | None = None) -> Volume:
@@ -64,6 +68,7 @@ def read_volume(
     allow_gaps: bool = False,
     force: bool = False,
     follow_links: bool = False,
+    rescale: tuple[float, float] | None = None,
     progress: Progress | None = None,
 ) -> Volume:
     """Read a volume in HU and LPS mm, from DICOM or from a NIfTI, NRRD or MetaImage file.
@@ -88,6 +93,9 @@ def read_volume(
     follow_links : bool
         True: also read the files and folders that symbolic links out of the folder lead to, as in a git-annex or
         DataLad repository.  False: a series beside which such links stand is refused, because they may be its slices.
+    rescale : (slope, intercept), optional
+        Values are ``slope * stored + intercept``, whatever the files say of them: where a header lacks the rescale, is
+        wrong about it, or a scanner has a scale of its own.  The certificate says that it was given.
     progress : callable, optional
         Called as ``progress(stage, done, total)`` with stage "scan" or "read", or "no answer yet from NAME" where the
         disk hangs.
@@ -110,6 +118,7 @@ def read_volume(
         ``series`` matches no series or several; the ``phase`` does not exist; an option for DICOM is given with another
         format; a package is missing; or ``path`` is empty.
     """
+    given = check_rescale(rescale)
     kind = tell_format(path)
     if kind is None:
         from clrecon.dicom import read_volume as read_dicom
@@ -121,12 +130,13 @@ def read_volume(
             allow_gaps=allow_gaps,
             force=force,
             follow_links=follow_links,
+            rescale=given,
             progress=progress,
         )
     _refuse_options(kind, series=series, phase=phase, allow_gaps=allow_gaps, force=force, follow_links=follow_links)
     from clrecon.formats import read_grid
 
-    return read_grid(Path(path), kind, progress=progress)
+    return read_grid(Path(path), kind, rescale=given, progress=progress)
 
 
 def list_series(
@@ -137,6 +147,7 @@ def list_series(
     allow_gaps: bool = False,
     force: bool = False,
     follow_links: bool = False,
+    rescale: tuple[float, float] | None = None,
     pixels: bool = False,
     progress: Progress | None = None,
 ) -> SeriesListing:
@@ -144,7 +155,7 @@ def list_series(
 
     Parameters
     ----------
-    path, series, phase, allow_gaps, force, follow_links, progress
+    path, series, phase, allow_gaps, force, follow_links, rescale, progress
         As in `read_volume`.
     pixels : bool
         True: also read the voxels, for entries that depend on them.  False: read only headers.
@@ -160,6 +171,7 @@ def list_series(
         There is nothing to list; all DICOM files, or a file of another format, are corrupt; `series` or `phase` names
         nothing or several; a package is missing; or an option for DICOM is given with another format.
     """
+    given = check_rescale(rescale)
     kind = tell_format(path)
     if kind is None:
         from clrecon.dicom import list_series as list_dicom
@@ -171,13 +183,14 @@ def list_series(
             allow_gaps=allow_gaps,
             force=force,
             follow_links=follow_links,
+            rescale=given,
             pixels=pixels,
             progress=progress,
         )
     _refuse_options(kind, series=series, phase=phase, allow_gaps=allow_gaps, force=force, follow_links=follow_links)
     from clrecon.formats import list_grid
 
-    return list_grid(Path(path), kind, pixels=pixels, progress=progress)
+    return list_grid(Path(path), kind, rescale=given, pixels=pixels, progress=progress)
 
 
 def _refuse_options(kind: str, **options: Any) -> None:

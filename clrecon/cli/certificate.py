@@ -120,7 +120,8 @@ def _describe_values(of: dict[str, Any]) -> Iterator[tuple[str, str]]:
     slope, intercept = (_span(rescale[name]) for name in ("slope", "intercept"))
     span = "" if of["hu_range"] is None else f"{of['hu_range'][0]:g} to {of['hu_range'][1]:g} "
     kind = rescale["type"] or "HU (the type is not stated)"
-    yield "values", f"{span}{kind}; slope {slope}, intercept {intercept}"
+    given = ", as given" if rescale.get("given") else ""
+    yield "values", f"{span}{kind}; slope {slope}, intercept {intercept}{given}"
     if of["padding_share"] is None:
         yield "padding", "not looked at" + (" (--pixels reads it)" if of["spacing_mm"] else "")
     else:

@@ -118,6 +118,7 @@ def _settings(options: argparse.Namespace) -> Any:
         allow_gaps=options.allow_gaps,
         force=options.force,
         follow_links=options.follow_links,
+        rescale=options.rescale,
     )
 
 

@@ -37,7 +37,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
     found = describe_input(
         options.input,
-        **pick(options, ("series", "phase", "allow_gaps", "force", "follow_links", "pixels", "strict")),
+        **pick(options, ("series", "phase", "allow_gaps", "force", "follow_links", "rescale", "pixels", "strict")),
         progress=console.progress,
     )
     console.result(found.listing)

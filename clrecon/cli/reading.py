@@ -8,7 +8,7 @@ __all__ = ["add_reading"]
 
 
 def add_reading(parser: argparse.ArgumentParser) -> None:
-    """Add --series, --phase, --allow-gaps, --force and --follow-links."""
+    """Add --series, --phase, --allow-gaps, --force, --follow-links and --rescale."""
     group = parser.add_argument_group("reading")
     group.add_argument(
         "--series",
@@ -35,3 +35,19 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="read the files and folders that symbolic links out of the folder lead to (git-annex, DataLad)",
     )
+    group.add_argument(
+        "--rescale",
+        type=_parse_rescale,
+        metavar="SLOPE,INTERCEPT",
+        help="compute HU as SLOPE x stored value + INTERCEPT, whatever the files say, like 1,-1024",
+    )
+
+
+def _parse_rescale(text: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 2:
+        raise argparse.ArgumentTypeError(f"{text!r} is no slope and intercept: SLOPE,INTERCEPT, such as 1,-1024")
+    return numbers

@@ -83,6 +83,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         allow_gaps=options.allow_gaps,
         force=options.force,
         follow_links=options.follow_links,
+        rescale=options.rescale,
         **given,
     )
     report = measure_stats(

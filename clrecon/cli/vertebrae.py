@@ -101,7 +101,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.vertebrae.job import make_vertebrae
     from clrecon.jobs.vertebrae.settings import VertebraeSettings
 
-    reading = ("series", "phase", "allow_gaps", "force", "follow_links")
+    reading = ("series", "phase", "allow_gaps", "force", "follow_links", "rescale")
     names = ("level", "seeds", "name_at", "first", "keep_unsure", "keep_ids")
     settings = VertebraeSettings(**pick(options, (*reading, *names)))
     with_picture = options.picture is not None or not getattr(options, "streams_output", False)  # beside what?

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from clrecon.dicom.headers.slice_header import SliceHeader
 from clrecon.dicom.parse.containers import advise_on, is_text
 from clrecon.dicom.parse.forced import describe_way_out
 from clrecon.dicom.pixels.voxels import read_voxels
@@ -24,6 +25,7 @@ from clrecon.geometry.certificate import Certificate
 from clrecon.sources.likeness import Likeness, judge_slices
 from clrecon.sources.listing import SeriesListing
 from clrecon.sources.plausibility import examine_voxels
+from clrecon.sources.rescale import Rescale
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress
 from clrecon.system.regular_files import open_regular
@@ -46,6 +48,7 @@ def read_volume(
     allow_gaps: bool = False,
     force: bool = False,
     follow_links: bool = False,
+    rescale: Rescale | None = None,
     progress: Progress | None = None,
 ) -> Volume:
     """Read one CT series as a volume in HU and LPS mm.
@@ -54,7 +57,7 @@ def read_volume(
     ----------
     path : str or path-like
         A folder, searched with its subfolders (any file names; DICOMDIR not needed), or one file.
-    series, phase, allow_gaps, force, follow_links, progress
+    series, phase, allow_gaps, force, follow_links, rescale, progress
         As in `clrecon.read_volume`.
 
     Returns
@@ -79,7 +82,7 @@ def read_volume(
     Source: DICOM PS3.3 C.7.6.2 (Image Plane), C.7.5.1 (padding), C.8.2.1 (CT image, rescale).
     """
     with _quiet_warnings():
-        scan, found = _scan_and_group(path, progress, force, follow_links)
+        scan, found = _scan_and_group(path, progress, force, follow_links, rescale)
         choice = choose_series(found, series)
         left = describe_left(found, choice, series)
         chosen = choice.series.choose(_checked_phase(phase), allow_gaps)
@@ -150,6 +153,7 @@ def list_series(
     allow_gaps: bool = False,
     force: bool = False,
     follow_links: bool = False,
+    rescale: Rescale | None = None,
     pixels: bool = False,
     progress: Progress | None = None,
 ) -> SeriesListing:
@@ -157,7 +161,7 @@ def list_series(
 
     Parameters
     ----------
-    path, series, phase, allow_gaps, force, follow_links, progress
+    path, series, phase, allow_gaps, force, follow_links, rescale, progress
         As in `read_volume`, which would read the series chosen here.
     pixels : bool
         True: also read the pixels of the chosen series, for padding, range of HU and saturation.  False: read only
@@ -178,7 +182,7 @@ def list_series(
     """
     phase = _checked_phase(phase)
     with _quiet_warnings():
-        scan, found = _scan_and_group(path, progress, force, follow_links)
+        scan, found = _scan_and_group(path, progress, force, follow_links, rescale)
         warnings = collect_scan_warnings(scan)
         number, certificate, refusal = None, None, None
         try:
@@ -238,7 +242,11 @@ def _describe_single(path: Path) -> str:
 
 
 def _scan_and_group(
-    path: str | os.PathLike[str], progress: Progress | None, force: bool, follow_links: bool
+    path: str | os.PathLike[str],
+    progress: Progress | None,
+    force: bool,
+    follow_links: bool,
+    rescale: Rescale | None = None,
 ) -> tuple[Scan, list[Series]]:
     try:
         folder = Path(path)
@@ -248,6 +256,9 @@ def _scan_and_group(
     if empty:
         raise UsageError("the input path is empty")
     scan = scan_path(folder, progress, force, follow_links)
+    if rescale is not None:
+        scan.rescale = rescale
+        scan.slices = [_rescaled(header, rescale) for header in scan.slices]
     if not scan.slices and not scan.others:
         shown = escape_text(str(path), 256)
         if scan.skipped["corrupt"]:
@@ -265,6 +276,19 @@ def _scan_and_group(
     found = group_series(scan)
     log.debug("%d files: %d slices in %d series, skipped %s", scan.files, len(scan.slices), len(found), scan.skipped)
     return scan, found
+
+
+def _rescaled(header: SliceHeader, rescale: Rescale) -> SliceHeader:
+    """Return a header that says what the user says of its values."""
+    return replace(
+        header,
+        slope=rescale.slope,
+        intercept=rescale.intercept,
+        has_slope=True,
+        has_intercept=True,
+        rescale_type="HU",
+        warnings=(*header.warnings, str(rescale)),
+    )
 
 
 def _describe_refusal(series: Series) -> str:

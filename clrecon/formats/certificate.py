@@ -25,7 +25,8 @@ def collect_header_warnings(grid: GridFile) -> list[str]:
     """Return warnings about a grid file that are known before its voxels are read."""
     spacing = judge_spacing(grid)
     unusual = [f"{spacing['text']}: maybe the file has other units than it says"] if spacing["ok"] is False else []
-    return [NOT_DICOM, *grid.warnings, *unusual]
+    given = [] if grid.rescale is None else [str(grid.rescale)]
+    return [NOT_DICOM, *grid.warnings, *unusual, *given]
 
 
 def collect_value_warnings(values: GridValues) -> list[str]:
@@ -78,7 +79,12 @@ def certify_grid(
         tilt_deg=signed_tilt(grid.affine),
         gap_mm={"min": gap, "max": gap, "median": gap},
         transfer_syntax_names=[f"{grid.kind}, {grid.dtype.name}"],
-        rescale={"slope": [grid.slope] * 2, "intercept": [grid.intercept] * 2, "type": None},
+        rescale={
+            "slope": [grid.slope] * 2,
+            "intercept": [grid.intercept] * 2,
+            "type": None,
+            **({} if grid.rescale is None else {"given": True}),
+        },
         padding_share=None if facts is None else facts.padding_share,
         padding_hu=None if facts is None else facts.padding_hu,
         hu_range=None if facts is None else [facts.hu_min, facts.hu_max],
@@ -108,6 +114,8 @@ def judge_grid(grid: GridFile, values: GridValues | None, value_gates: Sequence[
         gates.append(none_of("one_volume", int(values.likeness.is_mixed), mixed))
     if values is not None and values.doubts:
         gates.append(none_of("hu_known", len(values.doubts), doubtful))
+    elif grid.rescale is not None:
+        gates.append(none_of("hu_known", 0, doubtful))
     else:
         gates.append(unmeasured("hu_known", 0, None, f"{doubtful}: the file does not say what they are"))
     if values is None or values.doubts:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError
 from clrecon.formats.stream import VoxelBytes, check_end, check_size, read_bytes
 from clrecon.geometry.affine import Float64Array
+from clrecon.sources.rescale import Rescale
 
 __all__ = ["LABEL_MAP", "VOLUME", "GridFile", "Purpose"]
 
@@ -56,6 +57,8 @@ class GridFile:
         The bytes between the header and the voxels (NIfTI).
     fields : mapping
         All fields of the header (NRRD).
+    rescale : Rescale or None
+        Slope and intercept that the user gave in place of those of the header.
 
     Raises
     ------
@@ -76,6 +79,7 @@ class GridFile:
     warnings: tuple[str, ...] = ()
     extension: bytes = b""
     fields: Mapping[str, Any] = field(default_factory=dict)
+    rescale: Rescale | None = None
 
     def __post_init__(self) -> None:
         shape = self.shape_ijk if self.layers == 1 else (self.layers, *self.shape_ijk)

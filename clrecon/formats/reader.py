@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from clrecon.errors import RefusedInputError
@@ -12,6 +13,7 @@ from clrecon.formats.values import GridValues, read_values
 from clrecon.geometry import Volume
 from clrecon.sources.listing import SeriesEntry, SeriesListing
 from clrecon.sources.plausibility import VoxelFindings, examine_voxels
+from clrecon.sources.rescale import Rescale
 from clrecon.sources.stored_values import StoredRange
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress
@@ -22,7 +24,7 @@ __all__ = ["list_grid", "read_grid"]
 log = get_logger(__name__)
 
 
-def read_grid(path: Path, kind: str, *, progress: Progress | None = None) -> Volume:
+def read_grid(path: Path, kind: str, *, rescale: Rescale | None = None, progress: Progress | None = None) -> Volume:
     """Read a volume.
 
     Parameters
@@ -30,6 +32,8 @@ def read_grid(path: Path, kind: str, *, progress: Progress | None = None) -> Vol
     path : Path
     kind : {"NIfTI", "NRRD", "MetaImage"}
         As `clrecon.formats.kinds.tell_kind` returns it.
+    rescale : Rescale, optional
+        In place of the slope and intercept of the header.
     progress : callable, optional
         Called as ``progress("read", done, total)``.
 
@@ -40,7 +44,7 @@ def read_grid(path: Path, kind: str, *, progress: Progress | None = None) -> Vol
     RefusedInputError
         The file is cut off or corrupt, is not a volume of real numbers, or does not say where its voxels lie in space.
     """
-    grid = _open(path, kind)
+    grid = _open(path, kind, rescale)
     values = read_values(grid, progress)
     findings = _examine(grid, values)
     report = certify_grid(grid, values, _collect_warnings(grid, values, findings), findings.gates)
@@ -65,12 +69,14 @@ def _collect_warnings(grid: GridFile, values: GridValues | None, findings: Voxel
     return warnings
 
 
-def list_grid(path: Path, kind: str, *, pixels: bool = False, progress: Progress | None = None) -> SeriesListing:
+def list_grid(
+    path: Path, kind: str, *, rescale: Rescale | None = None, pixels: bool = False, progress: Progress | None = None
+) -> SeriesListing:
     """List the one volume of a file, with its certificate.
 
     Parameters
     ----------
-    path, kind, progress
+    path, kind, rescale, progress
         As in `read_grid`.
     pixels : bool
         True: read the voxels too, for the entries that depend on them.  False: read only the header.
@@ -80,7 +86,7 @@ def list_grid(path: Path, kind: str, *, pixels: bool = False, progress: Progress
     UsageError, RefusedInputError
         As `read_grid`.
     """
-    grid = _open(path, kind)
+    grid = _open(path, kind, rescale)
     values = read_values(grid, progress) if pixels else None
     findings = None if values is None else _examine(grid, values)
     warnings = _collect_warnings(grid, values, findings)
@@ -99,7 +105,7 @@ def list_grid(path: Path, kind: str, *, pixels: bool = False, progress: Progress
     return SeriesListing([entry], 1, {}, [], certificate)
 
 
-def _open(path: Path, kind: str) -> GridFile:
+def _open(path: Path, kind: str, rescale: Rescale | None) -> GridFile:
     try:
         grid = open_grid(path, kind, VOLUME)
     except OSError as error:
@@ -107,4 +113,6 @@ def _open(path: Path, kind: str) -> GridFile:
     if min(grid.shape_ijk) < 2:
         shown = " x ".join(map(str, grid.shape_ijk))
         raise RefusedInputError(f"{grid.name} has {shown} voxels: a volume has two at least along each axis")
-    return grid
+    if rescale is None:
+        return grid
+    return replace(grid, slope=rescale.slope, intercept=rescale.intercept, rescale=rescale)

@@ -42,6 +42,7 @@ def describe_input(
     allow_gaps: bool = False,
     force: bool = False,
     follow_links: bool = False,
+    rescale: tuple[float, float] | None = None,
     pixels: bool = False,
     strict: bool = False,
     progress: Progress | None = None,
@@ -57,7 +58,7 @@ def describe_input(
         reader, and any usable series is enough then.
     phase, allow_gaps
         As in `clrecon.read_volume`, of the series that is judged.
-    force, follow_links
+    force, follow_links, rescale
         As in `clrecon.read_volume`.
     pixels : bool
         Read the pixels of the series that is judged.
@@ -84,6 +85,7 @@ def describe_input(
         allow_gaps=allow_gaps,
         force=force,
         follow_links=follow_links,
+        rescale=rescale,
         pixels=pixels,
         progress=progress,
     )

@@ -209,6 +209,7 @@ def certify(
             "slope": [min(slopes), max(slopes)],
             "intercept": [min(intercepts), max(intercepts)],
             "type": headers[0].rescale_type or None,
+            **({"given": True} if scan.rescale is not None else {}),
         },
         hu_range=None if facts is None else [facts.hu_min, facts.hu_max],
         files={"found": scan.files, "used": len({h.file for h in headers}), "skipped": dict(scan.skipped)},

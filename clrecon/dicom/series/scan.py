@@ -23,6 +23,7 @@ from clrecon.dicom.parse.forced import describe_way_out, restore_start
 from clrecon.dicom.series.disk import DiskReader
 from clrecon.dicom.series.remains import Stranger, describe_start, find_remains
 from clrecon.errors import NoDicomError
+from clrecon.sources.rescale import Rescale
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text
 from clrecon.system.wording import name_parameter
@@ -74,6 +75,8 @@ class Scan:
         All other files that are not DICOM.
     files : int
         Number of regular files examined.
+    rescale : Rescale or None
+        Slope and intercept that the user gave for all slices.
     is_file : bool
         True: the path names one file and no folder.
     """
@@ -85,6 +88,7 @@ class Scan:
     suspects: list[CorruptFile] = field(default_factory=list)
     strangers: list[Stranger] = field(default_factory=list)
     files: int = 0
+    rescale: Rescale | None = None
     is_file: bool = False
 
 

@@ -42,7 +42,7 @@ class CorridorSettings(Selection):
 
     Parameters
     ----------
-    series, phase, allow_gaps, force, follow_links
+    series, phase, allow_gaps, force, follow_links, rescale
         See `clrecon.reading.Selection`.
     labels : path
         Label map of the vertebrae.

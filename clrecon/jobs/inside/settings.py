@@ -20,7 +20,7 @@ class InsideSettings(Selection):
 
     Parameters
     ----------
-    series, phase, allow_gaps, force, follow_links
+    series, phase, allow_gaps, force, follow_links, rescale
         See `clrecon.reading.Selection`.
     labels : path
         Label map: NIfTI, NRRD, MetaImage, DICOM SEG or RTSTRUCT.

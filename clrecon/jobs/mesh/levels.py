@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from clrecon.errors import RefusedInputError
 from clrecon.jobs.mesh.presets import find_preset
+from clrecon.jobs.mesh.purposes import find_purpose
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import say_hu
@@ -15,11 +18,36 @@ if TYPE_CHECKING:
     from clrecon.anatomy.iso_choice import IsoChoice
     from clrecon.geometry import Volume
 
-__all__ = ["choose_level", "describe_level", "warn_of_contrast"]
+__all__ = ["check_known_values", "choose_level", "describe_level", "warn_of_contrast"]
 
 THICK_SLICES_MM = 2.5
 """From this spacing on, thin walls across the slices are blurred so much that the half-way level can be too high: with
 slices of 2 mm it is as good as the best, with 3 mm it loses walls (docs/iso_value.md)."""
+
+
+VALUE_GATES = ("hu_known", "hu_scale", "stored_sign")
+"""Gates of a volume that fail where its values are not HU."""
+
+
+def check_known_values(volume: Volume, settings: MeshSettings) -> None:
+    """Refuse to choose the level of a print where the values are not HU; one in the values' own units is taken.
+
+    Raises
+    ------
+    RefusedInputError
+        A gate of the values failed, and the level is a preset or left to the measurement.
+    """
+    named = settings.iso_value is not None or isinstance(settings.half_way, Sequence) and settings.half_way != "auto"
+    if settings.purpose is None or not find_purpose(settings.purpose).is_for_print or named or not settings.follows_hu:
+        return
+    failed = [gate for gate in volume.report.get("gates", ()) if gate["name"] in VALUE_GATES and gate["ok"] is False]
+    if failed:
+        raise RefusedInputError(
+            f"a print needs a level of bone, and the values of this scan are not known to be HU"
+            f" ({failed[-1]['name']}: {failed[-1]['text']}). Give the level in the scan's own values"
+            f" ({name_parameter('iso_value', 'N')}), or say how HU follow from the stored values"
+            f" ({name_parameter('rescale', 'SLOPE,INTERCEPT')})"
+        )
 
 
 def choose_level(volume: Volume, settings: MeshSettings, progress: Progress = ignore_progress) -> IsoChoice | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.mesh.labels import extract_label_surfaces, open_labels
-from clrecon.jobs.mesh.levels import choose_level
+from clrecon.jobs.mesh.levels import check_known_values, choose_level
 from clrecon.jobs.mesh.parts import SELECT_STEPS, check_levels, extract_surfaces, select_parts
 from clrecon.jobs.mesh.prepare import fill_solid, mask_parts, narrow_volume, prepare_surfaces
 from clrecon.jobs.mesh.settings import MeshSettings
@@ -131,6 +131,7 @@ def _choose(
     volume: Volume, surfaces: list[Surface], settings: MeshSettings, device: Device, progress: Progress, watch: Laps
 ) -> tuple[Volume, list[Surface], IsoChoice | None]:
     """Return the volume for extraction, its surfaces, and the choice of the iso value if it was not given."""
+    check_known_values(volume, settings)
     choice = choose_level(volume, settings, progress)
     if choice is not None:
         surfaces = plan_surfaces([choice.iso_value])

@@ -22,7 +22,7 @@ class InputSettings(Selection):
 
     Parameters
     ----------
-    series, phase, allow_gaps, force, follow_links
+    series, phase, allow_gaps, force, follow_links, rescale
         See `clrecon.reading.Selection`.
     remove_table : bool
         First turn everything except the patient's body into air, see `clrecon.anatomy.body.remove_table`.

@@ -18,7 +18,7 @@ class VertebraeSettings(Selection):
 
     Parameters
     ----------
-    series, phase, allow_gaps, force, follow_links
+    series, phase, allow_gaps, force, follow_links, rescale
         See `clrecon.reading.Selection`.
     level : float, optional
         HU from which on a voxel is bone, see `clrecon.split_vertebrae`.
