@@ -52,7 +52,7 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "keys": (("sorted_keys[place] = key;", "sorted_keys[place] = ~key;"),),
         "values": (("= numbered ? index : values[index];", "= ~(numbered ? index : values[index]);"),),
     },
-    "mark_crossings": {"marks": (("if (may_pass(a, b, ours.x,", "if (!may_pass(a, b, ours.x,"),)},
+    "mark_crossings": {"marks": (("&& may_cut(this,", "&& !may_cut(this,"),)},
     "clear_labels": {"labels": (("= UNUSED;", "= ~UNUSED;"),)},
     "hook_corners": {"labels": (("min(corner.x, min(corner.y, corner.z))", "max(corner.x, max(corner.y, corner.z))"),)},
     "jump_labels": {"labels": ((": follow_labels(", ": n - 1 - follow_labels("),)},

@@ -15,7 +15,7 @@
  *
  * An item looks at the entries behind its own of its level, and at all of the levels with longer triangles: each pair
  * is seen once.  Both of its triangles are marked, by atomic_or(), unless float32 shows that they do not cut each other:
- * signs of volumes that exceed their rounding are those of exact arithmetic. */
+ * signs of volumes and areas that exceed their rounding are those of exact arithmetic. */
 
 /* Share of a volume's sum of absolute terms that its rounding does not reach. */
 #define ROUNDING 0x1p-20f
@@ -24,22 +24,74 @@
 
 #pragma OPENCL FP_CONTRACT OFF
 
-/* Side of the plane through a, b and c on which d lies, 1 or -1; 0 where float32 cannot tell. */
-static inline int side_of(const float3 a, const float3 b, const float3 c, const float3 d)
+/* The plane of a triangle: one corner, the normal, and for each of its parts the sum of its absolute terms. */
+typedef struct { float3 corner, normal, terms; } plane;
+
+static inline plane plane_of(const float3 a, const float3 b, const float3 c)
 {
-    const float3 p = b - a, q = c - a, r = d - a;
-    const float3 one = (float3)(q.y * r.z, q.z * r.x, q.x * r.y), other = (float3)(q.z * r.y, q.x * r.z, q.y * r.x);
-    const float volume = p.x * (one.x - other.x) + p.y * (one.y - other.y) + p.z * (one.z - other.z);
-    const float terms = fabs(p.x) * (fabs(one.x) + fabs(other.x)) + fabs(p.y) * (fabs(one.y) + fabs(other.y))
-                      + fabs(p.z) * (fabs(one.z) + fabs(other.z));
-    return (int)(volume > ROUNDING * terms) - (int)(volume < -ROUNDING * terms);
+    const float3 p = b - a, q = c - a;
+    const float3 one = p.yzx * q.zxy, other = p.zxy * q.yzx;
+    const plane found = {a, one - other, fabs(one) + fabs(other)};
+    return found;
 }
 
-/* True where all three corners surely lie on one side. */
-static inline int apart(const int3 sides)
+/* Side of a plane on which a point lies, 1 or -1; 0 where float32 cannot tell. */
+static inline int side_of(const plane *flat, const float3 point)
+{
+    const float3 r = point - flat->corner, parts = flat->normal * r, terms = flat->terms * fabs(r);
+    const float volume = parts.x + parts.y + parts.z, bound = ROUNDING * (terms.x + terms.y + terms.z);
+    return (int)(volume > bound) - (int)(volume < -bound);
+}
+
+/* Sides of a plane on which corners lie. */
+static inline int3 sides_of(const plane *flat, const float3 a, const float3 b, const float3 c)
+{
+    return (int3)(side_of(flat, a), side_of(flat, b), side_of(flat, c));
+}
+
+/* True where all corners surely lie on one side, but for those that are common: float32 cannot tell of these. */
+static inline int apart(const int3 sides, const int common)
 {
     const int sum = sides.x + sides.y + sides.z;
-    return sum == 3 || sum == -3;
+    return common + sum == 3 || common - sum == 3;
+}
+
+/* Axis along which the triangle a, b, c looks largest. */
+static inline int steepest(const float3 a, const float3 b, const float3 c)
+{
+    const float3 normal = fabs(cross(b - a, c - a));
+    return normal.x >= normal.y && normal.x >= normal.z ? 0 : normal.y >= normal.z ? 1 : 2;
+}
+
+/* A point seen along an axis. */
+static inline float2 shadow(const float3 point, const int axis)
+{
+    return axis == 0 ? point.yz : axis == 1 ? point.zx : point.xy;
+}
+
+/* Side of the line from a to b on which c lies, 1 or -1; 0 where float32 cannot tell. */
+static inline int turn_of(const float2 a, const float2 b, const float2 c)
+{
+    const float2 p = b - a, q = c - a;
+    const float one = p.x * q.y, other = p.y * q.x, bound = ROUNDING * (fabs(one) + fabs(other));
+    return (int)(one - other > bound) - (int)(one - other < -bound);
+}
+
+/* True where the edge from p to q surely lies beyond one of the edges of the triangle a, b, c, or beside all of it, as
+ * seen along an axis: they then have no point in common. */
+static inline int apart_in_shadow(
+    const float3 from, const float3 to, const float3 first, const float3 second, const float3 third)
+{
+    const int axis = steepest(first, second, third);
+    const float2 p = shadow(from, axis), q = shadow(to, axis);
+    const float2 a = shadow(first, axis), b = shadow(second, axis), c = shadow(third, axis);
+    const int inside = turn_of(a, b, c);
+    if (inside != 0
+        && ((turn_of(a, b, p) == -inside && turn_of(a, b, q) == -inside)
+            || (turn_of(b, c, p) == -inside && turn_of(b, c, q) == -inside)
+            || (turn_of(c, a, p) == -inside && turn_of(c, a, q) == -inside)))
+        return 1;
+    return apart((int3)(turn_of(p, q, a), turn_of(p, q, b), turn_of(p, q, c)), 0);
 }
 
 /* False where the line from p to q surely passes beside the triangle a, b, c, or where p and q lie on the same side. */
@@ -48,8 +100,51 @@ static inline int may_pass(
 {
     if (side_p == side_q && side_p != 0)
         return 0;
-    const int u = side_of(p, q, a, b), v = side_of(p, q, b, c), w = side_of(p, q, c, a);
-    return !((u > 0 || v > 0 || w > 0) && (u < 0 || v < 0 || w < 0));
+    const plane first = plane_of(p, q, a), second = plane_of(p, q, b), third = plane_of(p, q, c);
+    const int u = side_of(&first, b), v = side_of(&second, c), w = side_of(&third, a);
+    if ((u > 0 || v > 0 || w > 0) && (u < 0 || v < 0 || w < 0))
+        return 0;
+    return !apart_in_shadow(p, q, a, b, c);
+}
+
+/* True where triangles in one plane with the common edge b, c and the third corners a and d may lie on one side of it. */
+static inline int may_be_folded(const float3 a, const float3 b, const float3 c, const float3 d)
+{
+    const int axis = steepest(a, b, c);
+    const float2 from = shadow(b, axis), to = shadow(c, axis);
+    return turn_of(from, to, shadow(a, axis)) * turn_of(from, to, shadow(d, axis)) >= 0;
+}
+
+/* The triangle turned so that the corner whose flag is set comes first. */
+static inline uint3 turned(const uint3 triangle, const int3 flags)
+{
+    return flags.x ? triangle : flags.y ? triangle.yzx : triangle.zxy;
+}
+
+/* One for each corner of a triangle that is a corner of the other, too. */
+static inline int3 common_corners(const uint3 one, const uint3 other)
+{
+    return -((one == other) | (one == other.yzx) | (one == other.zxy));
+}
+
+/* False where triangles surely have nothing in common but `count` corners, flagged in `common`.  Of two with a common
+ * corner only the edges opposite to it can pass through the other triangle. */
+static inline int may_cut(
+    const uint3 one, const uint3 two, const int3 common, const int count, __global const float *restrict vertices)
+{
+    const int3 flags = common_corners(two, one);
+    const uint3 own = turned(one, count == 2 ? 1 - common : common), its = turned(two, count == 2 ? 1 - flags : flags);
+    const float3 a = vload3(own.x, vertices), b = vload3(own.y, vertices), c = vload3(own.z, vertices);
+    const float3 d = vload3(its.x, vertices), e = vload3(its.y, vertices), f = vload3(its.z, vertices);
+    if (count == 2)
+        return may_be_folded(a, b, c, d);
+    const plane here = plane_of(a, b, c), there = plane_of(d, e, f);
+    const int3 ours = sides_of(&there, a, b, c), theirs = sides_of(&here, d, e, f);
+    if (may_pass(b, c, ours.y, ours.z, d, e, f) || may_pass(e, f, theirs.y, theirs.z, a, b, c))
+        return 1;
+    return count == 0
+        && (may_pass(a, b, ours.x, ours.y, d, e, f) || may_pass(c, a, ours.z, ours.x, d, e, f)
+            || may_pass(d, e, theirs.x, theirs.y, a, b, c) || may_pass(f, d, theirs.z, theirs.x, a, b, c));
 }
 
 /* Parameters  vertices  in   (vertices, 3) coordinates, of which the largest has a magnitude of 1024 to 2048
@@ -63,7 +158,7 @@ static inline int may_pass(
  *             first items   the entries of this launch;  level_count: levels
  * Launch      global = items rounded up by the host, any local
  * Assumes     entries in the order of level, row and low x; boxes at most 0.998 edges long; at most 4096 rows along an axis
- * Guarantees  a bit is set for both triangles of each pair that cuts each other and shares no vertex; bits are only added.
+ * Guarantees  a bit is set for both triangles of each pair that cuts each other; bits are only added.
  *             Races: marks by atomic_or() alone */
 __kernel void mark_crossings(
     __global const float *restrict vertices, __global const uint *restrict corners, __global const float *restrict low,
@@ -75,8 +170,9 @@ __kernel void mark_crossings(
         return;
     const uint entry = first + get_global_id(0);
     const float3 begin = vload3(entry, low), end = vload3(entry, high);
-    const uint ca = corners[3 * entry], cb = corners[3 * entry + 1], cc = corners[3 * entry + 2];
-    const float3 a = vload3(ca, vertices), b = vload3(cb, vertices), c = vload3(cc, vertices);
+    const uint3 this = vload3(entry, corners);
+    const float3 a = vload3(this.x, vertices), b = vload3(this.y, vertices), c = vload3(this.z, vertices);
+    const plane own = plane_of(a, b, c);
     uint own_level = 0;
     while (entry >= levels[4 * own_level + 3])
         ++own_level;
@@ -110,20 +206,15 @@ __kernel void mark_crossings(
                     if (its_high.x < begin.x || its_low.y > end.y || its_high.y < begin.y || its_low.z > end.z
                         || its_high.z < begin.z)
                         continue;
-                    const uint cd = corners[3 * place], ce = corners[3 * place + 1], cf = corners[3 * place + 2];
-                    if (ca == cd || ca == ce || ca == cf || cb == cd || cb == ce || cb == cf || cc == cd || cc == ce
-                        || cc == cf)
+                    const uint3 that = vload3(place, corners);
+                    const int3 common = common_corners(this, that);
+                    const int count = common.x + common.y + common.z;
+                    const float3 d = vload3(that.x, vertices), e = vload3(that.y, vertices);
+                    const float3 f = vload3(that.z, vertices);
+                    if (count == 3 || apart(sides_of(&own, d, e, f), count))
                         continue;
-                    const float3 d = vload3(cd, vertices), e = vload3(ce, vertices), f = vload3(cf, vertices);
-                    const int3 ours = (int3)(side_of(d, e, f, a), side_of(d, e, f, b), side_of(d, e, f, c));
-                    if (apart(ours))
-                        continue;
-                    const int3 its = (int3)(side_of(a, b, c, d), side_of(a, b, c, e), side_of(a, b, c, f));
-                    if (apart(its))
-                        continue;
-                    if (may_pass(a, b, ours.x, ours.y, d, e, f) || may_pass(b, c, ours.y, ours.z, d, e, f)
-                        || may_pass(c, a, ours.z, ours.x, d, e, f) || may_pass(d, e, its.x, its.y, a, b, c)
-                        || may_pass(e, f, its.y, its.z, a, b, c) || may_pass(f, d, its.z, its.x, a, b, c)) {
+                    const plane other = plane_of(d, e, f);
+                    if (!apart(sides_of(&other, a, b, c), count) && may_cut(this, that, common, count, vertices)) {
                         atomic_or(&marks[entry / 32u], 1u << entry % 32u);
                         atomic_or(&marks[place / 32u], 1u << place % 32u);
                     }

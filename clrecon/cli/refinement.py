@@ -83,7 +83,7 @@ def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
     worst = max(found, key=lambda each: each["deviation"]["hd95_mm"] / each["voxel_mm"])
     parts = []
     if "smooth" in worst:
-        parts.append(f"smoothed ({count_of(worst['smooth']['iterations'], 'iteration')})")
+        parts.append(_describe_smoothing(worst["smooth"]))
     if "decimate" in worst:
         parts.append(_describe_decimation(worst["decimate"]))
     deviation, voxel = worst["deviation"], worst["voxel_mm"]
@@ -95,6 +95,16 @@ def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
         for name, key in (("mean", "assd_mm"), ("95 % within", "hd95_mm"), ("largest", "max_mm"))
     )
     return [f"{which} {', '.join(parts)}", f"         from the surface before: {lengths}"]
+
+
+def _describe_smoothing(found: dict[str, Any]) -> str:
+    """Describe the iterations, and what was not smoothed."""
+    parts = [count_of(found["iterations"], "iteration")]
+    if found["components_left"]:
+        parts.append(f"{count_of(found['components_left'], 'component')} left unsmoothed to keep the volume")
+    if found["vertices_not_finite"]:
+        parts.append(f"{count_of(found['vertices_not_finite'], 'vertex', 'vertices')} without a finite step not moved")
+    return f"smoothed ({'; '.join(parts)})"
 
 
 def _describe_decimation(found: dict[str, Any]) -> str:

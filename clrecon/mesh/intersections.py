@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.mesh.triangles import corner_edges, cross_product
 from clrecon.system.pieces import in_threads, local_origin
 from clrecon.system.progress import Steps
 
@@ -27,6 +29,9 @@ _FEW = 0.05
 _CELLS_A_SIDE = 128
 """Coarse cells along the longest side of a surface."""
 
+_ROUNDING = 2.0**-50
+"""Share of the sum of its absolute terms that the rounding of a volume or an area does not reach (Shewchuk 1997)."""
+
 Float64Array = NDArray[np.float64]
 FindCrossings = Callable[..., NDArray[np.int64]]
 """Finds pairs of triangles that cut each other, from the same arguments as `find_self_intersections`."""
@@ -44,10 +49,12 @@ def find_self_intersections(
     *,
     steps: Steps | None = None,
 ) -> NDArray[np.int64]:
-    """Find the pairs of triangles that cut each other.
+    """Find the pairs of triangles that cut each other, as CGAL counts them.
 
-    Two triangles cut each other when an edge of one passes through the inside of the other (Moeller 1997 for the
-    general case). Pairs that share a vertex are not examined, and pairs that touch or lie in one plane do not count.
+    Two triangles cut each other when they have a point in common, touch or overlap in one plane.  Of two with a common
+    corner only the edges opposite to it can reach the other triangle.  Two with a common edge cut each other when they
+    lie in one plane on the same side of it.  Corners at the same place are common; triangles with three common corners,
+    without area, or with a corner that is not finite, are left out.  The signs of all volumes and areas are exact.
 
     Parameters
     ----------
@@ -63,35 +70,58 @@ def find_self_intersections(
     ndarray, shape (k, 2), int64
         Numbers of triangles.
     """
+    sound = np.isfinite(vertices).all(axis=1)
+    if not sound.all():
+        kept = np.flatnonzero(sound[triangles].all(axis=1))
+        cut = find_self_intersections(
+            np.where(sound[:, None], vertices, 0.0), triangles[kept], None if changed is None else changed[kept]
+        )
+        return kept[cut]
     if len(triangles) == 0:
         return np.zeros((0, 2), dtype=np.int64)
-    points = vertices[triangles.T]  # corner, triangle, axis
-    points = points - local_origin(points.reshape(-1, 3))
+    columns = np.ascontiguousarray((vertices - local_origin(vertices)).T)
     corners = np.ascontiguousarray(triangles.T)
-    entries = _enter(*(np.ascontiguousarray(end.T) for end in (points.min(axis=0), points.max(axis=0))))
+    points = [columns.take(corner, axis=1) for corner in corners]
+    entries = _enter(np.minimum.reduce(points), np.maximum.reduce(points))
+    planes = _Planes.of(vertices, triangles, points)
     pieces = entries.pieces()
-    found = [np.zeros((0, 2), dtype=np.int64)] * (len(pieces) - 1)
+    close = [np.zeros((0, 2), dtype=np.int64)] * (len(pieces) - 1)
 
     def work(where: slice) -> None:
         one, other = entries.overlapping(slice(pieces[where.start], pieces[where.start + 1]), changed)
-        apart = np.ones(len(one), dtype=bool)
+        common = np.zeros(len(one), dtype=np.int8)
         for corner in corners:
             number = corner.take(one)
             for second in corners:
-                apart &= number != second.take(other)
-        one, other = one[apart], other[apart]
-        if len(one) == 0:
-            return
-        cut = _cut(points[:, one], points[:, other])
-        found[where.start] = np.column_stack([one[cut], other[cut]])
+                common += number == second.take(other)
+        close[where.start] = np.column_stack(planes.not_apart(points, one, other, common))
 
     def count(piece: slice) -> None:
         if steps is not None:
-            first, end = (len(triangles) * n // len(found) for n in (piece.start, piece.stop))
+            first, end = (len(triangles) * n // len(close) for n in (piece.start, piece.stop))
             steps.take(end - first)
 
-    in_threads(work, len(found), 1, count)
-    return np.concatenate(found) if found else np.zeros((0, 2), dtype=np.int64)
+    in_threads(work, len(close), 1, count)
+    return _leave_cut(vertices, triangles, np.concatenate(close)) if close else np.zeros((0, 2), dtype=np.int64)
+
+
+def _leave_cut(
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], pairs: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Leave the pairs of triangles, shape (k, 2), that cut each other."""
+    cut = np.zeros(len(pairs), dtype=bool)
+
+    def work(where: slice) -> None:
+        corners = triangles[pairs[where].T].transpose(0, 2, 1)  # of which triangle, corner, pair
+        one, other = vertices[corners].astype(np.float64)
+        found = np.flatnonzero(_cut(one, other, corners[0][:, None] == corners[1]))
+        # Corners at one place count as the same: only pairs that cut each other otherwise can have some.
+        one, other = vertices[corners[:, :, found]].astype(np.float64)
+        found = found[_cut(one, other, (one[:, None] == other).all(axis=3)) & _has_area(one) & _has_area(other)]
+        cut[where.start + found] = True
+
+    in_threads(work, len(pairs), _PIECE)
+    return pairs[cut]
 
 
 def find_changed_intersections(
@@ -216,22 +246,68 @@ class _Entries:
         return one[once], other[once]
 
 
+@dataclass(frozen=True)
+class _Planes:
+    """Planes of triangles: a corner x is surely above one where normal . x - offset > slack, below where < -slack.
+
+    Attributes
+    ----------
+    normal : ndarray, shape (3, m), float64
+    offset, slack : ndarray, shape (m,), float64
+    """
+
+    normal: Float64Array
+    offset: Float64Array
+    slack: Float64Array
+
+    @classmethod
+    def of(
+        cls, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], points: Sequence[Float64Array]
+    ) -> _Planes:
+        """Return the planes of triangles whose corners, relative to one origin, are `points`, three of shape (3, m)."""
+        normal, slack = np.empty((3, len(triangles))), np.empty(len(triangles))
+        farthest = max(float(np.abs(corner).max()) for corner in points)
+        for where, _, p, q in corner_edges(vertices, triangles, np.zeros(3)):
+            normal[:, where] = cross_product(p, q)
+            slack[where] = 2.0**-46 * farthest * np.abs(p).sum(axis=0) * np.abs(q).sum(axis=0)
+        return cls(normal, np.einsum("am,am->m", normal, points[0]), slack)
+
+    def not_apart(
+        self,
+        points: Sequence[Float64Array],
+        one: NDArray[np.int64],
+        other: NDArray[np.int64],
+        common: NDArray[np.int8],
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Leave out pairs of which one, but for its common corners, lies surely on one side of the other's plane."""
+        for _ in range(2):
+            normal, offset, slack = self.normal.take(other, axis=1), self.offset.take(other), self.slack.take(other)
+            above, below = common.copy(), common.copy()
+            for corner in points:
+                side = -offset
+                for along, row in zip(normal, corner, strict=True):
+                    side += along * row.take(one)
+                above += side > slack
+                below += side < -slack
+            near = np.flatnonzero((above != 3) & (below != 3))
+            one, other, common = other.take(near), one.take(near), common.take(near)
+        return one, other
+
+
 def _enter(low: Float64Array, high: Float64Array) -> _Entries:
     """Enter triangles, by their boxes of shape (3, m), into the cells of a grid."""
     start = low.min(axis=1)[:, None]
     size = float(np.median((high - low).max(axis=0))) or 1.0
-    while True:
-        first, last = ((corner - start) // size for corner in (low, high))
-        cells = (last - first + 1).prod(axis=0)
-        if cells.sum() <= _CELLS_A_TRIANGLE * low.shape[1]:
-            break
+    first, last = ((corner - start) // size for corner in (low, high))
+    while (last - first + 1).prod(axis=0).sum() > _CELLS_A_TRIANGLE * low.shape[1]:
         size *= 1.25
+        first, last = ((corner - start) // size for corner in (low, high))
     first, last = first.astype(np.int32), last.astype(np.int32)
     triangle, cell = _enter_into_cells(first, last)
     shape = cell.max(axis=1).astype(np.int64) + 1
     key = (cell[2] * shape[1] + cell[1]) * shape[0] + cell[0]
     order = np.argsort(key, kind="stable")
-    key, triangle, cell = key[order], triangle[order], cell[:, order]
+    key, triangle, cell = key.take(order), triangle.take(order), cell.take(order, axis=1)  # rows side by side
     ends = np.append(np.flatnonzero(key[1:] != key[:-1]) + 1, len(key))
     later = np.repeat(ends, np.diff(ends, prepend=0)) - 1 - np.arange(len(key))
     below, above = np.nextafter(low.astype(np.float32), -np.inf), np.nextafter(high.astype(np.float32), np.inf)
@@ -252,26 +328,121 @@ def _enter_into_cells(first: NDArray[np.int32], last: NDArray[np.int32]) -> tupl
     return triangle, cell
 
 
-def _cut(one: Float64Array, other: Float64Array) -> NDArray[np.bool_]:
-    """True where an edge of one triangle passes through the inside of the other; corners have shape (3, k, 3)."""
+def _cut(one: Float64Array, other: Float64Array, same: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """True where triangles cut each other; corners have shape (3, k, 3), and `same` (3, 3, k) says which are one."""
+    found = np.zeros(one.shape[1], dtype=bool)
+    common = same.sum(axis=(0, 1))
+    rows = np.flatnonzero(common == 0)
+    found[rows] = _meet(one[:, rows], other[:, rows])
+    for count, meet in ((1, _meet_beside_corner), (2, _fold)):
+        rows = np.flatnonzero(common == count)
+        # First comes the common corner, or the one that is not common.
+        first = [(same[:, :, rows].any(axis=axis) == (count == 1)).argmax(axis=0) for axis in (1, 0)]
+        order = [(np.arange(3)[:, None] + start) % 3 for start in first]
+        found[rows] = meet(one[order[0], rows], other[order[1], rows])
+    return found
+
+
+def _meet(
+    one: Float64Array, other: Float64Array, edges: tuple[tuple[int, int], ...] = ((0, 1), (1, 2), (2, 0))
+) -> NDArray[np.bool_]:
+    """True where one of these edges of either triangle has a point of the other triangle."""
     found = np.zeros(one.shape[1], dtype=bool)
     rows = np.arange(one.shape[1])
+    ends = sorted({end for edge in edges for end in edge})
     for _ in range(2):
-        sides = np.stack([_volume(other[0], other[1], other[2], corner) for corner in one])
-        # A triangle wholly on one side of the other's plane cannot have edges that cut the other.
-        astride = (sides > 0.0).any(axis=0) & (sides < 0.0).any(axis=0)
+        sides = np.zeros((3, len(rows)), dtype=np.int8)
+        for end in ends:
+            sides[end] = _side(other[0], other[1], other[2], one[end])
+        # A triangle wholly on one side of the other's plane cannot meet the other.
+        astride = (sides[ends] <= 0).any(axis=0) & (sides[ends] >= 0).any(axis=0)
         rows, one, other, sides = rows[astride], one[:, astride], other[:, astride], sides[:, astride]
-        for a, b in ((0, 1), (1, 2), (2, 0)):
-            through = np.flatnonzero(((sides[a] > 0.0) & (sides[b] < 0.0)) | ((sides[a] < 0.0) & (sides[b] > 0.0)))
+        for a, b in edges:
+            through = np.flatnonzero((sides[a] * sides[b] <= 0) & (sides[a] != sides[b]))
             p, q = one[a][through], one[b][through]
-            turns = [_volume(p, q, other[c][through], other[(c + 1) % 3][through]) for c in range(3)]
-            inside = np.all([turn > 0.0 for turn in turns], axis=0) | np.all([turn < 0.0 for turn in turns], axis=0)
-            found[rows[through]] |= inside
+            turns = np.array([_side(p, q, other[c][through], other[(c + 1) % 3][through]) for c in range(3)])
+            found[rows[through]] |= (turns >= 0).all(axis=0) | (turns <= 0).all(axis=0)
+            within = np.flatnonzero((sides[a] == 0) & (sides[b] == 0))
+            found[rows[within]] |= _meet_in_plane(one[a][within], one[b][within], other[:, within])
         one, other = other, one
     return found
 
 
-def _volume(a: Float64Array, b: Float64Array, c: Float64Array, d: Float64Array) -> Float64Array:
-    """Return six times the signed volume of a tetrahedron."""
-    (px, py, pz), (qx, qy, qz), (rx, ry, rz) = ((corner - a).T for corner in (b, c, d))
-    return px * (qy * rz - qz * ry) + py * (qz * rx - qx * rz) + pz * (qx * ry - qy * rx)
+def _meet_beside_corner(one: Float64Array, other: Float64Array) -> NDArray[np.bool_]:
+    """True where triangles with a common first corner have another point in common."""
+    return _meet(one, other, ((1, 2),))
+
+
+def _fold(one: Float64Array, other: Float64Array) -> NDArray[np.bool_]:
+    """True where triangles with a common edge, opposite to their first corners, lie in one plane on one side of it."""
+    found = _side(one[0], one[1], one[2], other[0]) == 0
+    rows = np.flatnonzero(found)
+    axis = _steepest(one[:, rows])
+    u, v, own, its = (_project(corner[rows], axis) for corner in (one[1], one[2], one[0], other[0]))
+    found[rows] = _turn(u, v, own) * _turn(u, v, its) > 0
+    return found
+
+
+def _meet_in_plane(p: Float64Array, q: Float64Array, triangle: Float64Array) -> NDArray[np.bool_]:
+    """True where edges from p to q have a point of the triangle in whose plane they lie."""
+    axis = _steepest(triangle)
+    p, q, *corners = (_project(points, axis) for points in (p, q, *triangle))
+    turns = np.array([_turn(p, q, corner) for corner in corners])
+    apart = (turns > 0).all(axis=0) | (turns < 0).all(axis=0)
+    inside = _turn(*corners)
+    for u, v in ((0, 1), (1, 2), (2, 0)):
+        apart |= np.all([_turn(corners[u], corners[v], end) * inside < 0 for end in (p, q)], axis=0)
+    return np.asarray(~apart)
+
+
+def _has_area(triangle: Float64Array) -> NDArray[np.bool_]:
+    """True for triangles, shape (3, k, 3), whose corners do not lie on one line."""
+    axes = np.arange(3)[:, None] * np.ones(triangle.shape[1], dtype=np.int64)
+    return np.any([_turn(*(_project(corner, axis) for corner in triangle)) != 0 for axis in axes], axis=0)
+
+
+def _steepest(triangle: Float64Array) -> NDArray[np.int64]:
+    """Return the axis, shape (k,), along which each triangle, shape (3, k, 3), looks largest."""
+    return np.abs(np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])).argmax(axis=1)
+
+
+def _project(points: Float64Array, axis: NDArray[np.int64]) -> Float64Array:
+    """Return the two other coordinates of points, shape (k, 3), as rows of shape (2, k)."""
+    row = np.arange(len(points))
+    return np.stack([points[row, (axis + 1) % 3], points[row, (axis + 2) % 3]])
+
+
+def _turn(a: Float64Array, b: Float64Array, c: Float64Array) -> NDArray[np.int8]:
+    """Return on which side of the line from a to b, shape (2, k), c lies: -1, 0 or 1, exactly."""
+    return _sign(_area, a, b, c)
+
+
+def _side(a: Float64Array, b: Float64Array, c: Float64Array, d: Float64Array) -> NDArray[np.int8]:
+    """Return on which side of the plane through a, b and c, shape (k, 3), d lies: -1, 0 or 1, exactly."""
+    return _sign(_volume, a.T, b.T, c.T, d.T)
+
+
+def _sign(measure: Callable[..., tuple[Any, Any]], *points: Float64Array) -> NDArray[np.int8]:
+    """Return the sign of a measure, exactly: where it is small beside the sum of its terms, from whole numbers."""
+    value, terms = measure(*points)
+    sign = np.sign(value).astype(np.int8)
+    unsure = np.flatnonzero(np.abs(value) < _ROUNDING * terms)
+    if len(unsure):
+        part, power = np.frexp(np.stack(points)[..., unsure])
+        whole = np.ldexp(part, 53).astype(np.int64).astype(object) << (power - power.min()).astype(object)
+        sign[unsure] = np.sign(measure(*whole)[0]).astype(np.int8)
+    return sign
+
+
+def _area(a: Any, b: Any, c: Any) -> tuple[Any, Any]:
+    """Return twice the signed area of a triangle, and the sum of its absolute terms."""
+    (px, py), (qx, qy) = b - a, c - a
+    return px * qy - py * qx, abs(px * qy) + abs(py * qx)
+
+
+def _volume(a: Any, b: Any, c: Any, d: Any) -> tuple[Any, Any]:
+    """Return six times the signed volume of a tetrahedron, and the sum of its absolute terms."""
+    (px, py, pz), (qx, qy, qz), (rx, ry, rz) = b - a, c - a, d - a
+    x, y, z = (qy * rz, qz * ry), (qz * rx, qx * rz), (qx * ry, qy * rx)
+    value = px * (x[0] - x[1]) + py * (y[0] - y[1]) + pz * (z[0] - z[1])
+    return value, sum(abs(p) * (abs(one) + abs(other)) for p, (one, other) in zip((px, py, pz), (x, y, z), strict=True))

@@ -65,7 +65,8 @@ class MeshQuality(Record):
     bounds_mm : [[x, y, z], [x, y, z]] or None
         Lowest and highest corner; None without vertices.
     self_intersections : int or None
-        Pairs of triangles that cut each other; None where nobody has looked for them, as here.
+        Pairs of triangles that cut or touch each other beside common corners, or overlap in one plane, as CGAL counts
+        them.  ``mesh.quality()`` does not look for them: None.  ``clrecon mesh --strict`` does.
     """
 
     vertices: int

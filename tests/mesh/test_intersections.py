@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 import sample_meshes as samples
@@ -27,12 +29,12 @@ def count_by_solving(vertices: np.ndarray, triangles: np.ndarray) -> int:
     found = 0
     for a in range(len(triangles)):
         for b in range(a):
-            if set(triangles[a]) & set(triangles[b]):
-                continue
+            common = set(triangles[a]) & set(triangles[b])
             found += any(
                 _edge_meets(vertices[triangles[f]], vertices[triangles[e]], i)
                 for f, e in ((a, b), (b, a))
                 for i in range(3)
+                if not common & {triangles[e][i], triangles[e][(i + 1) % 3]}
             )
     return found
 
@@ -46,6 +48,60 @@ def _edge_meets(face: np.ndarray, corners: np.ndarray, edge: int) -> bool:
     return bool(u > 0 and v > 0 and u + v < 1 and 0 < t < 1)
 
 
+def count_exactly(vertices: np.ndarray, triangles: np.ndarray) -> int:
+    """All pairs in fractions: each edge without a common corner is clipped to the other triangle and its plane."""
+    points = [tuple(Fraction(float(x)) for x in vertex) for vertex in vertices]
+    corners = [[points[vertex] for vertex in triangle] for triangle in triangles]
+    corners = [triangle for triangle in corners if any(_cross(*triangle))]
+    return sum(_meet_exactly(one, other) for a, one in enumerate(corners) for other in corners[:a])
+
+
+def _meet_exactly(one, other) -> bool:
+    common = set(one) & set(other)
+    if len(common) == 2:
+        own, its = (next(corner for corner in triangle if corner not in common) for triangle in (one, other))
+        u, v = sorted(common)
+        flat = _dot(_cross(*one), _minus(its, one[0])) == 0
+        return flat and _dot(_cross(u, v, own), _cross(u, v, its)) > 0
+    return any(
+        _edge_meets_exactly(triangle[i], triangle[(i + 1) % 3], face)
+        for face, triangle in ((one, other), (other, one))
+        for i in range(3)
+        if len(common) < 3 and not common & {triangle[i], triangle[(i + 1) % 3]}
+    )
+
+
+def _edge_meets_exactly(start, end, face) -> bool:
+    """Some share between 0 and 1 of the edge lies in the plane and on the inner side of all three edges."""
+    normal, low, high = _cross(*face), Fraction(0), Fraction(1)
+    planes = [(normal, face[0]), (tuple(-x for x in normal), face[0])]
+    for a, b in zip(face, face[1:] + face[:1], strict=True):
+        planes.append((_cross((0, 0, 0), normal, _minus(b, a)), a))
+    for inward, point in planes:
+        at, rise = _dot(inward, _minus(start, point)), _dot(inward, _minus(end, start))
+        if rise == 0:
+            if at < 0:
+                return False
+        elif rise > 0:
+            low = max(low, -at / rise)
+        else:
+            high = min(high, -at / rise)
+    return low <= high
+
+
+def _minus(a, b):
+    return tuple(x - y for x, y in zip(a, b, strict=True))
+
+
+def _dot(a, b):
+    return sum(x * y for x, y in zip(a, b, strict=True))
+
+
+def _cross(a, b, c):
+    p, q = _minus(b, a), _minus(c, a)
+    return p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
+
+
 def test_good_surfaces_have_none():
     assert count(samples.torus(60, 30)) == 0
     assert count(samples.sphere((300, -500, 20), 10, 4)) == 0
@@ -57,8 +113,10 @@ def test_two_triangles():
     assert count((np.array(flat + upright, float), [[0, 1, 2], [3, 4, 5]])) == 1
     above = np.array(flat + upright, float)
     above[3:, 2] += 1.0
-    assert count((above, [[0, 1, 2], [3, 4, 5]])) == 0  # a corner touches the face
-    assert count((np.array(flat + flat, float), [[0, 1, 2], [3, 4, 5]])) == 0  # one plane
+    assert count((above, [[0, 1, 2], [3, 4, 5]])) == 1  # a corner touches the face
+    above[3:, 2] += 2.0**-20
+    assert count((above, [[0, 1, 2], [3, 4, 5]])) == 0
+    assert count((np.array(flat + flat, float), [[0, 1, 2], [3, 4, 5]])) == 0  # the same: counted as such elsewhere
 
 
 @pytest.mark.parametrize("shift", [(3.1, 0.2, 0.3), (11.0, 4.0, -3.0), (19.5, 0.1, 0.2), (21.0, 0.0, 0.0)])
@@ -87,11 +145,75 @@ def test_the_unit_of_length_changes_no_pair(scale):
     assert count((scale * beside, [[0, 1, 2], [3, 4, 5]])) == 0
 
 
-def test_triangles_that_share_a_vertex_are_not_examined():
-    """The edge from vertex 3 to 4 passes through the inside of the first triangle."""
+def test_triangles_with_a_common_corner_cut_each_other_by_the_edges_opposite_to_it():
+    """The edge from vertex 3 to 4 passes through the inside of the first triangle, and then beside it."""
     vertices = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [1, 1, -1], [1, 1.5, 3], [0.5, 0.5, 3.0]])
     assert count((vertices, [[0, 1, 2], [5, 3, 4]])) == 1
+    for corners in ([0, 3, 4], [3, 4, 0], [4, 0, 3]):
+        assert count((vertices, [[0, 1, 2], corners])) == count((vertices, [[1, 2, 0], corners])) == 1
+    vertices[3:5] = (-1, 1, -1), (-1, 1, 3)
     assert count((vertices, [[0, 1, 2], [0, 3, 4]])) == 0
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize(
+    ("second", "expected"),
+    [
+        ([0, 1, 6], 0),  # the neighbour beyond a common edge
+        ([0, 1, 4], 1),  # folded onto the first: inside of it
+        ([0, 1, 3], 1),  # and partly outside
+        ([0, 7, 8], 0),  # beside it at a corner
+        ([0, 3, 5], 1),  # a common corner and an overlap
+        ([0, 2, 7], 0),
+        ([0, 2, 5], 1),
+        ([4, 3, 5], 1),  # no common corner
+        ([6, 7, 8], 0),
+    ],
+)
+def test_triangles_in_one_plane(second, expected, turned):
+    vertices = np.array([[0, 0], [4, 0], [0, 4], [3, 3], [1, 1], [2, 5], [2, -3], [-3, -1], [-1, -3]], float)
+    vertices = np.column_stack([vertices, vertices @ [2, -1] if turned else np.full(9, 7.25)])
+    assert count((vertices, [[0, 1, 2], second])) == count((vertices, [second, [0, 1, 2]])) == expected
+
+
+def test_corners_at_one_place_count_as_the_same():
+    vertices = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 0], [1, -3, 2], [-2, 1, 5]], float)
+    assert count((vertices, [[0, 1, 2], [3, 4, 5]])) == 0
+    vertices[3] = (1, 1, 0)  # within the face
+    assert count((vertices, [[0, 1, 2], [3, 4, 5]])) == 1
+
+
+@pytest.mark.parametrize("kind", ["whole", "plane", "turned", "float64"])
+@pytest.mark.parametrize("seed", range(2))
+def test_pairs_that_touch_fold_and_overlap_are_counted_exactly(kind, seed):
+    """Triangles over few places: most pairs have common corners, touch, or lie in one plane."""
+    random = np.random.default_rng(seed)
+    places = np.unique(random.integers(0, 4, (24, 3)), axis=0).astype(float)
+    if kind == "plane":
+        places[:, 2] = 0.0
+        places = np.unique(places, axis=0)
+    elif kind == "turned":
+        places = (places @ [[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.1, 0.0, 1.0]]).astype(np.float32).astype(float)
+    elif kind == "float64":
+        places = 1e3 * places + 1.0 / 3.0
+    triangles = np.array([random.choice(len(places), 3, replace=False) for _ in range(30)], np.uint32)
+    found = count_self_intersections(places, triangles)
+    assert found == count_exactly(places, triangles) > 50
+
+
+def test_triangles_with_a_corner_that_is_not_finite_are_left_out():
+    vertices, triangles = samples.join(samples.box(), samples.box((0.4, 0.5, 0.6)))
+    triangles = np.asarray(triangles, np.uint32)
+    every = find_self_intersections(vertices, triangles)
+    for value in (np.nan, np.inf):
+        spoilt = vertices.copy()
+        spoilt[triangles[every[0, 0], 0], 1] = value
+        sound = np.isfinite(spoilt[triangles]).all(axis=(1, 2))
+        expected = every[sound[every].all(axis=1)]
+        found = find_self_intersections(spoilt, triangles)
+        assert sorted(map(sorted, found.tolist())) == sorted(map(sorted, expected.tolist()))
+        assert 0 < len(expected) < len(every)
+    assert len(find_self_intersections(np.full((3, 3), np.nan), np.array([[0, 1, 2]], np.uint32))) == 0
 
 
 def test_triangles_that_are_points_cut_nothing():
@@ -160,10 +282,12 @@ def test_pairs_whose_boxes_are_apart_are_left_out(axis, monkeypatch):
     """Both triangles share a cell of the grid, which is 1.5 of their boxes long."""
     seen = []
     monkeypatch.setattr(
-        intersections, "_cut", lambda one, other: seen.append(one.shape[1]) or np.zeros(one.shape[1], bool)
+        intersections._Planes,
+        "not_apart",
+        lambda self, points, one, other, common: seen.append(len(one)) or (one[:0], other[:0]),
     )
     face = np.array([[0.0, 0, 0], [1, 0.5, 0.25], [0.5, 1, 1]])
-    for shift, pairs in ((1.25, []), (0.75, [1])):
+    for shift, pairs in ((1.25, [0]), (0.75, [0, 1])):
         both = np.concatenate([face, face + shift * np.eye(3)[axis]])
         assert count((both, [[0, 1, 2], [3, 4, 5]])) == 0
         assert seen == pairs

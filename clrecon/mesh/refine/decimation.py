@@ -68,10 +68,6 @@ _SHARE_SLACK = 0.005
 _SHARE_FOR_VOLUME = 0.1
 """Share of the bound that is kept for the shift that restores the volume of components."""
 
-_VOLUME_SLACK = 0.004
-"""Share of its volume by which a component may differ where that shift is too short.  A few dozen triangles can enclose
-several percent less after a collapse; the gate of the mesh job fails at 0.5 %."""
-
 
 def default_deviation(mesh: Mesh) -> float:
     """Return the default bound in mm: a quarter of the shortest voxel step that the mesh was made from.
@@ -149,7 +145,7 @@ def decimate_mesh(
         Share of the triangles to remove, above 0 and below 1. The bound may allow only less.
     max_deviation_mm : float, optional
         No vertex and no middle of an edge or a triangle of either surface lies farther than this from the other.
-        Default: `default_deviation`.
+        Default: a quarter of the shortest voxel step.
     progress : callable, optional
         Called as ``progress("decimate", triangles removed, triangles to remove)``, several times in a round.
     make_bounds : callable
@@ -264,8 +260,7 @@ def _with_volumes(
         step = np.zeros_like(places)
         restore_volumes(places, step, triangles, labels[standing], wanted, longest)
         now = measure_volumes(places + step, triangles, count, labels[standing], border[standing])
-        differ = ~wanted.is_open & (np.abs(now.mm3 - wanted.mm3) > _VOLUME_SLACK * np.abs(wanted.mm3))
-        if not clusters.undo(standing[differ[labels[standing]]]):
+        if not clusters.undo(standing[wanted.differ(now)[labels[standing]]]):
             break
         _mend(clusters, deviation)
     vertices = move_vertices(as_stored(places + origin), triangles, step, find_crossings)[0]

@@ -7,10 +7,11 @@ component, and takes vertices back where the surface would cut itself.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.exchange.coordinates import rounding_step
-from clrecon.mesh.connectivity import find_edges
+from clrecon.mesh.connectivity import Edges, find_edges, label_components
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
 from clrecon.mesh.refine.decimation import carry_on, check_refinement
@@ -32,8 +33,9 @@ def smooth_mesh(
     """Smooth a surface with a windowed sinc filter (Taubin, Zhang and Golub 1996), which hardly shrinks it.
 
     A vertex that the filter moves farther than the bound stops at the bound.  Each closed component then gets its
-    volume back by a shift along the normals, still within the bound.  Where triangles would cut each other, lose their
-    area or coincide, steps are halved or not made.  Vertices at an open border stay.
+    volume back by a shift along the normals, still within the bound.  Components that cannot have it back, such as
+    specks of a few triangles that the filter draws into a point, are not moved.  Where triangles would cut each other,
+    lose their area or coincide, steps are halved or not made.  Vertices at an open border stay.
 
     Parameters
     ----------
@@ -43,7 +45,7 @@ def smooth_mesh(
     max_deviation_mm : float, optional
         No point of the result lies farther than this from the given surface, and no point of that from the result: the
         triangles are the same and no corner moves farther, so no point between them does.  Default:
-        ``default_deviation``.
+        a quarter of the shortest voxel step that the report of the mesh names.
     progress : callable, optional
         Called as ``progress("smooth", steps done, all steps)``.
 
@@ -52,7 +54,8 @@ def smooth_mesh(
     Mesh
         The same triangles; normals from the faces; the report is taken over, with ``refinement["smooth"]``:
         ``iterations``, ``max_deviation_mm``, ``vertices_held_back`` (by the bound), ``vertices_taken_back`` (from cuts
-        and faces without area).
+        and faces without area), ``vertices_not_finite`` (not moved, as the filter gave no finite place) and
+        ``components_left`` (not moved, as they would not have kept their volume).
 
     Raises
     ------
@@ -75,9 +78,10 @@ def smooth_mesh(
     progress("smooth", 1, 3)
     edges = find_edges(mesh.triangles, mesh.vertex_count)
     step[edges.ends[:, edges.uses == 1]] = 0.0  # VTK smooths along the border as well
+    not_finite = ~np.isfinite(step).all(axis=1)
+    step[not_finite] = 0.0
     held = shorten_steps(step, longest)
-    volumes = measure_volumes(before, mesh.triangles)
-    restore_volumes(before, step, mesh.triangles, volumes.labels, volumes, longest)
+    left = _keep_volumes(before, step, mesh.triangles, edges, longest)
     progress("smooth", 2, 3)
     vertices, taken_back = move_vertices(mesh.vertices, mesh.triangles, step)
     progress("smooth", 3, 3)
@@ -86,5 +90,24 @@ def smooth_mesh(
         "max_deviation_mm": bound,
         "vertices_held_back": held,
         "vertices_taken_back": taken_back,
+        "vertices_not_finite": int(np.count_nonzero(not_finite)),
+        "components_left": left,
     }
     return Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), carry_on(mesh, "smooth", said))
+
+
+def _keep_volumes(
+    vertices: NDArray[np.float64],
+    step: NDArray[np.float64],
+    triangles: NDArray[np.uint32],
+    edges: Edges,
+    longest: float,
+) -> int:
+    """Change steps so that each closed component keeps its volume; return how many can do so only at rest."""
+    count, labels = label_components(triangles, len(vertices), edges)
+    border = edges.border(len(vertices))
+    wanted = measure_volumes(vertices, triangles, count, labels, border)
+    restore_volumes(vertices, step, triangles, labels, wanted, longest)
+    lost = wanted.differ(measure_volumes(vertices + step, triangles, count, labels, border))
+    step[np.append(lost, False)[labels]] = 0.0  # -1: no triangle uses it
+    return int(np.count_nonzero(lost))

@@ -22,7 +22,10 @@ def decimate_mesh(
     device: Device | str | int | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
-    """Remove triangles by collapsing edges in order of their quadric error, see ``clrecon.mesh.refine.decimation``.
+    """Remove triangles by collapsing edges in order of their quadric error (Garland and Heckbert 1997).
+
+    Collapses are undone where the result would exceed the bound, not be manifold, have faces without area, cut itself,
+    or lose a component or a tunnel.  So the share is not always reached: the bound decides how many triangles are left.
 
     Parameters
     ----------
@@ -30,7 +33,8 @@ def decimate_mesh(
     fraction : float
         Share of the triangles to remove, above 0 and below 1. The bound may allow only less.
     max_deviation_mm : float, optional
-        No vertex and no middle of an edge or a triangle of either surface lies farther than this from the other.
+        No vertex and no middle of an edge or a triangle of either surface lies farther than this from the other; a
+        point between them can.
         Default: a quarter of the shortest voxel step.
     device : Device, str or int, optional
         Bounds distances and finds triangles that cut each other, see `clrecon.device`.  None: numpy does it, which
@@ -42,7 +46,10 @@ def decimate_mesh(
     Returns
     -------
     Mesh
-        As that of `decimate_mesh`.
+        Normals from the faces; the report is taken over, with ``refinement["decimate"]``: ``fraction`` (asked for),
+        ``reached``, ``ended_by`` (``"share"`` or ``"bound"``), ``rounds``, ``max_deviation_mm``, ``triangles_before``,
+        ``vertices_taken_back`` (collapses that were undone) and ``topology`` (Euler numbers and components before and
+        after).
 
     Raises
     ------

@@ -13,6 +13,7 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.intersections import count_self_intersections
 from clrecon.mesh.normals import vertex_normals
+from clrecon.mesh.refine import smoothing
 from clrecon.mesh.refine.decimation import default_deviation
 from clrecon.mesh.refine.shifts import move_vertices, shorten_steps
 from clrecon.mesh.refine.smoothing import _PASS_BAND, smooth_mesh
@@ -214,3 +215,39 @@ def test_smoothing_tells_its_three_steps():
     told = []
     smooth_mesh(Mesh(*samples.sphere()), 5, 1.0, progress=lambda *said: told.append(said))
     assert told == [("smooth", step, 3) for step in range(4)]
+
+
+@pytest.mark.parametrize("iterations", [1, 20, 100, 1000])
+def test_a_speck_that_the_filter_draws_into_a_point_is_left_as_it_was(iterations):
+    """An octahedron whose volume has no gradient after the filter; the sphere beside it is smoothed."""
+    speck = np.concatenate([np.eye(3), -np.eye(3)]) * [0.11, 0.2, 0.3] + [50.0, 0.0, 0.0]
+    faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
+    alone = Mesh(speck, faces)
+    mesh = Mesh(*samples.join((speck, np.array(faces)), samples.sphere((0, 0, 0), RADIUS, 3)))
+    for each in (alone, mesh):
+        smooth = smooth_mesh(each, iterations, 0.25)
+        assert np.isfinite(smooth.vertices).all()
+        assert np.linalg.norm(smooth.vertices.astype(float) - each.vertices, axis=1).max() <= 0.25
+        assert smooth.quality()["volume_ml"] == pytest.approx(each.quality()["volume_ml"], rel=0.004)
+        said = smooth.report["refinement"]["smooth"]
+        assert said["vertices_not_finite"] == 0
+        if iterations > 1:
+            assert said["components_left"] == 1
+            np.testing.assert_array_equal(smooth.vertices[:6], each.vertices[:6])
+    assert not np.array_equal(smooth.vertices[6:], mesh.vertices[6:])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_steps_that_are_not_finite_are_not_made(value, monkeypatch):
+    rough = noisy_sphere(0.1)
+
+    def spoil(*arguments):
+        places = smooth_windowed_sinc(*arguments)
+        places[7, 1] = value
+        return places
+
+    monkeypatch.setattr(smoothing, "smooth_windowed_sinc", spoil)
+    smooth = smooth_mesh(rough, 20, 0.5)
+    assert np.isfinite(smooth.vertices).all() and np.std(radial_error(smooth)) < 0.5 * np.std(radial_error(rough))
+    assert smooth.report["refinement"]["smooth"]["vertices_not_finite"] == 1
+    assert np.linalg.norm(smooth.vertices[7] - rough.vertices[7]) < 0.05  # the shift for the volume alone
