@@ -66,7 +66,7 @@ class MeshQuality(Record):
         Lowest and highest corner; None without vertices.
     self_intersections : int or None
         Pairs of triangles that cut or touch each other beside common corners, or overlap in one plane, as CGAL counts
-        them.  ``mesh.quality()`` does not look for them: None.  ``clrecon mesh --strict`` does.
+        them.  ``mesh.quality()`` does not look for them: None.  A strict mesh job does.
     """
 
     vertices: int
