@@ -267,7 +267,7 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "positions": (("vstore3(place, vertex, positions)", "vstore3(-place, vertex, positions)"),),
         "normals": (("vstore3(-up /", "vstore3(up /"),),
     },
-    "own_samples": {"labels": (("(LABEL)owner;", "(LABEL)~owner;"),)},
+    "own_samples": {"labels": (("(LABEL)find_owner(", "(LABEL)~find_owner("),)},
     "classify_label": {"mask": BITS},
     "clear_survey": {
         "boxes": (("= INT_MAX;", "= -INT_MAX;"), ("= INT_MIN;", "= INT_MAX;")),

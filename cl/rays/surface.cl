@@ -249,6 +249,7 @@ static inline int pass_label(
  *             view     in   see rays/view.h; the box goes one index step beyond the outermost voxel centres
  *             normals  in   (planes) unit normals of the clip planes, LPS
  *             labels   in   (slices, nj, ni), label_colors (numbers) in: only with LABELS, see rays/label_color.h
+ *             near     in   (offsets) only with LABELS: see include/label_owner.h
  *             highlights in (HIGHLIGHTS) see rays/shade.h
  *             states   in/out  (height, width, 2) float4: premultiplied rgba; t of the first hit, sum of w t, label
  *                           that the ray passes through or OUT, -
@@ -273,7 +274,8 @@ __kernel void trace_surface(
     __global const VOXEL *restrict voxels, __global const uchar *restrict leaps, __global const float4 *restrict view,
     __global const float4 *restrict normals,
 #ifdef LABELS
-    __global const LABEL *restrict labels, __global const float4 *restrict label_colors,
+    __global const LABEL *restrict labels, __global const int4 *restrict near, const int offsets,
+    __global const float4 *restrict label_colors,
 #endif
     __global const float *restrict highlights, __global float4 *restrict states, __global uchar4 *restrict image,
     __global float *restrict depths, __global float *restrict means, const float4 background,
@@ -342,9 +344,9 @@ __kernel void trace_surface(
 #ifdef LABELS
                 hit *h = hits + lane;
                 if (all.ends[lane] >= 0.0f)
-                    h->label = find_surface_label(&s, labels, h->place);
+                    h->label = find_surface_label(&s, labels, near, offsets, h->place);
                 if (in_shadow)
-                    light = let_light_through(&s, labels, label_colors, to_light.lines + lane,
+                    light = let_light_through(&s, labels, near, offsets, label_colors, to_light.lines + lane,
                         (int)to_light.numbers[lane], (int)to_light.ends[lane]);
                 sights[lane].label = (float)h->label;
                 opacity = label_colors[h->label].w;

@@ -2,33 +2,36 @@
 #ifndef CLRECON_SURFACE_LABELS_H
 #define CLRECON_SURFACE_LABELS_H
 
+#include "include/label_owner.h"
 #include "rays/label_color.h"
 #include "rays/surface_lines.h"
 
 #define DARK 0.01f /* no light is left */
 
-/* Label of a place on the surface: that of the nearest voxel of its cell that is inside and has a label. */
+/* Label of a place on the surface: that which owns the nearest voxel of its cell that is inside, as in meshes. */
 static inline uint find_surface_label(
-    const scene *s, __global const LABEL *labels, const float4 field_place)
+    const scene *s, __global const LABEL *labels, __global const int4 *near, const int offsets,
+    const float4 field_place)
 {
     const closed_field *f = &s->field;
+    const field *inner = &f->inner;
     const float3 place = index_of(s, field_place);
     const float3 base = floor(place);
     float nearest = MAXFLOAT;
-    uint found = 0;
+    int i = 0, j = 0, k = 0;
     for (int corner = 0; corner < 8; ++corner) {
         const float3 at = base + (float3)((float)(corner & 1), (float)(corner >> 1 & 1), (float)(corner >> 2));
         const float3 away = at - place;
         const float distance = dot(away, away);
         if (distance >= nearest || read_closed(f, (int)at.x, (int)at.y, (int)at.z) < f->level)
             continue;
-        const uint label = find_label(labels, &f->inner, at);
-        if (label != 0) {
-            nearest = distance;
-            found = label;
-        }
+        nearest = distance;
+        i = (int)at.x;
+        j = (int)at.y;
+        k = clamp((int)at.z, inner->first_k, inner->end_k - 1) - inner->first_k;
     }
-    return found;
+    const int slices = inner->end_k - inner->first_k;
+    return nearest == MAXFLOAT ? 0 : find_owner(labels, near, offsets, i, j, k, inner->ni, inner->nj, slices);
 }
 
 /* The first sample of n to end - 1 that is outside, or inside of another label than `passed`; end where there is none.
@@ -65,11 +68,11 @@ static inline float4 find_label_differences(
 
 /* Share of the light that passes the part of a line that is inside, beginning at sample n, which is. */
 static inline float let_light_through(
-    const scene *s, __global const LABEL *labels, __global const float4 *label_colors,
-    const line *to_light, int n, const int end)
+    const scene *s, __global const LABEL *labels, __global const int4 *near, const int offsets,
+    __global const float4 *label_colors, const line *to_light, int n, const int end)
 {
     float light = 1.0f;
-    uint label = find_surface_label(s, labels, place_on(to_light, (float)n));
+    uint label = find_surface_label(s, labels, near, offsets, place_on(to_light, (float)n));
     int inside = 1;
     while (n < end && light > DARK) {
         if (inside) {
@@ -80,7 +83,7 @@ static inline float let_light_through(
         } else {
             n = follow_line(s, to_light, n, end, &inside);
             if (inside)
-                label = find_surface_label(s, labels, place_on(to_light, (float)n));
+                label = find_surface_label(s, labels, near, offsets, place_on(to_light, (float)n));
         }
     }
     return light;

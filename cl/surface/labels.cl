@@ -6,7 +6,7 @@
  *   1. own_samples      for each sample the label that it is inside of, or 0
  *      (for solid labels, the host fills their cavities before the next pass)
  *   2. classify_label   for each label one bit per sample, packed as in cl/masks/classify.cl */
-#include "include/label_type.h"
+#include "include/label_owner.h"
 #include "include/volume.h"
 
 /* Parameters  voxels        in   (nk, nj, ni)
@@ -31,25 +31,8 @@ __kernel void own_samples(
         inside[at] = 0;
         return;
     }
-    uint owner = labels[at];
-    if (owner == 0) {
-        const int k = (int)(at / plane), j = (int)(at % plane / row_length), i = (int)(at % row_length);
-        int found_in = -1;
-        for (int n = 0; n < offsets; ++n) {
-            const int4 step = near[n];
-            if (owner != 0 && step.w != found_in)
-                break;
-            const int i1 = i + step.x, j1 = j + step.y, k1 = k + step.z;
-            if (i1 < 0 || i1 >= ni || j1 < 0 || j1 >= nj || k1 < 0 || k1 >= nk)
-                continue;
-            const uint label = labels[voxel_index(i1, j1, k1, ni, nj)];
-            if (label != 0 && (owner == 0 || label < owner)) {
-                owner = label;
-                found_in = step.w;
-            }
-        }
-    }
-    inside[at] = (LABEL)owner;
+    const int k = (int)(at / plane), j = (int)(at % plane / row_length), i = (int)(at % row_length);
+    inside[at] = (LABEL)find_owner(labels, near, offsets, i, j, k, ni, nj, nk);
 }
 
 /* Parameters  inside      in   slices of (nk, nj, ni) from first_slice on: the label that each sample is inside of

@@ -56,6 +56,11 @@ class Growth:
         return cls(limit, *_sort(offsets[near], steps))
 
     @property
+    def table(self) -> NDArray[np.int32]:
+        """Offsets and shells for a device, shape (n, 4)."""
+        return np.concatenate([self.offsets, self.shells[:, None]], axis=1)
+
+    @property
     def reach(self) -> tuple[int, int, int]:
         """Largest offset along i, j, k in samples."""
         i, j, k = np.abs(self.offsets).max(axis=0, initial=0)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from clrecon.errors import DeviceError, DeviceFailedError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
+from clrecon.labels.growth import Growth
 from clrecon.opencl import Stopwatch, launch, memory_limits, upload
 from clrecon.operators.rays.buffers import PictureBuffers, count_queues, highlight_table
 from clrecon.operators.rays.leaps import find_leaps
@@ -53,7 +54,8 @@ def cast_surface(
         With `shadows`, a hit has only ambient light if the way from it to the fixed light meets something inside, one
         ray step away or farther; translucent labels let their share through.  A hit in a label with opacity below 1 is
         blended, and the ray continues: out of the inside to the next entry, or into the next label.
-        The label of a hit is that of the nearest inside voxel of its cell that has one.
+        The label of a hit is that of the nearest inside voxel of its cell; as in meshes of labels, a voxel without one
+        has that of the nearest of the voxels around it.
     camera : Camera
     size : (width, height)
     ray_step : float
@@ -185,10 +187,13 @@ class _Job:
         variants: dict[str, str] = {}
         tables = {"normals": upload(device, normals)}
         if self.labels is not None and self.style is not None:
+            near = Growth.of(self.resident.volume, None).table
             variants = {"LABELS": "1", **label_variants(self.labels.voxels.dtype)}
             tables |= {
                 "labels": slab_labels(self.resident, slab, self.labels, self.stopwatch),
                 "label_colors": upload(device, self.style.table),
+                "near": upload(device, near),
+                "offsets": len(near),
             }
         return variants, tables
 

@@ -127,7 +127,7 @@ class LabelExtraction:
         is_whole = end - first == self.volume.shape_ijk[2] and resident.is_held
         voxels_d = resident.whole(stopwatch) if is_whole else resident.part(first, end, stopwatch)
         labels = self.labels[first:end]
-        near = np.concatenate([self.growth.offsets, self.growth.shells[:, None]], axis=1)
+        near = self.growth.table
         with stopwatch.timed("upload"):
             labels_d = upload(device, labels)
             near_d = upload(device, near if len(near) else np.zeros((1, 4), np.int32))

@@ -13,6 +13,7 @@ from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.operators.rays.surface import cast_surface
 from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.reference.surface.labels import find_solid
 from clrecon.rendering import Lighting, Rendering
 from clrecon.rendering.pictures.styles import SurfaceLook
 from clrecon.rendering.views.camera import Camera
@@ -177,3 +178,29 @@ def test_what_has_no_label_can_be_hidden(device):
     red = (whole.image[..., 0] > 200) & (whole.image[..., 2] < 50)
     assert red.mean() > 0.05 and np.array_equal(left.image[red], whole.image[red])
     assert np.median(faint.image[alone, 3]) in range(120, 200)  # its front and its back
+
+
+@pytest.mark.parametrize("grid", ["even", "oblique"])
+def test_the_label_of_a_hit_is_that_of_meshes(device, grid):
+    """A mask that is a voxel too small in places, as those of other programs are: no stripe is left without a label."""
+    volume, labels = two_balls(grid)
+    rng = np.random.default_rng(5)
+    numbers = np.where(rng.random(labels.voxels.shape) < 0.4, 0, labels.voxels).astype(np.uint8)
+    inside = find_solid(volume, numbers, 300.0)
+    camera = look(volume, (0.3, 1.0, 0.2), 12.0)
+    style = labelled(LabelMap(numbers, volume.affine, NAMES), {"L1": "red", "L2": "blue"})
+    found = cast(device, volume, camera, style)
+    hit = np.isfinite(found.depth)
+    origins, directions = camera.rays(SIZE)
+    places = volume.lps_to_ijk(origins[hit] + found.depth[hit][:, None] * directions[hit])
+    corners = np.floor(places)[:, None, :] + np.array(list(np.ndindex(2, 2, 2)))
+    index = corners.astype(int)
+    away = np.linalg.norm(corners - places[:, None, :], axis=2)
+    away[volume.voxels[index[..., 2], index[..., 1], index[..., 0]] < 300] = np.inf
+    order = np.sort(away, axis=1)
+    clear = order[:, 1] - order[:, 0] > 1e-2
+    i, j, k = index[np.arange(len(index)), away.argmin(axis=1)].T
+    expected = np.array([(255, 255, 255), tuple(RED), tuple(BLUE)])[inside[k, j, i]]
+    assert clear.sum() > 200
+    np.testing.assert_allclose(found.image[hit][clear, :3], expected[clear], atol=1)
+    assert (inside[k, j, i] > 0).mean() > 0.98  # 2 % of the voxels have no labelled one around them
