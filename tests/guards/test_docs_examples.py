@@ -26,7 +26,7 @@ SMALLER = {
     '"twelve"': '"ct"',
     '"spine.nii.gz"': '"ct/levels.nrrd"',
     "size=(512, 512)": "size=(64, 64)",
-    "    TransferFunction.from_vtk(actor.prop, voxel_mm=0.8)    # any vtkVolumeProperty\n": "",
+    "TransferFunction.from_vtk(actor.prop, voxel_mm=0.8)    # any vtkVolumeProperty\n": "",
 }
 """What the machine of a test has not, or what takes long, and what stands for it."""
 

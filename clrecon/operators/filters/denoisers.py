@@ -216,9 +216,10 @@ def _run_non_local_means(
     noise = measure_noise(volume).hu if asked["sigma_hu"] is None else _number("sigma_hu", asked["sigma_hu"], 1e6)
     found = np.empty(volume.voxels.shape, np.float32)
     for k, layer in enumerate(volume.voxels):
-        found[k] = restoration.denoise_nl_means(
+        made = restoration.denoise_nl_means(
             layer.astype(np.float32), patch, reach, 0.8 * noise, fast_mode=True, sigma=noise, preserve_range=True
         )
+        found[k] = np.reshape(made, layer.shape)  # it drops the axis of a single column
         tell("filter", k + 1, len(found))
     return found, {"sigma_hu": noise, "patch": patch, "reach": reach, "dimensions": 2}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -79,8 +79,11 @@ def mask_bytes(shape_ijk: tuple[int, int, int], pad: int = 0) -> dict[str, int]:
     return {"mask of the voxels": 4 * (-(-ni // 32) + pad) * nj * nk, "row extents": 4 * nj * nk}
 
 
-def checked_band(hu: ArrayLike) -> tuple[float, float]:
-    """Return the two ends of a band of HU, both included; infinity leaves an end open.
+OPEN_BAND = (-math.inf, math.inf)
+
+
+def checked_band(hu: ArrayLike | Sequence[float | None]) -> tuple[float, float]:
+    """Return the two ends of a band of HU, both included; None or infinity leaves an end open.
 
     Raises
     ------
@@ -88,7 +91,8 @@ def checked_band(hu: ArrayLike) -> tuple[float, float]:
         These are not two numbers, the lower one first.
     """
     try:
-        low, high = np.asarray(hu, dtype=np.float64).tolist()
+        ends = np.asarray(hu, dtype=object).tolist()
+        low, high = (open_end if end is None else float(end) for end, open_end in zip(ends, OPEN_BAND, strict=True))
     except (TypeError, ValueError, OverflowError):
         low = high = math.nan
     if not low <= high:

@@ -61,7 +61,7 @@ class Mask(MaskComponents):
         Parameters
         ----------
         volume : Volume or DeviceVolume
-        hu : (float, float)
+        hu : (float or None, float or None)
             Both ends included; infinity leaves one open.  NaN lies in no band.
         device : Device, str or int, optional
             See `clrecon.device`; a `DeviceVolume` has its own.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +36,12 @@ PLANE_PLUS_ONE = "plane+1"
 WIDE_GAP = 1.5
 """Slice gap in pixels above which ``plane+1`` takes much bone too."""
 
+LAYER_MM = 0.02
+"""Points whose heights differ by less lie in one layer: files round."""
+
+FEWEST_LAYERS = 4
+"""Layers, and points a layer on average, from which on points without an affine are taken to lie in slices."""
+
 PLACES_CHECKED = 1 << 14
 """Points, evenly spread over the cloud, whose places are compared with their voxels: all would take as long as the
 search itself."""
@@ -64,7 +71,7 @@ def cluster_points(
     eps: float | None = None,
     min_samples: int | str = DEFAULT_MIN_SAMPLES,
     *,
-    hu: ArrayLike | None = None,
+    hu: ArrayLike | Sequence[float | None] | None = None,
     volume: Volume | DeviceVolume | None = None,
     device: Device | str | int | None = None,
     memory: int | None = None,
@@ -87,8 +94,8 @@ def cluster_points(
     min_samples : int or "plane+1"
         1 to 255, of free points any number from 1; 1 gives connected components.  "plane+1" is one more than the
         members of the stencil in a slice: a slice without bone above and below becomes noise.
-    hu : (float, float), optional
-        Band in HU, both ends included, for a volume.
+    hu : (float or None, float or None), optional
+        Band in HU, both ends included, for a volume; None leaves an end open.
     volume : Volume or DeviceVolume, optional
         The volume that a cloud comes from, for its lattice.  It is needed where slices are uneven; else the affine of
         the cloud's report will do.
@@ -260,7 +267,32 @@ def _cluster_free(
     labelled = cloud.changed(labels=found.labels)
     figures = measure_clusters(labelled)
     facts = {**found.facts, "sheets": int(figures.sheets.sum()), "largest_clusters": figures.as_dicts(REPORTED)}
-    return Clustering(labelled, np.zeros(len(cloud), np.uint8), (), facts, found.warnings, found.cores, figures)
+    warnings = (*found.warnings, *_warn_of_layers(cloud, eps))
+    return Clustering(labelled, np.zeros(len(cloud), np.uint8), (), facts, warnings, found.cores, figures)
+
+
+def _warn_of_layers(cloud: PointCloud, eps: float) -> list[str]:
+    """Return a warning where eps is below the distance of the slices that free points come from."""
+    affine = cloud.report.get("affine_ijk_to_lps_mm")
+    if affine is not None:
+        step = float(np.linalg.norm(np.asarray(affine, dtype=np.float64)[:3, :3], axis=0).max())
+    else:
+        step = max(_layer_step(along) for along in cloud.points.T)
+    if eps * (1.0 + 1e-6) >= step:
+        return []
+    return [
+        f"eps {eps:g} mm is below the {step:.4g} mm between the slices that the points come from: clusters end where a"
+        " surface runs across the slices, and a long bone falls into pieces"
+    ]
+
+
+def _layer_step(along: NDArray[Any]) -> float:
+    """Return the largest step between layers of points that are flat along an axis; 0 where they are not in layers."""
+    heights = np.sort(along.astype(np.float64))
+    gaps = np.diff(heights)
+    between = gaps[gaps > LAYER_MM]
+    in_layers = len(between) >= FEWEST_LAYERS and np.ptp(heights) - between.sum() <= LAYER_MM * len(between)
+    return float(np.median(between)) if in_layers and len(between) * FEWEST_LAYERS <= len(heights) else 0.0
 
 
 def _cluster_cloud(

@@ -107,7 +107,7 @@ def extract_points(
             level = iso_value if hu is None else hu
             cloud = _surface(resident, level, labels, label, progress)
         else:
-            band = _closed_band((iso_value, None) if hu is None else hu)
+            band = checked_band((iso_value, None) if hu is None else hu)
             cloud = _voxels(resident, band, kind == "shell", labels, label, paper, progress)
     cloud.report.update(kind=kind, voxels=resident.volume.voxels.size, points=len(cloud))
     return cloud
@@ -124,13 +124,6 @@ def _check(iso_value: object, kind: str | None, hu: object, labels: object, labe
     if paper and kind == "surface":
         raise UsageError(f"{name_parameter('paper', True)} places voxels: ask for voxels or shell")
     return kind
-
-
-def _closed_band(hu: Sequence[float | None]) -> Band:
-    """Return a band whose ends may be None for open ones; see `checked_band`."""
-    if len(hu) != 2:
-        return checked_band(np.array(hu, dtype=object))
-    return checked_band([-math.inf if hu[0] is None else hu[0], math.inf if hu[1] is None else hu[1]])
 
 
 def _describe(band: Band) -> str:

@@ -74,7 +74,7 @@ def find_ghost_slices(
     Parameters
     ----------
     volume : Volume or DeviceVolume
-    hu : (float, float)
+    hu : (float or None, float or None)
         Band in HU, both ends included.
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.  A `DeviceVolume` has its own.

@@ -1,6 +1,6 @@
 (() => {
   const SLICES = ["axial", "coronal", "sagittal"];
-  const PRESETS = { bone: [300, 1500], soft: [40, 400], lung: [-600, 1500], brain: [40, 80] };
+  const PRESETS = { bone: [300, 1500], soft: [50, 400], lung: [-600, 1500], brain: [40, 80] };
   // As far as there are both, the keys of the window (clrecon/viewer/window/window_keys.py).
   const KEYS = {
     "1 to 6": "view from anterior, posterior, left, right, superior, inferior", f: "parallel or perspective",

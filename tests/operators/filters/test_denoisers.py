@@ -115,3 +115,14 @@ def test_curvature_flow_takes_the_longest_stable_step(spacing, share):
     volume = Volume(noisy()[0].voxels, np.diag((*spacing, 1.0)))
     (step,) = clrecon.filter_volume(volume, "curvature-flow", iterations=1).report["filtered"]["steps"]
     assert step["time_step"] == pytest.approx(share * ITK_TIME_STEP, rel=1e-12)
+
+
+def test_a_volume_of_one_column_is_filtered_as_one_of_one_row():
+    pytest.importorskip("skimage")
+    plane = np.random.default_rng(0).normal(0.0, 20.0, (5, 30)).astype(np.int16)
+    column, row = (
+        clrecon.filter_volume(Volume(np.expand_dims(plane, axis), np.eye(4)), "non-local-means", sigma_hu=20.0).voxels
+        for axis in (2, 1)
+    )
+    np.testing.assert_array_equal(column[:, :, 0], row[:, 0, :])
+    assert column.std() < 0.5 * plane.std()

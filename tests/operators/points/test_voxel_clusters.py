@@ -408,3 +408,33 @@ def test_a_real_tilted_stack_with_gaps_equals_scikit_learn(device, real_data):
         expected = sklearn.DBSCAN(eps=eps * (1 + 1e-6), min_samples=6).fit_predict(volume.ijk_to_lps(step.cloud.ijk))
         np.testing.assert_array_equal(step.cloud.labels, expected)
         assert step.facts["clusters"] > 3
+
+
+def test_a_band_without_an_end_is_one_everywhere(device):
+    volume = Volume(noise((5, 6, 40), 0.3), FINE)
+    for hu, closed in (((1, None), (1, math.inf)), ((None, 0), (-math.inf, 0)), ((None, None), (-math.inf, math.inf))):
+        assert checked_band(hu) == closed
+        step = cluster_points(volume, 0.6, 2, hu=hu, device=device)
+        assert len(step.cloud) == len(clrecon.extract_points(volume, hu=hu, device=device)) > 0
+    for wrong in ((1,), (None, None, None), (2, 1), (None, "x"), (math.nan, None)):
+        with pytest.raises(UsageError, match="a band is two numbers in HU"):
+            cluster_points(volume, 0.6, 2, hu=wrong, device=device)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_an_eps_below_the_slice_step_is_warned_of_for_free_points(device, known):
+    """A long bone along the slices' axis: its surface has no points between the slices."""
+    _, j, i = np.indices((20, 24, 24))
+    bone = np.where(np.hypot(j - 12, i - 12) < 7.0, 600, -800).astype(np.int16)
+    volume = Volume(bone, np.diag((0.7, 0.7, 3.0, 1.0)))
+    cloud = clrecon.extract_points(volume, 200, kind="surface", device=device)
+    cloud = PointCloud(cloud.points, report=cloud.report if known else {})
+    broken = cluster_points(cloud, 2.0, 3, device=device)
+    assert broken.facts["clusters"] == 20
+    assert "eps 2 mm is below the 3 mm between the slices that the points come from" in broken.warnings[-1]
+    assert cluster_points(cloud, 3.0, 3, device=device).warnings == ()
+
+
+def test_points_that_lie_in_no_slices_are_not_warned_of(device):
+    points = np.random.default_rng(2).normal(0.0, 20.0, (500, 3))
+    assert cluster_points(PointCloud(points), 2.0, 3, device=device).warnings == ()

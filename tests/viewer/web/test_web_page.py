@@ -7,6 +7,7 @@ from importlib.resources import files
 
 import pytest
 
+from clrecon.rendering.looks.window import WINDOWS
 from clrecon.viewer.session.commands import COMMANDS
 from clrecon.viewer.web.page import compose_page
 from clrecon.viewer.window.window_keys import KEYS
@@ -34,3 +35,13 @@ def test_it_holds_no_place_that_was_not_filled_and_no_address() -> None:
     page = compose_page("127.0.0.1:1").content.decode()
     assert not re.search(r"@[A-Z]+@", page)
     assert set(re.findall(r"https?://[\w.]+", page)) == {"http://www.w3.org"}  # the name of SVG
+
+
+def test_its_windows_are_those_of_pictures() -> None:
+    script = (files("clrecon.viewer.web") / "page.js").read_text(encoding="utf-8")
+    presets = re.search(r"const PRESETS = \{(.*?)\};", script)
+    assert presets is not None
+    found = re.findall(r"(\w+): \[(-?\d+), (\d+)\]", presets[1])
+    assert len(found) == 4
+    for name, level, width in found:
+        assert WINDOWS[name] == (int(level) - 0.5 * int(width), int(level) + 0.5 * int(width))
