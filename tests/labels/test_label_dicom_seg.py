@@ -6,7 +6,7 @@ import dicom_series
 import numpy as np
 import pydicom
 import pytest
-from label_files import write_seg
+from label_files import ct_slices, write_seg
 from pydicom.uid import DeflatedExplicitVRLittleEndian, RLELossless
 
 from clrecon.dicom import read_volume
@@ -19,19 +19,6 @@ from clrecon.labels.reader import is_large_map, read_all_labels
 pytest.importorskip("highdicom")
 
 PLAN = dicom_series.Plan(shape=(7, 6, 9), angles=(10, -20, 35), gap=1.25)
-
-
-def ct_slices(plan=PLAN):
-    """The slices as highdicom wants them."""
-    slices = []
-    for k in range(plan.shape[0]):
-        ds = dicom_series.make_dataset(plan, k)
-        ds.StudyInstanceUID = dicom_series.ROOT + ".7"
-        for keyword in ("PatientBirthDate", "PatientSex", "StudyDate", "StudyTime", "StudyID", "AccessionNumber",
-                        "ReferringPhysicianName", "SeriesDate", "SeriesTime"):  # fmt: skip
-            setattr(ds, keyword, "")
-        slices.append(ds)
-    return slices
 
 
 def masks(overlap=False, shape=PLAN.shape):
@@ -53,7 +40,7 @@ def ct_volume(tmp_path, plan=PLAN):
 def test_segments_lie_on_their_ct(tmp_path, kind, syntax, leave_out_empty):
     segments = masks()
     path = write_seg(
-        tmp_path / "a.dcm", segments, ct_slices(), kind=kind, leave_out_empty=leave_out_empty, syntax=syntax
+        tmp_path / "a.dcm", segments, ct_slices(PLAN), kind=kind, leave_out_empty=leave_out_empty, syntax=syntax
     )
     labels = read_labels(path)
     assert labels.names == {1: "T12", 2: "L1 body"}
@@ -66,7 +53,7 @@ def test_segments_lie_on_their_ct(tmp_path, kind, syntax, leave_out_empty):
 @pytest.mark.parametrize("kind", ["BINARY", "LABELMAP"])
 def test_progress_counts_frames_from_the_first_to_the_last(tmp_path, kind):
     told: list = []
-    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices(), kind=kind)
+    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices(PLAN), kind=kind)
     read_labels(path, progress=lambda *step: told.append(step))
     frames = pydicom.dcmread(path).NumberOfFrames
     assert told == [("read", frame, frames) for frame in range(1, frames + 1)]
@@ -74,7 +61,7 @@ def test_progress_counts_frames_from_the_first_to_the_last(tmp_path, kind):
 
 @pytest.mark.parametrize(("kind", "syntax"), [("BINARY", None), ("LABELMAP", RLELossless)], ids=["bits", "rle"])
 def test_a_large_segmentation_is_held_against_its_scan_before_it_is_unpacked(tmp_path, monkeypatch, kind, syntax):
-    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices(), kind=kind, syntax=syntax)  # 5 slices of 9 x 6
+    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices(PLAN), kind=kind, syntax=syntax)  # 5 slices of 9 x 6
     small, fits = (Volume(np.zeros(shape, np.int16), np.eye(4)) for shape in ((1, 5, 6), (1, 5, 7)))
     assert not is_large_map(path) and read_labels(path, volume=small).numbers == (1, 2)
     frames = pydicom.dcmread(path).NumberOfFrames
@@ -97,7 +84,7 @@ def test_holes_between_frames_are_slices_without_labels(tmp_path):
     """No two frames are neighbours: their distance is not that of the slices."""
     mask = np.zeros(PLAN.shape, bool)
     mask[1::2, 2:4, 2:5] = True
-    path = write_seg(tmp_path / "a.dcm", [("odd", mask)], ct_slices())
+    path = write_seg(tmp_path / "a.dcm", [("odd", mask)], ct_slices(PLAN))
     taken = resample_labels(read_labels(path), ct_volume(tmp_path))
     assert pydicom.dcmread(path).NumberOfFrames == 3
     assert np.array_equal(taken.voxels == 1, mask)
@@ -111,7 +98,7 @@ def test_the_frames_of_a_tilted_gantry_form_a_sheared_stack(tmp_path):
 
 
 def test_overlapping_segments_are_refused_unless_one_is_chosen(tmp_path):
-    path = write_seg(tmp_path / "a.dcm", masks(overlap=True), ct_slices())
+    path = write_seg(tmp_path / "a.dcm", masks(overlap=True), ct_slices(PLAN))
     with pytest.raises(RefusedInputError, match=r"1 T12 and 2 L1 body share 8 voxels; choose labels .*only"):
         read_labels(path)
     first, second = (int(mask.sum()) for _, mask in masks(overlap=True))
@@ -123,7 +110,7 @@ def test_overlapping_segments_are_refused_unless_one_is_chosen(tmp_path):
 
 
 def test_labels_of_another_frame_of_reference_are_refused(tmp_path):
-    labels = read_labels(write_seg(tmp_path / "a.dcm", masks(), ct_slices()))
+    labels = read_labels(write_seg(tmp_path / "a.dcm", masks(), ct_slices(PLAN)))
     volume = ct_volume(tmp_path)
     assert labels.frame_of_reference_hash == volume.report["frame_of_reference_hash"]
     volume.report = amend(volume.report, frame_of_reference_hash="0" * 16)
@@ -157,7 +144,7 @@ def spoil(path, **values):
     ],
 )
 def test_what_is_no_sound_segmentation_is_refused(tmp_path, values, message):
-    path = spoil(write_seg(tmp_path / "a.dcm", masks(), ct_slices()), **values)
+    path = spoil(write_seg(tmp_path / "a.dcm", masks(), ct_slices(PLAN)), **values)
     with pytest.raises(RefusedInputError, match=message):
         read_labels(path)
 
@@ -181,13 +168,13 @@ def move(path, change):
     ],
 )
 def test_frames_without_a_sound_place_are_refused(tmp_path, change, message):
-    path = move(write_seg(tmp_path / "a.dcm", masks(), ct_slices()), change)
+    path = move(write_seg(tmp_path / "a.dcm", masks(), ct_slices(PLAN)), change)
     with pytest.raises(RefusedInputError, match=message):
         read_labels(path)
 
 
 def test_deflated_files_are_refused_before_they_are_inflated(tmp_path):
-    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices())
+    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices(PLAN))
     ds = pydicom.dcmread(path)
     ds.file_meta.TransferSyntaxUID = DeflatedExplicitVRLittleEndian
     ds.save_as(path)
@@ -197,7 +184,7 @@ def test_deflated_files_are_refused_before_they_are_inflated(tmp_path):
 
 @pytest.mark.fuzz
 def test_cut_anywhere_it_is_refused(tmp_path):
-    content = write_seg(tmp_path / "a.dcm", masks(), ct_slices()).read_bytes()
+    content = write_seg(tmp_path / "a.dcm", masks(), ct_slices(PLAN)).read_bytes()
     for length in range(0, len(content) - 2, 53):
         (tmp_path / "b.dcm").write_bytes(content[:length])
         with pytest.raises(RefusedInputError, match="."):
@@ -206,7 +193,7 @@ def test_cut_anywhere_it_is_refused(tmp_path):
 
 @pytest.mark.fuzz
 def test_damaged_anywhere_it_is_read_or_refused(tmp_path):
-    content = write_seg(tmp_path / "a.dcm", masks(), ct_slices(), kind="LABELMAP", syntax=RLELossless).read_bytes()
+    content = write_seg(tmp_path / "a.dcm", masks(), ct_slices(PLAN), kind="LABELMAP", syntax=RLELossless).read_bytes()
     random = np.random.default_rng(3)
     refused = 0
     for _ in range(150):
@@ -223,7 +210,7 @@ def test_damaged_anywhere_it_is_read_or_refused(tmp_path):
 @pytest.mark.parametrize(("keyword", "value"), [("Rows", b"\7\0"), ("FrameOfReferenceUID", b"1.2\0")])
 def test_an_element_twice_with_two_values_is_refused(tmp_path, keyword, value):
     """pydicom takes the second in silence."""
-    write_seg(tmp_path / "a.dcm", masks(), ct_slices())
+    write_seg(tmp_path / "a.dcm", masks(), ct_slices(PLAN))
     assert read_labels(tmp_path / "a.dcm").numbers
     data = (tmp_path / "a.dcm").read_bytes()
     head = dicom_series.element_bytes(keyword, b"")[:6]
@@ -258,7 +245,7 @@ def edit_frames(path, change):
 
 def test_frames_of_a_label_map_at_one_place_are_joined(tmp_path):
     segments = masks()
-    path = write_seg(tmp_path / "a.dcm", segments, ct_slices(), kind="LABELMAP")
+    path = write_seg(tmp_path / "a.dcm", segments, ct_slices(PLAN), kind="LABELMAP")
     edit_frames(path, lambda frames: [(px * (px == n), group) for n in (1, 2) for px, group in frames])
     taken = resample_labels(read_labels(path), ct_volume(tmp_path))
     for number, (_, mask) in enumerate(segments, start=1):
@@ -266,7 +253,7 @@ def test_frames_of_a_label_map_at_one_place_are_joined(tmp_path):
 
 
 def test_frames_of_a_label_map_that_contradict_each_other_are_refused(tmp_path):
-    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices(), kind="LABELMAP")
+    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices(PLAN), kind="LABELMAP")
     edit_frames(
         path,
         lambda frames: [*frames, *((2 * (px == 1).astype(np.uint8), group) for px, group in frames if (px == 1).any())],
@@ -277,7 +264,7 @@ def test_frames_of_a_label_map_that_contradict_each_other_are_refused(tmp_path):
 
 
 def test_a_background_of_its_own_is_no_label(tmp_path):
-    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices(), kind="LABELMAP")
+    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices(PLAN), kind="LABELMAP")
     before = read_labels(path)
     edit_frames(path, lambda frames: [(np.where(px == 0, 9, px).astype(np.uint8), group) for px, group in frames])
     spoil(path, PixelPaddingValue=9)
@@ -289,7 +276,7 @@ def test_a_background_of_its_own_is_no_label(tmp_path):
 
 def test_a_binary_segment_twice_at_one_place(tmp_path):
     """Equal frames are one; with other pixels they are two states of one segment, as in several points in time."""
-    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices())
+    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices(PLAN))
     before = read_labels(path)
     ds = pydicom.dcmread(path)
     groups, bits = list(ds.PerFrameFunctionalGroupsSequence), ds.pixel_array.astype(np.uint8)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import dicom_series
 import numpy as np
 from numpy.typing import DTypeLike
 
@@ -81,6 +82,19 @@ def write_nrrd(
         warnings.simplefilter("ignore")
         nrrd.write(str(path), voxels.transpose(range(voxels.ndim)[::-1]), fields)
     return path
+
+
+def ct_slices(plan: dicom_series.Plan) -> list[Any]:
+    """The slices of a plan as highdicom wants them."""
+    slices = []
+    for k in range(plan.shape[0]):
+        ds = dicom_series.make_dataset(plan, k)
+        ds.StudyInstanceUID = dicom_series.ROOT + ".7"
+        for keyword in ("PatientBirthDate", "PatientSex", "StudyDate", "StudyTime", "StudyID", "AccessionNumber",
+                        "ReferringPhysicianName", "SeriesDate", "SeriesTime"):  # fmt: skip
+            setattr(ds, keyword, "")
+        slices.append(ds)
+    return slices
 
 
 def write_seg(

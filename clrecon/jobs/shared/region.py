@@ -76,7 +76,7 @@ def apply_region(
     rules = parse_region_rules(settings.region or ())
     progress("region", 0, 0)
     volume = resident.volume
-    mask, facts = _find_region(resident, rules, settings.space_of_points)
+    mask, facts, warnings = _find_region(resident, rules, settings.space_of_points)
     kept, cells = mask.count, _count_cells(mask.to_numpy())
     every, all_cells = math.prod(volume.shape_ijk), math.prod(n - 1 for n in volume.shape_ijk)
     outside = value_outside(bands, volume.voxels.dtype)
@@ -96,7 +96,7 @@ def apply_region(
         f" {kept:,} of {every:,} voxels stay ({100.0 * kept / every:.3g} %), {cells:,} of {all_cells:,} cells"
     )
     report = carry_report(volume, restricted.volume)
-    restricted.volume.report = amend(report, region=facts, warnings=[*report.get("warnings", ()), said])
+    restricted.volume.report = amend(report, region=facts, warnings=[*report.get("warnings", ()), *warnings, said])
     return restricted
 
 
@@ -127,14 +127,20 @@ def value_outside(bands: Sequence[Band], dtype: np.dtype[Any]) -> float:
     return value
 
 
-def _find_region(resident: DeviceVolume, rules: Sequence[RegionRule], space: str) -> tuple[Mask, dict[str, Any]]:
-    """Return the voxels of the region: rules of one kind add up, those of different kinds cut each other."""
+def _find_region(
+    resident: DeviceVolume, rules: Sequence[RegionRule], space: str
+) -> tuple[Mask, dict[str, Any], list[str]]:
+    """Return the voxels of the region, facts, and warnings of label files.
+
+    Rules of one kind are united, those of different kinds intersected.
+    """
     facts: dict[str, Any] = {}
+    warnings: list[str] = []
     by_kind: dict[str, Mask] = {}
     for rule in rules:
         if rule.kind == "seed":
             continue
-        own = _mask_of(resident, rule, space, facts)
+        own = _mask_of(resident, rule, space, facts, warnings)
         if not own.count:
             raise UsageError(f"the region {rule} holds no voxel: {describe_extent(resident.volume, space)}")
         by_kind[rule.kind] = by_kind[rule.kind] | own if rule.kind in by_kind else own
@@ -143,7 +149,7 @@ def _find_region(resident: DeviceVolume, rules: Sequence[RegionRule], space: str
         kinds = " and ".join(str(rule) for rule in rules if rule.kind != "seed")
         raise UsageError(f"the region is empty: no voxel lies in {kinds}; {describe_extent(resident.volume, space)}")
     seeds = [rule.numbers for rule in rules if rule.kind == "seed"]
-    return (mask.grow(_to_lps(seeds, space)) if seeds else mask), facts
+    return (mask.grow(_to_lps(seeds, space)) if seeds else mask), facts, warnings
 
 
 def _count_cells(marked: NDArray[np.bool_]) -> int:
@@ -153,7 +159,7 @@ def _count_cells(marked: NDArray[np.bool_]) -> int:
     return sum(int(np.count_nonzero(low & high)) for low, high in zip(rows, rows[1:], strict=False))
 
 
-def _mask_of(resident: DeviceVolume, rule: RegionRule, space: str, facts: dict[str, Any]) -> Mask:
+def _mask_of(resident: DeviceVolume, rule: RegionRule, space: str, facts: dict[str, Any], warnings: list[str]) -> Mask:
     from clrecon.operators.masks.mask import Mask
 
     if rule.kind == "box":
@@ -168,7 +174,9 @@ def _mask_of(resident: DeviceVolume, rule: RegionRule, space: str, facts: dict[s
 
     assert rule.path is not None
     names = None if rule.name is None else [rule.name]
-    return Mask.from_labels(resident, read_labels(rule.path, names, volume=resident.volume), names)
+    labels = read_labels(rule.path, names, volume=resident.volume)
+    warnings += labels.warnings
+    return Mask.from_labels(resident, labels, names)
 
 
 def _line_of(volume: Volume, rule: RegionRule, facts: dict[str, Any]) -> Any:

@@ -257,3 +257,23 @@ def test_the_value_outside_is_outside() -> None:
     assert value_outside([(-inf, -400.0)], np.dtype(np.int16)) == 224.0
     assert value_outside([(-2000.0, 100.0)], np.dtype(np.int16)) == 1224.0
     assert value_outside([(200.0, inf)], np.dtype(np.uint8)) == 0.0
+
+
+def test_warnings_of_a_label_file_are_those_of_its_region(tmp_path):
+    scan = write_nrrd(tmp_path / "ct.nrrd", make_voxels(), AFFINE)
+    fields = {"Segment0_LabelValue": "1", "Segment0_Name": "bone", "Segment1_Name": "no value"}
+    labels = write_nrrd(tmp_path / "map.nrrd", (make_voxels() > 200).astype(np.uint8), AFFINE, **fields)
+    words = [
+        "mesh",
+        str(scan),
+        "-o",
+        str(tmp_path / "a.stl"),
+        "--hu",
+        "200",
+        "-q",
+        "--report",
+        str(tmp_path / "r.json"),
+    ]
+    assert main([*words, "--region", f"label:{labels}:bone"]) == 0
+    said = "1 of 2 segments have no LabelValue: their names are not known"
+    assert said in json.loads((tmp_path / "r.json").read_text())["warnings"]
