@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.anatomy.body_cells import PIECE, Cells, Mask, count_cells, grow, measure_cells
+from clrecon.anatomy.body_cells import DENSE_HU, PIECE, Cells, Mask, count_cells, grow, measure_cells
 from clrecon.anatomy.dense_pieces import (
     BONE_KEPT,
     DensePieces,
@@ -267,7 +267,8 @@ def _find_body(cells: Cells, steps: Steps) -> tuple[Mask, DensePieces]:
     pieces = find_dense_pieces(cells, dense_enough, thick, body)
     if not (body.any() or pieces.added.any()):
         raise RefusedInputError(
-            f"no body found: nothing above {TISSUE_HU:g} HU is {2 * OPENING_MM:g} mm thick, and there is no bone;"
+            f"no body found: nothing above {TISSUE_HU:g} HU is {2 * OPENING_MM:g} mm thick, and there is no bone"
+            f" ({_describe_dense(cells)});"
             " leave the table in"
         )
     body |= _thin_parts(tissue, body, cells.size_mm)
@@ -277,6 +278,13 @@ def _find_body(cells: Cells, steps: Steps) -> tuple[Mask, DensePieces]:
     body = grow(body, MARGIN_MM / across)
     steps.take()
     return body, pieces
+
+
+def _describe_dense(cells: Cells) -> str:
+    dense = int(cells.dense.sum(dtype=np.int64))
+    if not dense:
+        return f"no voxel above {DENSE_HU:g} HU"
+    return f"{dense:,} voxels above {DENSE_HU:g} HU, all of tables, rails or cables by their shape"
 
 
 def _fill_holes(mask: Mask) -> None:

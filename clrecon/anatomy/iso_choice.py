@@ -314,9 +314,15 @@ def _find_background(histogram: Float64Array) -> Background:
         )
     raise NoSurfaceError(
         f"no two materials to choose the iso value by: no mode between {FAT_HU[0]} and {SOFT_TISSUE_HU[1]} HU "
-        f"(soft tissue) nor below {AIR_MODE_HU} HU (air), most voxels are near "
-        f"{int(np.argmax(smooth)) + LOWEST_HU} HU; {_describe_way_out()}"
+        f"(soft tissue) nor below {AIR_MODE_HU} HU (air), most voxels are {_describe_mode(smooth)} HU;"
+        f" {_describe_way_out()}"
     )
+
+
+def _describe_mode(smooth: Float64Array) -> str:
+    """Describe where most voxels lie; those above the range of the histogram are counted at its end."""
+    mode = int(np.argmax(smooth)) + LOWEST_HU
+    return f"near {mode}" if mode < HIGHEST_HU - SMOOTHING_HU else f"at {HIGHEST_HU} or above, so values may not be"
 
 
 def _median(values: NDArray[Any], weights: NDArray[Any], share: float = 0.5) -> float:

@@ -6,6 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
+from clrecon.system.text import say_volume
 
 if TYPE_CHECKING:
     from clrecon.jobs.mesh.label_choice import LabelChoice
@@ -116,4 +117,4 @@ def _describe_volumes(labels: list[dict[str, Any]]) -> list[str]:
     label_ml = sum(mesh["label_compared_ml"] for mesh in surfaces)
     mesh_ml = sum(mesh["label_mesh_ml"] for mesh in surfaces)
     change = 100.0 * (mesh_ml / label_ml - 1.0)
-    return [f"         {mesh_ml:,.2f} ml of mesh for {label_ml:,.2f} ml of labels ({change:+.1f} %)"]
+    return [f"         {say_volume(mesh_ml)} of mesh for {say_volume(label_ml)} of labels ({change:+.1f} %)"]

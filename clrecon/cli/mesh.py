@@ -24,7 +24,7 @@ from clrecon.cli.refinement import (
     finish_with_gates,
 )
 from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS
-from clrecon.system.text import count_of, say_digits
+from clrecon.system.text import count_of, say_digits, say_ml, say_volume
 
 __all__ = [
     "WHAT_BONE_COSTS", "add_arguments", "add_levels", "add_selection", "add_solid", "describe_mesh",
@@ -266,7 +266,8 @@ def _describe_solid(solid: dict[str, Any] | None) -> list[str]:
     left = sum(kind["ml"] for kind in solid["open"].values())
     stays = f", {say_digits(left)} ml enclosed stay open" if left >= 0.05 else ""
     share = 100.0 * solid["filled_share"]
-    return [f"solid    {solid['filled_ml']:,.1f} ml filled, {share:.0f} % of the solid{stays}"]
+    filled = f"{solid['filled_ml']:,.1f} ml" if solid["filled_ml"] >= 0.1 else say_ml(solid["filled_ml"])
+    return [f"solid    {filled} filled, {share:.0f} % of the solid{stays}"]
 
 
 def _describe_inside(low: float | None, high: float | None) -> str:
@@ -318,7 +319,7 @@ def _describe_parts(meshes: list[dict[str, Any]]) -> list[str]:
         return []
     lines = []
     for mesh in meshes[:_SHOWN_PARTS]:
-        volume = "" if mesh["volume_ml"] is None else f", {mesh['volume_ml']:,.2f} ml"
+        volume = "" if mesh["volume_ml"] is None else f", {say_volume(mesh['volume_ml'])}"
         lines.append(f"         {mesh['name']}: {mesh['triangles']:,} triangles{volume}")
     if len(meshes) > _SHOWN_PARTS:
         lines.append(f"         and {len(meshes) - _SHOWN_PARTS:,} more")
@@ -339,7 +340,7 @@ def _describe_quality(report: dict[str, Any]) -> list[str]:
         return []
     closed = "closed" if report["closed"] else "not closed"
     manifold = "manifold" if report["manifold"] else "not manifold"
-    volume = "" if report["volume_ml"] is None else f", {report['volume_ml']:,.2f} ml"
+    volume = "" if report["volume_ml"] is None else f", {say_volume(report['volume_ml'])}"
     parts = f"{report['components']:,} component{'s' * (report['components'] != 1)}"
     return [f"         {parts}, {closed}, {manifold}, {report['area_mm2']:,.0f} mm2{volume}"]
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from clrecon.cli.console import Console
 from clrecon.jobs.mesh.purposes import PURPOSES, Purpose
-from clrecon.system.text import count_of, say_digits
+from clrecon.system.text import count_of, say_digits, say_ml
 
 __all__ = [
     "GATE_FAILED",
@@ -151,10 +151,9 @@ def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
             f", walls {wall['median_mm']:.1f} mm (median), 5 % below {say_digits(wall['p5_mm'], 2)} mm,"
             f" {100 * wall['thin_share']:.1f} % below {wall['thin_mm']:g} mm"
         )
-    pieces = f"{count_of(left_out['pieces'], 'piece')} of {say_digits(left_out['pieces_ml'])} ml together"
+    pieces = f"{count_of(left_out['pieces'], 'piece')} of {say_ml(left_out['pieces_ml'])} together"
     cavities = (
-        f"{count_of(left_out['cavities'], 'closed cavity', 'closed cavities')} of"
-        f" {say_digits(left_out['cavities_ml'])} ml"
+        f"{count_of(left_out['cavities'], 'closed cavity', 'closed cavities')} of {say_ml(left_out['cavities_ml'])}"
     )
     if left_out["pieces"] or left_out["cavities"]:
         lines.append(f"         left out {pieces}, filled {cavities}")
@@ -162,7 +161,7 @@ def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
         bone = left_out["pieces"] + facts["pieces"] - left_out["not_bone"]
         lines.append(
             f"         kept {facts['pieces']:,} of {bone:,} pieces with walls like bone; {left_out['not_bone']:,} of"
-            f" {say_digits(left_out['not_bone_ml'])} ml are not, or are crumbs"
+            f" {say_ml(left_out['not_bone_ml'])} are not, or are crumbs"
         )
     return lines
 

@@ -16,6 +16,7 @@ __all__ = [
     "say_digits",
     "say_hu",
     "say_ml",
+    "say_volume",
     "say_unknown",
 ]
 
@@ -89,6 +90,11 @@ def say_hu(value: float) -> str:
 def say_ml(ml: float, digits: int = 3) -> str:
     """Return a volume with its unit: ml, and mm3 below 0.1 ml."""
     return f"{say_digits(ml, digits)} ml" if abs(ml) >= 0.1 or ml == 0.0 else f"{say_digits(1000.0 * ml, digits)} mm3"
+
+
+def say_volume(ml: float) -> str:
+    """Return a measured volume with its unit: ml to two decimals, and mm3 below 0.1 ml."""
+    return f"{ml:,.2f} ml" if abs(ml) >= 0.1 else say_ml(ml)
 
 
 def say_band(low: float, high: float, unit: str = "HU") -> str:

@@ -240,6 +240,7 @@ def make_grain() -> np.ndarray:
 
 REFUSED = {
     "constant water": (np.zeros((8, 32, 32)), "soft tissue has its mode at 0 HU.* 0 edges of bone"),
+    "values of 16 bits": (np.full((8, 32, 32), 20000.0), "most voxels are at 3071 or above, so values may not be HU"),
     "constant bone": (np.full((8, 32, 32), 700.0), "no two materials.*most voxels are near 700 HU"),
     "padding": (np.full((8, 32, 32), -2000.0), "nothing but padding"),
     "white noise": (np.random.default_rng(6).normal(0, 100, (40, 128, 128)), "noise of 1?[09]\\d HU"),

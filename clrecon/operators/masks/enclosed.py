@@ -16,8 +16,11 @@ from clrecon.operators.masks.mask import Mask
 from clrecon.operators.masks.regions import checked_mm
 from clrecon.operators.masks.spaces import Spaces, find_joints, find_spaces
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
+from clrecon.points.stencil import Lattice
+from clrecon.system.gates import at_most
 from clrecon.system.progress import Progress, Steps
-from clrecon.system.text import count_of, say_digits, say_hu
+from clrecon.system.text import count_of, say_hu, say_ml
+from clrecon.system.wording import name_parameter
 
 LEAST_SAID_ML = 0.1
 """Smaller spaces that stay open are in the report alone."""
@@ -32,8 +35,16 @@ twice its radius less one step."""
 SEAL_STEPS = 1.25
 """The same radius in largest steps of the voxels: below one it would close nothing along that axis."""
 
-BONE_ML = 1.0
-"""Pieces at the level from this volume on are bones of their own: what lies between two of them is a joint."""
+MOST_SEAL_STEPS, SEAL_PARTS = 8.0, 7.0
+"""Without a given radius the ball reaches at most so many largest steps of the voxels, and at most this part of the
+side of a cube as large as the bone: small bones have small pores, and lie close together."""
+
+BONE_ML, BONE_SHARE = 1.0, 0.05
+"""Pieces at the level from this volume on, or from this share of all bone, are bones of their own: what lies between
+two of them is a joint."""
+
+MOST_CLOSED = 0.5
+"""Largest share of a solid bone that the ball alone may close; bone with marrow of thin trabeculae has 0.33."""
 
 LARGEST_MARROW_MM = 35.0
 """Radius of the smallest ball that fits into no marrow: the head of a femur is 20 to 29 mm in radius, the skull of a
@@ -74,7 +85,8 @@ def fill_enclosed(
         HU; inside is ``>= iso_value``.
     seal_mm : float, optional
         Radius of the ball, mm.  Below every step of the voxels it closes nothing.  None: 1.25 of the largest step, from
-        2.5 to 3 mm.
+        2.5 to 3 mm, and less where voxels or bones are small: at most 8 steps, and a seventh of the side of a cube as
+        large as the bone.
     largest_mm : float, optional
         A space into which a ball of this radius fits, or one smaller by up to a step of the voxels (at least 1 mm),
         stays open: no marrow is so thick, but the skull, the chest and the pelvis are.  None fills all.
@@ -89,12 +101,13 @@ def fill_enclosed(
     -------
     Volume or DeviceVolume
         As ``volume``.  ``report["solid"]``: ``seal_mm``, ``closes_mm`` (width up to which every pore is closed),
-        ``bone_ml``, ``filled_ml``, ``filled_share`` (of both
+        ``closed_ml`` (what the ball closed, of ``filled_ml``), ``bone_ml``, ``filled_ml``, ``filled_share`` (of both
         together), ``filled_air_ml`` (cells with air that the ball closed), ``filled_hu`` (the value of what was filled:
         the mean of the bone), ``spaces`` (number of spaces filled that are wider than the ball), ``at_ends`` (of these,
         how many the ends of the volume cut), ``largest_ml``, and ``open``: for each kind (``wide``, ``air``)
         ``spaces``, ``ml``, ``largest_ml`` and ``at_mm``, LPS mm of a place in the largest; ``warnings`` say what stays
-        open, and if more was filled than the bone itself has.
+        open, and if more was filled than the bone itself has.  ``report["gates"]`` has ``closed_by_seal``: the ball
+        closed at most half of the solid bone.
 
     Raises
     ------
@@ -115,14 +128,20 @@ def fill_enclosed(
         if not bone.count or bone.count == own.voxels.size:
             what = "no voxel has" if not bone.count else "every voxel has"
             low, high = own.hu_range or (float(own.voxels.min()), float(own.voxels.max()))
-            raise NoSurfaceError(
-                f"{what} {iso_value:g} HU or more: the volume runs from {say_hu(low)} to {say_hu(high)} HU"
-            )
-        if seal is None:
-            seal = float(np.clip(SEAL_STEPS * max(own.spacing), SEAL_MM, LARGEST_SEAL_MM))
+            ends = f"the volume runs from {say_hu(low)} to {say_hu(high)} HU"
+            raise NoSurfaceError(f"{what} {iso_value:g} HU or more: {ends}")
+        seal = seal or _default_seal(own, bone)
         steps.take()
         made = _fill(bone, (seal, largest, keep_air), float(rule.lowest_inside), steps)
         return resident.follow(made) if isinstance(volume, DeviceVolume) else made
+
+
+def _default_seal(volume: Volume, bone: Mask) -> float:
+    """Return the radius of the ball that fits voxels and bone, mm."""
+    step, voxel_mm3 = max(volume.spacing), float(np.prod(volume.spacing))
+    usual = float(np.clip(SEAL_STEPS * step, SEAL_MM, LARGEST_SEAL_MM))
+    bounds = MOST_SEAL_STEPS * step, (bone.count * voxel_mm3) ** (1.0 / 3.0) / SEAL_PARTS
+    return max(min(usual, *bounds), min(SEAL_STEPS * step, usual))
 
 
 def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, steps: Steps) -> Volume:
@@ -139,12 +158,16 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
     steps.take()
     kinds = {"wide": spaces.are_wide(largest_mm), "air": np.zeros(spaces.count, bool)}
     airy = spaces.mean_hu < AIR_LIMIT_HU
-    if keep_air and airy.any() and not _lies_in_air(bone, sealed, spaces):
+    if keep_air and airy.any() and not _lies_in_air(bone, sealed, spaces, seal_mm):
         kinds["air"] = airy & ~kinds["wide"]
     left = kinds["wide"] | kinds["air"]
     body = sealed | spaces.choose(~left)
     room = body - bone
-    joints = find_joints(bone, seal_mm, BONE_ML) & (sealed - bone)
+    from clrecon.labels.volumes import slice_voxel_ml  # label maps load pydicom, which others need not wait for
+
+    ml = slice_voxel_ml(volume)
+    bone_ml = float(_count_by_slice(bone.to_numpy()) @ ml)
+    joints = find_joints(bone, seal_mm, min(BONE_ML, BONE_SHARE * bone_ml)) & (sealed - bone)
     # what was closed only at the mouth of a pore, in a groove or in a joint is outside again
     filled = room - (~body | joints).dilate_within(room, seal_mm)
     steps.take()
@@ -152,17 +175,16 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
     value = _mean_inside(volume, bone, lowest_inside)
     voxels = np.where(marked, value, volume.voxels)
     steps.take()
-    from clrecon.labels.volumes import slice_voxel_ml  # label maps load pydicom, which others need not wait for
-
-    ml = slice_voxel_ml(volume)
-    bone_ml = float(_count_by_slice(bone.to_numpy()) @ ml)
     filled_ml = float(_count_by_slice(marked) @ ml)
+    closed_ml = float(_count_by_slice((filled & sealed).to_numpy()) @ ml)
+    lattice = Lattice.of(volume)
     facts = {
         "seal_mm": seal_mm,
-        "closes_mm": max(0.0, 2.0 * seal_mm - max(volume.spacing)),
+        "closes_mm": max(0.0, 2.0 * seal_mm - max(lattice.pixel, lattice.largest_gap)),
         "bone_ml": bone_ml,
         "filled_ml": filled_ml,
         "filled_share": filled_ml / (filled_ml + bone_ml),
+        "closed_ml": closed_ml,
         "filled_air_ml": float(_count_by_slice(marked & (volume.voxels < AIR_LIMIT_HU)) @ ml),
         "filled_hu": float(value),
         "spaces": int(np.count_nonzero(~left)),
@@ -174,7 +196,14 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
     report = volume.report
     if report.get("hu_range") is not None:
         report = amend(report, hu_range=made.report["hu_range"])
-    made.report = amend(report, solid=facts, warnings=[*report.get("warnings", ()), *_warn(facts)])
+    share = closed_ml / (filled_ml + bone_ml)
+    gate = at_most(
+        "closed_by_seal", share, MOST_CLOSED, None,
+        f"share of the solid bone that the ball of {seal_mm:.3g} mm closed, not marrow that bone encloses"
+        f" ({name_parameter('seal_mm', 'MM')}: a smaller ball)",
+    )  # fmt: skip
+    warnings = [*report.get("warnings", ()), *_warn(facts)]
+    made.report = amend(report, solid=facts, warnings=warnings, gates=[*report.get("gates", ()), gate])
     return made
 
 
@@ -182,11 +211,11 @@ def _count_by_slice(marked: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.count_nonzero(marked, axis=(1, 2))  # type: ignore[return-value]
 
 
-def _lies_in_air(bone: Mask, sealed: Mask, spaces: Spaces) -> bool:
+def _lies_in_air(bone: Mask, sealed: Mask, spaces: Spaces, seal_mm: float) -> bool:
     """Tell whether most of what lies beside the bone, outside, is air, as round a specimen."""
     inner = sealed | spaces.choose(np.ones(spaces.count, bool))
     step = float(np.max(bone.volume.spacing))
-    beside = bone.dilate(2.0 * max(SEAL_MM, step)) - inner
+    beside = bone.dilate(2.0 * max(seal_mm, step)) - inner
     low = float(np.finfo(np.float32).min)
     air = Mask.from_band(bone.volume, (low, AIR_LIMIT_HU), device=bone.device, memory=bone.memory)
     return bool(2 * (beside & air).count > beside.count)
@@ -210,17 +239,17 @@ def _warn(facts: dict[str, Any]) -> list[str]:
         left = facts["open"][kind]
         if left["ml"] >= LEAST_SAID_ML:
             at = ", ".join(f"{x:.0f}" for x in left["at_mm"])
-            several = f", the largest {say_digits(left['largest_ml'])} ml" if left["spaces"] > 1 else ""
+            several = f", the largest {say_ml(left['largest_ml'])}" if left["spaces"] > 1 else ""
             warnings.append(
-                f"solid: {say_digits(left['ml'])} ml stay open in {count_of(left['spaces'], 'enclosed space')}"
+                f"solid: {say_ml(left['ml'])} stay open in {count_of(left['spaces'], 'enclosed space')}"
                 f" ({what}{several}, round {at} mm LPS)"
             )
     if not facts["filled_ml"]:
         warnings.append("solid: nothing is enclosed at this level, and nothing was filled")
     elif facts["filled_ml"] > facts["bone_ml"]:
         warnings.append(
-            f"solid: {say_digits(facts['filled_ml'])} ml were filled, more than the"
-            f" {say_digits(facts['bone_ml'])} ml of the bone"
+            f"solid: {say_ml(facts['filled_ml'])} were filled, more than the"
+            f" {say_ml(facts['bone_ml'])} of the bone"
             " itself: see in a picture that it is marrow"
         )
     return warnings

@@ -10,6 +10,7 @@ from uneven_volume import uneven
 import clrecon
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
+from clrecon.labels.volumes import slice_voxel_ml
 from clrecon.operators.masks import enclosed
 from clrecon.phantom import PhantomSettings, make_phantom
 from clrecon.reference.masks import enclosed as twin
@@ -146,6 +147,59 @@ def test_air_in_bone_stays_open_in_a_patient_and_is_filled_in_a_dry_bone(device)
         assert facts["filled_ml"] > facts["filled_air_ml"] > 0.8 * facts["filled_ml"] > 4.5
 
 
+def tubes(step, *bones):
+    """Tubes along z of bones (y, x, outer, inner), mm, cut at both ends of the volume."""
+    y, x = np.mgrid[:130, :230] * step
+    layer = np.zeros(y.shape)
+    for middle_y, middle_x, outer, inner in bones:
+        away = np.hypot(y - middle_y, x - middle_x)
+        layer[away < outer] = 50
+        layer[(away < outer) & (away >= inner)] = 800
+    return whole(np.repeat(layer[None], 30, axis=0), (step,) * 3)
+
+
+def test_small_bones_are_filled_and_not_joined_by_default(device):
+    """Radius and ulna at 0.1 mm, 1 mm apart, below 1 ml each: a ball of 2.5 mm made one lump of them."""
+    volume = tubes(0.1, (6.5, 7.0, 6.0, 5.0), (6.5, 18.0, 4.0, 3.2))
+    made = clrecon.fill_enclosed(volume, 400, device=device)
+    filled, facts = marks(volume, made, 400), made.report["solid"]
+    assert facts["seal_mm"] == pytest.approx((1000 * facts["bone_ml"]) ** (1 / 3) / 7) and 0.7 < facts["seal_mm"] < 0.8
+    assert np.array_equal(filled, volume.voxels == 50)
+    coarser = clrecon.fill_enclosed(volume, 400, seal_mm=2.5, device=device)
+    between = (slice(None), slice(None), slice(131, 139))
+    assert not marks(volume, coarser, 400)[between].any()
+
+
+@pytest.mark.parametrize(
+    ("step", "radius", "seal_mm"),
+    [
+        (1.0, 20.0, 2.5),  # as for adults in a body scanner
+        (2.2, 20.0, 2.75),  # 1.25 steps
+        (0.1, 3.0, 0.545),  # a seventh of the side of a cube as large as the bone, 55 mm3
+        (0.05, 3.0, 0.4),  # 8 steps
+    ],
+)
+def test_the_default_seal_follows_voxels_and_bone(device, step, radius, seal_mm):
+    size = int(2.4 * radius / step)
+    volume = whole(np.where(abs(distances((size,) * 3) * step - 0.9 * radius) < 0.1 * radius, 800, 50), (step,) * 3)
+    facts = clrecon.fill_enclosed(volume, 400, device=device).report["solid"]
+    assert facts["seal_mm"] == pytest.approx(seal_mm, rel=0.05)
+
+
+def test_a_ball_that_closes_more_than_half_of_the_bone_fails_a_gate(device):
+    k, j, i = np.indices((24, 24, 24))
+    rods = sum((a % 4 < 1).astype(int) & (b % 4 < 1) for a, b in ((k, j), (j, i), (k, i))) > 0
+    volume = whole(np.where(rods, 800, 50))
+    lump = clrecon.fill_enclosed(volume, 400, seal_mm=3.0, device=device)
+    [gate] = [gate for gate in lump.report["gates"] if gate["name"] == "closed_by_seal"]
+    facts = lump.report["solid"]
+    assert gate["ok"] is False and gate["measured"] > gate["bound"] == 0.5
+    assert gate["measured"] == pytest.approx(facts["closed_ml"] / (facts["filled_ml"] + facts["bone_ml"]))
+    assert "the ball of 3 mm closed" in gate["text"] and "seal_mm=MM: a smaller ball" in gate["text"]
+    fine = clrecon.fill_enclosed(volume, 400, seal_mm=0.5, device=device)
+    assert [gate["ok"] for gate in fine.report["gates"] if gate["name"] == "closed_by_seal"] == [True]
+
+
 def test_two_bones_are_not_joined_and_a_groove_of_one_is_only_shallower(device):
     k, j, i = np.indices((30, 30, 40))
     block = (k >= 5) & (k < 25) & (j >= 5) & (j < 25)
@@ -169,7 +223,10 @@ def test_any_grid_equals_the_twin(device, which, seal_mm):
     volume = [*frames, uneven(noise), Volume(noise[:1], OBLIQUE)][which]
     bone = volume.voxels >= 75
     filled = clrecon.fill_enclosed(volume, 75, seal_mm=seal_mm, largest_mm=None, keep_air=False, device=device)
-    expected = twin.find_filled(volume, bone, seal_mm, enclosed.BONE_ML)
+    least = min(
+        enclosed.BONE_ML, enclosed.BONE_SHARE * float(np.count_nonzero(bone, axis=(1, 2)) @ slice_voxel_ml(volume))
+    )
+    expected = twin.find_filled(volume, bone, seal_mm, least)
     np.testing.assert_array_equal(marks(volume, filled, 75), expected)
     if seal_mm == 0.3 and which != 5:
         assert expected.any()

@@ -1,0 +1,24 @@
+"""Volumes in words: ml, and mm3 where ml have no digits left."""
+
+from __future__ import annotations
+
+import pytest
+
+from clrecon.system.text import say_ml, say_volume
+
+pytestmark = pytest.mark.unit
+
+
+@pytest.mark.parametrize(
+    ("ml", "short", "long"),
+    [
+        (1234.567, "1,235 ml", "1,234.57 ml"),
+        (0.1, "0.1 ml", "0.10 ml"),
+        (0.0999, "99.9 mm3", "99.9 mm3"),
+        (0.003355, "3.35 mm3", "3.35 mm3"),
+        (-0.002, "-2 mm3", "-2 mm3"),
+        (0.0, "0 ml", "0 ml"),
+    ],
+)
+def test_volumes_below_a_tenth_of_a_millilitre_are_said_in_mm3(ml, short, long):
+    assert (say_ml(ml), say_volume(ml)) == (short, long)
