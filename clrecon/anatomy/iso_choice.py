@@ -22,8 +22,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +51,8 @@ SOFT_TISSUE_HU = (-30, 150)
 """Range in which muscle, organs, blood and water have their mode."""
 FAT_HU = (-150, -31)
 """Range in which fat has its mode: the background of scans that show no other soft tissue."""
+AIR, SOFT_TISSUE = -1000.0, 40.0
+"""HU of the two materials by which a scan with a scale of its own is read."""
 AIR_MODE_HU = -700
 """Modes below this are air."""
 
@@ -179,10 +182,12 @@ def choose_iso_value(volume: Volume, *, progress: Progress | None = None) -> Iso
     count = max(FEWEST_SLICES, SAMPLED_VOXELS // (voxels.shape[1] * voxels.shape[2]))
     slice_step = -(-voxels.shape[0] // count)
     sampled = range((voxels.shape[0] - 1) % slice_step // 2, voxels.shape[0], slice_step)
-    histogram = _leave_padding(_count_values(voxels, sampled), voxels[0].size * len(sampled), volume.report)
+    scale = _OwnScale.of(volume.report)
+    examined, places = (voxels, sampled) if scale is None else scale.to_hu(voxels, sampled)
+    histogram = _leave_padding(_count_values(examined, places), voxels[0].size * len(sampled), volume.report)
     background = _find_background(histogram)
     progress("choose", 1, 3)
-    edges = measure_edges(voxels, sampled, background)
+    edges = measure_edges(examined, places, background)
     progress("choose", 2, 3)
     edges, left_out, flat_share = leave_contrast_medium(edges)
     progress("choose", 3, 3)
@@ -190,7 +195,47 @@ def choose_iso_value(volume: Volume, *, progress: Progress | None = None) -> Iso
     least = max(SEED_ABOVE_TISSUE_HU, LEAST_CONTRAST_SIGMAS * background.noise)
     if len(edges.bone) < FEWEST_EDGES or bone - tissue < least:
         raise NoSurfaceError(_no_bone(background, edges, histogram, len(sampled)))
-    return _describe(background, edges, (left_out, flat_share), sampled)
+    if scale is not None:
+        background, edges = scale.from_hu(background, edges)
+    choice = _describe(background, edges, (left_out, flat_share), sampled)
+    return choice if scale is None else dataclasses.replace(choice, reason=f"{choice.reason}; {scale}")
+
+
+class _OwnScale(NamedTuple):
+    """The scale of values that are not HU, by the air and soft tissue that the failed gate ``hu_scale`` found."""
+
+    air: float
+    tissue: float
+
+    @classmethod
+    def of(cls, report: Mapping[str, Any]) -> _OwnScale | None:
+        """Take air and soft tissue from a certificate; None where they have the values of a CT, or were not found."""
+        rescale = report.get("rescale") or {}
+        air, tissue = rescale.get("air"), rescale.get("soft_tissue")
+        return None if air is None or tissue is None else cls(air, tissue)
+
+    def __str__(self) -> str:
+        """What is said of it beside the reason of a choice."""
+        return f"on the scan's own scale, with air near {self.air:.0f} and soft tissue near {self.tissue:.0f}"
+
+    @property
+    def slope(self) -> float:
+        """HU for one unit of the scan."""
+        return (SOFT_TISSUE - AIR) / (self.tissue - self.air)
+
+    def to_hu(self, voxels: NDArray[Any], sampled: range) -> tuple[NDArray[np.float32], range]:
+        """Return the sampled slices in HU, and their places there."""
+        slices = [(np.asarray(voxels[k], np.float32) - self.air) * self.slope + AIR for k in sampled]
+        return np.stack(slices), range(len(slices))
+
+    def from_hu(self, background: Background, edges: BoneEdges) -> tuple[Background, BoneEdges]:
+        """Return what was measured in HU in the units of the scan."""
+        mode = self.air + (background.mode - AIR) / self.slope
+        bone, tissue = (self.air + (hu - AIR) / self.slope for hu in (edges.bone, edges.tissue))
+        return (
+            dataclasses.replace(background, mode=mode, noise=background.noise / self.slope),
+            BoneEdges(bone, tissue, edges.step / self.slope, edges.flat),
+        )
 
 
 def _describe(background: Background, edges: BoneEdges, flat: tuple[float, float], sampled: range) -> IsoChoice:

@@ -99,7 +99,7 @@ def read_volume(
         *collect_scan_warnings(scan),
         *left,
     ]
-    report = certify(chosen, stack, facts, scan, stack.affine, warnings, likeness, findings.gates)
+    report = certify(chosen, stack, facts, scan, stack.affine, warnings, likeness, findings)
     log.info("series %d of %d read: %s voxels %s", chosen.number, len(found), voxels.shape[::-1], voxels.dtype)
     log_warnings(log, report.warnings)
     return Volume(voxels, stack.affine, report, stack.slice_positions, hu_range=(facts.hu_min, facts.hu_max))
@@ -211,15 +211,14 @@ def _certify_chosen(
     stack = series.stack
     if stack is None or series.kind == "other":
         return None
-    facts, likeness, gates, warnings = None, None, None, collect_series_warnings(series)
+    facts, likeness, findings, warnings = None, None, None, collect_series_warnings(series)
     affine = None if series.problems else stack.affine
     if pixels and affine is not None:
         voxels, facts = read_voxels(stack.slices, progress)
         likeness = judge_slices(voxels, stack.tilt_deg, uneven=stack.line.uneven)
         findings = examine_voxels(voxels, facts, stack.slices, known=not count_unknown(stack.slices))
-        gates = findings.gates
         warnings += [*_describe_likeness(likeness), *findings.warnings]
-    return certify(series, stack, facts, scan, affine, [*warnings, *notes], likeness, gates)
+    return certify(series, stack, facts, scan, affine, [*warnings, *notes], likeness, findings)
 
 
 def _describe_likeness(likeness: Likeness | None) -> list[str]:

@@ -12,7 +12,7 @@ from clrecon.geometry.affine import column_spacing, signed_tilt, slice_normal
 from clrecon.geometry.certificate import Certificate
 from clrecon.geometry.orientation import describe_orientation
 from clrecon.sources.gates import PADDING_SHARE, judge_figures, judge_steps, list_odd_values
-from clrecon.sources.plausibility import leave_unexamined
+from clrecon.sources.plausibility import VoxelFindings, leave_unexamined
 from clrecon.system.gates import Gate, at_most, none_of, unmeasured
 
 __all__ = ["MODALITY", "certify_grid", "collect_header_warnings", "collect_value_warnings"]
@@ -46,7 +46,7 @@ def judge_spacing(grid: GridFile) -> Gate:
 
 
 def certify_grid(
-    grid: GridFile, values: GridValues | None, warnings: Sequence[str], value_gates: Sequence[Gate] | None = None
+    grid: GridFile, values: GridValues | None, warnings: Sequence[str], findings: VoxelFindings | None = None
 ) -> Certificate:
     """Build the report of a volume.
 
@@ -56,8 +56,8 @@ def certify_grid(
     values : GridValues or None
         None: the voxels were not read, and entries that depend on them are None.
     warnings : sequence of str
-    value_gates : sequence of Gate or None
-        Gates of the values of the voxels; None: they were not read.
+    findings : VoxelFindings or None
+        What the voxels say of their values; None: they were not read.
 
     Returns
     -------
@@ -84,12 +84,13 @@ def certify_grid(
             "intercept": [grid.intercept] * 2,
             "type": None,
             **({} if grid.rescale is None else {"given": True}),
+            **({} if findings is None else findings.materials),
         },
         padding_share=None if facts is None else facts.padding_share,
         padding_hu=None if facts is None else facts.padding_hu,
         hu_range=None if facts is None else [facts.hu_min, facts.hu_max],
         files={"found": 1, "used": 1, "skipped": {}},
-        gates=judge_grid(grid, values, value_gates),
+        gates=judge_grid(grid, values, None if findings is None else findings.gates),
         warnings=list(warnings),
     )
 

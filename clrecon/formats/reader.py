@@ -47,7 +47,7 @@ def read_grid(path: Path, kind: str, *, rescale: Rescale | None = None, progress
     grid = _open(path, kind, rescale)
     values = read_values(grid, progress)
     findings = _examine(grid, values)
-    report = certify_grid(grid, values, _collect_warnings(grid, values, findings), findings.gates)
+    report = certify_grid(grid, values, _collect_warnings(grid, values, findings), findings)
     log.info("%s file read: %s voxels %s", grid.kind, grid.shape_ijk, values.voxels.dtype)
     log_warnings(log, report.warnings)
     return Volume(values.voxels, grid.affine, report, hu_range=(values.facts.hu_min, values.facts.hu_max))
@@ -90,7 +90,7 @@ def list_grid(
     values = read_values(grid, progress) if pixels else None
     findings = None if values is None else _examine(grid, values)
     warnings = _collect_warnings(grid, values, findings)
-    certificate = certify_grid(grid, values, warnings, None if findings is None else findings.gates)
+    certificate = certify_grid(grid, values, warnings, findings)
     copied = ("slices", "shape_ijk", "spacing_mm", "affine_ijk_to_lps_mm", "tilt_deg", "grid_residual_max_mm", "gap_mm",
               "uneven", "extent_mm", "slice_thickness_mm")  # fmt: skip
     entry = SeriesEntry(

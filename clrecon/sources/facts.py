@@ -23,6 +23,8 @@ class PixelFacts:
         Number of values that lost bits of their own, see `clrecon.dicom.pixels.stray_bits`.
     stray_text : str
         One line about these values; empty if there are none.
+    padding_text : str
+        One line about padding that no header declares and that was found by its shape; empty if there is none.
     """
 
     padding_share: float
@@ -31,3 +33,4 @@ class PixelFacts:
     padding_hu: float | None = None
     stray: int = 0
     stray_text: str = ""
+    padding_text: str = ""

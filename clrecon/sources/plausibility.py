@@ -5,8 +5,8 @@ Shares are those of a sample of the voxels.  A figure that a warning states is c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -41,10 +41,13 @@ LEAST_PADDING_SHARE = 0.01
 
 @dataclass(frozen=True)
 class VoxelFindings:
-    """What the voxels say of their values: warnings, and the gates ``hu_scale`` and ``stored_sign``."""
+    """What the voxels say of their values: warnings, the gates ``hu_scale`` and ``stored_sign``, and the values of
+    ``air`` and ``soft_tissue`` where the first fails.
+    """
 
     warnings: list[str]
     gates: list[Gate]
+    materials: Mapping[str, float] = field(default_factory=dict)
 
 
 def examine_voxels(
@@ -82,11 +85,12 @@ def examine_voxels(
         unknown = unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: the sign of the values is lost")
         return VoxelFindings([], [unknown, sign])
     sample = ValueSample.of(voxels, facts)
-    scale = judge_scale(sample, facts, [one.slope for one in slices] or [1.0], known)
-    warnings = _warn_of_saturation(voxels, facts, slices)
+    scale, materials = judge_scale(sample, facts, [one.slope for one in slices] or [1.0], known)
+    warnings = [facts.padding_text] if facts.padding_text else []
+    warnings += _warn_of_saturation(voxels, facts, slices)
     if sample is not None and scale.ok is not False:
         warnings += _warn_of_padding(sample, voxels)
-    return VoxelFindings(warnings, [scale, sign])
+    return VoxelFindings(warnings, [scale, sign], materials)
 
 
 def leave_unexamined() -> list[Gate]:

@@ -69,8 +69,8 @@ class _Doubt(NamedTuple):
 
 def judge_scale(
     sample: ValueSample | None, facts: PixelFacts, slopes: Sequence[float] = (1.0,), known: bool = True
-) -> Gate:
-    """Judge the gate ``hu_scale``.
+) -> tuple[Gate, dict[str, float]]:
+    """Judge the gate ``hu_scale``; where it fails, return the places of ``air`` and ``soft_tissue`` too.
 
     Parameters
     ----------
@@ -83,10 +83,10 @@ def judge_scale(
         False: the header does not say that the values are HU.  Then only a missing or doubled intercept is told.
     """
     if sample is None or len(sample.values) < FEWEST_VALUES:
-        return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: too few voxels")
+        return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: too few voxels"), {}
     doubt = _find_shift(sample, facts)
     if doubt is None and not known:
-        return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: the values are not known to be HU")
+        return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: the values are not known to be HU"), {}
     peaks: list[Peak] = []
     if doubt is None:
         measured = sample.without_spikes(LOWEST_AIR_HU, HIGHEST_AIR_HU)
@@ -97,11 +97,12 @@ def judge_scale(
             f"air lies near {doubt.air:.0f} HU and soft tissue near {doubt.tissue:.0f} HU, where a CT has -1000 and 0"
             f" to 80: {doubt.reason}; thresholds in HU do not fit these values"
         )
-        return Gate("hu_scale", 2, 0, None, False, text)
+        found = {"air": round(doubt.air, 1), "soft_tissue": round(doubt.tissue, 1)}
+        return Gate("hu_scale", 2, 0, None, False, text), found
     places = [f"{peak.at:.0f}" for peak in peaks if _is_air(peak) or _is_tissue(peak)]
     if not places:
-        return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: neither was found")
-    return none_of("hu_scale", 0, f"{SCALE_SAID} (found at {', '.join(places)} HU)")
+        return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: neither was found"), {}
+    return none_of("hu_scale", 0, f"{SCALE_SAID} (found at {', '.join(places)} HU)"), {}
 
 
 def _is_air(peak: Peak) -> bool:

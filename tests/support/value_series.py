@@ -34,6 +34,16 @@ def make_body(noise: float = 12.0) -> np.ndarray:
     return np.maximum(make_layers(-1000, (40, -100), (35, 50), (12, 1500), (10, 250), noise=noise), -1024)
 
 
+def make_jaw(slope: float = 1.0, offset: float = 400.0, padding: float | None = 0.0, noise: float = 40.0) -> np.ndarray:
+    """A jaw in a cone beam: values ``slope * HU + offset``, and one value outside of a round field of view."""
+    hu = make_layers(-1000, (38, -90), (35, 50), noise=noise)
+    i = np.arange(SHAPE[2]) - CENTRE
+    bow = np.abs(radius_from(CENTRE, CENTRE - 6) - 24) < 3.5
+    hu = np.where(bow & (i > -8)[:, None], hu + 1300, hu)
+    values = np.rint(slope * hu + offset)
+    return values if padding is None else np.where(radius_from() > 46, padding, values)
+
+
 def write_values(folder: Path, hu: np.ndarray, plan: Plan | None = None, **values: Any) -> Path:
     """Write HU by the slope and intercept of the plan; `values` then say otherwise."""
     plan = plan or Plan(shape=hu.shape)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.dicom.headers.slice_header import SliceHeader
+from clrecon.dicom.pixels.disc_padding import fill_disc_padding
 from clrecon.dicom.pixels.padding import PaddingMasks, pack_mask
 from clrecon.dicom.pixels.stored import StoredPixels
 from clrecon.dicom.pixels.stray_bits import StrayBits, describe_stray_bits, find_stray_bits
@@ -115,10 +116,18 @@ def _fill_volume(
             pool.shutdown(cancel_futures=True)
             raise
         padding_hu = padding.fill(pool.map)
+    padded, said = padding.count, ""
+    disc = fill_disc_padding(voxels) if padding_hu is None else None
+    if disc is not None:
+        value, padded, padding_hu = disc
+        said = (
+            f"{100.0 * padded / voxels.size:.3g} % of the voxels, all outside of a round field of view, are at"
+            f" {value:g} HU: padding that the files do not declare, {padding_hu:g} HU is taken for it"
+        )
     if padding_hu is not None:
         low, high = min(low, padding_hu), max(high, padding_hu)
     count, text = describe_stray_bits(stray, slices)
-    return PixelFacts(padding.count / voxels.size, float(low), float(high), padding_hu, count, text)
+    return PixelFacts(padded / voxels.size, float(low), float(high), padding_hu, count, text, said)
 
 
 def _fill_slice(source: StoredPixels, header: SliceHeader, out: NDArray[Any]) -> _SliceFacts:

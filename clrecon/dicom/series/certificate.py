@@ -33,7 +33,7 @@ from clrecon.geometry.certificate import Certificate
 from clrecon.geometry.orientation import describe_orientation
 from clrecon.sources.facts import PixelFacts
 from clrecon.sources.likeness import Likeness
-from clrecon.system.gates import Gate
+from clrecon.sources.plausibility import VoxelFindings
 from clrecon.system.text import count_of, hash_uid
 
 __all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]
@@ -138,6 +138,17 @@ def _place(stack: Stack, is_so: Callable[[SliceHeader], bool]) -> str:
     return f"{len(positions)} of {len(stack.slices)} slices, {first}at {positions[0]:.2f} mm"
 
 
+def _describe_rescale(headers: Sequence[SliceHeader], scan: Scan, findings: VoxelFindings | None) -> dict[str, Any]:
+    slopes, intercepts = [h.slope for h in headers], [h.intercept for h in headers]
+    return {
+        "slope": [min(slopes), max(slopes)],
+        "intercept": [min(intercepts), max(intercepts)],
+        "type": headers[0].rescale_type or None,
+        **({"given": True} if scan.rescale is not None else {}),
+        **({} if findings is None else findings.materials),
+    }
+
+
 def certify(
     series: Series,
     stack: Stack,
@@ -146,7 +157,7 @@ def certify(
     affine: NDArray[np.float64] | None,
     warnings: Sequence[str],
     likeness: Likeness | None = None,
-    value_gates: Sequence[Gate] | None = None,
+    findings: VoxelFindings | None = None,
 ) -> Certificate:
     """Build the certificate of a series: the report of its volume, and what ``clrecon info`` shows.
 
@@ -162,8 +173,8 @@ def certify(
     warnings : sequence of str
     likeness : Likeness or None
         Likeness of the slices; None: the pixels were not read, or there are too few slices.
-    value_gates : sequence of Gate or None
-        Gates of the values of the voxels; None: the pixels were not read.
+    findings : VoxelFindings or None
+        What the voxels say of their values; None: the pixels were not read.
 
     Returns
     -------
@@ -172,8 +183,7 @@ def certify(
     headers, first, line = stack.slices, stack.slices[0], stack.line
     stated = next((h.stated_gap_mm for h in headers if h.stated_gap_mm is not None), None)
     lay = {h.patient_position for h in headers}
-    slopes, intercepts = [h.slope for h in headers], [h.intercept for h in headers]
-    gates = judge_series(series, stack, facts, likeness, value_gates)
+    gates = judge_series(series, stack, facts, likeness, None if findings is None else findings.gates)
     unsaid = [gate.text for gate in gates if gate.name in SAID_BY_GATES and gate.ok is False]
     identity = {"number": series.number, "uid_hash": hash_uid(series.identity.uid)}
     return Certificate(
@@ -205,12 +215,7 @@ def certify(
         transfer_syntaxes=sorted({h.transfer_syntax for h in headers}),
         transfer_syntax_names=sorted({SYNTAX_NAMES[h.transfer_syntax] for h in headers}),
         lossy=any(h.lossy for h in headers),
-        rescale={
-            "slope": [min(slopes), max(slopes)],
-            "intercept": [min(intercepts), max(intercepts)],
-            "type": headers[0].rescale_type or None,
-            **({"given": True} if scan.rescale is not None else {}),
-        },
+        rescale=_describe_rescale(headers, scan, findings),
         hu_range=None if facts is None else [facts.hu_min, facts.hu_max],
         files={"found": scan.files, "used": len({h.file for h in headers}), "skipped": dict(scan.skipped)},
         dropped=series.dropped,
