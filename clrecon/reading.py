@@ -168,7 +168,7 @@ def list_series(
     Raises
     ------
     NoDicomError, RefusedInputError, UsageError
-        There is nothing to list; all DICOM files, or a file of another format, are corrupt; `series` or `phase` names
+        There is nothing to list; all DICOM files, or a file of another format, are corrupt; ``series`` or ``phase`` names
         nothing or several; a package is missing; or an option for DICOM is given with another format.
     """
     given = check_rescale(rescale)
