@@ -168,8 +168,8 @@ def list_series(
     Raises
     ------
     NoDicomError, RefusedInputError, UsageError
-        There is nothing to list; all DICOM files, or a file of another format, are corrupt; ``series`` or ``phase`` names
-        nothing or several; a package is missing; or an option for DICOM is given with another format.
+        There is nothing to list; all DICOM files, or a file of another format, are corrupt; ``series`` or ``phase``
+        names nothing or several; a package is missing; or an option for DICOM is given with another format.
     """
     given = check_rescale(rescale)
     kind = tell_format(path)
