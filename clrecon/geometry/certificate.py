@@ -53,6 +53,9 @@ class Certificate(Record):
         As the headers state them; not used for the geometry.
     thickness : mapping or None
         Thickness and overlap of the slices.
+    numbering : mapping or None
+        ``first``, ``last`` and ``step`` of InstanceNumber along the stack; ``images`` and ``files`` of the series, and
+        what its headers state of them.
     frame_of_reference_hash : str or None
     padding_share : float or None
         Share of the voxels that hold no measurement.
@@ -98,6 +101,7 @@ class Certificate(Record):
     slice_thickness_mm: float | None = None
     thickness: Mapping[str, Any] | None = None
     stated_gap_mm: float | None = None
+    numbering: Mapping[str, Any] | None = None
     frame_of_reference_hash: str | None = None
     padding_share: float | None = None
     padding_hu: float | None = None

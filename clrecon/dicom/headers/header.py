@@ -246,6 +246,9 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
         warnings=tuple(warnings),
         patient_position=lay if (lay := values.text("PatientPosition").upper()) in PATIENT_POSITIONS else "",
         derived=tuple(derived),
+        instance_number=values.whole_or_none("InstanceNumber") if frames == 1 else None,
+        stated_images=values.whole_or_none("ImagesInAcquisition"),
+        stated_files=values.whole_or_none("NumberOfSeriesRelatedInstances"),
     )
     _check_pixel_room(header, elements.pixel_vr)
     return header

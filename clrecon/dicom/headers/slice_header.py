@@ -84,6 +84,10 @@ class SliceHeader:
         Position of the patient in the scanner, for example HFS; empty if it is not one of `PATIENT_POSITIONS`.
     derived : tuple of str
         The `DERIVED_WORDS` of a derived image; empty for an image that was measured.
+    instance_number : int or None
+        InstanceNumber; None for a frame of a multi-frame image.
+    stated_images, stated_files : int or None
+        ImagesInAcquisition and NumberOfSeriesRelatedInstances.
     """
 
     series: SeriesIdentity
@@ -127,6 +131,9 @@ class SliceHeader:
     warnings: tuple[str, ...]
     patient_position: str = ""
     derived: tuple[str, ...] = ()
+    instance_number: int | None = None
+    stated_images: int | None = None
+    stated_files: int | None = None
 
     @property
     def pixel_bytes(self) -> int:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.headers.slice_header import SliceHeader
 from clrecon.dicom.parse.transfer_syntaxes import SYNTAX_NAMES
+from clrecon.dicom.series.census import describe_numbers
 from clrecon.dicom.series.gates import judge_series
 from clrecon.dicom.series.phases import choose_phase
 from clrecon.dicom.series.scan import Scan
@@ -39,6 +40,7 @@ from clrecon.system.text import count_of, hash_uid
 __all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]
 
 SAID_BY_GATES = (
+    "complete_series",
     "padding_share",
     "stored_bits",
     "plausible_spacing",
@@ -209,6 +211,7 @@ def certify(
         slice_thickness_mm=median_thickness(headers),
         thickness=describe_thickness(headers, stack.distances_mm),
         stated_gap_mm=stated,
+        numbering=describe_numbers(series.census, stack),
         frame_of_reference_hash=hash_uid(first.frame_of_reference),
         padding_share=None if facts is None else facts.padding_share,
         padding_hu=None if facts is None else facts.padding_hu,

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from clrecon.dicom.headers.slice_header import SliceHeader
+from clrecon.dicom.series.census import judge_numbers
 from clrecon.dicom.series.series import Series
 from clrecon.dicom.stack.directions import (
     ORIENTATION_EXACT,
@@ -78,6 +79,7 @@ def judge_series(
     gates.append(_judge_spacing(stack))
     gates += _gates_of_places(stack)
     what = "slices at the place of another that differ from it and are no phases"
+    gates.append(judge_numbers(series.census, stack, _count_copies(series)))
     gates.append(none_of("duplicate_slices", _count_doubled(series), what))
     gates.append(_judge_one_volume(series, likeness))
     gates += _gates_of_values(stack.slices)
@@ -156,6 +158,13 @@ def _judge_one_volume(series: Series, likeness: Likeness | None) -> Gate:
     return none_of("one_volume", doubts + (likeness is not None and likeness.is_mixed), what)
 
 
+def _count_copies(series: Series) -> int:
+    try:
+        return series.places.copies
+    except RefusedInputError:
+        return 0
+
+
 def _count_doubled(series: Series) -> int:
     try:
         places = series.places
@@ -165,7 +174,7 @@ def _count_doubled(series: Series) -> int:
 
 
 def _judge_stated_gap(stack: Stack) -> Gate:
-    """Compare SpacingBetweenSlices with the positions: the only sign that every second slice is missing."""
+    """Compare SpacingBetweenSlices with the positions: a sign that every second slice is missing."""
     what, bound = "SpacingBetweenSlices differs from the positions by", 100.0 * STATED_GAP_TOLERANCE
     found = measure_stated_gap(stack.slices, stack.positions_mm, stack.line.gap_median_mm)
     if found is None:

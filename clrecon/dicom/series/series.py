@@ -12,6 +12,7 @@ from pathlib import Path
 from clrecon.dicom.headers.slice_header import OtherImage, SeriesIdentity, SliceHeader
 from clrecon.dicom.pixels.stored import StoredPixels
 from clrecon.dicom.pixels.voxels import read_voxels
+from clrecon.dicom.series.census import Census, take_census
 from clrecon.dicom.series.missing_parts import describe_missing_parts
 from clrecon.dicom.series.phases import (
     Places,
@@ -52,6 +53,8 @@ class Series:
         Files and folders that cannot be read and may be or contain slices of it.
     lost : list of str
         Descriptions of missing files that leave no hole: parts of concatenations.
+    census : Census
+        Numbers and counts of all parts of the series.
     number : int
         Place in the listing, from 1.
     patient, study : int
@@ -70,6 +73,7 @@ class Series:
     others: list[OtherImage] = field(default_factory=list)
     corrupt: list[CorruptFile] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
+    census: Census = Census()
     number: int = 0
     patient: int = 0
     study: int = 0
@@ -238,8 +242,9 @@ def group_series(scan: Scan) -> list[Series]:
         slices[_group_key(header)].append(header)
     for image in scan.others:
         others[_group_key(image)].append(image)
+    censuses = take_census(slices, others)
     found = []
-    for uid in {**slices, **others}:
+    for uid, census in censuses.items():
         parts = _split_slices(slices[uid])
         lost = describe_missing_parts(slices[uid])
         for part in parts:
@@ -253,6 +258,8 @@ def group_series(scan: Scan) -> list[Series]:
                 max(stacks, key=lambda part: len(part.headers)).others = images
             else:
                 parts.append(Series(images[0].series, "stack" if kind == "broken" else kind, others=images))
+        for part in parts:
+            part.census = census
         parts.sort(key=lambda part: (part.kind != "stack", -part.count))
         found += parts
     found.sort(key=_listing_key)
