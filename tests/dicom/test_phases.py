@@ -308,7 +308,7 @@ def test_volumes_whose_slices_lie_between_each_other_are_phases(tmp_path, keywor
             "AcquisitionNumber alternates along the stack: maybe several",
         ),
         ({"KVP": lambda k: (80, 120)[k > 3]}, "KVP differs along the stack: maybe parts"),
-        ({"SliceThickness": lambda k: 1.0 + (k == 3)}, "SliceThickness differs along the stack (1 of 7"),
+        ({"SliceThickness": lambda k: 2.0 + (k == 3)}, "SliceThickness differs along the stack (1 of 7"),
         ({"AcquisitionNumber": lambda k: 1 + k // 2}, None),
         ({"AcquisitionNumber": lambda k: k}, None),
     ],
