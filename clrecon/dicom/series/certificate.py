@@ -123,6 +123,11 @@ def _describe_what_was_left(series: Series) -> list[str]:
     return warnings
 
 
+def _describe_identity(series: Series) -> dict[str, Any]:
+    identity = series.identity
+    return {"number": series.number, "uid_hash": hash_uid(identity.uid), "modality": identity.modality}
+
+
 def _describe_phase(series: Series) -> dict[str, Any] | None:
     if series.phase is None or not series.places.phases:
         return None
@@ -187,10 +192,9 @@ def certify(
     lay = {h.patient_position for h in headers}
     gates = judge_series(series, stack, facts, likeness, None if findings is None else findings.gates)
     unsaid = [gate.text for gate in gates if gate.name in SAID_BY_GATES and gate.ok is False]
-    identity = {"number": series.number, "uid_hash": hash_uid(series.identity.uid)}
     return Certificate(
         format="DICOM",
-        series={**identity, "modality": series.identity.modality},
+        series=_describe_identity(series),
         phase=_describe_phase(series),
         slices=len(headers),
         slices_missing=stack.missing,
