@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,12 +27,18 @@ LEAST_LIKENESS = 1.25
 several volumes.  Four real scans, whole and with every 2nd, 3rd and 4th slice: at most 0.58, for periods of 3 and 4 at
 most 0.74 and 0.82; water with noise: 0.99, 1.06, 1.12."""
 PART_LIKENESS = 2.0
-"""The same ratio in the part of the picture where it is largest, with period 2. Those scans: at most 1.47 (slices 17 mm
-apart), at most 0.89 where slices are nearer.  The content of a part matters little: water with noise 1.01."""
+"""The same ratio in parts of the picture, with period 2, from which on `PARTS` of them show several volumes.  Those
+scans: at most 1.47 in any part (slices 17 mm apart), at most 0.89 where slices are nearer.  The content of a part
+matters little: water with noise 1.01."""
+PARTS = 4
+"""Number of parts that must reach it; of fewer, all.  One part alone must reach it along more slices
+(`MOST_ALIKE_PART`), in a long stack in more than one window: a vessel with contrast medium in one of two volumes does.
+A single place, such as a saw cut in bone of a sharp kernel, alternates within one volume too, because artefacts of a
+helical scan turn there."""
 PERIODS = (2, 3, 4)
 MOST_ALIKE, LEAST_ALIKE = 12, 4
 """Number of consecutive slices that must all reach it; of fewer slices all, but at least the second number."""
-LEAST_ALIKE_PART = 6
+MOST_ALIKE_PART, LEAST_ALIKE_PART = 20, 6
 HU_RANGE = (-1000, 2000)
 """Values are limited to this range; beyond are padding and metal.  Sums over a cell then fit 16 bits."""
 CELL, FINE_CELL, COARSE_CELLS = 4, 2, 32
@@ -47,7 +53,7 @@ NOISE_HU2, PART_NOISE_HU2 = 1.0, 25.0
 READERS = 4
 WINDOW, WINDOWS = 32, 3
 """Number of slices in a window, and windows examined, in an evenly spaced stack with more slices: interleaved volumes
-are interleaved from end to end."""
+are interleaved from end to end, so parts of the picture must show it in two windows."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +67,7 @@ class Likeness:
     whole : float
         Ratio over the whole picture; above 1 where neighbours are less alike.
     part : float or None
-        Ratio in the part of the picture where it is largest; None where parts were not examined.
+        Ratio that `PARTS` parts of the picture reach, or one along more slices; None where parts were not examined.
     """
 
     period: int
@@ -82,7 +88,7 @@ class Likeness:
         if self.whole > LEAST_LIKENESS:
             where, times = "neighbouring slices", self.whole
         else:
-            where, times = "somewhere in the picture neighbouring slices", self.part or 0.0
+            where, times = "in parts of the picture neighbouring slices", self.part or 0.0
         other = "the next but one" if self.period == 2 else f"those {self.period} further on"
         return (
             f"{where} are less alike than each is to {other} (differences {times:.3g} times as large): maybe "
@@ -101,8 +107,12 @@ def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool |
     if uneven or count <= WINDOW * WINDOWS:
         return measure_likeness(voxels, parts)
     starts = [(count - WINDOW) * place // (WINDOWS - 1) for place in range(WINDOWS)]
-    found = [measure_likeness(voxels[first : first + WINDOW], parts) for first in starts]
-    return max((one for one in found if one is not None), key=lambda one: one.suspicion, default=None)
+    found = [one for first in starts if (one := measure_likeness(voxels[first : first + WINDOW], parts)) is not None]
+    if not found:
+        return None
+    second = sorted(one.part or 0.0 for one in found)[-2] if parts and len(found) > 1 else None
+    whole = max(found, key=lambda one: one.whole / LEAST_LIKENESS)
+    return replace(whole, part=None if whole.part is None else second)
 
 
 def measure_likeness(voxels: NDArray[Any], parts: bool = True) -> Likeness | None:
@@ -138,7 +148,9 @@ def measure_likeness(voxels: NDArray[Any], parts: bool = True) -> Likeness | Non
     if parts and len(voxels) >= min(PERIODS) + LEAST_ALIKE_PART:
         tiles = [_average(one, PART) for one in differences[:2]]
         if tiles[0].size:
-            part = float(_steadily(_ratios(tiles, PART_NOISE_HU2)).max())
+            ratios = _ratios(tiles, PART_NOISE_HU2)
+            reached = np.sort(_steadily(ratios), axis=None)
+            part = max(float(reached[-min(PARTS, len(reached))]), float(_steadily(ratios, MOST_ALIKE_PART).max()))
     best = max(found, key=lambda one: one.whole)
     if best.whole <= LEAST_LIKENESS:
         best = found[0]
@@ -157,9 +169,9 @@ def _ratios(differences: Sequence[NDArray[np.float32]], noise: float) -> NDArray
     return np.asarray(np.max(nearer, axis=0) / np.maximum(differences[-1], noise))
 
 
-def _steadily(ratios: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the largest ratio that `MOST_ALIKE` consecutive stretches reach, or all if there are fewer."""
-    count = min(MOST_ALIKE, len(ratios))
+def _steadily(ratios: NDArray[np.float32], most: int = MOST_ALIKE) -> NDArray[np.float32]:
+    """Return the largest ratio that `most` consecutive stretches reach, or all if there are fewer."""
+    count = min(most, len(ratios))
     lowest = [np.min(ratios[first : first + count], axis=0) for first in range(len(ratios) - count + 1)]
     return np.asarray(np.max(lowest, axis=0))
 

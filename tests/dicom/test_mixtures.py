@@ -10,7 +10,7 @@ from dicom_series import Plan, write_series
 from clrecon.dicom import list_series, read_volume
 from clrecon.dicom.stack.attributes import alternates
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.sources.likeness import measure_likeness
+from clrecon.sources.likeness import judge_slices, measure_likeness
 
 GAP = 1.25
 EACH = 12
@@ -246,6 +246,26 @@ def test_contrast_medium_in_a_vessel_shows_in_its_part():
     found = measure_likeness(hu)
     assert found.whole < 1.0 and found.part > 2.0 and found.is_mixed
     assert not measure_likeness(hu, parts=False).is_mixed
+
+
+@pytest.mark.parametrize(("along", "places", "mixed"), [(16, 1, False), (16, 3, False), (16, 4, True), (30, 1, True)])
+def test_one_place_alternates_within_one_volume_two_volumes_in_many(along, places, mixed):
+    """Artefacts at a saw cut turn from slice to slice: many slices, or many places, show two volumes."""
+    hu = body(48)[16:].astype(np.int16)  # its outline moves beside the parts that alternate
+    for j, i in [(44, 44), (44, 72), (72, 44), (72, 72)][:places]:  # parts are 32 pixels wide
+        hu[1 : along + 1 : 2, j : j + 12, i : i + 12] += 200
+    found = measure_likeness(hu)
+    assert found.whole < 1.0 and found.is_mixed is mixed
+
+
+@pytest.mark.parametrize(("windows", "mixed"), [(1, False), (2, True)])
+def test_a_part_must_alternate_in_two_windows_of_a_long_stack(windows, mixed):
+    """The windows begin at 0, 48 and 96."""
+    hu = body(48)[16:].astype(np.int16)  # its outline moves beside the part that alternates
+    stack = np.concatenate([hu, hu, hu, hu])
+    stack[1 : 32 + 48 * (windows - 1) : 2, 44:56, 44:56] += 200
+    found = judge_slices(stack, 0.0)
+    assert found.is_mixed is mixed and found.whole < 1.0
 
 
 def test_too_few_slices_or_pixels_say_nothing():
