@@ -21,7 +21,13 @@ from clrecon.operators.rays.slabs import RAYS, RaySlab, entry_slice, plan_ray_sl
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.frame import volume_box
 from clrecon.rendering import Lighting, Rendering
-from clrecon.rendering.looks.window import checked_window, choose_water_window, choose_window, grey_image
+from clrecon.rendering.looks.window import (
+    checked_window,
+    choose_mip_window,
+    choose_water_window,
+    choose_window,
+    grey_image,
+)
 from clrecon.rendering.pictures.styles import Projection, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.progress import Progress, ignore_progress
@@ -210,7 +216,7 @@ class _Job:
             report["left_out"] = left_out
             if not left_out["body"]:
                 report["warnings"].append(_NO_BODY)
-        choose = choose_water_window if is_water else choose_window
+        choose = {"drr": choose_water_window, "mip": choose_mip_window}.get(style.kind, choose_window)
         window = choose(values) if style.window is None else checked_window(style.window)
         report["window_mm_water" if is_water else "window_hu"] = list(window)
         image = grey_image(values, window)

@@ -15,6 +15,7 @@ __all__ = [
     "BONE_WINDOW",
     "WINDOWS",
     "checked_window",
+    "choose_mip_window",
     "choose_water_window",
     "choose_window",
     "grey_image",
@@ -36,6 +37,10 @@ WINDOWS = {
 
 BODY_SHARE = 0.05
 """Least share of the most water along a ray; rays with less meet air, a table or the fold of a blanket, but no body."""
+
+
+BODY_HU = -500.0
+"""Highest HU along a ray below which it meets air, foam or a blanket, but no body."""
 
 
 def checked_window(window: Sequence[float] | str) -> tuple[float, float]:
@@ -99,6 +104,15 @@ def choose_window(values: NDArray[Any]) -> tuple[float, float]:
         return BONE_WINDOW
     low, high = _percentiles(there)
     return (low, high) if high - low >= 1.0 else (low - 0.5, low + 0.5)
+
+
+def choose_mip_window(values: NDArray[Any]) -> tuple[float, float]:
+    """Choose a window as `choose_window` from the rays of a maximum projection that meet the body, else from all.
+
+    Air beside the body would otherwise be black, and soft tissue, which every ray through the body meets, half white.
+    """
+    of_body = values[values >= BODY_HU]
+    return choose_window(of_body if len(of_body) else values)
 
 
 def choose_water_window(values: NDArray[Any]) -> tuple[float, float]:

@@ -188,7 +188,7 @@ class Projection(Style):
     window : (float, float) or str, optional
         Values shown as black and white, in HU or (drr) mm of water, or a name of
         ``clrecon.rendering.looks.window.WINDOWS`` such as "lung"; default: the 1st and the 99th percentile of the
-        picture, in "drr" of the rays that meet the body.
+        picture, in "drr" and "mip" of the rays that meet the body.
     ray_step : float, optional
         mm between samples; default: half the smallest spacing of the volume.
     keep_air : bool

@@ -20,6 +20,7 @@ from raycast_scenes import (
     ways_through,
 )
 
+import clrecon
 from clrecon.geometry import Volume
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
@@ -234,3 +235,17 @@ def test_thin_slabs_between_clip_planes_show_what_is_in_them(cast):
     for mode in ("mip", "minip", "mean"):
         values = cast(volume, mode, camera=camera, size=(8, 8), clip=slab).values
         assert np.abs(values - 210.0).max() <= 5.0 + tolerances.RAY_AXIS_HU
+
+
+def test_the_window_of_mip_is_that_of_the_body(device):
+    """Air and a blanket beside it do not count; without a body all rays do."""
+    voxels = np.full((12, 12, 40), -1000, np.int16)
+    voxels[:, :, 2:8] = -700
+    voxels[:, :, 10:38] = 60
+    voxels[4:8, :, 20:24] = 900
+    picture = clrecon.render(Volume(voxels, np.eye(4)), "mip", size=(80, 40), device=device)
+    low, high = picture.report["window_hu"]
+    assert -500.0 <= low <= 60.0
+    assert 800.0 < high <= 900.0
+    air = clrecon.render(Volume(np.minimum(voxels, -700), np.eye(4)), "mip", size=(80, 40), device=device)
+    assert air.report["window_hu"][0] < -900.0
