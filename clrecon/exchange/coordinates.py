@@ -106,7 +106,8 @@ def _scramble(vertices: NDArray[np.floating]) -> NDArray[np.uint64]:
     """Return a sum of scrambled coordinates: only vertices with equal sums have to be compared in full."""
     mixed = np.zeros(len(vertices), dtype=np.uint64)
     for column in vertices.T:
-        bits = (column + column.dtype.type(0)).view(f"u{column.dtype.itemsize}")  # + 0 turns -0 into 0
+        with np.errstate(invalid="ignore"):  # harmed bits
+            bits = (column + column.dtype.type(0)).view(f"u{column.dtype.itemsize}")  # + 0 turns -0 into 0
         mixed = (mixed ^ bits) * np.uint64(0x9E3779B97F4A7C15)
         mixed ^= mixed >> np.uint64(29)
     return mixed

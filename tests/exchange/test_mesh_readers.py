@@ -294,6 +294,18 @@ def test_a_file_cut_anywhere_is_refused_or_whole(extension: str, tmp_path: Path)
             assert extension == ".obj"
 
 
+def test_harmed_packed_bytes_are_refused(tmp_path: Path) -> None:
+    Mesh(*ball(5.0, 6)).save(tmp_path / "a.3mf")
+    np.savez_compressed(tmp_path / "a.npz", points=ball(5.0, 6)[0])
+    for name, read in (("a.3mf", clrecon.read_mesh), ("a.npz", clrecon.read_points)):
+        data = bytearray((tmp_path / name).read_bytes())
+        place = data.index(b".model" if name == "a.3mf" else b"points.npy", 100 if name == "a.3mf" else 0) + 40
+        data[place : place + 40] = b"\xff" * 40
+        (tmp_path / name).write_bytes(bytes(data))
+        with pytest.raises(RefusedInputError, match="cut or corrupt"):
+            read(tmp_path / name)
+
+
 def check_refused(path: Path, words: str) -> None:
     with pytest.raises(RefusedInputError, match=words) as error:
         clrecon.read_mesh(path)

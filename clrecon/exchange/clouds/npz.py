@@ -17,6 +17,7 @@ would copy each array as a whole.
 from __future__ import annotations
 
 import zipfile
+import zlib
 from math import prod
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -77,7 +78,7 @@ def verify(path: Path, content: PointContent) -> None:
         with zipfile.ZipFile(path) as archive:
             broken = archive.testzip()
             found = {Path(name).stem: _open_array(archive, name) for name in archive.namelist()}
-    except (zipfile.BadZipFile, ValueError, EOFError, OSError) as error:
+    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError) as error:
         raise refuse_file("in the archive", escape_text(str(error)), "a whole archive") from error
     if broken is not None:
         raise refuse_file("in the archive", escape_text(broken), "whole entries")
@@ -120,7 +121,9 @@ def read(path: Path) -> RawCloud:
             for entry in ("normals", "hu", "labels", "ijk", "space", "affine", "iso_value_hu", "certificate"):
                 if entry in entries:
                     found[entry] = _read_array(archive, entries[entry])
-    except (zipfile.BadZipFile, ValueError, EOFError, OSError, NotImplementedError, RuntimeError, MemoryError) as error:
+    except (
+        zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, NotImplementedError, RuntimeError, MemoryError,
+    ) as error:  # fmt: skip
         raise say_cut(name, error) from error
     return _describe(name, found)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import zipfile
+import zlib
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -74,7 +75,7 @@ def read(path: Path) -> RawMesh:
         shapes = _place(model)
     except (
         OSError, EOFError, ValueError, KeyError, OverflowError, MemoryError, NotImplementedError, RuntimeError,
-        zipfile.BadZipFile, expat.ExpatError,
+        zipfile.BadZipFile, zlib.error, expat.ExpatError,
     ) as error:  # fmt: skip
         raise say_cut(name, error) from error
     mesh = shapes.joined()

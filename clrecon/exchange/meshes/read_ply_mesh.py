@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError
 from clrecon.exchange.clouds.raw_cloud import RawCloud, read_remarks, say_cut
 from clrecon.exchange.clouds.read_ply import Element, Header, read_binary, read_header, read_text, skip_to_vertices
-from clrecon.exchange.meshes.raw_mesh import RawMesh
+from clrecon.exchange.meshes.raw_mesh import Part, RawMesh
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
@@ -50,7 +51,18 @@ def read(path: Path) -> RawMesh:
     cloud = RawCloud("PLY", points, found)
     normals = cloud.normals()
     said = read_remarks(header.comments)
-    return RawMesh("PLY", points, triangles, normals, warnings=cloud.warnings, **said)
+    color = _one_color(found)
+    parts = [] if color is None else [Part("", len(triangles), color)]
+    return RawMesh("PLY", points, triangles, normals, warnings=cloud.warnings, parts=parts, **said)
+
+
+def _one_color(columns: Mapping[str, NDArray[Any]]) -> tuple[float, float, float] | None:
+    """Return the colour that all vertices have."""
+    own = [columns.get(name) for name in ("red", "green", "blue")]
+    values = [
+        each[0] / 255.0 for each in own if each is not None and each.dtype == np.uint8 and len(np.unique(each)) == 1
+    ]
+    return (float(values[0]), float(values[1]), float(values[2])) if len(values) == 3 else None
 
 
 def _find_faces(header: Header, vertex: Element, name: str) -> Element:
