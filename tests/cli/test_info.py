@@ -295,7 +295,7 @@ def test_mesh_strict_counts_the_gates_of_the_volume(
         ds.LossyImageCompression = "01"
         ds.save_as(path)
     capsys.readouterr()
-    assert main([*arguments, "--strict", "-q"]) == 8
+    assert main([*arguments, "--strict", "-q"]) == 7
     assert capsys.readouterr().err.startswith("clrecon: error: volume: gate lossless failed: slices with lossy")
     assert main([*arguments, "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
