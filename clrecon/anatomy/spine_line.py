@@ -7,7 +7,7 @@ the path through the slices that agrees best.  The path is the canal where it ag
 it is followed as long as all but the mirror image agrees, see `clrecon.anatomy.spine_ends`.  Each slice's point is then
 moved to the middle of the space that the bone encloses, and the line is smoothed.
 
-The search is meant for the thoracic and lumbar spine of an adult, in a scan whose axes are those of the patient.
+The search is meant for the spine of an adult, in a scan whose axes are those of the patient.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from clrecon.anatomy.spine_cells import CELL_MM, Field, SpineCells, average_cells, disc_mean, grow_cortex, plan_cells
 from clrecon.anatomy.spine_ends import GAP_MM, SpineEnd, follow, look_beyond, missing_traits
-from clrecon.anatomy.spine_traits import BODY_RADIUS, WORTH, measure_likeness
+from clrecon.anatomy.spine_traits import BODY_RADIUS, WORTH, Likeness, measure_likeness
 from clrecon.errors import RefusedInputError
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.volume import Volume
@@ -32,7 +32,10 @@ WORST = 0.6
 """Most that a slice counts against the path, so that one slice with an artefact does not end it."""
 BEND_COST = 0.05
 DEEPER_AHEAD = 1.2
-"""The body is at least this many times deeper in front of the canal than behind it."""
+"""A trunk is at least this many times deeper in front of the canal than behind it; a neck need not be."""
+FORWARD = 0.12
+"""A spine is worth at least so much more than the same scan with front and back exchanged; necks 0.2 to 0.3, trunks 0.4
+to 0.5, lower legs less than 0.08."""
 SHORTEST_MM = 35.0
 SMOOTH_MM = 12.0
 POINT_STEP_MM = 15.0
@@ -52,6 +55,8 @@ class SpineLine:
         Share of the slices of the line whose traits are all sure, see `clrecon.anatomy.spine_traits.SURE`.
     searched_mm : float
         Height of the volume; the line may be shorter.
+    sure_mm : (float, float)
+        Heights between which its slices are sure, but for gaps, z of the upper and the lower end.
     upper, lower : SpineEnd or None
         Its ends: those of the scan, or where it was lost and why; None where only the sure part was asked for.
     """
@@ -59,6 +64,7 @@ class SpineLine:
     points: Float64Array
     sure_share: float
     searched_mm: float
+    sure_mm: tuple[float, float]
     upper: SpineEnd | None = None
     lower: SpineEnd | None = None
 
@@ -112,17 +118,27 @@ def find_spine_line(volume: Volume, *, sure_only: bool = False, progress: Progre
         )
     path = path[begin:end]
     ahead, behind = _depths(cells, path + (0, *likeness.first))
-    if behind is not None and ahead < DEEPER_AHEAD * behind:
+    if behind is not None and ahead < DEEPER_AHEAD * behind and not _faces_forward(cells, likeness, path):
         raise RefusedInputError(
-            f"what looks like a spine has {ahead:.0f} mm of the body in front and {behind:.0f} mm behind: it is none,"
-            " or front and back of the scan are mistaken; give points of the centre line"
+            f"what looks like a spine has {ahead:.0f} mm of the body in front and {behind:.0f} mm behind, and it looks"
+            " as much like one with front and back exchanged: it is none, or the affine of the scan has front and back"
+            " the wrong way round; give points of the centre line"
         )
+    lowest, highest = (float(cells.origin[2] + k * CELL_MM[2]) for k in (path[0, 0], path[-1, 0]))
     ends: list[SpineEnd | None] = [None, None]
     if not sure_only:
         path = follow(likeness, path)
         ends = [look_beyond(cells, likeness, path[place], step) for place, step in ((-1, 1), (0, -1))]
     share = float(likeness.sure[tuple(path.T)].mean())
-    return SpineLine(_centre_points(cells, path + (0, *likeness.first)), share, searched, *ends)
+    return SpineLine(_centre_points(cells, path + (0, *likeness.first)), share, searched, (highest, lowest), *ends)
+
+
+def _faces_forward(cells: SpineCells, likeness: Likeness, path: NDArray[np.int64]) -> bool:
+    """Return whether the slices of a path look less like a spine where front and back of the scan are exchanged."""
+    slices = slice(int(path[0, 0]), int(path[-1, 0]) + 1)
+    exchanged = measure_likeness(SpineCells(np.ascontiguousarray(cells.values[:, ::-1]), cells.origin), lambda _: None)
+    own, other = (one.worth[slices].max(axis=(1, 2)) for one in (likeness, exchanged))
+    return bool(np.median(own - other) >= FORWARD)
 
 
 def _describe_run(cells: SpineCells, run: NDArray[np.int64], searched: float) -> str:

@@ -18,10 +18,9 @@ PARTLY = 8
 _NAMING = "numbers, counted from the head. Look at the picture and name levels with --first T1 or --name-at X,Y,Z=L3"
 
 _EPILOG = """\
-A first guess for the chest and the loin of an adult: look at the picture, and correct the map before it is used, for
+A first guess for the spine of an adult from C3 down: look at the picture, and correct the map before it is used, for
 example in 3D Slicer. A trained segmentation (TotalSegmentator, TotalSpineSeg) is better where there is one. Vertebrae
-of which the search is not sure are left out of the map, each with a warning, and the exit code is 8. No OpenCL device
-is needed.
+of low confidence are left out of the map, each with a warning, and the exit code is 8. No OpenCL device is needed.
 
 examples:
   clrecon vertebrae CT_FOLDER -o spine.nii.gz
@@ -86,13 +85,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="name the level of the uppermost vertebra that is found (T1), and from it all others; without --first and"
         " --name-at they are numbered from the head",
     )
-    group.add_argument(
-        "--keep-unsure", action="store_true", help="write vertebrae of which the search is not sure, too"
-    )
+    group.add_argument("--keep-unsure", action="store_true", help="write vertebrae of low confidence too")
     checks = parser.add_argument_group("checks")
     add_no_clobber(checks)
     add_keep_ids(checks)
-    checks.add_argument("--report", metavar="FILE", help="write vertebrae, sureness, discs and times as JSON")
+    checks.add_argument("--report", metavar="FILE", help="write vertebrae, confidence, discs and times as JSON")
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -127,19 +124,19 @@ def run(options: argparse.Namespace, console: Console) -> int:
         console.say(f"report   {printable(options.report)}")
     for warning in report["warnings"]:
         console.warn(warning)
-    return PARTLY if report["unsure"] else 0
+    return PARTLY if report["low_confidence"] else 0
 
 
 def _describe(report: dict[str, Any]) -> list[str]:
-    rows = [("", "number", "sureness", "height mm", "ml", "")]
+    rows = [("", "number", "confidence", "height mm", "ml", "")]
     for one in report["vertebrae"]:
-        remarks = ("" if one["is_sure"] else "unsure ") + ("" if one["whole"] else "cut by the scan")
-        figures = f"{one['sureness']:.2f}", f"{one['height_mm']:.0f}", f"{one['volume_ml']:.1f}"
+        remarks = ("" if one["is_confident"] else "low confidence ") + ("" if one["whole"] else "cut by the scan")
+        figures = f"{one['confidence']:.2f}", f"{one['height_mm']:.0f}", f"{one['volume_ml']:.1f}"
         rows.append((one["name"], str(one["number"]), *figures, remarks.strip()))
     found = len(report["vertebrae"])
     return [
         f"input    {describe_volume(report['volume'])}",
-        f"found    {found} vertebra{'e' * (found != 1)}, {report['unsure']} unsure,"
+        f"found    {found} vertebra{'e' * (found != 1)}, {report['low_confidence']} of low confidence,"
         f" {count_of(len(report['discs']), 'disc')};"
         f" bone is {report['level_hu']:.0f} HU and more",
         *(f"         {line}" for line in table(rows, right=(1, 2, 3, 4))),

@@ -20,6 +20,14 @@ Planes = tuple[Float64Array, Float64Array]
 
 FRONT_MM, BEHIND_MM, BESIDE_MM = 46.0, 58.0, 42.0
 """Bone farther than this from the canal belongs to no vertebra."""
+RIB_MM = (55.0, 68.0)
+"""Bone so far beside the canal is rib, shoulder blade or pelvis, and so is what it joins in `Part.beside`: transverse
+processes reach 35 to 38 mm at T1, 23 to 30 at T12 and 40 to 50 at L3 (Panjabi et al., Spine 16 and 17, 1991, 1992)."""
+PROCESS_MM, NECK_OFF_MM, NECK_AHEAD_MM, NECK_SLOPE = 38.0, 2.0, 6.0, 1.1
+"""Ribs may lie beyond the first; and beside a body, in front of the transverse process, from the second beyond its wall
+on: there the process lies so far in front of the canal, and farther out it runs back by the last, mm a mm."""
+WAIST_MM = 30
+"""The wall of a body is the widest within so much above and below: its waist is narrower, and so is the sacrum."""
 BODY_MARGIN_MM = 5.0
 """In front of the canal bone farther than this from the walls of the bodies is rib, vessel or pelvis."""
 PEDICLE_MM = 8.0
@@ -29,6 +37,8 @@ CANAL_MM = 4.0
 """Holes that come so near to the middle of the canal are the canal and stay open."""
 MARKER_AHEAD_MM, MARKER_OFF_MM = 6.0, 2.0
 """A marker lies so far in front of the canal, within the walls of the body, and off the planes of the discs."""
+PEEL_MM = 1.5
+"""Voxels of the rim that are less than half as bright as the bone beside them are peeled off, no deeper than this."""
 BRIGHT_HU = 600.0
 BRIGHT_MM = 0.7
 ARCH_ASIDE_MM, SPINE_ASIDE_MM = 26.0, 12.0
@@ -59,9 +69,11 @@ class Part:
     place : ndarray, shape (nk, nj, ni), float32
         Place along the course of that plane.
     within : ndarray, shape (nk, nj, ni), bool
-        Near enough to the canal to be a vertebra.
+        Near enough to the canal to be a vertebra, or a rib beside it.
     body : ndarray, shape (nk, nj, ni), bool
         Within the walls of the bodies.
+    beside : ndarray, shape (nk, nj, ni), bool
+        Where ribs lie: beside the bodies, in front of the transverse processes, and beyond them.
     spacing : (dk, dj, di)
         mm.
     """
@@ -73,6 +85,7 @@ class Part:
     place: NDArray[np.float32]
     within: Mask
     body: Mask
+    beside: Mask
     spacing: tuple[float, float, float]
 
     @property
@@ -99,7 +112,9 @@ def planes_of(bounds: list[Bound], course: Course, looks: Looks) -> Planes:
 
 def cut_part(volume: Volume, course: Course, looks: Looks) -> Part:
     """Cut out the box of the volume that can hold the vertebrae."""
-    sides = [(x, y) for x in (-BESIDE_MM, BESIDE_MM) for y in (-FRONT_MM, BEHIND_MM)]
+    from scipy.ndimage import maximum_filter1d
+
+    sides = [(x, y) for x in (-RIB_MM[1], RIB_MM[1]) for y in (-FRONT_MM, BEHIND_MM)]
     corners = np.concatenate([course.canal + np.array([x, y, 0.0]) for x, y in sides])
     ijk = volume.lps_to_ijk(corners)
     low = np.clip(np.floor(ijk.min(axis=0)).astype(int), 0, np.array(volume.shape_ijk) - 1)
@@ -115,9 +130,11 @@ def cut_part(volume: Volume, course: Course, looks: Looks) -> Part:
         place=np.empty(values.shape, np.float32),
         within=np.empty(values.shape, bool),
         body=np.empty(values.shape, bool),
+        beside=np.empty(values.shape, bool),
         spacing=(dk, dj, di),
     )
     order = np.argsort(course.canal[:, 2], kind="stable")
+    widest = maximum_filter1d(looks.side_mm, 2 * WAIST_MM + 1)
     heights, numbers = course.canal[order, 2], np.arange(len(course))
     for k in range(len(values)):
         places = part.points(volume, k)
@@ -128,11 +145,14 @@ def cut_part(volume: Volume, course: Course, looks: Looks) -> Part:
             at = nearest + (off * course.down[nearest]).sum(axis=-1)
         ahead, aside = ((off * way[nearest]).sum(axis=-1) for way in (course.ahead, course.aside))
         part.ahead[k], part.aside[k], part.place[k] = ahead, aside, np.clip(at, 0, len(course) - 1)
-        front, side = np.interp(at, numbers, looks.front_mm), np.interp(at, numbers, looks.side_mm)
-        near = (ahead <= FRONT_MM) & (ahead >= -BEHIND_MM) & (np.abs(aside) <= BESIDE_MM)
+        front, side = np.interp(at, numbers, looks.front_mm), np.interp(at, numbers, widest)
+        near = (ahead <= FRONT_MM) & (ahead >= -BEHIND_MM) & (np.abs(aside) <= RIB_MM[1])
         near &= (at >= -1.0) & (at <= len(course))
         walls = (ahead <= front + BODY_MARGIN_MM) & (np.abs(aside) <= side + BODY_MARGIN_MM)
         part.within[k] = near & (walls | (ahead < PEDICLE_MM))
+        off = np.abs(aside) - side
+        before = (off > NECK_OFF_MM) & (ahead > NECK_AHEAD_MM - NECK_SLOPE * off)
+        part.beside[k] = near & (before | (np.abs(aside) > PROCESS_MM))
         part.body[k] = near & walls & (ahead >= MARKER_AHEAD_MM)
     return part
 
@@ -148,10 +168,13 @@ def _ball(spacing: tuple[float, float, float]) -> Mask:
 
 
 def fill_bone(part: Part, level: float) -> Mask:
-    """Return the bone of a part as a solid: from the level on, closed, without holes in its slices but the canal."""
+    """Return the bone of a part: from the level on, and as far as vertebrae reach closed, without holes in its slices
+    but the canal.
+    """
     from scipy.ndimage import binary_closing, binary_fill_holes, label
 
-    raw = (part.values >= level) & part.within
+    dense = (part.values >= level) & part.within
+    raw = dense & (np.abs(part.aside) <= BESIDE_MM)
     ball = _ball(part.spacing)
     margins = [(n // 2, n // 2) for n in ball.shape]
     inner = tuple(slice(n, n + size) for (n, _), size in zip(margins, raw.shape, strict=True))
@@ -163,12 +186,23 @@ def fill_bone(part: Part, level: float) -> Mask:
         fills[0] = False
         fills[np.unique(holes[tube])] = False
         plane |= fills[holes]
-    return np.asarray(bone & part.within)
+    return np.asarray((bone & part.within & (np.abs(part.aside) <= BESIDE_MM)) | dense)
+
+
+def _find_ribs(part: Part, bone: Mask) -> Mask:
+    """Return the bone beside the bodies that joins bone far beside them."""
+    from scipy.ndimage import label
+
+    beside, count = label(bone & part.beside)
+    is_rib = np.zeros(count + 1, bool)
+    is_rib[np.unique(beside[np.abs(part.aside) >= RIB_MM[0]])] = True
+    is_rib[0] = False
+    return np.asarray(is_rib[beside])
 
 
 def divide(
     part: Part, bone: Mask, bounds: list[Bound], planes: Planes, volume: Volume
-) -> tuple[NDArray[np.uint8], Float64Array]:
+) -> tuple[NDArray[np.uint8], Float64Array, Float64Array]:
     """Divide bone into the pieces between planes.
 
     Two watersheds from the same markers are compared.  That of the distance field keeps arches together that touch in
@@ -182,10 +216,14 @@ def divide(
         0 outside of bone; 1 above the first plane, and so on.
     doubtful : ndarray, shape (pieces + 1,), float64
         Share of each piece that the two watersheds give to different ones.
+    rim : ndarray, shape (pieces + 1,), float64
+        Share of each piece in voxels of its surface: of those partial volume makes the place uncertain.
     """
     from scipy.ndimage import distance_transform_edt, gaussian_filter
     from skimage.segmentation import watershed
 
+    ribs = _find_ribs(part, bone)
+    bone = bone & (np.abs(part.aside) <= BESIDE_MM)
     markers = _mark(part, bone, planes, volume)
     ridge = _ridges(part, bounds)
     depth = distance_transform_edt(bone, sampling=part.spacing)
@@ -193,9 +231,41 @@ def divide(
     bright = gaussian_filter(np.clip(part.values, 0.0, BRIGHT_HU), [BRIGHT_MM / step for step in part.spacing])
     by_brightness = watershed(RIDGE_HU * ridge - bright, markers, mask=bone)
     pieces = _bound(part, _settle(part, by_depth, by_brightness, bounds), bounds, planes, volume)
-    count = np.bincount(pieces.ravel(), minlength=len(bounds) + 2)
-    differ = np.bincount(pieces[by_depth != by_brightness], minlength=len(bounds) + 2)
-    return pieces, differ / np.maximum(count, 1)
+    pieces[ribs] = 0
+    pieces[~_peel(part, pieces > 0)] = 0
+    count, differ, rim = (
+        np.bincount(pieces[chosen], minlength=len(bounds) + 2)
+        for chosen in (pieces >= 0, by_depth != by_brightness, _find_rim(pieces))
+    )
+    return pieces, differ / np.maximum(count, 1), rim / np.maximum(count, 1)
+
+
+def _find_rim(pieces: NDArray[np.uint8]) -> Mask:
+    """Return the voxels beside one of another piece, or of none, or at the end of the volume."""
+    inner = np.ones(pieces.shape, bool)
+    for axis in range(3):
+        ours, inside = np.moveaxis(pieces, axis, 0), np.moveaxis(inner, axis, 0)
+        alike = ours[1:] == ours[:-1]
+        inside[0] = inside[-1] = False
+        inside[1:] &= alike
+        inside[:-1] &= alike
+    return ~inner
+
+
+def _peel(part: Part, bone: Mask) -> Mask:
+    """Return bone without the rim that partial volume and closing have added: the edge is where HU fall by half."""
+    from scipy.ndimage import binary_erosion, maximum_filter1d, minimum_filter1d
+
+    sizes = [2 * max(1, int(PEEL_MM / step + 1e-6)) + 1 for step in part.spacing]
+    brightest, darkest = part.values.copy(), part.values.copy()
+    for axis, size in enumerate(sizes):  # along the three axes alone: across the corner lies other bone
+        np.maximum(brightest, maximum_filter1d(part.values, size, axis=axis), out=brightest)
+        np.minimum(darkest, minimum_filter1d(part.values, size, axis=axis), out=darkest)
+    dim = part.values < 0.5 * (brightest + darkest)
+    for _ in range(max(1, round(PEEL_MM / min(part.spacing)))):
+        rim = bone & ~binary_erosion(bone, border_value=1)
+        bone = bone & ~(rim & dim)
+    return bone
 
 
 def _bound(

@@ -1,4 +1,4 @@
-"""What the search for vertebrae found: the label map, each vertebra with its sureness, the discs, a middle plane."""
+"""What the search for vertebrae found: the label map, each vertebra with its confidence, the discs, a middle plane."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Vertebra(Record):
     number : int
         Its number in the label map.
     name : str
-    sureness : float
-        0 to 1, the product of what was looked at; below 0.5 it is unsure.
-    is_sure : bool
+    confidence : float
+        The overlap (Dice) with the true vertebra that is to be expected, see docs/vertebrae.md; below 0.5 it is low.
+    is_confident : bool
     doubts : list of str
-        What is wrong with an unsure one.
+        What is wrong with one of low confidence.
     whole : bool
         False where the scan cuts it.
     centre_mm : list of float
@@ -39,8 +39,8 @@ class Vertebra(Record):
 
     number: int
     name: str
-    sureness: float
-    is_sure: bool
+    confidence: float
+    is_confident: bool
     doubts: list[str]
     whole: bool
     centre_mm: list[float]
@@ -60,7 +60,7 @@ class MiddlePlane(Message):
         HU, columns 1 mm apart; NaN outside of the scan.  Sagittal: the front is on the left.  Coronal: through the
         bodies, the patient's right is on the left.
     sagittal_labels, coronal_labels : ndarray, shape (n, columns), int32
-        Numbers of the vertebrae there, unsure ones included.
+        Numbers of the vertebrae there, those of low confidence included.
     canal_column, middle_column : int
         Column of the canal in the sagittal picture, and of the canal in the coronal one.
     lines : list of ((row, column), (row, column))
@@ -86,7 +86,7 @@ class VertebraSplit(Message):
     Attributes
     ----------
     labels : LabelMap
-        On the grid of the scan.  Sure vertebrae; unsure ones too where they are to be kept.
+        On the grid of the scan.  Those of low confidence are in it only where they are to be kept.
     vertebrae : list of Vertebra
         All that were found, from the head downwards.
     discs_mm : ndarray, shape (m, 3), float64
@@ -109,6 +109,6 @@ class VertebraSplit(Message):
     plane: MiddlePlane
 
     @property
-    def unsure(self) -> list[Vertebra]:
-        """The vertebrae of which the search is not sure."""
-        return [one for one in self.vertebrae if not one.is_sure]
+    def low_confidence(self) -> list[Vertebra]:
+        """The vertebrae of low confidence."""
+        return [one for one in self.vertebrae if not one.is_confident]

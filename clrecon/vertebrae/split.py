@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clrecon.anatomy.spine_line import find_spine_line
+from clrecon.anatomy.spine_line import SpineLine, find_spine_line
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.affine import Float64Array, checked_points
 from clrecon.geometry.volume import Volume
 from clrecon.labels import LabelMap
 from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.text import count_of
 from clrecon.system.wording import name_parameter
-from clrecon.vertebrae.course import AHEAD_MM, ASIDE_MM, Course, Field, follow_canal, sample_course
+from clrecon.vertebrae.course import AHEAD_MM, ASIDE_MM, BEYOND_MM, Course, Field, follow_canal, sample_course
 from clrecon.vertebrae.discs import (
     BODY_BACK_MM,
     TILTS_DEG,
@@ -29,7 +30,7 @@ from clrecon.vertebrae.discs import (
     end_of_bone,
     look_at_bodies,
 )  # fmt: skip
-from clrecon.vertebrae.judge import SURE, Piece, beside_share, judge, weigh
+from clrecon.vertebrae.judge import CONFIDENT, Piece, beside_share, judge, weigh
 from clrecon.vertebrae.naming import check_landmark, name_levels
 from clrecon.vertebrae.regions import cut_part, divide, fill_bone, planes_of
 from clrecon.vertebrae.result import MiddlePlane, Vertebra, VertebraSplit
@@ -45,7 +46,7 @@ CUT_MM = 8.0
 WINGS = 0.25
 """Share of bone beside a body from which on it is the sacrum's."""
 SEED_TO_CANAL_MM = 24.0
-ARCH_BEHIND_MM, ARCH_ASIDE_MM = 16.0, 8.0
+ARCH_BEHIND_MM, ARCH_ASIDE_MM = 13.0, 8.0
 """The spinous process lies so far behind the canal, within so much to either side."""
 
 
@@ -57,7 +58,7 @@ class _Found:
     scan: Field
     looks: Looks
     bounds: list[Bound]
-    usual: float
+    usual: NDArray[np.float64]
 
 
 def split_vertebrae(
@@ -72,7 +73,7 @@ def split_vertebrae(
 ) -> VertebraSplit:
     """Make a first guess of where each vertebra is, without a label map.
 
-    Meant for the thoracic and lumbar spine of an adult in CT.  It is a starting point for corrections by hand; a
+    Meant for the spine of an adult from C3 down in CT.  It is a starting point for corrections by hand; a
     trained segmentation is better.
 
     Parameters
@@ -91,7 +92,7 @@ def split_vertebrae(
         The level of the uppermost vertebra that is found (``"T1"``), cut or not: the others are named from there, as
         with ``name_at``.  Without both they are numbered from the head.
     keep_unsure : bool
-        True: the label map has vertebrae of which the search is not sure, too.
+        True: the label map has vertebrae of low confidence too.
     progress : callable, optional
         Called as ``progress("canal" or "vertebrae", steps done, steps)``.
 
@@ -104,7 +105,7 @@ def split_vertebrae(
     UsageError
         A parameter is impossible, ``name_at`` is in no vertebra, or there are more vertebrae than levels to name.
     RefusedInputError
-        No spine, fewer than two discs, or no vertebra of which the search is sure.
+        No spine, fewer than two discs, or all vertebrae are of low confidence.
     """
     progress = progress or ignore_progress
     _check(volume, level)
@@ -121,16 +122,16 @@ def split_vertebrae(
     bone = fill_bone(part, hu)
     progress("vertebrae", 2, 4)
     planes = planes_of(found.bounds, found.course, found.looks)
-    pieces, doubtful = divide(part, bone, found.bounds, planes, volume)
+    pieces, doubtful, rim = divide(part, bone, found.bounds, planes, volume)
     progress("vertebrae", 3, 4)
     voxel_ml = float(abs(np.linalg.det(volume.affine[:3, :3])) / 1000.0)
     behind = pieces[(part.ahead < -ARCH_BEHIND_MM) & (np.abs(part.aside) < ARCH_ASIDE_MM)]
     arches = np.asarray(voxel_ml * np.bincount(behind, minlength=len(found.bounds) + 2), dtype=np.float64)
-    spans, left_out = _spans(found, pieces, doubtful, arches, voxel_ml, hu)
+    spans, left_out = _spans(found, pieces, doubtful, rim, arches, voxel_ml, hu)
     place = 0 if landmark is None else _place_of(landmark, spans, found, volume, part.first, pieces)
     names = name_levels(len(spans), None if level_name is None else (place, level_name))
     vertebrae = _judge_all(spans, names, found)
-    kept = {one.number: one.name for one in vertebrae if one.is_sure or keep_unsure}
+    kept = {one.number: one.name for one in vertebrae if one.is_confident or keep_unsure}
     if not kept:
         raise RefusedInputError(_describe_refusal(vertebrae, left_out))
     every = np.zeros(len(found.bounds) + 2, np.uint8)  # number of each piece
@@ -163,9 +164,8 @@ def _checked_seeds(seeds: ArrayLike) -> Float64Array:
 def _canal_points(volume: Volume, seeds: Float64Array | None, progress: Progress) -> Float64Array:
     """Return the middle of the canal; with seeds, where it is not found, it lies behind them."""
     try:
-        return find_spine_line(
-            volume, sure_only=True, progress=lambda _, done, total: progress("canal", done, total)
-        ).points
+        line = find_spine_line(volume, progress=lambda _, done, total: progress("canal", done, total))
+        return _without_short_ends(line)
     except RefusedInputError as error:
         if seeds is not None:
             return np.asarray(seeds + np.array([0.0, SEED_TO_CANAL_MM, 0.0]))
@@ -173,6 +173,17 @@ def _canal_points(volume: Volume, seeds: Float64Array | None, progress: Progress
         raise RefusedInputError(
             f"{what}; no vertebrae without it: give a point in each of them ({name_parameter('seeds', 'X,Y,Z')})"
         ) from error
+
+
+def _without_short_ends(line: SpineLine) -> Float64Array:
+    """Return the points of a line without ends that are not sure and so short that going straight on is better."""
+    heights = line.points[::-1, 2]
+    upper, lower = line.sure_mm
+    first = upper if heights[-1] - upper < BEYOND_MM else heights[-1]
+    last = lower if lower - heights[0] < BEYOND_MM else heights[0]
+    inner = heights[(heights > last + 1.0) & (heights < first - 1.0)]
+    kept = np.array([last, *inner, first])[::-1]
+    return np.stack([np.interp(kept, heights, axis) for axis in line.points[::-1].T], axis=1)
 
 
 def _find_discs(volume: Volume, line: Float64Array, seeds: Float64Array | None) -> _Found:
@@ -193,8 +204,8 @@ def _find_discs(volume: Volume, line: Float64Array, seeds: Float64Array | None) 
             f" give a point in each vertebra ({name_parameter('seeds', 'X,Y,Z')})"
         )
     gaps = [float(b.at - a.at) for a, b in itertools.pairwise(bounds)] or [30.0]
-    first = end_of_bone(looks, bounds[0], gaps[0], -1, 0.5 * usual)
-    last = end_of_bone(looks, bounds[-1], gaps[-1], 1, 0.5 * usual)
+    first = end_of_bone(looks, bounds[0], gaps[0], -1)
+    last = end_of_bone(looks, bounds[-1], gaps[-1], 1)
     bounds = [*([first] if first else []), *bounds, *([last] if last else [])]
     return _Found(course, scan, looks, bounds, usual)
 
@@ -215,6 +226,7 @@ def _spans(
     found: _Found,
     pieces: NDArray[np.uint8],
     doubtful: Float64Array,
+    rim: Float64Array,
     arches: Float64Array,
     voxel_ml: float,
     level: float,
@@ -238,7 +250,15 @@ def _spans(
         if end <= begin:
             continue
         piece = Piece(
-            upper, lower, begin, end, float(volumes[n + 1]), share, float(doubtful[n + 1]), float(arches[n + 1])
+            upper,
+            lower,
+            begin,
+            end,
+            volume_ml=float(volumes[n + 1]),
+            largest_share=share,
+            doubtful_share=float(doubtful[n + 1]),
+            rim_share=float(rim[n + 1]),
+            arch_ml=float(arches[n + 1]),
         )
         reason = _no_vertebra(piece, found, gaps, level)
         if reason is None:
@@ -289,18 +309,18 @@ def _place_of(
 def _judge_all(spans: list[tuple[int, Piece]], names: dict[int, str], found: _Found) -> list[Vertebra]:
     vertebrae = []
     for n, ((_, piece), (number, name)) in enumerate(zip(spans, names.items(), strict=True)):
-        beside = [spans[m][1] for m in (n - 1, n + 1) if 0 <= m < len(spans)]
+        beside = [spans[m][1] for m in (n - 2, n - 1, n + 1, n + 2) if 0 <= m < len(spans)]
         gaps = [float(one.end - one.begin) for one in beside if one.whole and _between_discs(one)]
         traits = judge(piece, gaps if _between_discs(piece) else [], found.scan, found.looks, found.course, found.usual)
-        sureness, doubts = weigh(traits)
+        confidence, doubts = weigh(traits)
         middle = (piece.begin + piece.end) // 2
         centre = found.course.canal[middle] + found.looks.middle_mm[middle] * found.course.ahead[middle]
         vertebrae.append(
             Vertebra(
                 number=number,
                 name=name,
-                sureness=round(sureness, 3),
-                is_sure=sureness >= SURE,
+                confidence=round(confidence, 3),
+                is_confident=confidence >= CONFIDENT,
                 doubts=doubts,
                 whole=piece.whole,
                 centre_mm=[round(float(value), 2) for value in centre],
@@ -320,9 +340,10 @@ def _describe_refusal(vertebrae: list[Vertebra], left_out: list[str]) -> str:
         return f"no vertebra was found: {'; '.join(left_out) or 'nothing lies between two discs'}"
     first = vertebrae[0]
     return (
-        f"of {len(vertebrae)} vertebra{'e' * (len(vertebrae) > 1)} that were found none is sure ({first.name}:"
-        f" {'; '.join(first.doubts)}): give a point in each ({name_parameter('seeds', 'X,Y,Z')}), or keep them"
-        f" ({name_parameter('keep_unsure', True)}) and look at the picture"
+        f"none of the {count_of(len(vertebrae), 'vertebra', 'vertebrae')} found has a confidence of {CONFIDENT:g}"
+        f" or more ({first.name} {first.confidence:.2f}: {'; '.join(first.doubts)}): give a point in each"
+        f" ({name_parameter('seeds', 'X,Y,Z')}), or keep them ({name_parameter('keep_unsure', True)}) and look at the"
+        " picture"
     )
 
 
@@ -335,7 +356,7 @@ def _as_map(
 
 
 def _middle_plane(volume: Volume, found: _Found, spans: list[tuple[int, Piece]], labels: LabelMap) -> MiddlePlane:
-    """Sample the scan and all labels, unsure ones too, in the straightened middle plane and through the bodies."""
+    """Sample the scan and all labels in the straightened middle plane and through the bodies."""
     course, looks = found.course, found.looks
     ahead = np.arange(-58.0, AHEAD_MM[-1])
     sagittal = sample_course(volume, course, ahead, np.zeros(1))[:, ::-1, 0]

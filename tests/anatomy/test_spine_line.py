@@ -82,6 +82,16 @@ def test_how_the_voxels_are_ordered_and_how_the_patient_lies_does_not_matter(pha
     check_canal(find_spine_line(sagittal), canal)
 
 
+def test_a_canal_with_more_of_the_body_behind_it_than_in_front_is_found(phantom):
+    """As in a neck: 55 mm in front of the middle of the canal, and soft tissue as far back as the scan goes."""
+    volume, canal = phantom
+    row = round(float(volume.lps_to_ijk([canal.mean(axis=0)])[0, 1]))
+    voxels = np.array(volume.voxels)
+    voxels[:, : row - 30] = -1000
+    voxels[:, row:-8][voxels[:, row:-8] < -200] = 40
+    check_canal(find_spine_line(Volume(voxels, volume.affine)), canal)
+
+
 def test_uneven_slices_are_where_they_are(phantom):
     volume, canal = phantom
     kept = np.flatnonzero(np.arange(60) % 4 != 1)

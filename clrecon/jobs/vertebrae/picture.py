@@ -20,7 +20,7 @@ PIXELS_PER_MM = 3
 WINDOW_HU = (-150.0, 650.0)
 TINT = 0.35
 """Share of a vertebra's colour in its pixels."""
-UNSURE_COLOR = (255, 40, 40)
+LOW_COLOR = (255, 40, 40)
 LINE_COLOR = (255, 230, 0)
 TEXT_MM = 6.0
 NAMES_MM = 62
@@ -28,10 +28,10 @@ NAMES_MM = 62
 
 
 def draw_vertebrae(split: VertebraSplit) -> bytes:
-    """Return the picture as PNG: from the side, names and sureness, and from the front.
+    """Return the picture as PNG: from the side, names and confidence, and from the front.
 
     The spine is straightened along the canal; a row is a millimetre of it.  Planes between vertebrae are yellow,
-    vertebrae have colours of their own, and unsure ones are hatched in red.
+    vertebrae have colours of their own, and those of low confidence are hatched in red.
     """
     load_pillow()
     from PIL import Image, ImageDraw
@@ -39,9 +39,9 @@ def draw_vertebrae(split: VertebraSplit) -> bytes:
     plane = split.plane
     colors = (255 * distinct_colors(len(split.vertebrae))).astype(np.uint8)
     shades = {one.number: np.array(shade) for one, shade in zip(split.vertebrae, colors, strict=True)}
-    unsure = [one.number for one in split.unsure]
-    left = _tinted(plane.sagittal, plane.sagittal_labels, shades, unsure)
-    right = _tinted(plane.coronal, plane.coronal_labels, shades, unsure)
+    doubted = [one.number for one in split.low_confidence]
+    left = _tinted(plane.sagittal, plane.sagittal_labels, shades, doubted)
+    right = _tinted(plane.coronal, plane.coronal_labels, shades, doubted)
     gap = np.zeros((len(left), NAMES_MM * PIXELS_PER_MM, 3), np.uint8)
     picture = Image.fromarray(np.concatenate([left, gap, right], axis=1))
     pen = ImageDraw.Draw(picture)
@@ -53,8 +53,10 @@ def draw_vertebrae(split: VertebraSplit) -> bytes:
         pen.line([at, (picture.width, at[1])], fill=LINE_COLOR, width=1)
     font = load_font(TEXT_MM * PIXELS_PER_MM)
     for one, row in zip(split.vertebrae, split.plane.rows, strict=True):
-        text = f"{one.name}  {one.sureness:.2f}" + ("" if one.is_sure else "  unsure") + ("" if one.whole else "  cut")
-        color = tuple(int(value) for value in shades[one.number]) if one.is_sure else UNSURE_COLOR
+        text = (
+            f"{one.name}  {one.confidence:.2f}" + ("" if one.is_confident else "  low") + ("" if one.whole else "  cut")
+        )
+        color = tuple(int(value) for value in shades[one.number]) if one.is_confident else LOW_COLOR
         pen.text((left.shape[1] + 6, (row + 0.5) * PIXELS_PER_MM), text, color, font, "lm")
     stream = BytesIO()
     picture.save(stream, "PNG")
@@ -62,7 +64,7 @@ def draw_vertebrae(split: VertebraSplit) -> bytes:
 
 
 def _tinted(
-    values: NDArray[np.float32], labels: NDArray[np.int32], shades: dict[int, NDArray[np.uint8]], unsure: list[int]
+    values: NDArray[np.float32], labels: NDArray[np.int32], shades: dict[int, NDArray[np.uint8]], doubted: list[int]
 ) -> NDArray[np.uint8]:
     """Return grey values with the colours of the vertebrae over them, enlarged."""
     low, high = WINDOW_HU
@@ -73,8 +75,8 @@ def _tinted(
     rows, columns = np.indices(numbers.shape)
     for number, shade in shades.items():
         own = numbers == number
-        if number in unsure:
+        if number in doubted:
             own &= (rows + columns) % 12 < 4
-            shade = np.array(UNSURE_COLOR)
+            shade = np.array(LOW_COLOR)
         picture[own] = (1.0 - TINT) * picture[own] + TINT * shade
     return np.asarray(np.rint(picture), dtype=np.uint8)

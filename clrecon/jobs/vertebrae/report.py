@@ -27,8 +27,8 @@ class VertebraeReport(Record):
     ----------
     vertebrae : list of Vertebra
         All that were found, from the head downwards, see `clrecon.vertebrae.result.Vertebra`.
-    unsure : int
-        How many of them are unsure.
+    low_confidence : int
+        How many of them have a confidence below 0.5.
     written : int
         How many the label map has.
     discs : list of dict
@@ -46,7 +46,7 @@ class VertebraeReport(Record):
     """
 
     vertebrae: list[Any]
-    unsure: int
+    low_confidence: int
     written: int
     discs: list[dict[str, list[float]]]
     left_out: list[str]
@@ -70,17 +70,20 @@ def describe_split(
     """Describe the result of a job."""
     certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
     told = [str(warning) for warning in certificate.pop("warnings", [])]
-    fate = "it is in the label map all the same" if settings.keep_unsure else "it is not in the label map"
-    told += [f"{one.name} is unsure ({one.sureness:.2f}), {fate}: {'; '.join(one.doubts)}" for one in split.unsure]
-    if settings.name_at is not None and split.unsure:
-        told.append("names are counted past vertebrae that are unsure: check them with the picture")
+    fate = "is in the label map all the same" if settings.keep_unsure else "is not in the label map"
+    told += [
+        f"{one.name} has low confidence ({one.confidence:.2f}) and {fate}: {'; '.join(one.doubts)}"
+        for one in split.low_confidence
+    ]
+    if (settings.name_at or settings.first) is not None and split.low_confidence:
+        told.append("names are counted past vertebrae of low confidence: check them with the picture")
     rounded = [
         {"centre_mm": [round(float(v), 2) for v in centre], "normal": [round(float(v), 4) for v in normal]}
         for centre, normal in zip(split.discs_mm, split.disc_normals, strict=True)
     ]
     return VertebraeReport(
         vertebrae=split.vertebrae,
-        unsure=len(split.unsure),
+        low_confidence=len(split.low_confidence),
         written=len(split.labels.numbers),
         discs=rounded,
         left_out=split.left_out,

@@ -29,7 +29,7 @@ class VertebraeSettings(Selection):
     first : str, optional
         Level of the uppermost vertebra that is found; not together with `name_at`.
     keep_unsure : bool
-        Write vertebrae of which the search is not sure, too.
+        Write vertebrae of low confidence too.
     keep_ids : bool
         Write the hashes of the UIDs of series and frame of reference into the report.
 

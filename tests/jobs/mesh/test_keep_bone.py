@@ -104,7 +104,7 @@ def test_the_component_round_the_spinal_canal_is_kept_where_no_wall_tells(
     """Bone without a compact wall, poor in mineral or in thick slices."""
     from clrecon.anatomy import spine_line
 
-    line = spine_line.SpineLine(np.array([[15.0, 21.0, 30.0], [15.0, 21.0, 6.0]]), 1.0, 36.0)
+    line = spine_line.SpineLine(np.array([[15.0, 21.0, 30.0], [15.0, 21.0, 6.0]]), 1.0, 36.0, (30.0, 6.0))
     monkeypatch.setattr(spine_line, "find_spine_line", lambda volume, sure_only: line)
     read(make_scan(bone=330.0))
     report = run(tmp_path, device, iso_value=200.0, keep="bone")

@@ -43,7 +43,7 @@ def test_a_run_writes_map_picture_and_report(written: Path) -> None:
     labels = read_labels(written / "a.nii.gz")
     assert labels.names == {1: "vertebra_1", 2: "vertebra_2", 3: "vertebra_3"}
     assert [one["number"] for one in report["vertebrae"]] == list(labels.numbers)
-    assert (report["unsure"], report["written"], len(report["discs"])) == (0, 3, 2)
+    assert (report["low_confidence"], report["written"], len(report["discs"])) == (0, 3, 2)
     voxel_ml = 2.2 * 2.2 * 2.5 / 1000
     for one in report["vertebrae"]:
         assert one["volume_ml"] == pytest.approx(labels.counts[one["number"]] * voxel_ml, rel=1e-3)
@@ -54,6 +54,20 @@ def test_a_run_writes_map_picture_and_report(written: Path) -> None:
     yellow = (np.abs(pixels - [255, 230, 0]).max(axis=2) < 10).any(axis=1)
     rows = np.flatnonzero(yellow)
     assert len(np.split(rows, np.flatnonzero(np.diff(rows) > 20) + 1)) >= 2  # one line a disc at least
+
+
+def test_front_and_back_come_from_the_affine_where_no_patient_position_is_stated(
+    scan: Path, written: Path, tmp_path: Path
+) -> None:
+    silent = tmp_path / "silent"
+    silent.mkdir()
+    for path in scan.glob("*.dcm"):
+        header = pydicom.dcmread(path)
+        del header.PatientPosition
+        header.save_as(silent / path.name)
+    assert read_volume(silent).report["patient_position"] is None
+    assert main(["vertebrae", str(silent), "-o", str(tmp_path / "a.nii.gz"), "-q"]) == 0
+    assert np.array_equal(read_labels(tmp_path / "a.nii.gz").voxels, read_labels(written / "a.nii.gz").voxels)
 
 
 def test_without_a_landmark_the_command_says_how_to_name_levels(
@@ -90,24 +104,32 @@ def test_the_segmentation_is_the_same_map(scan: Path, written: Path, tmp_path: P
     assert str(pydicom.dcmread(path).PatientName) == "" and b"PHANTOM" not in path.read_bytes()
 
 
-def test_unsure_vertebrae_are_left_out_with_exit_code_8(
+def test_vertebrae_of_low_confidence_are_left_out_with_exit_code_8(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from clrecon.vertebrae import split
 
     def doubt(piece: Any, *given: Any) -> dict[str, tuple[float, str]]:
         low = piece.upper is not None and piece.upper.is_disc and piece.lower is not None and piece.lower.is_disc
-        return {"made up": (0.25 if low else 1.0, "a doubt of the test")}
+        value = 0.0 if low else 1.0
+        return {
+            "volume": (value, "a doubt of the test"),
+            "arch": (value, "a greater one"),
+            "line": (0.9, "a small one"),
+        }
 
     monkeypatch.setattr(split, "judge", doubt)
     given = ["vertebrae", str(scan), "-o", str(tmp_path / "a.nii.gz")]
     assert main(given) == 8
     told = capsys.readouterr()
-    assert "vertebra_2 is unsure (0.25), it is not in the label map: a doubt of the test" in told.err
-    assert "1 unsure" in told.out
+    assert (
+        "vertebra_2 has low confidence (0.42) and is not in the label map: a greater one; a doubt of the test"
+        in told.err
+    )
+    assert "1 of low confidence" in told.out
     assert read_labels(tmp_path / "a.nii.gz").numbers == (1, 3)
     assert main([*given, "--keep-unsure"]) == 8
-    assert "it is in the label map all the same" in capsys.readouterr().err
+    assert "is in the label map all the same" in capsys.readouterr().err
     assert read_labels(tmp_path / "a.nii.gz").numbers == (1, 2, 3)
 
 
