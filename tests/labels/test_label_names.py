@@ -130,7 +130,7 @@ def test_files_that_are_no_label_maps_are_refused(tmp_path):
         read_labels(tmp_path / "b.gz")
     with pytest.raises(UsageError, match="there is no label map"):
         read_labels(tmp_path / "c.nii")
-    with pytest.raises(UsageError, match="is a folder"):
+    with pytest.raises(RefusedInputError, match="is a folder without masks: one NIfTI, NRRD or MetaImage file"):
         read_labels(tmp_path)
     wrong: list = [2.5]
     with pytest.raises(UsageError, match="by number or name"):
