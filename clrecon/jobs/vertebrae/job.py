@@ -114,7 +114,9 @@ def _encode(labels: LabelMap, output: str | Path, source: str | Path, settings: 
         from clrecon.dicom.reader import list_slices
         from clrecon.labels.write_segmentation import encode_segmentation
 
-        chosen = {field.name: getattr(settings, field.name) for field in fields(Selection)}
+        of_values = {"rescale"}  # the other fields of a selection say which slices are read
+        names = {field.name for field in fields(Selection)} - of_values
+        chosen = {name: getattr(settings, name) for name in names}
         return encode_segmentation(labels, list_slices(source, **chosen))
     from clrecon.labels.write_nifti import encode_nifti
 
