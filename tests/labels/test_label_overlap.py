@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from clrecon.errors import RefusedInputError
-from clrecon.labels.overlap import Painter
+from clrecon.labels.overlap import Painter, Wanted
 
 
 def painter(names, only=None):
-    return Painter("a.dcm", np.zeros((1, 1, 4), np.uint16), names, only)
+    return Painter("a.dcm", np.zeros((1, 1, 4), np.uint16), names, Wanted(only))
 
 
 def mask(*voxels):
@@ -43,7 +43,7 @@ def test_the_pair_with_most_voxels_is_told_and_the_others_are_counted():
 
 
 def test_pairs_are_counted_over_all_slices():
-    one = Painter("a.dcm", np.zeros((2, 1, 4), np.uint16), {1: "a", 2: "b"}, None)
+    one = Painter("a.dcm", np.zeros((2, 1, 4), np.uint16), {1: "a", 2: "b"}, Wanted())
     for k in (0, 1):
         one.paint(k, 1, mask(0, 1))
         one.paint(k, 2, mask(1, 2))
