@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
+import pytest
 from pydicom.datadict import keyword_for_tag
 
 from clrecon.dicom.stack import attributes
 from clrecon.dicom.stack.attributes import INSTANCE_NUMBER, _code, alternates
+from clrecon.dicom.stack.element_kinds import ELEMENT_KINDS, find_verdict
 
+DOCS = Path(__file__).parents[2] / "docs"
 TAG = 0x00080032
 
 
@@ -34,22 +40,31 @@ def test_instance_numbers_are_two_heaps_from_twelve_slices_on():
     assert ways(INSTANCE_NUMBER, [*range(11), "x"]) == []
 
 
-def test_the_elements_that_may_alternate_within_one_volume():
-    assert {keyword_for_tag(tag) for tag in attributes.DOUBTFUL} == {
-        *(
-            "WindowCenter",
-            "WindowWidth",
-            "WindowCenterWidthExplanation",
-            "InstanceCreationDate",
-            "InstanceCreationTime",
-        ),
-        *("ExposureTime", "XRayTubeCurrent", "Exposure", "ExposureInuAs", "GeneratorPower"),
-        *("XRayTubeCurrentInmA", "ExposureInmAs", "CTDIvol"),
-    }
+def test_the_elements_whose_alternation_is_judged():
+    kinds = {(kind.verdict, kind.reason): {keyword_for_tag(tag) for tag in kind.tags} for kind in ELEMENT_KINDS}
+    assert all("" not in keywords for keywords in kinds.values())
+    assert len(kinds) == len(ELEMENT_KINDS) and sum(map(len, kinds.values())) == len(set().union(*kinds.values()))
+    page = (DOCS / "geometry.md").read_text()
+    rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \| (.+?) \| (\w+) .*\|$", page, re.M)
+    assert {(verdict, reason): set(re.findall(r"\w+", names)) for names, reason, verdict in rows} == kinds
     assert {keyword_for_tag(tag) for tag in attributes.NEVER} == {
         *("SOPInstanceUID", "SeriesInstanceUID", "InstanceNumber", "ImagePositionPatient", "ImageOrientationPatient"),
         "SliceLocation",
     }
+
+
+@pytest.mark.parametrize(
+    ("tag", "even", "uneven"),
+    [
+        (0x00080032, "phases", "phases"),  # AcquisitionTime
+        (0x00181140, "nothing", "pixels"),  # RotationDirection
+        (0x00181151, "pixels", "pixels"),  # XRayTubeCurrent
+        (0x00181130, "pixels", "phases"),  # TableHeight: in no row
+        (0x00291010, "pixels", "pixels"),  # private
+    ],
+)
+def test_verdicts_in_even_and_uneven_stacks(tag, even, uneven):
+    assert (find_verdict(tag, True), find_verdict(tag, False)) == (even, uneven)
 
 
 def test_an_order_has_to_repeat_three_times():

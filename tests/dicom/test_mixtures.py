@@ -76,6 +76,7 @@ def test_whatever_alternates_parts_two_volumes(tmp_path, first, second, keyword)
     said = refusal(tmp_path)
     assert f"2 phases whose slices lie between each other, choose one with phase: [1: {keyword} " in said
     assert "12 slices], [2:" in said and "DOE" not in said
+    assert said.endswith("; slices of phase 1 lie 1.25 mm apart, those of all phases 0.625 mm")
     assert keyword != "ContrastBolusAgent" or "[1: ContrastBolusAgent (none), 12 slices]" in said
     with pytest.raises(UsageError, match="no phase 3: 2 phases whose slices lie between each other"):
         read_volume(tmp_path, phase=3)
@@ -85,6 +86,10 @@ def test_whatever_alternates_parts_two_volumes(tmp_path, first, second, keyword)
         assert np.array_equal(volume.voxels, plan.hu() + 300 * number)
         assert volume.ijk_to_lps([(2, 3, 4)])[0] == pytest.approx(plan.truth([(2, 3, 4)])[0], abs=tolerances.AFFINE_MM)
         assert "IODINE" not in str(volume.report) and "DOE" not in str(volume.report)
+        chosen = volume.report["warnings"][0]
+        assert chosen.endswith(
+            f"12 slices of others left: slices of phase {number + 1} lie 1.25 mm apart, those of all phases 0.625 mm"
+        )
 
 
 def test_three_volumes_and_volumes_in_pairs(tmp_path):
@@ -163,6 +168,30 @@ def test_numbers_of_two_passes_and_other_pixels(tmp_path):
     own = [{"InstanceNumber": lambda k: k + 1}, {"InstanceNumber": lambda k: k + 13}]
     write_volumes(tmp_path, *own, pixels=picture(6))
     assert "[1: order of InstanceNumber 1, 12 slices]" in refusal(tmp_path)
+
+
+def test_a_gantry_that_turns_to_and_fro_makes_one_volume(tmp_path):
+    turning = ({"RotationDirection": "CW"}, {"RotationDirection": "CC"})
+    write_volumes(tmp_path / "alike", *turning, pixels=picture(0))
+    volume = read_volume(tmp_path / "alike")
+    assert volume.voxels.shape[0] == 2 * EACH and volume.report["warnings"] == []
+    assert volume.report["spacing_mm"][2] == pytest.approx(GAP / 2)
+    assert [gate["ok"] for gate in volume.report["gates"] if gate["name"] == "one_volume"] == [True]
+    write_volumes(tmp_path / "moved", *turning, pixels=picture(6))
+    warnings = read_volume(tmp_path / "moved").report["warnings"]
+    assert any("maybe two volumes between each other" in text for text in warnings)
+
+
+def test_an_element_of_no_row_leaves_an_even_stack_to_the_pixels(tmp_path):
+    own = ({"TableHeight": 100}, {"TableHeight": 101})
+    write_volumes(tmp_path / "moved", *own, pixels=picture(6))
+    assert "2 phases whose slices lie between each other, choose one with phase: [1: TableHeight" in refusal(
+        tmp_path / "moved"
+    )
+    write_volumes(tmp_path / "alike", *own, pixels=picture(0))
+    report = read_volume(tmp_path / "alike").report
+    assert any("TableHeight alternates along the stack: maybe several volumes" in text for text in report["warnings"])
+    assert [gate["name"] for gate in report["gates"] if gate["ok"] is False] == ["one_volume"]
 
 
 def test_pixels_alone_are_told_and_chosen_from(tmp_path):

@@ -17,7 +17,7 @@ from clrecon.dicom.headers.slice_header import SliceHeader
 from clrecon.dicom.parse.transfer_syntaxes import SYNTAX_NAMES
 from clrecon.dicom.series.census import describe_numbers
 from clrecon.dicom.series.gates import judge_series
-from clrecon.dicom.series.phases import choose_phase
+from clrecon.dicom.series.phases import choose_phase, describe_spacing
 from clrecon.dicom.series.scan import Scan
 from clrecon.dicom.series.series import Series
 from clrecon.dicom.stack.fit import Stack
@@ -111,7 +111,8 @@ def _describe_what_was_left(series: Series) -> list[str]:
         chosen = choose_phase(places.phases, series.phase)
         left = sum(len(phase.headers) for phase in places.phases) - len(chosen.headers)
         which = f"phase {chosen.number} of {len(places.phases)} ({chosen.keyword} {chosen.value})"
-        warnings.append(f"{which} read, {count_of(left, 'slice')} of others left")
+        spacing = f": {describe_spacing(places.phases, chosen)}" if places.interleaved else ""
+        warnings.append(f"{which} read, {count_of(left, 'slice')} of others left{spacing}")
         most = max(len(phase.headers) for phase in places.phases)
         if not places.interleaved and len(chosen.headers) < most:
             warnings.append(f"phase {chosen.number} has {count_of(len(chosen.headers), 'slice')}, another one {most}")

@@ -20,12 +20,22 @@ from clrecon.dicom.headers.slice_header import SliceHeader
 from clrecon.dicom.pixels.stored import StoredPixels
 from clrecon.dicom.pixels.voxels import read_voxels
 from clrecon.dicom.stack.attributes import Alternation
+from clrecon.dicom.stack.fit import measure_gap
 from clrecon.dicom.stack.mixture import find_mixture, values_of
 from clrecon.errors import UsageError
 from clrecon.system.text import join_names
 from clrecon.system.wording import name_parameter
 
-__all__ = ["Phase", "Places", "choose_phase", "describe_phases", "have_same_pixels", "part_alternating", "sort_places"]
+__all__ = [
+    "Phase",
+    "Places",
+    "choose_phase",
+    "describe_phases",
+    "describe_spacing",
+    "have_same_pixels",
+    "part_alternating",
+    "sort_places",
+]
 
 PLACES_SHOWN = 4
 PHASES_SHOWN = 12
@@ -343,7 +353,20 @@ def describe_phases(phases: Sequence[Phase], interleaved: bool = False) -> str:
     shown = [str(phase) for phase in phases[:PHASES_SHOWN]]
     more = f" and {len(phases) - PHASES_SHOWN} more" if len(phases) > PHASES_SHOWN else ""
     where = "whose slices lie between each other" if interleaved else "at the same places"
-    return f"{len(phases)} phases {where}, choose one with {name_parameter('phase')}: [{'], ['.join(shown)}]{more}"
+    spacing = f"; {describe_spacing(phases, phases[0])}" if interleaved else ""
+    return (
+        f"{len(phases)} phases {where}, choose one with {name_parameter('phase')}: [{'], ['.join(shown)}]{more}"
+        f"{spacing}"
+    )
+
+
+def describe_spacing(phases: Sequence[Phase], chosen: Phase) -> str:
+    """Say what the choice of one of several interleaved phases does to the distance of the slices."""
+    everything = [header for phase in phases for header in phase.headers]
+    return (
+        f"slices of phase {chosen.number} lie {measure_gap(chosen.headers):.4g} mm apart, those of all phases "
+        f"{measure_gap(everything):.4g} mm"
+    )
 
 
 def choose_phase(phases: Sequence[Phase], wanted: int, interleaved: bool = False) -> Phase:

@@ -3,7 +3,8 @@
 Two volumes half a gap apart sort into one evenly spaced stack.  Any element may distinguish them: a time, the contrast
 medium, an acquisition number that only one of them has, a private element.  So all headers of the stack to be read are
 read again completely.  Every element whose values repeat in a fixed order along the stack is found: ABAB, ABCABC, AABB.
-Within one volume values stay, count on, or change at single places.
+Within one volume values stay, count on, or change at single places; or they alternate with the turns of the gantry, so
+`clrecon.dicom.stack.element_kinds` has which elements mean what.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 
 from clrecon.dicom.headers.slice_header import SliceHeader
 from clrecon.dicom.parse.elements import CorruptFileError, NotDicomError, read_elements
+from clrecon.dicom.stack.element_kinds import find_verdict
 from clrecon.dicom.stack.numbers import median
 
 __all__ = ["Alternation", "alternate_places", "find_alternation"]
@@ -46,21 +48,6 @@ NEVER = frozenset({SOP_INSTANCE, SERIES_UID, INSTANCE_NUMBER, 0x00200032, 0x0020
 PIXEL_GROUP, OVERLAY_GROUPS = 0x0028, range(0x5000, 0x6100)
 """Groups of elements that describe the stored values of single slices: rescale, extremes, padding, overlays."""
 WINDOW_TAGS = frozenset({0x00281050, 0x00281051, 0x00281055})
-DOUBTFUL = WINDOW_TAGS | {
-    0x00080012,
-    0x00080013,
-    0x00181150,
-    0x00181151,
-    0x00181152,
-    0x00181153,
-    0x00181170,
-    0x00189330,
-    0x00189332,
-    0x00189345,
-}
-"""Elements that may alternate within one volume: when a file was written, how it is to be displayed, and tube current
-and exposure, which follow the patient.  Private elements, whose meaning is unknown, are equally doubtful: the number of
-the detector row is one of them."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +61,7 @@ class Alternation:
     groups : tuple of tuple of int
         The places, from 0, of each volume, in the order of the values.
     certain : bool
-        True: the element is constant within one volume.
+        True: the element is constant within one volume, see `clrecon.dicom.stack.element_kinds`.
     heaps : bool
         True: the groups are heaps of close numbers, and each slice has its own number.
     absent : int or None
@@ -105,7 +92,7 @@ def find_alternation(headers: Sequence[SliceHeader], even: bool) -> Alternation 
     headers : sequence of SliceHeader
         One slice for each place, in the order of the places.
     even : bool
-        True: all gaps are equal, so in a long stack only some windows are examined first.
+        True: all gaps are equal.  Fewer elements are certain then, and in a long stack some windows are examined first.
 
     Returns
     -------
@@ -117,9 +104,9 @@ def find_alternation(headers: Sequence[SliceHeader], even: bool) -> Alternation 
         return None
     if even and count > WINDOW * WINDOWS:
         starts = [(count - WINDOW) * place // (WINDOWS - 1) for place in range(WINDOWS)]
-        if not any(_find_in(headers[first : first + WINDOW]) for first in starts):
+        if not any(_find_in(headers[first : first + WINDOW], even) for first in starts):
             return None
-    return _find_in(headers)
+    return _find_in(headers, even)
 
 
 def alternate_places(count: int, period: int) -> Alternation:
@@ -131,15 +118,18 @@ def alternate_places(count: int, period: int) -> Alternation:
     return Alternation(0, tuple(tuple(range(first, count, period)) for first in range(period)), False)
 
 
-def _find_in(headers: Sequence[SliceHeader]) -> Alternation | None:
+def _find_in(headers: Sequence[SliceHeader], even: bool) -> Alternation | None:
     gaps = [float(np.linalg.norm(np.subtract(b.position_mm, a.position_mm))) for a, b in pairwise(headers)]
     doubtful = None
     for tag, column in sorted(_read_columns(headers).items()):
+        verdict = find_verdict(tag, even)
+        if verdict == "nothing":
+            continue
         for codes, heaps in _code(tag, column):
             if not alternates(codes, gaps):
                 continue
             groups = tuple(tuple(k for k, code in enumerate(codes) if code == one) for one in sorted(set(codes)))
-            certain = tag >> 16 & 1 == 0 and tag not in DOUBTFUL and tag != INSTANCE_NUMBER
+            certain = verdict == "phases"
             absent = next((number for number, group in enumerate(groups) if column[group[0]] == b""), None)
             found = Alternation(tag, groups, certain, heaps, absent)
             if certain:

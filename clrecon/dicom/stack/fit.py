@@ -28,7 +28,7 @@ from clrecon.geometry.uneven import fit_line, position_tolerance
 from clrecon.system.text import join_names
 from clrecon.system.wording import name_parameter
 
-__all__ = ["Line", "Stack", "group_places", "measure_stack", "measure_stated_gap"]
+__all__ = ["Line", "Stack", "group_places", "measure_gap", "measure_stack", "measure_stated_gap"]
 
 Float64Array = NDArray[np.float64]
 
@@ -276,6 +276,12 @@ def group_places(headers: Sequence[SliceHeader]) -> list[list[SliceHeader]]:
             last = distance
         places[-1].append(header)
     return places
+
+
+def measure_gap(headers: Sequence[SliceHeader]) -> float:
+    """Return the median distance in mm of neighbouring slices along their normal; two slices or more."""
+    row, column = _mean_directions(headers, [], [])
+    return median(np.diff(sort_slices(headers, _cross(row, column))[2]))
 
 
 def _cross(row: Float64Array, column: Float64Array) -> Float64Array:
