@@ -286,6 +286,7 @@ def _rescaled(header: SliceHeader, rescale: Rescale) -> SliceHeader:
         has_slope=True,
         has_intercept=True,
         rescale_type="HU",
+        modality_lut=False,
         warnings=(*header.warnings, str(rescale)),
     )
 

@@ -9,12 +9,14 @@ from dicom_series import Plan
 from value_series import (
     SHAPE,
     make_body,
+    make_table,
     write_values,
 )
 
 from clrecon import read_volume
 from clrecon.cli.main import main
 
+LUT = {"ModalityLUTSequence": make_table()}
 TWELVE = Plan(shape=SHAPE, bits_stored=12, signed=False)
 
 
@@ -50,6 +52,10 @@ ROWS = {
     "intercept off by -324": stated("hu_scale", "HU too low", RescaleIntercept=-1348),
     "intercept a tenth": stated("hu_scale", "soft tissue near 9", RescaleIntercept=-102.4),
     "type of other values": stated("hu_known", "RescaleType is 'OD'", RescaleType="OD"),
+    "table in place of slope": stated(
+        "hu_known hu_scale", "Modality LUT Sequence (0028,3000)", RescaleSlope=None, **LUT, RescaleIntercept=None
+    ),
+    "table beside the slope": stated("hu_known", "Modality LUT Sequence (0028,3000)", **LUT),
     "sign lost": stated("stored_sign", "seem to be signed", Plan(shape=SHAPE, intercept=0), PixelRepresentation=0),
     "sign made up": stated("stored_sign", "dense bone or metal", TWELVE, PixelRepresentation=1),
     "bits too few": stated("stored_bits", "beyond the 11 stored bits", TWELVE, BitsStored=11, HighBit=10),

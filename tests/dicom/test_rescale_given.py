@@ -80,6 +80,6 @@ def test_a_print_stops_where_values_are_not_hu(tmp_path, device, capsys, values,
         assert "a print needs a level of bone, and the values of this scan are not known to be HU" in text
         assert "(--hu N)" in text and "(--rescale SLOPE,INTERCEPT)" in text
         assert not out.exists()
-    assert main([*command, "--hu", str(level)]) in (0, 8) and out.exists()
+    assert main([*command, "--hu", str(level)]) == 7 and out.exists()
     out.unlink()
-    assert main([*command, "--rescale", "1,-1024"]) in (0, 8) and out.exists()
+    assert main([*command, "--rescale", "1,-1024"]) == 0 and out.exists()

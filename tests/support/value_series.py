@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 from dicom_series import Plan, set_values, write_series
+from pydicom.dataset import Dataset
+from pydicom.sequence import Sequence
 
 SHAPE = (8, 96, 96)
 CENTRE = 47.5
@@ -42,6 +44,17 @@ def make_jaw(slope: float = 1.0, offset: float = 400.0, padding: float | None = 
     hu = np.where(bow & (i > -8)[:, None], hu + 1300, hu)
     values = np.rint(slope * hu + offset)
     return values if padding is None else np.where(radius_from() > 46, padding, values)
+
+
+def make_table(undefined: bool = True) -> Sequence:
+    """A Modality LUT of 4,096 entries, which is an inverted ramp, as a sequence of undefined or defined length."""
+    table = Dataset()
+    table.LUTDescriptor, table.ModalityLUTType = [4096, 0, 16], "US"
+    table.add_new("LUTData", "OW", np.arange(4096)[::-1].astype("<u2").tobytes())
+    table.is_undefined_length_sequence_item = undefined
+    sequence = Sequence([table])
+    sequence.is_undefined_length = undefined
+    return sequence
 
 
 def write_values(folder: Path, hu: np.ndarray, plan: Plan | None = None, **values: Any) -> Path:

@@ -198,8 +198,7 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
     if elements.encoding_differs:
         warnings.append("implicit and explicit VR are mixed up: parsed as found, not as the transfer syntax says")
     image_type = [word.strip() for word in values.text("ImageType").upper().split("\\")]
-    derived = sorted(DERIVED_WORDS.intersection(re.split("[^A-Z]+", " ".join(image_type))))
-    derived = derived if "DERIVED" in image_type else []
+    derived = _list_derived(image_type)
     if derived:
         warnings.append(f"derived images (ImageType has DERIVED and {' '.join(derived)}): maybe not measured HU")
 
@@ -238,6 +237,7 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
         rescale_type=name_term(values.word("RescaleType"), RESCALE_TYPES),
         padding=values.float_padding(allocated) if float_pixels else values.padding(allocated, stored, signed),
         float_pixels=float_pixels,
+        modality_lut="ModalityLUTSequence" in values,
         lossy=values.word("LossyImageCompression") == "01",
         pixel_offset=elements.pixel_offset,
         pixel_length=elements.pixel_length,
@@ -252,6 +252,12 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
     )
     _check_pixel_room(header, elements.pixel_vr)
     return header
+
+
+def _list_derived(image_type: list[str]) -> list[str]:
+    """Return the `DERIVED_WORDS` of a derived image."""
+    found = sorted(DERIVED_WORDS.intersection(re.split("[^A-Z]+", " ".join(image_type))))
+    return found if "DERIVED" in image_type else []
 
 
 def _validate_geometry(values: Values) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:

@@ -88,6 +88,8 @@ class SliceHeader:
         InstanceNumber; None for a frame of a multi-frame image.
     stated_images, stated_files : int or None
         ImagesInAcquisition and NumberOfSeriesRelatedInstances.
+    modality_lut : bool
+        True: a table, not slope and intercept, gives the measured values.
     """
 
     series: SeriesIdentity
@@ -134,6 +136,7 @@ class SliceHeader:
     instance_number: int | None = None
     stated_images: int | None = None
     stated_files: int | None = None
+    modality_lut: bool = False
 
     @property
     def pixel_bytes(self) -> int:

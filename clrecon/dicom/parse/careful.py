@@ -28,6 +28,8 @@ from clrecon.dicom.parse.raw import (
 __all__ = ["parse_carefully"]
 
 INFLATE_STEP = 1 << 18
+ITEM = b"\xfe\xff\x00\xe0"
+"""Stands for a wanted sequence of undefined length: only whether it is there is asked."""
 META_TAGS = (MEDIA_CLASS, TRANSFER_SYNTAX)
 DESCRIPTIVE_TAGS = (0x00080005, 0x0008103E)
 """SpecificCharacterSet and SeriesDescription.  They only describe, so two different values in one file do no harm."""
@@ -167,6 +169,8 @@ def _collect(
                 raise CorruptFileError("ends within an element")
             values[int(element.tag)] = value
             vrs[int(element.tag)] = element.VR
+        elif wanted is not None and element.tag in wanted and element.VR == "SQ" and value:
+            values[int(element.tag)], vrs[int(element.tag)] = ITEM, "SQ"  # of undefined length: parsed already
         if last_group is None or element.tag in META_TAGS:
             order.add(int(element.tag), value if isinstance(value, bytes) else b"")
     return values, vrs, order.remarks

@@ -66,6 +66,7 @@ _TAGS = {
     "RescaleSlope": 0x00281053,
     "RescaleType": 0x00281054,
     "LossyImageCompression": 0x00282110,
+    "ModalityLUTSequence": 0x00283000,
 }
 WANTED_TAGS = tuple(_TAGS.values())
 _DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")

@@ -36,6 +36,7 @@ from clrecon.sources.facts import PixelFacts
 from clrecon.sources.likeness import Likeness
 from clrecon.sources.plausibility import VoxelFindings
 from clrecon.system.text import count_of, hash_uid
+from clrecon.system.wording import name_parameter
 
 __all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]
 
@@ -82,6 +83,11 @@ def collect_series_warnings(series: Series) -> list[str]:
             "no RescaleIntercept: slope {slope}, intercept 0 taken: maybe not HU",
         ),
         (lambda h: h.rescale_type not in ("", "HU"), "RescaleType is '{type}': the values are not HU"),
+        (
+            lambda h: h.modality_lut,
+            "the files have a Modality LUT Sequence (0028,3000), which is not applied: slope {slope}, intercept"
+            f" {{intercept}} taken, the values are not HU; {name_parameter('rescale')} says how HU follow from them",
+        ),
         (lambda h: h.photometric == "MONOCHROME1", "MONOCHROME1: meant to be shown inverted; the values are kept"),
         (lambda h: h.lossy, "lossy compression: the values are not those that were measured"),
     )

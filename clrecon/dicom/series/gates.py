@@ -184,7 +184,9 @@ def _judge_stated_gap(stack: Stack) -> Gate:
 
 def count_unknown(headers: Sequence[SliceHeader]) -> int:
     """Count slices whose values are not known to be HU."""
-    return sum(not (h.has_slope and h.has_intercept) or h.rescale_type not in ("", "HU") for h in headers)
+    return sum(
+        not (h.has_slope and h.has_intercept) or h.rescale_type not in ("", "HU") or h.modality_lut for h in headers
+    )
 
 
 def _gates_of_values(headers: Sequence[SliceHeader]) -> Iterator[Gate]:

@@ -1,0 +1,57 @@
+"""Modality LUTs: slope and intercept are not all that a file can say of its values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from dicom_series import Plan, set_values, write_series
+from pydicom.sequence import Sequence
+from pydicom.uid import (
+    DeflatedExplicitVRLittleEndian,
+    ExplicitVRBigEndian,
+    ExplicitVRLittleEndian,
+    ImplicitVRLittleEndian,
+)
+from value_series import make_table
+
+from clrecon import read_volume
+
+SAID = "Modality LUT Sequence (0028,3000), which is not applied: slope 1, intercept -1024 taken"
+
+
+def judge(path, **options):
+    report = read_volume(path, **options).report
+    (known,) = (gate for gate in report["gates"] if gate["name"] == "hu_known")
+    return known["measured"], [text for text in report["warnings"] if SAID in text]
+
+
+@pytest.mark.parametrize("undefined", [True, False])
+@pytest.mark.parametrize(
+    "syntax", [ExplicitVRLittleEndian, ImplicitVRLittleEndian, DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian]
+)
+def test_a_table_is_told_in_any_encoding(tmp_path, syntax, undefined):
+    def change(ds, k):
+        if k != 3:
+            return
+        set_values(ModalityLUTSequence=make_table(undefined))(ds, k)
+        if syntax == ExplicitVRBigEndian:
+            table = ds.ModalityLUTSequence[0]
+            table.LUTData = np.frombuffer(table.LUTData, "<u2").astype(">u2").tobytes()
+
+    plan = Plan(syntax=syntax)
+    write_series(tmp_path, plan, change)
+    measured, said = judge(tmp_path)
+    assert measured == 1
+    assert len(said) == 1 and said[0].endswith("(1 of 7 slices, at -396.25 mm)")
+
+
+def test_a_table_without_items_is_none(tmp_path):
+    empty = Sequence()
+    empty.is_undefined_length = True
+    write_series(tmp_path, change=set_values(ModalityLUTSequence=empty))
+    assert judge(tmp_path) == (0, [])
+
+
+def test_a_given_rescale_stands_in_place_of_the_table(tmp_path):
+    write_series(tmp_path, change=set_values(ModalityLUTSequence=make_table()))
+    assert judge(tmp_path, rescale=(1, -1024)) == (0, [])
