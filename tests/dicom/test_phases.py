@@ -325,3 +325,32 @@ def test_a_phase_that_is_shorter_than_another_is_said(tmp_path):
     write_phase(tmp_path, 2, 500, Plan(name="b{}".format, leave_out=(6,)), AcquisitionNumber=2)
     assert "phase 2 has 6 slices, another one 7" in read_volume(tmp_path, phase=2).report["warnings"]
     assert not any("another one" in text for text in read_volume(tmp_path, phase=1).report["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("elements", "told"),
+    [
+        ({"AcquisitionNumber": lambda k: k + 1}, "7 phases of one slice each, which differ in AcquisitionNumber"),
+        ({}, "7 of them with different pixels, and no element of their headers parts them into phases"),
+        ({"PixelData": lambda k: Plan().stored(0).tobytes()}, "copies of each other"),
+    ],
+)
+def test_images_that_all_lie_at_one_place_are_no_volume(tmp_path, elements, told):
+    def change(ds, k):
+        ds.ImagePositionPatient = list(Plan().origin)
+        for keyword, value in elements.items():
+            setattr(ds, keyword, value(k))
+
+    write_series(tmp_path, Plan(), change)
+    entry = list_series(tmp_path).series[0]
+    assert len(entry.problems) == 1
+    for phase in (None, 1):
+        with pytest.raises(RefusedInputError) as caught:
+            read_volume(tmp_path, phase=phase)
+        text = str(caught.value)
+        assert f"all 7 images lie in one plane, at ImagePositionPatient (-12.5, 31.25, -400) mm ({told})" in text
+        assert "a single slice cannot make a volume" in text and "export the series again" in text
+        assert "choose one with" not in text
+        assert ("choosing a phase does not help" in text) == bool(entry.phases)
+    with pytest.raises(UsageError, match="there is no phase 8: all 7 images lie in one plane"):
+        read_volume(tmp_path, phase=8)

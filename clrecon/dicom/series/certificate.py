@@ -114,7 +114,7 @@ def _describe_what_was_left(series: Series) -> list[str]:
         some = "slices" if places.copies > 1 else "slice"
         warnings.append(f"{places.copies} duplicate {some} dropped: same place, same pixels as another")
     if places.phases and series.phase is not None:
-        chosen = choose_phase(places.phases, series.phase)
+        chosen = choose_phase(places, series.phase)
         left = sum(len(phase.headers) for phase in places.phases) - len(chosen.headers)
         which = f"phase {chosen.number} of {len(places.phases)} ({chosen.keyword} {chosen.value})"
         spacing = f": {describe_spacing(places.phases, chosen)}" if places.interleaved else ""
@@ -138,9 +138,8 @@ def _describe_identity(series: Series) -> dict[str, Any]:
 def _describe_phase(series: Series) -> dict[str, Any] | None:
     if series.phase is None or not series.places.phases:
         return None
-    phases = series.places.phases
-    chosen = choose_phase(phases, series.phase)
-    return {"number": chosen.number, "of": len(phases), "keyword": chosen.keyword, "value": chosen.value}
+    chosen = choose_phase(series.places, series.phase)
+    return {"number": chosen.number, "of": len(series.places.phases), "keyword": chosen.keyword, "value": chosen.value}
 
 
 def _place(stack: Stack, is_so: Callable[[SliceHeader], bool]) -> str:

@@ -170,7 +170,7 @@ def _count_doubled(series: Series) -> int:
         places = series.places
     except RefusedInputError:
         return 0  # the pixels cannot be compared: already counted as a reason for refusal
-    return len(places.headers) - len(group_places(places.headers)) if places.problem else 0
+    return len(places.headers) - len(group_places(places.headers)) if places.problem and not places.phases else 0
 
 
 def _judge_stated_gap(stack: Stack) -> Gate:

@@ -94,7 +94,7 @@ class Places:
     phases : tuple of Phase
         Empty where each place has one slice; none is chosen yet.
     problem : str
-        Why slices at one place can neither be left out nor distinguished; empty if there is no problem.
+        Why the slices are no volume and no phase of them is one; empty if there is no problem.
     interleaved : bool
         True: the phases share no place, and the slices of one lie between those of another.
     doubt : str
@@ -123,6 +123,10 @@ def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHe
     kept = [[copies[0] for copies in found] for found in sorted_out]
     count = sum(map(len, places))
     headers = tuple(header for slices in kept for header in slices)
+    if len(places) == 1 and count > 1:
+        phases = _find_phases(sorted_out)
+        problem = _describe_one_place(count, headers, phases)
+        return Places(headers, count - len(headers), phases, problem=problem)
     if max(map(len, kept), default=0) <= 1:
         phases = _part(find_mixture(headers))
         return Places(headers, count - len(headers), phases, interleaved=bool(phases))
@@ -140,6 +144,22 @@ def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHe
         count - len(headers),
         problem=f"duplicate slices with different pixels{'' if alike else ' or geometry'} at {len(crowded)} "
         f"place{'s' * (len(crowded) > 1)}, and no element of their headers parts them into phases: {shown}{more}",
+    )
+
+
+def _describe_one_place(count: int, headers: Sequence[SliceHeader], phases: Sequence[Phase]) -> str:
+    """Describe the problem of a series whose images all lie at one place."""
+    what = "copies of each other"
+    if phases:
+        what = f"{len(phases)} phases of one slice each, which differ in {phases[0].keyword}"
+    elif len(headers) > 1:
+        what = f"{len(headers)} of them with different pixels, and no element of their headers parts them into phases"
+    at = ", ".join(f"{value:g}" for value in headers[0].position_mm)
+    return (
+        f"all {count} images lie in one plane, at ImagePositionPatient ({at}) mm ({what}): a single slice cannot make"
+        f" a volume{', and choosing a phase does not help' if phases else ''}. If one slice was scanned repeatedly"
+        " (cine, perfusion, bolus tracking), use another series; if these are different slices, their positions were"
+        " lost or overwritten: export the series again"
     )
 
 
@@ -348,12 +368,15 @@ def _since_first(seconds: Sequence[float | None], unit: str) -> list[str]:
     return ["(none)" if value is None else f"+{value - first:g} {unit}" for value in seconds]
 
 
-def describe_phases(phases: Sequence[Phase], interleaved: bool = False) -> str:
+def describe_phases(places: Places) -> str:
     """Describe the problem of a series with several phases of which none was chosen."""
+    if places.problem:
+        return places.problem
+    phases = places.phases
     shown = [str(phase) for phase in phases[:PHASES_SHOWN]]
     more = f" and {len(phases) - PHASES_SHOWN} more" if len(phases) > PHASES_SHOWN else ""
-    where = "whose slices lie between each other" if interleaved else "at the same places"
-    spacing = f"; {describe_spacing(phases, phases[0])}" if interleaved else ""
+    where = "whose slices lie between each other" if places.interleaved else "at the same places"
+    spacing = f"; {describe_spacing(phases, phases[0])}" if places.interleaved else ""
     return (
         f"{len(phases)} phases {where}, choose one with {name_parameter('phase')}: [{'], ['.join(shown)}]{more}"
         f"{spacing}"
@@ -369,17 +392,16 @@ def describe_spacing(phases: Sequence[Phase], chosen: Phase) -> str:
     )
 
 
-def choose_phase(phases: Sequence[Phase], wanted: int, interleaved: bool = False) -> Phase:
-    """Return the phase of that number; `interleaved` as in `Places`, for the message.
+def choose_phase(places: Places, wanted: int) -> Phase:
+    """Return the phase of that number.
 
     Raises
     ------
     UsageError
         The phase does not exist.
     """
-    for phase in phases:
+    for phase in places.phases:
         if phase.number == wanted:
             return phase
-    if not phases:
-        raise UsageError(f"there is no phase {wanted!r}: the series has one slice at each place")
-    raise UsageError(f"there is no phase {wanted!r}: {describe_phases(phases, interleaved)}")
+    known = describe_phases(places) if places.phases or places.problem else "the series has one slice at each place"
+    raise UsageError(f"there is no phase {wanted!r}: {known}")

@@ -115,7 +115,7 @@ class Series:
             return measure_stack(self.headers[:1])  # `problems` tells why
         headers = places.headers
         if places.phases:
-            headers = choose_phase(places.phases, self.phase or 1).headers
+            headers = choose_phase(places, self.phase or 1).headers
         elif places.problem:
             headers = headers[:1]
         return measure_stack(headers, self.allow_gaps)
@@ -135,7 +135,7 @@ class Series:
         except RefusedInputError:
             return {}
         phases = sum(len(phase.headers) for phase in places.phases)
-        left = phases - len(choose_phase(places.phases, self.phase).headers) if phases and self.phase else 0
+        left = phases - len(choose_phase(places, self.phase).headers) if phases and self.phase else 0
         counts = {"copy of another slice": places.copies, "other phase": left}
         return {reason: count for reason, count in counts.items() if count}
 
@@ -157,7 +157,7 @@ class Series:
         except RefusedInputError:
             return chosen  # its `problems` tell why
         if phase is not None and (phase != 1 or chosen.places.phases):
-            choose_phase(chosen.places.phases, phase, chosen.places.interleaved)
+            choose_phase(chosen.places, phase)
         return chosen
 
     def _part_further(self, places: Places, phase: int | None) -> Places:
@@ -216,7 +216,7 @@ class Series:
         if places.problem:
             return [places.problem]
         if places.phases and self.phase is None:
-            return [describe_phases(places.phases, places.interleaved)]
+            return [describe_phases(places)]
         return list(self.stack.problems) if self.stack is not None else []
 
     def describe(self) -> str:
