@@ -125,7 +125,7 @@ def test_thin_slices_may_differ_in_thickness_too():
 
 def test_a_long_even_stack_is_looked_at_in_three_windows_first(monkeypatch):
     seen = []
-    monkeypatch.setattr(attributes, "_find_in", lambda headers: seen.append([header.at for header in headers]))
+    monkeypatch.setattr(attributes, "_find_in", lambda headers, even: seen.append([header.at for header in headers]))
     stack = slices(at=list(range(100)), frames=[1] * 100)
     assert find_alternation(stack, even=True) is None
     assert [(part[0], part[-1]) for part in seen] == [(0, 31), (34, 65), (68, 99)]

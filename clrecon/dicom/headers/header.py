@@ -188,12 +188,7 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
     warnings = []
     if not series.uid:
         warnings.append("no SeriesInstanceUID: the slices of one folder are taken as one series, by SeriesNumber")
-    unused: dict[str, float | None] = {"SliceThickness": None, "SpacingBetweenSlices": None}
-    for keyword, tag in (("SliceThickness", "(0018,0050)"), ("SpacingBetweenSlices", "(0018,0088)")):
-        try:
-            unused[keyword] = values.decimals(keyword, 1)[0] if keyword in values else None
-        except ValueProblem:
-            warnings.append(f"{keyword} {tag} is no finite number; ignored, it plays no part in the geometry")
+    stated = _read_stated_lengths(values, warnings)
     warnings += (*dict.fromkeys(values.warnings), *elements.remarks)
     if elements.encoding_differs:
         warnings.append("implicit and explicit VR are mixed up: parsed as found, not as the transfer syntax says")
@@ -226,10 +221,11 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
         row_cosines=row_cosines,
         column_cosines=column_cosines,
         position_mm=position,  # type: ignore[arg-type]
+        position_digits=values.decimal_places("ImagePositionPatient"),  # type: ignore[arg-type]
         di_mm=di,
         dj_mm=dj,
-        slice_thickness_mm=unused["SliceThickness"],
-        stated_gap_mm=unused["SpacingBetweenSlices"],
+        slice_thickness_mm=stated["SliceThickness"],
+        stated_gap_mm=stated["SpacingBetweenSlices"],
         slope=slope,
         intercept=intercept,
         has_slope="RescaleSlope" in values,
@@ -258,6 +254,17 @@ def _list_derived(image_type: list[str]) -> list[str]:
     """Return the `DERIVED_WORDS` of a derived image."""
     found = sorted(DERIVED_WORDS.intersection(re.split("[^A-Z]+", " ".join(image_type))))
     return found if "DERIVED" in image_type else []
+
+
+def _read_stated_lengths(values: Values, warnings: list[str]) -> dict[str, float | None]:
+    """Return SliceThickness and SpacingBetweenSlices where they are numbers; they place no slice."""
+    lengths: dict[str, float | None] = {"SliceThickness": None, "SpacingBetweenSlices": None}
+    for keyword, tag in (("SliceThickness", "(0018,0050)"), ("SpacingBetweenSlices", "(0018,0088)")):
+        try:
+            lengths[keyword] = values.decimals(keyword, 1)[0] if keyword in values else None
+        except ValueProblem:
+            warnings.append(f"{keyword} {tag} is no finite number; ignored, it plays no part in the geometry")
+    return lengths
 
 
 def _validate_geometry(values: Values) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:

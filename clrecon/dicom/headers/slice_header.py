@@ -65,6 +65,8 @@ class SliceHeader:
         ImageOrientationPatient as stored.
     position_mm : tuple of 3 float
         ImagePositionPatient, LPS mm, centre of the first voxel.
+    position_digits : tuple of 3 int
+        Number of decimals of each number of ImagePositionPatient, as it was written.
     di_mm, dj_mm : float
         Column spacing (PixelSpacing[1]) and row spacing (PixelSpacing[0]).
     slice_thickness_mm, stated_gap_mm : float or None
@@ -114,6 +116,7 @@ class SliceHeader:
     row_cosines: tuple[float, float, float]
     column_cosines: tuple[float, float, float]
     position_mm: tuple[float, float, float]
+    position_digits: tuple[int, int, int]
     di_mm: float
     dj_mm: float
     slice_thickness_mm: float | None

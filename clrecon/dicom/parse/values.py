@@ -106,6 +106,16 @@ def _known_word(raw: bytes) -> str:
     return escape_text(decode_text(raw))
 
 
+def _count_places(number: str) -> int:
+    mantissa, _, exponent = number.strip().upper().partition("E")
+    return len(mantissa.partition(".")[2]) - int(exponent or 0)
+
+
+@lru_cache(_KNOWN_VALUES)
+def _share_counts(*counts: int) -> tuple[int, ...]:
+    return counts
+
+
 @lru_cache(_KNOWN_VALUES)
 def _share_pairs(*pairs: tuple[str, str]) -> tuple[tuple[str, str], ...]:
     return pairs
@@ -174,6 +184,10 @@ class Values:
         if raw[-1:] == b"\0":
             self.warnings.append(f"{_place(keyword)} ends with NUL, taken as padding: its last digit may be lost")
         return numbers
+
+    def decimal_places(self, keyword: str) -> tuple[int, ...]:
+        """Return how many digits each number of a text element has after its decimal point; below 0 for whole tens."""
+        return _share_counts(*map(_count_places, self.text(keyword).split("\\")))
 
     def whole_or_none(self, keyword: str) -> int | None:
         text = self.text(keyword)

@@ -151,7 +151,7 @@ def _judge_steps(census: Census, stack: Stack, numbers: NDArray[np.int64]) -> tu
     gaps = np.diff(stack.distances_mm)
     if (steps == unit).all():
         thickness = median_thickness(stack.slices)
-        gap = median(gaps)
+        gap = stack.line.gap_median_mm or median(gaps)  # where positions are rounded, not that of the numbers
         if unit == 1 or thickness is None or gap <= WIDER * thickness or gap < unit * CLOSEST * thickness:
             return 0, ""
         why = f"step {unit}, and slices of {thickness:g} mm lie {gap:.4g} mm apart"

@@ -22,6 +22,7 @@ from clrecon.dicom.pixels.voxels import read_voxels
 from clrecon.dicom.stack.attributes import Alternation
 from clrecon.dicom.stack.fit import measure_gap
 from clrecon.dicom.stack.mixture import find_mixture, values_of
+from clrecon.dicom.stack.rounding import measure_unit
 from clrecon.errors import UsageError
 from clrecon.system.text import join_names
 from clrecon.system.wording import name_parameter
@@ -143,7 +144,21 @@ def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHe
         headers,
         count - len(headers),
         problem=f"duplicate slices with different pixels{'' if alike else ' or geometry'} at {len(crowded)} "
-        f"place{'s' * (len(crowded) > 1)}, and no element of their headers parts them into phases: {shown}{more}",
+        f"place{'s' * (len(crowded) > 1)}, and no element of their headers parts them into phases: {shown}{more}"
+        f"{_describe_digits(headers)}",
+    )
+
+
+def _describe_digits(headers: Sequence[SliceHeader]) -> str:
+    """Say that places fall together because positions have too few digits; empty if they have enough."""
+    normal = np.cross(headers[0].row_cosines, headers[0].column_cosines)
+    unit, digits = measure_unit(headers, normal)
+    thickness = headers[0].slice_thickness_mm or 0.0
+    if not 0.0 < thickness < unit:
+        return ""
+    return (
+        f"; positions are written with {digits} decimal{'s' * (digits != 1)}, too few for slices of {thickness:g} mm: "
+        "write them with more digits"
     )
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from clrecon.dicom.headers.slice_header import SliceHeader
 from clrecon.dicom.stack.directions import ORIENTATION_EXACT, ORIENTATION_LIMIT, measure_directions
 from clrecon.dicom.stack.holes import Holes, find_holes
 from clrecon.dicom.stack.numbers import median
+from clrecon.dicom.stack.rounding import Rounding, find_rounding
 from clrecon.geometry import compose_affine, signed_tilt
 from clrecon.geometry.affine import TILT_REPORT_DEG
 from clrecon.geometry.uneven import fit_line, position_tolerance
@@ -51,7 +52,7 @@ class Line:
     residual_max_mm, residual_rms_mm : float
         Distance of the positions from their places.
     tolerance_mm : float
-        Largest residual that counts as rounding.
+        Largest residual that counts as rounding; the unit of the last digit where few digits were written.
     worst_slice : int
         Index of the slice with the largest residual.
     uneven : bool
@@ -135,6 +136,11 @@ def measure_stack(headers: Sequence[SliceHeader], allow_gaps: bool = False) -> S
         problems.append("a single slice cannot make a surface")
     else:
         line, holes = measure_line(positions, distances), find_holes(distances)
+        rounding = find_rounding(slices, distances, normal, line.tolerance_mm or 0.0)
+        off = line.residual_max_mm or 0.0
+        if rounding is not None and off <= rounding.unit_mm and (holes.places or line.uneven):
+            line, holes = _round_line(line, distances, rounding), Holes()
+            warnings.append(f"{rounding}; placed by even steps of {line.gap_median_mm:.6g} mm")
         if holes.places and allow_gaps:
             warnings.append(f"{holes.describe()}: what is there is placed exactly, surfaces bridge the gap")
         elif holes.places:
@@ -174,6 +180,13 @@ def measure_line(positions: Float64Array, distances: Float64Array) -> Line:
         worst_slice=int(residuals.argmax()),
         uneven=bool(residuals.max() > tolerance),
     )
+
+
+def _round_line(line: Line, distances: Float64Array, rounding: Rounding) -> Line:
+    """Return the line of positions that are rounded even steps: its step, not that of the written numbers."""
+    k = np.arange(len(distances)) - (len(distances) - 1) / 2.0
+    step = float(k @ distances / np.sum(k**2))
+    return replace(line, gap_median_mm=step, tolerance_mm=rounding.unit_mm, uneven=False)
 
 
 def _measure_sideways(positions: Float64Array, distances: Float64Array) -> float:
