@@ -24,7 +24,8 @@ class PixelFacts:
     stray_text : str
         One line about these values; empty if there are none.
     padding_text : str
-        One line about padding that no header declares and that was found by its shape; empty if there is none.
+        One line about padding that no header declares and that was found by its shape, or about declared padding that
+        masks tissue; empty if there is none.
     """
 
     padding_share: float

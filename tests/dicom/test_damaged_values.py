@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 from dicom_series import Plan
 from value_series import (
     SHAPE,
     make_body,
     make_table,
+    radius_from,
     write_values,
 )
 
@@ -28,10 +30,19 @@ class Row:
     gates: set[str]
     words: str
     plan: Plan | None = None
+    hu: np.ndarray | None = None
 
 
-def stated(gates, words, plan=None, **values):
-    return Row(values, set(gates.split()), words, plan)
+def stated(gates, words, plan=None, hu=None, **values):
+    return Row(values, set(gates.split()), words, plan, hu)
+
+
+def make_padded():
+    """The body in a round field of view, padded with the stored value -2000."""
+    return np.where(radius_from() > 46, -3024.0, make_body())
+
+
+UNDECLARED, MASKED = "padding that the files do not declare", "voxels with the HU of tissue"
 
 
 ROWS = {
@@ -58,12 +69,23 @@ ROWS = {
     "table beside the slope": stated("hu_known", "Modality LUT Sequence (0028,3000)", **LUT),
     "sign lost": stated("stored_sign", "seem to be signed", Plan(shape=SHAPE, intercept=0), PixelRepresentation=0),
     "sign made up": stated("stored_sign", "dense bone or metal", TWELVE, PixelRepresentation=1),
+    "padding missing": stated("", UNDECLARED, hu=make_padded()),
+    "padding doubled": stated("", UNDECLARED, hu=make_padded(), PixelPaddingValue=-4000),
+    "padding with the wrong sign": stated("", UNDECLARED, hu=make_padded(), PixelPaddingValue=2000),
+    "padding with the value of muscle": stated("", MASKED, PixelPaddingValue=1074),
+    "padding with the value of bone": stated("", MASKED, PixelPaddingValue=1274),
+    "limit of the padding in tissue": stated(
+        "", MASKED, hu=make_padded(), PixelPaddingValue=-2000, PixelPaddingRangeLimit=980
+    ),
+    "limit of the padding with the wrong sign": stated(
+        "padding_share one_volume", MASKED, hu=make_padded(), PixelPaddingValue=-2000, PixelPaddingRangeLimit=2000
+    ),
     "bits too few": stated("stored_bits", "beyond the 11 stored bits", TWELVE, BitsStored=11, HighBit=10),
 }
 
 
 def damage(folder, row):
-    write_values(folder, make_body(), row.plan, **row.values)
+    write_values(folder, make_body() if row.hu is None else row.hu, row.plan, **row.values)
     return folder
 
 
@@ -91,3 +113,20 @@ def test_every_command_that_reads_says_it(tmp_path, device, capsys, name):
     assert main([*mesh, "--strict"]) == 7
     assert f"gate {gate} failed" in capsys.readouterr().err
     assert f"comment CERTIFICATE gate_failed {gate}: ".encode() in (tmp_path / "a.ply").read_bytes()
+
+
+@pytest.mark.parametrize(("value", "limit"), [(-2000, None), (-2000, 24), (1074, None), (1074, 1075)])
+def test_nothing_is_said_of_padding_around_the_picture(tmp_path, value, limit):
+    """Below air, up to air, and with a value of tissue that nothing in the picture has."""
+    body = make_body()
+    body[np.isin(body, (50, 51))] = 52
+    hu = np.where(radius_from() > 46, value - 1024, body)
+    elements = {"PixelPaddingValue": value, **({} if limit is None else {"PixelPaddingRangeLimit": limit})}
+    report = read_volume(write_values(tmp_path, hu, **elements)).report
+    assert report["warnings"] == [] and report["padding_share"] > 0.2
+
+
+def test_masked_tissue_is_counted_exactly(tmp_path):
+    body = make_body()
+    folder = write_values(tmp_path, body, PixelPaddingValue=1074)
+    assert read_volume(folder).report["warnings"][0].startswith(f"{np.count_nonzero(body == 50):,} {MASKED}")

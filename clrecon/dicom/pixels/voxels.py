@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.headers.slice_header import SliceHeader
 from clrecon.dicom.pixels.disc_padding import fill_disc_padding
+from clrecon.dicom.pixels.masked_tissue import count_masked_tissue, describe_masked_tissue
 from clrecon.dicom.pixels.padding import PaddingMasks, pack_mask
 from clrecon.dicom.pixels.stored import StoredPixels
 from clrecon.dicom.pixels.stray_bits import StrayBits, describe_stray_bits, find_stray_bits
@@ -39,12 +40,15 @@ FLOAT_LIMIT = 1e9
 
 
 class _SliceFacts(NamedTuple):
-    """Figures of one slice: its padding, packed, its lowest and highest measured HU, and unusual bits."""
+    """Figures of one slice: its padding, packed, its lowest and highest measured HU, unusual bits, and how many voxels
+    of its padding are tissue by their looks.
+    """
 
     padding: tuple[bytes, int] | None
     low: float
     high: float
     stray: StrayBits | None
+    tissue: int
 
 
 class _RangeError(Exception):
@@ -93,7 +97,7 @@ def read_voxels(
 def _fill_volume(
     source: StoredPixels, slices: Sequence[SliceHeader], voxels: NDArray[Any], progress: Progress | None
 ) -> PixelFacts:
-    padding, low, high = PaddingMasks(voxels), np.inf, -np.inf
+    padding, low, high, tissue = PaddingMasks(voxels), np.inf, -np.inf, 0
     stray: list[StrayBits | None] = [None] * len(slices)
     most = MAX_READERS
     if source.compressed:
@@ -106,6 +110,7 @@ def _fill_volume(
                 padding.add(jobs[job], seen.padding)
                 low, high = min(low, seen.low), max(high, seen.high)
                 stray[jobs[job]] = seen.stray
+                tissue += seen.tissue
                 if progress is not None:
                     progress("read", done, len(slices))
         except _RangeError:
@@ -116,7 +121,7 @@ def _fill_volume(
             pool.shutdown(cancel_futures=True)
             raise
         padding_hu = padding.fill(pool.map)
-    padded, said = padding.count, ""
+    padded, said = padding.count, describe_masked_tissue(tissue)
     disc = fill_disc_padding(voxels) if padding_hu is None else None
     if disc is not None:
         value, padded, padding_hu = disc
@@ -142,9 +147,10 @@ def _fill_slice(source: StoredPixels, header: SliceHeader, out: NDArray[Any]) ->
     if header.padding is not None and not whole_cell:
         padding = _find_padding(header, stored)
     packed = None if padding is None else pack_mask(padding)
+    tissue = 0 if padding is None else count_masked_tissue(header, stored, padding)
     if padding is not None and packed is not None:
         if packed[1] == padding.size:
-            return _SliceFacts(packed, np.inf, -np.inf, stray)
+            return _SliceFacts(packed, np.inf, -np.inf, stray, tissue)
         # A measured value at this place does not matter: this saves one pass over the slice.
         np.copyto(stored, stored.flat[padding.argmin()], where=padding)
     low, high = stored.min(), stored.max()
@@ -161,7 +167,7 @@ def _fill_slice(source: StoredPixels, header: SliceHeader, out: NDArray[Any]) ->
             out[...] = stored * np.float64(header.slope) + header.intercept
     else:
         _rescale_integers(header, stored, out, hu_low, hu_high)
-    return _SliceFacts(packed, hu_low, hu_high, stray)
+    return _SliceFacts(packed, hu_low, hu_high, stray, tissue)
 
 
 def _rescale_integers(
