@@ -13,7 +13,8 @@ import pytest
 from pydicom.datadict import keyword_for_tag
 
 from clrecon.dicom.headers import multiframe
-from clrecon.dicom.headers.header import _check_matrix, _check_single_frame
+from clrecon.dicom.headers.classic_frames import count_frames
+from clrecon.dicom.headers.header import _check_matrix
 from clrecon.dicom.headers.surplus import _check_tail, check_surplus
 from clrecon.dicom.parse import encapsulated, plain
 from clrecon.dicom.parse.careful import _looks_implicit
@@ -165,9 +166,10 @@ def values_of(**raw: tuple[int, bytes, str]) -> Values:
 
 def test_a_single_slice_may_say_that_it_has_one_frame():
     for text in (b"", b"0 ", b"1 "):
-        _check_single_frame(values_of(frames=(0x00280008, text, "IS")), "1.2")
-    with pytest.raises(ValueProblem, match="multi-frame image of 2 frames"):
-        _check_single_frame(values_of(frames=(0x00280008, b"2 ", "IS")), "1.2")
+        assert count_frames(values_of(frames=(0x00280008, text, "IS")), "1.2") == 1
+    assert count_frames(values_of(frames=(0x00280008, b"2 ", "IS")), "1.2") == 2
+    with pytest.raises(ValueProblem, match="multi-frame image of 65537 frames"):
+        count_frames(values_of(frames=(0x00280008, b"65537", "IS")), "1.2")
 
 
 def test_unsigned_numbers_have_two_bytes_or_four_as_ul():

@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
+from clrecon.dicom.headers.classic_frames import count_frames, find_places, spread_frames
 from clrecon.dicom.headers.multiframe import ENHANCED_CT, read_groups, split_frames
 from clrecon.dicom.headers.phase_tags import SLICE_PHASES
 from clrecon.dicom.headers.slice_header import OtherImage, SeriesIdentity, SliceHeader
@@ -108,25 +109,14 @@ def read_headers(
     if sop_class in ENHANCED_CT:
         return _read_frames(elements, series, path, name, force)
     try:
-        _check_single_frame(values, sop_class)
-        header = _validate(values, series, path, name)
+        frames = count_frames(values, sop_class)
+        places = find_places(values, sop_class, frames) if frames > 1 else None
+        header = _validate(values, series, path, name, frames=frames)
         said = check_surplus(elements, header, force)
-        return [replace(header, warnings=(*header.warnings, *said)) if said else header]
+        header = replace(header, warnings=(*header.warnings, *said)) if said else header
+        return [header] if places is None else list(spread_frames(header, places))
     except ValueProblem as problem:
         return OtherImage(series, path, name, 1, "broken", f"{name}: {problem}")
-
-
-def _check_single_frame(values: Values, sop_class: str) -> None:
-    if "NumberOfFrames" not in values:
-        return
-    frames = values.whole_or_none("NumberOfFrames")
-    if frames is None or frames < 0:
-        raise values.wrong("NumberOfFrames", "1, or nothing, in a single slice")
-    if frames > 1:
-        raise ValueProblem(
-            f"multi-frame image of {frames} frames, SOP class {sop_class}: the places of its frames are not known, "
-            "only Enhanced CT has them: export the series as single slices or as Enhanced CT"
-        )
 
 
 def _read_frames(

@@ -49,6 +49,7 @@ _TAGS = {
     "SamplesPerPixel": 0x00280002,
     "PhotometricInterpretation": 0x00280004,
     "NumberOfFrames": 0x00280008,
+    "FrameIncrementPointer": 0x00280009,
     "Rows": 0x00280010,
     "Columns": 0x00280011,
     "PixelSpacing": 0x00280030,
@@ -67,6 +68,7 @@ _TAGS = {
     "RescaleType": 0x00281054,
     "LossyImageCompression": 0x00282110,
     "ModalityLUTSequence": 0x00283000,
+    "GridFrameOffsetVector": 0x3004000C,
 }
 WANTED_TAGS = tuple(_TAGS.values())
 _DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")

@@ -204,7 +204,7 @@ class Series:
         # Bad files leave holes, whose message would only hide the cause.
         if self.kind == "stack" and not texts:
             problems += self._find_stack_problems()
-        if self.kind == "stack" and self.is_file and self.count == 1:
+        if self.kind == "stack" and self.is_file and len(self.headers) == 1:
             problems.append("the path names one file of a series: name the folder that holds them all")
         return problems
 
