@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import tolerances
 
-from clrecon.errors import NoSurfaceError, OutputError, UsageError
-from clrecon.exchange.clouds.formats import CLOUD_FORMATS, describe_cloud_losses
+from clrecon.errors import NoSurfaceError, OutputError, RefusedInputError, UsageError
+from clrecon.exchange.clouds.formats import CLOUD_FORMATS, describe_cloud_losses, write_cloud
 from clrecon.exchange.file_format import FileFormat
 from clrecon.points import PointCloud
 from clrecon.points.reader import read_points
@@ -164,6 +164,25 @@ def test_laspy_reads_the_same(tmp_path):
     np.testing.assert_array_equal(las["label"], cloud.labels)
     np.testing.assert_array_equal(las["nz"], cloud.normals[:, 2])
     assert las.header.creation_date is None
+    assert [(record.user_id, record.record_id) for record in las.header.vlrs.get_by_id("clrecon")] == [("clrecon", 1)]
+
+
+def test_a_las_file_without_its_last_byte_is_refused(tmp_path):
+    pytest.importorskip("laspy")
+    size = make_cloud().save(tmp_path / "bone.las")
+    content = (tmp_path / "bone.las").read_bytes()
+    (tmp_path / "bone.las").write_bytes(content[:-1])
+    with pytest.raises(RefusedInputError, match=f"1,000 points of 50 bytes cannot come from {size - 1:,} bytes"):
+        read_points(tmp_path / "bone.las")
+
+
+def test_hashes_of_identifiers_stay_out_of_files(tmp_path):
+    cloud = PointCloud(np.eye(3), report={"certificate": {"frame_of_reference_hash": "0123456789abcdef"}})
+    for extension in (".ply", ".vtp", ".xyz"):
+        write_cloud(cloud, tmp_path / f"a{extension}")
+        write_cloud(cloud, tmp_path / f"b{extension}", keep_ids=True)
+        found = [b"0123456789abcdef" in (tmp_path / f"{name}{extension}").read_bytes() for name in "ab"]
+        assert found == [False, True]
 
 
 def test_open3d_reads_the_same(tmp_path):
@@ -323,6 +342,6 @@ def test_estimate_is_about_right(extension, tmp_path):
 
 
 def test_a_cloud_longer_than_las_can_count_is_refused(tmp_path):
-    with pytest.raises(OutputError, match="LAS in steps of 0.0001 mm holds"):
+    with pytest.raises(OutputError, match="^the cloud is 1e.06 mm long, LAS in steps of 0.0001 mm holds 429497 mm:"):
         PointCloud([[0.0, 0, 0], [1e6, 0, 0]]).save(tmp_path / "long.las")
     assert list(tmp_path.iterdir()) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import struct
@@ -14,7 +15,7 @@ import tolerances
 
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
 from clrecon.exchange import formats as writers
-from clrecon.exchange.coordinates import rounded_apart
+from clrecon.exchange.coordinates import find_places, rounded_apart
 from clrecon.exchange.file_format import FileFormat
 from clrecon.exchange.formats import FORMATS
 from clrecon.mesh import Mesh
@@ -174,6 +175,17 @@ def test_obj_header_and_exact_digits(mesh, tmp_path):
     assert not any("-0 " in f"{line} " for line in lines if line.startswith("v "))
     a, b, c = mesh.triangles[-1] + 1
     assert lines[-1] == (f"f {a} {b} {c}" if mesh.normals is None else f"f {a}//{a} {b}//{b} {c}//{c}")
+
+
+def test_objects_of_an_obj_file_count_vertices_and_normals_apart(tmp_path):
+    """The first of two tetrahedra has no normals: those of the second count from 1, its vertices from 5."""
+    vertices, triangles = np.vstack([np.zeros(3), np.eye(3)]), [[0, 2, 1], [1, 2, 3]]
+    with writers.stage_assembly(
+        [Mesh(vertices, triangles), Mesh(vertices, triangles, vertices)], tmp_path / "a.obj", "lps"
+    ) as staged:
+        staged.commit()
+    faces = [line for line in (tmp_path / "a.obj").read_text().splitlines() if line.startswith("f ")]
+    assert faces == ["f 1 3 2", "f 2 3 4", "f 5//1 7//3 6//2", "f 6//2 7//3 8//4"]
 
 
 def test_iso_value_is_left_out_when_not_known(tmp_path):
@@ -353,6 +365,33 @@ def test_estimate_is_about_right(extension, tmp_path):
         assert estimate == size
 
 
+def test_estimate_of_3mf_counts_the_digits_of_triangles():
+    """A triangle of five digits an index has 45 bytes; 6 are taken for it besides.  XML shrinks to a seventh."""
+    vertices, triangles = samples.torus(200, 100)
+    estimates = [
+        FORMATS[".3mf"].estimate(Mesh(vertices, triangles[:count]).describe("lps")) for count in (7_000, 14_000)
+    ]
+    assert estimates[1] - estimates[0] == 1_000 * (len('<triangle v1="19999" v2="19999" v3="19999"/>\n') + 6)
+
+
+def test_more_vertices_than_a_ply_file_can_count_are_refused():
+    content = Mesh(*samples.box()).describe("lps")
+    large = dataclasses.replace(content, vertices=samples.LongTable(2**31 + 1))
+    stream = io.BytesIO()
+    with pytest.raises(OutputError, match="^2147483649 vertices are too many for a PLY file, at most 2147483648$"):
+        FORMATS[".ply"].write(stream, large)
+    assert stream.getvalue() == b""
+
+
+def test_the_end_of_a_vtp_file_is_quoted_where_it_is_wrong(mesh, tmp_path):
+    mesh.save(tmp_path / "bone.vtp")
+    content = (tmp_path / "bone.vtp").read_bytes().rstrip()
+    assert content.endswith(b"</VTKFile>")
+    (tmp_path / "bone.vtp").write_bytes(content[:-10] + b"0123456789abcdefghij")
+    with pytest.raises(OutputError, match=r": b'456789abcdefghij' at the end, </VTKFile> expected;"):
+        FORMATS[".vtp"].verify(tmp_path / "bone.vtp", mesh.describe("lps"))
+
+
 def test_too_large_for_the_format(mesh, tmp_path, monkeypatch):
     small = FORMATS[".stl"]
     limited = FileFormat(small.estimate, small.write, small.verify, 5000)
@@ -398,3 +437,12 @@ def test_rounding_brings_no_vertex_to_a_place_of_others():
     rounded = rounded_apart(points)
     assert np.array_equal(rounded[-500:], rounded[:500])
     assert len(np.unique(rounded, axis=0)) == len(np.unique(points, axis=0)) == 9_500
+
+
+def test_places_of_one_sum_are_told_apart(monkeypatch):
+    vertices = np.float32([[1, 2, 3], [0, 0, 0], [1, 2, 3], [-0.0, 0, 0], [3, 2, 1]])
+    for is_scrambled in (True, False):
+        if not is_scrambled:
+            monkeypatch.setattr("clrecon.exchange.coordinates._scramble", lambda own: np.zeros(len(own), np.uint64))
+        first, place = find_places(vertices)
+        assert (first.tolist(), place.tolist()) == ([0, 1, 4], [0, 1, 0, 1, 2])

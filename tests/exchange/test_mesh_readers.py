@@ -132,6 +132,13 @@ def test_vtp_as_vtk_writes_it(tmp_path: Path, mode: str) -> None:
     assert np.array_equal(back.vertices, mesh.vertices) and np.array_equal(back.triangles, mesh.triangles)
 
 
+@pytest.mark.parametrize("extension", [".ply", ".obj", ".glb", ".vtp"])
+def test_normals_are_read_back(tmp_path: Path, extension: str) -> None:
+    normals = [[0, 0, 1], [0, -1, 0], [1, 0, 0], [0, 0, -1]]
+    Mesh(*TETRA, normals).save(tmp_path / f"a{extension}", "ras")
+    assert clrecon.read_mesh(tmp_path / f"a{extension}").normals.tolist() == normals
+
+
 @pytest.mark.parametrize("extension", [".obj", ".glb", ".3mf", ".vtp"])
 def test_objects_keep_their_names_colours_and_order(tmp_path: Path, extension: str) -> None:
     vertices, triangles = ball(5.0, 6)
@@ -258,6 +265,18 @@ def test_hostile_glb_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
     check_refused(glb_of(tmp_path / "a.glb", **changes), words)
 
 
+@pytest.mark.parametrize("kind", [b"BIM\0", b"BIO\0"])
+def test_a_second_chunk_of_another_kind_is_refused(kind: bytes, tmp_path: Path) -> None:
+    path = glb_of(tmp_path / "a.glb")
+    path.write_bytes(path.read_bytes().replace(b"BIN\0", kind))
+    check_refused(path, "its second chunk is no binary data of its length")
+
+
+def test_a_scene_without_triangles_is_an_empty_mesh(tmp_path: Path) -> None:
+    mesh = clrecon.read_mesh(glb_of(tmp_path / "a.glb", meshes=[{"primitives": []}]))
+    assert (mesh.vertices.shape, mesh.triangles.shape) == ((0, 3), (0, 3))
+
+
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
@@ -269,6 +288,16 @@ def test_hostile_glb_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
         ("a.obj", b"v 0 0 0\nv 1 0\n", "unequally many"),
         ("a.obj", b"v 0 0 0\nf 1 1 1 1\n", "4 corners"),
         ("a.obj", b"v a b c\n", "cut or corrupt"),
+        (
+            "a.obj",
+            b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 1\nf 1//1 2//3 3//1\n",
+            "refers to a vertex or normal that is not",
+        ),
+        (
+            "a.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 3\nquality float x\nend_header\n",
+            "in line 4 .*'quality float x'",
+        ),
         ("a.vtp", b'<VTKFile type="PolyData"><PolyData/></VTKFile>', "no triangles"),
         ("a.vtp", b'<!DOCTYPE a><VTKFile type="PolyData"></VTKFile>', "document type"),
     ],

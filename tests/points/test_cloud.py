@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,13 @@ def test_arrays_have_the_promised_types() -> None:
     assert len(cloud) == 5 and repr(cloud) == "PointCloud(5 points, with normals, hu, labels, ijk, LPS mm)"
     assert np.asarray(cloud) is cloud.points
     assert PointCloud([[5000.0, 0.0, 0.0]]).points.dtype == np.float64
+
+
+def test_points_are_rows_of_three() -> None:
+    assert PointCloud([]).points.shape == PointCloud(np.empty((0, 3))).points.shape == (0, 3)
+    for shape in ((3,), (2, 2), (0, 2), (1, 3, 1)):
+        with pytest.raises(UsageError, match=f"have shape .n, 3., these have {re.escape(str(shape))}"):
+            PointCloud(np.zeros(shape))
 
 
 def test_a_selection_takes_every_array_along() -> None:

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sample_meshes import LongTable
 
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
 from clrecon.points import PointCloud
-from clrecon.points.reader import read_points
+from clrecon.points.reader import _check_points, read_points
 
 pytestmark = pytest.mark.unit
 
@@ -265,3 +266,19 @@ def test_a_line_of_words_and_numbers_before_the_points_is_said(tmp_path):
     assert len(cloud) == 2
     (warning,) = cloud.report["file"]["warnings"]
     assert warning.startswith("line 2 holds words and numbers and is left out, 'X1 2 3'")
+
+
+@pytest.mark.parametrize(
+    ("side", "unit"),
+    [(2.5, "metres: then multiply them by 1000"), (3, ""), (5000, ""), (5001, "micrometres: then divide them by 1000")],
+)
+def test_a_unit_is_doubted_by_the_longest_side(side, unit, tmp_path):
+    rows = [f"{side * n / 99} 0 0" for n in range(100)]
+    warnings = read_points(write(tmp_path / "a.xyz", "\n".join(rows) + "\n")).report["file"]["warnings"]
+    doubt = f"the points lie in a box of {side:.3g} x 0 x 0, which is read as mm; perhaps they are in {unit}"
+    assert [line for line in warnings if "perhaps" in line] == [doubt] * bool(unit)
+
+
+def test_more_points_than_a_number_of_32_bits_can_tell_are_refused():
+    with pytest.raises(RefusedInputError, match="^a.npz has 2,147,483,648 points: 1 to 2,147,483,647 are read$"):
+        _check_points(LongTable(2**31), "a.npz")

@@ -48,6 +48,7 @@ def test_members_are_those_within_eps(which: str, eps: float) -> None:
     }[which]()
     stencil = make_stencil(Lattice.of(volume), eps)
     nk = volume.shape_ijk[2]
+    assert stencil.tables.shape == (nk, 2)
     for k in range(nk):
         within = {offset for offset in offsets_of(stencil, k) if 0 <= k + offset[2] < nk}
         assert within == offsets_by_search(volume, k, eps)
@@ -75,6 +76,25 @@ def test_an_eps_of_one_slice_gap_reaches_the_next_slice() -> None:
     lattice = Lattice((5, 5, 5), np.diag((1.0, 1.0, gap, 1.0)))
     assert make_stencil(lattice, 0.3).members == (3, 3)
     assert make_stencil(lattice, 0.3 * (1 - 3e-6)).is_alone
+
+
+def test_the_diagonal_decides_whether_a_volume_lies_within_eps() -> None:
+    """Of a box of 3 x 4 x 5 steps of 1 mm, and of an uneven stack of 6 slices."""
+    box = Lattice((4, 5, 6), np.eye(4))
+    assert make_stencil(box, 50.0**0.5).holds((4, 5, 6)) and not make_stencil(box, 7.0).holds((4, 5, 6))
+    volume = uneven()
+    corners = volume.ijk_to_lps([(i, j, k) for i in (0, 3) for j in (0, 4) for k in range(6)])
+    longest = np.linalg.norm(corners[:, None] - corners, axis=2).max()
+    lattice = Lattice.of(volume)
+    assert make_stencil(lattice, longest).holds(volume.shape_ijk)
+    assert not make_stencil(lattice, longest - 0.001).holds(volume.shape_ijk)
+
+
+def test_slices_with_the_same_neighbours_share_a_table() -> None:
+    places = np.array([(0.0, 0.0, z) for z in (0, 1, 2, 3, 4, 9)])
+    tables = make_stencil(Lattice((3, 3, 6), np.eye(4), places), 1.0).tables.tolist()
+    assert tables[1] == tables[2] == tables[3]
+    assert len({tuple(table) for table in tables}) == 4
 
 
 def test_rows_are_sorted_by_distance() -> None:

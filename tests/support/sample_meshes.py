@@ -119,3 +119,13 @@ def ordered_soup(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
         turned.append(np.roll(triangle, -first, axis=0).ravel())
     soup = np.array(turned).reshape(-1, 9)
     return soup[np.lexsort(soup.T[::-1])]
+
+
+class LongTable:
+    """Has a length and nothing else: what does not refuse it fails at once, and needs no memory."""
+
+    def __init__(self, rows: int):
+        self.rows = rows
+
+    def __len__(self) -> int:
+        return self.rows
