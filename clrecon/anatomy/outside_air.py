@@ -19,6 +19,7 @@ from clrecon.errors import NoSurfaceError, RefusedInputError
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.volume import AIR_HU, Volume
 from clrecon.system.progress import Progress, Steps
+from clrecon.system.text import say_ml
 from clrecon.system.wording import name_parameter
 
 __all__ = ["leave_outside_air"]
@@ -98,7 +99,7 @@ def leave_outside_air(volume: Volume, levels: Sequence[float], *, progress: Prog
     left_out_ml, kept_ml = _millilitres(outside, volume), _millilitres(voxels < max(levels), volume)
     if kept_ml == 0.0:
         raise NoSurfaceError(
-            f"nothing below {max(levels):g} HU lies within the body: {left_out_ml:,.1f} ml are outside of it"
+            f"nothing below {max(levels):g} HU lies within the body: {say_ml(left_out_ml)} are outside of it"
             f" ({name_parameter('keep_outside', True)} takes them)"
         )
     changed = volume.with_voxels(voxels)

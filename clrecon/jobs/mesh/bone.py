@@ -85,7 +85,8 @@ def find_bone(
     bone = _holds_spine(mesh, volume, count, labels)
     if not bone.any():
         told = [one for one, is_rail in zip(judged, rails, strict=True) if one is not None and not is_rail]
-        raise NoSurfaceError(f"at {surface.describe()}: {_describe_none(told, count, int(rails.sum()))} ({advice})")
+        why = f"{_describe_none(told, count, int(rails.sum()))}{_describe_other_values(volume)}"
+        raise NoSurfaceError(f"at {surface.describe()}: {why} ({advice})")
     mesh.report.setdefault("warnings", []).append(
         f"at {surface.describe()} no component has walls like bone: the one round the spinal canal was kept"
     )
@@ -101,6 +102,22 @@ def _describe_none(told: Sequence[dict[str, Any]], count: int, rails: int) -> st
     return (
         f"nothing here looks like bone: of {count_of(count, 'component')} the largest {_looks(largest)};"
         f" those of bone reach 600 at 5 % and more of it{but}"
+    )
+
+
+def _describe_other_values(volume: Volume) -> str:
+    """Say that values on another scale than HU show no bone; empty where they are HU."""
+    from clrecon.jobs.mesh.levels import list_failed_values
+    from clrecon.mesh.compare.walls import COMPACT_HU
+
+    failed = list_failed_values(volume)
+    low, high = volume.hu_range or (float(volume.voxels.min()), float(volume.voxels.max()))
+    if not failed and (low < 0.0 or high >= COMPACT_HU):  # HU of a scan with air, or with something dense
+        return ""
+    values = f"are not known to be HU ({failed[-1]['name']})" if failed else f"run from {low:g} to {high:g}"
+    return (
+        f"; bone is told by walls of {COMPACT_HU:g} HU, and the values of this scan {values}: say how HU follow from"
+        f" them ({name_parameter('rescale', 'SLOPE,INTERCEPT')})"
     )
 
 

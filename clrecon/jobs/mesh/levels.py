@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from clrecon.anatomy.iso_choice import IsoChoice
     from clrecon.geometry import Volume
 
-__all__ = ["check_known_values", "choose_level", "describe_level", "warn_of_contrast"]
+__all__ = ["check_known_values", "choose_level", "describe_level", "list_failed_values", "warn_of_contrast"]
 
 THICK_SLICES_MM = 2.5
 """From this spacing on, thin walls across the slices are blurred so much that the half-way level can be too high: with
@@ -27,6 +27,11 @@ slices of 2 mm it is as good as the best, with 3 mm it loses walls (docs/iso_val
 
 VALUE_GATES = ("hu_known", "hu_scale", "stored_sign")
 """Gates of a volume that fail where its values are not HU."""
+
+
+def list_failed_values(volume: Volume) -> list[dict[str, Any]]:
+    """Return the gates of `VALUE_GATES` that failed."""
+    return [gate for gate in volume.report.get("gates", ()) if gate["name"] in VALUE_GATES and gate["ok"] is False]
 
 
 def check_known_values(volume: Volume, settings: MeshSettings) -> None:
@@ -40,7 +45,7 @@ def check_known_values(volume: Volume, settings: MeshSettings) -> None:
     named = settings.iso_value is not None or isinstance(settings.half_way, Sequence) and settings.half_way != "auto"
     if settings.purpose is None or not find_purpose(settings.purpose).is_for_print or named or not settings.follows_hu:
         return
-    failed = [gate for gate in volume.report.get("gates", ()) if gate["name"] in VALUE_GATES and gate["ok"] is False]
+    failed = list_failed_values(volume)
     if failed:
         raise RefusedInputError(
             f"a print needs a level of bone, and the values of this scan are not known to be HU"

@@ -24,6 +24,7 @@ from clrecon.operators.surface.label_masks import extract_label_masks
 from clrecon.operators.vertebrae.crop import LabelCrop, check_types, crop_label
 from clrecon.operators.vertebrae.solid import CLOSE_MM, label_margin, make_solid
 from clrecon.operators.vertebrae.thickness import ShellThickness, measure_thickness
+from clrecon.system.text import say_volume
 from clrecon.system.wording import name_parameter
 
 __all__ = ["DENSE_HU", "PARTS", "VertebraInside", "name_band", "vertebra_inside"]
@@ -96,7 +97,7 @@ class VertebraInside:
         raise TypeError("a VertebraInside belongs to its process: send to_label_map(), as_dict() and the meshes")
 
     def __repr__(self) -> str:
-        parts = ", ".join(f"{name} {ml:.2f} ml" for name, ml in self.volumes_ml.items())
+        parts = ", ".join(f"{name} {say_volume(ml)}" for name, ml in self.volumes_ml.items())
         return f"VertebraInside({self.name}: {parts})"
 
     @property

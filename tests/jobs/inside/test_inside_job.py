@@ -11,6 +11,7 @@ import pytest
 from contract_tables import names_in
 
 import clrecon
+from clrecon.cli.inside import _describe_vertebra
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
 from clrecon.jobs.inside.settings import InsideSettings
@@ -159,3 +160,18 @@ def test_the_meshes_lie_in_the_patient(inside: Any, spine: Path, tmp_path: Path)
     distance = truth.signed_distance(points)
     assert abs(float(distance.mean())) < 0.3
     assert float(abs(distance).max()) < 2.0
+
+
+def test_small_volumes_are_said_in_cubic_millimetres() -> None:
+    vertebra = {
+        "name": "L1",
+        "volumes_ml": {"solid": 0.0123, "dense": 0.004, "trabecular": None, "canal": 0.1},
+        "dense_hu": (300.0, None),
+        "iso_value_hu": None,
+        "canal_height_mm": 2.0,
+        "dense_thickness": {"limit_mm": 0.1, "median_mm": None},
+    }
+    assert _describe_vertebra(vertebra)[1:3] == [
+        "         solid 12.3 mm3 (label), canal 0.10 ml, 2 mm high",
+        "         dense 4 mm3 (300 HU and above), trabecular 0 ml",
+    ]

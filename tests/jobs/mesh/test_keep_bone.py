@@ -13,6 +13,7 @@ from clrecon.geometry import Volume
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.label_choice import LabelChoice
 from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.system.gates import none_of
 
 AFFINE = np.diag((1.0, 1.0, 1.5, 1.0))
 HEART_ML, BONE_ML = 4 / 3 * np.pi * 12**3 / 1000, 4 / 3 * np.pi * 9**3 / 1000
@@ -84,6 +85,26 @@ def test_a_scan_of_contrast_medium_alone_is_said_and_holds_no_bone(read: Any, de
     ):
         run(tmp_path, device, iso_value=200.0, keep="bone")
     assert (tmp_path / "b.ply").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("scale", "gates", "said"),
+    [
+        (255.0 / 2000.0, [], "the values of this scan run from 0 to {:g}: say how HU follow from them"),
+        (1.0, [none_of("hu_known", 3, "slices")], "the values of this scan are not known to be HU (hu_known): say how"),
+    ],
+    ids=["8 bits", "raw"],
+)
+def test_values_on_another_scale_are_named_where_nothing_looks_like_bone(
+    scale: float, gates: list[Any], said: str, read: Any, device: Any, tmp_path: Path
+) -> None:
+    scan = make_scan(bone=0.0 if gates else 900.0)
+    shown = scan if gates else scan.with_voxels(np.clip((scan.voxels + 1000.0) * scale, 0, 255).astype(np.int16))
+    read(Volume(shown.voxels, shown.affine, {"gates": gates}))
+    with pytest.raises(NoSurfaceError) as caught:
+        run(tmp_path, device, iso_value=200.0, keep="bone")
+    assert f"; bone is told by walls of 600 HU, and {said.format(shown.voxels.max())}" in str(caught.value)
+    assert "rescale=" in str(caught.value) and not list(tmp_path.glob("b.*"))
 
 
 def test_pieces_say_which_of_them_are_no_bone(read: Any, device: Any, tmp_path: Path) -> None:
