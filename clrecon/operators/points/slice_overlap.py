@@ -67,9 +67,10 @@ def find_ghost_slices(
     """Find foreign slices inside a stack: screen captures, localizers, slices of another place.
 
     The voxels of a band are compared by Dice's coefficient D of two slices.  Slice k is a ghost if ``max(D(k - 1, k),
-    D(k, k + 1)) < 0.75 D(k - 1, k + 1)``: its neighbours are more like each other than like it.  Two foreign slices
-    side by side are not found; of two with one slice between, that slice may be taken for one.  The first and the last
-    slice have one neighbour and are not tested.
+    D(k, k + 1)) < 0.75 D(k - 1, k + 1)``, its neighbours are more like each other than like it, and if less than 0.45
+    of its voxels, corrected for chance, lie within one of them.  Two foreign slices side by side are not found; of two
+    with one slice between, that slice may be taken for one.  The first and the last slice have one neighbour and are
+    not tested.
 
     Parameters
     ----------
@@ -101,11 +102,12 @@ def find_ghost_slices(
 
     def work(told: list[str]) -> GhostSlices:
         stopwatch = Stopwatch()
-        beside = {"counts of rows": 12 * resident.volume.shape_ijk[1] * resident.volume.shape_ijk[2]}
+        ni, nj, nk = resident.volume.shape_ijk
+        beside = {"counts of rows": 12 * nj * nk}
         mask = mark_band(resident, band, beside=beside, stopwatch=stopwatch, progress=progress)
         with stopwatch.running(resident.device):
             counts = count_overlaps(resident.device, mask, stopwatch=stopwatch)
-        return judge_slices(counts, band, tuple(told))
+        return judge_slices(counts, ni * nj, band, tuple(told))
 
     with open_volume(volume, device, memory, "a search for ghost slices") as resident:
         return resident.attempt(work)

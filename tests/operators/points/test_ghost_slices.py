@@ -84,6 +84,41 @@ def test_what_the_test_can_and_cannot_find(device, places, found):
     assert np.isnan(test.around[[0, -1]]).all() and not np.isnan(test.around[1:-1]).any()
 
 
+def thick_slices(kind: str = "spine", slices: int = 30) -> np.ndarray:
+    settings = PhantomSettings(kind=kind, size=(120, 120), slices=slices, spacing=(1.5, 1.5, 5.0))
+    return make_phantom(settings)[0]
+
+
+def find_in(voxels: np.ndarray):
+    return judge_slices(twin.count_overlaps(voxels >= 200), 120 * 120, (200.0, np.inf))
+
+
+@pytest.mark.parametrize("slices", [24, 30, 40])
+def test_discs_between_vertebrae_are_no_ghosts(slices):
+    """They are unlike both neighbours, which are alike, but lie within one of them."""
+    found = find_in(thick_slices(slices=slices))
+    unlike = found.nearest < 0.75 * found.around
+    assert unlike.sum() == 3 and found.within[unlike].min() > 0.45
+    assert found.slices == () and found.as_dict()["within_share"] == 0.45
+
+
+@pytest.mark.parametrize("at", [1, 4, 12, 17, 28])
+def test_a_slice_of_another_scan_is_found_among_thick_slices(at):
+    voxels = thick_slices()
+    voxels[at] = thick_slices("skull")[15]
+    found = find_in(voxels)
+    assert found.slices == (at,)
+    assert found.as_dict()["ghost_slices"][0]["share_within_neighbour"] < 0.45
+
+
+def test_the_share_within_a_neighbour_is_corrected_for_chance():
+    """Of 4 voxels 3 lie within the slice before, which takes 5 of 20; of 4 voxels 1 within the one behind, 10 of 20."""
+    counts = np.array([[5, 4, 10], [3, 1, 0], [5, 0, 0]])
+    found = judge_slices(counts, 20, (0.0, 1.0))
+    assert found.within[1] == pytest.approx((3 / 4 - 5 / 20) / (1 - 5 / 20))
+    assert np.isnan(found.within[[0, 2]]).all()
+
+
 @pytest.mark.parametrize("slices", [1, 2])
 def test_stacks_without_an_inner_slice_are_not_tested(device, slices):
     found = find_ghost_slices(Volume(rods(slices), np.eye(4)), BONE, device=device)
@@ -110,7 +145,7 @@ def test_slabs_find_the_same(device):
 
 def test_points_of_ghosts_are_dropped():
     counts = twin.count_overlaps(np.concatenate([rods()[:6], other("line")[None], rods()[7:]]) >= 200)
-    found = judge_slices(counts, (200.0, np.inf))
+    found = judge_slices(counts, 40 * 50, (200.0, np.inf))
     assert found.slices == (6,)
     volume = Volume(rods(), np.diag((0.5, 0.5, 2.0, 1.0)))
     ijk = np.argwhere(volume.voxels >= 200)[:, ::-1]
