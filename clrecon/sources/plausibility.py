@@ -25,7 +25,7 @@ __all__ = ["VoxelFindings", "examine_voxels", "leave_unexamined"]
 CEILING_BITS = 12
 """Bits of most scanners, even where more bits are stored: 3071 HU with intercept -1024."""
 CEILING_HU = 3071
-"""Highest value where no header says how values were stored."""
+"""Highest value of 12 bits, however the values are stored now."""
 CEILING_VOXELS = 10
 """Least number of voxels at the ceiling; fewer may be noise in dense bone."""
 
@@ -103,18 +103,18 @@ def leave_unexamined() -> list[Gate]:
 
 def _warn_of_saturation(voxels: NDArray[Any], facts: PixelFacts, slices: Sequence[StoredValues]) -> list[str]:
     """Warn of voxels at the highest value that the stored bits, or the 12 bits of the scanner, can express."""
-    members: dict[tuple[float, int], list[int]] = {}
-    if not slices and facts.hu_max >= CEILING_HU:
-        members[float(CEILING_HU), CEILING_BITS] = list(range(len(voxels)))
+    members: dict[tuple[float, int], set[int]] = {}
+    if facts.hu_max >= CEILING_HU:
+        members[float(CEILING_HU), CEILING_BITS] = set(range(len(voxels)))
     for k, header in enumerate(slices):
         highest = (1 << (header.bits_stored - header.signed)) - 1
         for bits, stored in {(CEILING_BITS, (1 << CEILING_BITS) - 1), (header.bits_stored, highest)}:
             ceiling = float(np.float32(header.slope * stored + header.intercept))
             if stored <= highest and ceiling <= facts.hu_max:
-                members.setdefault((ceiling, bits), []).append(k)
+                members.setdefault((ceiling, bits), set()).add(k)
     warnings = []
     for (ceiling, bits), places in sorted(members.items()):
-        slope = abs(slices[places[0]].slope) if slices else 1.0
+        slope = abs(slices[min(places)].slope) if slices else 1.0
         at, above, beside = np.sum([_count_near(voxels[k], ceiling, slope) for k in places], axis=0).tolist()
         # Values continue beyond: measured with more bits, unless a great many voxels have exactly this value.
         if at <= CEILING_VOXELS or above and at <= CEILING_SPIKE * beside / (2 * CEILING_LEVELS):

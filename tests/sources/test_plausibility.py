@@ -145,6 +145,23 @@ def test_noise_below_air_is_no_padding(tmp_path):
 
 # --- saturated ---
 @pytest.mark.parametrize(
+    "plan",
+    [
+        Plan(shape=SHAPE, intercept=0),
+        Plan(shape=SHAPE, intercept=-1000),
+        Plan(shape=SHAPE, intercept=-8192, bits_stored=14, signed=False),
+    ],
+    ids=["signed HU", "another intercept", "14 bits"],
+)
+def test_the_ceiling_of_12_bits_is_one_however_the_values_are_stored(tmp_path, plan):
+    hu = make_scan()
+    hu[:, 23:25, 23:25] = 3071
+    assert told(write_hu(tmp_path, hu, plan)) == [
+        "24 voxels are at 3071 HU, the ceiling of 12 bits: metal is saturated, its surface displaced"
+    ]
+
+
+@pytest.mark.parametrize(
     ("bits", "signed", "top", "words"),
     [
         (16, True, 3071, "ceiling of 12 bits: metal is saturated"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from clrecon.mesh.compare.iso_distance import METAL_HU
 from clrecon.system.gates import Gate, at_most, failed_gates, is_true, none_of, unmeasured
 
 __all__ = [
@@ -119,10 +120,16 @@ def _gates_of_iso_distance(iso_distance: Mapping[str, Any]) -> Iterator[Gate]:
     yield none_of("iso_distance_found", iso_distance["not_found"], what)
     what = "distance of the vertices from the trilinear iso surface"
     measures = (("p95", DEVIATION_P95_VOXEL, "95 % of them"), ("mean", DEVIATION_MEAN_VOXEL, "mean"))
+    found, near = iso_distance["vertices_voxel"], iso_distance.get("near_metal", 0)
+    away = iso_distance.get("away_from_metal_voxel")
+    metal = f"{near:,} of {iso_distance['samples']['vertices']:,} near metal (above {METAL_HU:g} HU)" if near else ""
     for name, bound, which in measures:
-        found = iso_distance["vertices_voxel"]
-        if found:
-            yield at_most(f"iso_distance_{name}", found[name], bound, "voxel", f"{what}, {which}")
+        if away:
+            aside = f"without {metal}, with them {found[name]:.3g}"
+            yield at_most(f"iso_distance_{name}", away[name], bound, "voxel", f"{what}, {which} ({aside})")
+        elif found:
+            aside = f" ({metal})" if metal else ""
+            yield at_most(f"iso_distance_{name}", found[name], bound, "voxel", f"{what}, {which}{aside}")
         else:
             yield unmeasured(f"iso_distance_{name}", bound, "voxel", f"{what}: none was reached")
 

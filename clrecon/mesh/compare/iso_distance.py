@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from clrecon.system.pieces import chunks
 from clrecon.system.records import Record
 
 __all__ = [
+    "METAL_HU",
     "SAMPLES",
     "IsoDistance",
     "distances_to_iso_surface",
@@ -29,6 +31,12 @@ __all__ = [
 
 SAMPLES = 100_000
 """Most points; larger meshes are measured at every n-th vertex and triangle."""
+
+METAL_HU = 2000.0
+"""Bone is below, metal and enamel above."""
+METAL_REACH = 2
+"""Voxels.  At an edge of thousands of HU a level of bone lies in the outermost voxels: the surface is a staircase,
+which smoothing leaves."""
 
 _STEPS = 12
 _ON_THE_SURFACE = 1e-3
@@ -235,6 +243,10 @@ class IsoDistance(Record):
         None where none was found.
     vertices_voxel, centres_voxel : DistanceSummary or None
         The same in units of `voxel_mm`.
+    near_metal : int
+        Measured vertices within `METAL_REACH` voxels of a voxel above `METAL_HU`.
+    away_from_metal_voxel : DistanceSummary or None
+        As `vertices_voxel`, without those near metal; None where these are none, or more than half.
     """
 
     voxel_mm: float
@@ -244,6 +256,8 @@ class IsoDistance(Record):
     vertices_voxel: DistanceSummary | None
     centres_mm: DistanceSummary | None
     centres_voxel: DistanceSummary | None
+    near_metal: int = 0
+    away_from_metal_voxel: DistanceSummary | None = None
 
 
 def measure_iso_distance(mesh: Mesh, volume: Volume, rule: IsoRule, samples: int = SAMPLES) -> IsoDistance:
@@ -271,12 +285,42 @@ def measure_iso_distance(mesh: Mesh, volume: Volume, rule: IsoRule, samples: int
     vertices = mesh.vertices[:: -(-mesh.vertex_count // samples) or 1].astype(np.float64)
     triangles = mesh.triangles[:: -(-mesh.triangle_count // samples) or 1]
     centres = mesh.vertices[triangles].mean(axis=1, dtype=np.float64)
-    not_found, summaries = 0, []
-    for points in (vertices, centres):
-        distances = distances_to_iso_surface(volume, rule, points)
-        found = distances[np.isfinite(distances)]
-        not_found += len(points) - len(found)
-        summary = summarise_distances(found) if len(found) else None
-        in_voxels = None if summary is None else DistanceSummary(*(value / voxel for value in summary.values()))
-        summaries += [summary, in_voxels]
-    return IsoDistance(voxel, {"vertices": len(vertices), "centres": len(centres)}, not_found, *summaries)
+    of_vertices, of_centres = (distances_to_iso_surface(volume, rule, points) for points in (vertices, centres))
+    near = _find_near_metal(volume, rule, vertices)
+    count, away = int(np.count_nonzero(near)), None
+    if 0 < 2 * count <= len(near):
+        away = _summarise(of_vertices[~near], voxel)
+    return IsoDistance(
+        voxel,
+        {"vertices": len(vertices), "centres": len(centres)},
+        sum(int(np.count_nonzero(~np.isfinite(distances))) for distances in (of_vertices, of_centres)),
+        vertices_mm=_summarise(of_vertices),
+        vertices_voxel=_summarise(of_vertices, voxel),
+        centres_mm=_summarise(of_centres),
+        centres_voxel=_summarise(of_centres, voxel),
+        near_metal=count,
+        away_from_metal_voxel=away,
+    )
+
+
+def _summarise(distances: Float64Array, unit_mm: float = 1.0) -> DistanceSummary | None:
+    """Sum up the finite distances, None without one."""
+    found = distances[np.isfinite(distances)]
+    if len(found) == 0:
+        return None
+    return DistanceSummary(*(value / unit_mm for value in summarise_distances(found).values()))
+
+
+def _find_near_metal(volume: Volume, rule: IsoRule, points: Float64Array) -> NDArray[np.bool_]:
+    """Return which points have a voxel above `METAL_HU` within `METAL_REACH` voxels along each axis.
+
+    None has where the level itself is one of metal: the surface is that of an implant then, or values are no HU.
+    """
+    near = np.zeros(len(points), np.bool_)
+    if max(rule.levels) >= METAL_HU or volume.hu_range is None or volume.hu_range[1] <= METAL_HU:
+        return near
+    nearest = np.rint(volume.lps_to_ijk(points)).astype(np.int64)
+    reach = range(-METAL_REACH, METAL_REACH + 1)
+    for step in product(reach, repeat=3):
+        near |= _samples(volume, rule, nearest + step) > METAL_HU
+    return near

@@ -18,7 +18,7 @@ from clrecon.anatomy.dense_pieces import RAIL_MM, STRAIGHT_MM
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule
-from clrecon.mesh.compare.iso_distance import trilinear_values
+from clrecon.mesh.compare.iso_distance import METAL_HU, trilinear_values
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.records import Record
 
@@ -38,7 +38,6 @@ __all__ = [
 
 COMPACT_HU = 600.0
 """Compact bone reaches this below its surface; contrast medium in heart and vessels does not."""
-METAL_HU = 2000.0
 WALL_MM = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 """Depths along the inward normal; the wall is the highest value at these depths.  They extend to 1.5 voxels if that is
 deeper."""

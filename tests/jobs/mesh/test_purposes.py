@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
+from clrecon import Volume
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.for_purpose import settings_for
@@ -136,3 +138,39 @@ def test_paper_b_runs_as_a_whole(device: Any, tmp_path: Path, capsys: pytest.Cap
     said = capsys.readouterr()
     assert "cells" in said.out
     assert any("0.618 of their edges" in warning for warning in report["warnings"])
+
+
+def make_hip() -> Volume:
+    """A femur in a thigh with the head and stem of a prosthesis: metal has sharp edges and is cut off at 3071 HU."""
+    size = 72
+    k, j, i = np.mgrid[:size, :size, :size] - 35.5
+    radius = np.hypot(i, j)
+    shaft = (k > -29) & (k < 6)
+    hu = np.where(radius < 32, 40.0, -1000.0)
+    hu[shaft & (radius < 20)] = 250
+    hu[shaft & (radius < 20) & (radius > 15)] = 1100
+    head = np.sqrt(i**2 + j**2 + (k - 16.5) ** 2) < 14
+    stem = (np.hypot(i - 0.3 * k, j) < 5) & (k > -25) & (k < 24)
+    hu = gaussian_filter(hu, 0.9) + 8000 * gaussian_filter((head | stem).astype(float), 0.3)
+    hu += np.random.default_rng(3).normal(0, 12, hu.shape)
+    return Volume(np.rint(np.minimum(hu, 3071)).astype(np.int16), np.diag([1.0, 1.0, 1.5, 1.0]))
+
+
+def test_metal_is_named_and_distances_are_judged_without_it(device: Any, tmp_path: Path) -> None:
+    make_hip().save(tmp_path / "hip.nii.gz")
+    arguments = ["mesh", str(tmp_path / "hip.nii.gz"), "-o", str(tmp_path / "a.stl"), "--for", "print"]
+    arguments += ["--device", str(device.index), "--report", str(tmp_path / "a.json")]
+    assert main(arguments) == 0
+    report = json.loads((tmp_path / "a.json").read_text())
+    found, gates = report["iso_distance"], {gate["name"]: gate for gate in report["gates"]}
+    assert 0.3 < found["near_metal"] / found["samples"]["vertices"] < 0.5
+    for name, bound in (("p95", 0.25), ("mean", 0.1)):
+        whole, away, gate = (
+            found["vertices_voxel"][name],
+            found["away_from_metal_voxel"][name],
+            gates[f"iso_distance_{name}"],
+        )
+        assert whole > bound > 1.5 * away
+        assert (gate["measured"], gate["ok"]) == (away, True)
+        metal = f"{found['near_metal']:,} of {found['samples']['vertices']:,} near metal (above 2000 HU)"
+        assert f"(without {metal}, with them {whole:.3g})" in gate["text"]

@@ -100,6 +100,18 @@ def test_vertices_off_the_iso_surface():
     assert failed(judge_mesh(iso_distance={"vertices_voxel": None, "not_found": 3})) == {"iso_distance_found"}
 
 
+def test_distances_are_judged_away_from_metal_and_both_figures_are_said():
+    figures = {"vertices_voxel": {"p95": 0.3, "mean": 0.2}, "not_found": 0, "samples": {"vertices": 4000}}
+    figures |= {"near_metal": 1500, "away_from_metal_voxel": {"p95": 0.2, "mean": 0.11}}
+    _, p95, mean = judge_mesh(iso_distance=figures)
+    assert (p95["measured"], p95["ok"], mean["measured"], mean["ok"]) == (0.2, True, 0.11, False)
+    aside = "(without 1,500 of 4,000 near metal (above 2000 HU), with them 0.3)"
+    assert p95["text"].endswith(f", 95 % of them {aside}: 0.2 voxel, at most 0.25")
+    _, p95, mean = judge_mesh(iso_distance={**figures, "near_metal": 2500, "away_from_metal_voxel": None})
+    assert (p95["measured"], p95["ok"], mean["ok"]) == (0.3, False, False)
+    assert "(2,500 of 4,000 near metal (above 2000 HU))" in p95["text"]
+
+
 def test_the_volume_of_a_label():
     assert judge_label_volume(24.0, 63.0, "fill it")["ok"] is False
     assert judge_label_volume(24.0, 63.0, "fill it")["text"] == (

@@ -233,3 +233,35 @@ def test_a_mesh_that_does_not_say_whether_it_is_closed_is_open():
     rule = rule_of_report({"iso_level_hu": 225.5})
     assert rule is not None
     assert (rule.closed, rule.iso_level) == (False, 225.5)
+
+
+def metal_volume(level: float, count: int) -> tuple[Volume, Mesh]:
+    """Bone below i = 5 and one voxel of the level at (8, 3, 3); `count` of six vertices lie within two voxels of it."""
+    voxels = np.zeros((7, 7, 14), np.int16)
+    voxels[:, :, :5] = 900
+    voxels[3, 3, 8] = level
+    places: list[tuple[float, float, float]] = (
+        [(6, 3, 3), (8, 1, 5), (10, 5, 1), (11, 3, 3)] if count == 3 else [(8, 3, 3)] * count
+    )
+    places += [(4.5, 1, 1)] * (6 - len(places))
+    return Volume(voxels, np.eye(4)), Mesh(np.array(places, float), [[0, 1, 2], [3, 4, 5]])
+
+
+@pytest.mark.parametrize(("level", "iso_value", "near"), [(2001, 200, 3), (2000, 200, 0), (3071, 2500, 0)])
+def test_vertices_near_metal_are_counted_and_left_out(level, iso_value, near):
+    volume, mesh = metal_volume(level, 3)
+    rule = choose_iso_rule(volume, iso_value, closed=False)
+    found = measure_iso_distance(mesh, volume, rule)
+    assert found["near_metal"] == near
+    if not near:
+        assert found["away_from_metal_voxel"] is None
+        return
+    away = distances_to_iso_surface(volume, rule, mesh.vertices[3:].astype(np.float64))
+    assert np.isfinite(away).sum() >= 2
+    assert found["away_from_metal_voxel"]["max"] == np.nanmax(away)
+
+
+def test_where_most_is_metal_all_is_judged():
+    volume, mesh = metal_volume(3071, 4)
+    found = measure_iso_distance(mesh, volume, choose_iso_rule(volume, 200, closed=False))
+    assert (found["near_metal"], found["away_from_metal_voxel"]) == (4, None)
