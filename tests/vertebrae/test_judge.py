@@ -11,10 +11,10 @@ import pytest
 
 from clrecon.vertebrae.course import AHEAD_MM, ASIDE_MM, Course
 from clrecon.vertebrae.discs import Bound, Looks
-from clrecon.vertebrae.judge import Piece, beside_share, judge, weigh
+from clrecon.vertebrae.judge import WEIGHTS, Piece, Traits, _walls, beside_share, judge, weigh
 
 PLACES = 60
-WHOLE = Piece(Bound(10, 0, 40.0), Bound(50, 0, 20.0), 10, 50, 2.4, 0.775, 0.375, 0.3, 0.0276)
+WHOLE = Piece(Bound(10, 0, 40.0), Bound(50, 0, 20.0), 10, 50, 2.4, 0.775, 0.375, 0.75, 0.0276)
 """Most of its traits lie half way between bad and good."""
 
 
@@ -41,15 +41,20 @@ def scan_of() -> np.ndarray:
     return scan
 
 
-def traits_of(piece: Piece, gaps: tuple[float, ...] = (), depths: dict[int, float] | None = None) -> dict[str, float]:
+def judged(
+    piece: Piece, gaps: tuple[float, ...] = (), depths: dict[int, float] | None = None, scan: np.ndarray | None = None
+) -> Traits:
     nothing = np.zeros((PLACES, 3))
     known = np.zeros(PLACES, bool)
     known[10:35] = known[50:] = True  # 25 of 40
     course = Course(nothing, nothing, nothing, nothing, known, (False, False))
     usual = np.full(PLACES, 100.0)
     usual[50:] = 50.0
-    traits = judge(piece, gaps, scan_of(), looks_of(depths), course, usual)
-    return {name: value for name, (value, _) in traits.items()}
+    return judge(piece, gaps, scan_of() if scan is None else scan, looks_of(depths), course, usual)
+
+
+def traits_of(piece: Piece, gaps: tuple[float, ...] = (), depths: dict[int, float] | None = None) -> dict[str, float]:
+    return {name: value for name, (value, _) in judged(piece, gaps, depths).items()}
 
 
 def test_every_trait_of_a_whole_vertebra() -> None:
@@ -68,7 +73,7 @@ def test_every_trait_of_a_whole_vertebra() -> None:
             "volume": 0.5,
             "border": 0.5,
             "arch": 0.5,
-            "rim": 0.7,
+            "rim": 0.25,
             "one part": 0.5,
         },
         rel=1e-6,
@@ -89,6 +94,38 @@ def test_every_trait_of_a_whole_vertebra() -> None:
 def test_single_traits(changes: dict[str, Any], gaps: tuple[float, ...], name: str, value: float) -> None:
     found = traits_of(replace(WHOLE, **changes), gaps, {20: 36.0})
     assert found[name] == pytest.approx(min(value, 1.0), rel=1e-6)
+
+
+def test_what_is_said_of_each_trait() -> None:
+    assert [text for _, text in judged(WHOLE, (10.0, 28.0, 99.0), {20: 36.0}).values()] == [
+        "the disc at its upper end is 40 HU darker than bone",
+        "the disc at its lower end is 20 HU darker than bone",
+        "36 HU darker plane within it: there may be another disc",
+        "its body has a wall in 70 % of the directions",
+        "the middle of its body has 70 HU",
+        "5 % of the middle of its body is fat or air",
+        "18 % of its canal is filled with bone or air",
+        "its canal was seen on 62 % of its height",
+        "its height is 40 mm, and 28 mm is usual beside it",
+        "its volume is 2.4 ml, not 3 to 80",
+        "38 % of it may be a neighbour's: their joints are closed",
+        "it has only 0.0 ml of a spinous process",
+        "75 % of its voxels lie in its surface: the slices are thick for its size",
+        "78 % of it hang together",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("wall", "beyond", "share"), [(300.0, 240.0, 1.0), (300.0, 241.0, 0.0), (130.0, 70.0, 1.0), (129.0, 0.0, 0.0)]
+)
+def test_a_wall_is_dense_and_60_hu_denser_than_what_lies_beyond(wall: float, beyond: float, share: float) -> None:
+    """A dark ring within the wall makes none; in front alone are 12 of the 18 directions."""
+    looks = replace(looks_of(), front_mm=np.full(PLACES, 40.0), side_mm=np.full(PLACES, 30.0))
+    radius = np.hypot((AHEAD_MM[:, None] - 20.0) / 20.0, ASIDE_MM / 30.0)
+    page = np.where(radius < 0.95, 0.0, np.where(radius < 1.05, wall, beyond))
+    assert _walls(np.repeat(page[None], PLACES, axis=0), looks, WHOLE) == share
+    page[:20] = 70.0
+    assert _walls(np.repeat(page[None], PLACES, axis=0), looks, WHOLE) == pytest.approx(share * 12 / 18)
 
 
 def test_traits_that_only_a_whole_vertebra_has() -> None:
@@ -115,6 +152,7 @@ def test_a_further_disc_is_looked_for_well_within(end: int, depths: dict[int, fl
 def test_confidence_is_what_the_traits_take_from_the_logarithm() -> None:
     good = {name: (1.0, name) for name in ("arch", "volume", "height", "line")}
     assert weigh(good) == (1.0, [])
+    assert weigh({name: (0.0, name) for name in WEIGHTS})[0] == pytest.approx(math.exp(-3.67))
     confidence, doubts = weigh({**good, "arch": (0.0, "no arch"), "line": (0.39, "no line"), "height": (0.65, "low")})
     assert confidence == pytest.approx(math.exp(-0.45 - 0.15 * 0.61 - 0.25 * 0.35)) and confidence < 0.6
     assert doubts == ["no arch", "no line"]  # 0.0915 is more than a fifth of 0.45, 0.0875 is less
@@ -126,10 +164,13 @@ def test_bone_beside_a_body() -> None:
     looks, scan = looks_of(), np.full((PLACES, len(AHEAD_MM), len(ASIDE_MM)), np.nan, np.float32)
     looks.side_mm[:10] = 12.0
     lower = replace(WHOLE, begin=29, end=49)  # the wall 20 mm above: 12 mm; its middle: 34 to 43
-    scan[34:44, 6:21, :] = 0.0
+    scan[34:44] = 0.0
     for first in (42 + 15, 42 - 23):
         scan[34:44, 6:21, first : first + 9] = 100.0
     assert beside_share(scan, looks, lower, 100.0) == 1.0
+    scan[34:44, 6] = 0.0
+    assert beside_share(scan, looks, lower, 100.0) == pytest.approx(14 / 15)
+    scan[34:44, 6] = scan[34:44, 7]
     assert beside_share(scan, looks, lower, 101.0) == 0.0
     scan[34:36] = np.where(scan[34:36] == 100.0, 99.0, scan[34:36])
     assert beside_share(scan, looks, lower, 100.0) == pytest.approx(0.8)
