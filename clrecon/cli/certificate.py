@@ -33,6 +33,8 @@ def _describe_places(of: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "voxels", f"{size} of {_times(of['spacing_mm'], '.4g')} mm{box}"
     if of["orientation"] is not None:
         yield "directions", _describe_directions(of["orientation"], of["patient_position"])
+    if of["anatomical_orientation"] is not None:
+        yield "anatomy", "QUADRUPED: an animal; back is dorsal, front ventral, head cranial, feet caudal (trunk)"
     if of["grid_residual_max_mm"] is not None:
         yield "positions", _describe_residual(of)
         yield "gaps", _describe_gaps(of)

@@ -39,6 +39,8 @@ class Certificate(Record):
     orientation : mapping or None
         Directions of the axes in the patient.
     patient_position : str or None
+    anatomical_orientation : str or None
+        "QUADRUPED": the letters of `orientation` are those of an animal on four legs.
     tilt_deg : float or None
     grid_residual_max_mm, grid_residual_rms_mm, grid_tolerance_mm : float or None
         Distances of slice positions from the affine, and their bound.
@@ -90,6 +92,7 @@ class Certificate(Record):
     affine_ijk_to_lps_mm: list[list[float]] | None
     orientation: Mapping[str, Any] | None
     patient_position: str | None = None
+    anatomical_orientation: str | None = None
     tilt_deg: float | None
     grid_residual_max_mm: float | None = None
     grid_residual_rms_mm: float | None = None

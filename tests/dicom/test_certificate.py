@@ -11,6 +11,7 @@ from contract_tables import names_in
 from dicom_series import Plan, set_raw, set_values, write_series
 
 from clrecon import list_series, read_volume
+from clrecon.cli.main import main
 from clrecon.dicom import reader
 from clrecon.dicom.stack.layout import summarise_gaps
 from clrecon.geometry import compose_affine
@@ -250,3 +251,15 @@ def test_a_stack_without_directions_has_a_certificate_in_strict_json(tmp_path, o
     gates = {gate["name"]: gate for gate in certificate["gates"]}
     assert gates["orientation_exact"]["ok"] is False
     assert gates["orientation_same"]["ok"] is None and gates["orientation_same"]["measured"] is None
+
+
+@pytest.mark.parametrize(("value", "told"), [("QUADRUPED", True), ("BIPED", False), (None, False)])
+def test_animals_on_four_legs_are_said(tmp_path, capsys, value, told):
+    """The letters of directions mean other ones, in pictures too."""
+    change = set_values(AnatomicalOrientationType=value) if value else set_values()
+    write_series(tmp_path, Plan(), change)
+    report = read_volume(tmp_path).report
+    assert report["anatomical_orientation"] == ("QUADRUPED" if told else None)
+    assert any("QUADRUPED" in text and "A as ventral" in text for text in report["warnings"]) is told
+    assert main(["info", str(tmp_path)]) == 0
+    assert ("back is dorsal" in capsys.readouterr().out) is told

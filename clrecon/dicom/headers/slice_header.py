@@ -92,6 +92,8 @@ class SliceHeader:
         ImagesInAcquisition and NumberOfSeriesRelatedInstances.
     modality_lut : bool
         True: a table, not slope and intercept, gives the measured values.
+    quadruped : bool
+        True: AnatomicalOrientationType says that the directions are those of an animal on four legs.
     """
 
     series: SeriesIdentity
@@ -140,6 +142,7 @@ class SliceHeader:
     stated_images: int | None = None
     stated_files: int | None = None
     modality_lut: bool = False
+    quadruped: bool = False
 
     @property
     def pixel_bytes(self) -> int:

@@ -29,6 +29,7 @@ _TAGS = {
     "Modality": 0x00080060,
     "SeriesDescription": 0x0008103E,
     "PatientID": 0x00100020,
+    "AnatomicalOrientationType": 0x00102210,
     "SliceThickness": 0x00180050,
     "KVP": 0x00180060,
     "SpacingBetweenSlices": 0x00180088,

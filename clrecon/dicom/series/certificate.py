@@ -88,6 +88,12 @@ def collect_series_warnings(series: Series) -> list[str]:
             "the files have a Modality LUT Sequence (0028,3000), which is not applied: slope {slope}, intercept"
             f" {{intercept}} taken, the values are not HU; {name_parameter('rescale')} says how HU follow from them",
         ),
+        (
+            lambda h: h.quadruped,
+            "AnatomicalOrientationType (0010,2210) is QUADRUPED, an animal: along its trunk x runs to its left, y to"
+            " dorsal, z to cranial; read P as dorsal, A as ventral, S as cranial and I as caudal. In head and limbs the"
+            " letters mean other directions, and rules for people (couch, front and back, vertebrae) may not fit",
+        ),
         (lambda h: h.photometric == "MONOCHROME1", "MONOCHROME1: meant to be shown inverted; the values are kept"),
         (lambda h: h.lossy, "lossy compression: the values are not those that were measured"),
     )
@@ -210,6 +216,7 @@ def certify(
         affine_ijk_to_lps_mm=None if affine is None else affine.tolist(),
         orientation=None if affine is None else describe_orientation(affine),
         patient_position=(lay.pop() or None) if len(lay) == 1 else None,
+        anatomical_orientation="QUADRUPED" if any(h.quadruped for h in headers) else None,
         tilt_deg=stack.tilt_deg,
         grid_residual_max_mm=line.residual_max_mm,
         grid_residual_rms_mm=line.residual_rms_mm,
