@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.sources.rescale import check_rescale
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.text import escape_text
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ def read_selected(path: str | os.PathLike[str], selection: Selection, *, progres
     return read_volume(path, **chosen, progress=progress)
 
 
+@explains_arguments
 def read_volume(
     path: str | os.PathLike[str],
     series: int | str | None = None,
@@ -139,6 +141,7 @@ def read_volume(
     return read_grid(Path(path), kind, rescale=given, progress=progress)
 
 
+@explains_arguments
 def list_series(
     path: str | os.PathLike[str],
     series: int | str | None = None,

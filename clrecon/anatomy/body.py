@@ -30,6 +30,7 @@ from clrecon.anatomy.dense_pieces import (
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.volume import AIR_HU, Volume
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.pieces import in_threads
 from clrecon.system.progress import Progress, Steps
 from clrecon.system.text import say_ml
@@ -65,6 +66,7 @@ BODY_STEPS = 5
 AIR_RANGE_HU = (-1100.0, -900.0)
 
 
+@explains_arguments
 def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Progress | None = None) -> Volume:
     """Turn everything outside the patient's body into air: table, blankets, cables.
 
@@ -140,6 +142,7 @@ def describe_pieces(pieces: list[dict[str, Any]]) -> str:
     return ", ".join(f"{say_ml(piece['ml'])} around ({at}) mm LPS" for piece, at in zip(pieces, places, strict=True))
 
 
+@explains_arguments
 def mask_field_of_view(volume: Volume, radius_mm: float | None = None, *, progress: Progress | None = None) -> Volume:
     """Turn everything outside of a circle around the centre of the slices into air.
 

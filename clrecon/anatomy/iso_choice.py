@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from clrecon.anatomy.bone_edges import Background, BoneEdges, leave_contrast_medium, measure_edges
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry.volume import AIR_HU, Volume
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import count_of, say_share
 from clrecon.system.wording import name_parameter
@@ -132,8 +133,12 @@ class IsoChoice:
     slice_step: int | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """All attributes but iso value and reason, for a report."""
-        return {name: value for name, value in dataclasses.asdict(self).items() if name not in ("iso_value", "reason")}
+        """Return all attributes by name."""
+        return dataclasses.asdict(self)
+
+    def measurements(self) -> dict[str, Any]:
+        """Return what is behind the choice, for reports that have iso value and reason beside it."""
+        return {name: value for name, value in self.as_dict().items() if name not in ("iso_value", "reason")}
 
 
 def half_iso_value(bone_hu: float, tissue_hu: float) -> IsoChoice:
@@ -153,6 +158,7 @@ def half_iso_value(bone_hu: float, tissue_hu: float) -> IsoChoice:
     return IsoChoice(tissue + (bone - tissue) / 2.0, bone, tissue, "half", reason)
 
 
+@explains_arguments
 def choose_iso_value(volume: Volume, *, progress: Progress | None = None) -> IsoChoice:
     """Measure bone and the tissue beside it, and choose the iso value half way between them.
 

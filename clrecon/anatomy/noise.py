@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
+from clrecon.system.arguments import explains_arguments
 
 __all__ = ["Noise", "measure_noise"]
 
@@ -48,6 +49,7 @@ class Noise:
     slices: int
 
 
+@explains_arguments
 def measure_noise(volume: Volume) -> Noise:
     """Measure the noise of a scan: the standard deviation of HU within soft tissue.
 

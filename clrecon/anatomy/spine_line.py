@@ -24,6 +24,7 @@ from clrecon.anatomy.spine_traits import BODY_RADIUS, WORTH, Likeness, measure_l
 from clrecon.errors import RefusedInputError
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.volume import Volume
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, Steps
 
 __all__ = ["SpineLine", "find_spine_line"]
@@ -79,6 +80,7 @@ class SpineLine:
         return float(self.points[0, 2] - self.points[-1, 2])
 
 
+@explains_arguments
 def find_spine_line(volume: Volume, *, sure_only: bool = False, progress: Progress | None = None) -> SpineLine:
     """Find the middle of the spinal canal.
 

@@ -17,6 +17,7 @@ from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.labels.resample import resample_labels
+from clrecon.system.arguments import explains_arguments
 
 __all__ = ["Corridor", "VertebraCorridors", "find_corridors", "measure_corridors", "screw_diameter"]
 
@@ -123,6 +124,7 @@ def screw_diameter(radius: float, margin: float) -> float:
     return max(0.0, math.floor(20.0 * (radius - margin) + 1e-9) / 10.0)
 
 
+@explains_arguments
 def find_corridors(volume: Volume, labels: LabelMap, label: int | str, iso_value: float) -> VertebraCorridors:
     """Find the widest straight corridors through the pedicles of a labelled vertebra.
 

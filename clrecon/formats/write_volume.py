@@ -29,6 +29,7 @@ from clrecon.formats.write_nrrd import write_nrrd
 from clrecon.geometry.regular import LARGEST_SHEAR_DEGREES, describe_unevenness, shear_degrees
 from clrecon.geometry.resample import resample_volume
 from clrecon.geometry.volume import Volume
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.files import StagedFile, stage_file
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.wording import name_parameter
@@ -96,6 +97,7 @@ def check_volume_format(path: str | os.PathLike[str]) -> str:
     raise UsageError(f"the name of the volume file is {name[-40:]!r}: it ends with one of {', '.join(FORMATS)}")
 
 
+@explains_arguments
 def write_volume(
     volume: Volume,
     path: str | os.PathLike[str],

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from copy import deepcopy
-from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -94,18 +93,19 @@ class BaseVolume(Grid):
         if slice_positions is not None:
             self._stack = UnevenStack.of(self._affine, slice_positions, self._voxels.shape[0])
         self.report: dict[str, Any] = {"warnings": []} if report is None else report
-        if hu_range is not None:
-            self.hu_range = hu_range
+        self._hu_range = hu_range
 
     @property
     def certificate(self) -> Certificate | None:
         """The report of a volume that was read; None where the volume was made from arrays."""
         return self.report if isinstance(self.report, Certificate) else None
 
-    @cached_property
+    @property
     def hu_range(self) -> tuple[float, float] | None:
-        """Lowest and highest finite value, as found at the first call; None where no value is finite."""
-        return _value_range(self._voxels)
+        """Lowest and highest finite value, None where no value is finite; searched anew where voxels can be written."""
+        if self._hu_range is None or self._voxels.flags.writeable:
+            self._hu_range = _value_range(self._voxels)
+        return self._hu_range
 
     @property
     def affine(self) -> Float64Array:

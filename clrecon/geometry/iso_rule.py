@@ -313,7 +313,7 @@ def check_topology(topology: str, ranged: bool = False) -> None:
 
 def _checked_level(level: Level, below: bool) -> tuple[float, float | None]:
     """Check the iso value, or the two ends of a range, and return them."""
-    if isinstance(level, str | int | float) or np.ndim(level) == 0:
+    if not isinstance(level, list | tuple | np.ndarray) or np.ndim(level) == 0:
         return checked_iso_value(level), None  # type: ignore[arg-type]
     if len(level) != 2:
         raise UsageError(f"a range of HU has two ends, not {tuple(level)}")

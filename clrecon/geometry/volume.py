@@ -18,6 +18,7 @@ from clrecon.geometry.itk import make_sitk, take_sitk
 from clrecon.geometry.nifti import make_nibabel, take_nibabel
 from clrecon.geometry.resample import resample_volume
 from clrecon.geometry.slicing import slice_volume
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 from clrecon.system.public import public_function
 from clrecon.system.targets import keep_existing
@@ -82,6 +83,7 @@ class Volume(BaseVolume):
         """
         return slice_volume(self, key)
 
+    @explains_arguments
     def crop(
         self: Own,
         *,
@@ -118,6 +120,7 @@ class Volume(BaseVolume):
             raise UsageError(f"a crop needs a box: {', '.join(CROPS[:-1])} or {CROPS[-1]}")
         return crop_volume(self, *box, margin=margin, space=space)
 
+    @explains_arguments
     def resample(self: Own, step_mm: float, *, progress: Progress | None = None) -> Own:
         """Return a copy (trilinear) on a regular grid with one step along all axes, at right angles.
 
@@ -140,6 +143,7 @@ class Volume(BaseVolume):
         """
         return resample_volume(self, step_mm, progress=progress)
 
+    @explains_arguments
     def save(
         self,
         path: str | os.PathLike[str],
@@ -177,6 +181,7 @@ class Volume(BaseVolume):
             write_volume = public_function("write_volume")
             return int(write_volume(self, path, resample=resample, keep_ids=keep_ids, progress=progress))
 
+    @explains_arguments
     def to_pyvista(self, resample: bool = False) -> Any:
         """Return the volume as ``pyvista.ImageData`` in LPS mm, its HU as the active point data ``HU``.
 
@@ -207,6 +212,7 @@ class Volume(BaseVolume):
         return make_image_data(image_of(self, resample, "to_pyvista"))
 
     @classmethod
+    @explains_arguments
     def from_pyvista(cls: type[Own], image: Any, name: str | None = None, space: str | None = None) -> Own:
         """Make a volume of a ``pyvista.ImageData``, or ``vtkImageData``; its voxels are a copy.
 
@@ -230,6 +236,7 @@ class Volume(BaseVolume):
 
         return cls(*take_image_data(image, name, space))
 
+    @explains_arguments
     def to_sitk(self, resample: bool = False) -> Any:
         """Return the volume as ``SimpleITK.Image``, a copy in LPS mm, ITK's own frame.
 
@@ -263,6 +270,7 @@ class Volume(BaseVolume):
         """
         return cls(*take_sitk(image))
 
+    @explains_arguments
     def to_nibabel(self, resample: bool = False) -> Any:
         """Return the volume as ``nibabel.Nifti1Image``: array (i, j, k) on the memory of the voxels, affine to RAS mm.
 

@@ -13,6 +13,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Grid
 from clrecon.geometry.affine import checked_affine
 from clrecon.labels.names import check_name, find_number
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.public import public_function
 
 __all__ = ["LARGEST_NUMBER", "LabelMap"]
@@ -24,7 +25,8 @@ LARGEST_NUMBER = 65_535
 class LabelMap(Grid):
     """Whole numbers that tell to which structure each voxel belongs; 0 is no structure.
 
-    ``voxels`` are uint8 or uint16.
+    ``voxels`` are uint8 or uint16 and cannot be written: an array that its owner can still change is copied, since the
+    map knows which labels it has.
 
     Parameters
     ----------
@@ -60,6 +62,10 @@ class LabelMap(Grid):
         self.frame_of_reference_hash = frame_of_reference_hash
         self.warnings = tuple(warnings)
 
+    def __setstate__(self, state: dict[str, object]) -> None:
+        super().__setstate__(state)
+        self._voxels.flags.writeable = False
+
     @cached_property
     def counts(self) -> dict[int, int]:
         """Number of voxels of each label number that occurs, without 0."""
@@ -79,10 +85,12 @@ class LabelMap(Grid):
         """Name of each number that occurs, and of each that the file names."""
         return {number: self.name(number) for number in sorted({*self.counts, *self._names} - {0})}
 
+    @explains_arguments
     def name(self, number: int) -> str:
         """Return the name of ``number``, ``label_N`` where the file gives none."""
         return self._names.get(number) or f"label_{number}"
 
+    @explains_arguments
     def find(self, label: str | int) -> int:
         """Return the number of a label.
 
@@ -126,4 +134,8 @@ def _checked_voxels(voxels: ArrayLike) -> NDArray[Any]:
     low, high = int(array.min()), int(array.max())
     if low < 0 or high > LARGEST_NUMBER:
         raise UsageError(f"labels run from 0 to {LARGEST_NUMBER:,}, these from {low:,} to {high:,}")
-    return np.ascontiguousarray(array, dtype=np.uint8 if array.dtype.itemsize == 1 else np.uint16)
+    made = np.ascontiguousarray(array, dtype=np.uint8 if array.dtype.itemsize == 1 else np.uint16)
+    if made.flags.writeable:
+        made = made.copy() if np.shares_memory(made, voxels if isinstance(voxels, np.ndarray) else array) else made
+        made.flags.writeable = False
+    return made

@@ -21,6 +21,7 @@ from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap
 from clrecon.labels.overlap import Wanted, check_wanted
 from clrecon.labels.segmentation import SEGMENTATION_CLASSES, read_segmentation, tell_pixel_bytes
 from clrecon.labels.structures import STRUCTURE_SET, read_structures
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
 
@@ -48,6 +49,7 @@ WARNINGS_SHOWN = 3
 """Warnings that a refusal quotes."""
 
 
+@explains_arguments
 def read_labels(
     path: str | Path,
     only: Sequence[str | int] | None = None,

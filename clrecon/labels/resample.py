@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.errors import RefusedInputError, UsageError
+from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume, apply_affine
 from clrecon.labels.label_map import LabelMap
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import say_ml
@@ -55,6 +56,7 @@ class ResampledLabels:
     warnings: tuple[str, ...]
 
 
+@explains_arguments
 def resample_labels(labels: LabelMap, volume: Volume, *, progress: Progress | None = None) -> ResampledLabels:
     """Resample a label map to the grid of a volume: for each voxel the label whose centre is nearest, in mm.
 
@@ -82,11 +84,6 @@ def resample_labels(labels: LabelMap, volume: Volume, *, progress: Progress | No
     UsageError
         The arguments are not a LabelMap and a Volume.
     """
-    if not isinstance(labels, LabelMap) or not isinstance(volume, Volume):
-        raise UsageError(
-            "a label map is brought to a volume: resample_labels(LabelMap, Volume), not"
-            f" ({type(labels).__name__}, {type(volume).__name__})"
-        )
     shares = check_together(labels, volume)
     voxels, exact = _take(labels, volume, progress or ignore_progress)
     misplaced = warn_of_place(labels, volume, voxels)

@@ -15,6 +15,7 @@ from clrecon.geometry import Volume
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.resample import ResampledLabels, resample_labels
 from clrecon.labels.volumes import label_ml, slice_voxel_ml
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
 from clrecon.system.text import say_digits
@@ -114,6 +115,7 @@ def check_percentiles(percentiles: Sequence[float]) -> tuple[float, ...]:
     return tuple(sorted(set(numbers)))
 
 
+@explains_arguments
 def measure_labels(
     volume: Volume,
     labels: LabelMap,

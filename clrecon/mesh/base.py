@@ -20,6 +20,7 @@ from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import apply_affine, checked_affine, normal_matrix
 from clrecon.mesh.normals import vertex_normals
 from clrecon.mesh.pieces import find_pieces
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.messages import Message
 from clrecon.system.targets import keep_existing
 
@@ -129,6 +130,7 @@ class BaseMesh(Message):
                 row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
                 raise UsageError(f"{name} {row:,} is not finite: {values[row].tolist()}")
 
+    @explains_arguments
     def in_space(self, space: str) -> tuple[NDArray[np.floating], NDArray[np.float32] | None]:
         """Return vertices and normals in another patient frame; the mesh itself is always LPS.
 
@@ -209,6 +211,7 @@ class BaseMesh(Message):
         normals = vertex_normals(content.vertices, self.triangles) if content.normals is None else content.normals
         return replace(content, normals=normals, pieces=find_pieces(self.vertices, self.triangles, most))
 
+    @explains_arguments
     def save(
         self, path: str | os.PathLike[str], space: str = "lps", *, no_clobber: bool = False, keep_ids: bool = False
     ) -> int:

@@ -14,6 +14,7 @@ from clrecon.geometry.frames import choose_space, frame_from_lps
 from clrecon.mesh.base import BaseMesh
 from clrecon.mesh.components import select_components, split_components
 from clrecon.mesh.quality import MeshQuality, measure_quality, measure_triangles
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.packages import import_package
 from clrecon.system.public import public_function
 
@@ -74,6 +75,7 @@ class Mesh(BaseMesh):
         """Return the parts that share no vertex, each a mesh, the largest area first."""
         return self.split()
 
+    @explains_arguments
     def split(
         self,
         keep_largest: int | None = None,
@@ -99,6 +101,7 @@ class Mesh(BaseMesh):
         """
         return split_components(self, keep_largest, min_volume_ml, seeds=seeds)
 
+    @explains_arguments
     def keep_largest(self, count: int = 1) -> Mesh:
         """Return the mesh with its ``count`` parts of largest area alone.
 
@@ -132,6 +135,7 @@ class Mesh(BaseMesh):
         return wrap_polydata(self._vertices, self._triangles, self._normals)
 
     @classmethod
+    @explains_arguments
     def from_pyvista(cls, polydata: Any, space: str | None = None) -> Mesh:
         """Make a mesh of a ``pyvista.PolyData``; polygons and strips become triangles.
 
@@ -176,6 +180,7 @@ class Mesh(BaseMesh):
         return made
 
     @classmethod
+    @explains_arguments
     def from_trimesh(cls, mesh: Any, space: str | None = None) -> Mesh:
         """Make a mesh of a ``trimesh.Trimesh``.
 

@@ -13,6 +13,7 @@ from clrecon.exchange.meshes import read_3mf, read_glb, read_obj, read_ply_mesh,
 from clrecon.exchange.meshes.raw_mesh import RawMesh
 from clrecon.geometry import SPACES, frame_from_lps
 from clrecon.mesh.mesh import Mesh
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.text import escape_text
 
@@ -33,6 +34,7 @@ MESH_INPUTS = tuple(_READERS)
 """Extensions of files that are read as meshes."""
 
 
+@explains_arguments
 def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh:
     """Read a mesh from a file.
 

@@ -18,6 +18,7 @@ from clrecon.phantom.levels import level_number
 from clrecon.phantom.placement import place_slices
 from clrecon.phantom.settings import CENTRE_LPS_MM, KINDS, PhantomSettings
 from clrecon.phantom.spine import label_levels, plan_spine
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.regular_files import read_regular
 
 __all__ = ["PhantomTruth", "phantom_truth"]
@@ -128,6 +129,7 @@ def _checked(points_mm: ArrayLike) -> Float64Array:
     return points
 
 
+@explains_arguments
 def phantom_truth(source: str | Path | PhantomSettings) -> PhantomTruth:
     """Return the truth of a phantom as functions of mm.
 

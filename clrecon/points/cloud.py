@@ -14,6 +14,7 @@ from clrecon.exchange.content import PointContent, describe_facts
 from clrecon.exchange.coordinates import as_stored
 from clrecon.geometry import frame_from_lps
 from clrecon.points.voxel_numbers import VoxelNumbers
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.installing import install_command
 from clrecon.system.messages import Message
 from clrecon.system.public import public_function
@@ -230,7 +231,7 @@ class PointCloud(Message):
         else:
             fits = chosen.ndim == 1 and (chosen.size == 0 or chosen.dtype.kind in "iu")
             fits = fits and (chosen.size == 0 or (chosen.min() >= 0 and chosen.max() < len(self)))
-            chosen = chosen.astype(np.intp)
+            chosen = chosen.astype(np.intp) if fits else chosen
         if not fits:
             raise UsageError(
                 f"a selection of a cloud of {len(self):,} points is as many truth values or numbers of points below"
@@ -242,6 +243,7 @@ class PointCloud(Message):
         taken = {name: _take(values, numbers) for name, values in of_points.items() if values is not None}
         return PointCloud.of_known(points, **taken, report=dict(self.report))
 
+    @explains_arguments
     def in_space(self, space: str) -> tuple[NDArray[np.floating], NDArray[np.float32] | None]:
         """Return points and normals in another patient frame; the cloud itself is always LPS.
 
@@ -272,6 +274,7 @@ class PointCloud(Message):
         ijk = self.ijk if with_ijk else None
         return PointContent(vertices=points, normals=normals, hu=self._hu, labels=self._labels, ijk=ijk, **facts)
 
+    @explains_arguments
     def save(
         self, path: str | os.PathLike[str], space: str = "lps", *, no_clobber: bool = False, keep_ids: bool = False
     ) -> int:

@@ -12,6 +12,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.points.cloud import PointCloud
 from clrecon.points.step import PointStep
+from clrecon.system.arguments import explains_arguments
 
 __all__ = ["GHOST_SHARE", "WITHIN_SHARE", "GhostSlices", "drop_ghost_slices", "fill_ghost_slices", "judge_slices"]
 
@@ -126,6 +127,7 @@ def judge_slices(
     return GhostSlices(tuple(np.flatnonzero(ghosts).tolist()), points, nearest, around, within, hu, warnings)
 
 
+@explains_arguments
 def drop_ghost_slices(cloud: PointCloud, found: GhostSlices, *, volume: Volume | None = None) -> PointStep:
     """Remove the points of ghost slices.
 
@@ -164,6 +166,7 @@ def drop_ghost_slices(cloud: PointCloud, found: GhostSlices, *, volume: Volume |
     return PointStep(left, removed, (REASON,), found.as_dict(), found.warnings)
 
 
+@explains_arguments
 def fill_ghost_slices(volume: Volume, found: GhostSlices) -> Volume:
     """Return a volume whose ghosts are copies of the slice before, or behind where that is a ghost too.
 

@@ -13,6 +13,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.points.cloud import PointCloud
 from clrecon.points.cluster_figures import SHEET_POINTS, SHEET_RATIO, ClusterFigures, measure_clusters
 from clrecon.points.step import PointStep
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.wording import name_parameter
 
 __all__ = ["KEEP_FORMS", "KeepRule", "keep_clusters", "parse_keep_rules"]
@@ -63,6 +64,7 @@ def _parse(rule: str) -> KeepRule:
     raise UsageError(f"the keep rule {str(rule)!r} is not known: the rules are {KEEP_FORMS}, N and POINTS from 1 on")
 
 
+@explains_arguments
 def keep_clusters(
     cloud: PointCloud,
     rules: str | Sequence[str] = (),

@@ -12,6 +12,7 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.exchange.clouds.reader import read_raw_cloud
 from clrecon.geometry import SPACES, frame_from_lps
 from clrecon.points.cloud import MOST_POINTS, PointCloud
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.text import escape_text
 
@@ -26,6 +27,7 @@ SMALLEST_MM, LARGEST_MM = 3.0, 5000.0
 """Sides of the box of what a CT shows; 2 m in metres, and 5 mm in micrometres, lie beyond."""
 
 
+@explains_arguments
 def read_points(path: str | os.PathLike[str], *, space: str | None = None) -> PointCloud:
     """Read a cloud from a file.
 

@@ -16,6 +16,7 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.affine import Float64Array, checked_points
 from clrecon.geometry.volume import Volume
 from clrecon.labels import LabelMap
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import count_of
 from clrecon.system.wording import name_parameter
@@ -61,6 +62,7 @@ class _Found:
     usual: NDArray[np.float64]
 
 
+@explains_arguments
 def split_vertebrae(
     volume: Volume,
     *,

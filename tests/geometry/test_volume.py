@@ -144,3 +144,11 @@ def test_the_range_of_values_leaves_out_what_is_no_number():
     assert Volume(voxels, np.eye(4)).hu_range is None
     voxels[1, 2, 3], voxels[1, 0, 0] = 7.5, np.inf
     assert Volume(voxels, np.eye(4)).hu_range == (7.5, 7.5)
+
+
+def test_the_range_of_values_follows_an_array_that_changes():
+    voxels = np.zeros((2, 3, 4), np.int16)
+    volume = Volume(voxels, OBLIQUE)
+    assert volume.hu_range == (0.0, 0.0)
+    voxels[1, 2, 3] = 700
+    assert volume.hu_range == (0.0, 700.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 from label_files import OBLIQUE, make_labels
@@ -135,3 +137,16 @@ def test_files_that_are_no_label_maps_are_refused(tmp_path):
     wrong: list = [2.5]
     with pytest.raises(UsageError, match="by number or name"):
         read_labels(tmp_path / "a.nii", wrong)
+
+
+def test_a_map_knows_its_labels_whatever_becomes_of_the_array_it_was_made_from():
+    array = make_labels(numbers=(0, 2, 5, 7, 8, 11)).astype(np.uint8)
+    made = LabelMap(array, OBLIQUE)
+    before = dict(made.counts)
+    array[:] = 3
+    assert made.counts == before and 3 not in np.unique(made.voxels)
+    for each in (made, pickle.loads(pickle.dumps(made))):
+        with pytest.raises(ValueError, match="read-only"):
+            each.voxels[0, 0, 0] = 1
+    array.flags.writeable = False
+    assert np.shares_memory(LabelMap(array, OBLIQUE).voxels, array)

@@ -314,7 +314,7 @@ def _compose(
         level_bias=KNOWN_BIAS,
         iso_value_hu=iso_value,
         iso_value_reason="as given" if choice is None else choice.reason,
-        iso_value_choice=None if choice is None else choice.as_dict(),
+        iso_value_choice=None if choice is None else choice.measurements(),
         space=settings.space,
         margin_mm=float(settings.margin),
         grade_scale=SCALE if any(each["screws"] for each in vertebrae) else None,

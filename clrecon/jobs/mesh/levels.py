@@ -95,7 +95,7 @@ def describe_level(
             f"slices are {volume.spacing[2]:.3g} mm apart: walls thinner than that may be lost at"
             f" {choice.iso_value:g} HU; compare with a lower iso value, such as {name_parameter('preset', 'bone')}"
         )
-    return {"iso_value_reason": choice.reason, "iso_value_choice": choice.as_dict()}, warnings
+    return {"iso_value_reason": choice.reason, "iso_value_choice": choice.measurements()}, warnings
 
 
 def warn_of_contrast(choice: IsoChoice) -> list[str]:

@@ -17,6 +17,7 @@ from clrecon.geometry.grid import Grid
 from clrecon.geometry.iso_rule import layer_normal_matrices
 from clrecon.mesh.compare.boxes import meets_box
 from clrecon.mesh.mesh import Mesh
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.messages import Message
 from clrecon.system.pieces import chunks
 from clrecon.system.progress import Progress, ignore_progress
@@ -134,6 +135,7 @@ class CellOverlap(Record):
     jaccard: float
 
 
+@explains_arguments
 def find_mesh_cells(mesh: Mesh, grid: Grid, *, name: str = "", progress: Progress | None = None) -> GridCells:
     """Find the grid cells that the triangles of a mesh pass through.
 
@@ -255,6 +257,7 @@ def _tested(
         yield cells[meets], part[pair[meets]]
 
 
+@explains_arguments
 def measure_cells(
     mesh: Mesh | GridCells,
     reference: Mesh | GridCells,

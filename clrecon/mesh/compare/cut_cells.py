@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry.grid import Grid
 from clrecon.mesh.compare.cells import GridCells
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 
 __all__ = ["SignedSurface", "find_cut_cells"]
@@ -28,6 +29,7 @@ class SignedSurface(Protocol):
         """Distance to the surface, shape (n,), mm, negative inside, of points (n, 3), LPS mm."""
 
 
+@explains_arguments
 def find_cut_cells(
     truth: SignedSurface, grid: Grid, *, name: str = "truth", progress: Progress | None = None
 ) -> GridCells:

@@ -11,6 +11,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.triangles import cross_products
 from clrecon.mesh.vtk import CellLocator
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
@@ -152,6 +153,7 @@ def _enclosed_ml(mesh: Mesh, origin: NDArray[np.float64]) -> float:
     return six / 6000.0
 
 
+@explains_arguments
 def compare_meshes(
     mesh: Mesh, reference: Mesh, samples: int = SAMPLES, *, progress: Progress | None = None
 ) -> MeshDistance:

@@ -27,6 +27,7 @@ from clrecon.mesh.normals import vertex_normals
 from clrecon.mesh.quality import MeshQuality, measure_quality
 from clrecon.mesh.triangles import cross_products
 from clrecon.mesh.vtk import CellLocator
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.pieces import chunks, local_origin
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
@@ -182,6 +183,7 @@ def why_unsigned(quality: MeshQuality, name: str) -> str | None:
     return None
 
 
+@explains_arguments
 def measure_distance(
     mesh: Mesh,
     reference: Mesh,
@@ -245,6 +247,7 @@ def measure_distance(
     )
 
 
+@explains_arguments
 def measure_vertex_distances(
     mesh: Mesh, reference: Mesh, *, progress: Progress | None = None
 ) -> tuple[NDArray[np.float64], bool]:

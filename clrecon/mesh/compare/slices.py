@@ -15,6 +15,7 @@ from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.mesh.compare.lattice import Lattice, count_points, exclusive_or, find_level_runs
 from clrecon.mesh.compare.parity import find_piercings
 from clrecon.mesh.mesh import Mesh
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
 
@@ -57,6 +58,7 @@ class SliceOverlap(Record):
     rows_odd: int
 
 
+@explains_arguments
 def measure_slices(
     mesh: Mesh,
     volume: Volume,

@@ -12,6 +12,7 @@ from clrecon.geometry.grid import Grid
 from clrecon.mesh.compare.cut_cells import SignedSurface
 from clrecon.mesh.compare.distances import sample_surface_points
 from clrecon.mesh.mesh import Mesh
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
 
@@ -60,6 +61,7 @@ class TruthDistance(Record):
     samples: int
 
 
+@explains_arguments
 def measure_truth(
     mesh: Mesh,
     truth: SignedSurface,

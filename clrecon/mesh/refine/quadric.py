@@ -21,6 +21,7 @@ from clrecon.mesh.normals import vertex_normals
 from clrecon.mesh.refine.collapses import last_of_collapses
 from clrecon.mesh.refine.decimation import carry_on, check_share, check_triangles
 from clrecon.mesh.refine.topology import TopologyChange, compare_topology, measure_topology
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.gates import Gate, none_of
 from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress, ignore_progress
@@ -36,6 +37,7 @@ _NEAREST = 3
 Points = NDArray[np.float64]
 
 
+@explains_arguments
 def collapse_quadric(mesh: Mesh, fraction: float, *, progress: Progress | None = None) -> Mesh:
     """Remove triangles by collapsing edges in order of their quadric error, with no bound (Garland and Heckbert 1997).
 

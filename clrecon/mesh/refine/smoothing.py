@@ -17,6 +17,7 @@ from clrecon.mesh.normals import vertex_normals
 from clrecon.mesh.refine.decimation import carry_on, check_refinement
 from clrecon.mesh.refine.shifts import measure_volumes, move_vertices, restore_volumes, shorten_steps
 from clrecon.mesh.vtk import smooth_windowed_sinc
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress, ignore_progress
 
@@ -27,6 +28,7 @@ _PASS_BAND = 0.1
 and by 0.15 at the 95th percentile; half the pass band loses more than 0.5 % of the volume."""
 
 
+@explains_arguments
 def smooth_mesh(
     mesh: Mesh, iterations: int = 20, max_deviation_mm: float | None = None, *, progress: Progress | None = None
 ) -> Mesh:

@@ -36,6 +36,7 @@ from clrecon.operators.filters.result import finish_result
 from clrecon.operators.filters.settings import BilateralSettings, inside_level
 from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
 from clrecon.operators.resident.voxel_types import voxel_variants
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 
 __all__ = ["Filtered", "filter_bilateral", "prepare_bilateral", "run_bilateral"]
@@ -64,6 +65,7 @@ def prepare_bilateral(device: Device, dtype: DTypeLike = np.int16) -> Program:
     return load_program(device, "filters/bilateral.cl", variants)
 
 
+@explains_arguments
 def filter_bilateral(
     volume: VolumeKind,
     *,

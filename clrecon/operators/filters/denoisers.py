@@ -18,6 +18,7 @@ from clrecon.geometry.regular import shear_degrees
 from clrecon.operators.filters.result import report_filter
 from clrecon.operators.filters.settings import checked_length
 from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.installing import install_command
 from clrecon.system.progress import Progress, ignore_progress
 
@@ -61,6 +62,7 @@ class _Denoiser:
     needs_grid: bool = True
 
 
+@explains_arguments
 def filter_volume(
     volume: VolumeKind, name: str, *, progress: Progress | None = None, **parameters: float | None
 ) -> VolumeKind:

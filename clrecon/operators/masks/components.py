@@ -14,6 +14,7 @@ from clrecon.operators.masks import logic
 from clrecon.operators.masks.band_mask import mask_bytes, zero_words
 from clrecon.operators.masks.morphology import MaskShapes
 from clrecon.operators.masks.runs import Components, find_components, mark_at_border, mark_with_voxels, write_runs
+from clrecon.system.arguments import explains_arguments
 
 __all__ = ["MaskComponents"]
 
@@ -23,6 +24,7 @@ Bits = TypeVar("Bits", bound="MaskComponents")
 class MaskComponents(MaskShapes):
     """A mask whose components are looked at; what `clrecon.Mask` is made of."""
 
+    @explains_arguments
     def fill_holes(self: Bits, by_slice: bool = False) -> Bits:
         """Choose the voxels that chosen ones enclose too.
 

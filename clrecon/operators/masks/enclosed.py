@@ -17,6 +17,7 @@ from clrecon.operators.masks.regions import checked_mm
 from clrecon.operators.masks.spaces import Spaces, find_joints, find_spaces
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points.stencil import Lattice
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.gates import at_most
 from clrecon.system.progress import Progress, Steps
 from clrecon.system.text import count_of, say_hu, say_ml
@@ -54,6 +55,7 @@ AIR_LIMIT_HU = -200.0
 """A space whose mean is lower holds air: fat is -100, air cells with thin walls are below -400."""
 
 
+@explains_arguments
 def fill_enclosed(
     volume: Volume | DeviceVolume,
     iso_value: float,

@@ -18,6 +18,7 @@ from clrecon.operators.masks.components import MaskComponents
 from clrecon.operators.masks.regions import RowSpans, box_spans, checked_box, tube_spans
 from clrecon.operators.masks.runs import write_runs
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 from clrecon.system.text import say_band
 
@@ -47,6 +48,7 @@ class Mask(MaskComponents):
     # Made of
 
     @classmethod
+    @explains_arguments
     def from_band(
         cls,
         volume: Volume | DeviceVolume,
@@ -92,6 +94,7 @@ class Mask(MaskComponents):
             return resident.attempt(make)
 
     @classmethod
+    @explains_arguments
     def from_labels(
         cls,
         volume: Volume | DeviceVolume,
@@ -120,10 +123,6 @@ class Mask(MaskComponents):
         DeviceError
             As for `from_band`.
         """
-        from clrecon.labels import LabelMap
-
-        if not isinstance(labels, LabelMap):
-            raise UsageError(f"labels are a LabelMap, see clrecon.read_labels, not {type(labels).__name__}")
         chosen = None if numbers is None else [labels.find(number) for number in numbers]
         with open_volume(volume, device, memory, "a mask") as resident:
             voxels = resident.bring(labels).voxels
@@ -133,6 +132,7 @@ class Mask(MaskComponents):
             return cls._packed(resident, wanted[voxels], f"labels {', '.join(names)}" if names else "no label")
 
     @classmethod
+    @explains_arguments
     def from_array(
         cls,
         volume: Volume | DeviceVolume,
@@ -166,6 +166,7 @@ class Mask(MaskComponents):
             return cls._packed(resident, array if array.dtype == np.bool_ else array != 0, "an array")
 
     @classmethod
+    @explains_arguments
     def from_box(
         cls,
         volume: Volume | DeviceVolume,
@@ -200,6 +201,7 @@ class Mask(MaskComponents):
             return cls._spanned(resident, box_spans(resident.volume, sides), name)
 
     @classmethod
+    @explains_arguments
     def from_tube(
         cls,
         volume: Volume | DeviceVolume,
@@ -231,6 +233,7 @@ class Mask(MaskComponents):
 
     # What it holds
 
+    @explains_arguments
     def to_label_map(self, name: str | None = None) -> LabelMap:
         """Return a label map on the grid of the volume, with number 1 where voxels are chosen.
 
@@ -250,6 +253,7 @@ class Mask(MaskComponents):
             raise UsageError("the slices of the volume are uneven, and a label map has even ones: take to_numpy()")
         return LabelMap(self.to_numpy().view(np.uint8), self.volume.affine, {1: name or self.name})
 
+    @explains_arguments
     def apply(self, volume: Volume | DeviceVolume, outside: float = AIR_HU) -> Any:
         """Return a volume with another value at the voxels that are not chosen.
 

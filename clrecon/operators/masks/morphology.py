@@ -14,6 +14,7 @@ from clrecon.operators.masks.band_mask import mask_bytes, zero_words
 from clrecon.operators.masks.mask_bits import MaskBits
 from clrecon.operators.masks.regions import checked_mm
 from clrecon.points.stencil import SLACK, Stencil
+from clrecon.system.arguments import explains_arguments
 
 __all__ = ["MaskShapes"]
 
@@ -23,6 +24,7 @@ Shapes = TypeVar("Shapes", bound="MaskShapes")
 class MaskShapes(MaskBits):
     """A mask that is changed by balls; what `clrecon.Mask` is made of."""
 
+    @explains_arguments
     def dilate(self: Shapes, mm: float, *, by_slice: bool = False) -> Shapes:
         """Choose all voxels within a distance of a chosen voxel.
 
@@ -45,6 +47,7 @@ class MaskShapes(MaskBits):
         """
         return self._made(self._spread(mm, by_slice), f"({self.name}) dilated by {mm:g} mm")
 
+    @explains_arguments
     def erode(self: Shapes, mm: float, *, by_slice: bool = False) -> Shapes:
         """Choose the voxels that have no other voxel than chosen ones within a distance.
 
@@ -62,6 +65,7 @@ class MaskShapes(MaskBits):
         """
         return self._made(self._erode(mm, by_slice), f"({self.name}) eroded by {mm:g} mm")
 
+    @explains_arguments
     def open(self: Shapes, mm: float, *, by_slice: bool = False) -> Shapes:
         """Erode, then dilate: all balls of this radius that fit into what is chosen and into the volume.
 
@@ -78,6 +82,7 @@ class MaskShapes(MaskBits):
         eroded = self._made(self._erode(mm, by_slice), self.name)
         return self._made(eroded._spread(mm, by_slice), f"({self.name}) opened by {mm:g} mm")
 
+    @explains_arguments
     def close(self: Shapes, mm: float, *, by_slice: bool = False) -> Shapes:
         """Dilate, then erode: gaps into which no ball of this radius fits are filled.
 
@@ -96,6 +101,7 @@ class MaskShapes(MaskBits):
         dilated = self._made(self._spread(mm, by_slice), self.name)
         return self._made(dilated._spread(mm, by_slice, erode=True, beyond=True), f"({self.name}) closed by {mm:g} mm")
 
+    @explains_arguments
     def dilate_within(self: Shapes, room: Shapes, mm: float) -> Shapes:
         """Choose the voxels of another mask that short ways over faces of its voxels join with chosen ones.
 

@@ -30,6 +30,7 @@ from clrecon.operators.points.normals import FEWEST_NEIGHBOURS, PlaneFits
 from clrecon.operators.points.outliers import DistanceMeasure
 from clrecon.points import PointCloud, PointStep
 from clrecon.points.features import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 
 __all__ = ["FEATURES", "denoise_points", "prepare_bilateral"]
@@ -57,6 +58,7 @@ def prepare_bilateral(device: Device) -> Program:
     return load_program(device, "points/bilateral.cl", {"LANES": device.kernel_variants["LANES"]})
 
 
+@explains_arguments
 def denoise_points(
     cloud: PointCloud,
     k: int = 16,

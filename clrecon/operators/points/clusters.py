@@ -23,6 +23,7 @@ from clrecon.points.cluster_figures import ClusterFigures, measure_clusters
 from clrecon.points.keep import REPORTED
 from clrecon.points.stencil import Lattice, Stencil, checked_eps, make_stencil
 from clrecon.points.voxel_numbers import VoxelNumbers
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 from clrecon.system.wording import name_parameter
 
@@ -66,6 +67,7 @@ class Clustering(PointStep):
     figures: ClusterFigures | None = None
 
 
+@explains_arguments
 def cluster_points(
     cloud: PointCloud | Volume | DeviceVolume,
     eps: float | None = None,

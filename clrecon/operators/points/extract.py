@@ -21,6 +21,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points import PointCloud
 from clrecon.points.kinds import KINDS
 from clrecon.points.voxel_numbers import VoxelNumbers
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 from clrecon.system.text import say_hu
 from clrecon.system.wording import name_parameter
@@ -33,6 +34,7 @@ __all__ = ["extract_points"]
 Band = tuple[float, float]
 
 
+@explains_arguments
 def extract_points(
     volume: Volume | DeviceVolume,
     iso_value: float | None = None,

@@ -28,6 +28,7 @@ from clrecon.opencl import (
 from clrecon.operators.points.cell_edge import choose_cell_edge
 from clrecon.operators.points.grid import MOST_PAIRS, GridPlan, PointGrid, fill_grid, plan_grid, prepare_grid
 from clrecon.points import PointCloud
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 
 __all__ = [
@@ -287,6 +288,7 @@ def _check_pairs(grid: PointGrid, starts: NDArray[np.uint32]) -> None:
         )
 
 
+@explains_arguments
 def find_neighbours(
     points: PointCloud | ArrayLike,
     k: int = 16,

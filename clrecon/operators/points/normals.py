@@ -28,6 +28,7 @@ from clrecon.operators.points.gradients import find_gradients
 from clrecon.operators.points.neighbours import NeighbourSearch, Part, check_neighbours, take_points
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points import PointCloud, PointStep
+from clrecon.system.arguments import as_numbers, explains_arguments
 from clrecon.system.progress import Progress
 from clrecon.system.text import say_share
 from clrecon.system.wording import name_parameter
@@ -99,6 +100,7 @@ class PlaneFits:
         )  # fmt: skip
 
 
+@explains_arguments
 def estimate_normals(
     cloud: PointCloud,
     k: int = 16,
@@ -175,7 +177,7 @@ def estimate_normals(
 
 
 def _check_viewpoint(viewpoint: ArrayLike) -> NDArray[np.float64]:
-    place = np.asarray(viewpoint, dtype=np.float64)
+    place = as_numbers("viewpoint", viewpoint)
     if place.shape != (3,) or not np.isfinite(place).all():
         raise UsageError(f"a viewpoint is three numbers in LPS mm, not {viewpoint!r}")
     return place

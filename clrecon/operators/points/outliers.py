@@ -24,6 +24,7 @@ from clrecon.opencl import (
 )
 from clrecon.operators.points.neighbours import NeighbourSearch, Part, check_neighbours, take_points
 from clrecon.points import PointCloud, PointStep
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 
 __all__ = ["DistanceMeasure", "prepare_outliers", "remove_outliers"]
@@ -78,6 +79,7 @@ class DistanceMeasure:
         return download(device, self._means, self._means_d), download(device, self._nearest, self._nearest_d)
 
 
+@explains_arguments
 def remove_outliers(
     cloud: PointCloud,
     k: int = 16,

@@ -18,6 +18,7 @@ from clrecon.operators.points.field_walls import CUBE, Walls, count_bits, find_w
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.points import PointCloud
 from clrecon.points.spacing import mean_spacing
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import say_share
 from clrecon.system.wording import name_parameter
@@ -69,6 +70,7 @@ UNIT_ERROR = 1e-3
 """Normals whose length differs more from 1 are made unit vectors."""
 
 
+@explains_arguments
 def reconstruct_surface(
     cloud: PointCloud,
     spacing: float | None = None,
@@ -171,8 +173,6 @@ def _own_spacing(cloud: PointCloud) -> float:
 
 def _check_cloud(cloud: PointCloud) -> NDArray[np.float32]:
     """Return the normals of a cloud as unit vectors."""
-    if not isinstance(cloud, PointCloud):
-        raise UsageError(f"a surface is made from a PointCloud, not from {type(cloud).__name__}")
     if len(cloud) < FEWEST_POINTS:
         raise UsageError(f"the cloud has {len(cloud)} points: a closed surface needs at least {FEWEST_POINTS}")
     if cloud.normals is None:

@@ -10,6 +10,7 @@ from clrecon.opencl import Device, Program, Stopwatch, allocate, download, launc
 from clrecon.operators.masks.band_mask import VoxelMask, checked_band, mark_band
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points.ghost_slices import GhostSlices, judge_slices
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 
 __all__ = ["count_overlaps", "find_ghost_slices", "prepare_slice_overlap"]
@@ -56,6 +57,7 @@ def count_overlaps(device: Device, mask: VoxelMask, *, stopwatch: Stopwatch | No
     return counts
 
 
+@explains_arguments
 def find_ghost_slices(
     volume: Volume | DeviceVolume,
     hu: ArrayLike,

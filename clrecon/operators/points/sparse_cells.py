@@ -30,6 +30,7 @@ from clrecon.operators.points.grid import GridPlan, PointGrid, fill_grid, plan_g
 from clrecon.operators.points.neighbours import find_neighbours
 from clrecon.operators.primitives.union_find import hook_in_rounds, prepare_components
 from clrecon.points import PointCloud, PointStep
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import say_share
 from clrecon.system.wording import name_parameter
@@ -168,6 +169,7 @@ def _judge_cells(
     return kinds, facts
 
 
+@explains_arguments
 def remove_sparse_cells(
     cloud: PointCloud | ArrayLike,
     edge: float | None = None,

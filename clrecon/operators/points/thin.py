@@ -24,6 +24,7 @@ from clrecon.opencl import (
 )
 from clrecon.operators.points.grid import GridPlan, fill_grid, plan_grid, prepare_grid
 from clrecon.points import PointCloud, PointStep
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.wording import name_parameter
 
@@ -64,6 +65,7 @@ def choose_points(
     return download(device, chosen, chosen_d)
 
 
+@explains_arguments
 def thin_points(
     cloud: PointCloud | ArrayLike,
     spacing: float,

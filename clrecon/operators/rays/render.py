@@ -23,11 +23,13 @@ from clrecon.rendering.pictures.styles import SlicesInSpace, Style, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.default_view import default_view
 from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 
 __all__ = ["VolumeRenderer", "render"]
 
 
+@explains_arguments
 def render(
     shown: Subject | Sequence[Subject | tuple[Subject, Style]],
     style: Style | str | None = None,

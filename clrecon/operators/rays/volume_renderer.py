@@ -41,6 +41,7 @@ from clrecon.rendering.views.default_view import ANTERIOR, default_view
 from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size
 from clrecon.rendering.views.plane import find_plane
 from clrecon.rendering.views.seen import check_center
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
 
@@ -101,6 +102,7 @@ class VolumeRenderer(Closing):
         if self._is_own:
             self._resident.close()
 
+    @explains_arguments
     def render(
         self,
         style: Style | str | None = None,
@@ -154,6 +156,7 @@ class VolumeRenderer(Closing):
             self._inner = VolumeRenderer(volume, device=self._resident.device, memory=self._resident.memory)
         return self._inner
 
+    @explains_arguments
     def frame(self, style: Style) -> Grid:
         """Return what cameras fit: the volume, or the box of what is left of it where a part is masked, cut or hidden.
 

@@ -24,6 +24,7 @@ from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.curved import CurvedSheet, straightened_sheet, stretched_length, stretched_sheet
 from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size, find_up, find_view
 from clrecon.rendering.views.plane import find_plane, finest_step, plane_sheet
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 
 __all__ = ["cut_slice", "reformat_curve", "take_curve", "take_cut"]
@@ -41,6 +42,7 @@ LEAST_PIXELS = 768
 look at."""
 
 
+@explains_arguments
 def cut_slice(
     volume: Volume | DeviceVolume,
     plane: Camera | str | Sequence[float] = "axial",
@@ -160,6 +162,7 @@ def _describe_miss(volume: Volume, camera: Camera) -> str:
     return "the picture shows nothing of the volume: look at its place, or make it larger"
 
 
+@explains_arguments
 def reformat_curve(
     volume: Volume | DeviceVolume,
     curve: Curve | ArrayLike | str = "spine",

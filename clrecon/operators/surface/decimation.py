@@ -9,11 +9,13 @@ from clrecon.mesh.refine import decimation
 from clrecon.opencl import Device, take_device, work_on
 from clrecon.operators.surface.crossings import find_crossings
 from clrecon.operators.surface.near_faces import DeviceBounds
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 
 __all__ = ["decimate_mesh"]
 
 
+@explains_arguments
 def decimate_mesh(
     mesh: Mesh,
     fraction: float,

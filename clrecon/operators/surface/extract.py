@@ -24,6 +24,7 @@ from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
 from clrecon.operators.surface.trilinear import check_row
 from clrecon.points import PointCloud
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
 from clrecon.system.wording import name_parameter
@@ -73,6 +74,7 @@ class SurfaceExtractor(Closing):
         if self._is_own:
             self._resident.close()
 
+    @explains_arguments
     def forecast(self, *, closed: bool = True, topology: str = "separated") -> dict[str, int]:
         """Estimate the memory of an extraction before anything is computed.
 
@@ -99,6 +101,7 @@ class SurfaceExtractor(Closing):
             "scratch_bytes": sum(slab.scratch().values()),
         }
 
+    @explains_arguments
     def extract(
         self,
         iso_value: Level,
@@ -122,6 +125,7 @@ class SurfaceExtractor(Closing):
             seeds, grid = Seeds.read(grow_from, self._resident), replace(grid, grows=True)
         return self._resident.attempt(lambda told: self._extract(grid, told, progress, seeds))
 
+    @explains_arguments
     def extract_vertices(
         self, iso_value: Level, *, closed: bool = True, below: bool = False, progress: Progress | None = None
     ) -> PointCloud:
@@ -187,6 +191,7 @@ class SurfaceExtractor(Closing):
         return self._placements[border]
 
 
+@explains_arguments
 def extract_isosurface(
     volume: Volume | DeviceVolume,
     iso_value: Level,
@@ -290,6 +295,7 @@ def _open(
         yield opened.enter_context(SurfaceExtractor(volume, **where))
 
 
+@explains_arguments
 def extract_isosurfaces(
     volume: Volume | DeviceVolume,
     iso_values: Sequence[Level],

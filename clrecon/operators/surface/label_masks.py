@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from clrecon.errors import RefusedInputError, UsageError
+from clrecon.errors import RefusedInputError
 from clrecon.labels import LabelMap
 from clrecon.labels.enclosed import find_enclosed
 from clrecon.labels.occupancy import FULL
@@ -25,11 +25,13 @@ from clrecon.operators.surface.extraction import Part
 from clrecon.operators.surface.label_groups import choose_numbers, each_label
 from clrecon.operators.surface.label_survey import survey_labels
 from clrecon.operators.surface.mask_extraction import HeldMap, MaskExtraction, prepare_label_masks
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 
 __all__ = ["extract_label_masks", "prepare_label_masks", "warn_of_volume"]
 
 
+@explains_arguments
 def extract_label_masks(
     labels: LabelMap,
     *,
@@ -88,8 +90,6 @@ def extract_label_masks(
     Gibson 1998, Constrained elastic surface nets (a surface that is smoothed within the voxels of its mask); Lorensen
     and Cline 1987.
     """
-    if not isinstance(labels, LabelMap):
-        raise UsageError(f"labels' own surfaces need a LabelMap, see clrecon.read_labels, not {type(labels).__name__}")
     if not labels.numbers:
         raise RefusedInputError("the label map is empty: no voxel has a label")
     marching_cubes.check_row(labels.shape_ijk[0])

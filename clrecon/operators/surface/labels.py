@@ -24,6 +24,7 @@ from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Part
 from clrecon.operators.surface.label_extraction import HeldSlices, LabelExtraction, prepare_labels
 from clrecon.operators.surface.label_groups import choose_numbers, each_label
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 
 __all__ = ["extract_labels", "prepare_labels"]
@@ -47,6 +48,7 @@ def _refuse_label(
     )
 
 
+@explains_arguments
 def extract_labels(
     volume: Volume | DeviceVolume,
     labels: LabelMap,

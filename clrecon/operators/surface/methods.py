@@ -22,6 +22,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.extract import SurfaceExtractor
 from clrecon.operators.surface.seeds import AUTO
 from clrecon.operators.surface.soup import extract_soup, weld
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 from clrecon.system.wording import name_parameter
 
@@ -112,6 +113,7 @@ def check_method(
     return chosen
 
 
+@explains_arguments
 def extract_by_method(
     volume: Volume | DeviceVolume,
     iso_value: Level,

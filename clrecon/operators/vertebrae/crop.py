@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.errors import RefusedInputError, UsageError
+from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume, column_spacing
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels import LabelMap
 from clrecon.labels.resample import check_together, warn_of_place
 from clrecon.labels.solid import find_boxes
 
-__all__ = ["LabelCrop", "check_types", "crop_label"]
+__all__ = ["LabelCrop", "crop_label"]
 
 SPARE_VOXELS = 3
 """Voxels beyond the distances that are asked for, so that nothing round the label touches the end of the crop."""
@@ -50,19 +50,6 @@ class LabelCrop:
     inside_share: float
     axial: bool
     warnings: tuple[str, ...]
-
-
-def check_types(volume: object, labels: object) -> None:
-    """Refuse arguments that are not a Volume and a LabelMap.
-
-    Raises
-    ------
-    UsageError
-    """
-    if not isinstance(volume, Volume):
-        raise UsageError(f"the inside of a vertebra needs a Volume, not {type(volume).__name__}")
-    if not isinstance(labels, LabelMap):
-        raise UsageError(f"labels are a LabelMap, see clrecon.read_labels, not {type(labels).__name__}")
 
 
 def crop_label(volume: Volume, labels: LabelMap, label: int | str, margin_mm: float) -> LabelCrop:

@@ -21,9 +21,10 @@ from clrecon.opencl import Device
 from clrecon.operators.masks.mask import Mask
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.label_masks import extract_label_masks
-from clrecon.operators.vertebrae.crop import LabelCrop, check_types, crop_label
+from clrecon.operators.vertebrae.crop import LabelCrop, crop_label
 from clrecon.operators.vertebrae.solid import CLOSE_MM, label_margin, make_solid
 from clrecon.operators.vertebrae.thickness import ShellThickness, measure_thickness
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.text import say_volume
 from clrecon.system.wording import name_parameter
 
@@ -126,6 +127,7 @@ class VertebraInside:
         """
         return self._map({name: mask for name, mask in self.masks.items() if name != "solid"})
 
+    @explains_arguments
     def extract_meshes(self, *, memory: int | None = None) -> dict[str, Mesh]:
         """Return the surface of each part, as `extract_label_masks` makes it, by the names of ``PARTS``.
 
@@ -181,6 +183,7 @@ class VertebraInside:
         return LabelMap(voxels, self.volume.affine, {PARTS.index(name) + 1: name for name in masks})
 
 
+@explains_arguments
 def vertebra_inside(
     volume: Volume,
     labels: LabelMap,
@@ -235,7 +238,6 @@ def vertebra_inside(
     DeviceError
         The device has no room, or it fails.
     """
-    check_types(volume, labels)
     band = _checked_dense(dense)
     crop = crop_label(volume, labels, label, label_margin(volume, close_mm, grow_mm))
     with DeviceVolume(crop.volume, device=device, memory=memory) as resident:

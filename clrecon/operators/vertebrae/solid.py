@@ -18,7 +18,8 @@ from clrecon.operators.masks.mask import Mask
 from clrecon.operators.masks.regions import checked_mm
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.label_extraction import LabelExtraction
-from clrecon.operators.vertebrae.crop import LabelCrop, check_types, crop_label
+from clrecon.operators.vertebrae.crop import LabelCrop, crop_label
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.text import say_hu
 
 __all__ = ["CLOSE_MM", "label_margin", "make_solid", "vertebra_solid"]
@@ -27,6 +28,7 @@ CLOSE_MM = 1.5
 """Radius of the balls that close pores and vessels of the cortex."""
 
 
+@explains_arguments
 def vertebra_solid(
     volume: Volume,
     labels: LabelMap,
@@ -80,7 +82,6 @@ def vertebra_solid(
     DeviceError
         The device has no room, or it fails.
     """
-    check_types(volume, labels)
     crop = crop_label(volume, labels, label, label_margin(volume, close_mm, grow_mm))
     with DeviceVolume(crop.volume, device=device, memory=memory) as resident:
         return make_solid(resident, crop, iso_value, close_mm, grow_mm)[0]

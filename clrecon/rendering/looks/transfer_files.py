@@ -23,6 +23,7 @@ from clrecon.rendering.looks.slicer_files import (
 )
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.looks.transfer_text import FORMAT, VERSION
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.regular_files import read_regular
 from clrecon.system.text import escape_text
 
@@ -36,6 +37,7 @@ _FIELDS = ("format", "version", "name", "description", "unit_distance_mm", "poin
 _LIGHT = ("ambient", "diffuse", "specular", "specular_power", "soft_gradient", "direction")
 
 
+@explains_arguments
 def load_transfer_function(path: str | os.PathLike[str], name: str | None = None) -> TransferFunction:
     """Read a transfer function: clrecon's JSON, 3D Slicer's .vp, .vp.json, presets.xml and .mrml, ParaView's .json.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -13,6 +14,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.rendering.looks.lighting import Lighting
 from clrecon.rendering.looks.piecewise import check_ascending, check_share, evaluate_curve
+from clrecon.system.arguments import as_numbers, explains_arguments
 from clrecon.system.messages import Message
 
 __all__ = ["TransferFunction"]
@@ -179,6 +181,7 @@ class TransferFunction(Message):
         """
         return evaluate_curve(self._points[:, 0], self._points[:, 1:], np.asarray(hu, dtype=np.float64))
 
+    @explains_arguments
     def table(self, low: float, high: float, nodes: int) -> NDArray[np.float32]:
         """Return red, green, blue, opacity (nodes, 4), float32, at ``nodes`` evenly spaced HU from low to high, both
         included.
@@ -194,11 +197,12 @@ class TransferFunction(Message):
         """Return the factor on the opacity (...,), float64, at magnitudes of the gradient (...,) in HU per mm; 1
         without one.
         """
-        at = np.asarray(magnitude, dtype=np.float64)
+        at = as_numbers("magnitude", magnitude)
         if self._gradient_opacity is None:
             return np.ones(at.shape)
         return evaluate_curve(self._gradient_opacity[:, 0], self._gradient_opacity[:, 1:], at)[..., 0]
 
+    @explains_arguments
     def gradient_table(self, high: float, nodes: int) -> NDArray[np.float32]:
         """Return `gradient_factor` (nodes,), float32, at ``nodes`` even magnitudes from 0 to ``high`` HU per mm.
 
@@ -214,6 +218,7 @@ class TransferFunction(Message):
         own = {name: getattr(self, name) for name in ("points", "unit_distance", "gradient_opacity", "lighting")}
         return TransferFunction(**{**own, "name": self._name, "description": self._description, **changes})
 
+    @explains_arguments
     def scaled(self, opacity: float) -> TransferFunction:
         """Return a copy with every opacity multiplied by ``opacity``, at most 1.
 
@@ -228,6 +233,7 @@ class TransferFunction(Message):
         points[:, 4] = np.minimum(points[:, 4] * opacity, 1.0)
         return self.changed(points=points)
 
+    @explains_arguments
     def shifted(self, hu: float) -> TransferFunction:
         """Return a copy with every point moved up by ``hu``.
 
@@ -241,6 +247,7 @@ class TransferFunction(Message):
         return self.changed(points=points)
 
     @classmethod
+    @explains_arguments
     def from_window(cls, low: float, high: float, **parameters: Any) -> TransferFunction:
         """Return a window for projections: grey from black at ``low`` HU to white at ``high`` HU, opacity from 0 to 1.
 
@@ -262,6 +269,7 @@ class TransferFunction(Message):
         return cls([(hu, grey, grey, grey, grey) for hu, grey in sorted(ends)], **parameters)
 
     @classmethod
+    @explains_arguments
     def from_pyvista(
         cls, cmap: Any, opacity: Any, clim: tuple[float, float], *, unit_distance: float = 1.0, **parameters: Any
     ) -> TransferFunction:
@@ -291,6 +299,7 @@ class TransferFunction(Message):
         return cls(points_from_pyvista(cmap, opacity, clim), unit_distance=unit_distance, **parameters)
 
     @classmethod
+    @explains_arguments
     def from_vtk(cls, volume_property: Any, *, voxel_mm: float = 1.0, **parameters: Any) -> TransferFunction:
         """Return the function of the first component of a vtkVolumeProperty (or pyvista's): colours, opacities, light.
 
@@ -311,6 +320,7 @@ class TransferFunction(Message):
 
         return cls(**{**parameters_from_vtk(volume_property, voxel_mm), **parameters})
 
+    @explains_arguments
     def to_vtk(self, *, voxel_mm: float = 1.0) -> Any:
         """Return a vtkVolumeProperty: colours, opacities, unit distance, light (`Lighting()` where it has none).
 
@@ -320,7 +330,8 @@ class TransferFunction(Message):
 
         return property_to_vtk(self, voxel_mm)
 
-    def save(self, path: Any, *, no_clobber: bool = False) -> None:
+    @explains_arguments
+    def save(self, path: str | os.PathLike[str], *, no_clobber: bool = False) -> None:
         """Write it as JSON, as docs/transfer_functions.md says; `load_transfer_function` reads it.
 
         With ``no_clobber`` a file of that name stays and is an error.

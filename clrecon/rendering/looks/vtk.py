@@ -12,6 +12,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.rendering.looks.lighting import UNSHADED, Lighting
 from clrecon.rendering.looks.piecewise import merge_curves, straighten_curve
+from clrecon.system.arguments import as_numbers
 
 __all__ = ["curve_from_nodes", "parameters_from_vtk", "points_from_pyvista", "property_to_vtk"]
 
@@ -179,7 +180,7 @@ def points_from_pyvista(cmap: Any, opacity: Any, clim: tuple[float, float]) -> F
     """Return the points of `TransferFunction` from pyvista's lookup table: see `TransferFunction.from_pyvista`."""
     import pyvista
 
-    limits = np.asarray(clim, dtype=np.float64)
+    limits = as_numbers("clim", clim)
     if limits.shape != (2,) or not (np.isfinite(limits).all() and limits[0] < limits[1]):
         raise UsageError(f"the limits of a colour map are a lower and a higher HU, not {clim!r}")
     if not isinstance(opacity, (str, float, int)):

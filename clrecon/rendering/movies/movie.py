@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.rendering.views.camera import Camera
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.files import Staged, check_writable, stage_file
 from clrecon.system.progress import Progress
 from clrecon.system.targets import keep_existing
@@ -47,6 +48,7 @@ SLOWEST = 0.1
 """Fewest frames per second."""
 
 
+@explains_arguments
 def turntable_cameras(camera: Camera, frames: int, degrees: float = 360.0) -> list[Camera]:
     """Return cameras around the focal point, turning about the axis of the body towards the patient's left.
 
@@ -134,6 +136,7 @@ def check_animation(path: str | os.PathLike[str], fps: float = 25.0) -> str:
     return extension
 
 
+@explains_arguments
 def write_animation(
     frames: Iterable[Rendering | NDArray[np.uint8]],
     path: str | os.PathLike[str],

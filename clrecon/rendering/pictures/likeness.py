@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.records import Record
 
 __all__ = ["RANGE", "SHIFT", "WINDOW", "PictureLikeness", "make_control_pictures", "measure_pictures"]
@@ -50,6 +51,7 @@ class PictureLikeness(Record):
     box: tuple[int, int, int, int]
 
 
+@explains_arguments
 def measure_pictures(
     picture: ArrayLike, reference: ArrayLike, *, background: Sequence[int] | int = 0, whole: bool = False
 ) -> PictureLikeness:

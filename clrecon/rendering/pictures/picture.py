@@ -11,6 +11,7 @@ import numpy as np
 
 from clrecon.errors import UsageError
 from clrecon.rendering.pictures.picture_data import PictureData
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.targets import keep_existing
 
 __all__ = ["Rendering"]
@@ -43,6 +44,7 @@ class Rendering(PictureData):
         width, height = self.size
         return f"<Rendering {self.mode}, {width} x {height} pixels, camera {self.camera}>"
 
+    @explains_arguments
     def with_background(self, color: str | Sequence[float]) -> Rendering:
         """Return the same picture, opaque, in front of a colour.
 
@@ -65,6 +67,7 @@ class Rendering(PictureData):
         image[..., :3] = np.rint(mixed)
         return replace(self, image=image)
 
+    @explains_arguments
     def annotated(self, *, letters: bool = False, scale_bar: bool = False, caption: str | None = None) -> Rendering:
         """Return the same picture with sides of the patient, a scale bar or a line of text.
 
@@ -75,6 +78,7 @@ class Rendering(PictureData):
         image = annotate(self, letters=letters, scale_bar=scale_bar, caption=caption)
         return self if image is self.image else replace(self, image=image)
 
+    @explains_arguments
     def save(self, path: str | os.PathLike[str], *, quality: int = 95, no_clobber: bool = False) -> int:
         """Write the picture to a file; the extension chooses the format.
 
@@ -105,6 +109,7 @@ class Rendering(PictureData):
         with keep_existing(no_clobber):
             return write_image(self, path, quality)
 
+    @explains_arguments
     def save_depth(self, path: str | os.PathLike[str], *, expected: bool = False, no_clobber: bool = False) -> int:
         """Write ``depth`` in mm to ``.npy`` or, as float32 with NaN, to ``.tif``.
 
@@ -126,6 +131,7 @@ class Rendering(PictureData):
         with keep_existing(no_clobber):
             return write_floats(self.expected_depth if expected else self.depth, path, self.pixel_mm)
 
+    @explains_arguments
     def save_values(self, path: str | os.PathLike[str], *, no_clobber: bool = False) -> int:
         """Write ``values`` as `save_depth` writes depths.
 
@@ -142,6 +148,7 @@ class Rendering(PictureData):
         with keep_existing(no_clobber):
             return write_floats(self.values, path, self.pixel_mm)
 
+    @explains_arguments
     def to_pyvista(self, form: str = "points", *, expected: bool = False, distance: float | None = None) -> Any:
         """Return the picture as a PyVista data set in LPS mm, for a scene with meshes.
 

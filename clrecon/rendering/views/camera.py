@@ -20,6 +20,7 @@ from clrecon.rendering.views.directions import (
     find_view,
     number_or_nan,
 )
+from clrecon.system.arguments import explains_arguments
 
 __all__ = ["Camera", "CameraBasis", "box_corners"]
 
@@ -127,6 +128,7 @@ class Camera:
         self.basis()
 
     @classmethod
+    @explains_arguments
     def fit(
         cls,
         volume: Grid,
@@ -199,6 +201,7 @@ class Camera:
         return float((across / self.half_height() - points @ forward).max())
 
     @classmethod
+    @explains_arguments
     def from_pyvista(cls, source: Any, size: Sequence[int] | None = None) -> Camera:
         """Return the camera of a PyVista plotter, a PyVista or a VTK camera, see ``clrecon.rendering.views.vtk``.
 
@@ -259,6 +262,7 @@ class Camera:
         assert self.view_angle is not None
         return float(np.tan(np.radians(0.5 * self.view_angle)))
 
+    @explains_arguments
     def pixel_mm(self, size: Sequence[int]) -> float:
         """Return the side of a pixel in mm: everywhere in a parallel picture, at the focal point in a perspective one.
 
@@ -270,6 +274,7 @@ class Camera:
         _, height = checked_size(size)
         return 2.0 * self.half_height() * (1.0 if self.is_parallel else self.distance) / height
 
+    @explains_arguments
     def rays(self, size: Sequence[int]) -> tuple[Float64Array, Float64Array]:
         """Return the ray of each pixel, through its centre (x + 0.5, y + 0.5).
 
@@ -295,6 +300,7 @@ class Camera:
         directions /= np.linalg.norm(directions, axis=2, keepdims=True)
         return np.broadcast_to(self.position, offsets.shape).copy(), directions
 
+    @explains_arguments
     def project(self, points: ArrayLike, size: Sequence[int]) -> tuple[Float64Array, Float64Array]:
         """Return where points appear in the picture; the inverse of `rays`.
 
@@ -327,6 +333,7 @@ class Camera:
         y = 0.5 * height - from_position @ up / pixel
         return np.column_stack([x, y]), depths
 
+    @explains_arguments
     def orbit(self, azimuth: float, elevation: float = 0.0) -> Camera:
         """Return a camera turned around the focal point; angles are counted as in `fit`.
 
@@ -348,6 +355,7 @@ class Camera:
         offset = turn @ np.subtract(self.position, self.focal_point)
         return replace(self, position=_triple(self.focal_point + offset), up=_triple(turn @ self.up))
 
+    @explains_arguments
     def zoomed(self, zoom: float) -> Camera:
         """Return a camera at the same place that shows everything ``zoom`` times as large.
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.affine import Float64Array
+from clrecon.system.arguments import explains_arguments
 from clrecon.system.regular_files import read_regular
 from clrecon.system.text import escape_text
 
@@ -22,6 +23,7 @@ MARKUP_SPACES = {"LPS": "lps", "RAS": "ras", "1": "lps", "0": "ras"}
 """The values by which 3D Slicer names the frame of its points."""
 
 
+@explains_arguments
 def read_curve_points(path: str | Path, space: str | None = None) -> Float64Array:
     """Read the points of a centre line.
 

@@ -176,7 +176,7 @@ def test_clouds_that_cannot_be_used_are_refused(device):
         (PointCloud(np.empty((0, 3))), "the cloud has 0 points: a closed surface needs at least 4"),
         (cloud.select([0]), "the cloud has 1 points"),
         (PointCloud(cloud.points), "the cloud has no normals"),
-        (cloud.points, "made from a PointCloud, not from ndarray"),
+        (cloud.points, "cloud must be a PointCloud, not ndarray"),
         (cloud.changed(normals=np.where(np.arange(500)[:, None] < 3, 0.0, cloud.normals)), "3 of 500 normals are 0"),
     ):
         with pytest.raises(UsageError, match=words):

@@ -387,7 +387,7 @@ def test_the_report_says_what_was_done(device):
 
 def test_what_cannot_be_is_refused(device):
     labels = LabelMap(np.ones((2, 3, 4), np.uint8), np.eye(4))
-    with pytest.raises(UsageError, match="need a LabelMap"):
+    with pytest.raises(UsageError, match="labels must be a LabelMap"):
         extract_label_masks(labels.voxels, device=device)
     with pytest.raises(RefusedInputError, match="the label map is empty"):
         extract_label_masks(LabelMap(np.zeros((2, 3, 4), np.uint8), np.eye(4)), device=device)

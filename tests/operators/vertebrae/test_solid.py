@@ -101,9 +101,9 @@ def test_what_cannot_be_is_refused_in_words(device):
     voxels, ring = tube()
     affine = np.eye(4)
     volume, labels = Volume(voxels, affine), LabelMap(ring, affine, {1: "ring"})
-    with pytest.raises(UsageError, match="needs a Volume, not ndarray"):
+    with pytest.raises(UsageError, match="volume must be a Volume.*, not ndarray"):
         vertebra_solid(voxels, labels, 1, device=device)
-    with pytest.raises(UsageError, match="labels are a LabelMap"):
+    with pytest.raises(UsageError, match="labels must be a LabelMap"):
         vertebra_solid(volume, ring, 1, device=device)
     with pytest.raises(UsageError, match="ring"):
         vertebra_solid(volume, labels, "L9", device=device)

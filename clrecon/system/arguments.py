@@ -1,0 +1,181 @@
+"""Arguments of public functions: where one fails on an argument of a wrong kind, the error names the parameter.
+
+What is wanted is read from the annotations, so that it stands once.  Only kinds are told apart (a number, a text, a
+`Volume`); what a function checks by itself it says by itself, with ranges and shapes.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import operator
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
+
+from clrecon.errors import ClreconError, UsageError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+_CLASSES = (
+    "Volume", "DeviceVolume", "Mesh", "LabelMap", "PointCloud", "Mask", "Camera", "Grid", "GridCells", "GhostSlices",
+    "Lighting", "Clip", "TransferFunction", "Rendering", "Style", "PhantomSettings",
+)  # fmt: skip
+_LARGEST = 2**63
+
+_MAKERS = {
+    "a Volume": "see clrecon.read_volume and clrecon.Volume(voxels, affine)",
+    "a Mesh": "see clrecon.read_mesh and clrecon.Mesh(vertices, triangles)",
+    "a LabelMap": "see clrecon.read_labels and clrecon.LabelMap(voxels, affine)",
+    "a PointCloud": "see clrecon.read_points and clrecon.PointCloud(points)",
+}
+
+Given = ParamSpec("Given")
+Made = TypeVar("Made")
+Accepts = Callable[[Any], bool]
+
+
+def _is_flag(value: Any) -> bool:
+    return type(value).__name__ in ("bool", "bool_") or (isinstance(value, int) and value in (0, 1))
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, str | bytes) or getattr(value, "ndim", 0) != 0:
+        return False
+    try:
+        return float(value) is not None
+    except (TypeError, ValueError, OverflowError):
+        return False
+
+
+def _is_whole(value: Any) -> bool:
+    try:
+        return not isinstance(value, bool) and abs(operator.index(value)) < _LARGEST
+    except TypeError:
+        return False
+
+
+def _is_sequence(value: Any) -> bool:
+    if isinstance(value, str | bytes | dict | set):
+        return False
+    return hasattr(value, "__len__") and hasattr(value, "__getitem__") and getattr(value, "ndim", 1) != 0
+
+
+def _is_iterable(value: Any) -> bool:
+    return getattr(value, "__iter__", None) is not None and getattr(value, "ndim", 1) != 0
+
+
+def _is_of_class(name: str, value: Any) -> bool:
+    """Tell it by the names of the value's classes: the class itself may not be loaded."""
+    return any(kind.__name__ == name and kind.__module__.startswith("clrecon") for kind in type(value).__mro__)
+
+
+_KINDS: dict[str, tuple[str, Accepts]] = {
+    "None": ("None", lambda value: value is None),
+    "bool": ("True or False", _is_flag),
+    "int": ("a whole number", _is_whole),
+    "float": ("a number", _is_number),
+    "str": ("a text", lambda value: isinstance(value, str)),
+    "Path": ("a path", lambda value: hasattr(value, "__fspath__")),
+    "os.PathLike": ("a path", lambda value: hasattr(value, "__fspath__")),
+    "Progress": ("a function", callable),
+    "Sequence": ("a sequence", _is_sequence),
+    "Iterable": (
+        "a sequence",
+        lambda value: getattr(value, "__iter__", None) is not None and getattr(value, "ndim", 1) != 0,
+    ),
+    # of `Mask`, whose parts stand in classes of their own
+    **dict.fromkeys(("Shapes", "Bits"), ("a Mask", functools.partial(_is_of_class, "Mask"))),
+    **{name: (f"a {name}", functools.partial(_is_of_class, name)) for name in _CLASSES},
+}
+
+
+def _read_kinds(annotation: Any) -> list[tuple[str, Accepts]] | None:
+    """Return the kinds that an annotation allows; None where one of them is not known here."""
+    if not isinstance(annotation, str):
+        return None
+    kinds = [_read_kind(*word.partition("[")[::2]) for word in _split(annotation, "|")]
+    return None if None in kinds else cast("list[tuple[str, Accepts]]", kinds)
+
+
+def _read_kind(name: str, inner: str) -> tuple[str, Accepts] | None:
+    if name != "tuple":
+        return _KINDS.get(name)
+    count = 0 if "..." in inner else len(_split(inner[:-1], ","))
+    return f"{count or 'some'} values", lambda value: _is_sequence(value) and count in (0, len(value))
+
+
+def _split(text: str, separator: str) -> list[str]:
+    """Split at the separators that stand in no brackets."""
+    parts, depth = [""], 0
+    for letter in text:
+        depth += (letter == "[") - (letter == "]")
+        if letter == separator and not depth:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return [part.strip() for part in parts]
+
+
+def _describe(kinds: list[tuple[str, Accepts]]) -> str:
+    words = list(dict.fromkeys(word for word, _ in kinds))
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
+
+
+def _advise(kinds: list[tuple[str, Accepts]]) -> str:
+    """Return where the first kind that is an object of clrecon comes from."""
+    return next((f": {_MAKERS[word]}" for word, _ in kinds if word in _MAKERS), "")
+
+
+def explains_arguments(function: Callable[Given, Made]) -> Callable[Given, Made]:
+    """Turn the foreign error of a public function into a `UsageError` where an argument is not of the annotated kind.
+
+    ``volume must be a Volume or a DeviceVolume, not ndarray`` in place of an AttributeError from deep within.
+    """
+    signature = inspect.signature(function)
+    checked = {
+        name: kinds
+        for name, parameter in signature.parameters.items()
+        if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+        and (kinds := _read_kinds(parameter.annotation)) is not None
+    }
+
+    @functools.wraps(function)
+    def call(*args: Given.args, **kwargs: Given.kwargs) -> Made:
+        try:
+            return function(*args, **kwargs)
+        except ClreconError:
+            raise
+        except Exception as error:
+            try:
+                given = signature.bind(*args, **kwargs).arguments
+            except TypeError:  # an argument is missing or one too many: the error says so
+                raise error from None
+            for name, value in given.items():
+                kinds = checked.get(name)
+                if kinds is not None and not any(accepts(value) for _, accepts in kinds):
+                    wanted = f"{name} must be {_describe(kinds)}, not {_name_value(value)}{_advise(kinds)}"
+                    raise UsageError(wanted) from error
+            raise
+
+    return call
+
+
+def as_numbers(name: str, values: Any) -> NDArray[np.float64]:
+    """Return an argument as an array of float64; a `UsageError` with its name where it holds anything else."""
+    import numpy as np
+
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise UsageError(f"{name} must be numbers, not {_name_value(values)}") from None
+
+
+def _name_value(value: Any) -> str:
+    """Return a short value itself, of others the type."""
+    if isinstance(value, int) and abs(value) >= _LARGEST:
+        return f"one of {value.bit_length()} bits"
+    if value is None or (isinstance(value, str | int | float | complex) and len(repr(value)) <= 40):
+        return repr(value)
+    return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__

@@ -1,0 +1,197 @@
+"""Each parameter of each public function is given what it is not: a `ClreconError`, or a TypeError that names it."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import clrecon
+from clrecon.errors import ClreconError, UsageError
+from clrecon.geometry import Volume
+from clrecon.system.arguments import explains_arguments
+
+pytestmark = pytest.mark.first_device
+
+RESULTS = {
+    "Clustering", "MiddlePlane", "Neighbours", "Noise", "PhantomTruth", "PointStep", "Rendering", "Vertebra",
+    "VertebraSplit",
+}  # fmt: skip
+"""Classes that functions return and nobody makes."""
+INNER = {
+    "attempt", "bring", "changed", "clear", "describe", "describe_parts", "follow", "halve", "keep", "kept_bytes",
+    "make_way", "of_known", "part", "pays_whole", "place", "plan", "program", "release_slices", "render_with_layers",
+    "shortage", "slice_origins", "upload", "whole",
+}  # fmt: skip
+"""Methods of public classes for clrecon's own modules."""
+WITH_METHODS = {
+    "Camera", "Clip", "LabelMap", "Mask", "Mesh", "PointCloud", "Rendering", "SurfaceExtractor", "TransferFunction",
+    "Volume", "VolumeRenderer",
+}  # fmt: skip
+FREE = {"memory", "progress", "report", "trusted"}
+
+
+class Nothing:
+    """What no parameter takes."""
+
+
+@cache
+def things() -> dict[str, Any]:
+    """One of each kind, a ball of bone in 10 slices."""
+    k, j, i = np.indices((10, 11, 12))
+    ball = np.where((k - 5) ** 2 + (j - 5) ** 2 + (i - 6) ** 2 < 12, 700, -1000).astype(np.int16)
+    volume = clrecon.Volume(ball, np.diag([1.0, 1.0, 1.5, 1.0]))
+    return {
+        "Volume": volume,
+        "LabelMap": clrecon.LabelMap((ball > 0).astype(np.uint8), volume.affine, {1: "bone"}),
+        "Mesh": clrecon.extract_isosurface(volume, 200),
+        "PointCloud": clrecon.extract_points(volume, hu=(200, 3000)),
+        "Mask": clrecon.Mask.from_band(volume, (200, 3000)),
+        "Camera": clrecon.Camera.fit(volume),
+        "Clip": clrecon.Clip.box((0, 0, 0), (5, 5, 5)),
+        "Rendering": clrecon.render(volume, size=(16, 16)),
+        "TransferFunction": clrecon.TransferFunction.from_window(0, 1000),
+        "SurfaceExtractor": clrecon.SurfaceExtractor(volume),
+        "VolumeRenderer": clrecon.VolumeRenderer(volume),
+    }
+
+
+def wrong_values() -> list[Any]:
+    odd = [
+        None,
+        True,
+        -1,
+        float("nan"),
+        10**400,
+        "nonsense",
+        b"x",
+        [],
+        [None, "a"],
+        {},
+        Nothing(),
+        2j,
+        int,
+        (200, None),
+    ]
+    arrays = [np.zeros(3), np.zeros((2, 2), object)]
+    return [*odd, *arrays, *(things()[name] for name in ("Volume", "Mesh", "LabelMap", "PointCloud", "Camera"))]
+
+
+def public_callables() -> list[str]:
+    """Names of functions and classes, and ``Class.method`` of what `things` has."""
+    found = [name for name in dir(clrecon) if not name.startswith("_") and name not in RESULTS]
+    found = [name for name in found if callable(getattr(clrecon, name)) and is_own(getattr(clrecon, name))]
+    classes = [name for name in found if inspect.isclass(getattr(clrecon, name))]
+    methods = [f"{name}.{method}" for name in classes for method in methods_of(getattr(clrecon, name))]
+    return [name for name in found if name != "time_limit"] + methods
+
+
+def is_own(thing: Any) -> bool:
+    return thing.__module__.startswith("clrecon") and not (inspect.isclass(thing) and issubclass(thing, Exception))
+
+
+def methods_of(kind: type) -> list[str]:
+    if kind.__name__ not in WITH_METHODS:
+        return []
+    own = [each for base in kind.__mro__ if base.__module__.startswith("clrecon") for each in vars(base)]
+    chosen = dict.fromkeys(name for name in own if not name.startswith("_") and name not in INNER)
+    return [name for name in chosen if callable(getattr(kind, name)) and parameters(getattr(kind, name))]
+
+
+def parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
+    """The parameters that are tried: by name, and with a meaning of their own."""
+    named = inspect.signature(function).parameters.values()
+    tried = [each for each in named if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)]
+    return [each for each in tried if each.name not in FREE | {"self"}]
+
+
+def sound_arguments(function: Callable[..., Any], folder: Path) -> dict[str, Any]:
+    """What the function needs, as far as it follows from names and annotations."""
+    volume, mesh = things()["Volume"], things()["Mesh"]
+    known = {
+        "hu": (200, 3000), "iso_value": 200, "iso_values": [200], "label": 1, "voxels": volume.voxels,
+        "affine": volume.affine, "points": things()["PointCloud"].points, "vertices": mesh.vertices,
+        "triangles": mesh.triangles, "path": folder / "new.nii.gz", "name": "median", "method": "t-mc", "mm": 1.0,
+        "rules": "largest:1", "fraction": 0.5, "frames": [things()["Rendering"]] * 2, "room": things()["Mask"],
+    }  # fmt: skip
+    found = {}
+    for each in parameters(function):
+        if each.default is each.empty:
+            of_kind = [thing for name, thing in things().items() if name in str(each.annotation)]
+            found[each.name] = known.get(each.name, of_kind[0] if of_kind else 3)
+    return found
+
+
+def faults(function: Callable[..., Any], folder: Path) -> Iterator[str]:
+    sound = sound_arguments(function, folder)
+    if "samples" in inspect.signature(function).parameters:
+        sound["samples"] = 50
+    for parameter in parameters(function):
+        for value in wrong_values():
+            try:
+                function(**{**sound, parameter.name: value})
+            except ClreconError:
+                pass
+            except Exception as error:
+                if not isinstance(error, TypeError) or parameter.name not in str(error):
+                    shown = type(value).__name__ if not isinstance(value, str | float | None) else repr(value)
+                    yield f"{parameter.name}={shown}: {type(error).__name__}: {error}"
+
+
+@pytest.mark.untraced
+@pytest.mark.parametrize("name", public_callables())
+def test_a_wrong_argument_is_refused_by_its_name(
+    name: str, device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    kind, _, method = name.partition(".")
+    function = getattr(things()[kind] if method else clrecon, method or kind)
+    assert list(faults(function, tmp_path)) == []
+
+
+@explains_arguments
+def sample(
+    volume: Volume, count: int = 1, share: float | None = None, names: tuple[str, str] = ("a", "b")
+) -> tuple[int, ...]:
+    return volume.shape[0] + range(100)[count], round(share or 0.0), len(names[1])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            {"volume": np.zeros((2, 2, 2)).tolist()},
+            "volume must be a Volume, not list: see clrecon.read_volume and clrecon.Volume(voxels, affine)",
+        ),
+        ({"count": 1.5}, "count must be a whole number, not 1.5"),
+        ({"count": 10**400}, "count must be a whole number, not one of 1329 bits"),
+        ({"share": "x"}, "share must be a number or None, not 'x'"),
+        ({"share": int}, "share must be a number or None, not the class int"),
+        ({"names": ("a",)}, "names must be 2 values, not tuple"),
+    ],
+)
+def test_the_message_says_what_is_wanted_and_what_came(arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        sample(**{"volume": things()["Volume"], **arguments})
+    assert str(refused.value) == words and refused.value.__cause__ is not None
+
+
+def test_sound_arguments_and_errors_of_another_cause_stay_as_they_are() -> None:
+    volume = things()["Volume"]
+    assert sample(volume, np.uint8(3), np.float32(0.5), ["a", "b"]) == (13, 0, 1)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="missing 1 required positional argument: 'volume'"):
+        sample()  # type: ignore[call-arg]
+    with pytest.raises(IndexError):
+        sample(volume, 100)
+
+
+def test_the_sweep_finds_a_function_that_checks_nothing(tmp_path: Path) -> None:
+    def careless(mesh: Any) -> int:
+        return len(mesh.vertices)
+
+    assert any("AttributeError" in each for each in faults(careless, tmp_path))
