@@ -136,6 +136,7 @@ def test_the_range_of_values_is_found_when_it_is_asked_for():
     assert volume.hu_range == (-5.0, 18.0)
     assert volume.with_voxels(voxels * 2).hu_range == (-10.0, 36.0)
     assert volume.with_voxels(voxels * 2).report["hu_range"] == [-10.0, 36.0]
+    voxels.flags.writeable = False  # what cannot change is believed
     assert Volume(voxels, np.eye(4), hu_range=(-7.0, 99.0)).hu_range == (-7.0, 99.0)
 
 
