@@ -193,7 +193,7 @@ def test_labels_of_the_whole_body_go_with_a_thin_part():
     oblique = Volume(np.zeros(SHAPE, np.int16), placed(STEPS, (1.0, 1.0, 3.0)))
     resample_labels(labels, oblique, progress=lambda *call: told.append(call))
     assert told == [("resample", k, 6) for k in range(6)]
-    with pytest.raises(UsageError, match=r"not \(LabelMap, DeviceVolume\)"):
+    with pytest.raises(UsageError, match="volume must be a Volume, not DeviceVolume"):
         resample_labels(labels, object.__new__(DeviceVolume))
 
 
