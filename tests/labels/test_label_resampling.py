@@ -131,7 +131,7 @@ def test_an_empty_map_is_refused():
 
 
 def test_only_label_maps_and_volumes():
-    with pytest.raises(UsageError, match="LabelMap, Volume"):
+    with pytest.raises(UsageError, match="labels must be a LabelMap, not ndarray"):
         resample_labels(VOXELS, VOLUME)
 
 

@@ -95,7 +95,7 @@ def test_labels_are_chosen_by_number_and_name(device):
     assert again.count == made.count
     with pytest.raises(UsageError, match="L9"):
         clrecon.Mask.from_labels(volume, labels, ["L9"], device=device)
-    with pytest.raises(UsageError, match="labels are a LabelMap"):
+    with pytest.raises(UsageError, match="labels must be a LabelMap"):
         clrecon.Mask.from_labels(volume, numbers, device=device)
 
 
