@@ -108,9 +108,10 @@ class UnevenStack(Message):
 
     def origins_at(self, k: Float64Array) -> Float64Array:
         """Return positions (n, 3) at slice coordinates (n,); fractions and coordinates beyond the ends are allowed."""
-        layer = np.clip(np.floor(k).astype(np.int64), 0, len(self.positions) - 2)
+        layer = np.nan_to_num(np.clip(np.floor(k), 0, len(self.positions) - 2)).astype(np.int64)
         part = (k - layer)[:, None]
-        return self.positions[layer] * (1.0 - part) + self.positions[layer + 1] * part
+        with np.errstate(invalid="ignore"):  # a point that is not finite has no place
+            return self.positions[layer] * (1.0 - part) + self.positions[layer + 1] * part
 
     def ijk_to_lps(self, points: Float64Array) -> Float64Array:
         """Map index coordinates (n, 3) to LPS mm (n, 3)."""
@@ -119,7 +120,8 @@ class UnevenStack(Message):
     def lps_to_ijk(self, points: Float64Array) -> Float64Array:
         """Map LPS mm (n, 3) to index coordinates (n, 3)."""
         heights = self.positions @ self.normal
-        wanted = points @ self.normal
+        with np.errstate(invalid="ignore"):
+            wanted = points @ self.normal
         layer = np.clip(np.searchsorted(heights, wanted, side="right") - 1, 0, len(heights) - 2)
         k = layer + (wanted - heights[layer]) / (heights[layer + 1] - heights[layer])
         in_slice = points - self.origins_at(k)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import Grid
 from clrecon.geometry.affine import checked_affine
-from clrecon.labels.names import check_name, find_number
+from clrecon.labels.names import check_name, check_wanted, find_number
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.public import public_function
 
@@ -48,6 +48,7 @@ class LabelMap(Grid):
         affine; or a name is not text.
     """
 
+    @explains_arguments
     def __init__(
         self,
         voxels: ArrayLike,
@@ -106,6 +107,18 @@ class LabelMap(Grid):
             map.
         """
         return find_number(label, self.names, self.counts)
+
+    @explains_arguments
+    def choose(self, labels: Iterable[int | str] | int | str | None) -> tuple[int, ...]:
+        """Return the numbers of one or several labels, each once; of all that occur for None.
+
+        Raises
+        ------
+        UsageError
+            The sequence is empty, or as for `find`.
+        """
+        wanted = check_wanted(labels)
+        return self.numbers if wanted is None else tuple(dict.fromkeys(self.find(label) for label in wanted))
 
     def _repr_html_(self) -> str | None:
         """Return the HTML that a notebook shows: a table; None where it shows the text."""

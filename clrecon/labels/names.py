@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 from clrecon.errors import UsageError
 from clrecon.system.text import escape_text
 
-__all__ = ["check_name", "file_suffixes", "find_number", "label_suffix", "list_labels"]
+__all__ = ["check_name", "check_wanted", "file_suffixes", "find_number", "label_suffix", "list_labels"]
 
 SUFFIX_LENGTH = 40
 LABELS_LISTED = 60
@@ -117,3 +117,21 @@ def file_suffixes(names: Mapping[int, str]) -> dict[int, str]:
     if len({suffix.casefold() for suffix in unique.values()}) < len(unique):  # a suffix with number is also a name
         return {number: f"label_{number}" for number in names}
     return unique
+
+
+def check_wanted(only: str | int | Iterable[str | int] | None) -> tuple[str | int, ...] | None:
+    """Return `only` as a tuple; None stays None.
+
+    Raises
+    ------
+    UsageError
+        A label is neither a number nor text.
+    """
+    if only is None:
+        return None
+    wanted = (only,) if isinstance(only, str | int) else tuple(only)
+    if not all(isinstance(label, str | int) for label in wanted):
+        raise UsageError("labels are chosen by number or name")
+    if not wanted:
+        raise UsageError("no label is chosen: name one, or leave the choice out for all")
+    return wanted

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.errors import RefusedInputError, UsageError
+from clrecon.errors import RefusedInputError
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap
 from clrecon.labels.names import check_name, find_number
 from clrecon.system.wording import name_parameter
 
-__all__ = ["Painter", "Wanted", "check_wanted"]
+__all__ = ["Painter", "Wanted"]
 
 
 class Wanted(NamedTuple):
@@ -94,21 +94,3 @@ class Painter:
                 f" choose labels that do not overlap ({name_parameter('only')}), one run each"
             )
         return LabelMap(self._voxels, affine, self._names, **options)
-
-
-def check_wanted(only: str | int | Iterable[str | int] | None) -> tuple[str | int, ...] | None:
-    """Return `only` as a tuple; None stays None.
-
-    Raises
-    ------
-    UsageError
-        A label is neither a number nor text.
-    """
-    if only is None:
-        return None
-    wanted = (only,) if isinstance(only, str | int) else tuple(only)
-    if not all(isinstance(label, str | int) for label in wanted):
-        raise UsageError("labels are chosen by number or name")
-    if not wanted:
-        raise UsageError("no label is chosen: name one, or leave the choice out for all")
-    return wanted

@@ -18,7 +18,8 @@ from clrecon.geometry.volume import Volume
 from clrecon.labels.folder import open_masks, read_masks
 from clrecon.labels.grids import read_grid_labels
 from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap
-from clrecon.labels.overlap import Wanted, check_wanted
+from clrecon.labels.names import check_wanted
+from clrecon.labels.overlap import Wanted
 from clrecon.labels.segmentation import SEGMENTATION_CLASSES, read_segmentation, tell_pixel_bytes
 from clrecon.labels.structures import STRUCTURE_SET, read_structures
 from clrecon.system.arguments import explains_arguments
@@ -52,7 +53,7 @@ WARNINGS_SHOWN = 3
 @explains_arguments
 def read_labels(
     path: str | Path,
-    only: Sequence[str | int] | None = None,
+    only: Sequence[str | int] | str | int | None = None,
     *,
     volume: Grid | None = None,
     progress: Progress | None = None,

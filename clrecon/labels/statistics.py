@@ -119,7 +119,7 @@ def check_percentiles(percentiles: Sequence[float]) -> tuple[float, ...]:
 def measure_labels(
     volume: Volume,
     labels: LabelMap,
-    only: Sequence[str | int] | None = None,
+    only: Sequence[str | int] | str | int | None = None,
     *,
     percentiles: Sequence[float] = PERCENTILES,
     progress: Progress | None = None,
@@ -162,7 +162,7 @@ def measure_resampled(
     volume: Volume,
     labels: LabelMap,
     taken: ResampledLabels,
-    only: Sequence[str | int] | None = None,
+    only: Sequence[str | int] | str | int | None = None,
     *,
     percentiles: Sequence[float] = PERCENTILES,
     progress: Progress | None = None,
@@ -172,7 +172,7 @@ def measure_resampled(
 
     wanted = check_percentiles(percentiles)
     progress = progress or ignore_progress
-    numbers = labels.numbers if only is None else sorted({labels.find(label) for label in only})
+    numbers = sorted(labels.choose(only))
     boxes = find_objects(taken.voxels)
     voxel_ml = slice_voxel_ml(volume)
     figures = []

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import inspect
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 from clrecon.errors import ClreconError, UsageError
@@ -81,10 +81,8 @@ _KINDS: dict[str, tuple[str, Accepts]] = {
     "os.PathLike": ("a path", lambda value: hasattr(value, "__fspath__")),
     "Progress": ("a function", callable),
     "Sequence": ("a sequence", _is_sequence),
-    "Iterable": (
-        "a sequence",
-        lambda value: getattr(value, "__iter__", None) is not None and getattr(value, "ndim", 1) != 0,
-    ),
+    "Iterable": ("a sequence", _is_iterable),
+    "Mapping": ("a mapping", lambda value: isinstance(value, Mapping)),
     # of `Mask`, whose parts stand in classes of their own
     **dict.fromkeys(("Shapes", "Bits"), ("a Mask", functools.partial(_is_of_class, "Mask"))),
     **{name: (f"a {name}", functools.partial(_is_of_class, name)) for name in _CLASSES},

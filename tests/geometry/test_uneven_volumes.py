@@ -95,3 +95,10 @@ def test_what_is_no_stack_is_refused(change, says):
 def test_a_volume_says_that_its_slices_are_uneven():
     assert repr(uneven()) == "Volume(4 x 5 x 6 int16, spacing 0.5 x 0.7 x 1.822 mm, uneven slices)"
     assert repr(Volume(np.zeros((2, 3, 4), np.uint8), np.eye(4))) == "Volume(4 x 3 x 2 uint8, spacing 1 x 1 x 1 mm)"
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_point_that_is_not_finite_has_no_place():
+    volume = Volume(np.zeros((4, 5, 6), np.int16), np.eye(4), None, [(0, 0, z) for z in (0.0, 1.0, 2.5, 3.0)])
+    places = volume.lps_to_ijk([[np.nan, 0, 0], [0, 0, np.inf], [1, 2, 2.5]])
+    assert not np.isfinite(places[:2]).all(axis=1).any() and places[2].tolist() == [1.0, 2.0, 2.0]

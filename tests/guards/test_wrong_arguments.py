@@ -114,7 +114,8 @@ def sound_arguments(function: Callable[..., Any], folder: Path) -> dict[str, Any
     """What the function needs, as far as it follows from names and annotations."""
     volume, mesh = things()["Volume"], things()["Mesh"]
     known = {
-        "hu": (200, 3000), "iso_value": 200, "iso_values": [200], "label": 1, "voxels": volume.voxels,
+        "hu": (200, 3000), "iso_value": 200, "iso_values": [200], "label": 1,
+        "voxels": things()["LabelMap"].voxels,
         "affine": volume.affine, "points": things()["PointCloud"].points, "vertices": mesh.vertices,
         "triangles": mesh.triangles, "path": folder / "new.nii.gz", "name": "median", "method": "t-mc", "mm": 1.0,
         "rules": "largest:1", "fraction": 0.5, "frames": [things()["Rendering"]] * 2, "room": things()["Mask"],

@@ -150,3 +150,12 @@ def test_a_map_knows_its_labels_whatever_becomes_of_the_array_it_was_made_from()
             each.voxels[0, 0, 0] = 1
     array.flags.writeable = False
     assert np.shares_memory(LabelMap(array, OBLIQUE).voxels, array)
+
+
+def test_one_label_or_several_are_chosen_by_number_or_name():
+    labels = label_map()
+    assert labels.choose(None) == labels.numbers
+    assert labels.choose(2) == labels.choose("T12") == labels.choose([2, "t12"]) == (2,)
+    assert labels.choose(("rib left 11", 5)) == (8, 5)
+    with pytest.raises(UsageError, match="no label is chosen"):
+        labels.choose([])

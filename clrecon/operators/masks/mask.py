@@ -99,7 +99,7 @@ class Mask(MaskComponents):
         cls,
         volume: Volume | DeviceVolume,
         labels: LabelMap,
-        numbers: Sequence[int | str] | None = None,
+        numbers: Sequence[int | str] | int | str | None = None,
         *,
         device: Device | str | int | None = None,
         memory: int | None = None,
@@ -123,12 +123,12 @@ class Mask(MaskComponents):
         DeviceError
             As for `from_band`.
         """
-        chosen = None if numbers is None else [labels.find(number) for number in numbers]
+        chosen = labels.choose(numbers)
         with open_volume(volume, device, memory, "a mask") as resident:
             voxels = resident.bring(labels).voxels
             wanted = np.zeros(int(np.iinfo(voxels.dtype).max) + 1, np.bool_)
-            wanted[list(labels.numbers) if chosen is None else chosen] = True
-            names = [labels.name(number) for number in (labels.numbers if chosen is None else chosen)]
+            wanted[list(chosen)] = True
+            names = [labels.name(number) for number in chosen]
             return cls._packed(resident, wanted[voxels], f"labels {', '.join(names)}" if names else "no label")
 
     @classmethod

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, NoReturn, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
@@ -76,6 +76,14 @@ class MaskBits:
         ni, nj, nk = self.shape_ijk
         words = download(self.device, np.empty((nk, nj, -(-ni // 32)), "<u4"), self._mask_d)
         return np.unpackbits(words.view(np.uint8), axis=2, count=ni, bitorder="little").view(np.bool_)
+
+    __array_ufunc__ = None  # an array and a mask have no common operators
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        """Return the chosen voxels, shape (nk, nj, ni), bool, for numpy: always a copy."""
+        if copy is False:
+            raise ValueError("the bits of a mask are an array only as a copy")
+        return self.to_numpy().astype(np.bool_ if dtype is None else dtype, copy=False)
 
     # Logic
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TypeVar
 
-from clrecon.errors import DeviceMemoryError, UsageError
-from clrecon.labels import LabelMap
+from clrecon.errors import DeviceMemoryError
 from clrecon.labels.solid import Box
 from clrecon.opencl import MemoryLimits, describe_shortage
 from clrecon.operators.surface.slabs import Slab
 
-__all__ = ["Window", "choose_numbers", "each_label", "group_boxes"]
+__all__ = ["Window", "each_label", "group_boxes"]
 
 Held = TypeVar("Held")
 Made = TypeVar("Made")
@@ -28,16 +27,6 @@ class Window(Slab):
     def voxel_slices(self) -> tuple[int, int]:
         """First and end of the slices of the volume on the device."""
         return self.held
-
-
-def choose_numbers(labels: LabelMap, numbers: Sequence[int | str] | None) -> tuple[int, ...]:
-    """Return the numbers of the labels that are asked for, each once; all that occur if none are named."""
-    if numbers is None:
-        return labels.numbers
-    chosen = tuple(dict.fromkeys(labels.find(number) for number in numbers))
-    if not chosen:
-        raise UsageError("choose at least one label")
-    return chosen
 
 
 def group_boxes(boxes: dict[int, Box], needs: dict[str, int], scratch: int, room: MemoryLimits) -> list[dict[int, Box]]:

@@ -22,7 +22,7 @@ from clrecon.opencl import (
 )
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Part
-from clrecon.operators.surface.label_groups import choose_numbers, each_label
+from clrecon.operators.surface.label_groups import each_label
 from clrecon.operators.surface.label_survey import survey_labels
 from clrecon.operators.surface.mask_extraction import HeldMap, MaskExtraction, prepare_label_masks
 from clrecon.system.arguments import explains_arguments
@@ -36,7 +36,7 @@ def extract_label_masks(
     labels: LabelMap,
     *,
     device: Device | str | int | None = None,
-    numbers: Sequence[int | str] | None = None,
+    numbers: Sequence[int | str] | int | str | None = None,
     closed: bool = True,
     memory: int | None = None,
     progress: Progress | None = None,
@@ -93,7 +93,7 @@ def extract_label_masks(
     if not labels.numbers:
         raise RefusedInputError("the label map is empty: no voxel has a label")
     marching_cubes.check_row(labels.shape_ijk[0])
-    chosen = choose_numbers(labels, numbers)
+    chosen = labels.choose(numbers)
 
     def make(current: Device, told: list[str]) -> dict[int, Mesh]:
         run = MaskExtraction(labels, current, memory, closed)

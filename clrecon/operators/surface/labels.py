@@ -23,7 +23,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Part
 from clrecon.operators.surface.label_extraction import HeldSlices, LabelExtraction, prepare_labels
-from clrecon.operators.surface.label_groups import choose_numbers, each_label
+from clrecon.operators.surface.label_groups import each_label
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 
@@ -55,7 +55,7 @@ def extract_labels(
     iso_value: float,
     *,
     device: Device | str | int | None = None,
-    numbers: Sequence[int | str] | None = None,
+    numbers: Sequence[int | str] | int | str | None = None,
     grow_mm: float | None = None,
     closed: bool = True,
     solid: bool = False,
@@ -143,11 +143,11 @@ def _make_meshes(
     run: LabelExtraction,
     labels: LabelMap,
     taken: ResampledLabels,
-    numbers: Sequence[int | str] | None,
+    numbers: Sequence[int | str] | int | str | None,
     progress: Progress | None,
 ) -> dict[int, Mesh]:
     """Make the meshes of labels that have one; a label that was named must have one."""
-    chosen = choose_numbers(labels, numbers)
+    chosen = labels.choose(numbers)
     boxes = find_boxes(taken.voxels, chosen, run.growth.reach)
     refuse = None if numbers is None else partial(_refuse_label, run.volume, taken, labels, run.rule)
     missing = [number for number in chosen if number not in boxes]

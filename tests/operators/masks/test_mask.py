@@ -191,3 +191,11 @@ def test_under_a_simulator(device):
     assert 0 < grown.count <= opened.count
     assert mask.apply(volume, -5.0).voxels.min() == -5
     assert not (clrecon.Mask.from_band(volume, (0, 1), device=device) & ~mask & mask).count
+
+
+def test_numpy_takes_a_mask_as_its_voxels(device):
+    mask = clrecon.Mask.from_band(
+        Volume(np.arange(24, dtype=np.int16).reshape(2, 3, 4), np.eye(4)), (5, 9), device=device
+    )
+    assert np.asarray(mask).dtype == np.bool_ and np.array_equal(np.asarray(mask), mask.to_numpy())
+    assert np.asarray(mask, dtype=np.uint8).sum() == 5
