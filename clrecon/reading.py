@@ -96,8 +96,8 @@ def read_volume(
         True: also read the files and folders that symbolic links out of the folder lead to, as in a git-annex or
         DataLad repository.  False: a series beside which such links stand is refused, because they may be its slices.
     rescale : (slope, intercept), optional
-        Values are ``slope * stored + intercept``, whatever the files say of them: where a header lacks the rescale, is
-        wrong about it, or a scanner has a scale of its own.  The certificate says that it was given.
+        Values are ``slope * stored + intercept``, regardless of the files: where a header lacks the rescale, is wrong
+        about it, or a scanner has a scale of its own.  The certificate says that it was given.
     progress : callable, optional
         Called as ``progress(stage, done, total)`` with stage "scan" or "read", or "no answer yet from NAME" where the
         disk hangs.

@@ -39,7 +39,7 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         "--rescale",
         type=_parse_rescale,
         metavar="SLOPE,INTERCEPT",
-        help="compute HU as SLOPE x stored value + INTERCEPT, whatever the files say, like 1,-1024",
+        help="compute HU as SLOPE x stored value + INTERCEPT, regardless of the files, like 1,-1024",
     )
 
 

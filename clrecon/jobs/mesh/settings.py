@@ -206,7 +206,7 @@ class MeshSettings(InputSettings):
         option = name_parameter("all_parts", True)
         if not self.is_for_print:
             raise UsageError(
-                f"{option} belongs to {name_parameter('purpose', 'print')}, which else keeps the largest bone alone;"
+                f"{option} belongs to {name_parameter('purpose', 'print')}; without it the largest bone alone is kept;"
                 " other meshes have all components unless an option leaves some out"
             )
         if self.keep_largest is not None or self.seeds or self.labels_pick:

@@ -69,7 +69,7 @@ def fill_enclosed(
 ) -> Any:
     """Return a volume in which what the voxels at a level and above enclose, as marrow, is above the level too.
 
-    The voxels at the level and above are closed by a ball, so that pores of the cortex are no way in.  The ball acts
+    The voxels at the level and above are closed by a ball, so that gaps in the cortex are closed.  The ball acts
     between the centres of voxels: every pore up to twice its radius less one step of the voxels is closed.  A space is
     enclosed where no way over faces of voxels leads from it to the border of the volume, or only to places of an end
     of the volume that are enclosed in that end's own slice: the canal of a long bone that the scan cuts.  From outside
