@@ -174,7 +174,7 @@ def write_animation(
     Raises
     ------
     UsageError
-        The extension is unknown, there is no encoder, the folder contains other files, or `fps` is out of range; or
+        The extension is unknown, there is no encoder, the folder contains other files, or ``fps`` is out of range; or
         there is no frame, frames differ in size, or have opacity that the format would
         lose.
     OutputError
