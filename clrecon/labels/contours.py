@@ -26,6 +26,11 @@ NOISE_MM = 0.05
 """Contours of which one goes this little beyond the other do not cross: writers round to 0.01 mm."""
 
 
+THIN_PIXELS = 0.25
+"""Contours with less between them, on average along the outline, are one contour drawn twice and no hole in the other:
+a ring so thin holds hardly a pixel centre."""
+
+
 def fill_contours(contours: Iterable[NDArray[np.float64]], shape: tuple[int, int]) -> NDArray[np.bool_]:
     """Return the pixels of one slice whose centres lie inside of contours.
 
@@ -79,7 +84,7 @@ class United:
     ----------
     inside : ndarray, shape (nj, ni), bool
     repeated : int
-        Contours that equal another and do not count.
+        Contours that equal another, or nearly, and do not count.
     crossing : int
         Pairs of contours that cross.
     """
@@ -101,6 +106,11 @@ class _Patch:
     surely: NDArray[np.bool_]
     maybe: NDArray[np.bool_]
     area: float
+    outline: float
+
+    def is_drawn_again(self, other: _Patch) -> bool:
+        """Tell whether one of two nested contours leaves next to nothing of the other."""
+        return abs(self.area - other.area) <= THIN_PIXELS * max(self.outline, other.outline)
 
     def common(self, other: _Patch) -> tuple[slice, slice]:
         """Return the part of the own pixels that lies in the box of another contour, which overlaps."""
@@ -135,18 +145,21 @@ def unite_contours(
     repeated = len(contours) - len(unique)
     near = _find_near(unique, shape)
     patches = {n: _fill_patch(unique[n], shape, pixel_mm) for n in sorted({n for pair in near for n in pair})}
-    crossing, nested = [], []
+    crossing, nested, again = [], [], []
     for a, b in near:
         one, other = patches[a], patches[b]
         if not (one.inside[one.common(other)] & other.inside[other.common(one)]).any():
             continue
         if _goes_beyond(one, other) and _goes_beyond(other, one):
             crossing.append((a, b))
+        elif one.is_drawn_again(other):
+            again.append((a, b))
         else:
             nested.append((a, b) if one.area >= other.area else (b, a))
-    if not crossing:
+    if not crossing and not again:
         return United(fill_contours(unique, shape), repeated)
-    return United(_paint(unique, crossing, nested, shape), repeated, len(crossing))
+    repeated += len({max(pair) for pair in again})
+    return United(_paint(unique, crossing + again, nested, shape), repeated, len(crossing))
 
 
 def _paint(
@@ -216,6 +229,7 @@ def _fill_patch(corners: NDArray[np.float64], shape: tuple[int, int], pixel_mm: 
         inside & np.all(moved, axis=0),
         inside | np.any(moved, axis=0),
         abs(float(i @ np.roll(j, -1) - j @ np.roll(i, -1))) / 2.0,
+        float(np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1).sum()),
     )
 
 

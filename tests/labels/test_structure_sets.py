@@ -326,3 +326,27 @@ def test_commands_take_them(tmp_path, capsys):
     assert one["name"] == "L3" and one["ml"] == pytest.approx(3 * 9 * 7 * 0.7 * 0.5 * 1.25 / 1000)
     picture = ["render", str(tmp_path / "ct"), "-o", str(tmp_path / "p.png"), "--size", "64", *words]
     assert main(picture) == 0, capsys.readouterr()
+
+
+def circle(radius, corners=40, centre=(20.0, 20.0)):
+    turns = np.arange(corners) * 2.0 * np.pi / corners
+    return np.stack((np.cos(turns), np.sin(turns)), axis=1) * radius + centre
+
+
+@pytest.mark.parametrize(
+    "copy",
+    [circle(15.0, centre=(20.1, 20.0)), circle(15.0, centre=(20.001, 20.0)), circle(15.0, 80), circle(14.9)],
+    ids=["a tenth of a voxel aside", "a thousandth", "twice the corners", "a little smaller"],
+)
+def test_a_contour_drawn_again_is_no_hole_in_itself(copy):
+    drawn = circle(15.0)
+    once = fill_contours([drawn], (41, 41))
+    for contours in ([drawn, copy], [copy, drawn]):
+        united = unite_contours(contours, (41, 41), (1.0, 1.0))
+        assert np.array_equal(united.inside, once | fill_contours([copy], (41, 41)))
+        assert united.repeated + united.crossing == 1
+
+
+def test_a_ring_of_one_voxel_is_a_ring():
+    ring = unite_contours([circle(15.0), circle(14.0)], (41, 41), (1.0, 1.0))
+    assert (ring.repeated, ring.crossing) == (0, 0) and not ring.inside[20, 20] and ring.inside[20, 5:7].any()
