@@ -54,14 +54,21 @@ def is_true(name: str, flag: bool, what: str) -> Gate:
 
 def at_most(name: str, measured: float, bound: float, unit: str | None, what: str) -> Gate:
     """Gate: a figure must not be larger than its bound."""
-    text = f"{what}: {measured:.3g}{' ' * bool(unit)}{unit or ''}, at most {bound:.3g}"
+    text = f"{what}: {_say(measured, bound, 3)}{' ' * bool(unit)}{unit or ''}, at most {bound:.3g}"
     return Gate(name, measured, bound, unit, measured <= bound, text)
 
 
 def at_least(name: str, measured: float, bound: float, unit: str | None, what: str) -> Gate:
     """Gate: a figure must not be smaller than its bound."""
-    text = f"{what}: {measured:.4g}{' ' * bool(unit)}{unit or ''}, at least {bound:g}"
+    text = f"{what}: {_say(measured, bound, 4)}{' ' * bool(unit)}{unit or ''}, at least {bound:g}"
     return Gate(name, measured, bound, unit, measured >= bound, text)
+
+
+def _say(measured: float, bound: float, digits: int) -> str:
+    """Return a figure with as many digits as tell it from its bound, `digits` at least."""
+    while measured != bound and digits < 17 and f"{measured:.{digits}g}" == f"{bound:.{digits}g}":
+        digits += 1
+    return f"{measured:.{digits}g}"
 
 
 def unmeasured(name: str, bound: float | bool, unit: str | None, why: str) -> Gate:
