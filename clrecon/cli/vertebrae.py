@@ -15,7 +15,7 @@ from clrecon.system.text import count_of
 __all__ = ["add_arguments", "run"]
 
 PARTLY = 8
-_NAMING = "numbers, counted from the head. Look at the picture and name levels with --first T1 or --name-at X,Y,Z=L3"
+_NAMING = "numbers, counted from the head: name the levels with --first T1 or --name-at X,Y,Z=L3"
 
 _EPILOG = """\
 A first guess for the spine of an adult from C3 down: look at the picture, and correct the map before it is used, for

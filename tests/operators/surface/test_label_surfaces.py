@@ -221,7 +221,7 @@ def test_labels_without_a_surface_are_refused_or_left_out(device):
         extract_labels(volume, label_map, 6, device=device)
     with pytest.raises(UsageError, match="label '9' is not in the label map; there are: 2 liver, 5 label_5"):
         extract_labels(volume, label_map, 3, device=device, numbers=[9])
-    with pytest.raises(UsageError, match="at least one label"):
+    with pytest.raises(UsageError, match="no label is chosen"):
         extract_labels(volume, label_map, 3, device=device, numbers=[])
     far = OBLIQUE.copy()
     far[0, 3] += 1000
