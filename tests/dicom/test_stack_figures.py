@@ -312,7 +312,8 @@ def test_a_doubt_about_the_order_is_said_once(monkeypatch):
     own = headers(1.0, 1.0)
     for header in own:
         header.has_slope = header.has_intercept = True
-        header.lossy, header.warnings = False, ()
+        header.lossy = header.modality_lut = header.quadruped = False
+        header.warnings = ()
     monkeypatch.setattr(certificate, "_describe_what_was_left", lambda series: [])
     for said, doubt, expected in (([], "A doubt", ["A doubt"]), (["A doubt."], "A doubt", ["A doubt."]), ([], "", [])):
         stack = SimpleNamespace(slices=own, warnings=said)

@@ -287,7 +287,7 @@ def test_what_cannot_be_filled_is_refused(device):
         clrecon.fill_enclosed(volume, 400, seal_mm=0, device=device)
     with pytest.raises(UsageError, match="the radius of the thickest marrow is -1"):
         clrecon.fill_enclosed(volume, 400, largest_mm=-1, device=device)
-    with pytest.raises(UsageError, match="volume must be a Volume"):
+    with pytest.raises(UsageError, match="needs a Volume, not ndarray"):
         clrecon.fill_enclosed(volume.voxels, 400, device=device)
     for options in ({"below": True}, {}):
         with pytest.raises(UsageError, match="solid=True goes with one iso value"):
