@@ -31,20 +31,12 @@ _NAMES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz", ".nrrd", ".nhdr", ".mha"
 class Selection:
     """The part of an input that is read.
 
-    Parameters
-    ----------
-    series : str or int, optional
-        Series of the input; None leaves the choice to `read_volume`.
-    phase : int, optional
-        Number of the phase, if the series has several.
-    allow_gaps : bool
-        Read a stack with missing slices.
-    force : bool
-        Read data sets without preamble or meta header.
-    follow_links : bool
-        Read the files and folders that symbolic links out of the folder lead to.
-    rescale : (slope, intercept), optional
-        In place of what the files say.
+    series: Series of the input; None leaves the choice to `read_volume`.
+    phase: Number of the phase, if the series has several.
+    allow_gaps: Read a stack with missing slices.
+    force: Read data sets without preamble or meta header.
+    follow_links: Read the files and folders that symbolic links out of the folder lead to.
+    rescale: (slope, intercept). In place of what the files say.
     """
 
     series: int | str | None = None

@@ -233,24 +233,12 @@ def _air_level(volume: Volume, outside: Callable[[int], Mask]) -> Any:
 def find_body(volume: Volume, *, steps: Steps | None = None) -> tuple[Mask, tuple[int, int, int]]:
     """Find the cells of the patient's body, with its margin.
 
-    Parameters
-    ----------
-    volume : Volume
-        A scan in HU.
-    steps : Steps, optional
-        Counts the slices of `count_cells` and `BODY_STEPS`.
+    volume: A scan in HU.
+    steps: Counts the slices of `count_cells` and `BODY_STEPS`.
 
-    Returns
-    -------
-    body : ndarray, shape (ck, cj, ci), bool
-        One entry a cell of ``step`` voxels.
-    step : (int, int, int)
-        Number of voxels of a cell along i, j, k.
-
-    Raises
-    ------
-    RefusedInputError
-        Nothing is thick and dense enough, and there is no bone.
+    Returns:
+    body: ndarray, shape (ck, cj, ci), bool. One entry a cell of ``step`` voxels.
+    step: (int, int, int). Number of voxels of a cell along i, j, k.
     """
     steps = steps or Steps(None, "mask", count_cells(volume)[0] + BODY_STEPS)
     cells = measure_cells(volume, steps.take_slice)

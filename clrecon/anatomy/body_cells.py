@@ -36,16 +36,11 @@ PIECE = 4
 class Cells:
     """Figures of the voxels in each cell.
 
-    Attributes
-    ----------
-    mean : ndarray, shape (ck, cj, ci), float32
-        Mean HU; cells at the far ends may hold fewer voxels.
-    dense, hard, metal : ndarray, shape (ck, cj, ci), uint16 or wider
-        Number of voxels above `DENSE_HU`, `HARD_HU` and `METAL_HU`; the type holds the number of voxels of a full cell.
-    step : (int, int, int)
-        Number of voxels of a cell along i, j, k.
-    size_mm : (float, float, float)
-        Lengths of a cell along i, j, k.
+    mean: ndarray, shape (ck, cj, ci), float32. Mean HU; cells at the far ends may hold fewer voxels.
+    dense, hard, metal: ndarray, shape (ck, cj, ci), uint16 or wider. Number of voxels above `DENSE_HU`, `HARD_HU` and
+        `METAL_HU`; the type holds the number of voxels of a full cell.
+    step: Number of voxels of a cell along i, j, k.
+    size_mm: Lengths of a cell along i, j, k.
     """
 
     mean: NDArray[np.float32]
@@ -82,12 +77,8 @@ def count_cells(volume: Volume) -> tuple[int, int, int]:
 def measure_cells(volume: Volume, done: Callable[[slice], None] | None = None) -> Cells:
     """Compute the cells, reading the voxels once, slab by slab.
 
-    Parameters
-    ----------
-    volume : Volume
-        A scan in HU.
-    done : callable, optional
-        Called in the thread of the caller with the slices of cells that are finished.
+    volume: A scan in HU.
+    done: Called in the thread of the caller with the slices of cells that are finished.
     """
     nk, nj, ni = volume.voxels.shape
     si, sj, sk = _voxels_of_a_cell(volume)

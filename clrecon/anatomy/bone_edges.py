@@ -78,14 +78,9 @@ def measure_edges(voxels: NDArray[Any], sampled: range, background: Background) 
 def _measure_slice(padded: NDArray[Any], axis: int, background: Background) -> tuple[NDArray[Any], ...]:
     """Measure bone, tissue, steepest step and flatness of the edges of one slice along one axis.
 
-    Parameters
-    ----------
-    padded : ndarray, shape (nj + 2 p, ni + 2 p)
-        The slice with its border values continued by p = `REACH` + `FLAT` voxels, where every walk ends because values
-        are constant.
-    axis : {0, 1}
-        Along the columns (j) or along the rows (i).
-    background : Background
+    padded: ndarray, shape (nj + 2 p, ni + 2 p). The slice with its border values continued by p = `REACH` + `FLAT`
+        voxels, where every walk ends because values are constant.
+    axis: {0, 1}. Along the columns (j) or along the rows (i).
     """
     border = REACH + FLAT
     inside = padded >= background.seed
@@ -144,13 +139,8 @@ def _walk(
 def leave_contrast_medium(edges: BoneEdges) -> tuple[BoneEdges, float, float]:
     """Leave out edges that end in flat, faint plateaus (contrast medium), unless most edges do.
 
-    Returns
-    -------
-    BoneEdges
-    float
-        Share of the contrast that was left out.
-    float
-        Share of the contrast that is flat and faint, left out or not.
+    Returns: Share of the contrast that was left out.
+    Returns: Share of the contrast that is flat and faint, left out or not.
     """
     total = edges.contrast.sum()
     share = float(edges.contrast[edges.flat].sum() / total) if total else 0.0

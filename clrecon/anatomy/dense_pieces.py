@@ -81,14 +81,10 @@ lower value."""
 class DensePieces:
     """Decision on all dense pieces.
 
-    Attributes
-    ----------
-    specimen : bool
-        The scan shows dry bone without soft tissue.
-    added : ndarray, shape (ck, cj, ci), bool
-        Cells that belong to the body in addition to those found by their thickness.
-    counted : ndarray, shape (ck, cj, ci), bool
-        Dense cells that count as bone.
+    specimen: The scan shows dry bone without soft tissue.
+    added: ndarray, shape (ck, cj, ci), bool. Cells that belong to the body in addition to those found by their
+        thickness.
+    counted: ndarray, shape (ck, cj, ci), bool. Dense cells that count as bone.
     """
 
     specimen: bool
@@ -138,15 +134,10 @@ def _sum_by(labels: NDArray[np.int32], of: NDArray[Any], count: int) -> Float64A
 def find_dense_pieces(cells: Cells, tissue: Mask, thick: Mask, body: Mask) -> DensePieces:
     """Decide for every dense piece whether it belongs to the body and whether it counts as bone.
 
-    Parameters
-    ----------
-    cells : Cells
-    tissue : ndarray, shape (ck, cj, ci), bool
-        Cells that are not air.
-    thick : ndarray, shape (ck, cj, ci), bool
-        The thick cells among these.
-    body : ndarray, shape (ck, cj, ci), bool
-        Cells found by their thickness, without margin; all False if there are none.
+    tissue: ndarray, shape (ck, cj, ci), bool. Cells that are not air.
+    thick: ndarray, shape (ck, cj, ci), bool. The thick cells among these.
+    body: ndarray, shape (ck, cj, ci), bool. Cells found by their thickness, without margin; all False if there are
+        none.
     """
     from scipy import ndimage
 
@@ -276,20 +267,12 @@ def _room(cells: Cells, pieces: _Pieces, chosen: Mask) -> Float64Array:
 def judge_bone(cells: Cells, pieces: DensePieces, kept: Mask) -> tuple[dict[str, Any], Gate]:
     """Count the dense voxels that stay, and judge the share of bone among them.
 
-    Parameters
-    ----------
-    cells : Cells
-    pieces : DensePieces
-    kept : ndarray, shape (ck, cj, ci), bool
-        The body with its margin.
+    kept: ndarray, shape (ck, cj, ci), bool. The body with its margin.
 
-    Returns
-    -------
-    facts : dict
-        ``specimen``, ``bone_voxels`` (above 300 HU, in pieces that count), ``bone_voxels_removed``, ``bone_kept``
+    Returns:
+    facts: ``specimen``, ``bone_voxels`` (above 300 HU, in pieces that count), ``bone_voxels_removed``, ``bone_kept``
         (share, None without any), ``other_voxels_removed`` (above 300 HU, in tables and cables).
-    gate : dict
-        ``bone_kept``, at least `BONE_KEPT`.
+    gate: ``bone_kept``, at least `BONE_KEPT`.
     """
     bone = int(cells.dense[pieces.counted].sum(dtype=np.int64))
     lost = int(cells.dense[pieces.counted & ~kept].sum(dtype=np.int64))
@@ -311,10 +294,7 @@ def judge_bone(cells: Cells, pieces: DensePieces, kept: Mask) -> tuple[dict[str,
 def find_removed(cells: Cells, pieces: DensePieces, kept: Mask) -> list[Piece]:
     """Return the largest pieces of bone that are removed.
 
-    Parameters
-    ----------
-    cells, pieces, kept
-        As for `judge_bone`.
+    cells, pieces, kept: As for `judge_bone`.
     """
     lost = _label(cells, pieces.counted & ~kept)
     return _list_largest(cells, lost.labels, lost.dense, cells.dense)
@@ -323,13 +303,8 @@ def find_removed(cells: Cells, pieces: DensePieces, kept: Mask) -> list[Piece]:
 def find_boneless(cells: Cells, kept: Mask, tissue: Mask) -> list[Piece]:
     """Return the largest pieces of the body that hold no bone, beside others that do.
 
-    Parameters
-    ----------
-    cells : Cells
-    kept : ndarray, shape (ck, cj, ci), bool
-        The body with its margin.
-    tissue : ndarray, shape (ck, cj, ci), bool
-        Cells that are not air.
+    kept: ndarray, shape (ck, cj, ci), bool. The body with its margin.
+    tissue: ndarray, shape (ck, cj, ci), bool. Cells that are not air.
     """
     parts = _label(cells, kept)
     has_bone = parts.is_hard & (parts.hard > 0.0)
@@ -356,19 +331,12 @@ def _list_largest(cells: Cells, labels: NDArray[np.int32], voxels: Float64Array,
 def judge_circle(cells: Cells, inside: Mask) -> tuple[dict[str, Any], Gate]:
     """Count the voxels of bone that a circle cuts off, with the precision of a cell.
 
-    Parameters
-    ----------
-    cells : Cells
-    inside : ndarray, shape (cj, ci), bool
-        Cells of a slice with their centre in the circle.
+    inside: ndarray, shape (cj, ci), bool. Cells of a slice with their centre in the circle.
 
-    Returns
-    -------
-    facts : dict
-        ``bone_voxels`` (above 300 HU, of pieces of bone), ``bone_voxels_removed``, of these ``bone_voxels_apart`` in
+    Returns:
+    facts: ``bone_voxels`` (above 300 HU, of pieces of bone), ``bone_voxels_removed``, of these ``bone_voxels_apart`` in
         pieces that lie wholly outside, and ``bone_kept``: the share that stays (None without bone).
-    gate : dict
-        ``bone_in_circle``, at least `BONE_KEPT`.
+    gate: ``bone_in_circle``, at least `BONE_KEPT`.
     """
     pieces = _label(cells, cells.dense > 0)
     hard = (pieces.hard >= HARD_SHARE * pieces.dense) & (pieces.dense > 0)

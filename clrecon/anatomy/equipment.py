@@ -39,15 +39,9 @@ RING_CELLS, SOFT_RING = 2, 0.8
 def find_equipment(cells: Cells, labels: NDArray[np.int32], chosen: Mask, tissue: Mask) -> Mask:
     """Return which of the chosen pieces are bars or metal and do not lie in soft tissue.
 
-    Parameters
-    ----------
-    cells : Cells
-    labels : ndarray, shape (ck, cj, ci)
-        Number of the piece of each cell.
-    chosen : ndarray, shape (n,), bool
-        By number.
-    tissue : ndarray, shape (ck, cj, ci), bool
-        Cells that are not air.
+    labels: ndarray, shape (ck, cj, ci). Number of the piece of each cell.
+    chosen: ndarray, shape (n,), bool. By number.
+    tissue: ndarray, shape (ck, cj, ci), bool. Cells that are not air.
     """
     from scipy import ndimage
 

@@ -70,13 +70,8 @@ _airs: WeakKeyDictionary[Any, tuple[NDArray[np.bool_], NDArray[Any]]] = WeakKeyD
 def warn_of_face(volume: Volume, values: Iterable[float | None], what: str) -> list[str]:
     """Return the warning about a surface or picture that shows one of some HU, if that can be a face.
 
-    Parameters
-    ----------
-    volume : Volume
-    values : iterable of float or None
-        HU; None is ignored.
-    what : str
-        "surface" or "picture".
+    values: HU; None is ignored.
+    what: "surface" or "picture".
     """
     if not any(value is not None and shows_face(volume, value) for value in values):
         return []
@@ -93,19 +88,11 @@ def warn_of_skin(volume: Volume, vertices: NDArray[Any], triangles: NDArray[Any]
 def measure_skin(volume: Volume, vertices: NDArray[Any], triangles: NDArray[Any]) -> float:
     """Measure the area of a surface that lies beside the air around a patient, in cm2.
 
-    Parameters
-    ----------
-    volume : Volume
-    vertices : ndarray, shape (v, 3)
-        LPS mm, in the frame of the volume.
-    triangles : ndarray of int, shape (t, 3)
-        They face outwards.
+    vertices: ndarray, shape (v, 3). LPS mm, in the frame of the volume.
+    triangles: ndarray of int, shape (t, 3). They face outwards.
 
-    Returns
-    -------
-    float
-        Right to some cm2: the air is told once for each volume, on a grid of about 2 mm and without passages narrower
-        than `OPEN_MM`, and at most `MOST_SAMPLES` triangles stand for all.
+    Returns: Right to some cm2: the air is told once for each volume, on a grid of about 2 mm and without passages
+        narrower than `OPEN_MM`, and at most `MOST_SAMPLES` triangles stand for all.
     """
     if volume not in _airs:
         _airs[volume] = _outer_air(volume)
@@ -156,10 +143,7 @@ def shows_face(volume: Volume, hu: float) -> bool:
 def find_head(volume: Volume) -> bool | None:
     """Tell whether a scan shows a head, from its voxels; the answer is kept for each volume.
 
-    Returns
-    -------
-    bool or None
-        True: slices show the vault of a skull.  False: every slice with a body shows that of a trunk, or one that
+    Returns: True: slices show the vault of a skull.  False: every slice with a body shows that of a trunk, or one that
         fills the slice, so that no skin shows.  None: neither, such as a leg, or a face without the vault.
     """
     try:

@@ -82,37 +82,23 @@ def _describe_way_out() -> str:
 class IsoChoice:
     """An iso value half way between two materials, with the measurements behind it.
 
-    Attributes
-    ----------
-    iso_value : float
-        HU, half way between `bone_hu` and `tissue_hu`; a whole number where it was measured.
-    bone_hu, tissue_hu : float
-        The plateaus on both sides of the edge of bone, HU.
-    method : {"auto", "half"}
-        "auto": measured.  "half": computed from given plateaus.
-    reason : str
-        The choice in words, one line.
-    background : {"soft tissue", "air"} or None
-        The material that the bone lies in.  This and all that follows is None where the plateaus were given.
-    background_mode_hu, noise_hu : float or None
-        The mode of the background in the histogram and its width, HU.
-    edges : int or None
-        Number of edges measured.
-    spread_hu : float or None
-        Half the interquartile range of the half-way levels of single edges.
-    steepness_hu_per_voxel : float or None
-        Median of the steepest step of an edge along a row or column: `spread_hu` / this is what the spread means in
-        voxels, at most.
-    faint_share : float or None
-        Share of the edges whose bone stays below the iso value.  That bone, thin, poor in mineral or touched in
-        passing by a slice, is lost.
-    contrast_medium_share : float or None
-        Share of the contrast left out because it ends in a flat plateau below `CONTRAST_MEDIUM_HU`.
-    flat_share : float or None
-        Share of the contrast in flat plateaus before that decision: where it is above three quarters they are not left
-        out but taken for bone.
-    slices, slice_step : int or None
-        Number of slices examined, and the distance from one to the next in slices.
+    iso_value: HU, half way between `bone_hu` and `tissue_hu`; a whole number where it was measured.
+    bone_hu, tissue_hu: The plateaus on both sides of the edge of bone, HU.
+    method: {"auto", "half"}. "auto": measured.  "half": computed from given plateaus.
+    reason: The choice in words, one line.
+    background: {"soft tissue", "air"} or None. The material that the bone lies in.  This and all that follows is None
+        where the plateaus were given.
+    background_mode_hu, noise_hu: The mode of the background in the histogram and its width, HU.
+    edges: Number of edges measured.
+    spread_hu: Half the interquartile range of the half-way levels of single edges.
+    steepness_hu_per_voxel: Median of the steepest step of an edge along a row or column: `spread_hu` / this is what the
+        spread means in voxels, at most.
+    faint_share: Share of the edges whose bone stays below the iso value.  That bone, thin, poor in mineral or touched
+        in passing by a slice, is lost.
+    contrast_medium_share: Share of the contrast left out because it ends in a flat plateau below `CONTRAST_MEDIUM_HU`.
+    flat_share: Share of the contrast in flat plateaus before that decision: where it is above three quarters they are
+        not left out but taken for bone.
+    slices, slice_step: Number of slices examined, and the distance from one to the next in slices.
     """
 
     iso_value: float
@@ -142,13 +128,7 @@ class IsoChoice:
 
 
 def half_iso_value(bone_hu: float, tissue_hu: float) -> IsoChoice:
-    """Return the iso value half way between two materials of known HU.
-
-    Raises
-    ------
-    UsageError
-        A number is not finite, or bone is not above tissue.
-    """
+    """Return the iso value half way between two materials of known HU."""
     bone, tissue = float(bone_hu), float(tissue_hu)
     if not (math.isfinite(bone) and math.isfinite(tissue)):
         raise UsageError(f"bone and tissue must be finite numbers of HU, not {bone_hu} and {tissue_hu}")

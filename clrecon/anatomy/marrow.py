@@ -21,11 +21,7 @@ def holds_ball(
 ) -> bool:
     """Tell whether a ball fits into a body: true for every ball of this radius, for a smaller one by a voxel or 1 mm.
 
-    Parameters
-    ----------
-    body, ends, steps
-        As for `measure_width`.
-    radius_mm : float
+    body, ends, steps: As for `measure_width`.
     """
     width = measure_width(body, ends, steps)
     if abs(width - radius_mm) > BLOCKS_OFF * max(BLOCK_MM, *steps):
@@ -44,15 +40,10 @@ def measure_width(
 
     Where an end of the volume cuts the body, a disc in that end counts as a ball: of a skull only the cap may be there.
 
-    Parameters
-    ----------
-    body : ndarray, shape (nk, nj, ni), bool
-        Without room around it.
-    ends : 3 pairs of bool
-        For each axis of the array whether its first and its last layer lie at an end of the volume: the body goes on
+    body: ndarray, shape (nk, nj, ni), bool. Without room around it.
+    ends: For each axis of the array whether its first and its last layer lie at an end of the volume: the body goes on
         there as it is.  All else around it is outside.
-    steps : (float, float, float)
-        Of the voxels along k, j, i, mm.
+    steps: Of the voxels along k, j, i, mm.
     """
     from scipy.ndimage import distance_transform_edt
 

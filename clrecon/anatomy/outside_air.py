@@ -40,29 +40,14 @@ OWN_STEPS = 6
 def leave_outside_air(volume: Volume, levels: Sequence[float], *, progress: Progress | None = None) -> Volume:
     """Raise the air around the patient above the iso values, so that no surface of air includes it.
 
-    Parameters
-    ----------
-    volume : Volume
-        A scan in HU.
-    levels : sequence of float
-        Iso values, HU.  What is denser than -300 HU is never left out.
-    progress : callable, optional
-        Called as ``progress("mask", steps done, steps)``.
+    volume: A scan in HU.
+    levels: Iso values, HU.  What is denser than -300 HU is never left out.
+    progress: Called as ``progress("mask", steps done, steps)``.
 
-    Returns
-    -------
-    Volume
-        A volume with the same places.  Air outside gets a value as far above the highest level as air is below it, so
-        that a surface between it and air of the body lies half way.  ``report["outside_air"]`` has ``left_out_ml``,
+    Returns: A volume with the same places.  Air outside gets a value as far above the highest level as air is below it,
+        so that a surface between it and air of the body lies half way.  ``report["outside_air"]`` has ``left_out_ml``,
         ``kept_ml`` (below the highest level), ``opening_mm2`` (area where the two kinds of air meet, as far as it was
         measured) and ``filled_hu`` (the new value).
-
-    Raises
-    ------
-    RefusedInputError
-        No body was found.
-    NoSurfaceError
-        All voxels below the levels are outside.
     """
     level = min(max(levels), TISSUE_HU)
     steps = Steps(progress, "mask", count_cells(volume)[0] + BODY_STEPS + OWN_STEPS)

@@ -40,12 +40,8 @@ HU_RANGE = (-1024, 1500)
 class SpineCells:
     """Mean HU of cells.
 
-    Attributes
-    ----------
-    values : ndarray, shape (nz, ny, nx), float32
-        HU; uppermost slice last; -1024 outside of the scan.
-    origin : ndarray, shape (3,), float64
-        Centre of the first cell, LPS mm.
+    values: ndarray, shape (nz, ny, nx), float32. HU; uppermost slice last; -1024 outside of the scan.
+    origin: ndarray, shape (3,), float64. Centre of the first cell, LPS mm.
     """
 
     values: Field
@@ -65,14 +61,9 @@ def heights(mm: float) -> int:
 class Lattice:
     """Where the cells of a volume lie.
 
-    Attributes
-    ----------
-    block : ndarray, shape (3,), int64
-        Voxels that are averaged, along i, j, k.
-    count : ndarray, shape (3,), int64
-        Cells along x, y, z.
-    origin : ndarray, shape (3,), float64
-        Centre of the first cell, LPS mm.
+    block: ndarray, shape (3,), int64. Voxels that are averaged, along i, j, k.
+    count: ndarray, shape (3,), int64. Cells along x, y, z.
+    origin: ndarray, shape (3,), float64. Centre of the first cell, LPS mm.
     """
 
     block: NDArray[np.int64]
@@ -99,14 +90,9 @@ def plan_cells(volume: Volume) -> Lattice:
 def average_cells(volume: Volume, lattice: Lattice, done: Callable[[slice], None]) -> SpineCells:
     """Average the voxels in blocks of about a cell, then interpolate at the cells.
 
-    Parameters
-    ----------
-    volume : Volume
-        A scan in HU.
-    lattice : Lattice
-        From `plan_cells`.
-    done : callable
-        Called in the thread of the caller with the slices that are finished: of blocks, then of cells.
+    volume: A scan in HU.
+    lattice: From `plan_cells`.
+    done: Called in the thread of the caller with the slices that are finished: of blocks, then of cells.
     """
     means = _average_blocks(volume, lattice, done)
     x, y, z = (lattice.origin[axis] + CELL_MM[axis] * np.arange(lattice.count[axis]) for axis in range(3))

@@ -37,14 +37,9 @@ LOOKED_AT = 9
 class SpineEnd:
     """An end of the line that was found.
 
-    Attributes
-    ----------
-    z_mm : float
-        Height of the last slice of the line, LPS mm.
-    lost_mm : float or None
-        Height of the first slice in which it was not found again; None where the scan ends there.
-    because : str
-        What was found there instead; empty where the scan ends.
+    z_mm: Height of the last slice of the line, LPS mm.
+    lost_mm: Height of the first slice in which it was not found again; None where the scan ends there.
+    because: What was found there instead; empty where the scan ends.
     """
 
     z_mm: float
@@ -55,16 +50,10 @@ class SpineEnd:
 def follow(likeness: Likeness, path: NDArray[np.int64]) -> NDArray[np.int64]:
     """Follow the canal beyond both ends of a path.
 
-    Parameters
-    ----------
-    likeness : Likeness
-    path : ndarray, shape (n, 3)
-        Cells (k, j, i) of the likeness, one a slice, k ascending.
+    path: ndarray, shape (n, 3). Cells (k, j, i) of the likeness, one a slice, k ascending.
 
-    Returns
-    -------
-    ndarray, shape (m, 3)
-        The longer path; its new slices have the traits of `STILL`, but for gaps up to `GAP_MM` between them.
+    Returns: ndarray, shape (m, 3). The longer path; its new slices have the traits of `STILL`, but for gaps up to
+        `GAP_MM` between them.
     """
     below = _beyond(likeness, path[0], -1)[::-1]
     above = _beyond(likeness, path[-1], 1)
@@ -94,14 +83,8 @@ def _beyond(likeness: Likeness, last: NDArray[np.int64], step: int, stop: bool =
 def look_beyond(cells: SpineCells, likeness: Likeness, last: NDArray[np.int64], step: int) -> SpineEnd:
     """Return the end of a path at its last cell: whether the scan ends there, or what was found instead of the canal.
 
-    Parameters
-    ----------
-    cells : SpineCells
-    likeness : Likeness
-    last : ndarray, shape (3,)
-        Cell (k, j, i) of the likeness.
-    step : {-1, 1}
-        Downwards or upwards.
+    last: ndarray, shape (3,). Cell (k, j, i) of the likeness.
+    step: {-1, 1}. Downwards or upwards.
     """
     z_mm = float(cells.origin[2] + last[0] * CELL_MM[2])
     left = len(likeness.worth) - 1 - int(last[0]) if step > 0 else int(last[0])

@@ -48,18 +48,12 @@ CANAL_WIDTH_MM = 11.0
 class SpineLine:
     """The middle of the spinal canal.
 
-    Attributes
-    ----------
-    points : ndarray, shape (n, 3), float64
-        LPS mm, from the head downwards, about 10 mm apart.
-    sure_share : float
-        Share of the slices of the line whose traits are all sure, see `clrecon.anatomy.spine_traits.SURE`.
-    searched_mm : float
-        Height of the volume; the line may be shorter.
-    sure_mm : (float, float)
-        Heights between which its slices are sure, but for gaps, z of the upper and the lower end.
-    upper, lower : SpineEnd or None
-        Its ends: those of the scan, or where it was lost and why; None where only the sure part was asked for.
+    points: ndarray, shape (n, 3), float64. LPS mm, from the head downwards, about 10 mm apart.
+    sure_share: Share of the slices of the line whose traits are all sure, see `clrecon.anatomy.spine_traits.SURE`.
+    searched_mm: Height of the volume; the line may be shorter.
+    sure_mm: Heights between which its slices are sure, but for gaps, z of the upper and the lower end.
+    upper, lower: Its ends: those of the scan, or where it was lost and why; None where only the sure part was asked
+        for.
     """
 
     points: Float64Array

@@ -52,16 +52,10 @@ PIECE = 4
 class Likeness:
     """How much each cell of a box is like the middle of the spinal canal.
 
-    Attributes
-    ----------
-    worth : ndarray, shape (nz, ny, nx), float32
-        Sum of the traits for it, less those against it.
-    sure : ndarray, shape (nz, ny, nx), bool
-        Each trait for it is at least as in `SURE`.
-    goes_on : ndarray, shape (nz, ny, nx), bool
-        The traits of `STILL` are at least as there.
-    first : (int, int)
-        Row and column of the box among the cells; outside of it are only air and what is not measured.
+    worth: ndarray, shape (nz, ny, nx), float32. Sum of the traits for it, less those against it.
+    sure: ndarray, shape (nz, ny, nx), bool. Each trait for it is at least as in `SURE`.
+    goes_on: ndarray, shape (nz, ny, nx), bool. The traits of `STILL` are at least as there.
+    first: Row and column of the box among the cells; outside of it are only air and what is not measured.
     """
 
     worth: Field
@@ -78,11 +72,7 @@ class Likeness:
 def measure_likeness(cells: SpineCells, done: Callable[[slice], None]) -> Likeness:
     """Measure how much each cell is like the middle of the spinal canal.
 
-    Parameters
-    ----------
-    cells : SpineCells
-    done : callable
-        Called in the thread of the caller with the slices that are finished.
+    done: Called in the thread of the caller with the slices that are finished.
     """
     rows, columns = (_extent(cells.values, axis) for axis in (1, 2))
     box = SpineCells(np.ascontiguousarray(cells.values[:, rows, columns]), cells.origin)

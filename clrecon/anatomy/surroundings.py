@@ -34,17 +34,10 @@ a voxel beside it, the share of a voxel that can be mistaken for something else 
 def leave_out_surroundings(volume: Volume, *, progress: Progress | None = None) -> Volume:
     """Give the voxels outside of the body a value above all others.
 
-    Parameters
-    ----------
-    volume : Volume
-        A scan in HU.  Voxels that a mask has turned into air lie outside of what is found to be the body.
-    progress : callable, optional
-        Called as ``progress("mask", steps done, steps)``.
+    volume: A scan in HU.  Voxels that a mask has turned into air lie outside of what is found to be the body.
+    progress: Called as ``progress("mask", steps done, steps)``.
 
-    Returns
-    -------
-    Volume
-        With the same places, of the same type where that has room above the values, else float32.
+    Returns: With the same places, of the same type where that has room above the values, else float32.
         ``report["left_out"]`` has ``highest_hu``, the highest value that counts: voxels above it are left out;
         ``value_hu``, which they get; and ``body``: whether a body was found.  Without one nothing is left out.
     """
@@ -78,11 +71,8 @@ def leave_out_surroundings(volume: Volume, *, progress: Progress | None = None) 
 def count_left_out(volume: Volume) -> dict[str, Any] | None:
     """Count the voxels that a volume leaves out.
 
-    Returns
-    -------
-    dict or None
-        ``voxels``, their ``share`` of all, ``body``: whether a body was found, and ``region``: whether a region was
-        applied too; None for another volume.
+    Returns: ``voxels``, their ``share`` of all, ``body``: whether a body was found, and ``region``: whether a region
+        was applied too; None for another volume.
     """
     facts = volume.report.get(LEFT_OUT)
     if facts is None:

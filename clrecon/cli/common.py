@@ -202,13 +202,7 @@ def add_device(parser: argparse._ActionsContainer, computes: bool = True) -> Non
 
 
 def _parse_seconds(text: str) -> float:
-    """Read the seconds of a time limit.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        The text is not a number from 0 on.
-    """
+    """Read the seconds of a time limit."""
     try:
         check_time_limit(float(text))
     except ValueError as error:
@@ -233,13 +227,7 @@ _MOST_MEMORY = 2.0**63
 
 
 def parse_size(text: str) -> int:
-    """Read an amount of memory: a number with B, kB, MB, GB (powers of 1000), KiB, MiB or GiB (of 1024).
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        The text is not an amount of memory.
-    """
+    """Read an amount of memory: a number with B, kB, MB, GB (powers of 1000), KiB, MiB or GiB (of 1024)."""
     match = _SIZE.fullmatch(text.strip())
     if match is None or (match[3] and not match[2]):
         raise argparse.ArgumentTypeError(f"{text!r} is no amount of memory: write it as 500MB or 2GiB")
@@ -252,18 +240,10 @@ def parse_size(text: str) -> int:
 def guard(action: Callable[[], int], console: Console, debug: bool) -> int:
     """Run `action` and turn any error into an exit code and at most one line on stderr.
 
-    Parameters
-    ----------
-    action : callable
-        Returns the exit code.
-    console : Console
-    debug : bool
-        Print the traceback too.
+    action: Returns the exit code.
+    debug: Print the traceback too.
 
-    Returns
-    -------
-    int
-        The exit code.
+    Returns: The exit code.
     """
     try:
         code = action()

@@ -62,14 +62,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 def write_script(shell: str) -> str:
     """Return the script of a shell, made from the parsers of all commands.
 
-    Parameters
-    ----------
-    shell : {"bash", "zsh", "fish"}
-
-    Raises
-    ------
-    UsageError
-        Another shell.
+    shell: {"bash", "zsh", "fish"}
     """
     if shell not in SHELLS:
         raise UsageError(f"no completion for {shell!r:.60}{guess_word(shell, SHELLS)}: use one of {', '.join(SHELLS)}")

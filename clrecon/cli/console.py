@@ -68,10 +68,7 @@ def printable(text: object) -> str:
 class Console:
     """The output streams of one command.
 
-    Parameters
-    ----------
-    as_json : bool
-        stdout gets one JSON object and nothing else.
+    as_json: stdout gets one JSON object and nothing else.
 
     Notes
     -----
@@ -162,13 +159,7 @@ class Console:
             self._drawn = 0
 
     def finish(self) -> None:
-        """Remove the moving line and flush stdout, so that an error of stdout appears here, not at the end.
-
-        Raises
-        ------
-        OutputError
-            stdout cannot take the result: a full disk, or it was closed before the command began.
-        """
+        """Remove the moving line and flush stdout, so that an error of stdout appears here, not at the end."""
         self.clear()
         if self._lacks_stdout:
             raise OutputError("cannot write to standard output: it is closed; add -q if the words are not needed")

@@ -16,11 +16,7 @@ Surfaces end there as at the ends of a scan. Of several boxes, what is in all of
 def add_cropping(parser: argparse.ArgumentParser, frame: str = "of the frame of --space") -> None:
     """Declare ``--clip-box``, ``--between`` and ``--around``.
 
-    Parameters
-    ----------
-    parser : ArgumentParser
-    frame : str
-        The frame of the numbers, for the help.
+    frame: The frame of the numbers, for the help.
     """
     group = parser.add_argument_group(f"crop, in mm {frame}", _RULES)
     group.add_argument(

@@ -101,13 +101,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _parse_band(text: str) -> tuple[float | None, float | None]:
-    """Read ``A``, ``A:`` or ``A:B``, numbers of HU; ``:B`` leaves the lower end open.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        The text is none of these.
-    """
+    """Read ``A``, ``A:`` or ``A:B``, numbers of HU; ``:B`` leaves the lower end open."""
     low, colon, high = text.partition(":")
     try:
         ends = [float(end) if end else None for end in (low, high)]

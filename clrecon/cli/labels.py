@@ -55,13 +55,7 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def label_choice(options: argparse.Namespace) -> LabelChoice | None:
-    """Make the settings of labels from the options, None without a label map.
-
-    Raises
-    ------
-    UsageError
-        An option was given that needs a label map.
-    """
+    """Make the settings of labels from the options, None without a label map."""
     if options.labels is not None:
         from clrecon.jobs.mesh.label_choice import LabelChoice
 

@@ -17,13 +17,7 @@ _HALF = "half:"
 
 
 def parse_hu(text: str) -> dict[str, Any]:
-    """Read the value of ``--hu``: numbers, ranges, ``auto`` or ``half:BONE,TISSUE``; returns entries of `MeshSettings`.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        The text is none of these.
-    """
+    """Read the value of ``--hu``: numbers, ranges, ``auto`` or ``half:BONE,TISSUE``; returns entries of `MeshSettings`."""
     if text == "auto":
         return {"half_way": "auto"}
     if not text.startswith(_HALF):
@@ -49,13 +43,7 @@ def _parse_level(part: str, text: str) -> float | tuple[float, float]:
 
 
 def parse_levels(text: str, whole: str | None = None) -> tuple[float, ...]:
-    """Read one number, or several with commas between them; `whole` is the full text of which `text` is a part.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        A part is not a number; the message names the part.
-    """
+    """Read one number, or several with commas between them; `whole` is the full text of which `text` is a part."""
     levels = []
     for part in text.split(","):
         try:

@@ -74,15 +74,9 @@ example:    clrecon mesh CT_FOLDER -o bone.stl
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments without the name of the program; default: those of the process.
+    argv: Arguments without the name of the program; default: those of the process.
 
-    Returns
-    -------
-    int
-        The exit code.
+    Returns: The exit code.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     _escape_unencodable()

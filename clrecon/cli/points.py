@@ -8,13 +8,7 @@ __all__ = ["parse_point"]
 
 
 def parse_point(text: str) -> tuple[float, ...]:
-    """Read ``X,Y,Z``, three numbers in mm.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        These are not three numbers.
-    """
+    """Read ``X,Y,Z``, three numbers in mm."""
     try:
         point = tuple(float(part) for part in text.split(","))
     except ValueError:

@@ -123,13 +123,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 
 def _show_meshes_alone(options: argparse.Namespace) -> None:
-    """Make the first of the meshes the input; of several without a colour each gets one of its own.
-
-    Raises
-    ------
-    UsageError
-        There is no mesh, or the mode shows something else.
-    """
+    """Make the first of the meshes the input; of several without a colour each gets one of its own."""
     if not options.meshes:
         raise UsageError("there is nothing to show: name a scan, a cloud or a mesh as INPUT, or meshes with --mesh")
     if options.mode not in (None, "mesh") or options.preset is not None:

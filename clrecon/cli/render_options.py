@@ -272,13 +272,7 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
 
 
 def render_settings(options: argparse.Namespace) -> RenderSettings:
-    """Make settings from the options of the command.
-
-    Raises
-    ------
-    UsageError
-        `RenderSettings.of` refuses a value.
-    """
+    """Make settings from the options of the command."""
     named = options.color in POINT_COLORS
     given = pick(options, RenderSettings.keywords()) | {
         "color": None if named else options.color,
@@ -294,13 +288,7 @@ def render_settings(options: argparse.Namespace) -> RenderSettings:
 
 
 def label_look(options: argparse.Namespace) -> LabelLook | None:
-    """Make the settings of labels from the options, None without a label map.
-
-    Raises
-    ------
-    UsageError
-        An option was given that needs a label map.
-    """
+    """Make the settings of labels from the options, None without a label map."""
     if options.labels is not None:
         return LabelLook(options.labels, dict(options.label_color), dict(options.label_opacity))
     for option, given in (("--label-color", options.label_color), ("--label-opacity", options.label_opacity)):
@@ -310,13 +298,7 @@ def label_look(options: argparse.Namespace) -> LabelLook | None:
 
 
 def turntable(options: argparse.Namespace) -> Turntable | None:
-    """Make the settings of the turntable from the options, None without a turntable.
-
-    Raises
-    ------
-    UsageError
-        An option was given that needs a turntable.
-    """
+    """Make the settings of the turntable from the options, None without a turntable."""
     given = {name: getattr(options, name) for name in ("frames", "fps", "degrees")}
     given = {name: value for name, value in given.items() if value is not None}
     if options.turntable is not None:

@@ -61,19 +61,11 @@ def render_listing(
 ) -> list[str]:
     """Lay out a listing.
 
-    Parameters
-    ----------
-    listing : dict
-        See `clrecon.jobs.info.InputListing`.
-    certificate : sequence of (str, str)
-        Description of the series that was judged, see `clrecon.cli.certificate`.
-    refused : int, optional
-        Number of a series whose problems are said elsewhere.
+    listing: See `clrecon.jobs.info.InputListing`.
+    certificate: sequence of (str, str). Description of the series that was judged, see `clrecon.cli.certificate`.
+    refused: Number of a series whose problems are said elsewhere.
 
-    Returns
-    -------
-    list of str
-        Lines for stdout; with styles only if stdout is a terminal and ``NO_COLOR`` is not set.
+    Returns: Lines for stdout; with styles only if stdout is a terminal and ``NO_COLOR`` is not set.
     """
     terminal = is_terminal(sys.stdout)
     width = max(shutil.get_terminal_size().columns, _NARROWEST) if terminal else _UNLIMITED

@@ -36,13 +36,6 @@ def run_with_streams(command: str, run: Callable[[], int], options: argparse.Nam
     """Run a command; what it should write to ``-`` goes to standard output once the command is done.
 
     A file is made as a whole first, checked as any other, and then copied: nothing of it appears if the command fails.
-
-    Raises
-    ------
-    UsageError
-        Two things should go to standard output, the command writes several files, or a terminal would get bytes.
-    OutputError
-        Standard output cannot take the file.
     """
     wanted = {name: str(getattr(options, name, None) or "") for name in _FILES}
     wanted = {name: value for name, value in wanted.items() if value == DASH or value.startswith(f"{DASH}.")}

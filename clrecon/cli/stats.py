@@ -29,12 +29,7 @@ _LEAST_NAME = 8
 
 
 def _parse_numbers(text: str) -> tuple[float, ...]:
-    """Read numbers with commas between them.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-    """
+    """Read numbers with commas between them."""
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError:

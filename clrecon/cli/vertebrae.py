@@ -32,13 +32,7 @@ examples:
 
 
 def _parse_name(text: str) -> tuple[tuple[float, ...], str]:
-    """Read ``X,Y,Z=L3``.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        The text has another form.
-    """
+    """Read ``X,Y,Z=L3``."""
     point, equals, level = text.rpartition("=")
     if not equals or not level.strip():
         raise argparse.ArgumentTypeError(f"{text!r} is no named point: write it as X,Y,Z=L3")

@@ -37,42 +37,23 @@ BESIDE_MM = 1.5
 class Corridor:
     """The widest line through one pedicle.  Points are LPS mm.
 
-    Attributes
-    ----------
-    side : {"left", "right"}
-        Of the patient.
-    refused : str or None
-        Why there is no corridor; everything below is None then.
-    radius : float
-        Least distance of the line from the surface of the bone, from `back` to `tip`, mm.
-    entry : ndarray, shape (3,)
-        Where the line, followed backwards, leaves the bone.
-    back : ndarray, shape (3,)
-        Where its distance begins to count: in the coronal plane through the canal's axis.
-    pass_point : ndarray, shape (3,)
-        In the narrowest coronal section of the pedicle.
-    tip : ndarray, shape (3,)
-        At 80 % of the body's depth.
-    length : float
-        From entry to tip, mm.
-    medial_deg, sagittal_deg : float
-        Angles in the vertebra's frame, see `clrecon.corridors.measures.angles`.
-    medial_lps_deg, sagittal_lps_deg : float
-        The same in the patient's frame.
-    medial_range_deg, sagittal_range_deg : (float, float)
-        Angles, in the vertebra's frame, of lines whose radius is at most 0.1 mm less.
-    margins : dict
-        Least distance from the surface by quarter, mm.
-    canal : float or None
-        Least distance from the wall of the vertebral canal, mm.
-    bias : Bias or None
-        How far the level lies from the half maximum of this pedicle's wall.
-    by_hu_share : float
-        Share of the walls' points that HU place and not the label.
-    width_voxels : float
-        Width of the corridor in voxels, across its nearest wall.
-    tried : int
-        Lines whose distance was taken.
+    side: {"left", "right"}. Of the patient.
+    refused: Why there is no corridor; everything below is None then.
+    radius: Least distance of the line from the surface of the bone, from `back` to `tip`, mm.
+    entry: ndarray, shape (3,). Where the line, followed backwards, leaves the bone.
+    back: ndarray, shape (3,). Where its distance begins to count: in the coronal plane through the canal's axis.
+    pass_point: ndarray, shape (3,). In the narrowest coronal section of the pedicle.
+    tip: ndarray, shape (3,). At 80 % of the body's depth.
+    length: From entry to tip, mm.
+    medial_deg, sagittal_deg: Angles in the vertebra's frame, see `clrecon.corridors.measures.angles`.
+    medial_lps_deg, sagittal_lps_deg: The same in the patient's frame.
+    medial_range_deg, sagittal_range_deg: Angles, in the vertebra's frame, of lines whose radius is at most 0.1 mm less.
+    margins: Least distance from the surface by quarter, mm.
+    canal: Least distance from the wall of the vertebral canal, mm.
+    bias: How far the level lies from the half maximum of this pedicle's wall.
+    by_hu_share: Share of the walls' points that HU place and not the label.
+    width_voxels: Width of the corridor in voxels, across its nearest wall.
+    tried: Lines whose distance was taken.
     """
 
     side: str
@@ -101,15 +82,8 @@ class Corridor:
 class VertebraCorridors:
     """Both corridors of a vertebra.
 
-    Attributes
-    ----------
-    name : str
-        Of the label.
-    bone : SolidBone
-    frame : VertebraFrame
-    corridors : tuple of Corridor
-        Left and right.
-    warnings : tuple of str
+    name: Of the label.
+    corridors: Left and right.
     """
 
     name: str
@@ -161,27 +135,11 @@ def find_corridors(volume: Volume, labels: LabelMap, label: int | str, iso_value
 def measure_corridors(volume: Volume, labels: NDArray[Any], number: int, level: float, name: str) -> VertebraCorridors:
     """Find the corridors through the pedicles of a vertebra whose labels lie on the grid of the volume.
 
-    Parameters
-    ----------
-    volume : Volume
-        HU.
-    labels : ndarray, shape (nk, nj, ni)
-        Labels on the grid of the volume, see `clrecon.labels.resample_labels`.
-    number : int
-        Label of the vertebra.
-    level : float
-        HU at which the bone's surface lies.
-    name : str
-        Name of the label, for messages.
-
-    Returns
-    -------
-    VertebraCorridors
-
-    Raises
-    ------
-    RefusedInputError
-        The label is not that of a whole vertebra, or it is cut off at the end of the scan.
+    volume: HU.
+    labels: ndarray, shape (nk, nj, ni). Labels on the grid of the volume, see `clrecon.labels.resample_labels`.
+    number: Label of the vertebra.
+    level: HU at which the bone's surface lies.
+    name: Name of the label, for messages.
     """
     bone = fill_vertebra(volume, labels, number, level, name)
     try:

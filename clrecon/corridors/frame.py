@@ -51,22 +51,13 @@ BODY_DEPTH_MM = (10.0, 55.0)
 class VertebraFrame:
     """Axes and sizes of one vertebra.
 
-    Attributes
-    ----------
-    origin : ndarray, shape (3,)
-        LPS mm of the middle of the body, between its endplates.
-    axes : ndarray, shape (3, 3)
-        Rows: the vertebra's own left, posterior and cranial directions, unit vectors in LPS.
-    canal : (float, float)
-        x and y of the canal's axis at the height of the origin, mm in the frame.
-    canal_lean : (float, float)
-        By how much x and y of the canal's axis change for each mm of z.
-    canal_radius : float
-        Radius of the largest circle in the hole, mm.
-    body_y : (float, float)
-        Front and back wall of the body in the median plane at the height of the origin, mm in the frame.
-    body_height : float
-        Distance of the endplates at the body's axis, mm.
+    origin: ndarray, shape (3,). LPS mm of the middle of the body, between its endplates.
+    axes: ndarray, shape (3, 3). Rows: the vertebra's own left, posterior and cranial directions, unit vectors in LPS.
+    canal: x and y of the canal's axis at the height of the origin, mm in the frame.
+    canal_lean: By how much x and y of the canal's axis change for each mm of z.
+    canal_radius: Radius of the largest circle in the hole, mm.
+    body_y: Front and back wall of the body in the median plane at the height of the origin, mm in the frame.
+    body_height: Distance of the endplates at the body's axis, mm.
     """
 
     origin: Float64Array
@@ -149,16 +140,7 @@ def _look_through(points: Float64Array) -> tuple[float, Float64Array, Float64Arr
 def find_frame(bone: SolidBone, what: str) -> VertebraFrame:
     """Find the frame of a vertebra.
 
-    Parameters
-    ----------
-    bone : SolidBone
-    what : str
-        Name of the label, for messages.
-
-    Raises
-    ------
-    RefusedInputError
-        There is no canal, or no body in front of it: the label is not that of a whole vertebra.
+    what: Name of the label, for messages.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -225,14 +207,10 @@ def _halve(
 def _fit_plates(local: Float64Array, axes: Float64Array, what: str) -> tuple[Float64Array, float, float]:
     """Fit planes to the upper and lower ends of the columns of the body.
 
-    Returns
-    -------
-    up : ndarray, shape (3,)
-        Mean of both normals, LPS.
-    shift : float
-        Height of the middle between both planes, mm.
-    height : float
-        Distance of both planes at the axis.
+    Returns:
+    up: ndarray, shape (3,). Mean of both normals, LPS.
+    shift: Height of the middle between both planes, mm.
+    height: Distance of both planes at the axis.
     """
     near = local[np.hypot(local[:, 0], local[:, 1]) <= PLATE_RADIUS_MM]
     place = np.floor(near[:, :2] / 1.5).astype(np.intp) + 20

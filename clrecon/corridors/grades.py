@@ -35,20 +35,9 @@ LONGEST_MM, WIDEST_MM = 150.0, 15.0
 class Screw:
     """A given screw.
 
-    Parameters
-    ----------
-    entry, tip : ndarray, shape (3,)
-        Ends of its axis, LPS mm.
-    diameter : float
-        mm.
-    name : str
-    label : str, optional
-        Name or number of the vertebra that it belongs to.
-
-    Raises
-    ------
-    UsageError
-        A number is not finite, or no screw can have it.
+    entry, tip: ndarray, shape (3,). Ends of its axis, LPS mm.
+    diameter: mm.
+    label: Name or number of the vertebra that it belongs to.
     """
 
     entry: Float64Array
@@ -72,21 +61,13 @@ class Screw:
 class ScrewGrade:
     """The grade of a screw.
 
-    Attributes
-    ----------
-    grade : {"A", "B", "C", "D", "E"}
-    breach_mm : float
-        How far its surface lies outside of the bone at most, 0 for none.
-    direction : str or None
-        The quarter of the largest breach: medial, lateral, cranial or caudal.
-    breaches_mm : dict
-        Largest breach by quarter.
-    margins_mm : dict
-        Least distance of the screw's surface from that of the bone by quarter; below 0 where it is outside or the axis
-        is nearer than the radius.
-    front_mm : float
-        Largest distance outside of the bone in the front half of the body, which is not graded.
-    side : str
+    grade: {"A", "B", "C", "D", "E"}
+    breach_mm: How far its surface lies outside of the bone at most, 0 for none.
+    direction: The quarter of the largest breach: medial, lateral, cranial or caudal.
+    breaches_mm: Largest breach by quarter.
+    margins_mm: Least distance of the screw's surface from that of the bone by quarter; below 0 where it is outside or
+        the axis is nearer than the radius.
+    front_mm: Largest distance outside of the bone in the front half of the body, which is not graded.
     """
 
     grade: str
@@ -112,18 +93,7 @@ def grade_screw(bone: SolidBone, frame: VertebraFrame, screw: Screw, what: str) 
     plane what lies in the canal.  Farther back the screw has to leave the bone, and farther in front the original scale
     does not look.
 
-    Parameters
-    ----------
-    bone : SolidBone
-    frame : VertebraFrame
-    screw : Screw
-    what : str
-        Name of the vertebra, for messages.
-
-    Raises
-    ------
-    UsageError
-        The screw lies far from the vertebra, or its tip behind the pedicle.
+    what: Name of the vertebra, for messages.
     """
     first, last = frame.to_frame(np.stack((screw.entry, screw.tip)))
     if first[1] < last[1]:

@@ -33,14 +33,10 @@ CANAL_SAMPLES = 16
 class Bias:
     """How far the surface at the level lies outside of the half maximum of the pedicle's own wall.
 
-    Attributes
-    ----------
-    median_mm, low_mm, high_mm : float
-        Median and quartiles over the rays; positive: the level lies outside, and distances are too large.
-    half_hu : float
-        Median of the levels half way between the wall's peak and the tissue beside it.
-    rays : int
-        Rays with a wall that is dense enough.
+    median_mm, low_mm, high_mm: Median and quartiles over the rays; positive: the level lies outside, and distances are
+        too large.
+    half_hu: Median of the levels half way between the wall's peak and the tissue beside it.
+    rays: Rays with a wall that is dense enough.
     """
 
     median_mm: float
@@ -79,14 +75,9 @@ def sector_names(offsets: Float64Array, direction: Float64Array, side: float) ->
 def margins(surface: Float64Array, first: Float64Array, last: Float64Array, side: float) -> dict[str, float | None]:
     """Return the least distance of a segment from the surface in each quarter, mm; None where there is none.
 
-    Parameters
-    ----------
-    surface : ndarray, shape (n, 3)
-        Points in the frame.
-    first, last : ndarray, shape (3,)
-        Ends of the segment, in the frame.
-    side : float
-        1 left, -1 right.
+    surface: ndarray, shape (n, 3). Points in the frame.
+    first, last: ndarray, shape (3,). Ends of the segment, in the frame.
+    side: 1 left, -1 right.
     """
     way = last - first
     share = np.clip((surface - first) @ way / (way @ way), 0.0, 1.0)
@@ -129,17 +120,9 @@ def find_exit(bone: SolidBone, start: Float64Array, direction: Float64Array, rea
 def measure_bias(bone: SolidBone, frame: VertebraFrame, first: Float64Array, last: Float64Array) -> Bias | None:
     """Measure how far the surface lies from the half maximum of the pedicle's wall, on rays square to a line.
 
-    Parameters
-    ----------
-    bone : SolidBone
-    frame : VertebraFrame
-    first, last : ndarray, shape (3,)
-        Ends of the part of the line that lies in the pedicle, in the frame.
+    first, last: ndarray, shape (3,). Ends of the part of the line that lies in the pedicle, in the frame.
 
-    Returns
-    -------
-    Bias or None
-        None where less than a quarter of the rays meets a wall that HU show.
+    Returns: None where less than a quarter of the rays meets a wall that HU show.
     """
     medial, up = _across(last - first, 1.0)
     turns = np.linspace(0.0, 2.0 * np.pi, RAYS, endpoint=False)

@@ -68,14 +68,9 @@ AT_ONCE = 250_000
 class Span:
     """Where the distance of lines counts on one side, mm in the vertebra's frame.
 
-    Attributes
-    ----------
-    side : float
-        1 left, -1 right.
-    back, tip : float
-        y of the coronal planes at both ends.
-    pass_y : float
-        y of the coronal section in which the pedicle is narrowest.
+    side: 1 left, -1 right.
+    back, tip: y of the coronal planes at both ends.
+    pass_y: y of the coronal section in which the pedicle is narrowest.
     """
 
     side: float
@@ -88,18 +83,12 @@ class Span:
 class Line:
     """A line on one side, in the vertebra's frame.
 
-    Attributes
-    ----------
-    x, z : float
-        Pass point in the plane ``y = span.pass_y``, mm.
-    medial_deg, sagittal_deg : float
-        Angles of its projections: on the axial plane towards the midline, on the sagittal plane towards cranial.
-    radius : float
-        Its least distance from the surface, mm.
-    medial_range, sagittal_range : (float, float)
-        Angles of lines whose radius is at most `SAME_MM` less.
-    tried : int
-        Lines whose distance was taken.
+    x, z: Pass point in the plane ``y = span.pass_y``, mm.
+    medial_deg, sagittal_deg: Angles of its projections: on the axial plane towards the midline, on the sagittal plane
+        towards cranial.
+    radius: Its least distance from the surface, mm.
+    medial_range, sagittal_range: Angles of lines whose radius is at most `SAME_MM` less.
+    tried: Lines whose distance was taken.
     """
 
     x: float
@@ -130,16 +119,10 @@ def line_points(lines: Float64Array, span: Span) -> Float64Array:
 def segment_distances(first: Float64Array, last: Float64Array, points: Float64Array) -> Float64Array:
     """Return the least distance of each segment from some points.
 
-    Parameters
-    ----------
-    first, last : ndarray, shape (n, 3)
-        Ends of the segments.
-    points : ndarray, shape (m, 3)
+    first, last: ndarray, shape (n, 3). Ends of the segments.
+    points: ndarray, shape (m, 3)
 
-    Returns
-    -------
-    ndarray, shape (n,)
-        Infinite where there are no points.
+    Returns: ndarray, shape (n,). Infinite where there are no points.
     """
     least = np.full(len(first), np.inf)
     if not len(points):
@@ -174,13 +157,8 @@ def segment_distances(first: Float64Array, last: Float64Array, points: Float64Ar
 class _Judge:
     """Scores of lines on one side.
 
-    Attributes
-    ----------
-    depth : callable
-        Quick distances at points.
-    surface : ndarray, shape (n, 3)
-        Points of the surface, mm in the frame.
-    span : Span
+    depth: Quick distances at points.
+    surface: ndarray, shape (n, 3). Points of the surface, mm in the frame.
     """
 
     depth: Depth
@@ -236,21 +214,12 @@ def _thin(points: Float64Array) -> Float64Array:
 def find_line(depth: Depth, surface: Float64Array, frame: VertebraFrame, side: float) -> tuple[Line | None, Span]:
     """Find the widest line of one side.
 
-    Parameters
-    ----------
-    depth : callable
-        Quick distances, for the many lines of the first search; 0 or less outside.
-    surface : ndarray, shape (n, 3)
-        Points of the surface, mm in the frame: exact distances, for the best lines.
-    frame : VertebraFrame
-    side : float
-        1 left, -1 right.
+    depth: Quick distances, for the many lines of the first search; 0 or less outside.
+    surface: ndarray, shape (n, 3). Points of the surface, mm in the frame: exact distances, for the best lines.
+    side: 1 left, -1 right.
 
-    Returns
-    -------
-    line : Line or None
-        None where no line stays inside of the bone.
-    span : Span
+    Returns:
+    line: None where no line stays inside of the bone.
     """
     back = frame.canal[1]
     tip = frame.body_y[1] - BODY_SHARE * (frame.body_y[1] - frame.body_y[0])
@@ -300,12 +269,10 @@ def _refine(
 ) -> tuple[Float64Array, Float64Array, int]:
     """Move lines to higher scores, in ever finer steps of the `free` columns; all lines at once.
 
-    Returns
-    -------
-    lines : ndarray, shape (n, 4)
-    score : ndarray, shape (n,)
-    tried : int
-        Lines that were judged.
+    Returns:
+    lines: ndarray, shape (n, 4)
+    score: ndarray, shape (n,)
+    tried: Lines that were judged.
     """
     lines = lines.copy()
     score = judge.score(lines)

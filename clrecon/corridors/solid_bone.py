@@ -40,14 +40,9 @@ LARGEST_MM = 250.0
 class Lattice:
     """Points in even steps along the axes of LPS.
 
-    Attributes
-    ----------
-    origin : ndarray, shape (3,)
-        LPS mm of the first point.
-    step : float
-        mm.
-    shape : (int, int, int)
-        Points along z, y, x, as of an array.
+    origin: ndarray, shape (3,). LPS mm of the first point.
+    step: mm.
+    shape: Points along z, y, x, as of an array.
     """
 
     origin: Float64Array
@@ -111,25 +106,17 @@ def _own(labels: NDArray[Any], number: int, volume: Volume) -> NDArray[np.bool_]
 class SolidBone:
     """The solid bone of one vertebra.
 
-    Attributes
-    ----------
-    lattice : Lattice
-    hu : ndarray, shape of the lattice, float32
-        HU at the points of the lattice within `MARGIN_MM` of the label; elsewhere `AIR_HU`.
-    solid : ndarray, shape of the lattice, bool
-        True inside.
-    mask : ndarray, shape of the lattice, bool
-        True in the label itself, whatever the HU.
-    surface : ndarray, shape (n, 3)
-        Points of the surface, LPS mm, about one step apart.
-    by_hu : ndarray, shape (n,), bool
-        True where HU cross the level there; False where the label alone ends or fills the bone.
-    level : float
-        HU.
-    steps : ndarray, shape (3, 3)
-        Columns: the steps of the scan's voxels along i, j, k, mm.
-    cut : ndarray, shape (m, 3)
-        Voxels of the label in the outermost layer of the scan, LPS mm: beyond them the vertebra may go on.
+    hu: ndarray, shape of the lattice, float32. HU at the points of the lattice within `MARGIN_MM` of the label;
+        elsewhere `AIR_HU`.
+    solid: ndarray, shape of the lattice, bool. True inside.
+    mask: ndarray, shape of the lattice, bool. True in the label itself, whatever the HU.
+    surface: ndarray, shape (n, 3). Points of the surface, LPS mm, about one step apart.
+    by_hu: ndarray, shape (n,), bool. True where HU cross the level there; False where the label alone ends or fills the
+        bone.
+    level: HU.
+    steps: ndarray, shape (3, 3). Columns: the steps of the scan's voxels along i, j, k, mm.
+    cut: ndarray, shape (m, 3). Voxels of the label in the outermost layer of the scan, LPS mm: beyond them the vertebra
+        may go on.
     """
 
     lattice: Lattice
@@ -205,21 +192,9 @@ def fill_vertebra(volume: Volume, labels: NDArray[Any], number: int, level: floa
     Inside is what has the level or more and is the label's own (within the label, or one voxel beyond it), and what it
     encloses: see `clrecon.labels.solid.fill_solid`.  The vertebral canal is open above and below, and so stays outside.
 
-    Parameters
-    ----------
-    volume : Volume
-    labels : ndarray, shape (nk, nj, ni)
-        Labels on the grid of the volume.
-    number : int
-    level : float
-        HU.
-    what : str
-        Name of the label, for messages.
-
-    Raises
-    ------
-    RefusedInputError
-        No voxel has the label, or it is too large for a vertebra, or nothing of it is as dense as the level.
+    labels: ndarray, shape (nk, nj, ni). Labels on the grid of the volume.
+    level: HU.
+    what: Name of the label, for messages.
     """
     spacing = np.array(volume.spacing)
     margin = tuple(int(np.ceil(MARGIN_MM / step)) + 1 for step in spacing[::-1])

@@ -53,29 +53,12 @@ def read_volume(
 ) -> Volume:
     """Read one CT series as a volume in HU and LPS mm.
 
-    Parameters
-    ----------
-    path : str or path-like
-        A folder, searched with its subfolders (any file names; DICOMDIR not needed), or one file.
-    series, phase, allow_gaps, force, follow_links, rescale, progress
-        As in `clrecon.read_volume`.
+    path: A folder, searched with its subfolders (any file names; DICOMDIR not needed), or one file.
+    series, phase, allow_gaps, force, follow_links, rescale, progress: As in `clrecon.read_volume`.
 
-    Returns
-    -------
-    Volume
-        ``voxels`` (nk, nj, ni) int16, int32 or float32 in HU, padding at the air beside it
-        (``report["padding_hu"]``); ``affine`` index (i, j, k) to LPS mm, slices by ascending position along the
-        normal; ``report`` the certificate.  Unevenly spaced slices keep their own positions (`Volume.uneven`), with a
-        warning.
-
-    Raises
-    ------
-    NoDicomError
-        There is nothing at the path, no DICOM, or no CT.
-    RefusedInputError
-        Files are corrupt, or geometry or pixels cannot be trusted; the message names files and figures.
-    UsageError
-        `series` matches no series or several; the `phase` does not exist; `path` is empty or not a path.
+    Returns: ``voxels`` (nk, nj, ni) int16, int32 or float32 in HU, padding at the air beside it
+        (``report["padding_hu"]``); ``affine`` index (i, j, k) to LPS mm, slices by ascending position along the normal;
+        ``report`` the certificate.  Unevenly spaced slices keep their own positions (`Volume.uneven`), with a warning.
 
     Notes
     -----
@@ -116,20 +99,9 @@ def list_slices(
 ) -> list[tuple[Path, int, int]]:
     """List the slices of which `read_volume` makes a volume, slice k at place k.
 
-    Parameters
-    ----------
-    path, series, phase, allow_gaps, force, follow_links
-        As in `read_volume`.
+    path, series, phase, allow_gaps, force, follow_links: As in `read_volume`.
 
-    Returns
-    -------
-    list of (Path, int, int)
-        File of the slice, its frame there from 0, and number of frames of the file.
-
-    Raises
-    ------
-    NoDicomError, RefusedInputError, UsageError
-        As `read_volume`, as far as headers tell.
+    Returns: list of (Path, int, int). File of the slice, its frame there from 0, and number of frames of the file.
     """
     with _quiet_warnings():
         _, found = _scan_and_group(path, None, force, follow_links)
@@ -159,26 +131,10 @@ def list_series(
 ) -> SeriesListing:
     """List the series at a path, with the geometry and problems of each, and the certificate of the chosen one.
 
-    Parameters
-    ----------
-    path, series, phase, allow_gaps, force, follow_links, rescale, progress
-        As in `read_volume`, which would read the series chosen here.
-    pixels : bool
-        True: also read the pixels of the chosen series, for padding, range of HU and saturation.  False: read only
+    path, series, phase, allow_gaps, force, follow_links, rescale, progress: As in `read_volume`, which would read the
+        series chosen here.
+    pixels: True: also read the pixels of the chosen series, for padding, range of HU and saturation.  False: read only
         headers.
-
-    Returns
-    -------
-    SeriesListing
-
-    Raises
-    ------
-    NoDicomError
-        There is nothing at the path, or no DICOM.
-    RefusedInputError
-        All DICOM files are corrupt, or with `pixels` those of the chosen series cannot be read.
-    UsageError
-        `series` matches no series or several; the `phase` does not exist; `path` is empty or not a path.
     """
     phase = _checked_phase(phase)
     with _quiet_warnings():

@@ -36,18 +36,11 @@ _AXES = re.compile(r"[LRPASI]{3}")
 def certificate_lines(report: Mapping[str, Any], *, keep_ids: bool = False) -> tuple[str, ...]:
     """Return the lines for a file.
 
-    Parameters
-    ----------
-    report : mapping
-        ``volume.report``, see docs/contract.md.
-    keep_ids : bool
-        True: with the hash of the frame of reference.
+    report: ``volume.report``, see docs/contract.md.
+    keep_ids: With the hash of the frame of reference.
 
-    Returns
-    -------
-    tuple of str
-        At most `LINE_LENGTH` printable ASCII characters each, none of them ``=``: readers look for ``SPACE=`` anywhere.
-        Empty if nothing is known.
+    Returns: At most `LINE_LENGTH` printable ASCII characters each, none of them ``=``: readers look for ``SPACE=``
+        anywhere. Empty if nothing is known.
     """
     return tuple(_plain(line) for line in (*_facts(report, keep_ids), *_faults(report)))
 

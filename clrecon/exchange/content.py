@@ -26,25 +26,16 @@ BONE_COLOR = (0.89, 0.86, 0.78)
 class PointContent:
     """Points as they go into a file: those of a cloud, or the vertices of a mesh.
 
-    Attributes
-    ----------
-    vertices : ndarray, shape (n, 3), float32, or float64 far from the origin
-        mm in `space`.
-    normals : ndarray, shape (n, 3), float32, or None
-    space : str
-        ``LPS`` or ``RAS``.
-    to_lps : ndarray, shape (3, 3), float64
-        Rotation from `space` to LPS.
-    iso_value_hu : float or None
-    affine : ndarray, shape (4, 4), float64, or None
-        Index (i, j, k) of the volume to LPS mm, whatever `space` is.
-    inside : str or None
-        The values that the surface encloses, for example "below -400 HU"; None for those from the iso value on.
-    certificate : tuple of str
-        Facts about the volume, see `clrecon.exchange.certificate`; one printable ASCII line each.
-    hu : ndarray, shape (n,), float32, or None
-    labels : ndarray, shape (n,), int32, or None
-    ijk : ndarray, shape (n, 3), int32, or None
+    vertices: ndarray, shape (n, 3), float32, or float64 far from the origin. mm in `space`.
+    normals: ndarray, shape (n, 3), float32, or None
+    space: ``LPS`` or ``RAS``.
+    to_lps: ndarray, shape (3, 3), float64. Rotation from `space` to LPS.
+    affine: ndarray, shape (4, 4), float64, or None. Index (i, j, k) of the volume to LPS mm, whatever `space` is.
+    inside: The values that the surface encloses, for example "below -400 HU"; None for those from the iso value on.
+    certificate: Facts about the volume, see `clrecon.exchange.certificate`; one printable ASCII line each.
+    hu: ndarray, shape (n,), float32, or None
+    labels: ndarray, shape (n,), int32, or None
+    ijk: ndarray, shape (n, 3), int32, or None
     """
 
     vertices: NDArray[np.floating]
@@ -84,14 +75,9 @@ class PointContent:
 class Pieces:
     """Parts of a mesh, for a format that shows them one by one.
 
-    Attributes
-    ----------
-    of_triangle : ndarray, shape (m,), integer
-        The part of each triangle, from 0.
-    names : tuple of str
-        One for each part.
-    volumes_ml : tuple of float or None
-        What each part encloses.
+    of_triangle: ndarray, shape (m,), integer. The part of each triangle, from 0.
+    names: One for each part.
+    volumes_ml: What each part encloses.
     """
 
     of_triangle: NDArray[np.integer]
@@ -103,19 +89,12 @@ class Pieces:
 class Content(PointContent):
     """A mesh as it goes into a file.
 
-    Attributes
-    ----------
-    triangles : ndarray, shape (m, 3), uint32
-    name : str or None
-        Name of the object, for formats that have names.
-    color : (float, float, float) or None
-        Red, green and blue, 0 to 1, for formats that have colours; None: the colour of the format's writer.
-    vertex_colors : ndarray, shape (n, 3), uint8, or None
-        A colour for each vertex, in PLY, in place of `color`.
-    distances : ndarray, shape (n,), float32, or None
-        mm from another surface at each vertex, in PLY.
-    pieces : Pieces or None
-        For pages.
+    triangles: ndarray, shape (m, 3), uint32
+    name: Name of the object, for formats that have names.
+    color: Red, green and blue, 0 to 1, for formats that have colours; None: the colour of the format's writer.
+    vertex_colors: ndarray, shape (n, 3), uint8, or None. A colour for each vertex, in PLY, in place of `color`.
+    distances: ndarray, shape (n,), float32, or None. mm from another surface at each vertex, in PLY.
+    pieces: For pages.
     """
 
     triangles: NDArray[np.uint32]
@@ -130,10 +109,7 @@ class Content(PointContent):
 class Assembly:
     """Several meshes as they go into one file, each an object with a name and a colour of its own.
 
-    Attributes
-    ----------
-    parts : tuple of Content
-        All in the same space.
+    parts: All in the same space.
     """
 
     parts: tuple[Content, ...]
@@ -149,19 +125,10 @@ def describe_facts(report: Mapping[str, Any], space: str, *, keep_ids: bool = Fa
 
     Nothing else of the report is ever written.
 
-    Parameters
-    ----------
-    report : mapping
-        ``iso_value_hu``, ``inside_hu``, ``affine_ijk_to_lps_mm``, and ``certificate`` (the report of a volume) or
+    report: ``iso_value_hu``, ``inside_hu``, ``affine_ijk_to_lps_mm``, and ``certificate`` (the report of a volume) or
         ``certificate_lines`` (those of a file that was read).
-    space : {"lps", "ras"}
-    keep_ids : bool
-        True: with the hash of the frame of reference.
-
-    Raises
-    ------
-    UsageError
-        Unknown space.
+    space: {"lps", "ras"}
+    keep_ids: With the hash of the frame of reference.
     """
     iso_value, affine = report.get("iso_value_hu"), report.get("affine_ijk_to_lps_mm")
     certificate, lines = report.get("certificate"), report.get("certificate_lines")

@@ -18,15 +18,10 @@ _MOST_STEPS_APART = 64
 def as_stored(points: NDArray[Any]) -> NDArray[np.floating]:
     """Convert coordinates to the type in which a `Mesh` keeps them.
 
-    Parameters
-    ----------
-    points : ndarray, shape (n, 3), mm
+    points: ndarray, shape (n, 3), mm
 
-    Returns
-    -------
-    ndarray, shape (n, 3), C-contiguous
-        float32; float64 where they are not float32 already and lie so far from the origin that float32 would round
-        them by more than 2e-4 mm, see `clrecon.geometry.precision`.
+    Returns: ndarray, shape (n, 3), C-contiguous. float32; float64 where they are not float32 already and lie so far
+        from the origin that float32 would round them by more than 2e-4 mm, see `clrecon.geometry.precision`.
     """
     dtype = np.float64 if points.dtype != np.float32 and is_far(points) else np.float32
     return np.ascontiguousarray(points, dtype=dtype)
@@ -35,15 +30,10 @@ def as_stored(points: NDArray[Any]) -> NDArray[np.floating]:
 def rounding_step(vertices: NDArray[np.floating]) -> float:
     """Return the step, in mm, to which coordinates of vertices have been rounded.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), float32 or float64, mm
+    vertices: ndarray, shape (n, 3), float32 or float64, mm
 
-    Returns
-    -------
-    float
-        The step of float32 at the largest coordinate.  float64 vertices were computed in float32 relative to a point
-        near their centre: the step there.
+    Returns: The step of float32 at the largest coordinate.  float64 vertices were computed in float32 relative to a
+        point near their centre: the step there.
     """
     if len(vertices) == 0:
         return 0.0
@@ -58,14 +48,9 @@ def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
     When a file without indices, such as STL, is read, these are joined: a surface that is closed by index can then be
     open.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), float32 or float64
+    vertices: ndarray, shape (n, 3), float32 or float64
 
-    Returns
-    -------
-    ndarray, shape (k,), int64
-        All vertices of each such place, in order of the place's coordinates.
+    Returns: ndarray, shape (k,), int64. All vertices of each such place, in order of the place's coordinates.
     """
     mixed = _scramble(vertices)
     ordered = np.sort(mixed)
@@ -81,16 +66,11 @@ def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
 def find_places(vertices: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Number the places at which vertices lie, in the order in which they occur first.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), float32 or float64
+    vertices: ndarray, shape (n, 3), float32 or float64
 
-    Returns
-    -------
-    first : ndarray, shape (p,), int64
-        The first vertex at each place.
-    place : ndarray, shape (n,), int64
-        The place of each vertex.
+    Returns:
+    first: ndarray, shape (p,), int64. The first vertex at each place.
+    place: ndarray, shape (n,), int64. The place of each vertex.
     """
     mixed = _scramble(vertices)
     _, first, place = np.unique(mixed, return_index=True, return_inverse=True)
@@ -116,15 +96,11 @@ def _scramble(vertices: NDArray[np.floating]) -> NDArray[np.uint64]:
 def rounded_apart(vertices: NDArray[np.floating]) -> NDArray[np.float32]:
     """Round vertices to float32 so that no two coincide unless they did before.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), float32 or float64, mm
+    vertices: ndarray, shape (n, 3), float32 or float64, mm
 
-    Returns
-    -------
-    ndarray, shape (n, 3), float32
-        The nearest values; where several places round to one, all but the first are moved by steps of float32, each
-        with all of its vertices.  That keeps about 1,000 places apart that round to one; of more some may coincide.
+    Returns: ndarray, shape (n, 3), float32. The nearest values; where several places round to one, all but the first
+        are moved by steps of float32, each with all of its vertices.  That keeps about 1,000 places apart that round to
+        one; of more some may coincide.
     """
     rounded = vertices.astype(np.float32)
     if vertices.dtype == np.float32:

@@ -26,16 +26,10 @@ Contents = TypeVar("Contents", bound=PointContent | Assembly)
 class FileFormat(Generic[Contents]):
     """A file format of meshes or clouds.
 
-    Attributes
-    ----------
-    estimate : callable
-        Estimates the size of the file in bytes; exact or rather too small.
-    write : callable
-        Writes the contents to a stream.
-    verify : callable
-        Reads the file back and raises `OutputError` unless sizes and counts are those of the contents.
-    most_bytes : int
-        Largest file that the format, or common readers of it, can handle.
+    estimate: Estimates the size of the file in bytes; exact or rather too small.
+    write: Writes the contents to a stream.
+    verify: Reads the file back and raises `OutputError` unless sizes and counts are those of the contents.
+    most_bytes: Largest file that the format, or common readers of it, can handle.
     """
 
     estimate: Callable[[Contents], int]
@@ -47,18 +41,8 @@ class FileFormat(Generic[Contents]):
 def find_extension(path: str | os.PathLike[str], formats: Mapping[str, Any], noun: str) -> str:
     """Return the extension of a file in lower case, such as ``.ply``.
 
-    Parameters
-    ----------
-    path : str or path
-    formats : mapping
-        Its keys are the extensions that are written.
-    noun : str
-        What the file holds, "mesh" or "cloud".
-
-    Raises
-    ------
-    UsageError
-        The extension is missing, or no writer has it.
+    formats: Its keys are the extensions that are written.
+    noun: What the file holds, "mesh" or "cloud".
     """
     try:
         extension = os.path.splitext(os.fspath(path))[1].lower()
@@ -75,20 +59,8 @@ def stage_content(
 ) -> AbstractContextManager[StagedFile]:
     """Write contents under a temporary name; see `clrecon.system.files.stage_file`.
 
-    Parameters
-    ----------
-    content : PointContent or Assembly
-    path : str or path
-    chosen : FileFormat
-    counted : str
-        What it holds, for example "12 triangles", for a message.
-    others : str
-        Formats without a limit, for a message.
-
-    Raises
-    ------
-    OutputError
-        The file would be too large, or cannot be written.
+    counted: What it holds, for example "12 triangles", for a message.
+    others: Formats without a limit, for a message.
     """
     expected_bytes = chosen.estimate(content)
     if expected_bytes > chosen.most_bytes:

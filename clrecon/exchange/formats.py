@@ -55,12 +55,7 @@ MOST_PARTS = 20
 
 
 def check_assembly(path: str | os.PathLike[str]) -> None:
-    """Refuse a file whose format holds one object only.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse a file whose format holds one object only."""
     extension = check_format(path)
     if extension not in ASSEMBLIES:
         raise UsageError(
@@ -86,13 +81,7 @@ def stage_assembly(
 
 
 def check_format(path: str | os.PathLike[str]) -> str:
-    """Return the extension of a mesh file in lower case, such as ``.stl``.
-
-    Raises
-    ------
-    UsageError
-        The extension is missing, or no writer has it.
-    """
+    """Return the extension of a mesh file in lower case, such as ``.stl``."""
     return find_extension(path, FORMATS, "mesh")
 
 
@@ -110,10 +99,7 @@ def describe_rounding(mesh: Writable, extension: str) -> list[str]:
 def write_mesh(mesh: Writable, path: str | os.PathLike[str], space: str = "lps", *, keep_ids: bool = False) -> int:
     """Write a mesh to a file; what `Mesh.save` does.
 
-    Returns
-    -------
-    int
-        Size of the file in bytes.
+    Returns: Size of the file in bytes.
     """
     with stage_mesh(mesh, path, space, keep_ids=keep_ids) as staged:
         staged.commit()

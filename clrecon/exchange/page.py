@@ -56,24 +56,12 @@ def estimate(content: Content | Assembly) -> int:
 
 
 def write(stream: BinaryIO, content: Content | Assembly) -> None:
-    """Write the page.
-
-    Raises
-    ------
-    UsageError
-        There are more triangles than a browser shows.
-    """
+    """Write the page."""
     stream.write(compose_page(content))
 
 
 def compose_page(content: Content | Assembly) -> bytes:
-    """Return the page of one or several meshes.
-
-    Raises
-    ------
-    UsageError
-        There are more triangles than a browser shows.
-    """
+    """Return the page of one or several meshes."""
     meshes = parts_of(content)
     count = sum(len(mesh.triangles) for mesh in meshes)
     if count > MOST_TRIANGLES:
@@ -108,13 +96,7 @@ def compose_page(content: Content | Assembly) -> bytes:
 
 
 def parse_page(page: bytes) -> tuple[dict[str, Any], CodedSurface]:
-    """Return the facts and the surface that a page of `compose_page` holds.
-
-    Raises
-    ------
-    ValueError
-        It is no such page.
-    """
+    """Return the facts and the surface that a page of `compose_page` holds."""
     blocks = dict(_BLOCK.findall(page.decode("utf-8")))
     if set(blocks) != {"facts", "surface"} or not page.endswith(b"</html>\n"):
         raise ValueError("this is no page of a surface")

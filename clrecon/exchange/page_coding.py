@@ -30,14 +30,9 @@ _LEVEL = 6
 class CodedSurface:
     """A surface as a page holds it.
 
-    Attributes
-    ----------
-    vertices, triangles : int
-        Counts; vertices that no triangle uses are left out.
-    low_mm, step_mm : tuple of float
-        Lowest corner of the bounding box, and the step of a coordinate along each axis.
-    data : bytes
-        gzip of the byte planes.
+    vertices, triangles: Counts; vertices that no triangle uses are left out.
+    low_mm, step_mm: Lowest corner of the bounding box, and the step of a coordinate along each axis.
+    data: gzip of the byte planes.
     """
 
     vertices: int
@@ -57,14 +52,9 @@ def encode_surface(
 ) -> CodedSurface:
     """Code a surface of at least one triangle.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3)
-        mm.
-    normals : ndarray, shape (n, 3), float32
-        Unit vectors.
-    triangles : ndarray, shape (m, 3), integer
-        Their order stays.
+    vertices: ndarray, shape (n, 3). mm.
+    normals: ndarray, shape (n, 3), float32. Unit vectors.
+    triangles: ndarray, shape (m, 3), integer. Their order stays.
     """
     order, corners = _renumber(triangles, len(vertices))
     places = vertices[order].astype(np.float64)
@@ -90,13 +80,7 @@ def encode_surface(
 
 
 def decode_surface(coded: CodedSurface) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.uint32]]:
-    """Return vertices in mm, normals (not of unit length: as they were rounded) and triangles, as a page shows them.
-
-    Raises
-    ------
-    ValueError
-        The bytes are not those of a surface of these counts.
-    """
+    """Return vertices in mm, normals (not of unit length: as they were rounded) and triangles, as a page shows them."""
     try:
         data = np.frombuffer(gzip.decompress(coded.data), np.uint8)
     except (OSError, EOFError, zlib.error) as error:

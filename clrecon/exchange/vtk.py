@@ -22,15 +22,12 @@ def make_polydata(
     VTK counts in signed integers: indices are seen as int32 without a copy below 2**31 vertices and are copied to
     int64 above.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), float32 or float64, C-contiguous
-    triangles : ndarray, shape (m, 3), uint32, C-contiguous, every index below n, or None
-        None: a cloud, each point a cell of its own, without which nothing of it is drawn.
-    normals : ndarray, shape (n, 3), float32, C-contiguous, or None
-        They become the active normals, named ``Normals``.
-    hu, labels : ndarray, shape (n,), float32 and int32, optional
-        The point arrays ``HU``, which becomes the active scalars, and ``label``.
+    vertices: ndarray, shape (n, 3), float32 or float64, C-contiguous
+    triangles: ndarray, shape (m, 3), uint32, C-contiguous, every index below n, or None. None: a cloud, each point a
+        cell of its own, without which nothing of it is drawn.
+    normals: ndarray, shape (n, 3), float32, C-contiguous, or None. They become the active normals, named ``Normals``.
+    hu, labels: ndarray, shape (n,), float32 and int32. The point arrays ``HU``, which becomes the active scalars, and
+        ``label``.
     """
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkPoints

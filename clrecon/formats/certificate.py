@@ -50,18 +50,8 @@ def certify_grid(
 ) -> Certificate:
     """Build the report of a volume.
 
-    Parameters
-    ----------
-    grid : GridFile
-    values : GridValues or None
-        None: the voxels were not read, and entries that depend on them are None.
-    warnings : sequence of str
-    findings : VoxelFindings or None
-        What the voxels say of their values; None: they were not read.
-
-    Returns
-    -------
-    Certificate
+    values: None: the voxels were not read, and entries that depend on them are None.
+    findings: What the voxels say of their values; None: they were not read.
     """
     facts = None if values is None else values.facts
     spacing = column_spacing(grid.affine)

@@ -20,16 +20,10 @@ PACKING = 1
 class VolumeContent:
     """What a volume file holds.
 
-    Attributes
-    ----------
-    voxels : ndarray, shape (nk, nj, ni)
-        int16, int32 or float32.
-    affine : ndarray, shape (4, 4), float64
-        Index (i, j, k) to LPS mm.
-    lines : tuple of str
-        The certificate, plain ASCII, one fact a line: name, blank, value.
-    progress : callable
-        ``progress("write", done, total)``.
+    voxels: ndarray, shape (nk, nj, ni). int16, int32 or float32.
+    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm.
+    lines: The certificate, plain ASCII, one fact a line: name, blank, value.
+    progress: ``progress("write", done, total)``.
     """
 
     voxels: NDArray[Any]

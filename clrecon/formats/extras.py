@@ -13,11 +13,5 @@ _PACKAGES = {"nrrd": "pynrrd"}
 
 
 def import_extra(module: str, purpose: Purpose) -> Any:
-    """Import `module`.
-
-    Raises
-    ------
-    UsageError
-        It is not installed; the message says how to install it.
-    """
+    """Import `module`."""
     return import_package(module, f"this {purpose.noun}", _PACKAGES.get(module))

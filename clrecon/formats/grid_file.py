@@ -32,38 +32,18 @@ VOLUME = Purpose("volume")
 class GridFile:
     """A grid of numbers in a file.
 
-    Attributes
-    ----------
-    name : str
-        Name of the file, for messages on the terminal; it is never written to reports.
-    purpose : Purpose
-    kind : str
-        "NIfTI-1", "NIfTI-2", "NRRD" or "MetaImage".
-    shape_ijk : tuple of int
-        (ni, nj, nk).
-    layers : int
-        Numbers of one voxel, side by side in the file; 1 except for layered label maps.
-    dtype : dtype
-        Type as stored, with its byte order.
-    slope, intercept : float
-        The value of a stored number is ``stored * slope + intercept``.
-    affine : ndarray, shape (4, 4), float64
-        Index (i, j, k) to LPS mm.
-    voxel_bytes : VoxelBytes
-        Where the numbers are.
-    warnings : tuple of str
-        Doubtful points of the header; they contain no names.
-    extension : bytes
-        The bytes between the header and the voxels (NIfTI).
-    fields : mapping
-        All fields of the header (NRRD).
-    rescale : Rescale or None
-        Slope and intercept that the user gave in place of those of the header.
-
-    Raises
-    ------
-    RefusedInputError
-        The sizes are impossible, or the file cannot hold them.
+    name: Name of the file, for messages on the terminal; it is never written to reports.
+    kind: "NIfTI-1", "NIfTI-2", "NRRD" or "MetaImage".
+    shape_ijk: (ni, nj, nk).
+    layers: Numbers of one voxel, side by side in the file; 1 except for layered label maps.
+    dtype: Type as stored, with its byte order.
+    slope, intercept: The value of a stored number is ``stored * slope + intercept``.
+    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm.
+    voxel_bytes: Where the numbers are.
+    warnings: Doubtful points of the header; they contain no names.
+    extension: The bytes between the header and the voxels (NIfTI).
+    fields: All fields of the header (NRRD).
+    rescale: Slope and intercept that the user gave in place of those of the header.
     """
 
     name: str

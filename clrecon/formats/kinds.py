@@ -18,13 +18,7 @@ _START_BYTES = 512
 
 
 def tell_kind(path: Path) -> str | None:
-    """Return the kind of a file: "DICOM", "NIfTI", "NRRD", "MetaImage", or None.
-
-    Raises
-    ------
-    OSError
-        The file cannot be read.
-    """
+    """Return the kind of a file: "DICOM", "NIfTI", "NRRD", "MetaImage", or None."""
     with open_regular(path) as file:
         start = file.read(_START_BYTES)
     if start[128:132] == b"DICM":  # the 128 bytes before it may look like any format
@@ -52,14 +46,6 @@ def name_of_grid(path: Path) -> str:
 
 
 def open_grid(path: Path, kind: str, purpose: Purpose) -> GridFile:
-    """Read the header of a file of one of the `kind` "NIfTI", "NRRD" and "MetaImage".
-
-    Raises
-    ------
-    UsageError
-        A package is missing.
-    RefusedInputError
-        The file is of the wrong kind, cut off or corrupt, or does not say where its voxels lie in space.
-    """
+    """Read the header of a file of one of the `kind` "NIfTI", "NRRD" and "MetaImage"."""
     opener = {"NIfTI": open_nifti, "NRRD": open_nrrd, "MetaImage": open_metaimage}[kind]
     return opener(path, purpose)

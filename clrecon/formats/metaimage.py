@@ -72,16 +72,7 @@ def is_metaimage(start: bytes) -> bool:
 
 
 def open_metaimage(path: Path, purpose: Purpose) -> GridFile:
-    """Read the header.
-
-    Raises
-    ------
-    UsageError
-        SimpleITK is not installed.
-    RefusedInputError
-        The header is corrupt, does not say where the voxels lie, or names files elsewhere or several; the voxels are
-        text, colours or vectors, or have more than three axes.
-    """
+    """Read the header."""
     name = escape_text(path.name)
     fields, end = _read_fields(path, name)
     header = _Header(fields, name, purpose)
@@ -136,12 +127,7 @@ class _Header:
         self.warnings: list[str] = []
 
     def check(self) -> None:
-        """Refuse a header unless it describes one grid of real numbers with a position.
-
-        Raises
-        ------
-        RefusedInputError
-        """
+        """Refuse a header unless it describes one grid of real numbers with a position."""
         self._check_kind()
         axes = self.numbers("NDims", 1)[0]
         if axes not in (3, 4):

@@ -61,15 +61,7 @@ def is_nifti(start: bytes) -> bool:
 
 
 def open_nifti(path: Path, purpose: Purpose) -> GridFile:
-    """Read the header.
-
-    Raises
-    ------
-    UsageError
-        nibabel is not installed.
-    RefusedInputError
-        The file is cut off or corrupt, says no place in space, holds colours, or has more than three axes.
-    """
+    """Read the header."""
     name = escape_text(path.name)
     with open_regular(path) as file:
         compressed = _is_gzip(file)
@@ -175,24 +167,12 @@ def _dtype(header: Any, name: str, purpose: Purpose) -> np.dtype[Any]:
 def nifti_affine(header: Any, shape: tuple[int, int, int], name: str) -> tuple[Float64Array, list[str]]:
     """Return the affine of a NIfTI header, converted from RAS to LPS: the sform, else the qform.
 
-    Parameters
-    ----------
-    header : nibabel.Nifti1Header or Nifti2Header
-    shape : (ni, nj, nk)
-    name : str
-        Name of the file, for messages.
+    shape: (ni, nj, nk)
+    name: Name of the file, for messages.
 
-    Returns
-    -------
-    affine : ndarray, shape (4, 4), float64
-        Index (i, j, k) to LPS mm.
-    warnings : list of str
-        Disagreements of sform and qform, or of the affine and pixdim.
-
-    Raises
-    ------
-    RefusedInputError
-        The header has neither form, or the form is not an affine.
+    Returns:
+    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm.
+    warnings: Disagreements of sform and qform, or of the affine and pixdim.
     """
     warnings = []
     sform = header.get_sform(coded=True)[0]

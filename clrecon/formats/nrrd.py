@@ -66,16 +66,7 @@ def is_nrrd(start: bytes) -> bool:
 
 
 def open_nrrd(path: Path, purpose: Purpose) -> GridFile:
-    """Read the header.
-
-    Raises
-    ------
-    UsageError
-        pynrrd is not installed.
-    RefusedInputError
-        The file is cut off or corrupt, says no place in space, or has more than three axes (label maps: more than three
-        axes and a list of layers).
-    """
+    """Read the header."""
     name = escape_text(path.name)
     with open_regular(path) as file:
         start = file.read(LARGEST_HEADER)
@@ -123,13 +114,7 @@ def _parse(text: bytes, name: str, purpose: Purpose) -> dict[str, Any]:
 
 
 def _voxel_file(path: Path, named: str) -> Path:
-    """Return the one file beside a detached header that holds the voxels.
-
-    Raises
-    ------
-    RefusedInputError
-        The header names several files, or one that is not there or not beside it.
-    """
+    """Return the one file beside a detached header that holds the voxels."""
     if not named or named.split()[0].upper() == "LIST" or "%" in named:
         raise RefusedInputError(
             f"{escape_text(path.name)} has its voxels in several files ('data file: {escape_text(named)}'): one is read"
@@ -192,23 +177,10 @@ def _dtype(header: dict[str, Any], name: str, purpose: Purpose) -> np.dtype[Any]
 def nrrd_affine(header: dict[str, Any], name: str) -> Float64Array:
     """Return the affine of a NRRD header, converted from the frame that it names to LPS.
 
-    Parameters
-    ----------
-    header : dict
-        As `nrrd.read_header` returns it.
-    name : str
-        Name of the file, for messages.
+    header: As `nrrd.read_header` returns it.
+    name: Name of the file, for messages.
 
-    Returns
-    -------
-    ndarray, shape (4, 4), float64
-        Index (i, j, k) to LPS mm, of the three axes that have a direction.
-
-    Raises
-    ------
-    RefusedInputError
-        The frame is missing or not known, the units are unknown, directions or origin are missing, or they give no
-        affine.
+    Returns: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm, of the three axes that have a direction.
     """
     space = str(header.get("space", "")).strip().lower()
     if space not in LPS_FROM_SPACE:

@@ -27,22 +27,9 @@ log = get_logger(__name__)
 def read_grid(path: Path, kind: str, *, rescale: Rescale | None = None, progress: Progress | None = None) -> Volume:
     """Read a volume.
 
-    Parameters
-    ----------
-    path : Path
-    kind : {"NIfTI", "NRRD", "MetaImage"}
-        As `clrecon.formats.kinds.tell_kind` returns it.
-    rescale : Rescale, optional
-        In place of the slope and intercept of the header.
-    progress : callable, optional
-        Called as ``progress("read", done, total)``.
-
-    Raises
-    ------
-    UsageError
-        A package is missing; the message names the extra that installs it.
-    RefusedInputError
-        The file is cut off or corrupt, is not a volume of real numbers, or does not say where its voxels lie in space.
+    kind: {"NIfTI", "NRRD", "MetaImage"}. As `clrecon.formats.kinds.tell_kind` returns it.
+    rescale: In place of the slope and intercept of the header.
+    progress: Called as ``progress("read", done, total)``.
     """
     grid = _open(path, kind, rescale)
     values = read_values(grid, progress)
@@ -74,17 +61,8 @@ def list_grid(
 ) -> SeriesListing:
     """List the one volume of a file, with its certificate.
 
-    Parameters
-    ----------
-    path, kind, rescale, progress
-        As in `read_grid`.
-    pixels : bool
-        True: read the voxels too, for the entries that depend on them.  False: read only the header.
-
-    Raises
-    ------
-    UsageError, RefusedInputError
-        As `read_grid`.
+    path, kind, rescale, progress: As in `read_grid`.
+    pixels: True: read the voxels too, for the entries that depend on them.  False: read only the header.
     """
     grid = _open(path, kind, rescale)
     values = read_values(grid, progress) if pixels else None

@@ -42,15 +42,10 @@ _CHUNK = 2**18
 class VoxelBytes:
     """The place of a grid's numbers in a file.
 
-    Attributes
-    ----------
-    path : Path
-        The file itself, or the file that its header names.
-    offset : int
-        Bytes in the file before the numbers, or before their compressed stream.
-    packing : {"raw", "gzip", "zlib"}
-    skip : int
-        Inflated bytes before the numbers.
+    path: The file itself, or the file that its header names.
+    offset: Bytes in the file before the numbers, or before their compressed stream.
+    packing: {"raw", "gzip", "zlib"}
+    skip: Inflated bytes before the numbers.
     """
 
     path: Path
@@ -94,15 +89,7 @@ class ZlibFile(io.RawIOBase):
         return True
 
     def readinto(self, buffer: Any) -> int:
-        """Fill `buffer` with what one step inflates; return the number of bytes, 0 at the end.
-
-        Raises
-        ------
-        EOFError
-            The stream ends before its own end.
-        zlib.error
-            The stream is corrupt.
-        """
+        """Fill `buffer` with what one step inflates; return the number of bytes, 0 at the end."""
         target = memoryview(buffer).cast("B")
         while len(target) and not self._inflater.eof:  # 0 would mean no limit
             packed = self._inflater.unconsumed_tail or self._file.read(_CHUNK)
@@ -118,22 +105,10 @@ class ZlibFile(io.RawIOBase):
 def check_size(name: str, shape: tuple[int, ...], item_bytes: int, file_bytes: int, compressed: bool) -> None:
     """Compare the size that a header promises with what the file can hold.
 
-    Parameters
-    ----------
-    name : str
-        Name of the file.
-    shape : tuple of int
-    item_bytes : int
-        Bytes of one number.
-    file_bytes : int
-        Size of the file.
-    compressed : bool
-        True: the data are compressed.
-
-    Raises
-    ------
-    RefusedInputError
-        The sizes are impossible.
+    name: Name of the file.
+    item_bytes: Bytes of one number.
+    file_bytes: Size of the file.
+    compressed: The data are compressed.
     """
     if min(shape) < 1 or prod(shape) > LARGEST_GRID:
         raise RefusedInputError(
@@ -155,13 +130,7 @@ def check_size(name: str, shape: tuple[int, ...], item_bytes: int, file_bytes: i
 
 
 def read_bytes(stream: BinaryIO, count: int, name: str, where: str) -> bytes:
-    """Read exactly `count` bytes of a stream, which may be compressed.
-
-    Raises
-    ------
-    RefusedInputError
-        The stream ends earlier, or is corrupt.
-    """
+    """Read exactly `count` bytes of a stream, which may be compressed."""
     parts, missing = [], count
     try:
         while missing > 0:
@@ -176,14 +145,7 @@ def read_bytes(stream: BinaryIO, count: int, name: str, where: str) -> bytes:
 
 
 def check_end(stream: BinaryIO, name: str) -> None:
-    """Read to the end of the data, where the checksum of a compressed stream is.
-
-    Raises
-    ------
-    RefusedInputError
-        The checksum is wrong, or many bytes follow the last number: damaged data may inflate to more than was promised,
-        and a header with a damaged size may promise too little.
-    """
+    """Read to the end of the data, where the checksum of a compressed stream is."""
     found = 0
     try:
         while part := stream.read(LARGEST_SURPLUS + 1):
@@ -195,13 +157,7 @@ def check_end(stream: BinaryIO, name: str) -> None:
 
 
 def file_beside(header: Path, named: str) -> Path:
-    """Return the file of voxels that a header names, in the folder of the header or below it.
-
-    Raises
-    ------
-    RefusedInputError
-        The file lies elsewhere, also by a link; it does not exist; or it is not a regular file.
-    """
+    """Return the file of voxels that a header names, in the folder of the header or below it."""
     name, shown = escape_text(header.name), escape_text(named)
     paths = (PurePosixPath(named), PureWindowsPath(named))
     if "\0" in named or any(path.anchor or ".." in path.parts for path in paths):

@@ -59,17 +59,7 @@ def read_values(grid: GridFile, progress: Progress | None = None) -> GridValues:
 
     NaN, which resampling writes where there was no image, becomes `AIR_HU` with a warning.
 
-    Parameters
-    ----------
-    grid : GridFile
-    progress : callable, optional
-        Called as ``progress("read", done, total)``.
-
-    Raises
-    ------
-    RefusedInputError
-        The data are cut off or corrupt; they hold infinity, whole numbers beyond 32 bits, or only NaN; or the volume
-        does not fit into memory.
+    progress: Called as ``progress("read", done, total)``.
     """
     filling = _Filling(grid)
     for k, stored in enumerate(grid.iterate_slices()):

@@ -20,15 +20,7 @@ _NAME = "volume.mha"
 
 
 def write_metaimage(stream: BinaryIO, content: VolumeContent) -> None:
-    """Write the file.  SimpleITK writes to a name alone: a temporary file, whose bytes go to the stream.
-
-    Raises
-    ------
-    UsageError
-        SimpleITK is not installed.
-    OutputError
-        SimpleITK cannot write the temporary file.
-    """
+    """Write the file.  SimpleITK writes to a name alone: a temporary file, whose bytes go to the stream."""
     sitk = import_extra("SimpleITK", VOLUME)
     content.progress("write", 0, 0)
     image = make_sitk(content.voxels, content.affine)

@@ -20,13 +20,7 @@ COMMENT_CODE = 6
 
 
 def write_nifti(stream: BinaryIO, content: VolumeContent, *, packed: bool) -> None:
-    """Write the file; the certificate is a header extension of plain text.
-
-    Raises
-    ------
-    UsageError
-        nibabel is not installed.
-    """
+    """Write the file; the certificate is a header extension of plain text."""
     if not packed:
         _write_parts(stream, content)
         return

@@ -42,13 +42,7 @@ class _Undated(io.RawIOBase):
 
 
 def write_nrrd(stream: BinaryIO, content: VolumeContent) -> None:
-    """Write the file, its voxels packed by gzip.
-
-    Raises
-    ------
-    UsageError
-        pynrrd is not installed.
-    """
+    """Write the file, its voxels packed by gzip."""
     nrrd = import_extra("nrrd", VOLUME)
     header = {
         "space": "left-posterior-superior",

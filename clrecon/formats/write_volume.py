@@ -52,16 +52,10 @@ SAME_PLACE_MM = 1e-3
 class VolumeFormat:
     """A format that volumes are written in.
 
-    Attributes
-    ----------
-    kind : str
-        As `clrecon.formats.kinds.tell_kind` names it.
-    module : str
-        The library that writes it.
-    holds_shear : bool
-        The axes of its voxels may lie at any angle.
-    write : callable
-        Gets a stream and the content.
+    kind: As `clrecon.formats.kinds.tell_kind` names it.
+    module: The library that writes it.
+    holds_shear: The axes of its voxels may lie at any angle.
+    write: Gets a stream and the content.
     """
 
     kind: str
@@ -79,13 +73,7 @@ FORMATS = {
 
 
 def check_volume_format(path: str | os.PathLike[str]) -> str:
-    """Return the extension of a volume file in lower case, such as ``.nii.gz``.
-
-    Raises
-    ------
-    UsageError
-        No writer has this extension, or its package is missing.
-    """
+    """Return the extension of a volume file in lower case, such as ``.nii.gz``."""
     try:
         name = os.path.basename(os.fspath(path)).lower()
     except TypeError as error:
@@ -191,12 +179,7 @@ def describe_shear(volume: Volume) -> str | None:
 
 
 def check_holds(volume: Volume, extension: str) -> None:
-    """Refuse a volume that the format cannot hold.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse a volume that the format cannot hold."""
     shear = shear_degrees(volume.affine)
     if volume.uneven:
         fault = f"no {extension} file can hold it: {describe_unevenness(volume.slice_origins())}"
@@ -209,13 +192,7 @@ def check_holds(volume: Volume, extension: str) -> None:
 
 
 def _verify(path: Path, kind: str, content: VolumeContent) -> None:
-    """Read the header back.
-
-    Raises
-    ------
-    OutputError
-        Another shape or place is found than was written.
-    """
+    """Read the header back."""
     grid = open_grid(path, kind, VOLUME)
     last = np.array([*content.voxels.shape[::-1], 1.0]) - (1.0, 1.0, 1.0, 0.0)
     ends = (np.array([0.0, 0.0, 0.0, 1.0]), last)

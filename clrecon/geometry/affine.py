@@ -42,15 +42,10 @@ _LONG_AXIS = 0.5
 def compose_affine(i_step: ArrayLike, j_step: ArrayLike, k_step: ArrayLike, origin: ArrayLike) -> Float64Array:
     """Build the affine from its three steps and the position of voxel (0, 0, 0).
 
-    Parameters
-    ----------
-    i_step, j_step, k_step, origin : array_like, shape (3,)
-        LPS mm.  `i_step` is the row cosines times PixelSpacing[1], `j_step` the column cosines times
-        PixelSpacing[0].
+    i_step, j_step, k_step, origin: array_like, shape (3,). LPS mm.  `i_step` is the row cosines times PixelSpacing[1],
+        `j_step` the column cosines times PixelSpacing[0].
 
-    Returns
-    -------
-    ndarray, shape (4, 4), float64
+    Returns: ndarray, shape (4, 4), float64
     """
     affine = np.eye(4)
     for column, vector in enumerate((i_step, j_step, k_step, origin)):
@@ -59,13 +54,7 @@ def compose_affine(i_step: ArrayLike, j_step: ArrayLike, k_step: ArrayLike, orig
 
 
 def checked_affine(affine: ArrayLike) -> Float64Array:
-    """Return `affine` as a float64 copy after checking that it is one.
-
-    Raises
-    ------
-    UsageError
-        Not 4x4 numbers, not finite, last row not (0, 0, 0, 1), or singular.
-    """
+    """Return `affine` as a float64 copy after checking that it is one."""
     try:
         if np.iscomplexobj(affine):
             raise TypeError("complex numbers")
@@ -89,31 +78,16 @@ def checked_affine(affine: ArrayLike) -> Float64Array:
 def apply_affine(affine: Float64Array, points: ArrayLike) -> Float64Array:
     """Map points through an affine, in float64.
 
-    Parameters
-    ----------
-    affine : ndarray, shape (4, 4)
-    points : array_like, shape (n, 3)
+    affine: ndarray, shape (4, 4)
+    points: array_like, shape (n, 3)
 
-    Returns
-    -------
-    ndarray, shape (n, 3), float64
-
-    Raises
-    ------
-    UsageError
-        `points` is not (n, 3).
+    Returns: ndarray, shape (n, 3), float64
     """
     return checked_points(points) @ affine[:3, :3].T + affine[:3, 3]
 
 
 def checked_points(points: ArrayLike) -> Float64Array:
-    """Return points (n, 3) as float64 after checking their shape.
-
-    Raises
-    ------
-    UsageError
-        They do not have this shape, or are no numbers.
-    """
+    """Return points (n, 3) as float64 after checking their shape."""
     try:
         checked = np.asarray(points, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:

@@ -132,14 +132,9 @@ class BaseVolume(Grid):
     def slice_origins(self, border: int = 0) -> Float64Array:
         """Positions in LPS mm of voxel (0, 0, k) for k from ``-border`` to ``nk - 1 + border``.
 
-        Parameters
-        ----------
-        border : int
-            Number of further positions beyond either end, in the steps of the ends.
+        border: Number of further positions beyond either end, in the steps of the ends.
 
-        Returns
-        -------
-        ndarray, shape (nk + 2 * border, 3), float64
+        Returns: ndarray, shape (nk + 2 * border, 3), float64
         """
         k = np.arange(-border, self._voxels.shape[0] + border, dtype=np.float64)
         if self._stack is not None:
@@ -152,16 +147,8 @@ class BaseVolume(Grid):
         ``hu_range`` of the copied report is that of the new values.  Its other entries about voxels, such as
         ``padding_share`` and ``padding_hu``, still describe the series as it was read.
 
-        Parameters
-        ----------
-        voxels : array_like, shape (nk, nj, ni)
-        report : dict, optional
-            In place of a copy of this volume's.
-
-        Raises
-        ------
-        UsageError
-            The shape differs.
+        voxels: array_like, shape (nk, nj, ni)
+        report: In place of a copy of this volume's.
         """
         array = _as_array(voxels)
         if array.shape != self._voxels.shape:

@@ -22,10 +22,7 @@ ON_EDGE_MM = 1e-6
 class Block(NamedTuple):
     """Voxels first to end - 1 along each axis.
 
-    Attributes
-    ----------
-    first, end : (int, int, int)
-        Indices (i, j, k).
+    first, end: Indices (i, j, k).
     """
 
     first: tuple[int, int, int]
@@ -41,15 +38,10 @@ class Block(NamedTuple):
 def find_block(grid: Grid, origins: Float64Array, low: ArrayLike, high: ArrayLike, margin: int = 0) -> Block | None:
     """Return the smallest block that holds every voxel whose centre lies in a box; None where no centre does.
 
-    Parameters
-    ----------
-    grid : Grid
-    origins : ndarray, shape (nk, 3)
-        LPS mm of voxel (0, 0, k) of each slice.
-    low, high : array_like, shape (3,)
-        Corners of the box along the axes of the patient, LPS mm; infinite numbers leave a side open.
-    margin : int
-        Voxels more on each side, as far as the grid goes.
+    origins: ndarray, shape (nk, 3). LPS mm of voxel (0, 0, k) of each slice.
+    low, high: array_like, shape (3,). Corners of the box along the axes of the patient, LPS mm; infinite numbers leave
+        a side open.
+    margin: Voxels more on each side, as far as the grid goes.
     """
     ni, nj, nk = grid.shape_ijk
     low, high = np.asarray(low, np.float64) - ON_EDGE_MM, np.asarray(high, np.float64) + ON_EDGE_MM
@@ -81,15 +73,9 @@ def place_block(affine: Float64Array, origins: Float64Array, uneven: bool, block
     A block of uneven slices that are even among themselves, by the rule of the reader, has an affine alone: that which
     these slices have when they are read without the others.
 
-    Parameters
-    ----------
-    affine : ndarray, shape (4, 4)
-        Of the whole grid.
-    origins : ndarray, shape (nk, 3)
-        LPS mm of voxel (0, 0, k) of each slice of the whole grid.
-    uneven : bool
-        The slices of the whole grid lie elsewhere than its affine says.
-    block : Block
+    affine: ndarray, shape (4, 4). Of the whole grid.
+    origins: ndarray, shape (nk, 3). LPS mm of voxel (0, 0, k) of each slice of the whole grid.
+    uneven: The slices of the whole grid lie elsewhere than its affine says.
     """
     placed = np.array(affine)
     aside = affine[:3, 0] * block.first[0] + affine[:3, 1] * block.first[1]
@@ -108,11 +94,7 @@ def place_block(affine: Float64Array, origins: Float64Array, uneven: bool, block
 def describe_place(report: Mapping[str, Any], volume: Any) -> dict[str, Any]:
     """Return the entries of a report that change with the shape and the place of a volume, as far as it has them.
 
-    Parameters
-    ----------
-    report : mapping
-        Of the volume that `volume` was made of.
-    volume : Volume
+    report: Of the volume that `volume` was made of.
     """
     ni, nj, nk = volume.shape_ijk
     di, dj, dk = volume.spacing

@@ -28,19 +28,9 @@ def crop_box(
 ) -> Box | None:
     """Return the box that is in all of those that are given; None without any.
 
-    Parameters
-    ----------
-    clip_box : (x0, x1, y0, y1, z0, z1), optional
-        A box in mm; None, or an infinite number, leaves a side open.
-    between : (z0, z1), optional
-        Heights in mm, one of them may be None.
-    around : (x, y, z, r), optional
-        A point and half the side of the cube around it, mm.
-
-    Raises
-    ------
-    UsageError
-        A value has another count of numbers, is no number, or the box holds nothing.
+    clip_box: (x0, x1, y0, y1, z0, z1). A box in mm; None, or an infinite number, leaves a side open.
+    between: (z0, z1). Heights in mm, one of them may be None.
+    around: (x, y, z, r). A point and half the side of the cube around it, mm.
     """
     boxes = []
     for name, values in (("clip_box", clip_box), ("between", between), ("around", around)):
@@ -60,12 +50,7 @@ def crop_box(
 
 
 def _box_of(name: str, given: Sequence[float | None]) -> Box:
-    """Return the corners of one box.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Return the corners of one box."""
     count, form = _COUNTS[name]
     named = name_parameter(name)
     everywhere = math.inf

@@ -22,63 +22,31 @@ class Certificate(Record):
     Lengths are mm, angles degrees.  None means that the file does not tell, that it was refused, or that only pixels
     tell and they were not read.
 
-    Attributes
-    ----------
-    format : str
-        "DICOM", or the kind of the file.
-    series : mapping
-        ``number``, ``uid_hash`` (None without an identifier) and ``modality``.
-    phase : mapping or None
-        ``number``, ``of``, ``keyword`` and ``value`` of the phase that was read, if there are several.
-    slices, slices_missing : int
-    shape_ijk : list of int
-    spacing_mm : list of float or None
-    extent_mm : list of float or None
-        Size of the box of whole voxels along rows, columns and the slice normal.
-    affine_ijk_to_lps_mm : nested list (4, 4) or None
-    orientation : mapping or None
-        Directions of the axes in the patient.
-    patient_position : str or None
-    anatomical_orientation : str or None
-        "QUADRUPED": the letters of `orientation` are those of an animal on four legs.
-    tilt_deg : float or None
-    grid_residual_max_mm, grid_residual_rms_mm, grid_tolerance_mm : float or None
-        Distances of slice positions from the affine, and their bound.
-    gap_mm : mapping
-        ``min``, ``max`` and ``median`` distance of neighbouring slices along the normal.
-    uneven : bool or None
-    gap_runs : list or None
-        Runs of equal gaps, where they are uneven.
-    slice_positions_mm : nested list (slices, 3) or None
-        LPS mm, where slices are uneven.
-    slice_thickness_mm, stated_gap_mm : float or None
-        As the headers state them; not used for the geometry.
-    thickness : mapping or None
-        Thickness and overlap of the slices.
-    numbering : mapping or None
-        ``first``, ``last`` and ``step`` of InstanceNumber along the stack; ``images`` and ``files`` of the series, and
-        what its headers state of them.
-    frame_of_reference_hash : str or None
-    padding_share : float or None
-        Share of the voxels that hold no measurement.
-    padding_hu : float or None
-        HU of these voxels in the volume.
-    transfer_syntaxes, transfer_syntax_names : list of str
-    lossy : bool
-    rescale : mapping
-        ``slope`` and ``intercept``, lowest and highest each, and ``type``.
-    hu_range : [float, float] or None
-        Lowest and highest value in the volume, padding included.
-    files : mapping
-        ``found``, ``used`` and ``skipped`` (reason to count).
-    dropped : mapping of str to int
-        Reason to number of slices left out.
-    gates : list of Gate
-    warnings, problems : list of str
-        Doubts, and reasons to refuse.
-    masked : mapping
-        Facts about what was done after reading: parts that were turned into air (``remove_table``, ``field_of_view``,
-        ``outside_air``) and filters (``filtered``); each is an entry of its own.
+    format: "DICOM", or the kind of the file.
+    series: ``number``, ``uid_hash`` (None without an identifier) and ``modality``.
+    phase: ``number``, ``of``, ``keyword`` and ``value`` of the phase that was read, if there are several.
+    extent_mm: Size of the box of whole voxels along rows, columns and the slice normal.
+    affine_ijk_to_lps_mm: nested list (4, 4) or None
+    orientation: Directions of the axes in the patient.
+    anatomical_orientation: "QUADRUPED": the letters of `orientation` are those of an animal on four legs.
+    grid_residual_max_mm, grid_residual_rms_mm, grid_tolerance_mm: Distances of slice positions from the affine, and
+        their bound.
+    gap_mm: ``min``, ``max`` and ``median`` distance of neighbouring slices along the normal.
+    gap_runs: Runs of equal gaps, where they are uneven.
+    slice_positions_mm: nested list (slices, 3) or None. LPS mm, where slices are uneven.
+    slice_thickness_mm, stated_gap_mm: As the headers state them; not used for the geometry.
+    thickness: Thickness and overlap of the slices.
+    numbering: ``first``, ``last`` and ``step`` of InstanceNumber along the stack; ``images`` and ``files`` of the
+        series, and what its headers state of them.
+    padding_share: Share of the voxels that hold no measurement.
+    padding_hu: HU of these voxels in the volume.
+    rescale: ``slope`` and ``intercept``, lowest and highest each, and ``type``.
+    hu_range: [float, float] or None. Lowest and highest value in the volume, padding included.
+    files: ``found``, ``used`` and ``skipped`` (reason to count).
+    dropped: Reason to number of slices left out.
+    warnings, problems: Doubts, and reasons to refuse.
+    masked: Facts about what was done after reading: parts that were turned into air (``remove_table``,
+        ``field_of_view``, ``outside_air``) and filters (``filtered``); each is an entry of its own.
     """
 
     format: str
@@ -143,12 +111,8 @@ def without_ids(report: Mapping[str, Any]) -> dict[str, Any]:
 def amend(report: dict[str, Any], **changes: Any) -> dict[str, Any]:
     """Return the report of a volume with some entries changed or added; a certificate stays a certificate.
 
-    Parameters
-    ----------
-    report : dict
-        ``volume.report``.
-    **changes
-        For a certificate: its fields, and entries of `Certificate.masked`.
+    report: ``volume.report``.
+    **changes: For a certificate: its fields, and entries of `Certificate.masked`.
     """
     if not isinstance(report, Certificate):
         return {**report, **changes}

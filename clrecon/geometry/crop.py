@@ -26,24 +26,12 @@ def crop_volume(volume: Own, low: ArrayLike, high: ArrayLike, *, margin: int = 0
     Voxels keep their places; slices of an uneven volume keep their own positions.  Where the volume lies oblique to the
     patient, the block also holds voxels beyond the box.
 
-    Parameters
-    ----------
-    volume : Volume
-    low, high : array_like, shape (3,)
-        Corners of the box along the axes of the patient, mm of the frame `space`; infinite numbers leave a side open.
-    margin : int
-        Voxels more on each side, as far as the volume goes.
-    space : {"lps", "ras"}
+    low, high: array_like, shape (3,). Corners of the box along the axes of the patient, mm of the frame `space`;
+        infinite numbers leave a side open.
+    margin: Voxels more on each side, as far as the volume goes.
+    space: {"lps", "ras"}
 
-    Returns
-    -------
-    Volume
-        Its voxels are a view of those of `volume` where they can be.  ``report["crop"]`` has the figures.
-
-    Raises
-    ------
-    UsageError
-        The corners are no numbers, or in the wrong order, no voxel centre lies in the box, or `margin` is below 0.
+    Returns: Its voxels are a view of those of `volume` where they can be.  ``report["crop"]`` has the figures.
     """
     try:
         box = np.array([low, high], dtype=np.float64)

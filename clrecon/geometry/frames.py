@@ -18,15 +18,7 @@ SPACES = ("lps", "ras")
 def frame_from_lps(space: str) -> NDArray[np.float64]:
     """Return the 3x3 rotation from LPS mm to `space`.
 
-    Parameters
-    ----------
-    space : {"lps", "ras"}
-        Upper or lower case.
-
-    Raises
-    ------
-    UsageError
-        Unknown space.
+    space: {"lps", "ras"}. Upper or lower case.
     """
     name = str(space).lower()
     if name == "lps":
@@ -39,14 +31,9 @@ def frame_from_lps(space: str) -> NDArray[np.float64]:
 def lps_affine_from_ras(affine: ArrayLike) -> NDArray[np.float64]:
     """Turn an affine to RAS mm (NIfTI, FreeSurfer) into one to LPS mm; its own inverse.
 
-    Parameters
-    ----------
-    affine : array_like, shape (4, 4)
-        Index (i, j, k) to RAS mm.
+    affine: array_like, shape (4, 4). Index (i, j, k) to RAS mm.
 
-    Returns
-    -------
-    ndarray, shape (4, 4), float64
+    Returns: ndarray, shape (4, 4), float64
     """
     return np.asarray(np.diag((-1.0, -1.0, 1.0, 1.0)) @ np.asarray(affine, dtype=np.float64), dtype=np.float64)
 
@@ -54,19 +41,9 @@ def lps_affine_from_ras(affine: ArrayLike) -> NDArray[np.float64]:
 def choose_space(asked: str | None, named: object, what: str) -> str:
     """Return ``LPS`` or ``RAS``: the patient frame of what another library holds.
 
-    Parameters
-    ----------
-    asked : str or None
-        That of the caller; None: that which `named` says, else LPS.
-    named : object
-        What the data themselves say, None where they say nothing.
-    what : str
-        The data, for messages.
-
-    Raises
-    ------
-    UsageError
-        The frame that was asked for is unknown, or not the one that the data name; or that one is unknown.
+    asked: That of the caller; None: that which `named` says, else LPS.
+    named: What the data themselves say, None where they say nothing.
+    what: The data, for messages.
     """
     if asked is not None:
         frame_from_lps(asked)

@@ -19,12 +19,8 @@ class Grid(Message):
 
     It pickles and copies as `clrecon.system.messages` says: memory-mapped voxels are sent as their place in the file.
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni)
-        Checked by the subclass.
-    affine : ndarray, shape (4, 4), float64
-        Index (i, j, k) to LPS mm, checked too; it becomes read-only.
+    voxels: ndarray, shape (nk, nj, ni). Checked by the subclass.
+    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm, checked too; it becomes read-only.
     """
 
     def __init__(self, voxels: NDArray[Any], affine: Float64Array):

@@ -27,14 +27,9 @@ Taken = tuple[NDArray[Any], Float64Array]
 class Image(NamedTuple):
     """Voxels that an image can hold.
 
-    Attributes
-    ----------
-    voxels : ndarray, shape (nk, nj, ni)
-        Those of the volume, where it is not resampled.
-    affine : ndarray, shape (4, 4), float64
-        Index (i, j, k) to LPS mm.
-    resampled : str or None
-        Why they are resampled.
+    voxels: ndarray, shape (nk, nj, ni). Those of the volume, where it is not resampled.
+    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm.
+    resampled: Why they are resampled.
     """
 
     voxels: NDArray[Any]
@@ -45,23 +40,10 @@ class Image(NamedTuple):
 def image_of(volume: BaseVolume, resample: bool, method: str, *, holds_shear: bool = False) -> Image:
     """Return a volume as an image has it.
 
-    Parameters
-    ----------
-    volume : Volume
-    resample : bool
-        True: a volume that no image can hold is resampled (trilinear) to a regular grid around all its voxels: i and j
+    resample: A volume that no image can hold is resampled (trilinear) to a regular grid around all its voxels: i and j
         in their own steps, k in the smallest step of the slices along their normal.
-    method : str
-        The method of `Volume` that was called, for messages.
-    holds_shear : bool
-        The image's axes may lie at any angle.
-
-    Raises
-    ------
-    UsageError
-        The volume is uneven, or sheared, and is not to be resampled.
-    RefusedInputError
-        The regular grid would have more than 2^31 voxels.
+    method: The method of `Volume` that was called, for messages.
+    holds_shear: The image's axes may lie at any angle.
     """
     fault = _fault_of(volume, holds_shear)
     if fault is None:

@@ -46,36 +46,25 @@ __all__ = [
 class IsoRule:
     """How one iso value, or a range of HU, divides one volume.
 
-    Attributes
-    ----------
-    iso_value : float
-        As asked for, HU; for a range its lower end.
-    lowest_inside : int or float
-        A sample is inside when its value is >= this.  For integer voxels the lowest integer >= the iso value.
-    iso_level : float
-        Where the surface lies between two samples.  For integer voxels and an integer iso value k it is k - 0.5:
+    iso_value: As asked for, HU; for a range its lower end.
+    lowest_inside: A sample is inside when its value is >= this.  For integer voxels the lowest integer >= the iso
+        value.
+    iso_level: Where the surface lies between two samples.  For integer voxels and an integer iso value k it is k - 0.5:
         between the integers k - 1 and k, so that no vertex ever falls on a sample.
-    outside : float
-        The value beyond the border of a closed volume: the lowest value of the volume, but not below `AIR_HU`.
-    closed : bool
-        True: the volume is surrounded by `outside`.  False: the surface ends open at the border.
-    value_scale : float
-        Power of two by which float voxels are multiplied, so that none exceeds 1; 1 for integer voxels.
-    topology : {"separated", "trilinear"}
-        Inside samples that only meet across a face or through a cell are kept apart, or joined where the trilinear
-        interpolation of the samples joins them.
-    inside : {"above", "below", "between"}
-        The samples that the surface encloses.  "above": those >= `lowest_inside`. "below": the others; the surface is
-        that of "above" turned round, and `outside` lies above the level.  "between": those of a range.
-    upper_value : float or None
-        For a range: the upper end as asked for, HU, which belongs to the range.
-    highest_inside : int, float or None
-        For a range: a sample is inside when its value is also <= this.  For integer voxels the highest integer <= the
-        upper end.
-    upper_level : float or None
-        For a range: where the surface lies between an inside sample and one above the range.  For integer voxels and an
-        integer end k it is k + 0.5.
-    vertex_rule : {"linear", "golden", "golden-search"}
+    outside: The value beyond the border of a closed volume: the lowest value of the volume, but not below `AIR_HU`.
+    closed: True: the volume is surrounded by `outside`.  False: the surface ends open at the border.
+    value_scale: Power of two by which float voxels are multiplied, so that none exceeds 1; 1 for integer voxels.
+    topology: {"separated", "trilinear"}. Inside samples that only meet across a face or through a cell are kept apart,
+        or joined where the trilinear interpolation of the samples joins them.
+    inside: {"above", "below", "between"}. The samples that the surface encloses.  "above": those >= `lowest_inside`.
+        "below": the others; the surface is that of "above" turned round, and `outside` lies above the level.
+        "between": those of a range.
+    upper_value: For a range: the upper end as asked for, HU, which belongs to the range.
+    highest_inside: For a range: a sample is inside when its value is also <= this.  For integer voxels the highest
+        integer <= the upper end.
+    upper_level: For a range: where the surface lies between an inside sample and one above the range.  For integer
+        voxels and an integer end k it is k + 0.5.
+    vertex_rule: {"linear", "golden", "golden-search"}
     """
 
     iso_value: float
@@ -142,13 +131,7 @@ class IsoRule:
 
 
 def data_range(volume: Volume) -> tuple[float, float]:
-    """Return the lowest and the highest value of the volume.
-
-    Raises
-    ------
-    NoSurfaceError
-        The volume holds NaN.
-    """
+    """Return the lowest and the highest value of the volume."""
     low, high = math.inf, -math.inf
     for k, voxels in enumerate(volume.voxels):
         lowest, highest = float(voxels.min()), float(voxels.max())
@@ -173,10 +156,7 @@ def _lowest_value(volume: Volume) -> float:
 class ValueRange:
     """The range of a volume's values, as an iso rule needs it; each figure is found when first asked for and then kept.
 
-    Parameters
-    ----------
-    volume : Volume
-        Its voxels must not change afterwards.
+    volume: Its voxels must not change afterwards.
     """
 
     def __init__(self, volume: Volume):
@@ -205,27 +185,13 @@ def choose_iso_rule(
 ) -> IsoRule:
     """Decide what is inside and where the surface lies.
 
-    Parameters
-    ----------
-    volume : Volume
-    iso_value : float or (float, float)
-        HU.  A sample is inside when its value is >= `iso_value`; of a range, when it lies within, both ends included.
-    closed : bool
-        Surround the volume with outside.
-    topology : {"separated", "trilinear"}
-    below : bool
-        A sample is inside when its value is < `iso_value`: the same surface, turned round.
-    vertex_rule : {"linear", "golden", "golden-search"}
-    values : ValueRange, optional
-        Those of this volume; given where several rules for one volume are chosen.
-
-    Raises
-    ------
-    UsageError
-        `iso_value` is neither a finite number nor a range of two; the topology is unknown or cannot be used with a
-        range; or values are too large to be interpolated in float32.
-    NoSurfaceError
-        Float voxels that hold NaN or infinite values.
+    iso_value: float or (float, float). HU.  A sample is inside when its value is >= `iso_value`; of a range, when it
+        lies within, both ends included.
+    closed: Surround the volume with outside.
+    topology: {"separated", "trilinear"}
+    below: A sample is inside when its value is < `iso_value`: the same surface, turned round.
+    vertex_rule: {"linear", "golden", "golden-search"}
+    values: Those of this volume; given where several rules for one volume are chosen.
     """
     iso_value, upper_value = _checked_level(iso_value, below)
     check_topology(topology, ranged=upper_value is not None)
@@ -297,12 +263,7 @@ def _choose_outside(rule: IsoRule, low: float, dtype: DTypeLike) -> float:
 
 
 def check_topology(topology: str, ranged: bool = False) -> None:
-    """Refuse an unknown topology, and "trilinear" for a range.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse an unknown topology, and "trilinear" for a range."""
     if topology not in TOPOLOGIES:
         raise UsageError(f"there is no topology {topology!r}: it is one of {', '.join(TOPOLOGIES)}")
     if ranged and topology == "trilinear":
@@ -349,16 +310,8 @@ def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
     same point, and a triangle between them would have no area.  So each stays at least four units in the last place of
     the volume's largest coordinate away from the sample; a vertex that belongs closer is moved by less than that.
 
-    Returns
-    -------
-    ndarray, shape (3,), float64
-        Typically 2e-4 of a step, eight times the rounding error of the coordinates.  Along k the margin of the thinnest
-        layer, see `layer_margins`.
-
-    Raises
-    ------
-    UsageError
-        The volume is so large that float32 cannot tell its voxels apart well.
+    Returns: ndarray, shape (3,), float64. Typically 2e-4 of a step, eight times the rounding error of the coordinates.
+        Along k the margin of the thinnest layer, see `layer_margins`.
     """
     largest, unit = _largest_and_unit(volume, border)
     steps = np.array(volume.spacing)
@@ -378,10 +331,8 @@ def layer_margins(volume: Volume, border: int) -> NDArray[np.float64]:
     Each layer has its own: the margin of a layer a few micrometres thick would be tenths of a millimetre in a thick
     one.
 
-    Returns
-    -------
-    ndarray, shape (nk + 2 * border,), float64
-        From the layer at slice ``-border``; the last is the layer beyond the last slice.
+    Returns: ndarray, shape (nk + 2 * border,), float64. From the layer at slice ``-border``; the last is the layer
+        beyond the last slice.
     """
     if not volume.uneven:
         return np.full(volume.shape_ijk[2] + 2 * border, vertex_margin(volume, border)[2])
@@ -401,9 +352,7 @@ def slice_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
     Gradients are central differences, so the step along k is the mean of the steps to both neighbours.  This is exact
     for a linear field, even with uneven slices.
 
-    Returns
-    -------
-    ndarray, shape (nk + 2 * border, 3, 3), float64
+    Returns: ndarray, shape (nk + 2 * border, 3, 3), float64
     """
     origins = volume.slice_origins(border + 1)
     return _normal_matrices(volume, border, 0.5 * (origins[2:] - origins[:-2]))
@@ -414,10 +363,7 @@ def layer_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
 
     Gradients are those of the trilinear field within a cell, per step of that cell.
 
-    Returns
-    -------
-    ndarray, shape (nk + 2 * border, 3, 3), float64
-        The last is the layer beyond the last slice.
+    Returns: ndarray, shape (nk + 2 * border, 3, 3), float64. The last is the layer beyond the last slice.
     """
     return _normal_matrices(volume, border, np.diff(volume.slice_origins(border + 1), axis=0)[1:])
 

@@ -27,13 +27,7 @@ def make_sitk(voxels: NDArray[Any], affine: Float64Array) -> Any:
 
 
 def take_sitk(image: Any) -> Taken:
-    """Take voxels, a copy, and affine of a ``SimpleITK.Image``.
-
-    Raises
-    ------
-    UsageError
-        It is no image of three axes with one number a voxel.
-    """
+    """Take voxels, a copy, and affine of a ``SimpleITK.Image``."""
     sitk = import_package("SimpleITK", "an image of SimpleITK")
     if not isinstance(image, sitk.Image):
         raise UsageError(f"{type(image).__name__} is no SimpleITK.Image")

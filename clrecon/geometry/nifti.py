@@ -26,11 +26,7 @@ SCANNER = 1
 def place_in_header(header: Any, affine: Float64Array) -> None:
     """Write the place of the voxels into a header of nibabel.
 
-    Parameters
-    ----------
-    header : nibabel.Nifti1Header
-    affine : ndarray, shape (4, 4)
-        Index (i, j, k) to LPS mm.
+    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
     """
     ras = lps_affine_from_ras(affine)
     header.set_xyzt_units(MM)
@@ -55,13 +51,7 @@ def make_nibabel(voxels: NDArray[Any], affine: Float64Array) -> Any:
 
 
 def take_nibabel(image: Any) -> Taken:
-    """Take voxels and affine of an image of nibabel; values as its header scales them.
-
-    Raises
-    ------
-    UsageError
-        It is no image of three axes with one real number a voxel, or does not say where it lies.
-    """
+    """Take voxels and affine of an image of nibabel; values as its header scales them."""
     nibabel = import_package("nibabel", "an image of nibabel")
     if not isinstance(image, nibabel.spatialimages.SpatialImage):
         raise UsageError(f"{type(image).__name__} is no image of nibabel: of a file take nibabel.load(path)")

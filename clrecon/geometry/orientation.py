@@ -15,12 +15,9 @@ __all__ = ["describe_orientation"]
 def describe_orientation(affine: Float64Array) -> dict[str, Any]:
     """Describe the directions of index space in the patient.
 
-    Returns
-    -------
-    dict
-        ``row``, ``column``, ``normal``: unit vectors in LPS along i, along j, and row x column.  ``axes``: for i, j and
-        the normal, the letter of the patient direction nearest to it (L left, R right, P posterior, A anterior,
-        S superior, I inferior).  ``off_axis_deg``: angle between the normal and the nearest patient axis.
+    Returns: ``row``, ``column``, ``normal``: unit vectors in LPS along i, along j, and row x column.  ``axes``: for i,
+        j and the normal, the letter of the patient direction nearest to it (L left, R right, P posterior, A anterior, S
+        superior, I inferior).  ``off_axis_deg``: angle between the normal and the nearest patient axis.
         ``right_handed``: the determinant of the affine is above zero.
     """
     row, column = (affine[:3, axis] / np.linalg.norm(affine[:3, axis]) for axis in (0, 1))

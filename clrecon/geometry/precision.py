@@ -66,10 +66,8 @@ def describe_far(volume: Volume) -> list[str]:
 def find_vertex_origin(volume: Volume) -> Float64Array | None:
     """Return the point in LPS mm that float32 vertices of a volume are counted from; None for the origin of the frame.
 
-    Returns
-    -------
-    ndarray, shape (3,), float64, or None
-        Whole millimetres near the centre of a volume that reaches `FAR_MM` or more.
+    Returns: ndarray, shape (3,), float64, or None. Whole millimetres near the centre of a volume that reaches `FAR_MM`
+        or more.
     """
     if largest_coordinate(volume) < FAR_MM:
         return None

@@ -32,11 +32,7 @@ ON_GRID = 1e-6
 class RegularGrid(NamedTuple):
     """Points in even steps along axes at right angles.
 
-    Attributes
-    ----------
-    affine : ndarray, shape (4, 4), float64
-        Index to LPS mm, right-handed.
-    shape_ijk : (int, int, int)
+    affine: ndarray, shape (4, 4), float64. Index to LPS mm, right-handed.
     """
 
     affine: Float64Array
@@ -63,13 +59,8 @@ def regular_grid(grid: Grid, origins: Float64Array, step_mm: float | None = None
     steps of the grid and k the smallest distance of slices along the normal: where a volume is sheared but even, the
     planes are those of its slices.
 
-    Parameters
-    ----------
-    grid : Grid
-    origins : ndarray, shape (nk, 3)
-        LPS mm of voxel (0, 0, k) of each slice.
-    step_mm : float, optional
-        Step along all three axes.
+    origins: ndarray, shape (nk, 3). LPS mm of voxel (0, 0, k) of each slice.
+    step_mm: Step along all three axes.
     """
     di, dj, _ = grid.spacing
     first = grid.affine[:3, 0] / di
@@ -93,10 +84,7 @@ def regular_grid(grid: Grid, origins: Float64Array, step_mm: float | None = None
 def resample_grid(grid: Grid, regular: RegularGrid, air: float, progress: Progress = ignore_progress) -> NDArray[Any]:
     """Resample a grid (trilinear) at the points of a regular one, plane by plane; `air` beyond its voxels.
 
-    Returns
-    -------
-    ndarray, shape (nk, nj, ni)
-        In the type of the voxels; integers are rounded.
+    Returns: ndarray, shape (nk, nj, ni). In the type of the voxels; integers are rounded.
     """
     ni, nj, nk = regular.shape_ijk
     dtype = grid.voxels.dtype
@@ -130,11 +118,9 @@ def _sample_plane(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """A slice (bilinear, its outer values beyond it) at ``first + column * columns + row * rows``.
 
-    Returns
-    -------
-    found : ndarray of `shape`, float32
-    inside : ndarray of `shape`, bool
-        At most half a voxel beyond the outer centres.
+    Returns:
+    found: ndarray of `shape`, float32
+    inside: ndarray of `shape`, bool. At most half a voxel beyond the outer centres.
     """
     from scipy import ndimage
 

@@ -24,13 +24,7 @@ MOST_VOXELS = 2**31
 
 
 def check_step(step_mm: float) -> None:
-    """Refuse a step that no regular grid has.
-
-    Raises
-    ------
-    UsageError
-        It is no number, or below 0.01 mm.
-    """
+    """Refuse a step that no regular grid has."""
     number = isinstance(step_mm, int | float | np.integer | np.floating)
     if not (number and math.isfinite(step_mm) and step_mm >= SMALLEST_STEP_MM):
         shown = f"{step_mm:g}" if number else repr(step_mm)[:40]
@@ -40,16 +34,7 @@ def check_step(step_mm: float) -> None:
 def check_count(regular: RegularGrid, steps: str) -> None:
     """Refuse a grid that is too large.
 
-    Parameters
-    ----------
-    regular : RegularGrid
-    steps : str
-        What its steps are, for the message.
-
-    Raises
-    ------
-    RefusedInputError
-        It has more than 2^31 voxels.
+    steps: What its steps are, for the message.
     """
     if math.prod(regular.shape_ijk) > MOST_VOXELS:
         shape = " x ".join(f"{n:,}" for n in regular.shape_ijk)
@@ -70,24 +55,9 @@ def resample_volume(volume: Own, step_mm: float, *, progress: Progress | None = 
     centres; points beyond the voxels are air (`AIR_HU`).  Whole numbers are rounded.  Steps longer than those of the
     volume take single values and no means: smooth the volume first where that matters.
 
-    Parameters
-    ----------
-    volume : Volume
-    step_mm : float
-    progress : callable, optional
-        ``progress("resample", done, total)`` in slices.
+    progress: ``progress("resample", done, total)`` in slices.
 
-    Returns
-    -------
-    Volume
-        ``report["resampled"]`` says so, with ``step_mm`` and ``method``.
-
-    Raises
-    ------
-    UsageError
-        `step_mm` is no length, or below 0.01 mm.
-    RefusedInputError
-        The result would have more than 2^31 voxels.
+    Returns: ``report["resampled"]`` says so, with ``step_mm`` and ``method``.
     """
     check_step(step_mm)
     regular = regular_grid(volume, volume.slice_origins(), step_mm)

@@ -26,22 +26,10 @@ def slice_volume(volume: Own, key: Any) -> Own:
     The rules are those of nibabel's ``image.slicer``, in the order of the array: ``volume[key].voxels`` is
     ``volume.voxels[key]``.
 
-    Parameters
-    ----------
-    volume : Volume
-    key : slice, or tuple of up to three slices
-        Along k, j, i; ``...`` stands for whole axes.  A step of 2 takes every other voxel and doubles the spacing,
+    key: Along k, j, i; ``...`` stands for whole axes.  A step of 2 takes every other voxel and doubles the spacing,
         without smoothing.  A step below zero turns an axis round: index space may become left-handed.
 
-    Returns
-    -------
-    Volume
-        Its voxels are a view of those of `volume` where they can be.  ``report["sliced"]`` has the figures.
-
-    Raises
-    ------
-    UsageError
-        An index is no slice, there are more than three, or nothing is left.
+    Returns: Its voxels are a view of those of `volume` where they can be.  ``report["sliced"]`` has the figures.
     """
     slices = _checked_slices(key)
     ranges = [range(*one.indices(size)) for one, size in zip(slices, volume.shape, strict=True)]
@@ -74,12 +62,7 @@ def slice_volume(volume: Own, key: Any) -> Own:
 
 
 def _checked_slices(key: Any) -> tuple[slice, slice, slice]:
-    """Return one slice for each of k, j, i.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Return one slice for each of k, j, i."""
     given = key if isinstance(key, tuple) else (key,)
     places = [place for place, one in enumerate(given) if one is Ellipsis]
     if len(places) == 1:

@@ -46,12 +46,9 @@ def fit_line(positions: Float64Array) -> tuple[Float64Array, Float64Array]:
 def fit_even(positions: Float64Array, normal: Float64Array) -> tuple[Float64Array, Float64Array, bool]:
     """Fit even places to slices at positions (n, 3), n >= 2.
 
-    Returns
-    -------
-    step, origin : ndarray, shape (3,)
-        LPS mm.
-    is_even : bool
-        No position is further off than `position_tolerance` of the median gap along the normal.
+    Returns:
+    step, origin: ndarray, shape (3,). LPS mm.
+    is_even: No position is further off than `position_tolerance` of the median gap along the normal.
     """
     step, origin = fit_line(positions)
     off = np.linalg.norm(positions - (origin + np.arange(len(positions))[:, None] * step), axis=1)
@@ -63,14 +60,9 @@ def fit_even(positions: Float64Array, normal: Float64Array) -> tuple[Float64Arra
 class UnevenStack(Message):
     """Positions of all slices, with the in-plane steps that they share.
 
-    Attributes
-    ----------
-    in_plane : ndarray, shape (3, 2), float64
-        Steps along i and j, mm.
-    positions : ndarray, shape (nk, 3), float64
-        Centre of voxel (0, 0, k), LPS mm.
-    normal : ndarray, shape (3,), float64
-        Unit length, towards larger k.
+    in_plane: ndarray, shape (3, 2), float64. Steps along i and j, mm.
+    positions: ndarray, shape (nk, 3), float64. Centre of voxel (0, 0, k), LPS mm.
+    normal: ndarray, shape (3,), float64. Unit length, towards larger k.
     """
 
     in_plane: Float64Array
@@ -79,14 +71,7 @@ class UnevenStack(Message):
 
     @classmethod
     def of(cls, affine: Float64Array, positions: ArrayLike, slices: int) -> UnevenStack:
-        """Check positions against an affine, which gives the in-plane steps and the direction of growing k.
-
-        Raises
-        ------
-        UsageError
-            There is not one finite position for each slice, there are fewer than two, or a position does not advance in
-            the affine's direction.
-        """
+        """Check positions against an affine, which gives the in-plane steps and the direction of growing k."""
         table = np.array(checked_points(positions))
         if len(table) != slices or slices < 2:
             raise UsageError(f"{len(table)} slice positions for {slices} slices: one each, and at least two")

@@ -31,12 +31,7 @@ SEARCH_STEPS = 24
 
 
 def check_vertex_rule(vertex_rule: str, topology: str = "separated") -> None:
-    """Refuse an unknown rule, and one that does not go with the topology.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse an unknown rule, and one that does not go with the topology."""
     if vertex_rule not in VERTEX_RULES:
         raise UsageError(f"{name_parameter('vertex_rule')} is one of {', '.join(VERTEX_RULES)}, not {vertex_rule!r}")
     if vertex_rule != "linear" and topology == "trilinear":

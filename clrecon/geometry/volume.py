@@ -75,11 +75,6 @@ class Volume(BaseVolume):
 
         The certificate stays, with shape, place and range of the part, its entry ``sliced`` and a warning; its gates
         are those of the scan as it was read.
-
-        Raises
-        ------
-        UsageError
-            An index is no slice, there are more than three, or nothing is left.
         """
         return slice_volume(self, key)
 

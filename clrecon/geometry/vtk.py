@@ -48,13 +48,7 @@ def make_image_data(own: Image) -> Any:
 
 
 def take_image_data(image: Any, name: str | None, space: str | None) -> Taken:
-    """Take voxels, a copy, and affine of a ``pyvista.ImageData``; see `Volume.from_pyvista`.
-
-    Raises
-    ------
-    UsageError
-        It is no ImageData, or has not one real number at each point.
-    """
+    """Take voxels, a copy, and affine of a ``pyvista.ImageData``; see `Volume.from_pyvista`."""
     import pyvista
 
     found = pyvista.wrap(image) if hasattr(image, "GetPointData") else image

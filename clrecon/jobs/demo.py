@@ -46,28 +46,12 @@ def make_demo(
 ) -> dict[str, Any]:
     """Write a phantom CT series, a picture of it, its bone mesh and the report; check a sphere of known volume.
 
-    Parameters
-    ----------
-    output : path
-        A new or empty folder, or one of an earlier demonstration, which is replaced.
-    device : str, optional
-        Name or index of an OpenCL device.
-    no_clobber : bool
-        True: a folder that holds anything stays and is an `OutputError`.
-    progress : callable, optional
+    output: A new or empty folder, or one of an earlier demonstration, which is replaced.
+    device: Name or index of an OpenCL device.
+    no_clobber: A folder that holds anything stays and is an `OutputError`.
 
-    Returns
-    -------
-    dict
-        ``folder``, ``files``, ``affine_error_mm`` (largest difference between the affine of the report and that of
+    Returns: ``folder``, ``files``, ``affine_error_mm`` (largest difference between the affine of the report and that of
         the truth), ``check`` (see `check_sphere`), ``seconds``, ``mesh`` and ``picture`` (the reports of both).
-
-    Raises
-    ------
-    UsageError
-        The folder contains other files.
-    OutputError, DeviceError
-        Nothing is written then, and an earlier demonstration is intact.
     """
     from clrecon.operators import choose_device
 
@@ -132,10 +116,7 @@ def _look(device: str) -> RenderSettings:
 def check_sphere(device: Device) -> dict[str, Any]:
     """Mesh a sphere in anisotropic voxels, tilted gantry and oblique frame, and compare with geometry.
 
-    Returns
-    -------
-    dict
-        ``volume_ml``, ``true_volume_ml``, ``area_mm2``, ``true_area_mm2``, ``radius_error_max_mm`` (largest
+    Returns: ``volume_ml``, ``true_volume_ml``, ``area_mm2``, ``true_area_mm2``, ``radius_error_max_mm`` (largest
         distance of a vertex from the sphere), ``spacing_mm``, ``tilt_deg``.
     """
     import numpy as np

@@ -16,25 +16,14 @@ __all__ = ["run_device_selftest", "survey_devices"]
 def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError | None]:
     """List every OpenCL platform and device, and say which device would be used.
 
-    Parameters
-    ----------
-    name : str, optional
-        Value of `device` for a job.
+    name: Value of `device` for a job.
 
-    Returns
-    -------
-    survey : dict
-        ``{"platforms": [{"name", "version", "note"}], "devices": [{"index", "name", "platform", "type", "version",
+    Returns:
+    survey: ``{"platforms": [{"name", "version", "note"}], "devices": [{"index", "name", "platform", "type", "version",
         "driver", "memory_bytes", "max_allocation_bytes", "compute_units", "simulator", "fault", "chosen", ...}],
         "chosen": index or None, "warnings": [text]}``.  A fault is what is remembered of the check at the first use of
         a device, empty where it passed or was not checked yet; nothing runs on any device.
-    problem : DeviceError or None
-        Why no device would be used.
-
-    Raises
-    ------
-    DeviceError
-        pyopencl itself cannot be imported.
+    problem: Why no device would be used.
     """
     from clrecon.opencl import cache_warnings, choose_remembered, list_devices, list_platforms, remembered_fault
 
@@ -67,25 +56,12 @@ def run_device_selftest(
 ) -> dict[str, Any]:
     """Compare every kernel with its twin, in a process of its own.
 
-    Parameters
-    ----------
-    name : str, optional
-        Device name or index.
-    progress : callable, optional
-        Called as ``progress("selftest", checks done, all checks)``.
-    tell : callable, optional
-        Called with the device and each result, as they are returned, as soon as it is there.
+    name: Device name or index.
+    progress: Called as ``progress("selftest", checks done, all checks)``.
+    tell: Called with the device and each result, as they are returned, as soon as it is there.
 
-    Returns
-    -------
-    dict
-        ``{"device": {...}, "passed": bool, "operators": [{"operator", "passed", "detail", "seconds"}],
-        "warnings": [text]}``.
-
-    Raises
-    ------
-    DeviceError
-        The device does not exist, or no process can be started.
+    Returns: ``{"device": {...}, "passed": bool, "operators": [{"operator", "passed", "detail", "seconds"}], "warnings":
+        [text]}``.
     """
     from clrecon.jobs.selftest.run import run_selftest
     from clrecon.jobs.selftest.table import CHECKS

@@ -14,18 +14,12 @@ __all__ = ["InputListing", "describe_input"]
 class InputListing(NamedTuple):
     """The listing of an input.
 
-    Attributes
-    ----------
-    listing : dict
-        ``{"series": [...], "chosen": number or None, "certificate": {...} or None}``, see docs/contract.md.  ``chosen``
-        is the series that a job would use, None if it would refuse; ``certificate`` is that of the series that was
-        judged, refused or not.
-    notes : list of str
-        Files that were passed over, series that were not chosen, and why none is chosen.
-    problem : ClreconError or None
-        Why the command fails: no series can be used, the requested one cannot, or a gate failed.
-    refused : int or None
-        Number of the series that was judged and cannot be used; `problem` or the notes say why.
+    listing: ``{"series": [...], "chosen": number or None, "certificate": {...} or None}``, see docs/contract.md.
+        ``chosen`` is the series that a job would use, None if it would refuse; ``certificate`` is that of the series
+        that was judged, refused or not.
+    notes: Files that were passed over, series that were not chosen, and why none is chosen.
+    problem: Why the command fails: no series can be used, the requested one cannot, or a gate failed.
+    refused: Number of the series that was judged and cannot be used; `problem` or the notes say why.
     """
 
     listing: dict[str, Any]
@@ -49,32 +43,13 @@ def describe_input(
 ) -> InputListing:
     """List the series of an input and certify one.
 
-    Parameters
-    ----------
-    source : path
-        DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
-    series : str, optional
-        Number, SeriesInstanceUID, its hash or description of the series to judge; None leaves the choice to the
+    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
+    series: Number, SeriesInstanceUID, its hash or description of the series to judge; None leaves the choice to the
         reader, and any usable series is enough then.
-    phase, allow_gaps
-        As in `clrecon.read_volume`, of the series that is judged.
-    force, follow_links, rescale
-        As in `clrecon.read_volume`.
-    pixels : bool
-        Read the pixels of the series that is judged.
-    strict : bool
-        True: a failed gate is a problem, and so is a listing without a chosen series.
-    progress : callable, optional
-
-    Returns
-    -------
-    InputListing
-
-    Raises
-    ------
-    NoDicomError, RefusedInputError, UsageError
-        Nothing to list, all files corrupt, pixels that cannot be read, or not exactly one series answers to `series`,
-        or it has no such phase.
+    phase, allow_gaps: As in `clrecon.read_volume`, of the series that is judged.
+    force, follow_links, rescale: As in `clrecon.read_volume`.
+    pixels: Read the pixels of the series that is judged.
+    strict: A failed gate is a problem, and so is a listing without a chosen series.
     """
     from clrecon.reading import list_series
 

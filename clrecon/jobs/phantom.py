@@ -23,27 +23,13 @@ def make_phantom(
 ) -> dict[str, Any]:
     """Write a phantom CT series with its truth.
 
-    Parameters
-    ----------
-    output : path
-        Folder for the DICOM files, ``truth.json`` and, of a scene, ``materials.nrrd``, or of chosen levels
+    output: Folder for the DICOM files, ``truth.json`` and, of a scene, ``materials.nrrd``, or of chosen levels
         ``levels.nrrd``.
-    no_clobber : bool
-        True: a folder that holds anything stays and is an `OutputError`.
-    progress : callable, optional
-    **settings
-        Fields of `clrecon.phantom.PhantomSettings`; those that are None keep their default.  ``size`` may be a
+    no_clobber: A folder that holds anything stays and is an `OutputError`.
+    **settings: Fields of `clrecon.phantom.PhantomSettings`; those that are None keep their default.  ``size`` may be a
         text like ``"256x192"`` (columns x rows), ``missing`` one like ``"20-22,40"``.
 
-    Returns
-    -------
-    dict
-        The truth, as in ``truth.json``.
-
-    Raises
-    ------
-    UsageError, OutputError
-        Settings are impossible, or the folder cannot be written.
+    Returns: The truth, as in ``truth.json``.
     """
     from clrecon.phantom import PhantomSettings, parse_missing, parse_size, write_phantom
 

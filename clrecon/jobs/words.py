@@ -10,12 +10,8 @@ __all__ = ["list_words"]
 def list_words(command: str, setting: str) -> list[str]:
     """Return the words that a setting can be; an empty list where it takes numbers, files or free text.
 
-    Parameters
-    ----------
-    command : str
-        Name of a command: a preset of pictures is not one of meshes.
-    setting : str
-        Name of the option's value, such as ``preset``.
+    command: Name of a command: a preset of pictures is not one of meshes.
+    setting: Name of the option's value, such as ``preset``.
     """
     from clrecon.jobs.mesh.presets import PRESETS as LEVELS
     from clrecon.jobs.mesh.purposes import PURPOSES

@@ -43,15 +43,10 @@ ROUNDS = 3
 class Canal:
     """The canal of one vertebra.
 
-    Attributes
-    ----------
-    voxels : ndarray, shape (nk, nj, ni), bool
-    closed_slices : int
-        Slices in which the arch is closed, alone or together with its neighbours.
-    together : int
-        Slices that close the arch together; 1 where single ones do.
-    height_mm : float
-        Height of the slices of the canal: that of the pedicles.
+    voxels: ndarray, shape (nk, nj, ni), bool
+    closed_slices: Slices in which the arch is closed, alone or together with its neighbours.
+    together: Slices that close the arch together; 1 where single ones do.
+    height_mm: Height of the slices of the canal: that of the pedicles.
     """
 
     voxels: Bits
@@ -69,17 +64,10 @@ def find_canal(solid: Bits, volume: Volume) -> Canal | None:
     These slices are the pedicles' height.  In them the back half goes on from the nearest closed slice, in the
     direction of the canal.
 
-    Parameters
-    ----------
-    solid : ndarray, shape (nk, nj, ni), bool
-        Solid bone of one vertebra, its holes filled.
-    volume : Volume
-        Where its voxels are; the slices are axial within 45 degrees.
+    solid: ndarray, shape (nk, nj, ni), bool. Solid bone of one vertebra, its holes filled.
+    volume: Where its voxels are; the slices are axial within 45 degrees.
 
-    Returns
-    -------
-    Canal or None
-        None where the arch is closed nowhere.
+    Returns: None where the arch is closed nowhere.
     """
     places = _Places(volume)
     main, together = _join_holes(solid, places)

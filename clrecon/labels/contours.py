@@ -34,16 +34,11 @@ a ring so thin holds hardly a pixel centre."""
 def fill_contours(contours: Iterable[NDArray[np.float64]], shape: tuple[int, int]) -> NDArray[np.bool_]:
     """Return the pixels of one slice whose centres lie inside of contours.
 
-    Parameters
-    ----------
-    contours : iterable of ndarray, shape (n, 2), float64
-        Corners (i, j) in pixels, 0 at the centre of the first; the last corner is joined to the first.
-    shape : (int, int)
-        (nj, ni).
+    contours: iterable of ndarray, shape (n, 2), float64. Corners (i, j) in pixels, 0 at the centre of the first; the
+        last corner is joined to the first.
+    shape: (nj, ni).
 
-    Returns
-    -------
-    ndarray, shape (nj, ni), bool
+    Returns: ndarray, shape (nj, ni), bool
     """
     nj, ni = shape
     inside = np.zeros(shape, dtype=bool)
@@ -80,13 +75,9 @@ def _cross_rows(corners: NDArray[np.float64], nj: int) -> tuple[NDArray[np.int64
 class United:
     """The pixels inside of the contours of a slice, and what was done to find them.
 
-    Attributes
-    ----------
-    inside : ndarray, shape (nj, ni), bool
-    repeated : int
-        Contours that equal another, or nearly, and do not count.
-    crossing : int
-        Pairs of contours that cross.
+    inside: ndarray, shape (nj, ni), bool
+    repeated: Contours that equal another, or nearly, and do not count.
+    crossing: Pairs of contours that cross.
     """
 
     inside: NDArray[np.bool_]
@@ -127,19 +118,9 @@ def unite_contours(
 
     Two contours cross if both hold some pixel centre, and each holds one that is beyond the other.
 
-    Parameters
-    ----------
-    contours : sequence of ndarray, shape (n, 2), float64
-        As of `fill_contours`.
-    shape : (int, int)
-        (nj, ni).
-    pixel_mm : (float, float)
-        Spacing (di, dj).
-
-    Raises
-    ------
-    ValueError
-        There are too many contours that lie over each other.
+    contours: sequence of ndarray, shape (n, 2), float64. As of `fill_contours`.
+    shape: (nj, ni).
+    pixel_mm: Spacing (di, dj).
     """
     unique = list({_canonical(corners, pixel_mm): corners for corners in contours}.values())
     repeated = len(contours) - len(unique)

@@ -50,13 +50,9 @@ def find_enclosed(
 ) -> tuple[int, ...]:
     """Return the labels that share more faces with other labels than they have free, and the labels that touch them.
 
-    Parameters
-    ----------
-    labels : ndarray, shape (nk, nj, ni)
-    faces : ndarray
-        The table of `count_faces`.
-    boxes : dict of int to 3 slices, optional
-        Box of each label and the samples around it; None: the whole map.
+    labels: ndarray, shape (nk, nj, ni)
+    faces: The table of `count_faces`.
+    boxes: Box of each label and the samples around it; None: the whole map.
     """
     enclosed = np.flatnonzero(faces[:, 1] > faces[:, 0])
     involved = set(enclosed.tolist())
@@ -92,17 +88,12 @@ def level_biases(levels: dict[int, int], size: int) -> NDArray[np.int32]:
 class Borders:
     """How the volumes of enclosed labels change with their levels.
 
-    Attributes
-    ----------
-    numbers : tuple of int
-    voxels : ndarray, shape (n,)
-        Number of voxels of each label.
-    slopes : scipy.sparse array, shape (n, n)
-        Number of voxels that label `row` loses when the level of label `column` rises by one.
-    parts : ndarray, shape (n,)
-        Number of the group of each label; labels that touch, directly or through others, form a group.
-    filled : ndarray, shape (n,)
-        True for labels of a group that is bounded by the ends of the map alone.
+    voxels: ndarray, shape (n,). Number of voxels of each label.
+    slopes: scipy.sparse array, shape (n, n). Number of voxels that label `row` loses when the level of label `column`
+        rises by one.
+    parts: ndarray, shape (n,). Number of the group of each label; labels that touch, directly or through others, form a
+        group.
+    filled: ndarray, shape (n,). True for labels of a group that is bounded by the ends of the map alone.
     """
 
     numbers: tuple[int, ...]
@@ -154,11 +145,7 @@ class Borders:
 def choose_levels(borders: Borders, measure: Callable[[dict[int, int]], dict[int, float]]) -> dict[int, int]:
     """Choose the levels at which enclosed labels have, as nearly as possible, the volumes of their voxels.
 
-    Parameters
-    ----------
-    borders : Borders
-    measure : callable
-        Function from the levels of all these labels to the volumes of their meshes, in voxels.
+    measure: Function from the levels of all these labels to the volumes of their meshes, in voxels.
     """
     from scipy.sparse.linalg import spsolve
 

@@ -28,12 +28,8 @@ MOST_ASIDE = 0.4
 class LabelSlices(NamedTuple):
     """The slices of a label map of a scan.
 
-    Attributes
-    ----------
-    affine : ndarray, shape (4, 4)
-        Index (i, j, k) of the map to LPS mm.
-    nearest : ndarray, shape (slices,), int64
-        For each slice of the map the slice of the scan whose labels it has.
+    affine: ndarray, shape (4, 4). Index (i, j, k) of the map to LPS mm.
+    nearest: ndarray, shape (slices,), int64. For each slice of the map the slice of the scan whose labels it has.
     """
 
     affine: Float64Array
@@ -41,13 +37,7 @@ class LabelSlices(NamedTuple):
 
 
 def label_slices(volume: Volume) -> LabelSlices:
-    """Return the slices of a label map: those of an even scan, thinner ones of an uneven scan.
-
-    Raises
-    ------
-    UsageError
-        The slices of an uneven scan lie too far off a line, or their gaps differ too much.
-    """
+    """Return the slices of a label map: those of an even scan, thinner ones of an uneven scan."""
     count = volume.shape_ijk[2]
     if not volume.uneven:
         return LabelSlices(volume.affine, np.arange(count))

@@ -28,11 +28,6 @@ def open_masks(folder: Path) -> dict[str, GridFile]:
     """Read the headers of the masks of a folder, by the names of their structures in alphabetical order.
 
     Hidden files, folders and files of other kinds are left out.
-
-    Raises
-    ------
-    RefusedInputError
-        There is no mask, a header is corrupt, two files name one structure, or the folder holds DICOM.
     """
     shown = escape_text(folder.name)
     masks: dict[str, GridFile] = {}
@@ -66,21 +61,8 @@ def read_masks(folder: Path, masks: dict[str, GridFile], wanted: Wanted, progres
 
     A voxel of several masks belongs to the first of them in alphabetical order, wanted ones before others.
 
-    Parameters
-    ----------
-    folder : Path
-    masks : dict of str to GridFile
-        As `open_masks` returns them.
-    wanted : Wanted
-    progress : callable
-        Called as ``progress("read", masks done, all masks)``.
-
-    Raises
-    ------
-    UsageError
-        A wanted structure has no file.
-    RefusedInputError
-        A file is cut off or corrupt, is no mask of one structure, or has another grid than the first.
+    masks: As `open_masks` returns them.
+    progress: Called as ``progress("read", masks done, all masks)``.
     """
     names = dict(enumerate(masks, start=1))
     chosen = set(names) if wanted.labels is None else {find_number(one, names, names) for one in wanted.labels}

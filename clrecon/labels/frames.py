@@ -32,15 +32,9 @@ _UNSAID = "says neither SpacingBetweenSlices nor SliceThickness"
 class FrameStack:
     """The evenly spaced stack that frames form.
 
-    Attributes
-    ----------
-    affine : ndarray, shape (4, 4), float64
-        Index (i, j, k) to LPS mm.
-    places : list of int
-        Slice index k of each frame.
-    slices : int
-    warnings : tuple of str
-        What the header leaves open about the step between slices.
+    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm.
+    places: Slice index k of each frame.
+    warnings: What the header leaves open about the step between slices.
     """
 
     affine: Float64Array
@@ -66,21 +60,9 @@ def _group(shared: Any, group: Any, sequence: str) -> Any:
 def place_frames(shared: Any, groups: list[Any], name: str) -> FrameStack:
     """Place the frames of a SEG by their own positions.
 
-    Parameters
-    ----------
-    shared : pydicom.Dataset or None
-        Shared functional groups.
-    groups : list of pydicom.Dataset
-        Per-frame functional groups.
-    name : str
-        Name of the file, for messages.
-
-    Raises
-    ------
-    RefusedInputError
-        Frames differ in direction or spacing, or are not evenly spaced.
-    ValueError, AttributeError, KeyError
-        A position, direction or spacing is missing or not made of numbers.
+    shared: Shared functional groups.
+    groups: Per-frame functional groups.
+    name: Name of the file, for messages.
     """
     directions = np.stack(
         [_numbers(_group(shared, g, "PlaneOrientationSequence").ImageOrientationPatient, 6) for g in groups]

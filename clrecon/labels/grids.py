@@ -41,20 +41,8 @@ class _Segment:
 def read_grid_labels(grid: GridFile, wanted: Wanted, progress: Progress = ignore_progress) -> LabelMap:
     """Read a label map or a segmentation.
 
-    Parameters
-    ----------
-    grid : GridFile
-    wanted : Wanted
-        Of segments in layers only the others may overlap.
-    progress : callable
-        Called as ``progress("read", slices done, all slices)``.
-
-    Raises
-    ------
-    UsageError
-        A wanted label does not exist.
-    RefusedInputError
-        The file is cut off or corrupt, is not a label map, or has segments that overlap.
+    wanted: Of segments in layers only the others may overlap.
+    progress: Called as ``progress("read", slices done, all slices)``.
     """
     segments, said = _read_segments(grid)
     ni, nj, nk = grid.shape_ijk
@@ -100,11 +88,6 @@ def _read_segments(grid: GridFile) -> tuple[list[_Segment], list[str]]:
     """Return the segments that the header of a .seg.nrrd names, in their order, and what is to be said about them.
 
     3D Slicer wrote neither layers nor values before version 4.11: segment n was layer n.
-
-    Raises
-    ------
-    RefusedInputError
-        They do not say in which of several layers they are, or which value they have there.
     """
     fields = grid.fields
     found = {int(m[1]) for field in fields if (m := re.fullmatch(r"Segment([0-9]{1,5})_(Name|ID|LabelValue)", field))}

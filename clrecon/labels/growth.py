@@ -23,14 +23,10 @@ SAME_DISTANCE = 1e-6
 class Growth:
     """The growth of labels on one grid.
 
-    Attributes
-    ----------
-    grow_mm : float or None
-        Distance of growth; None: one voxel in each direction.
-    offsets : ndarray, shape (n, 3), int32
-        (di, dj, dk) to the samples around, without (0, 0, 0), nearest in mm first, shear included.
-    shells : ndarray, shape (n,), int32
-        Shell numbers from 0; offsets of equal length have the same.
+    grow_mm: Distance of growth; None: one voxel in each direction.
+    offsets: ndarray, shape (n, 3), int32. (di, dj, dk) to the samples around, without (0, 0, 0), nearest in mm first,
+        shear included.
+    shells: ndarray, shape (n,), int32. Shell numbers from 0; offsets of equal length have the same.
     """
 
     grow_mm: float | None
@@ -39,13 +35,7 @@ class Growth:
 
     @classmethod
     def of(cls, volume: Volume, grow_mm: float | None) -> Growth:
-        """Make the growth by `grow_mm` on the grid of a volume.
-
-        Raises
-        ------
-        UsageError
-            `grow_mm` is not a number, negative, or so large that a label would cover whole bones beside it.
-        """
+        """Make the growth by `grow_mm` on the grid of a volume."""
         steps = volume.affine[:3, :3]
         if grow_mm is None:
             return cls(None, *_sort(_offsets_within((1, 1, 1)), steps))

@@ -23,13 +23,7 @@ _VERTEBRA = ("vertebra", "vertebrae", "vert", "level")
 
 
 def check_name(name: str) -> str:
-    """Return a name as one printable line of limited length.
-
-    Raises
-    ------
-    UsageError
-        The name is not text.
-    """
+    """Return a name as one printable line of limited length."""
     if not isinstance(name, str):
         raise UsageError(f"the name of a label is text, not {type(name).__name__}")
     return escape_text(name.strip())
@@ -63,17 +57,7 @@ def find_number(label: str | int, names: Mapping[int, str], present: Collection[
     """Return the number of `label`: a number itself, else the exact name, else the only name that says the same
     level of the spine, else the only one that contains it as a part.
 
-    Parameters
-    ----------
-    label : str or int
-    names : mapping of int to str
-    present : collection of int
-        Numbers that occur in voxels.
-
-    Raises
-    ------
-    UsageError
-        No label or several labels have this name, or no voxel has the label; the message lists the labels that occur.
+    present: Numbers that occur in voxels.
     """
     text = str(label).strip()
     wanted = text.casefold()
@@ -120,13 +104,7 @@ def file_suffixes(names: Mapping[int, str]) -> dict[int, str]:
 
 
 def check_wanted(only: str | int | Iterable[str | int] | None) -> tuple[str | int, ...] | None:
-    """Return `only` as a tuple; None stays None.
-
-    Raises
-    ------
-    UsageError
-        A label is neither a number nor text.
-    """
+    """Return `only` as a tuple; None stays None."""
     if only is None:
         return None
     wanted = (only,) if isinstance(only, str | int) else tuple(only)

@@ -40,19 +40,11 @@ more."""
 def next_level(tried: Sequence[tuple[int, float]], wanted: float, rise: float) -> int:
     """Return the level to try next: by Newton's method, then the secant method, then interpolation between two levels.
 
-    Parameters
-    ----------
-    tried : sequence of (int, float)
-        Levels and their volumes, in the order of the trials.
-    wanted : float
-        The wanted volume.
-    rise : float
-        Approximate change of the volume when the level rises by one: below 0.
+    tried: sequence of (int, float). Levels and their volumes, in the order of the trials.
+    wanted: The wanted volume.
+    rise: Approximate change of the volume when the level rises by one: below 0.
 
-    Returns
-    -------
-    int
-        The next level; or the best of the tried levels, where no further trial is useful.
+    Returns: The next level; or the best of the tried levels, where no further trial is useful.
     """
     if not tried:
         return START

@@ -33,22 +33,9 @@ class Painter:
     No two wanted segments may overlap.  A voxel of a wanted and another segment goes to the wanted one; a voxel of
     several others goes to the lowest number.
 
-    Parameters
-    ----------
-    file : str
-        Name of the file, for messages.
-    voxels : ndarray, shape (nk, nj, ni), uint16
-        Zeros, to be written.
-    names : mapping of int to str
-        The segments.
-    wanted : Wanted
-
-    Raises
-    ------
-    UsageError
-        A wanted label does not exist.
-    RefusedInputError
-        A number is not a possible label number.
+    file: Name of the file, for messages.
+    voxels: ndarray, shape (nk, nj, ni), uint16. Zeros, to be written.
+    names: The segments.
     """
 
     def __init__(self, file: str, voxels: NDArray[Any], names: Mapping[int, str], wanted: Wanted):
@@ -79,13 +66,7 @@ class Painter:
         plane[mask] = number
 
     def finish(self, affine: Float64Array, **options: Any) -> LabelMap:
-        """Return the map.
-
-        Raises
-        ------
-        RefusedInputError
-            Segments overlap that may not overlap.
-        """
+        """Return the map."""
         if self._shared:
             (a, b), count = max(self._shared.items(), key=lambda item: item[1])
             raise RefusedInputError(

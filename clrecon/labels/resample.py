@@ -39,15 +39,10 @@ TIES = 1e-6
 class ResampledLabels:
     """A label map on the grid of a volume.
 
-    Attributes
-    ----------
-    voxels : ndarray, shape (nk, nj, ni), uint8 or uint16
-        On the grid of the volume.  Do not change it: it may be the map's own array.
-    exact : bool
-        True: every voxel of the volume coincides with a voxel of the map or lies outside the map.
-    inside : dict of int to float
-        For each number its share of labelled voxels that lie inside the volume, 0 to 1.
-    warnings : tuple of str
+    voxels: ndarray, shape (nk, nj, ni), uint8 or uint16. On the grid of the volume.  Do not change it: it may be the
+        map's own array.
+    exact: Every voxel of the volume coincides with a voxel of the map or lies outside the map.
+    inside: For each number its share of labelled voxels that lie inside the volume, 0 to 1.
     """
 
     voxels: NDArray[Any]
@@ -97,12 +92,7 @@ def warn_of_place(labels: LabelMap, volume: Volume, voxels: NDArray[Any] | None 
     Where only the order or direction of the axes differs, as after a careful turn, there is none unless the labels lie
     better in bone at the same indices.
 
-    Parameters
-    ----------
-    labels : LabelMap
-    volume : Volume
-    voxels : ndarray, shape (nk, nj, ni), optional
-        The map on the grid of the volume; None: it is brought there if it is needed.
+    voxels: ndarray, shape (nk, nj, ni). The map on the grid of the volume; None: it is brought there if it is needed.
     """
     if labels.shape_ijk != volume.shape_ijk:
         return []
@@ -154,15 +144,7 @@ def _take(labels: LabelMap, volume: Volume, progress: Progress) -> tuple[NDArray
 def check_together(labels: LabelMap, volume: Volume) -> dict[int, float]:
     """Refuse a label map that cannot belong to this scan.
 
-    Returns
-    -------
-    dict of int to float
-        For each number its share of labelled voxels that lie inside the volume, 0 to 1.
-
-    Raises
-    ------
-    RefusedInputError
-        The map is empty, names another frame of reference, or less than 1 % of it lies inside the volume.
+    Returns: For each number its share of labelled voxels that lie inside the volume, 0 to 1.
     """
     if not labels.numbers:
         raise RefusedInputError("the label map is empty: no voxel has a label")

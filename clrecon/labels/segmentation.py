@@ -77,23 +77,9 @@ def read_segmentation(
 ) -> LabelMap:
     """Read a DICOM SEG of binary segments or of a label map.
 
-    Parameters
-    ----------
-    path : Path
-    wanted : Wanted
-        Only the other segments may overlap.
-    progress : callable
-        Called as ``progress("read", frames done, all frames)``.
-    check : callable, optional
-        See `Check`; its errors are those of this function.
-
-    Raises
-    ------
-    UsageError
-        A wanted segment does not exist.
-    RefusedInputError
-        The file is not a SEG or is corrupt, has fractional segments, frames that form no evenly spaced stack or
-        segments that overlap, or is compressed other than by RLE.
+    wanted: Only the other segments may overlap.
+    progress: Called as ``progress("read", frames done, all frames)``.
+    check: See `Check`; its errors are those of this function.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # pydicom's messages quote the file unescaped
@@ -156,13 +142,7 @@ def _read(path: Path, name: str, wanted: Wanted, progress: Progress, check: Chec
 
 
 def _join_maps(voxels: NDArray[Any], stack: FrameStack, pixels: _FramePixels, progress: Progress) -> None:
-    """Read the frames of a label map; frames at one place may each hold some of its segments.
-
-    Raises
-    ------
-    RefusedInputError
-        Two frames give one voxel two segments.
-    """
+    """Read the frames of a label map; frames at one place may each hold some of its segments."""
     written: set[int] = set()
     for frame, k in enumerate(stack.places):
         plane = pixels.read_map(frame)
@@ -295,13 +275,7 @@ class _FramePixels:
         return plane.reshape(layout.rows, layout.columns)
 
     def read_map(self, frame: int) -> NDArray[Any]:
-        """Return frame `frame` of a label map, its background 0.
-
-        Raises
-        ------
-        RefusedInputError
-            The background has another number, and 0 is a segment.
-        """
+        """Return frame `frame` of a label map, its background 0."""
         plane = self.read(frame)
         if not self._background:
             return plane

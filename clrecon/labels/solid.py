@@ -43,22 +43,12 @@ def fill_solid(solid: NDArray[Any], labels: NDArray[Any], number: int, box: Box,
     layer of the mask, the HU decide there: they place the outer surface.  Pores of the cortex are too narrow for a
     path.
 
-    Parameters
-    ----------
-    solid : ndarray, shape (nk, nj, ni)
-        For each sample the label that it is inside of, 0 for none; changed in place.
-    labels : ndarray, shape (nk, nj, ni)
-        The mask, not grown.
-    number : int
-    box : 3 slices
-        Box of the label and at least one sample around it, as `find_boxes` returns it.
-    closed : bool
-        True: everything beyond the border of the volume is outside.
+    solid: ndarray, shape (nk, nj, ni). For each sample the label that it is inside of, 0 for none; changed in place.
+    labels: ndarray, shape (nk, nj, ni). The mask, not grown.
+    box: Box of the label and at least one sample around it, as `find_boxes` returns it.
+    closed: Everything beyond the border of the volume is outside.
 
-    Returns
-    -------
-    int
-        Number of samples that were filled.
+    Returns: Number of samples that were filled.
     """
     from scipy.ndimage import binary_dilation, binary_erosion
 

@@ -35,25 +35,14 @@ _ODD_VOLUME = 0.02
 class LabelFigures(Record):
     """Figures of one label.
 
-    Attributes
-    ----------
-    number : int
-    name : str
-    voxels : int
-        Voxels of the scan that carry the label.
-    ml : float
-        Their volume: each voxel reaches half way to the neighbouring slices.
-    label_ml : float
-        Volume of the label on the map's own grid, which may go beyond the scan.
-    inside_share : float
-        Share of the label's voxels that lie inside the scan, 0 to 1.
-    unmeasured : int
-        Voxels without a finite value; the figures of HU leave them out.
-    mean_hu, sd_hu : float or None
-        Mean and standard deviation over the volume (divided by the whole, not by one voxel less); None without voxels.
-    min_hu, max_hu : float or None
-    percentiles_hu : mapping of str to float or None
-        ``{"5": ...}``: the least HU up to which at least this percentage of the volume lies.
+    voxels: Voxels of the scan that carry the label.
+    ml: Their volume: each voxel reaches half way to the neighbouring slices.
+    label_ml: Volume of the label on the map's own grid, which may go beyond the scan.
+    inside_share: Share of the label's voxels that lie inside the scan, 0 to 1.
+    unmeasured: Voxels without a finite value; the figures of HU leave them out.
+    mean_hu, sd_hu: Mean and standard deviation over the volume (divided by the whole, not by one voxel less); None
+        without voxels.
+    percentiles_hu: ``{"5": ...}``: the least HU up to which at least this percentage of the volume lies.
     """
 
     number: int
@@ -98,13 +87,7 @@ def name_percentile(percent: float) -> str:
 
 
 def check_percentiles(percentiles: Sequence[float]) -> tuple[float, ...]:
-    """Return percentiles in ascending order, each once.
-
-    Raises
-    ------
-    UsageError
-        One of them is not a number from 0 to 100.
-    """
+    """Return percentiles in ascending order, each once."""
     try:
         numbers = [float(percent) for percent in percentiles]
     except (TypeError, ValueError, OverflowError):

@@ -31,13 +31,7 @@ def empty_labels(name: str, shape: tuple[int, int, int]) -> NDArray[np.uint16]:
 
 
 def iterate_labels(grid: GridFile) -> Iterator[NDArray[np.uint16]]:
-    """Yield the slices of `grid` as label numbers, shape (nj, ni) or (nj, ni, layers).
-
-    Raises
-    ------
-    RefusedInputError
-        The data end early, or hold fractions, negative or too large numbers; the message names the slice.
-    """
+    """Yield the slices of `grid` as label numbers, shape (nj, ni) or (nj, ni, layers)."""
     for k, stored in enumerate(grid.iterate_slices()):
         numbers = stored * grid.slope + grid.intercept if grid.scaled else stored
         yield _as_labels(numbers, grid.name, grid.place(k))

@@ -92,23 +92,9 @@ def read_structures(
     `clrecon.labels.contours`.  The label's number is the ROI's.  Of an uneven scan the map has thinner slices, see
     `clrecon.labels.fine_slices`.
 
-    Parameters
-    ----------
-    path : Path
-    volume : Volume or None
-        The scan.
-    wanted : Wanted
-        Only the other ROIs may overlap, and only the wanted ones have to fit the scan.
-    progress : callable
-        Called as ``progress("read", ROIs done, all ROIs)``.
-
-    Raises
-    ------
-    UsageError
-        There is no scan, its slices are too uneven, or a wanted ROI does not exist.
-    RefusedInputError
-        The file is corrupt, a contour lies between the slices or is not parallel to them, the ROI has another frame of
-        reference than the scan, or ROIs overlap.
+    volume: The scan.
+    wanted: Only the other ROIs may overlap, and only the wanted ones have to fit the scan.
+    progress: Called as ``progress("read", ROIs done, all ROIs)``.
     """
     name = escape_text(path.name)
     if volume is None:
@@ -142,12 +128,7 @@ def read_structures(
 
 
 def _check_frames(name: str, structures: dict[int, _Structure], volume: Volume) -> None:
-    """Refuse ROIs of another frame of reference than the scan's; where one of both is not said, nothing is known.
-
-    Raises
-    ------
-    RefusedInputError
-    """
+    """Refuse ROIs of another frame of reference than the scan's; where one of both is not said, nothing is known."""
     ours = volume.report.get("frame_of_reference_hash")
     strange = [one for one in structures.values() if ours and one.frame_hash and one.frame_hash != ours]
     if strange:
@@ -215,12 +196,7 @@ class _Raster:
         return found.inside | fill_contours(exclusive, self._shape)
 
     def refuse_misplaced(self) -> None:
-        """Refuse an ROI whose contours do not lie on the slices.
-
-        Raises
-        ------
-        RefusedInputError
-        """
+        """Refuse an ROI whose contours do not lie on the slices."""
         if self._misplaced:
             raise RefusedInputError(
                 f"{self._file}: {self._misplaced} of {len(self._structure.contours)} contours of {self._shown} lie"
@@ -229,12 +205,7 @@ class _Raster:
             )
 
     def refuse_empty(self) -> None:
-        """Refuse an ROI without any voxel, when all of it was filled.
-
-        Raises
-        ------
-        RefusedInputError
-        """
+        """Refuse an ROI without any voxel, when all of it was filled."""
         if not self._voxels:
             why = "; ".join(self.describe()) or f"{self._shown}: its contours hold no voxel centre"
             raise RefusedInputError(f"{self._file} has no voxel for the label that was chosen: {why}")
@@ -286,13 +257,7 @@ def _allowed_mm(heights: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _points_of(contour: _Contour, file: str, shown: str) -> NDArray[np.float64]:
-    """Return the points (n, 3) of a contour, LPS mm.
-
-    Raises
-    ------
-    RefusedInputError
-        They are no numbers, not three for each point, or not as many as the file says.
-    """
+    """Return the points (n, 3) of a contour, LPS mm."""
     words = contour.data.rstrip(b" \0")
     try:
         numbers = np.array([float(word) for word in words.split(b"\\")] if words else [])
@@ -308,13 +273,7 @@ def _points_of(contour: _Contour, file: str, shown: str) -> NDArray[np.float64]:
 
 
 def _parse(path: Path, name: str) -> dict[int, _Structure]:
-    """Return the ROIs by their numbers.
-
-    Raises
-    ------
-    RefusedInputError
-        The file is corrupt or compressed, or has no ROI.
-    """
+    """Return the ROIs by their numbers."""
     from pydicom.filereader import read_file_meta_info
 
     try:

@@ -36,14 +36,9 @@ def label_ml(labels: LabelMap, number: int) -> float:
 def count_ml(voxels: NDArray[Any], number: int, box: Box, voxel_ml: NDArray[np.float64]) -> float:
     """Return the volume of the voxels of a grid that carry `number`, ml.
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni)
-    number : int
-    box : 3 slices
-        Slices along k, j, i, around all voxels of the label.
-    voxel_ml : ndarray, shape (nk,)
-        See `slice_voxel_ml`.
+    voxels: ndarray, shape (nk, nj, ni)
+    box: Slices along k, j, i, around all voxels of the label.
+    voxel_ml: ndarray, shape (nk,). See `slice_voxel_ml`.
     """
     counts = np.count_nonzero(voxels[box] == number, axis=(1, 2))
     return float(counts @ voxel_ml[box[0]])

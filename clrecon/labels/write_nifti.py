@@ -24,29 +24,14 @@ CARET_CODE = 30
 
 
 def load_nibabel() -> Any:
-    """Import nibabel.
-
-    Raises
-    ------
-    UsageError
-        It is not installed.
-    """
+    """Import nibabel."""
     return import_extra("nibabel", LABEL_MAP)
 
 
 def encode_nifti(labels: LabelMap, *, packed: bool) -> bytes:
     """Return the bytes of the file; the same labels give the same bytes.
 
-    Parameters
-    ----------
-    labels : LabelMap
-    packed : bool
-        True: gzip, as in .nii.gz.
-
-    Raises
-    ------
-    UsageError
-        nibabel is not installed.
+    packed: Gzip, as in .nii.gz.
     """
     nibabel = load_nibabel()
     image = nibabel.Nifti1Image(np.asarray(labels.voxels).transpose(2, 1, 0), None)

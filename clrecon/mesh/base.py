@@ -113,11 +113,6 @@ class BaseMesh(Message):
         """Check every number: indices have a vertex, coordinates and normals are finite.
 
         A mesh is checked when it is made; this is for arrays that were changed since.
-
-        Raises
-        ------
-        UsageError
-            A number is wrong; the message names the first one.
         """
         if self.triangle_count and int(self._triangles.max()) >= self.vertex_count:
             row = int(np.flatnonzero((self._triangles >= self.vertex_count).any(axis=1))[0])
@@ -134,15 +129,11 @@ class BaseMesh(Message):
     def in_space(self, space: str) -> tuple[NDArray[np.floating], NDArray[np.float32] | None]:
         """Return vertices and normals in another patient frame; the mesh itself is always LPS.
 
-        Parameters
-        ----------
-        space : {"lps", "ras"}
-            RAS negates x and y, which is a half turn: the winding of the triangles stays.
+        space: {"lps", "ras"}. RAS negates x and y, which is a half turn: the winding of the triangles stays.
 
-        Returns
-        -------
-        vertices : ndarray, shape (n, 3), mm, of the type of `vertices`
-        normals : ndarray, shape (n, 3), float32, or None
+        Returns:
+        vertices: ndarray, shape (n, 3), mm, of the type of `vertices`
+        normals: ndarray, shape (n, 3), float32, or None
         """
         signs = np.diag(frame_from_lps(space)).astype(np.float32)
         if space.lower() == "lps":
@@ -154,23 +145,12 @@ class BaseMesh(Message):
     def transformed(self: Own, matrix: ArrayLike) -> Own:
         """Return the mesh moved, turned or scaled by an affine; this one stays as it is.
 
-        Parameters
-        ----------
-        matrix : array_like, shape (4, 4)
-            LPS mm to LPS mm; the last row is (0, 0, 0, 1).  A mirror is allowed: triangles are turned round, so that
-            they stay counter-clockwise when seen from outside.
+        matrix: array_like, shape (4, 4). LPS mm to LPS mm; the last row is (0, 0, 0, 1).  A mirror is allowed:
+            triangles are turned round, so that they stay counter-clockwise when seen from outside.
 
-        Returns
-        -------
-        Mesh
-            Normals go through the inverse transpose.  The report has ``moved_by``, the matrix from the place where the
-            scan put the mesh, and no longer the affine and the certificate of the scan: they say nothing of its new
+        Returns: Normals go through the inverse transpose.  The report has ``moved_by``, the matrix from the place where
+            the scan put the mesh, and no longer the affine and the certificate of the scan: they say nothing of its new
             place.
-
-        Raises
-        ------
-        UsageError
-            `matrix` is no affine, or singular.
         """
         checked = checked_affine(matrix)
         normals = self._normals
@@ -221,32 +201,14 @@ class BaseMesh(Message):
         either complete or absent, and an older file of that name is replaced in one step.  It holds no patient data,
         date or path.
 
-        Parameters
-        ----------
-        path : str or path
-            ``.stl``, ``.ply``, ``.obj``, ``.glb``, ``.vtp``, ``.3mf`` or ``.html``, upper or lower case.
-        space : {"lps", "ras"}
-            Patient frame of the coordinates; the file names it.  Units are mm; a node matrix in GLB maps them to the
-            metres, Y up, of glTF.  STL holds only float32, a page 65,536 steps a side, which it names; the other
-            formats keep float64 vertices.
-        no_clobber : bool
-            True: a file of that name stays and is an `OutputError`.
-        keep_ids : bool
-            True: the comments hold the hash of the frame of reference, by which files of one scan are told.
+        path: ``.stl``, ``.ply``, ``.obj``, ``.glb``, ``.vtp``, ``.3mf`` or ``.html``, upper or lower case.
+        space: {"lps", "ras"}. Patient frame of the coordinates; the file names it.  Units are mm; a node matrix in GLB
+            maps them to the metres, Y up, of glTF.  STL holds only float32, a page 65,536 steps a side, which it names;
+            the other formats keep float64 vertices.
+        no_clobber: A file of that name stays and is an `OutputError`.
+        keep_ids: The comments hold the hash of the frame of reference, by which files of one scan are told.
 
-        Returns
-        -------
-        int
-            Size of the file in bytes.
-
-        Raises
-        ------
-        UsageError
-            Unknown extension or space, or the mesh fails `check`.
-        NoSurfaceError
-            The mesh has no triangle.
-        OutputError
-            The file cannot be written; an older one of that name is intact.
+        Returns: Size of the file in bytes.
         """
         with keep_existing(no_clobber):
             return write_mesh(self, path, space, keep_ids=keep_ids)

@@ -45,15 +45,11 @@ product, by up to 1 where triangles are long and thin."""
 class _Chosen:
     """Components of a mesh, and which of them are kept.
 
-    Attributes
-    ----------
-    label_of_vertex, label_of_triangle : ndarray, int64
-        Number of the component; -1 for vertices that no triangle uses.
-    ranked : ndarray, shape (count,), int64
-        Components from the largest area to the smallest, see `_rank`; in their own order if no rank was asked for.
-    keep : ndarray, shape (count,), bool
-    facts : dict
-        Entries for the report of the result.
+    label_of_vertex, label_of_triangle: ndarray, int64. Number of the component; -1 for vertices that no triangle uses.
+    ranked: ndarray, shape (count,), int64. Components from the largest area to the smallest, see `_rank`; in their own
+        order if no rank was asked for.
+    keep: ndarray, shape (count,), bool
+    facts: Entries for the report of the result.
     """
 
     label_of_vertex: NDArray[np.int64]
@@ -79,36 +75,18 @@ def select_components(
     border of the scan encloses nothing, and the wall of a cavity has a negative volume.  The wall of a cavity is a
     component of its own; where it is dropped, the cavity is filled.
 
-    Parameters
-    ----------
-    mesh : Mesh
-    keep_largest : int, optional
-        Keep this number of components, those of largest area.  If areas are equal within the rounding of the
+    keep_largest: Keep this number of components, those of largest area.  If areas are equal within the rounding of the
         coordinates, the first component in the mesh is kept.
-    min_volume_ml : float, optional
-        Keep components that enclose at least this volume, regardless of sign.  The volume of an open component is
-        measured as if its rim were joined to the mean of its corners.
-    seeds : sequence of (x, y, z)
-        Keep the components whose surface lies nearest to one of these points, LPS mm.
-    labelled : (int, ndarray), optional
-        Result of `label_components` for this mesh, if it is already known (a device finds it faster).
-    among : ndarray, shape (count,), bool, optional
-        True for components of `labelled` that may be kept.
+    min_volume_ml: Keep components that enclose at least this volume, regardless of sign.  The volume of an open
+        component is measured as if its rim were joined to the mean of its corners.
+    seeds: sequence of (x, y, z). Keep the components whose surface lies nearest to one of these points, LPS mm.
+    labelled: (int, ndarray). Result of `label_components` for this mesh, if it is already known (a device finds it
+        faster).
+    among: ndarray, shape (count,), bool. True for components of `labelled` that may be kept.
 
-    Returns
-    -------
-    Mesh
-        Vertices and triangles keep their order, normals and report are taken over; the mesh itself when nothing is
+    Returns: Vertices and triangles keep their order, normals and report are taken over; the mesh itself when nothing is
         dropped.  Its report has ``components_found`` and ``components_kept``, and with seeds ``seed_distances_mm``: how
         far the surface lies from each.
-
-    Raises
-    ------
-    UsageError
-        `keep_largest` below 1, `min_volume_ml` negative or not a number, or a seed is not a point, or farther than 20
-        mm from every component.
-    NoSurfaceError
-        The mesh is empty or no component is large enough; the message states the largest.
     """
     chosen = _choose(mesh, keep_largest, min_volume_ml, seeds, labelled, among)
     if chosen.keep.all():
@@ -129,25 +107,12 @@ def split_components(
 ) -> list[Own]:
     """Split a surface into its components.
 
-    Parameters
-    ----------
-    mesh, keep_largest, min_volume_ml, seeds, labelled, among
-        As in `select_components`; components that it would drop are left out.
-    most : int, optional
-        Refuse more components than this.
+    mesh, keep_largest, min_volume_ml, seeds, labelled, among: As in `select_components`; components that it would drop
+        are left out.
+    most: Refuse more components than this.
 
-    Returns
-    -------
-    list of Mesh
-        One mesh for each component, the largest area first (the first of equal ones). Vertices and triangles keep their
-        order, normals and report are taken over.
-
-    Raises
-    ------
-    UsageError
-        As `select_components`, or there are more than `most` components.
-    NoSurfaceError
-        As `select_components`.
+    Returns: One mesh for each component, the largest area first (the first of equal ones). Vertices and triangles keep
+        their order, normals and report are taken over.
     """
     chosen = _choose(mesh, keep_largest, min_volume_ml, seeds, labelled, among, rank=True)
     kept = np.flatnonzero(chosen.keep)
@@ -243,12 +208,8 @@ def _rank(areas: NDArray[np.float64], step: float) -> NDArray[np.int64]:
 
     Areas are equal when they differ from the first of their group by no more than rounding explains.
 
-    Parameters
-    ----------
-    areas : ndarray, shape (count,), float64
-        mm2.
-    step : float
-        Rounding step of the coordinates, mm: `rounding_step`.
+    areas: ndarray, shape (count,), float64. mm2.
+    step: Rounding step of the coordinates, mm: `rounding_step`.
     """
     ranked = np.argsort(-areas, kind="stable")
     falling = areas[ranked]

@@ -34,20 +34,14 @@ IntArray = NDArray[np.integer]
 class Edges:
     """The edges of a mesh; half-edges that start and end at one vertex are left out.
 
-    Attributes
-    ----------
-    count : int
-        Number of different edges.
-    boundary, nonmanifold : int
-        Edges with exactly one face, and with more than two.
-    oriented : bool
-        No two faces run along an edge in the same direction.
-    half_edges : ndarray, int32 or int64
-        All half-edges, those of one edge side by side, first those that run to the higher vertex number.
-    first : ndarray, int64, shape (count,)
-        Index in `half_edges` at which those of an edge begin.
-    ends : ndarray, uint32, shape (2, count)
-        Lower and higher vertex number of each edge; edges are in order of the lower, then of the higher one.
+    count: Number of different edges.
+    boundary, nonmanifold: Edges with exactly one face, and with more than two.
+    oriented: No two faces run along an edge in the same direction.
+    half_edges: ndarray, int32 or int64. All half-edges, those of one edge side by side, first those that run to the
+        higher vertex number.
+    first: ndarray, int64, shape (count,). Index in `half_edges` at which those of an edge begin.
+    ends: ndarray, uint32, shape (2, count). Lower and higher vertex number of each edge; edges are in order of the
+        lower, then of the higher one.
     """
 
     count: int
@@ -93,16 +87,11 @@ def order_by_number(numbers: IntArray, size: int) -> IntArray:
 class Fans:
     """The triangles around each vertex.
 
-    Parameters
-    ----------
-    triangles : ndarray, shape (m, 3), uint32
-    vertex_count : int
+    triangles: ndarray, shape (m, 3), uint32
 
-    Attributes
-    ----------
-    rows : ndarray, shape (3 * m,), int
-        Triangles, those around vertex v from ``begin[v]`` to ``begin[v + 1]``, in their order.
-    begin : ndarray, shape (vertex_count + 1,), int64
+    rows: ndarray, shape (3 * m,), int. Triangles, those around vertex v from ``begin[v]`` to ``begin[v + 1]``, in their
+        order.
+    begin: ndarray, shape (vertex_count + 1,), int64
     """
 
     def __init__(self, triangles: NDArray[np.uint32], vertex_count: int):
@@ -172,13 +161,8 @@ def find_split_vertices(
 ) -> IntArray:
     """Find the vertices whose faces form several fans, for example the waist of an hourglass.
 
-    Parameters
-    ----------
-    triangles : ndarray, shape (m, 3), uint32
-    vertex_count : int
-    edges : Edges
-    opposite : ndarray, optional
-        Result of `opposite_half_edges`; with it the faces around each vertex are counted by going round it once.
+    triangles: ndarray, shape (m, 3), uint32
+    opposite: Result of `opposite_half_edges`; with it the faces around each vertex are counted by going round it once.
     """
     corners = triangles.reshape(-1)
     degree = np.bincount(corners, minlength=vertex_count)
@@ -228,19 +212,13 @@ def label_components(
 ) -> tuple[int, NDArray[np.int64]]:
     """Number the components: triangles that share a vertex belong to one component.
 
-    Parameters
-    ----------
-    triangles : ndarray, shape (m, 3), uint32
-    vertex_count : int
-    edges : Edges, optional
-        If they are already known, labelling takes a third of the time.
+    triangles: ndarray, shape (m, 3), uint32
+    edges: If they are already known, labelling takes a third of the time.
 
-    Returns
-    -------
-    count : int
-        Number of components, not counting vertices that no triangle uses.
-    labels : ndarray, shape (vertex_count,), int64
-        Component of each vertex, numbered in order of the first vertex; -1 for unused vertices.
+    Returns:
+    count: Number of components, not counting vertices that no triangle uses.
+    labels: ndarray, shape (vertex_count,), int64. Component of each vertex, numbered in order of the first vertex; -1
+        for unused vertices.
     """
     used = np.zeros(vertex_count, dtype=bool)
     used[triangles.reshape(-1)] = True

@@ -56,19 +56,12 @@ def find_self_intersections(
     lie in one plane on the same side of it.  Corners at the same place are common; triangles with three common corners,
     without area, or with a corner that is not finite, are left out.  The signs of all volumes and areas are exact.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), mm
-    triangles : ndarray, shape (m, 3), uint32
-    changed : ndarray, shape (m,), bool, optional
-        Only pairs with one of these are examined.
-    steps : Steps, optional
-        Counts the triangles.
+    vertices: ndarray, shape (n, 3), mm
+    triangles: ndarray, shape (m, 3), uint32
+    changed: ndarray, shape (m,), bool. Only pairs with one of these are examined.
+    steps: Counts the triangles.
 
-    Returns
-    -------
-    ndarray, shape (k, 2), int64
-        Numbers of triangles.
+    Returns: ndarray, shape (k, 2), int64. Numbers of triangles.
     """
     sound = np.isfinite(vertices).all(axis=1)
     if not sound.all():
@@ -132,18 +125,13 @@ def find_changed_intersections(
 ) -> NDArray[np.int64]:
     """Find the pairs of triangles that cut each other and of which one has changed.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), mm
-    triangles : ndarray, shape (m, 3), uint32
-    changed : ndarray, shape (m,), bool
-    find_crossings : callable
-        `find_self_intersections`, or what finds the same elsewhere.  It is not needed where few have changed.
+    vertices: ndarray, shape (n, 3), mm
+    triangles: ndarray, shape (m, 3), uint32
+    changed: ndarray, shape (m,), bool
+    find_crossings: `find_self_intersections`, or what finds the same elsewhere.  It is not needed where few have
+        changed.
 
-    Returns
-    -------
-    ndarray, shape (k, 2), int64
-        As of `find_self_intersections`.
+    Returns: ndarray, shape (k, 2), int64. As of `find_self_intersections`.
     """
     if not changed.any():
         return np.zeros((0, 2), dtype=np.int64)
@@ -158,15 +146,11 @@ def find_beside(
 ) -> NDArray[np.bool_]:
     """Find the changed triangles and those that can touch one of them: whose box shares a coarse cell with one.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), mm
-    triangles : ndarray, shape (m, 3), uint32
-    changed : ndarray, shape (m,), bool
+    vertices: ndarray, shape (n, 3), mm
+    triangles: ndarray, shape (m, 3), uint32
+    changed: ndarray, shape (m,), bool
 
-    Returns
-    -------
-    ndarray, shape (m,), bool
+    Returns: ndarray, shape (m,), bool
     """
     if np.count_nonzero(changed) > _FEW * len(triangles):
         return np.ones(len(triangles), dtype=bool)
@@ -199,16 +183,11 @@ def find_beside(
 class _Entries:
     """Triangles in the cells of a grid, those of a cell side by side: a triangle is in all cells that its box meets.
 
-    Attributes
-    ----------
-    triangle : ndarray, shape (e,), int64
-    cell : ndarray, shape (3, e), int32
-    later : ndarray, shape (e,), int64
-        Number of entries of the same cell that follow.
-    low, high : ndarray, shape (3, e), float32, mm
-        Box of the triangle, rounded outward.
-    first : ndarray, shape (3, m), int32
-        Lowest cell of each triangle.
+    triangle: ndarray, shape (e,), int64
+    cell: ndarray, shape (3, e), int32
+    later: ndarray, shape (e,), int64. Number of entries of the same cell that follow.
+    low, high: ndarray, shape (3, e), float32, mm. Box of the triangle, rounded outward.
+    first: ndarray, shape (3, m), int32. Lowest cell of each triangle.
     """
 
     triangle: NDArray[np.int64]
@@ -250,10 +229,8 @@ class _Entries:
 class _Planes:
     """Planes of triangles: a corner x is surely above one where normal . x - offset > slack, below where < -slack.
 
-    Attributes
-    ----------
-    normal : ndarray, shape (3, m), float64
-    offset, slack : ndarray, shape (m,), float64
+    normal: ndarray, shape (3, m), float64
+    offset, slack: ndarray, shape (m,), float64
     """
 
     normal: Float64Array

@@ -23,21 +23,13 @@ def find_nearest_triangle(
     The box around a triangle is never farther away than the triangle, and its nearest corner is never nearer.  So only
     triangles whose box is nearer than the nearest of all corners are measured exactly.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), float32 or float64
-        mm.
-    triangles : ndarray, shape (m, 3), uint32
-        At least one, every index below n.
-    point : ndarray, shape (3,), float64
-        mm.
+    vertices: ndarray, shape (n, 3), float32 or float64. mm.
+    triangles: ndarray, shape (m, 3), uint32. At least one, every index below n.
+    point: ndarray, shape (3,), float64. mm.
 
-    Returns
-    -------
-    triangle : int
-        Row of `triangles`; of several that are equally near, up to the rounding of the coordinates, the first.
-    distance : float
-        mm.
+    Returns:
+    triangle: Row of `triangles`; of several that are equally near, up to the rounding of the coordinates, the first.
+    distance: mm.
     """
     columns = np.ascontiguousarray(vertices.T.astype(np.float64)) - point[:, None]
     corner_distance = np.einsum("ij,ij->j", columns, columns)

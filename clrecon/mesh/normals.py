@@ -15,15 +15,10 @@ def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
 
     These normals do not depend on how the surface is divided into triangles (Thuermer and Wuethrich 1998).
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), float32 or float64
-    triangles : ndarray, shape (m, 3), uint32
+    vertices: ndarray, shape (n, 3), float32 or float64
+    triangles: ndarray, shape (m, 3), uint32
 
-    Returns
-    -------
-    ndarray, shape (n, 3), float32
-        Unit vectors; (0, 0, 1) where a vertex has no face or its faces cancel.
+    Returns: ndarray, shape (n, 3), float32. Unit vectors; (0, 0, 1) where a vertex has no face or its faces cancel.
     """
     total = np.zeros((3, len(vertices)))
     for where, _, p, q in corner_edges(vertices, triangles, np.zeros(3)):

@@ -16,19 +16,12 @@ __all__ = ["find_pieces", "measure_components"]
 def find_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32], most: int) -> Pieces:
     """Divide a surface into its components of largest area, and one part of all others.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3)
-        mm.
-    triangles : ndarray, shape (m, 3), uint32
-    most : int
-        Components that are parts of their own.  1: the surface is one part, whatever its components.
+    vertices: ndarray, shape (n, 3). mm.
+    triangles: ndarray, shape (m, 3), uint32
+    most: Components that are parts of their own.  1: the surface is one part, whatever its components.
 
-    Returns
-    -------
-    Pieces
-        The largest area first.  The volume of an open component is measured as if its rim were joined to the mean of
-        its corners; that of all others together is the sum, regardless of sign.
+    Returns: The largest area first.  The volume of an open component is measured as if its rim were joined to the mean
+        of its corners; that of all others together is the sum, regardless of sign.
     """
     if most == 1:
         whole = np.zeros(len(triangles), dtype=np.int64)

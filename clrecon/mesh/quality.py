@@ -28,45 +28,25 @@ __all__ = ["MeshQuality", "measure_quality", "measure_triangles"]
 class MeshQuality(Record):
     """The figures of a triangle surface.
 
-    Attributes
-    ----------
-    vertices, triangles : int
-    closed : bool
-        There are triangles and every edge is in exactly two, also after coincident vertices are joined, as readers of
-        STL do.
-    manifold : bool
-        No edge in more than two faces, no two faces along an edge in one direction, the faces around every vertex one
-        fan, no face with a vertex twice.
-    oriented : bool
-        No two faces run along an edge in the same direction.
-    boundary_edges, nonmanifold_edges : int
-        Edges in one face, in more than two.
-    nonmanifold_vertices : int
-        Vertices whose faces form several fans.
-    coincident_vertices : int
-        Used vertices that coincide with another one.
-    open_edges_by_place : int
-        Edges that are not in exactly two faces after coincident vertices are joined.
-    components : int
-        Parts that share no vertex.
-    euler_number : int
-        Used vertices - edges + faces.
-    genus : int or None
-        Handles of all parts together; None if not closed and manifold.
-    zero_area_faces, duplicate_faces, unused_vertices : int
-    shortest_edge_mm : float or None
-        None without edges.
-    area_mm2 : float
-    volume_ml : float
-        Enclosed volume, signed: cavities count negative, a surface turned inside out is negative as a whole.  Means
-        nothing unless `closed`: it is then relative to the centre of the bounds.
-    outward : bool
-        The volume is positive.
-    bounds_mm : [[x, y, z], [x, y, z]] or None
-        Lowest and highest corner; None without vertices.
-    self_intersections : int or None
-        Pairs of triangles that cut or touch each other beside common corners, or overlap in one plane, as CGAL counts
-        them.  ``mesh.quality()`` does not look for them: None.  A strict mesh job does.
+    closed: There are triangles and every edge is in exactly two, also after coincident vertices are joined, as readers
+        of STL do.
+    manifold: No edge in more than two faces, no two faces along an edge in one direction, the faces around every vertex
+        one fan, no face with a vertex twice.
+    oriented: No two faces run along an edge in the same direction.
+    boundary_edges, nonmanifold_edges: Edges in one face, in more than two.
+    nonmanifold_vertices: Vertices whose faces form several fans.
+    coincident_vertices: Used vertices that coincide with another one.
+    open_edges_by_place: Edges that are not in exactly two faces after coincident vertices are joined.
+    components: Parts that share no vertex.
+    euler_number: Used vertices - edges + faces.
+    genus: Handles of all parts together; None if not closed and manifold.
+    shortest_edge_mm: None without edges.
+    volume_ml: Enclosed volume, signed: cavities count negative, a surface turned inside out is negative as a whole.
+        Means nothing unless `closed`: it is then relative to the centre of the bounds.
+    outward: The volume is positive.
+    bounds_mm: [[x, y, z], [x, y, z]] or None. Lowest and highest corner; None without vertices.
+    self_intersections: Pairs of triangles that cut or touch each other beside common corners, or overlap in one plane,
+        as CGAL counts them.  ``mesh.quality()`` does not look for them: None.  A strict mesh job does.
     """
 
     vertices: int
@@ -96,21 +76,8 @@ class MeshQuality(Record):
 def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> MeshQuality:
     """Measure a triangle surface.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), float32 or float64
-        Millimetres.
-    triangles : ndarray, shape (m, 3), uint32
-        Indices of vertices.
-
-    Returns
-    -------
-    MeshQuality
-
-    Raises
-    ------
-    UsageError
-        A triangle refers to a vertex that does not exist.
+    vertices: ndarray, shape (n, 3), float32 or float64. Millimetres.
+    triangles: ndarray, shape (m, 3), uint32. Indices of vertices.
     """
     vertex_count, triangle_count = len(vertices), len(triangles)
     if triangle_count and int(triangles.max()) >= vertex_count:

@@ -19,13 +19,10 @@ def corner_edges(
 
     Differences of float32 coordinates and their products are exact in float64.
 
-    Yields
-    ------
-    where : slice
-        The triangles of this piece.
-    corner, p, q : ndarray, shape (3, k), float64
-        One row each for x, y, z, mm; `corner` is relative to `origin`, `p` is the edge to the second corner, `q` to the
-        third.
+    Yields:
+    where: The triangles of this piece.
+    corner, p, q: ndarray, shape (3, k), float64. One row each for x, y, z, mm; `corner` is relative to `origin`, `p` is
+        the edge to the second corner, `q` to the third.
     """
     columns = np.ascontiguousarray(vertices.T.astype(np.float64))
     for where in chunks(len(triangles), size):
@@ -56,12 +53,10 @@ def cross_products(
     six times the signed volume of the tetrahedron over the origin (divergence theorem). With float32 coordinates, c is
     zero exactly for triangles without area.
 
-    Yields
-    ------
-    where : slice
-        The triangles of this piece.
-    corner, cross : ndarray, shape (3, k), float64
-        One row each for x, y, z; `corner` is relative to `origin`, mm; `cross` is mm2.
+    Yields:
+    where: The triangles of this piece.
+    corner, cross: ndarray, shape (3, k), float64. One row each for x, y, z; `corner` is relative to `origin`, mm;
+        `cross` is mm2.
     """
     for where, corner, p, q in corner_edges(vertices, triangles, origin, size):
         yield where, corner, cross_product(p, q)

@@ -22,10 +22,8 @@ LINE_TOLERANCE = 1e-9
 class CellLocator:
     """Search for triangles of a surface by place, with `vtkStaticCellLocator`.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), mm, near zero
-    triangles : ndarray, shape (m, 3), uint32, at least one
+    vertices: ndarray, shape (n, 3), mm, near zero
+    triangles: ndarray, shape (m, 3), uint32, at least one
     """
 
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
@@ -113,13 +111,7 @@ def wrap_polydata(
 
 
 def unwrap_polydata(polydata: Any) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None, str | None]:
-    """Points, triangles, normals and the frame that a ``pyvista.PolyData`` names; see `Mesh.from_pyvista`.
-
-    Raises
-    ------
-    UsageError
-        It is no PolyData, or has no faces.
-    """
+    """Points, triangles, normals and the frame that a ``pyvista.PolyData`` names; see `Mesh.from_pyvista`."""
     import pyvista
 
     found = pyvista.wrap(polydata) if hasattr(polydata, "GetPolys") else polydata

@@ -54,13 +54,7 @@ def upload(device: Device, array: NDArray[Any]) -> Any:
 def copy_buffer(
     device: Device, source_d: Any, target_d: Any, size: int, offset: int = 0, source_offset: int = 0
 ) -> None:
-    """Copy `size` bytes of a buffer, from byte `source_offset` on, to byte `offset` of another one on the same device.
-
-    Raises
-    ------
-    DeviceError
-        The device failed.
-    """
+    """Copy `size` bytes of a buffer, from byte `source_offset` on, to byte `offset` of another one on the same device."""
     cl = import_pyopencl()
     try:
         with device.lock:
@@ -86,13 +80,7 @@ def empty_output(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> tu
 
 
 def download(device: Device, array: NDArray[Any], array_d: Any, offset: int = 0) -> NDArray[Any]:
-    """Wait for the device and return `array` with the contents of `array_d` from byte `offset` on.
-
-    Raises
-    ------
-    DeviceError
-        The device failed.
-    """
+    """Wait for the device and return `array` with the contents of `array_d` from byte `offset` on."""
     cl = import_pyopencl()
     if not array.nbytes:
         return array

@@ -17,10 +17,7 @@ __all__ = ["Command", "CommandFailedError", "Commands", "has_hung_commands", "ke
 class CommandFailedError(Exception):
     """A command failed while the device worked on it.
 
-    Attributes
-    ----------
-    code : int
-        OpenCL's number of the error.
+    code: OpenCL's number of the error.
     """
 
     def __init__(self, code: int):
@@ -31,13 +28,8 @@ class CommandFailedError(Exception):
 class Command(NamedTuple):
     """A kernel or a transfer that was enqueued.
 
-    Attributes
-    ----------
-    what : str
-        For messages, such as "kernel emit_vertices".
-    event, queue : pyopencl objects
-    held : tuple
-        Buffers and arrays that the command uses.
+    what: For messages, such as "kernel emit_vertices".
+    held: Buffers and arrays that the command uses.
     """
 
     what: str
@@ -82,13 +74,7 @@ class Commands:
         return next((command for command in commands if command.is_running), None)
 
     def forget(self, last: Command) -> None:
-        """Forget the commands up to `last`, which has ended, so that all before have ended too.
-
-        Raises
-        ------
-        CommandFailedError
-            One of them failed.
-        """
+        """Forget the commands up to `last`, which has ended, so that all before have ended too."""
         with self._lock:
             commands = self._waiting
             count = commands.index(last) + 1 if last in commands else 0

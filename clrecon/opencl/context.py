@@ -86,45 +86,27 @@ class _Opened:
 class Device:
     """An OpenCL device; context and queue are made at first use.
 
-    Attributes
-    ----------
-    index : int
-        Index in ``clrecon.devices()``; this number chooses the device.
-    name, platform, type, version, driver : str
-        `type` is "gpu", "accelerator", "cpu" or "custom"; `platform` is the platform's name.
-    memory_bytes, max_allocation_bytes : int
-        All memory of the device, and the largest single buffer.
-    compute_units : int
-    most_steps : int or None
-        Steps after which the loops of a work-item end whatever they have done, see `quirks.most_steps`.
-    is_simulator : bool
-        A checking simulator such as Oclgrind: used only when it is named.
-    shortcoming : str
-        Why the device cannot be used; empty if it can.
-    fault : str or None
-        What the check at first use found wrong, empty if nothing; None before the check.
-    keeps_binaries : bool
-        Built programs are kept for the next process by `clrecon.opencl.cache.binaries`: the driver keeps none.
-    known_good : KnownGood or None
-        The check of the programs that PoCL keeps; None for other drivers, and where nothing is kept.
-    kernel_variants : dict of str to str
-        ``-D`` definitions for kernels that are written for vectors, see `quirks.kernel_variants`.
-    first_header : str
-        Header that stands before every kernel file, see `quirks.first_header`; empty for none.
-    build_options : tuple of str
-        Options for every program.  In caches that several computers share, they distinguish CPUs that the driver does
-        not.
-    lock : threading.RLock
-        Held while a kernel gets its arguments and is enqueued: kernels are shared between threads.
-    stand_in : Device or None
-        The CPU device that takes over if this one fails, see `clrecon.opencl.stand_in`; None for a device that was
-        named.
-    handed_over : list of str
-        The warning that says so, once it did.
-    commands : Commands
-        What is in the queue; `clrecon.opencl.waiting` waits for it.
-    trace : callable or None
-        Told in words what is done, before a kernel file is built or a kernel is launched; each launch is then waited
+    index: Index in ``clrecon.devices()``; this number chooses the device.
+    name, platform, type, version, driver: `type` is "gpu", "accelerator", "cpu" or "custom"; `platform` is the
+        platform's name.
+    memory_bytes, max_allocation_bytes: All memory of the device, and the largest single buffer.
+    most_steps: Steps after which the loops of a work-item end whatever they have done, see `quirks.most_steps`.
+    is_simulator: A checking simulator such as Oclgrind: used only when it is named.
+    shortcoming: Why the device cannot be used; empty if it can.
+    fault: What the check at first use found wrong, empty if nothing; None before the check.
+    keeps_binaries: Built programs are kept for the next process by `clrecon.opencl.cache.binaries`: the driver keeps
+        none.
+    known_good: The check of the programs that PoCL keeps; None for other drivers, and where nothing is kept.
+    kernel_variants: ``-D`` definitions for kernels that are written for vectors, see `quirks.kernel_variants`.
+    first_header: Header that stands before every kernel file, see `quirks.first_header`; empty for none.
+    build_options: Options for every program.  In caches that several computers share, they distinguish CPUs that the
+        driver does not.
+    lock: Held while a kernel gets its arguments and is enqueued: kernels are shared between threads.
+    stand_in: The CPU device that takes over if this one fails, see `clrecon.opencl.stand_in`; None for a device that
+        was named.
+    handed_over: The warning that says so, once it did.
+    commands: What is in the queue; `clrecon.opencl.waiting` waits for it.
+    trace: Told in words what is done, before a kernel file is built or a kernel is launched; each launch is then waited
         for.  For the self-test, which has to say what a driver crashed in.
     """
 
@@ -222,13 +204,7 @@ class Device:
 
     @property
     def context(self) -> Any:
-        """The pyopencl context of this device alone.
-
-        Raises
-        ------
-        DeviceError
-            The driver refuses.
-        """
+        """The pyopencl context of this device alone."""
         cl = quirks.import_pyopencl()
         self._refuse_fork()
         with self.lock:
@@ -290,14 +266,9 @@ class Device:
     def fail(self, what: str, error: Exception, *, is_late: bool = False) -> DeviceError:
         """Return the error for a failed call, and give the context up: a lost device needs a new one.
 
-        Parameters
-        ----------
-        what : str
-            What failed.
-        error : Exception
-            Error of the driver.
-        is_late : bool
-            The driver had accepted the command before.
+        what: What failed.
+        error: Error of the driver.
+        is_late: The driver had accepted the command before.
         """
         self.give_up()
         log.info("%s on %s: %s; its context is given up", what, self.label, describe_error(error))

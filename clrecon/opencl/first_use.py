@@ -48,12 +48,8 @@ _under_check: list[Any] = []
 def register(check: Callable[[Device], str], *command: str) -> None:
     """Set the check: a function that returns what is wrong with a device, empty if nothing is.
 
-    Parameters
-    ----------
-    check : callable
-    *command : str
-        Arguments of the Python interpreter that make the same check; the index of a device follows.  The last line of
-        its output is the answer as JSON.
+    *command: Arguments of the Python interpreter that make the same check; the index of a device follows.  The last
+        line of its output is the answer as JSON.
     """
     _check[:] = [check]
     _command[:] = command

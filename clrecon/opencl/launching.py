@@ -85,26 +85,11 @@ def launch(
 ) -> None:
     """Enqueue `kernel` over at least `items` work-items.
 
-    Parameters
-    ----------
-    device : Device
-    kernel : Kernel
-        Kernel of a program, see `load_program`.
-    items : int
-        Number of work-items; rounded up to whole groups of `Device.group_size`, so kernels check their bounds first.
-    stopwatch : Stopwatch, optional
-        Records the time.
-    **arguments
-        The kernel's arguments, by their names in its source: buffers, numbers, and four numbers for a float4. Numbers
-        are converted to the types in the source.
-
-    Raises
-    ------
-    TypeError
-        An argument is missing or unknown, or its value does not fit its type; where the device has a `trace`, also a
-        buffer for reading alone in the place of one that is written.
-    DeviceError
-        The driver refuses; the message names the kernel and the sizes.
+    kernel: Kernel of a program, see `load_program`.
+    items: Number of work-items; rounded up to whole groups of `Device.group_size`, so kernels check their bounds first.
+    stopwatch: Records the time.
+    **arguments: The kernel's arguments, by their names in its source: buffers, numbers, and four numbers for a float4.
+        Numbers are converted to the types in the source.
     """
     cl = import_pyopencl()
     group = device.group_size

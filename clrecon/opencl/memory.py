@@ -22,14 +22,9 @@ def _mib(size: int, up: bool = False) -> str:
 class MemoryLimits:
     """The memory that may be taken on a device.
 
-    Attributes
-    ----------
-    label : str
-        Name of the device, for messages.
-    device_bytes, device_buffer_bytes : int
-        Memory of the device for all buffers together, and for the largest single one.
-    asked_bytes : int, optional
-        Bytes that the user allows, if less.
+    label: Name of the device, for messages.
+    device_bytes, device_buffer_bytes: Memory of the device for all buffers together, and for the largest single one.
+    asked_bytes: Bytes that the user allows, if less.
     """
 
     label: str
@@ -60,12 +55,7 @@ class MemoryLimits:
 
 
 def check_memory(memory: int | None) -> None:
-    """Refuse a value that is not a byte count of at least 1; None stands for all memory of the device.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse a value that is not a byte count of at least 1; None stands for all memory of the device."""
     if memory is not None and (isinstance(memory, bool) or not isinstance(memory, int) or memory < 1):
         raise UsageError(f"memory is a whole number of bytes, not {memory!r}")
 
@@ -97,26 +87,11 @@ def check_budget(
 ) -> int:
     """Check that all `buffers` fit the device together and each alone.
 
-    Parameters
-    ----------
-    device : Device
-    buffers : mapping of str to int
-        Bytes of all buffers that exist at the same time, by description.
-    memory : int, optional
-        Bytes that may be taken on the device; None is all of its memory.
-    less_may_fit : bool
-        The caller can do the work in smaller parts.
+    buffers: Bytes of all buffers that exist at the same time, by description.
+    memory: Bytes that may be taken on the device; None is all of its memory.
+    less_may_fit: The caller can do the work in smaller parts.
 
-    Returns
-    -------
-    int
-        The sum in bytes.
-
-    Raises
-    ------
-    DeviceError
-        A buffer exceeds the device's largest allocation, or the sum exceeds its memory or the user's limit.  It is a
-        `DeviceMemoryError` where less may fit, and a `DeviceFailedError` where another device may have room.
+    Returns: The sum in bytes.
     """
     limits = memory_limits(device, memory)
     shortage = describe_shortage(limits, buffers)

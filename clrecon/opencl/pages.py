@@ -43,10 +43,7 @@ class _Loan(np.ndarray[Any, np.dtype[Any]]):
 class PagePool:
     """Blocks of memory that are lent as numpy arrays and return automatically.
 
-    Parameters
-    ----------
-    spare_bytes : int
-        Most bytes of unused memory that are kept.
+    spare_bytes: Most bytes of unused memory that are kept.
     """
 
     def __init__(self, spare_bytes: int = SPARE_BYTES):
@@ -61,13 +58,7 @@ class PagePool:
             return sum(map(len, self._spare))
 
     def empty(self, shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
-        """Return an uninitialised array, C-contiguous, aligned for every vector type.
-
-        Raises
-        ------
-        MemoryError
-            The system does not provide that much memory.
-        """
+        """Return an uninitialised array, C-contiguous, aligned for every vector type."""
         dtype = np.dtype(dtype)
         count = int(np.prod(shape, dtype=object))
         size = count * dtype.itemsize

@@ -65,12 +65,7 @@ def _take_float4(numbers: Any) -> Any:
 class Kernel:
     """A kernel of a built program, with its arguments.
 
-    Attributes
-    ----------
-    name : str
-    arguments : tuple of KernelArgument
-        In the kernel's order.
-    cl_kernel : pyopencl.Kernel
+    arguments: In the kernel's order.
     """
 
     def __init__(self, cl_kernel: Any, arguments: tuple[KernelArgument, ...]):
@@ -97,15 +92,7 @@ class Kernel:
     def order(self, values: Mapping[str, Any]) -> tuple[Any, ...]:
         """Return the arguments as the driver takes them: in the kernel's order, with numbers in its types.
 
-        Parameters
-        ----------
-        values : mapping of str to buffer, number or four numbers
-            One for each argument, by name.
-
-        Raises
-        ------
-        TypeError
-            A name is missing or unknown, or a value does not fit its argument.
+        values: One for each argument, by name.
         """
         if values.keys() != self._expected:
             raise TypeError(self._describe_difference(values))
@@ -160,18 +147,8 @@ class Program:
 def load_program(device: Device, name: str, variants: Mapping[str, str] | None = None) -> Program:
     """Build kernel file `name` for `device`, or return what an earlier call built.
 
-    Parameters
-    ----------
-    device : Device
-    name : str
-        For example ``"surface/marching_cubes.cl"``.
-    variants : mapping of str to str, optional
-        ``-D`` definitions; only for variants such as the element type, never for sizes.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses; the message holds its first complaint, the log follows in ``__cause__``.
+    name: For example ``"surface/marching_cubes.cl"``.
+    variants: ``-D`` definitions; only for variants such as the element type, never for sizes.
     """
     chosen = (f"-D{macro}={value}" for macro, value in sorted((variants or {}).items()))
     options = (*device.build_options, *chosen)

@@ -46,11 +46,6 @@ def import_pyopencl() -> Any:
     pyopencl 2026.1 reads PYOPENCL_CACHE_FAILURE_FATAL without a default when its binary cache cannot be used
     (read-only home, Oclgrind): the KeyError then hides the cause.  It does not know what PYOPENCL_NO_CACHE set to
     nothing means.
-
-    Raises
-    ------
-    DeviceError
-        PYOPENCL_NO_CACHE is no truth value, or the number of PoCL's threads none that it can have.
     """
     _check_thread_counts()
     os.environ.setdefault("PYOPENCL_CACHE_FAILURE_FATAL", "")

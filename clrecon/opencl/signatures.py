@@ -31,14 +31,8 @@ _QUALIFIERS = {"const", "restrict", "volatile", "unsigned", "__global", "__const
 class KernelArgument:
     """One argument of a kernel.
 
-    Attributes
-    ----------
-    name : str
-    type : str
-        Type in OpenCL C, for example ``"int"`` or ``"float4"``; for a buffer the type of its elements.
-    is_buffer : bool
-    is_written : bool
-        A buffer whose elements are not const.
+    type: Type in OpenCL C, for example ``"int"`` or ``"float4"``; for a buffer the type of its elements.
+    is_written: A buffer whose elements are not const.
     """
 
     name: str
@@ -73,17 +67,8 @@ def _split_source(source: str) -> tuple[tuple[str, str, str], ...]:
 def find_signatures(source: str, definitions: Mapping[str, str]) -> dict[str, tuple[KernelArgument, ...]]:
     """Return the arguments of all kernels of a source.
 
-    Parameters
-    ----------
-    source : str
-        Text with its includes, as `clrecon.opencl.sources.read_kernel_source` returns it.
-    definitions : mapping of str to str
-        Macros that the options of the build define.
-
-    Raises
-    ------
-    ValueError
-        A directive or an argument is written in a way that this reader does not know.
+    source: Text with its includes, as `clrecon.opencl.sources.read_kernel_source` returns it.
+    definitions: Macros that the options of the build define.
     """
     macros, text = _preprocess(source, definitions)
     signatures = {}

@@ -89,17 +89,8 @@ def _numbers(name: str) -> dict[str, set[str]]:
 def kernel_number(name: str, macro: str) -> float:
     """Return the number that a kernel file or header defines as `macro`: its one place.
 
-    Parameters
-    ----------
-    name : str
-        Such as ``"rays/project.cl"``.
-    macro : str
-        Such as ``"AIR_HU"``, of a line ``#define AIR_HU (-1000.0f)``.
-
-    Raises
-    ------
-    KeyError
-        The file defines no such number, or several.
+    name: Such as ``"rays/project.cl"``.
+    macro: Such as ``"AIR_HU"``, of a line ``#define AIR_HU (-1000.0f)``.
     """
     numbers = _numbers(name).get(macro, set())
     if len(numbers) != 1:

@@ -28,15 +28,7 @@ log = get_logger(__name__)
 def take_device(name: str | int | Device | None) -> Device:
     """Choose the device for some work; one that nobody named has a stand-in, if the machine has a CPU device.
 
-    Parameters
-    ----------
-    name : str, int, Device or None
-        As for `choose_device`.
-
-    Raises
-    ------
-    DeviceError
-        As `choose_device`.
+    name: As for `choose_device`.
     """
     device = choose_device(name)
     if isinstance(name, Device):
@@ -58,18 +50,9 @@ def _find_cpu(device: Device) -> Device | None:
 def work_on(device: Device, work: Callable[[Device, list[str]], Made]) -> Made:
     """Do some work on a device: on a lost one once more with a fresh context, and at last on its stand-in.
 
-    Parameters
-    ----------
-    device : Device
-        As `take_device` returns it.  Once its stand-in has taken over, that does all further work.
-    work : callable
-        Called with the device to work on, and with warnings for the report of the work.  It makes everything anew each
-        time that it is called.
-
-    Raises
-    ------
-    DeviceError
-        The device failed, and there is no stand-in, or that failed too: the error is that of the device.
+    device: As `take_device` returns it.  Once its stand-in has taken over, that does all further work.
+    work: Called with the device to work on, and with warnings for the report of the work.  It makes everything anew
+        each time that it is called.
     """
     lost: list[str] = []
     first: DeviceFailedError | None = None

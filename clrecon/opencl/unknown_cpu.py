@@ -53,20 +53,9 @@ def choose_name(cpuinfo: str) -> str:
 class NameOfCpu:
     """The place where a PoCL device keeps the name of its CPU, and the name to write there.
 
-    Parameters
-    ----------
-    address : int
-        Address of the driver's structure of the device (its ``cl_device_id``).
+    address: Address of the driver's structure of the device (its ``cl_device_id``).
 
-    Attributes
-    ----------
-    name : str
-        One of `CPU_NAMES`.
-
-    Raises
-    ------
-    LookupError
-        The name is not where it is expected, or memory cannot be read.
+    name: One of `CPU_NAMES`.
     """
 
     def __init__(self, address: int):
@@ -78,13 +67,7 @@ class NameOfCpu:
             raise LookupError(str(error)) from error
 
     def write(self) -> None:
-        """Write the name, if it is not there yet.
-
-        Raises
-        ------
-        LookupError
-            The system refuses, or the place no longer holds the name of a CPU.
-        """
+        """Write the name, if it is not there yet."""
         try:
             with _Memory() as memory:
                 if memory.read_text(self._place) != self.name.encode():

@@ -81,15 +81,7 @@ def _take_helper() -> _Helper:
 
 
 def wait(device: Device) -> None:
-    """Wait until the device has finished all commands.
-
-    Raises
-    ------
-    DeviceTimeoutError
-        The device made no progress for the seconds of `time_limit`.  It gets a fresh context.
-    DeviceError
-        A command failed.
-    """
+    """Wait until the device has finished all commands."""
     last = device.commands.last
     if last is None:
         return

@@ -43,10 +43,7 @@ VOLUME_SHARE = 2e-3
 def check_ball(device: Device) -> str:
     """Extract the surface of a ball and compare it with the ball.
 
-    Returns
-    -------
-    str
-        What is wrong; empty if nothing is.
+    Returns: What is wrong; empty if nothing is.
     """
     k, j, i = np.ogrid[:SIZE, :SIZE, :SIZE]
     distance = np.sqrt((i - CENTRE[0]) ** 2 + (j - CENTRE[1]) ** 2 + (k - CENTRE[2]) ** 2)

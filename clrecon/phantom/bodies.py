@@ -28,22 +28,10 @@ def _sub_voxel_centre(affine: NDArray[np.float64], settings: PhantomSettings) ->
 def choose_body(affine: NDArray[np.float64], settings: PhantomSettings) -> Body:
     """Make the analytic body of `settings` for a volume with this affine.
 
-    Parameters
-    ----------
-    affine : ndarray, shape (4, 4)
-        Index (i, j, k) to LPS mm.
-    settings : PhantomSettings
-        Of an analytic kind.
+    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
+    settings: Of an analytic kind.
 
-    Returns
-    -------
-    Body
-        Wholly inside the volume, with at least one voxel of background on every side.
-
-    Raises
-    ------
-    UsageError
-        The body would not fit, or is thinner than two voxels.
+    Returns: Wholly inside the volume, with at least one voxel of background on every side.
     """
     centre = _sub_voxel_centre(affine, settings)
     # distances between opposite faces of the volume, halved: rows of the inverse are the faces' normals per step

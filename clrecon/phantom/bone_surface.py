@@ -117,12 +117,7 @@ class _Shape:
 
 
 class BoneSurface:
-    """The surface of some vertebrae, in mm of their plan.
-
-    Parameters
-    ----------
-    vertebrae : sequence of Vertebra
-    """
+    """The surface of some vertebrae, in mm of their plan."""
 
     def __init__(self, vertebrae: Sequence[Vertebra]):
         from scipy.spatial import cKDTree

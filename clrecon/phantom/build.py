@@ -132,31 +132,18 @@ def make_phantom(
 ) -> tuple[NDArray[np.int16], NDArray[np.float64], dict[str, Any]]:
     """Make a phantom in memory.
 
-    Parameters
-    ----------
-    settings : PhantomSettings
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
+    progress: Called as ``progress(stage, done, total)``.
 
-    Returns
-    -------
-    voxels : ndarray, shape (nk, nj, ni), int16
-        HU; of several phases the first.
-    affine : ndarray, shape (4, 4), float64
-        Index (i, j, k) to LPS mm, as the decimal strings of a written series give it; of an uneven or gapped series
-        that of the even one, and the truth has the positions.
-    truth : dict
-        Plain JSON types: ``kind, shape_ijk, affine_ijk_to_lps_mm, spacing_mm (di, dj, dk), tilt_deg,
-        iso_value_hu``, ``half_maximum_hu`` and ``surface`` (analytic shapes, else null), ``spine`` (centres of the
-        vertebrae, the marker on the patient's left and what is absent, else null), ``ghosts`` (the foreign slices, else
-        null), ``parts`` (scenes: each material
-        with its label in `label_materials`, voxels, volume and voxels above 300 HU, else null), ``noise_hu,
-        point_spread_mm, seed, version, settings``; and ``series`` of one that is uneven, gapped or phased.
-
-    Raises
-    ------
-    UsageError
-        The shape does not fit the volume.
+    Returns:
+    voxels: ndarray, shape (nk, nj, ni), int16. HU; of several phases the first.
+    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm, as the decimal strings of a written series give
+        it; of an uneven or gapped series that of the even one, and the truth has the positions.
+    truth: Plain JSON types: ``kind, shape_ijk, affine_ijk_to_lps_mm, spacing_mm (di, dj, dk), tilt_deg, iso_value_hu``,
+        ``half_maximum_hu`` and ``surface`` (analytic shapes, else null), ``spine`` (centres of the vertebrae, the
+        marker on the patient's left and what is absent, else null), ``ghosts`` (the foreign slices, else null),
+        ``parts`` (scenes: each material with its label in `label_materials`, voxels, volume and voxels above 300 HU,
+        else null), ``noise_hu, point_spread_mm, seed, version, settings``; and ``series`` of one that is uneven, gapped
+        or phased.
     """
     placement = place_slices(settings)
     voxels, truth, _ = _make(settings, placement, progress)
@@ -166,20 +153,9 @@ def make_phantom(
 def label_materials(settings: PhantomSettings) -> LabelArray:
     """Label each voxel of a scene with its material; this is the truth for the voxels of `make_phantom`.
 
-    Parameters
-    ----------
-    settings : PhantomSettings
-        Of a kind that is a scene.
+    settings: Of a kind that is a scene.
 
-    Returns
-    -------
-    ndarray, shape (nk, nj, ni), uint8
-        Index in `clrecon.phantom.MATERIALS`, see ``parts`` of the truth.
-
-    Raises
-    ------
-    UsageError
-        The kind is not a scene.
+    Returns: ndarray, shape (nk, nj, ni), uint8. Index in `clrecon.phantom.MATERIALS`, see ``parts`` of the truth.
     """
     if not KINDS[settings.kind].is_scene:
         raise UsageError(f"a {settings.kind} is no scene of materials: its truth is a surface or a list of levels")
@@ -192,15 +168,7 @@ def is_phantom_truth(truth: Any) -> bool:
 
 
 def _check_replaceable(folder: Path) -> None:
-    """Accept a folder that is absent, empty, or holds an earlier phantom and nothing else.
-
-    Raises
-    ------
-    UsageError
-        It holds something else, or is the current folder.
-    OutputError
-        It is a file, or the folder around it is missing.
-    """
+    """Accept a folder that is absent, empty, or holds an earlier phantom and nothing else."""
     if not folder.parent.is_dir():
         raise OutputError(f"cannot write {folder.name}: the folder around it does not exist; make it first")
     if not folder.exists():
@@ -235,25 +203,10 @@ def write_phantom(
     The series is written into a temporary folder beside `out_folder`, read back, and then renamed: `out_folder` is
     either complete or untouched.
 
-    Parameters
-    ----------
-    out_folder : path
-        A new or empty folder, or one that holds an earlier phantom and nothing else (then replaced).
-    settings : PhantomSettings
-    progress : callable, optional
-        Called as ``progress(stage, done, total)``.
+    out_folder: A new or empty folder, or one that holds an earlier phantom and nothing else (then replaced).
+    progress: Called as ``progress(stage, done, total)``.
 
-    Returns
-    -------
-    dict
-        The truth, see `make_phantom`; the same as in truth.json.
-
-    Raises
-    ------
-    UsageError
-        `out_folder` holds other files, or the shape does not fit the volume.
-    OutputError
-        The files cannot be written.
+    Returns: The truth, see `make_phantom`; the same as in truth.json.
     """
     folder = resolve_target(out_folder)
     try:

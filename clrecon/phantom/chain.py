@@ -50,21 +50,14 @@ _ANCHOR_LEVEL = "T12"
 class SpineChoice:
     """What is chosen of a spine: its levels, its bend and its facets.
 
-    Attributes
-    ----------
-    levels : tuple of str
-        Levels that are shown, from top to bottom.
-    kyphosis_deg, scoliosis_deg : float
-        Angle between the first and the last chosen level that is added to the natural one, in the sagittal plane
-        (positive: the back is round) and in the coronal plane (positive: the middle lies to the left).
-    facet_gap_mm : float, optional
-        Distance of neighbouring vertebrae in their facet joints; None: the shapes' own, 2 mm and more.
-    centred : bool
-        True: the levels are put into the middle of the volume; False: T12 is, as without a choice.
-    normal : (x, y, z)
-        Normal of the slices.
-    length_mm : float, optional
-        Length of the volume along `normal`; None: as long as the chosen levels need.
+    levels: Levels that are shown, from top to bottom.
+    kyphosis_deg, scoliosis_deg: Angle between the first and the last chosen level that is added to the natural one, in
+        the sagittal plane (positive: the back is round) and in the coronal plane (positive: the middle lies to the
+        left).
+    facet_gap_mm: Distance of neighbouring vertebrae in their facet joints; None: the shapes' own, 2 mm and more.
+    centred: True: the levels are put into the middle of the volume; False: T12 is, as without a choice.
+    normal: (x, y, z). Normal of the slices.
+    length_mm: Length of the volume along `normal`; None: as long as the chosen levels need.
     """
 
     levels: tuple[str, ...]
@@ -85,17 +78,10 @@ class SpineChoice:
 class Chain:
     """All planned levels.
 
-    Attributes
-    ----------
-    names : tuple of str
-    sizes : dict of str to ndarray
-        mm of each level.
-    frames : list of ndarray, shape (3, 3)
-        Rows are the local left, posterior and superior directions.
-    centres : ndarray, shape (n, 3)
-        Middle of each vertebral body, mm.
-    moved : ndarray, shape (n, 3)
-        How far the bend has moved each centre; 0 without one.
+    sizes: mm of each level.
+    frames: list of ndarray, shape (3, 3). Rows are the local left, posterior and superior directions.
+    centres: ndarray, shape (n, 3). Middle of each vertebral body, mm.
+    moved: ndarray, shape (n, 3). How far the bend has moved each centre; 0 without one.
     """
 
     names: tuple[str, ...]
@@ -127,20 +113,10 @@ def _stack(sizes: dict[str, Float64Array], frames: list[Float64Array], anchor: i
 def lay_chain(generator: np.random.Generator, seed: int, half_depth: float, choice: SpineChoice | None) -> Chain:
     """Lay the levels out, the middle of T12 a little below the middle of the volume.
 
-    Parameters
-    ----------
-    generator : Generator
-        Small changes of the curve of chest and loin.
-    seed : int
-        Those of the neck, which is planned where a cervical level is chosen.
-    half_depth : float
-        Half the depth of the trunk, mm: the tips of the spinous processes stay about 20 mm under the skin.
-    choice : SpineChoice, optional
-        None: T1 to L5, straight.
-
-    Returns
-    -------
-    Chain
+    generator: Small changes of the curve of chest and loin.
+    seed: Those of the neck, which is planned where a cervical level is chosen.
+    half_depth: Half the depth of the trunk, mm: the tips of the spinous processes stay about 20 mm under the skin.
+    choice: None: T1 to L5, straight.
     """
     count = len(THORACOLUMBAR)
     sizes = {key: np.interp(np.arange(count), _KEYS, values) for key, values in _SIZES.items()}

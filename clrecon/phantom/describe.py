@@ -63,11 +63,8 @@ def _angle(across: float, up: float) -> float:
 def describe_series(settings: PhantomSettings, placement: Placement) -> dict[str, Any] | None:
     """Describe slices that are uneven, missing or of several phases; None for an even stack.
 
-    Returns
-    -------
-    dict or None
-        ``uneven_mm``, ``missing`` (numbers from 1), ``phases``, and ``slice_positions_lps_mm`` of the first pixel of
-        each slice that is written.
+    Returns: ``uneven_mm``, ``missing`` (numbers from 1), ``phases``, and ``slice_positions_lps_mm`` of the first pixel
+        of each slice that is written.
     """
     if not (settings.uneven_mm or settings.missing or settings.phases > 1):
         return None

@@ -118,24 +118,9 @@ def write_series(
 ) -> None:
     """Write one file for each slice that is not missing into an existing folder and read each back.
 
-    Parameters
-    ----------
-    folder : Path
-    voxels : ndarray, shape (nk, nj, ni), int16
-        HU, at most 32767 + `RESCALE_INTERCEPT`.
-    settings : PhantomSettings
-    placement : Placement
-    progress : callable, optional
-        Called as ``progress("write", done, slices)``.
-    phase : int
-        Number of the phase, from 0; its files follow those of the phase before.
-
-    Raises
-    ------
-    OutputError
-        A file does not read back as it was written.
-    OSError
-        A file cannot be written.
+    voxels: ndarray, shape (nk, nj, ni), int16. HU, at most 32767 + `RESCALE_INTERCEPT`.
+    progress: Called as ``progress("write", done, slices)``.
+    phase: Number of the phase, from 0; its files follow those of the phase before.
     """
     for k, header in enumerate(_make_headers(settings, placement, phase)):
         if k + 1 not in settings.missing:

@@ -49,15 +49,7 @@ def _distance_to(vertebra: Vertebra, points: Float64Array) -> Float64Array:
 def close_facets(vertebrae: Sequence[Vertebra], gap_mm: float) -> list[Vertebra]:
     """Widen the upper articular processes by balls whose distance from the vertebra above is `gap_mm`.
 
-    Parameters
-    ----------
-    vertebrae : sequence of Vertebra
-        From top to bottom; neighbours in this sequence that are not neighbours in the spine stay as they are.
-    gap_mm : float
-
-    Returns
-    -------
-    list of Vertebra
+    vertebrae: From top to bottom; neighbours in this sequence that are not neighbours in the spine stay as they are.
     """
     closed = list(vertebrae[:1])
     for lower in vertebrae[1:]:

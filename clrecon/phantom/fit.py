@@ -34,16 +34,9 @@ def spine_choice(
 ) -> SpineChoice:
     """Return a choice for slices that lie as `slice_directions` says.
 
-    Parameters
-    ----------
-    levels : tuple of str
-    bend : (kyphosis, scoliosis)
-        Degrees.
-    facet_gap_mm : float, optional
-    centred : bool
-    directions : (tilt, oblique, prone)
-    length_mm : float, optional
-        Length of the volume along the normal of its slices.
+    bend: (kyphosis, scoliosis). Degrees.
+    directions: (tilt, oblique, prone)
+    length_mm: Length of the volume along the normal of its slices.
     """
     row, column, _ = slice_directions(*directions)
     x, y, z = (float(value) for value in np.cross(row, column))
@@ -64,20 +57,9 @@ def fit_slices(
 ) -> int:
     """Return the number of slices: the given one, if it holds the vertebral bodies, else as many as the bones need.
 
-    Parameters
-    ----------
-    choice : SpineChoice
-    size : (columns, rows)
-    spacing : (dj, di, dk)
-        mm.
-    seed : int
-    directions : (tilt, oblique, prone)
-    slices : int, optional
-
-    Raises
-    ------
-    UsageError
-        The vertebral bodies do not fit into the slices, their rows or their columns; or too many slices are needed.
+    size: (columns, rows)
+    spacing: (dj, di, dk). mm.
+    directions: (tilt, oblique, prone)
     """
     dj, di, dk = spacing
     open_joints = dataclasses.replace(choice, facet_gap_mm=None)

@@ -30,23 +30,14 @@ def slice_directions(
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return the directions of a phantom's axes in the patient.
 
-    Parameters
-    ----------
-    tilt_deg : float
-        Gantry tilt.
-    oblique : (about_x, about_y, about_z)
-        Degrees by which the frame is then rotated.
-    prone : bool
-        True: rows and columns are turned by half a turn.
-    gap_mm : float
-        Distance of two slices along their normal.
+    tilt_deg: Gantry tilt.
+    oblique: (about_x, about_y, about_z). Degrees by which the frame is then rotated.
+    prone: Rows and columns are turned by half a turn.
+    gap_mm: Distance of two slices along their normal.
 
-    Returns
-    -------
-    row, column : ndarray, shape (3,)
-        Unit vectors along i and j, LPS.
-    step : ndarray, shape (3,)
-        Slice step in mm: longer than the gap where the gantry is tilted.
+    Returns:
+    row, column: ndarray, shape (3,). Unit vectors along i and j, LPS.
+    step: ndarray, shape (3,). Slice step in mm: longer than the gap where the gantry is tilted.
     """
     tilt = math.radians(tilt_deg)
     rotation = _rotation(oblique)

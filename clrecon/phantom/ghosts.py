@@ -27,13 +27,7 @@ BACKGROUND_HU, TEXT_HU = -1000, 2000
 
 
 def ghost_places(slices: int) -> tuple[int, int]:
-    """Return the numbers of the two foreign slices of a stack.
-
-    Raises
-    ------
-    UsageError
-        The stack has fewer than `FEWEST_SLICES`.
-    """
+    """Return the numbers of the two foreign slices of a stack."""
     if slices < FEWEST_SLICES:
         raise UsageError(f"{slices} slices have no room for ghosts: at least {FEWEST_SLICES} are needed")
     first, second = (round(share * slices) for share in PLACES)
@@ -43,16 +37,9 @@ def ghost_places(slices: int) -> tuple[int, int]:
 def draw_ghosts(voxels: NDArray[np.int16], seed: int) -> dict[str, Any]:
     """Replace two slices of a stack: by a screen capture, and by a sagittal view of the stack itself.
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni), int16
-        HU, changed in place.
-    seed : int
+    voxels: ndarray, shape (nk, nj, ni), int16. HU, changed in place.
 
-    Returns
-    -------
-    dict
-        What the truth says of them.
+    Returns: What the truth says of them.
     """
     capture, sagittal = ghost_places(len(voxels))
     view = _sagittal(voxels)
@@ -97,16 +84,10 @@ def make_localizer(
 ) -> tuple[FileDataset, NDArray[np.int16]]:
     """Return header and HU of a sagittal localizer of the stack, in the series of its slices.
 
-    Parameters
-    ----------
-    slice_header : FileDataset
-        Of a slice.
-    voxels : ndarray, shape (nk, nj, ni), int16
-    affine : ndarray, shape (4, 4)
-    number : int
-        InstanceNumber.
-    instance : str
-        SOPInstanceUID.
+    voxels: ndarray, shape (nk, nj, ni), int16
+    affine: ndarray, shape (4, 4)
+    number: InstanceNumber.
+    instance: SOPInstanceUID.
     """
     from pydicom.uid import UID
 

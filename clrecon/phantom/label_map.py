@@ -20,19 +20,9 @@ def write_label_map(
 ) -> None:
     """Write labels that lie where `affine` says, oblique and sheared ones included.
 
-    Parameters
-    ----------
-    path : Path
-    labels : ndarray, shape (nk, nj, ni), uint8
-    affine : ndarray, shape (4, 4)
-        Index (i, j, k) to LPS mm.
-    names : mapping of int to str, optional
-        Names of labels, in ASCII; they are written as segments, as 3D Slicer does.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
+    labels: ndarray, shape (nk, nj, ni), uint8
+    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
+    names: Names of labels, in ASCII; they are written as segments, as 3D Slicer does.
     """
 
     def vector(values: NDArray[np.float64]) -> str:

@@ -37,20 +37,9 @@ def _parse_level(text: str, whole: str) -> int:
 def parse_levels(text: str) -> tuple[str, ...]:
     """Read a choice of levels such as ``"L1-L5"``, ``"C3"`` or ``"C3-C7,T1-T5"``.
 
-    Parameters
-    ----------
-    text : str
-        Levels, and ranges from the upper to the lower one, with commas between them, in any order.
+    text: Levels, and ranges from the upper to the lower one, with commas between them, in any order.
 
-    Returns
-    -------
-    tuple of str
-        Each level once, from top to bottom.
-
-    Raises
-    ------
-    UsageError
-        A level is unknown or named twice, or a range runs upwards.
+    Returns: Each level once, from top to bottom.
     """
     if not isinstance(text, str) or len(text) > _LONGEST or not re.fullmatch(r"[ -~]+", text):
         raise UsageError("levels are a text like C1-L5, L4-L5 or C3-C7,T1-T5")

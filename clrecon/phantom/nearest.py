@@ -27,20 +27,12 @@ def nearest_on_surface(
 ) -> Float64Array:
     """Move `starts` over the surface towards `points`.
 
-    Parameters
-    ----------
-    function : callable
-        Zero on the surface; its gradient is no zero near it.
-    points, starts : ndarray, shape (n, 3)
-        mm; a start near the surface for each point.
-    rounds : int
-    damping : float
-        Share of the way along the tangent plane that a round goes.
+    function: Zero on the surface; its gradient is no zero near it.
+    points, starts: ndarray, shape (n, 3). mm; a start near the surface for each point.
+    damping: Share of the way along the tangent plane that a round goes.
 
-    Returns
-    -------
-    ndarray, shape (n,)
-        Distance to the nearest point of the surface on the way; infinite where none was reached.
+    Returns: ndarray, shape (n,). Distance to the nearest point of the surface on the way; infinite where none was
+        reached.
     """
     best = np.full(len(points), np.inf)
     at = starts

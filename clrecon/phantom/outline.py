@@ -24,13 +24,9 @@ _NECK_SHARE = {"C7": 0.45, "C6": 0.85}
 class Outline:
     """Ellipses that follow each other along z.
 
-    Attributes
-    ----------
-    z : ndarray, shape (n,)
-        Heights in mm, ascending.
-    rows : ndarray, shape (5, n)
-        Middle x and y, half width and half depth in mm, and the share of the neck, at these heights; between them
-        linear, beyond them constant.
+    z: ndarray, shape (n,). Heights in mm, ascending.
+    rows: ndarray, shape (5, n). Middle x and y, half width and half depth in mm, and the share of the neck, at these
+        heights; between them linear, beyond them constant.
     """
 
     z: Float64Array
@@ -44,16 +40,9 @@ class Outline:
 def plan_outline(chain: Chain, half_width: float, half_depth: float) -> Outline | None:
     """Plan the outline round a chain.
 
-    Parameters
-    ----------
-    chain : Chain
-    half_width, half_depth : float
-        Half axes of the trunk, mm.
+    half_width, half_depth: Half axes of the trunk, mm.
 
-    Returns
-    -------
-    Outline or None
-        None round a straight trunk: its ellipse has its middle at x = y = 0 at all heights.
+    Returns: None round a straight trunk: its ellipse has its middle at x = y = 0 at all heights.
     """
     with_neck = chain.names[0] == "C1"
     if not with_neck and not chain.moved.any():

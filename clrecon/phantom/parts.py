@@ -21,24 +21,14 @@ Float64Array = NDArray[np.float64]
 class Vertebra:
     """One level: its frame and its sizes.
 
-    Attributes
-    ----------
-    name : str
-    center : ndarray, shape (3,)
-        Middle of the vertebral body, mm.
-    axes : ndarray, shape (3, 3)
-        Rows are the local left, posterior and superior directions.
-    width, depth, height, canal_half_width, canal_half_depth : float
-        mm.
-    lumbar : float
-        0 thoracic shape to 1 lumbar shape of the processes.
-    waves : ndarray, shape (n, 5)
-        Trabecular texture, see `clrecon.phantom.fields.waves_at`.
-    room : float
-        mm by which upper and lower articular processes lie farther apart than in a spine without a choice of levels,
+    center: ndarray, shape (3,). Middle of the vertebral body, mm.
+    axes: ndarray, shape (3, 3). Rows are the local left, posterior and superior directions.
+    width, depth, height, canal_half_width, canal_half_depth: mm.
+    lumbar: 0 thoracic shape to 1 lumbar shape of the processes.
+    waves: ndarray, shape (n, 5). Trabecular texture, see `clrecon.phantom.fields.waves_at`.
+    room: mm by which upper and lower articular processes lie farther apart than in a spine without a choice of levels,
         in which neighbours nearly touch.
-    facets : ndarray, shape (m, 4)
-        Balls (x, y, z, radius; local mm) that widen the upper articular processes.
+    facets: ndarray, shape (m, 4). Balls (x, y, z, radius; local mm) that widen the upper articular processes.
     """
 
     name: str
@@ -87,24 +77,13 @@ class Rib:
 class Anatomy:
     """All parts of the spine phantom.
 
-    Attributes
-    ----------
-    vertebrae, discs, ribs : lists, top to bottom
-    half_width, half_depth : float
-        Half axes of the body outline about x = y = 0.
-    curve_x, curve_y : ndarray
-        Polynomials (highest power first) in z / 100 mm: centre line of the vertebral bodies.
-    curve_z : (low, high)
-        Range in which the polynomials hold.
-    marker : ndarray, shape (3,)
-        Centre of the small metal ball on the patient's left.
-    marker_radius : float
-    absent : list of str
-        Parts left out on purpose.
-    centres : dict of str to ndarray
-        Middle of the body of every planned level, shown or not.
-    outline : Outline, optional
-        Where the body's outline is not that of a straight trunk.
+    half_width, half_depth: Half axes of the body outline about x = y = 0.
+    curve_x, curve_y: Polynomials (highest power first) in z / 100 mm: centre line of the vertebral bodies.
+    curve_z: (low, high). Range in which the polynomials hold.
+    marker: ndarray, shape (3,). Centre of the small metal ball on the patient's left.
+    absent: Parts left out on purpose.
+    centres: Middle of the body of every planned level, shown or not.
+    outline: Where the body's outline is not that of a straight trunk.
     """
 
     vertebrae: list[Vertebra]

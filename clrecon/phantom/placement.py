@@ -23,13 +23,7 @@ Float64Array = NDArray[np.float64]
 
 
 def format_decimal(value: float) -> str:
-    """Write a number as a DICOM decimal string: at most 16 characters, as many digits as fit.
-
-    Raises
-    ------
-    UsageError
-        The number is not finite.
-    """
+    """Write a number as a DICOM decimal string: at most 16 characters, as many digits as fit."""
     if not math.isfinite(value):
         raise UsageError(f"{value} cannot be written as a decimal string")
     value = float(value) + 0.0  # no minus zero
@@ -47,20 +41,13 @@ def format_decimal(value: float) -> str:
 class Placement:
     """Where the slices lie: the decimal strings of the files, and the affine that these strings give.
 
-    Attributes
-    ----------
-    orientation : list of 6 str
-        Row cosines, then column cosines.
-    pixel_spacing : list of 2 str
-        dj, di in mm.
-    positions : list of lists of 3 str
-        Centre of pixel (0, 0) of every slice, LPS mm.
-    slice_thickness, tilt : str
-        dk in mm and the gantry tilt in degrees.
-    affine : ndarray, shape (4, 4)
-        Index (i, j, k) to LPS mm; in an uneven stack that of even slices between the first and the last.
-    places : ndarray, shape (slices,)
-        k of each slice in the affine: 0, 1, 2 and so on, but for an uneven stack.
+    orientation: Row cosines, then column cosines.
+    pixel_spacing: dj, di in mm.
+    positions: Centre of pixel (0, 0) of every slice, LPS mm.
+    slice_thickness, tilt: dk in mm and the gantry tilt in degrees.
+    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm; in an uneven stack that of even slices between the first
+        and the last.
+    places: ndarray, shape (slices,). k of each slice in the affine: 0, 1, 2 and so on, but for an uneven stack.
     """
 
     orientation: list[str]
@@ -82,16 +69,7 @@ def _slice_places(settings: PhantomSettings) -> Float64Array:
 
 
 def place_slices(settings: PhantomSettings) -> Placement:
-    """Compute orientation and positions of all slices, centred on `CENTRE_LPS_MM`.
-
-    Parameters
-    ----------
-    settings : PhantomSettings
-
-    Returns
-    -------
-    Placement
-    """
+    """Compute orientation and positions of all slices, centred on `CENTRE_LPS_MM`."""
     dj, di, dk = settings.spacing
     row, column, step = slice_directions(settings.tilt, settings.oblique, settings.prone, dk)
 

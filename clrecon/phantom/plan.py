@@ -115,21 +115,11 @@ def plan_anatomy(
 ) -> Anatomy:
     """Lay out the phantom for a field of view.
 
-    Parameters
-    ----------
-    field_of_view_mm : (width, depth, length)
-        Extents of the volume along columns, rows and slices.  The body outline follows width and depth between
-        the limits of a slim child and of an adult; bones keep their size.
-    steps_mm : ndarray, shape (3, 3)
-        Columns are the voxel steps in LPS mm.
-    seed : int
-        Small changes of position and the phases of the texture.
-    choice : SpineChoice, optional
-        Levels, bend and facets; None: T1 to L5, straight, T12 in the middle.
-
-    Returns
-    -------
-    Anatomy
+    field_of_view_mm: (width, depth, length). Extents of the volume along columns, rows and slices.  The body outline
+        follows width and depth between the limits of a slim child and of an adult; bones keep their size.
+    steps_mm: ndarray, shape (3, 3). Columns are the voxel steps in LPS mm.
+    seed: Small changes of position and the phases of the texture.
+    choice: Levels, bend and facets; None: T1 to L5, straight, T12 in the middle.
     """
     generator = np.random.default_rng((seed, 11))
     half_width = float(np.clip(min(0.45 * field_of_view_mm[0], 0.60 * field_of_view_mm[1]), 118.0, 160.0))

@@ -77,24 +77,11 @@ def sample_distance(
 ) -> NDArray[Any]:
     """Sample the signed distance of `body` at every voxel centre.
 
-    Parameters
-    ----------
-    body : Body
-    affine : array_like, shape (4, 4)
-        Index (i, j, k) to LPS mm; any invertible affine.
-    shape_kji : (nk, nj, ni)
-    dtype : dtype, optional
-        Type of the result.
+    affine: array_like, shape (4, 4). Index (i, j, k) to LPS mm; any invertible affine.
+    shape_kji: (nk, nj, ni)
+    dtype: Type of the result.
 
-    Returns
-    -------
-    ndarray, shape (nk, nj, ni)
-        mm, positive inside; its iso value is 0.
-
-    Raises
-    ------
-    UsageError
-        Not an affine, or an empty shape.
+    Returns: ndarray, shape (nk, nj, ni). mm, positive inside; its iso value is 0.
     """
     matrix, shape = checked_affine(affine), _checked_shape(shape_kji)
     field = np.empty(shape, dtype=dtype)
@@ -138,24 +125,11 @@ def sample_occupancy(
 
     Exactly 0 or 1 away from the surface; near it the average over ``subsamples**3`` cells of the voxel.
 
-    Parameters
-    ----------
-    body : Body
-    affine : array_like, shape (4, 4)
-        Index (i, j, k) to LPS mm; any invertible affine, shear included.
-    shape_kji : (nk, nj, ni)
-    subsamples : int, optional
-        Cells along each of the voxel's three edges.
+    affine: array_like, shape (4, 4). Index (i, j, k) to LPS mm; any invertible affine, shear included.
+    shape_kji: (nk, nj, ni)
+    subsamples: Cells along each of the voxel's three edges.
 
-    Returns
-    -------
-    ndarray, shape (nk, nj, ni), float32
-        0 to 1; its iso value is 0.5.
-
-    Raises
-    ------
-    UsageError
-        Not an affine, an empty shape, or fewer than one cell.
+    Returns: ndarray, shape (nk, nj, ni), float32. 0 to 1; its iso value is 0.5.
     """
     matrix, shape = checked_affine(affine), _checked_shape(shape_kji)
     if subsamples < 1:
@@ -221,20 +195,12 @@ def apply_point_spread(
     On a perpendicular stack this is the isotropic point spread; on a sheared one the blur between slices follows
     the slice step, as the averaging of a moving table does.
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni), float32
-        Changed in place.
-    affine : array_like, shape (4, 4)
-    sigma_mm : float
-        Standard deviation; 0 does nothing.
-    places : ndarray, shape (nk,), optional
-        k of each slice in the affine; default: 0, 1, 2 and so on.
+    voxels: ndarray, shape (nk, nj, ni), float32. Changed in place.
+    affine: array_like, shape (4, 4)
+    sigma_mm: Standard deviation; 0 does nothing.
+    places: ndarray, shape (nk,). k of each slice in the affine; default: 0, 1, 2 and so on.
 
-    Returns
-    -------
-    ndarray
-        `voxels`.
+    Returns: `voxels`.
     """
     if not (math.isfinite(sigma_mm) and sigma_mm >= 0.0):
         raise UsageError(f"the point spread must be 0 mm or more, got {sigma_mm}")
@@ -259,18 +225,10 @@ def apply_point_spread(
 def add_noise(voxels: Float32Array, sigma_hu: float, seed: int) -> Float32Array:
     """Add white Gaussian noise in place; every slice has its own stream, so threads do not change the result.
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni), float32
-        HU, changed in place.
-    sigma_hu : float
-        Standard deviation in HU.
-    seed : int
+    voxels: ndarray, shape (nk, nj, ni), float32. HU, changed in place.
+    sigma_hu: Standard deviation in HU.
 
-    Returns
-    -------
-    ndarray
-        `voxels`.
+    Returns: `voxels`.
     """
     if sigma_hu > 0.0:
 

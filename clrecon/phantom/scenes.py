@@ -40,20 +40,12 @@ DENSE_HU = 300.0
 class Part:
     """One solid of one material.
 
-    Attributes
-    ----------
-    material : str
-        One of `MATERIALS`.
-    hu : float
-    distance : callable
-        Takes x, y, z (float32, mm in the part's own frame) and gives the distance to the surface in mm, positive
+    material: One of `MATERIALS`.
+    distance: Takes x, y, z (float32, mm in the part's own frame) and gives the distance to the surface in mm, positive
         inside.
-    low, high : (x, y, z)
-        Box that holds the part, in its own frame, mm.
-    center : (x, y, z)
-        Origin of the frame of the part, mm about the centre of the volume.
-    axes : ndarray, shape (3, 3)
-        Rows are the directions of that frame.
+    low, high: (x, y, z). Box that holds the part, in its own frame, mm.
+    center: (x, y, z). Origin of the frame of the part, mm about the centre of the volume.
+    axes: ndarray, shape (3, 3). Rows are the directions of that frame.
     """
 
     material: str
@@ -91,22 +83,13 @@ def draw_scene(
 
     Every interface is a linear ramp of about one voxel.  Thick slices are averaged from thin ones.
 
-    Parameters
-    ----------
-    parts : sequence of Part
-        In the order of painting.
-    settings : PhantomSettings
-    affine : ndarray, shape (4, 4)
-        Index (i, j, k) to LPS mm.
-    progress : callable, optional
-        Called as ``progress("draw", done, slices)``.
+    parts: In the order of painting.
+    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
+    progress: Called as ``progress("draw", done, slices)``.
 
-    Returns
-    -------
-    voxels : ndarray, shape (nk, nj, ni), float32
-        HU.
-    labels : ndarray, shape (nk, nj, ni), uint8
-        Index in `MATERIALS` of the part that holds the centre of each voxel.
+    Returns:
+    voxels: ndarray, shape (nk, nj, ni), float32. HU.
+    labels: ndarray, shape (nk, nj, ni), uint8. Index in `MATERIALS` of the part that holds the centre of each voxel.
     """
     shape = settings.shape_kji
     grid = affine.copy()

@@ -86,13 +86,7 @@ _SAID_PLURAL = dict.fromkeys(("levels", "phases", "ghosts", "uneven_mm", "facet_
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Read ``"256"`` or ``"256x192"`` as (columns, rows).
-
-    Raises
-    ------
-    UsageError
-        `text` has another form.
-    """
+    """Read ``"256"`` or ``"256x192"`` as (columns, rows)."""
     parts = text.lower().split("x")
     if len(parts) > 2 or not all(re.fullmatch(r" *[0-9]{1,9} *", part) for part in parts):
         raise UsageError(f"size {text!r} is not understood: use columns or columns x rows, like 256 or 256x192")
@@ -100,13 +94,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_missing(text: str) -> tuple[int, ...]:
-    """Read numbers of slices such as ``"20-22,40"``.
-
-    Raises
-    ------
-    UsageError
-        `text` has another form.
-    """
+    """Read numbers of slices such as ``"20-22,40"``."""
     numbers: list[int] = []
     for part in text.split(","):
         found = re.fullmatch(r" *([0-9]{1,4})(?: *- *([0-9]{1,4}))? *", part, re.ASCII)
@@ -120,69 +108,41 @@ def parse_missing(text: str) -> tuple[int, ...]:
 class PhantomSettings:
     """What a phantom shows and how it is sampled.
 
-    Attributes
-    ----------
-    kind : str
-        One of `KINDS`.  ``plane`` is an oblique slab with finite faces, so that it has an area and a volume.
-    size : (columns, rows)
-        Extents of a slice in pixels.
-    slices : int
-        Number of slices; default: as many as whole vertebrae of `levels` need, 120 without levels.
-    spacing : (dj, di, dk)
-        mm, in DICOM's order: distance between rows, between columns, and between neighbouring slices **along the
-        slice normal**.  With a tilted gantry the slice step itself is longer: ``dk / cos(tilt)``.  Default: that of
-        the kind, so that 256 x 256 pixels hold it whole.
-    tilt : float
-        Gantry tilt in degrees: slices rotated about the patient's x axis while the table still moves along z, so
-        the slice step is not parallel to the slice normal (a shear).  At most 45 either way.
-    oblique : (about_x, about_y, about_z)
-        Degrees by which the whole frame (slices and slice step) is then rotated rigidly about the patient's x,
-        then y, then z axis.
-    noise : float
-        Standard deviation of white Gaussian noise in HU; default 12, 0 for an analytic shape.
-    point_spread_mm : float
-        Standard deviation of the Gaussian point spread in mm; default 0.5, 0 for an analytic shape.
-    seed : int
-        Same settings and seed give the same bytes; another seed moves the shape by part of a voxel, and gives other
+    kind: One of `KINDS`.  ``plane`` is an oblique slab with finite faces, so that it has an area and a volume.
+    size: (columns, rows). Extents of a slice in pixels.
+    slices: Number of slices; default: as many as whole vertebrae of `levels` need, 120 without levels.
+    spacing: (dj, di, dk). mm, in DICOM's order: distance between rows, between columns, and between neighbouring slices
+        **along the slice normal**.  With a tilted gantry the slice step itself is longer: ``dk / cos(tilt)``.  Default:
+        that of the kind, so that 256 x 256 pixels hold it whole.
+    tilt: Gantry tilt in degrees: slices rotated about the patient's x axis while the table still moves along z, so the
+        slice step is not parallel to the slice normal (a shear).  At most 45 either way.
+    oblique: (about_x, about_y, about_z). Degrees by which the whole frame (slices and slice step) is then rotated
+        rigidly about the patient's x, then y, then z axis.
+    noise: Standard deviation of white Gaussian noise in HU; default 12, 0 for an analytic shape.
+    point_spread_mm: Standard deviation of the Gaussian point spread in mm; default 0.5, 0 for an analytic shape.
+    seed: Same settings and seed give the same bytes; another seed moves the shape by part of a voxel, and gives other
         noise and texture.
-    inside_hu, outside_hu : float
-        HU of an analytic shape and of its surroundings (not used by other kinds).
-    radius_mm : float, optional
-        Sphere radius, torus centre-line radius, cylinder radius, or half the thickness of the plane's slab.
+    inside_hu, outside_hu: HU of an analytic shape and of its surroundings (not used by other kinds).
+    radius_mm: Sphere radius, torus centre-line radius, cylinder radius, or half the thickness of the plane's slab.
         Default: a part of the field of view.
-    table : {"none", "flat", "curved", "headrest"}, optional
-        Table that the body lies on; default: nothing, the spine's own couch, a curved table for the kind ``empty``.
-        Not for analytic shapes.
-    table_gap_mm : float
-        Gap between body and table: at 0 they touch, below 0 the body sinks in.  The spine's own couch ignores it.
-    prone : bool
-        The patient lies on the face: the table is at the front, and the image's rows and columns are turned by half a
-        turn about z, as a scanner does it (PatientPosition HFP).
-    ghosts : bool
-        Of a spine: two slices of the stack are foreign, a screen capture and a sagittal view, the folder has a
+    table: {"none", "flat", "curved", "headrest"}. Table that the body lies on; default: nothing, the spine's own couch,
+        a curved table for the kind ``empty``. Not for analytic shapes.
+    table_gap_mm: Gap between body and table: at 0 they touch, below 0 the body sinks in.  The spine's own couch ignores
+        it.
+    prone: The patient lies on the face: the table is at the front, and the image's rows and columns are turned by half
+        a turn about z, as a scanner does it (PatientPosition HFP).
+    ghosts: Of a spine: two slices of the stack are foreign, a screen capture and a sagittal view, the folder has a
         sagittal localizer, and the table is the curved one unless another is named.
-    levels : str, optional
-        Of a spine: the vertebrae that it shows, from C1 to L5, like ``"C1-L5"``, ``"L4-L5"`` or ``"C3-C7,T1-T5"``, in
-        the middle of the stack.  Their joints are 2 mm wide or more.  Default: T1 to L5 with T12 in the middle, as far
-        as the slices show them.
-    facet_gap_mm : float, optional
-        Of a spine: distance of neighbouring vertebrae in their facet joints, at most 1.5 mm.
-    kyphosis_deg, scoliosis_deg : float
-        Of a spine: angle between the first and the last of its levels that is added to the natural curve, from -60 to
-        60; vertebrae stay rigid.  Positive: the back is round, the middle lies to the left.
-    uneven_mm : float
-        Of a spine: the gaps of the slices differ by up to this much from their mean, at most 0.4 of it.
-    missing : tuple of int
-        Numbers of slices, from 1 as in file names, that are not written; not the first and not the last.
-    phases : int
-        Of a spine: this many series of slices at the same places, with ever more contrast medium in the vessels.
-    transfer_syntax : {"explicit", "implicit"}
-        Value representations in the files, both little endian and uncompressed.
-
-    Raises
-    ------
-    UsageError
-        From the constructor, with the numbers, when a value cannot be used.
+    levels: Of a spine: the vertebrae that it shows, from C1 to L5, like ``"C1-L5"``, ``"L4-L5"`` or ``"C3-C7,T1-T5"``,
+        in the middle of the stack.  Their joints are 2 mm wide or more.  Default: T1 to L5 with T12 in the middle, as
+        far as the slices show them.
+    facet_gap_mm: Of a spine: distance of neighbouring vertebrae in their facet joints, at most 1.5 mm.
+    kyphosis_deg, scoliosis_deg: Of a spine: angle between the first and the last of its levels that is added to the
+        natural curve, from -60 to 60; vertebrae stay rigid.  Positive: the back is round, the middle lies to the left.
+    uneven_mm: Of a spine: the gaps of the slices differ by up to this much from their mean, at most 0.4 of it.
+    missing: Numbers of slices, from 1 as in file names, that are not written; not the first and not the last.
+    phases: Of a spine: this many series of slices at the same places, with ever more contrast medium in the vessels.
+    transfer_syntax: {"explicit", "implicit"}. Value representations in the files, both little endian and uncompressed.
     """
 
     kind: str = "spine"

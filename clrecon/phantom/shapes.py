@@ -89,12 +89,8 @@ def _listed(vector: Float64Array) -> list[float]:
 class Sphere:
     """Ball.
 
-    Parameters
-    ----------
-    center : array_like, shape (3,)
-        LPS mm.
-    radius : float
-        mm.
+    center: array_like, shape (3,). LPS mm.
+    radius: mm.
     """
 
     def __init__(self, center: ArrayLike, radius: float):
@@ -135,14 +131,9 @@ class Sphere:
 class Torus:
     """Ring torus.
 
-    Parameters
-    ----------
-    center : array_like, shape (3,)
-        LPS mm.
-    axis : array_like, shape (3,)
-        Axis of revolution, any length.
-    major, minor : float
-        Radius of the ring's centre line and of the tube in mm, ``minor < major``.
+    center: array_like, shape (3,). LPS mm.
+    axis: array_like, shape (3,). Axis of revolution, any length.
+    major, minor: Radius of the ring's centre line and of the tube in mm, ``minor < major``.
     """
 
     def __init__(self, center: ArrayLike, axis: ArrayLike, major: float, minor: float):
@@ -192,14 +183,9 @@ class Torus:
 class Cylinder:
     """Circular cylinder with flat caps.
 
-    Parameters
-    ----------
-    center : array_like, shape (3,)
-        Middle of the axis, LPS mm.
-    axis : array_like, shape (3,)
-        Direction of the axis, any length.
-    radius, length : float
-        mm.
+    center: array_like, shape (3,). Middle of the axis, LPS mm.
+    axis: array_like, shape (3,). Direction of the axis, any length.
+    radius, length: mm.
     """
 
     def __init__(self, center: ArrayLike, axis: ArrayLike, radius: float, length: float):
@@ -247,18 +233,12 @@ class Cylinder:
 class Box:
     """Oblique box: a slab with two large faces square to `normal`.
 
-    Parameters
-    ----------
-    center : array_like, shape (3,)
-        LPS mm.
-    normal : array_like, shape (3,)
-        Direction of the thickness, any length.
-    thickness : float
-        Extent along `normal`, mm.
-    width, height : float
-        Extents along the two other edges, mm.
-    edge : array_like, shape (3,), optional
-        Direction of the width; its part along `normal` is taken out.  Default: some direction square to `normal`.
+    center: array_like, shape (3,). LPS mm.
+    normal: array_like, shape (3,). Direction of the thickness, any length.
+    thickness: Extent along `normal`, mm.
+    width, height: Extents along the two other edges, mm.
+    edge: array_like, shape (3,). Direction of the width; its part along `normal` is taken out.  Default: some direction
+        square to `normal`.
     """
 
     def __init__(
@@ -326,12 +306,8 @@ class Box:
 class HalfSpace:
     """Everything below a plane: inside where ``(p - point) . normal <= 0``.
 
-    Parameters
-    ----------
-    point : array_like, shape (3,)
-        A point of the plane, LPS mm.
-    normal : array_like, shape (3,)
-        Outward direction, any length.
+    point: array_like, shape (3,). A point of the plane, LPS mm.
+    normal: array_like, shape (3,). Outward direction, any length.
     """
 
     def __init__(self, point: ArrayLike, normal: ArrayLike):

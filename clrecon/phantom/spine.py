@@ -126,18 +126,11 @@ class _Scene:
 def plan_spine(settings: PhantomSettings, affine: Float64Array) -> tuple[Anatomy, Float64Array]:
     """Plan the spine of a phantom.
 
-    Parameters
-    ----------
-    settings : PhantomSettings
-    affine : ndarray, shape (4, 4)
-        Index (i, j, k) to LPS mm.
+    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
 
-    Returns
-    -------
-    anatomy : Anatomy
-        In mm about `CENTRE_LPS_MM`.
-    grid : ndarray, shape (4, 4)
-        Index to mm of the plan.
+    Returns:
+    anatomy: In mm about `CENTRE_LPS_MM`.
+    grid: ndarray, shape (4, 4). Index to mm of the plan.
     """
     # The plan's origin is the centre of the volume.
     grid = affine.copy()
@@ -150,16 +143,9 @@ def plan_spine(settings: PhantomSettings, affine: Float64Array) -> tuple[Anatomy
 def label_levels(settings: PhantomSettings, affine: Float64Array) -> NDArray[np.uint8]:
     """Label each voxel of a spine phantom with the number of the vertebra that holds its centre.
 
-    Parameters
-    ----------
-    settings : PhantomSettings
-    affine : ndarray, shape (4, 4)
-        Index (i, j, k) to LPS mm.
+    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
 
-    Returns
-    -------
-    ndarray, shape (nk, nj, ni), uint8
-        0 where no vertebra is, else `clrecon.phantom.levels.level_number`.
+    Returns: ndarray, shape (nk, nj, ni), uint8. 0 where no vertebra is, else `clrecon.phantom.levels.level_number`.
     """
     anatomy, grid = plan_spine(settings, affine)
     labels = np.zeros(settings.shape_kji, dtype=np.uint8)
@@ -183,24 +169,14 @@ def draw_spine(
 ) -> tuple[Float32Array, Anatomy]:
     """Draw the spine phantom without point spread and noise.
 
-    Parameters
-    ----------
-    settings : PhantomSettings
-    affine : ndarray, shape (4, 4)
-        Index (i, j, k) to LPS mm.
-    progress : callable, optional
-        Called as ``progress("draw", done, slices)``.
-    places : ndarray, shape (nk,), optional
-        k of each slice in the affine; default: 0, 1, 2 and so on.
-    blood_hu : float
-        HU of heart and vessels.
+    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
+    progress: Called as ``progress("draw", done, slices)``.
+    places: ndarray, shape (nk,). k of each slice in the affine; default: 0, 1, 2 and so on.
+    blood_hu: HU of heart and vessels.
 
-    Returns
-    -------
-    voxels : ndarray, shape (nk, nj, ni), float32
-        HU.
-    anatomy : Anatomy
-        The plan, in mm about `CENTRE_LPS_MM`.
+    Returns:
+    voxels: ndarray, shape (nk, nj, ni), float32. HU.
+    anatomy: The plan, in mm about `CENTRE_LPS_MM`.
     """
     shape = settings.shape_kji
     di, dj, dk = column_spacing(affine)

@@ -93,19 +93,9 @@ TABLES: dict[str, Callable[[Plan], list[Part]]] = {
 def lay_under(plan: Plan, table: str, gap_mm: float, prone: bool) -> list[Part]:
     """Make the parts of a table `gap_mm` under a body: under its back, or under its front when it lies prone.
 
-    Parameters
-    ----------
-    plan : Plan
-        Plan of the body.
-    table : str
-        One of `TABLES`.
-    gap_mm : float
-        Gap between body and table: at 0 they touch, below 0 the body sinks in.
-    prone : bool
-
-    Returns
-    -------
-    list of Part
+    plan: Plan of the body.
+    table: One of `TABLES`.
+    gap_mm: Gap between body and table: at 0 they touch, below 0 the body sinks in.
     """
     down = -1.0 if prone else 1.0
     center = (0.0, plan.front - gap_mm if prone else plan.back + gap_mm, 0.0)

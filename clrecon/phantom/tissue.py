@@ -134,25 +134,13 @@ def draw_tissue(
 ) -> Field:
     """Draw one slice without bone, in bands of rows.
 
-    Parameters
-    ----------
-    anatomy : Anatomy
-    x, y, z : ndarray, shape (nj, ni), float32
-        mm of the plan.
-    ramp : float
-        Width of an interface, mm.
-    seed : int
-    table : sequence of Part, optional
-        Table that the body lies on; None: a couch of its own.
-    prone : bool
-        True: that couch is under the front.
-    blood_hu : float
-        HU of heart and vessels.
+    x, y, z: ndarray, shape (nj, ni), float32. mm of the plan.
+    ramp: Width of an interface, mm.
+    table: Table that the body lies on; None: a couch of its own.
+    prone: That couch is under the front.
+    blood_hu: HU of heart and vessels.
 
-    Returns
-    -------
-    ndarray, shape (nj, ni), float32
-        HU.
+    Returns: ndarray, shape (nj, ni), float32. HU.
     """
     canvas = np.full(x.shape, AIR_HU, dtype=np.float32)
     rows = max(1, _BAND // x.shape[1])

@@ -141,9 +141,7 @@ def vertebra_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field
 
     It is exact on the surface and of first order near it; `clrecon.phantom.truth` has true distances.
 
-    Returns
-    -------
-    ndarray, of the type and the broadcast shape of x, y and z
+    Returns: ndarray, of the type and the broadcast shape of x, y and z
     """
     bone, cuts = vertebra_shape(vertebra, x, y, z)
     for cut in cuts:

@@ -18,12 +18,8 @@ MARGIN = 1e-3
 def count_cells(points: NDArray[np.floating], edge: float) -> tuple[int, int, int]:
     """Return the number of cells along each axis: ``int(((max + e) - (min - e)) / edge) + 1``.
 
-    Parameters
-    ----------
-    points : ndarray, shape (n, 3)
-        mm; at least one.
-    edge : float
-        Edge of the cells in mm.
+    points: ndarray, shape (n, 3). mm; at least one.
+    edge: Edge of the cells in mm.
 
     References
     ----------
@@ -38,16 +34,10 @@ def count_cells(points: NDArray[np.floating], edge: float) -> tuple[int, int, in
 def find_cell_numbers(points: NDArray[np.floating], edge: float) -> NDArray[np.int64]:
     """Return the number of the cell of each point: ``a + nx (b + ny c)`` with ``a = int((x - (min - e)) / edge)``.
 
-    Parameters
-    ----------
-    points : ndarray, shape (n, 3)
-        mm; at least one.
-    edge : float
-        Edge of the cells in mm.
+    points: ndarray, shape (n, 3). mm; at least one.
+    edge: Edge of the cells in mm.
 
-    Returns
-    -------
-    ndarray, shape (n,), int64
+    Returns: ndarray, shape (n,), int64
 
     References
     ----------

@@ -54,28 +54,16 @@ def _take(values: NDArray[Any] | VoxelNumbers, numbers: NDArray[np.intp]) -> Any
 class PointCloud(Message):
     """Points in the patient frame LPS, millimetres, with normals, HU, labels and voxel indices where they are known.
 
-    Parameters
-    ----------
-    points : array_like, shape (n, 3)
-        LPS mm, finite; kept as float32, without a copy when they are C-contiguous float32.  Others that reach 4096 mm
-        from the origin, where float32 would round them by more than 2e-4 mm, are kept as float64.
-    normals : array_like, shape (n, 3), optional
-        Unit vectors that point out of bone, LPS; kept as float32.
-    hu : array_like, shape (n,), optional
-        Hounsfield units; kept as float32.
-    labels : array_like, shape (n,), optional
-        Clusters or labels of a label map, whole numbers; -1 is noise.  Kept as int32.
-    ijk : array_like, shape (n, 3), optional
-        Voxel indices of points that are voxel centres; kept as int32.
-    report : dict, optional
-        Facts about the origin of this cloud, without patient data.  ``affine_ijk_to_lps_mm``, ``iso_value_hu`` and
+    points: array_like, shape (n, 3). LPS mm, finite; kept as float32, without a copy when they are C-contiguous
+        float32.  Others that reach 4096 mm from the origin, where float32 would round them by more than 2e-4 mm, are
+        kept as float64.
+    normals: array_like, shape (n, 3). Unit vectors that point out of bone, LPS; kept as float32.
+    hu: array_like, shape (n,). Hounsfield units; kept as float32.
+    labels: array_like, shape (n,). Clusters or labels of a label map, whole numbers; -1 is noise.  Kept as int32.
+    ijk: array_like, shape (n, 3). Voxel indices of points that are voxel centres; kept as int32.
+    report: Facts about the origin of this cloud, without patient data.  ``affine_ijk_to_lps_mm``, ``iso_value_hu`` and
         ``certificate`` (the report of the volume) are written to the formats that have a place for them, as with a
         `Mesh`.
-
-    Raises
-    ------
-    UsageError
-        A shape or type cannot be used, a coordinate is not finite, or an array has another length than `points`.
     """
 
     def __init__(
@@ -215,15 +203,7 @@ class PointCloud(Message):
     def select(self, mask: ArrayLike) -> PointCloud:
         """Return the cloud of some of the points.
 
-        Parameters
-        ----------
-        mask : array_like, shape (n,) bool, or (m,) of integers
-            Points to keep, or their numbers in the order wanted.
-
-        Raises
-        ------
-        UsageError
-            The mask does not fit the cloud.
+        mask: array_like, shape (n,) bool, or (m,) of integers. Points to keep, or their numbers in the order wanted.
         """
         chosen = np.asarray(mask)
         if chosen.dtype == bool:
@@ -247,15 +227,11 @@ class PointCloud(Message):
     def in_space(self, space: str) -> tuple[NDArray[np.floating], NDArray[np.float32] | None]:
         """Return points and normals in another patient frame; the cloud itself is always LPS.
 
-        Parameters
-        ----------
-        space : {"lps", "ras"}
-            RAS negates x and y.
+        space: {"lps", "ras"}. RAS negates x and y.
 
-        Returns
-        -------
-        points : ndarray, shape (n, 3), mm, of the type of `points`
-        normals : ndarray, shape (n, 3), float32, or None
+        Returns:
+        points: ndarray, shape (n, 3), mm, of the type of `points`
+        normals: ndarray, shape (n, 3), float32, or None
         """
         signs = np.diag(frame_from_lps(space)).astype(np.float32)
         if space.lower() == "lps":
@@ -283,30 +259,12 @@ class PointCloud(Message):
         The file is either complete or absent, and an older file of that name is replaced in one step.  It holds no
         patient data, date or path.  docs/clouds.md says what each format keeps.
 
-        Parameters
-        ----------
-        path : str or path
-            ``.ply``, ``.vtp``, ``.npz``, ``.xyz`` or ``.las`` (with the extra ``las``), upper or lower case.
-        space : {"lps", "ras"}
-            Patient frame of the coordinates in mm; the file names it.
-        no_clobber : bool
-            True: a file of that name stays and is an `OutputError`.
-        keep_ids : bool
-            True: the comments hold the hash of the frame of reference, by which files of one scan are told.
+        path: ``.ply``, ``.vtp``, ``.npz``, ``.xyz`` or ``.las`` (with the extra ``las``), upper or lower case.
+        space: {"lps", "ras"}. Patient frame of the coordinates in mm; the file names it.
+        no_clobber: A file of that name stays and is an `OutputError`.
+        keep_ids: The comments hold the hash of the frame of reference, by which files of one scan are told.
 
-        Returns
-        -------
-        int
-            Size of the file in bytes.
-
-        Raises
-        ------
-        UsageError
-            Unknown extension or space, or laspy is needed and not installed.
-        NoSurfaceError
-            The cloud has no point.
-        OutputError
-            The file cannot be written; an older one of that name is intact.
+        Returns: Size of the file in bytes.
         """
         with keep_existing(no_clobber):
             return write_cloud(self, path, space, keep_ids=keep_ids)
@@ -326,11 +284,6 @@ class PointCloud(Message):
 
         The attributes are ``positions``, ``normals``, ``hu`` (n, 1) and ``label`` (n, 1), those that are known;
         ``to_legacy()`` of the result gives the class that has positions and normals alone.
-
-        Raises
-        ------
-        UsageError
-            open3d is not installed, or cannot be loaded.
         """
         try:
             import open3d

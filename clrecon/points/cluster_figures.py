@@ -33,16 +33,10 @@ LEAST_RUN = 4
 class ClusterFigures:
     """The clusters of a cloud, an entry of each array for each.
 
-    Attributes
-    ----------
-    points : ndarray, shape (c,), int64
-        Number of points.
-    centres : ndarray, shape (c, 3), float64
-        Mean of the points, LPS mm.
-    boxes : ndarray, shape (c, 2, 3), float64
-        Lowest and highest coordinates, LPS mm.
-    deviations : ndarray, shape (c, 3), float64
-        Standard deviations along the principal axes, mm, ascending.
+    points: ndarray, shape (c,), int64. Number of points.
+    centres: ndarray, shape (c, 3), float64. Mean of the points, LPS mm.
+    boxes: ndarray, shape (c, 2, 3), float64. Lowest and highest coordinates, LPS mm.
+    deviations: ndarray, shape (c, 3), float64. Standard deviations along the principal axes, mm, ascending.
     """
 
     points: NDArray[np.int64]
@@ -113,13 +107,7 @@ class _Runs:
 
 
 def measure_clusters(cloud: PointCloud) -> ClusterFigures:
-    """Measure each cluster of a cloud with labels; noise is left out.
-
-    Raises
-    ------
-    UsageError
-        The cloud has no labels.
-    """
+    """Measure each cluster of a cloud with labels; noise is left out."""
     if cloud.labels is None:
         raise UsageError("the points have no labels: cluster them first")
     points = cloud.points

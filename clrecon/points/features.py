@@ -21,19 +21,12 @@ def distance_ratios(
 
     The paper's "mean point distance" of the cell is read as the mean distance of its points to their nearest ones.
 
-    Parameters
-    ----------
-    means : ndarray, shape (n,), mm
-        Mean distance of each point to its neighbours, itself not among them.
-    nearest : ndarray, shape (n,), mm
-        Distance of each point to the nearest other one.
-    cells : ndarray, shape (n,), whole numbers from 0
-        Cell of each point.
+    means: ndarray, shape (n,), mm. Mean distance of each point to its neighbours, itself not among them.
+    nearest: ndarray, shape (n,), mm. Distance of each point to the nearest other one.
+    cells: ndarray, shape (n,), whole numbers from 0. Cell of each point.
 
-    Returns
-    -------
-    ndarray, shape (n,), float64
-        Infinite where all points of a cell coincide with others and the neighbours do not, 0 where these do too.
+    Returns: ndarray, shape (n,), float64. Infinite where all points of a cell coincide with others and the neighbours
+        do not, 0 where these do too.
     """
     counts = np.bincount(cells)
     spacing = np.bincount(cells, nearest) / np.maximum(counts, 1)

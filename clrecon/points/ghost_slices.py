@@ -30,23 +30,16 @@ REASON = "ghost slice"
 class GhostSlices:
     """The result of the slice test.
 
-    Attributes
-    ----------
-    slices : tuple of int
-        The ghosts, ascending.
-    points : ndarray, shape (nk,), int64
-        Voxels of the band in each slice.
-    nearest : ndarray, shape (nk,), float64
-        The higher one of Dice's coefficients with the slice before and the one behind.
-    around : ndarray, shape (nk,), float64
-        Dice's coefficient of these two slices with each other.
-    within : ndarray, shape (nk,), float64
-        Share of a slice's voxels that lie within one of its neighbours, the larger one of both, corrected for chance: 0
-        where it is the share that the neighbour takes of its whole slice, 1 where all of them lie within.
-    hu : (float, float)
-        The band.
-    warnings : tuple of str
-        A line each.
+    slices: The ghosts, ascending.
+    points: ndarray, shape (nk,), int64. Voxels of the band in each slice.
+    nearest: ndarray, shape (nk,), float64. The higher one of Dice's coefficients with the slice before and the one
+        behind.
+    around: ndarray, shape (nk,), float64. Dice's coefficient of these two slices with each other.
+    within: ndarray, shape (nk,), float64. Share of a slice's voxels that lie within one of its neighbours, the larger
+        one of both, corrected for chance: 0 where it is the share that the neighbour takes of its whole slice, 1 where
+        all of them lie within.
+    hu: The band.
+    warnings: A line each.
 
     Notes
     -----
@@ -100,16 +93,11 @@ def judge_slices(
 ) -> GhostSlices:
     """Tell the ghosts from the counts of voxels.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (3, nk), int64
-        Voxels of each slice, and those that it has in common with the next slice and with the one after.
-    area : int
-        All voxels of a slice.
-    hu : (float, float)
-        Band of the voxels.
-    warnings : tuple of str
-        Given on.
+    counts: ndarray, shape (3, nk), int64. Voxels of each slice, and those that it has in common with the next slice and
+        with the one after.
+    area: All voxels of a slice.
+    hu: Band of the voxels.
+    warnings: Given on.
     """
     points, nk = counts[0], counts.shape[1]
     nearest, around, within = np.full((3, nk), np.nan)
@@ -131,24 +119,11 @@ def judge_slices(
 def drop_ghost_slices(cloud: PointCloud, found: GhostSlices, *, volume: Volume | None = None) -> PointStep:
     """Remove the points of ghost slices.
 
-    Parameters
-    ----------
-    cloud : PointCloud
-        Voxel centres, or with ``volume`` points of a surface, of which those nearer than one slice to a ghost go.
-    found : GhostSlices
-        Of the volume that the cloud comes from, see `find_ghost_slices`.
-    volume : Volume, optional
-        That volume, for clouds without ``ijk``.
+    cloud: Voxel centres, or with ``volume`` points of a surface, of which those nearer than one slice to a ghost go.
+    found: Of the volume that the cloud comes from, see `find_ghost_slices`.
+    volume: That volume, for clouds without ``ijk``.
 
-    Returns
-    -------
-    PointStep
-        Reason "ghost slice".
-
-    Raises
-    ------
-    UsageError
-        The cloud has no voxel indices and no volume is given, or its slices are not those that were tested.
+    Returns: Reason "ghost slice".
     """
     nk = len(found.points)
     k = cloud.voxel_slices()
@@ -173,16 +148,7 @@ def fill_ghost_slices(volume: Volume, found: GhostSlices) -> Volume:
     It is for what looks at whole bodies, such as `remove_table`: a screen capture would tie body and table into one.
     No value of a filled slice was measured there: remove its points with `drop_ghost_slices` all the same.
 
-    Parameters
-    ----------
-    volume : Volume
-    found : GhostSlices
-        Of this volume.
-
-    Raises
-    ------
-    UsageError
-        The volume has another number of slices than were tested.
+    found: Of this volume.
     """
     if volume.shape_ijk[2] != len(found.points):
         raise UsageError(f"{len(found.points)} slices were tested, the volume has {volume.shape_ijk[2]}")

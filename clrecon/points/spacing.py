@@ -25,15 +25,9 @@ def mean_spacing(points: NDArray[np.floating]) -> float:
     ``e / sqrt(n / c)``.  The edge is chosen so that a cell holds about four points.  Of points that fill a body it is
     about four fifths of their spacing.
 
-    Parameters
-    ----------
-    points : ndarray, shape (n, 3), floating
-        Millimetres.
+    points: ndarray, shape (n, 3), floating. Millimetres.
 
-    Returns
-    -------
-    float
-        Mm; 0 for clouds without extent, and for fewer than two points.
+    Returns: Mm; 0 for clouds without extent, and for fewer than two points.
     """
     if len(points) < 2:
         return 0.0

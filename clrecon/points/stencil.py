@@ -29,13 +29,10 @@ PLACES = 9
 class Lattice:
     """Where the voxels of a volume lie, without the volume.
 
-    Attributes
-    ----------
-    shape_ijk : (ni, nj, nk)
-    affine : ndarray, shape (4, 4), float64
-        Index (i, j, k) to LPS mm.
-    origins : ndarray, shape (nk, 3), float64, or None
-        LPS mm of voxel (0, 0, k) of each slice where the slices are uneven; the affine then says nothing about k.
+    shape_ijk: (ni, nj, nk)
+    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm.
+    origins: ndarray, shape (nk, 3), float64, or None. LPS mm of voxel (0, 0, k) of each slice where the slices are
+        uneven; the affine then says nothing about k.
     """
 
     shape_ijk: tuple[int, int, int]
@@ -81,19 +78,13 @@ class Lattice:
 class Stencil:
     """Offsets of the voxels within eps of a voxel, row by row of the volume.
 
-    Attributes
-    ----------
-    rows : ndarray, shape (m, 4), int32
-        dj, dk, lowest di and highest di of each row, nearest rows first, of one table after the other.
-    tables : ndarray, shape (nk, 2), int32
-        First row of the table of each slice, and the one after its last.
-    in_plane : int
-        Members of the stencil in its own slice, the voxel itself included.
-    members : (int, int)
-        Fewest and most members over all slices that have neighbours as far as the stencil reaches; equal in an even
-        stack.
-    reach : int
-        Largest \\|di\\|.
+    rows: ndarray, shape (m, 4), int32. dj, dk, lowest di and highest di of each row, nearest rows first, of one table
+        after the other.
+    tables: ndarray, shape (nk, 2), int32. First row of the table of each slice, and the one after its last.
+    in_plane: Members of the stencil in its own slice, the voxel itself included.
+    members: Fewest and most members over all slices that have neighbours as far as the stencil reaches; equal in an
+        even stack.
+    reach: Largest \\|di\\|.
     """
 
     rows: NDArray[np.int32]
@@ -141,13 +132,7 @@ class Stencil:
 
 
 def checked_eps(eps: float) -> float:
-    """Return `eps` as a float.
-
-    Raises
-    ------
-    UsageError
-        It is not a finite number above 0.
-    """
+    """Return `eps` as a float."""
     if isinstance(eps, bool) or not isinstance(eps, (int, float, np.number)) or not 0.0 < float(eps) < math.inf:
         raise UsageError(f"eps is {eps!r}: a distance above 0 mm is needed")
     return float(eps)
@@ -159,16 +144,7 @@ def make_stencil(lattice: Lattice, eps: float) -> Stencil:
     Where the slices are uneven, the places of both slices count and the affine says nothing about k.  Offsets that lead
     out of the volume from every voxel are left out.
 
-    Parameters
-    ----------
-    lattice : Lattice
-    eps : float
-        mm; see `SLACK`.
-
-    Raises
-    ------
-    UsageError
-        `eps` is not a number above 0.
+    eps: mm; see `SLACK`.
     """
     eps = checked_eps(eps)
     nk = lattice.shape_ijk[2]

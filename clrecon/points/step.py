@@ -23,18 +23,12 @@ def count_numbers(numbers: NDArray[np.uint8], reasons: Sequence[str]) -> dict[st
 class PointStep:
     """The result of a function that takes a cloud and gives another one.
 
-    Attributes
-    ----------
-    cloud : PointCloud
-        The new cloud: the points that are kept, in the order of the input.
-    removed : ndarray, shape (n,), uint8
-        For each point of the input 0 if it is kept, or the number of the reason why it was removed, from 1.
-    reasons : tuple of str
-        The reasons: number r is ``reasons[r - 1]``, for example "noise" or "sheet".
-    facts : mapping
-        Further entries of the step's report: parameters as they were used, figures measured, doubtful points.
-    warnings : tuple of str
-        A line each.
+    cloud: The new cloud: the points that are kept, in the order of the input.
+    removed: ndarray, shape (n,), uint8. For each point of the input 0 if it is kept, or the number of the reason why it
+        was removed, from 1.
+    reasons: The reasons: number r is ``reasons[r - 1]``, for example "noise" or "sheet".
+    facts: Further entries of the step's report: parameters as they were used, figures measured, doubtful points.
+    warnings: A line each.
     """
 
     cloud: PointCloud

@@ -15,11 +15,8 @@ __all__ = ["VoxelNumbers"]
 class VoxelNumbers:
     """Voxels of a volume by number.
 
-    Attributes
-    ----------
-    numbers : ndarray, shape (n,), uint32 or int64
-        ``i + ni * (j + nj * k)``.
-    shape_ijk : (ni, nj, nk)
+    numbers: ndarray, shape (n,), uint32 or int64. ``i + ni * (j + nj * k)``.
+    shape_ijk: (ni, nj, nk)
     """
 
     numbers: NDArray[Any]

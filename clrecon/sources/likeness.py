@@ -60,14 +60,9 @@ are interleaved from end to end, so parts of the picture must show it in two win
 class Likeness:
     """Ratio of the differences from neighbours to those from a slice farther on.
 
-    Attributes
-    ----------
-    period : int
-        Number of slices from one slice to the most similar one.
-    whole : float
-        Ratio over the whole picture; above 1 where neighbours are less alike.
-    part : float or None
-        Ratio that `PARTS` parts of the picture reach, or one along more slices; None where parts were not examined.
+    period: Number of slices from one slice to the most similar one.
+    whole: Ratio over the whole picture; above 1 where neighbours are less alike.
+    part: Ratio that `PARTS` parts of the picture reach, or one along more slices; None where parts were not examined.
     """
 
     period: int
@@ -118,19 +113,12 @@ def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool |
 def measure_likeness(voxels: NDArray[Any], parts: bool = True) -> Likeness | None:
     """Compare slices with their neighbours and with slices farther on.
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni)
-        HU, one slice at each place, in the order of the places.
-    parts : bool
-        True: examine parts of the picture too.  Use False for a tilted gantry: scanners that measure several slices in
-        one turn shift the slices of a turn against each other, which shows in objects that do not change along the
+    voxels: ndarray, shape (nk, nj, ni). HU, one slice at each place, in the order of the places.
+    parts: True: examine parts of the picture too.  Use False for a tilted gantry: scanners that measure several slices
+        in one turn shift the slices of a turn against each other, which shows in objects that do not change along the
         table (a head holder) in real scans.
 
-    Returns
-    -------
-    Likeness or None
-        None where there are too few slices or pixels.
+    Returns: None where there are too few slices or pixels.
     """
     if len(voxels) < min(PERIODS) + LEAST_ALIKE:
         return None

@@ -16,33 +16,19 @@ __all__ = ["SeriesEntry", "SeriesListing"]
 class SeriesEntry:
     """One line of a listing; `as_dict` is the documented machine-readable form.
 
-    Attributes
-    ----------
-    number : int
-        From 1, the value that ``series=`` takes.
-    patient, study : int or None
-        Numbers of the patient and the study among those found, from 1; their identifiers are not given.  None where the
-        files do not tell.
-    kind : {"stack", "localizer", "capture", "other"}
-        Only stacks are read.
-    phases : list of dict
-        ``{"number", "keyword", "value", "slices"}`` of each volume, where slices share places; else empty.
-    slices : int
-        Number of images, with copies and all phases.
-    uid_hash : str or None
-        First 16 hexadecimal digits of the SHA-256 of the SeriesInstanceUID, None where the files have none.
-    shape_ijk, spacing_mm, affine_ijk_to_lps_mm, tilt_deg : list, list, nested list, float; or None
-        None where the geometry is unknown or refused.
-    grid_residual_max_mm : float or None
-        Largest distance of a slice position from the affine.
-    gap_mm : dict
-        "min", "max" and "median" distance of neighbouring slices along the normal, None where unknown.
-    extent_mm : list or None
-        Size of the box of whole voxels along rows, columns and the slice normal.
-    slice_thickness_mm : float or None
-        As stated; not used for the geometry.
-    dropped : dict of str to int
-        Maps a reason to the number of slices left out of the stack.
+    number: From 1, the value that ``series=`` takes.
+    patient, study: Numbers of the patient and the study among those found, from 1; their identifiers are not given.
+        None where the files do not tell.
+    kind: {"stack", "localizer", "capture", "other"}. Only stacks are read.
+    phases: ``{"number", "keyword", "value", "slices"}`` of each volume, where slices share places; else empty.
+    slices: Number of images, with copies and all phases.
+    uid_hash: First 16 hexadecimal digits of the SHA-256 of the SeriesInstanceUID, None where the files have none.
+    shape_ijk, spacing_mm, affine_ijk_to_lps_mm, tilt_deg: None where the geometry is unknown or refused.
+    grid_residual_max_mm: Largest distance of a slice position from the affine.
+    gap_mm: "min", "max" and "median" distance of neighbouring slices along the normal, None where unknown.
+    extent_mm: Size of the box of whole voxels along rows, columns and the slice normal.
+    slice_thickness_mm: As stated; not used for the geometry.
+    dropped: Maps a reason to the number of slices left out of the stack.
     """
 
     number: int
@@ -76,19 +62,11 @@ class SeriesEntry:
 class SeriesListing:
     """The series at a path.
 
-    Attributes
-    ----------
-    series : list of SeriesEntry
-    chosen : int or None
-        Number of the series that `read_volume` reads for the same ``series``; None where it would not choose.
-    skipped : dict of str to int
-        Maps a reason to the number of files passed over.
-    warnings : list of str
-    certificate : Certificate or None
-        Certificate of the chosen series, as in ``volume.report``, even if the series is refused; None where no series
-        is chosen or none of its slices has a valid header.
-    refusal : ClreconError or None
-        The reason why no series is chosen; `warnings` contains its text too.
+    chosen: Number of the series that `read_volume` reads for the same ``series``; None where it would not choose.
+    skipped: Maps a reason to the number of files passed over.
+    certificate: Certificate of the chosen series, as in ``volume.report``, even if the series is refused; None where no
+        series is chosen or none of its slices has a valid header.
+    refusal: The reason why no series is chosen; `warnings` contains its text too.
     """
 
     series: list[SeriesEntry]

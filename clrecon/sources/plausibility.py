@@ -60,22 +60,10 @@ def examine_voxels(
 ) -> VoxelFindings:
     """Examine the values that were read.
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni)
-        HU.
-    facts : PixelFacts
-    slices : sequence of StoredValues
-        In the order of k; empty for files other than DICOM.
-    known : bool
-        False: the header does not say that the values are HU, or they surely are not.
-    stored : sequence of StoredValues
-        As `slices`, for other files of whole numbers.
-
-    Raises
-    ------
-    RefusedInputError
-        All voxels have one value.
+    voxels: ndarray, shape (nk, nj, ni). HU.
+    slices: In the order of k; empty for files other than DICOM.
+    known: False: the header does not say that the values are HU, or they surely are not.
+    stored: As `slices`, for other files of whole numbers.
     """
     if facts.hu_min == facts.hu_max:
         what = "padding" if facts.padding_share == 1.0 else f"{facts.hu_min:g} HU"

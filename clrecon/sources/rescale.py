@@ -25,13 +25,7 @@ class Rescale(NamedTuple):
 
 
 def check_rescale(given: Any) -> Rescale | None:
-    """Check two numbers; None stays None.
-
-    Raises
-    ------
-    UsageError
-        They are no slope other than 0 and intercept within 1e6.
-    """
+    """Check two numbers; None stays None."""
     if given is None:
         return None
     try:

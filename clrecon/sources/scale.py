@@ -72,15 +72,9 @@ def judge_scale(
 ) -> tuple[Gate, dict[str, float]]:
     """Judge the gate ``hu_scale``; where it fails, return the places of ``air`` and ``soft_tissue`` too.
 
-    Parameters
-    ----------
-    sample : ValueSample or None
-        Values of the measured voxels; None where there are too few.
-    facts : PixelFacts
-    slopes : sequence of float
-        Slopes of the rescale.  Where all are 1, one that is too large cannot be told from a dry specimen.
-    known : bool
-        False: the header does not say that the values are HU.  Then only a missing or doubled intercept is told.
+    sample: Values of the measured voxels; None where there are too few.
+    slopes: Slopes of the rescale.  Where all are 1, one that is too large cannot be told from a dry specimen.
+    known: False: the header does not say that the values are HU.  Then only a missing or doubled intercept is told.
     """
     if sample is None or len(sample.values) < FEWEST_VALUES:
         return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: too few voxels"), {}

@@ -10,12 +10,7 @@ __all__ = ["StoredRange", "StoredValues"]
 class StoredValues(Protocol):
     """What a header says of the values of its slice.
 
-    Attributes
-    ----------
-    bits_stored : int
-    signed : bool
-    slope, intercept : float
-        Of the rescale to HU.
+    slope, intercept: Of the rescale to HU.
     """
 
     @property

@@ -17,11 +17,6 @@ def aligned_empty(shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
 
     CPU drivers use the memory of such an array directly (Intel's copies any other array), and kernels may read it as
     vectors.
-
-    Raises
-    ------
-    MemoryError
-        The system does not provide that much memory.
     """
     dtype = np.dtype(dtype)
     size = int(np.prod(shape, dtype=object)) * dtype.itemsize

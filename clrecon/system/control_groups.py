@@ -17,10 +17,7 @@ _FILES = {  # Of a version of control groups: the files of limit and use, and th
 def free_bytes_of_container(proc: Path, groups: Path) -> float:
     """Return the bytes that this process may still take before it is killed; infinity without a limit.
 
-    Parameters
-    ----------
-    proc, groups : Path
-        Folders of processes and of control groups: ``/proc`` and ``/sys/fs/cgroup``.
+    proc, groups: Folders of processes and of control groups: ``/proc`` and ``/sys/fs/cgroup``.
     """
     return min(_group_bytes(proc, groups), default=math.inf)
 

@@ -74,12 +74,8 @@ class NoDisplayError(UsageError):
 class Display:
     """What was found.
 
-    Attributes
-    ----------
-    fault : str or None
-        Why no window can be opened, as the end of a sentence; None where one can.
-    driver : str
-        What OpenGL says that it draws with; empty where it says nothing.
+    fault: Why no window can be opened, as the end of a sentence; None where one can.
+    driver: What OpenGL says that it draws with; empty where it says nothing.
     """
 
     fault: str | None = None
@@ -154,12 +150,8 @@ class DisplayProbe:
 def read_words(told: bytes, code: int) -> Display:
     """Return what the words and the end of a child mean.
 
-    Parameters
-    ----------
-    told : bytes
-        Lines of JSON, each with more than the one before.
-    code : int
-        Its exit status; negative or above 128 where it was ended by a signal.
+    told: Lines of JSON, each with more than the one before.
+    code: Its exit status; negative or above 128 where it was ended by a signal.
     """
     try:
         facts = json.loads(told.decode().splitlines()[-1])

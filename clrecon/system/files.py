@@ -62,28 +62,13 @@ def replace_file(
 ) -> int:
     """Write a file as a whole or not at all.
 
-    Parameters
-    ----------
-    path : str or path
-        The target.  A regular file of that name is replaced; its permissions are kept.  A new file gets the
+    path: The target.  A regular file of that name is replaced; its permissions are kept.  A new file gets the
         permissions that the umask allows.
-    write : callable
-        Gets a binary stream, open for writing, and writes the contents.
-    verify : callable, optional
-        Gets the path of the finished temporary file and raises `OutputError` if its contents are wrong.
-    expected_bytes : int, optional
-        Expected size of the file; checked against the free space before anything is written.
+    write: Gets a binary stream, open for writing, and writes the contents.
+    verify: Gets the path of the finished temporary file and raises `OutputError` if its contents are wrong.
+    expected_bytes: Expected size of the file; checked against the free space before anything is written.
 
-    Returns
-    -------
-    int
-        Size of the file in bytes.
-
-    Raises
-    ------
-    OutputError
-        The folder is missing or cannot be written to, the target is not a regular file or is write-protected, the
-        disk is full, or the check failed.  An older target is intact and no temporary file is left.
+    Returns: Size of the file in bytes.
     """
     with stage_file(path, write, verify, expected_bytes=expected_bytes) as staged:
         staged.commit()
@@ -103,10 +88,7 @@ class Staged(Protocol):
 class StagedFile:
     """A finished file under a temporary name beside its target.
 
-    Attributes
-    ----------
-    size : int
-        Bytes.
+    size: Bytes.
     """
 
     def __init__(self, path: str | os.PathLike[str], temporary: Path, target: Path, stream: BinaryIO, size: int):
@@ -115,13 +97,7 @@ class StagedFile:
         self.size = size
 
     def commit(self) -> None:
-        """Rename the file over its target.
-
-        Raises
-        ------
-        OutputError
-            The system refuses to rename, or an existing file is kept; an older target is intact.
-        """
+        """Rename the file over its target."""
         if sys.platform == "win32":
             with system_errors(self._path):
                 self._stream.close()  # Windows cannot rename an open file.
@@ -209,11 +185,7 @@ def check_writable(path: str | os.PathLike[str], *, expected_bytes: int = 0) -> 
 
     Creates an empty temporary file beside the target and removes it at once; the target is not touched.
 
-    Parameters
-    ----------
-    path : str or path
-    expected_bytes : int, optional
-        Expected size of the file, if it is known.
+    expected_bytes: Expected size of the file, if it is known.
     """
     target = checked_target(path)
     with system_errors(path):

@@ -19,20 +19,8 @@ log = get_logger(__name__)
 def check_folder(path: str | os.PathLike[str], own: re.Pattern[str], what: str) -> Path:
     """Return the folder that will be made or replaced.
 
-    Parameters
-    ----------
-    path : path
-    own : pattern
-        Names of files that an earlier run can have written.
-    what : str
-        What will be in it, for messages: "frames".
-
-    Raises
-    ------
-    UsageError
-        The folder holds more than files of an earlier run, or is the current folder.
-    OutputError
-        The path is not a folder or cannot be replaced, or its parent folder is missing or cannot be written to.
+    own: Names of files that an earlier run can have written.
+    what: What will be in it, for messages: "frames".
     """
     folder = resolve_target(path)
     with system_errors(path):
@@ -70,10 +58,7 @@ def _check_existing(path: str | os.PathLike[str], folder: Path, own: re.Pattern[
 class StagedFolder:
     """A finished folder under a temporary name beside its place.
 
-    Attributes
-    ----------
-    size : int
-        Total size of its files in bytes.
+    size: Total size of its files in bytes.
     """
 
     def __init__(self, path: str | os.PathLike[str], made: Path, folder: Path, size: int):
@@ -82,13 +67,7 @@ class StagedFolder:
         self.size = size
 
     def commit(self) -> None:
-        """Move the folder to its place; that of an earlier run is removed at the end of the ``with`` block.
-
-        Raises
-        ------
-        OutputError
-            The system refuses, or an existing folder is kept; an older folder is intact.
-        """
+        """Move the folder to its place; that of an earlier run is removed at the end of the ``with`` block."""
         with hold_interrupts():
             place_folder(self._made, self._folder, self._path, keep=self._keep)
         log.info("folder written: %d bytes", self.size)

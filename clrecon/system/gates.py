@@ -18,18 +18,10 @@ __all__ = ["Gate", "at_least", "at_most", "failed_gates", "is_true", "none_of", 
 class Gate(Record):
     """A figure and its bound.
 
-    Attributes
-    ----------
-    name : str
-    measured : float, bool or None
-        None: not measured.
-    bound : float or bool
-    unit : str or None
-        None for counts, shares and flags.
-    ok : bool or None
-        None: not measured.
-    text : str
-        One line without patient data.
+    measured: None: not measured.
+    unit: None for counts, shares and flags.
+    ok: None: not measured.
+    text: One line without patient data.
     """
 
     name: str

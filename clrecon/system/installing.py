@@ -18,10 +18,7 @@ def install_command(*packages: str) -> str:
     A bare ``pip`` may belong to another Python, and an extra of clrecon can be named only where an index has clrecon.
     Environments without pip, as uv makes them, get uv's own command.
 
-    Parameters
-    ----------
-    *packages : str
-        Names as package indexes have them.
+    *packages: Names as package indexes have them.
     """
     python = [sys.executable or "python3"]
     if importlib.util.find_spec("pip") is None and shutil.which("uv") is not None:

@@ -20,17 +20,10 @@ __all__ = ["FilePlace", "Mapping", "find_mapping"]
 class FilePlace:
     """The place of a C-contiguous array in a file, and the state of the file at that time.
 
-    Attributes
-    ----------
-    path : str
-        Absolute.
-    offset : int
-        Bytes before the first value.
-    dtype : str
-        With the byte order, as ``numpy.dtype.str`` has it.
-    shape : tuple of int
-    file_bytes, changed_ns : int
-        Size of the file, and when it was changed last (ns since 1970).
+    path: Absolute.
+    offset: Bytes before the first value.
+    dtype: With the byte order, as ``numpy.dtype.str`` has it.
+    file_bytes, changed_ns: Size of the file, and when it was changed last (ns since 1970).
     """
 
     path: str
@@ -41,13 +34,7 @@ class FilePlace:
     changed_ns: int
 
     def open(self) -> NDArray[Any]:
-        """Map the array into memory, read-only.
-
-        Raises
-        ------
-        RefusedInputError
-            The file does not exist, cannot be read, or has changed since.
-        """
+        """Map the array into memory, read-only."""
         what = f"voxels were sent as a place in the file {self.path}"
         try:
             found = os.stat(self.path)
@@ -68,18 +55,10 @@ class FilePlace:
 class Mapping:
     """A memory mapping of a file.
 
-    Attributes
-    ----------
-    file : mmap
-    address : int
-        Address of its first byte in memory.
-    path : str or None
-        Path of the file, if it is known.
-    start : int
-        Offset in the file at which the mapping begins, bytes.
-    identity : (int, int) or None
-        Device and number of the file when the mapping was found: another file may take its name later.
-    writeable : bool
+    address: Address of its first byte in memory.
+    path: Path of the file, if it is known.
+    start: Offset in the file at which the mapping begins, bytes.
+    identity: Device and number of the file when the mapping was found: another file may take its name later.
     """
 
     file: mmap.mmap
@@ -104,10 +83,7 @@ class Mapping:
         """Return where `part`, a C-contiguous view of the mapping, is in the file; changes are written to the file
         first.
 
-        Returns
-        -------
-        FilePlace or None
-            None where the path no longer names the mapped file.
+        Returns: None where the path no longer names the mapped file.
         """
         if self.path is None or self.identity is None:
             return None

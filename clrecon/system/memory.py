@@ -49,17 +49,8 @@ def physical_memory_bytes() -> float:
 def allocate_voxels(shape: Sequence[int], dtype: DTypeLike, name: str = "") -> NDArray[Any]:
     """Return an uninitialised array for a volume, see `aligned_empty`.
 
-    Parameters
-    ----------
-    shape : (nk, nj, ni)
-    dtype : numpy type
-    name : str
-        Name of the file, for the message.
-
-    Raises
-    ------
-    RefusedInputError
-        The array does not fit into the free memory.
+    shape: (nk, nj, ni)
+    name: Name of the file, for the message.
     """
     needed = math.prod(shape) * np.dtype(dtype).itemsize
     available = available_memory_bytes()

@@ -14,19 +14,9 @@ __all__ = ["import_package"]
 def import_package(module: str, what: str, package: str | None = None) -> Any:
     """Import `module`.
 
-    Parameters
-    ----------
-    module : str
-        As Python imports it.
-    what : str
-        What needs it, for the message.
-    package : str, optional
-        As it is installed, where that is another name.
-
-    Raises
-    ------
-    UsageError
-        It is not installed; the message says how to install it.
+    module: As Python imports it.
+    what: What needs it, for the message.
+    package: As it is installed, where that is another name.
     """
     try:
         return import_module(module)

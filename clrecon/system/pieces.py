@@ -35,14 +35,9 @@ def in_threads(
 ) -> None:
     """Call a function with slices that cover ``range(count)``, several at a time; numpy runs side by side in threads.
 
-    Parameters
-    ----------
-    work : callable
-        What it raises is raised here.
-    count, size : int
-        Length of the range, and of the slices.
-    done : callable, optional
-        Called in the thread of the caller with each slice that is finished, in order.  What it raises ends the work.
+    work: What it raises is raised here.
+    count, size: Length of the range, and of the slices.
+    done: Called in the thread of the caller with each slice that is finished, in order.  What it raises ends the work.
     """
     pieces = list(chunks(count, size))
     threads = count_readers(len(pieces), _MOST_THREADS)

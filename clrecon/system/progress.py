@@ -21,13 +21,8 @@ def ignore_progress(stage: str, done: int = 0, total: int = 0) -> None:
 class Steps:
     """Counts the steps of work that several functions share, and reports each.
 
-    Parameters
-    ----------
-    progress : callable or None
-        None reports nothing.
-    stage : str
-    total : int
-        All steps.
+    progress: None reports nothing.
+    total: All steps.
     """
 
     def __init__(self, progress: Progress | None, stage: str, total: int) -> None:

@@ -14,13 +14,7 @@ _READ = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
 
 
 def open_regular(path: str | os.PathLike[str], buffering: int = -1) -> BinaryIO:
-    """Open a regular file for reading, as ``open(path, "rb", buffering)`` does.
-
-    Raises
-    ------
-    OSError
-        It cannot be opened, or is a folder, FIFO, socket or device; these are refused without waiting.
-    """
+    """Open a regular file for reading, as ``open(path, "rb", buffering)`` does."""
     descriptor = os.open(path, _READ)
     if stat.S_ISREG(os.fstat(descriptor).st_mode):
         return os.fdopen(descriptor, "rb", buffering)

@@ -119,14 +119,7 @@ def _missing_advice(path: str | os.PathLike[str]) -> str:
 
 
 def resolve_target(path: str | os.PathLike[str]) -> Path:
-    """Return the absolute path behind all links, whether something is there or not.
-
-    Raises
-    ------
-    OutputError
-        The name cannot be that of a file, the current folder is gone, or the path leads to an open stream such as
-        standard output.
-    """
+    """Return the absolute path behind all links, whether something is there or not."""
     text = os.fspath(path)
     try:
         os.fsencode(text)
@@ -220,19 +213,9 @@ def final_mode(target: Path, new: int = 0o666) -> int:
 def place_file(temporary: Path, target: Path, path: str | os.PathLike[str], *, keep: bool) -> None:
     """Rename a finished file to its target.
 
-    Parameters
-    ----------
-    temporary, target : Path
-        In the same folder.
-    path : path
-        The target as the user named it, for messages.
-    keep : bool
-        True: fail if the target exists, also if it came into being a moment ago.
-
-    Raises
-    ------
-    OutputError
-        The system refuses, or an existing file is kept.  Whatever was at the target is intact.
+    temporary, target: In the same folder.
+    path: The target as the user named it, for messages.
+    keep: Fail if the target exists, also if it came into being a moment ago.
     """
     with system_errors(path):
         if not keep:

@@ -40,11 +40,7 @@ def escape_text(text: str, limit: int = TEXT_LIMIT) -> str:
 def guess_word(word: object, known: Iterable[str]) -> str:
     """Return `` (did you mean X?)`` with the known word that is most like `word`; empty if none is like it.
 
-    Parameters
-    ----------
-    word : object
-        What was given; upper and lower case count alike.
-    known : iterable of str
+    word: What was given; upper and lower case count alike.
     """
     if not isinstance(word, str) or len(word) > TEXT_LIMIT:
         return ""

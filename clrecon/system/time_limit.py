@@ -22,13 +22,7 @@ def device_seconds() -> float:
 
 
 def check_time_limit(seconds: float) -> float:
-    """Return the seconds of a time limit, infinite for 0.
-
-    Raises
-    ------
-    UsageError
-        `seconds` is not a number from 0 on.
-    """
+    """Return the seconds of a time limit, infinite for 0."""
     if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not seconds >= 0.0:
         raise UsageError(f"a time limit is a number of seconds, 0 for none, not {seconds!r}")
     return float(seconds) or math.inf

@@ -31,12 +31,8 @@ _speaker: Speaker = in_python
 def name_parameter(parameter: str, value: object = None) -> str:
     """Name a parameter, with a value if one is given, in Python's words or those of the command line.
 
-    Parameters
-    ----------
-    parameter : str
-        As Python calls it, such as ``"keep_largest"``.
-    value : object, optional
-        True, a number, a text, or capital letters that stand for one: ``"N"``.
+    parameter: As Python calls it, such as ``"keep_largest"``.
+    value: True, a number, a text, or capital letters that stand for one: ``"N"``.
     """
     return _speaker(parameter, value)
 

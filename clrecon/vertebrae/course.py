@@ -30,16 +30,11 @@ ASIDE_MM = np.arange(-42.0, 43.0)
 class Course:
     """Places along the spinal canal, 1 mm apart, from the head downwards.
 
-    Attributes
-    ----------
-    canal : ndarray, shape (n, 3), float64
-        LPS mm.
-    down, ahead, aside : ndarray, shape (n, 3), float64
-        Unit vectors at each place: along the canal, to the front, and to the patient's left.
-    known : ndarray, shape (n,), bool
-        False where the line of the canal was only continued.
-    reaches : (bool, bool)
-        True where the first, and the last, place is the border of the scan.
+    canal: ndarray, shape (n, 3), float64. LPS mm.
+    down, ahead, aside: ndarray, shape (n, 3), float64. Unit vectors at each place: along the canal, to the front, and
+        to the patient's left.
+    known: ndarray, shape (n,), bool. False where the line of the canal was only continued.
+    reaches: True where the first, and the last, place is the border of the scan.
     """
 
     canal: Float64Array
@@ -60,12 +55,8 @@ class Course:
 def follow_canal(points: Float64Array, volume: Grid) -> Course:
     """Follow the middle of the canal, and beyond the ends of its line as far as the scan goes.
 
-    Parameters
-    ----------
-    points : ndarray, shape (m, 3), float64
-        LPS mm from the head downwards, see `clrecon.anatomy.spine_line.SpineLine`.
-    volume : Grid
-        The scan.
+    points: ndarray, shape (m, 3), float64. LPS mm from the head downwards, see `clrecon.anatomy.spine_line.SpineLine`.
+    volume: The scan.
     """
     from scipy.interpolate import PchipInterpolator
     from scipy.ndimage import gaussian_filter1d
@@ -106,19 +97,10 @@ def sample_course(
 ) -> Field:
     """Return a scan or label map in planes across the canal.
 
-    Parameters
-    ----------
-    grid : Volume or LabelMap
-    course : Course
-    ahead_mm, aside_mm : ndarray
-        Places of the rows and columns of a plane.
-    order : int
-        1: trilinear interpolation; 0: the nearest voxel.
+    ahead_mm, aside_mm: Places of the rows and columns of a plane.
+    order: 1: trilinear interpolation; 0: the nearest voxel.
 
-    Returns
-    -------
-    ndarray, shape (n, len(ahead_mm), len(aside_mm)), float32
-        NaN outside of the grid.
+    Returns: ndarray, shape (n, len(ahead_mm), len(aside_mm)), float32. NaN outside of the grid.
     """
     from scipy.ndimage import map_coordinates
 

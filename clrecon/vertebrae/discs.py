@@ -64,18 +64,12 @@ UNLIKE_COST = 2.0
 class Looks:
     """The scan along the canal, as far as discs show in it.
 
-    Attributes
-    ----------
-    brightness : ndarray, shape (n, tilts), float32
-        HU of the plane at each place and tilt: core and side walls.
-    core : ndarray, shape (n, ahead), float32
-        HU of the middle of each plane, from side to side.
-    depth : ndarray, shape (n, tilts), float32
-        How much darker the plane is than those beside it, on the side where it is less so, HU.
-    middle_mm : ndarray, shape (n,), float64
-        Middle of the body in front of the canal.
-    front_mm, side_mm : ndarray, shape (n,), float64
-        Front wall of the body, and its side walls.
+    brightness: ndarray, shape (n, tilts), float32. HU of the plane at each place and tilt: core and side walls.
+    core: ndarray, shape (n, ahead), float32. HU of the middle of each plane, from side to side.
+    depth: ndarray, shape (n, tilts), float32. How much darker the plane is than those beside it, on the side where it
+        is less so, HU.
+    middle_mm: ndarray, shape (n,), float64. Middle of the body in front of the canal.
+    front_mm, side_mm: ndarray, shape (n,), float64. Front wall of the body, and its side walls.
     """
 
     brightness: Field
@@ -90,16 +84,10 @@ class Looks:
 class Bound:
     """A plane at which a vertebra begins or ends.
 
-    Attributes
-    ----------
-    at : int
-        Place along the canal.
-    tilt : int
-        Index into `TILTS_DEG`.
-    depth_hu : float
-        How much darker it is than what lies beside it.
-    is_disc : bool
-        False: bone ends there and no other vertebra follows.
+    at: Place along the canal.
+    tilt: Index into `TILTS_DEG`.
+    depth_hu: How much darker it is than what lies beside it.
+    is_disc: False: bone ends there and no other vertebra follows.
     """
 
     at: int
@@ -128,10 +116,7 @@ def _edge(image: Field, first: int, least: int, most: int) -> NDArray[np.float64
 def look_at_bodies(scan: Field) -> Looks:
     """Measure at each place and tilt how much a plane looks like a disc.
 
-    Parameters
-    ----------
-    scan : ndarray, shape (n, ahead, aside), float32
-        See `clrecon.vertebrae.course.sample_course`.
+    scan: ndarray, shape (n, ahead, aside), float32. See `clrecon.vertebrae.course.sample_course`.
     """
     clipped = np.clip(scan, -200.0, 900.0)
     core = _mean(clipped[:, :, np.abs(ASIDE_MM) <= CORE_ASIDE_MM], axis=2)
@@ -215,12 +200,8 @@ def _lines(image: Field, along: NDArray[np.float64], ahead: NDArray[np.float64])
 def choose_discs(looks: Looks) -> tuple[list[Bound], NDArray[np.float64]]:
     """Choose the discs together.
 
-    Returns
-    -------
-    list of Bound
-        From the head downwards; empty where nothing looks like a disc.
-    ndarray, shape (n,), float64
-        Depth of a usual disc at each place, HU.
+    Returns: From the head downwards; empty where nothing looks like a disc.
+    Returns: ndarray, shape (n,), float64. Depth of a usual disc at each place, HU.
     """
     depth = np.nan_to_num(looks.depth, nan=-1e3)
     usual = _usual_depth(depth.max(axis=1))
@@ -272,12 +253,8 @@ def discs_between(looks: Looks, seeds: list[int]) -> tuple[list[Bound], NDArray[
 def end_of_bone(looks: Looks, bound: Bound, gap: float, sign: int) -> Bound | None:
     """Return where the bone beyond the first (`sign` -1) or last disc ends, None where it does not end in time.
 
-    Parameters
-    ----------
-    bound : Bound
-        That disc.
-    gap : float
-        Distance of neighbouring discs there, mm.
+    bound: That disc.
+    gap: Distance of neighbouring discs there, mm.
     """
     flat = looks.brightness[:, len(TILTS_DEG) // 2]
     first, last = (int(bound.at + sign * share * gap) for share in END_SHARES)

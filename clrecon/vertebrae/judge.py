@@ -42,21 +42,12 @@ WALL_DIRECTIONS = np.radians(np.arange(-130.0, 131.0, 15.0))
 class Piece:
     """The bone between two planes.
 
-    Attributes
-    ----------
-    upper, lower : Bound or None
-        None where the scan ends first.
-    begin, end : int
-        Places along the canal.
-    volume_ml : float
-    largest_share : float
-        Share of its voxels in its largest connected part.
-    doubtful_share : float
-        Share of its voxels that two ways of dividing the bone give to different vertebrae.
-    rim_share : float
-        Share of its voxels in its surface.
-    arch_ml : float
-        Volume of its spinous process.
+    upper, lower: None where the scan ends first.
+    begin, end: Places along the canal.
+    largest_share: Share of its voxels in its largest connected part.
+    doubtful_share: Share of its voxels that two ways of dividing the bone give to different vertebrae.
+    rim_share: Share of its voxels in its surface.
+    arch_ml: Volume of its spinous process.
     """
 
     upper: Bound | None
@@ -98,17 +89,9 @@ def judge(
 ) -> Traits:
     """Judge a piece.
 
-    Parameters
-    ----------
-    piece : Piece
-    gaps : sequence of float
-        Heights of the whole pieces beside it, up to two above and two below, mm.
-    scan : ndarray
-        See `clrecon.vertebrae.course.sample_course`.
-    looks : Looks
-    course : Course
-    usual : ndarray, shape (n,)
-        Depth of a usual disc at each place, HU.
+    gaps: Heights of the whole pieces beside it, up to two above and two below, mm.
+    scan: See `clrecon.vertebrae.course.sample_course`.
+    usual: ndarray, shape (n,). Depth of a usual disc at each place, HU.
     """
     height = piece.end - piece.begin
     traits: Traits = {}

@@ -17,13 +17,7 @@ LEVELS = (
 
 
 def check_level(name: str) -> str:
-    """Return the name of a level as `LEVELS` has it.
-
-    Raises
-    ------
-    UsageError
-        There is no level of this name.
-    """
+    """Return the name of a level as `LEVELS` has it."""
     level = str(name).strip().upper()
     if not re.fullmatch(r"[CTL][0-9]{1,2}", level) or level not in LEVELS:
         raise UsageError(f"there is no vertebra {str(name)[:20]!r}: they are C1 to C7, T1 to T12 and L1 to L6")
@@ -31,13 +25,7 @@ def check_level(name: str) -> str:
 
 
 def check_landmark(name_at: tuple[Sequence[float], str] | None, first: str | None) -> str | None:
-    """Return the level of the landmark as `LEVELS` has it, None without one.
-
-    Raises
-    ------
-    UsageError
-        There is no such level, or there are two landmarks.
-    """
+    """Return the level of the landmark as `LEVELS` has it, None without one."""
     if name_at is not None and first is not None:
         raise UsageError(
             f"{name_parameter('first')} and {name_parameter('name_at')} both name levels: give one of them"
@@ -49,16 +37,7 @@ def check_landmark(name_at: tuple[Sequence[float], str] | None, first: str | Non
 def name_levels(count: int, given: tuple[int, str] | None) -> dict[int, str]:
     """Return the number in the label map and the name of each of `count` vertebrae, from the head downwards.
 
-    Parameters
-    ----------
-    count : int
-    given : (int, str), optional
-        Place of a vertebra, from 0, and its level.  Without it they are ``vertebra_1`` and so on.
-
-    Raises
-    ------
-    UsageError
-        The row would reach beyond C1 or L6.
+    given: Place of a vertebra, from 0, and its level.  Without it they are ``vertebra_1`` and so on.
     """
     if given is None:
         return {n: f"vertebra_{n}" for n in range(1, count + 1)}

@@ -58,24 +58,16 @@ ARCH_DOWN = 0.3
 class Part:
     """The part of a volume round the spine, and where each of its voxels lies from the canal.
 
-    Attributes
-    ----------
-    first : (k, j, i)
-        First voxel of the part in the volume.
-    values : ndarray, shape (nk, nj, ni), float32
-        HU.
-    ahead, aside : ndarray, shape (nk, nj, ni), float32
-        mm in front of the canal and to its left, in the plane across the canal.
-    place : ndarray, shape (nk, nj, ni), float32
-        Place along the course of that plane.
-    within : ndarray, shape (nk, nj, ni), bool
-        Near enough to the canal to be a vertebra, or a rib beside it.
-    body : ndarray, shape (nk, nj, ni), bool
-        Within the walls of the bodies.
-    beside : ndarray, shape (nk, nj, ni), bool
-        Where ribs lie: beside the bodies, in front of the transverse processes, and beyond them.
-    spacing : (dk, dj, di)
-        mm.
+    first: (k, j, i). First voxel of the part in the volume.
+    values: ndarray, shape (nk, nj, ni), float32. HU.
+    ahead, aside: ndarray, shape (nk, nj, ni), float32. mm in front of the canal and to its left, in the plane across
+        the canal.
+    place: ndarray, shape (nk, nj, ni), float32. Place along the course of that plane.
+    within: ndarray, shape (nk, nj, ni), bool. Near enough to the canal to be a vertebra, or a rib beside it.
+    body: ndarray, shape (nk, nj, ni), bool. Within the walls of the bodies.
+    beside: ndarray, shape (nk, nj, ni), bool. Where ribs lie: beside the bodies, in front of the transverse processes,
+        and beyond them.
+    spacing: (dk, dj, di). mm.
     """
 
     first: tuple[int, int, int]
@@ -210,14 +202,11 @@ def divide(
     are ridges between arches at the heights of the discs.  Where they differ, a group of voxels in front of the canal
     goes to the vertebra at whose height it lies, and an arch to the one that is a little higher.
 
-    Returns
-    -------
-    pieces : ndarray, shape (nk, nj, ni), uint8
-        0 outside of bone; 1 above the first plane, and so on.
-    doubtful : ndarray, shape (pieces + 1,), float64
-        Share of each piece that the two watersheds give to different ones.
-    rim : ndarray, shape (pieces + 1,), float64
-        Share of each piece in voxels of its surface: of those partial volume makes the place uncertain.
+    Returns:
+    pieces: ndarray, shape (nk, nj, ni), uint8. 0 outside of bone; 1 above the first plane, and so on.
+    doubtful: ndarray, shape (pieces + 1,), float64. Share of each piece that the two watersheds give to different ones.
+    rim: ndarray, shape (pieces + 1,), float64. Share of each piece in voxels of its surface: of those partial volume
+        makes the place uncertain.
     """
     from scipy.ndimage import distance_transform_edt, gaussian_filter
     from skimage.segmentation import watershed

@@ -28,26 +28,11 @@ def add_rendering(
 ) -> Any:
     """Add a picture to the scene of a PyVista plotter, in its own colours.
 
-    Parameters
-    ----------
-    plotter : pyvista.Plotter
-        Plotter of a scene in LPS mm.
-    rendering : Rendering
-    form : {"points", "plane"}
-        See `Rendering.to_pyvista`.  Points are as large as the pixels of a picture that is as high as the window.
-    move_camera : bool
-        True: give the plotter the camera of the picture.
-    options
-        Options of `Rendering.to_pyvista`: `expected`, `distance`.
-
-    Returns
-    -------
-    pyvista.Actor
-
-    Raises
-    ------
-    UsageError
-        As in `Rendering.to_pyvista`.
+    plotter: Plotter of a scene in LPS mm.
+    form: {"points", "plane"}. See `Rendering.to_pyvista`.  Points are as large as the pixels of a picture that is as
+        high as the window.
+    move_camera: Give the plotter the camera of the picture.
+    options: Options of `Rendering.to_pyvista`: `expected`, `distance`.
     """
     data = rendering_to_pyvista(rendering, form, **options)
     style = {}
@@ -67,22 +52,10 @@ def merge_scene(plotter: Any, rendering: Rendering) -> Rendering:
     Each pixel of the picture is one layer at its expected depth, each pixel of the scene one at its nearest surface.
     The order is right wherever the nearer layer is opaque.  The plotter keeps the picture's camera.
 
-    Parameters
-    ----------
-    plotter : pyvista.Plotter
-        Plotter of a scene in LPS mm, with a window as large as the picture; off screen, or already shown.
-    rendering : Rendering
-        With a transparent background.
+    plotter: Plotter of a scene in LPS mm, with a window as large as the picture; off screen, or already shown.
+    rendering: With a transparent background.
 
-    Returns
-    -------
-    Rendering
-        With a transparent background and the depths of both.
-
-    Raises
-    ------
-    UsageError
-        The picture has no camera or a coloured background, the window has another size or several views.
+    Returns: With a transparent background and the depths of both.
     """
     if rendering.camera is None:
         raise UsageError("this picture is no projection (its camera is None): no scene is seen as it is")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-from dataclasses import FrozenInstanceError, dataclass, fields, is_dataclass
+from dataclasses import FrozenInstanceError, dataclass
 from importlib import import_module
 from typing import Any
 
@@ -111,12 +111,8 @@ def all_records() -> list[type[Record]]:
     return found
 
 
-def test_every_record_compares_as_a_dict_and_documents_its_fields() -> None:
+def test_every_record_compares_as_a_dict() -> None:
     kinds = all_records()
     assert {Certificate, Gate} <= set(kinds)
     for kind in kinds:
         assert kind.__eq__ is dict.__eq__, f"{kind.__name__} is made without eq=False"
-        if is_dataclass(kind):
-            told = "".join(parent.__doc__ or "" for parent in kind.__mro__)
-            missing = [field.name for field in fields(kind) if field.name not in told]
-            assert missing == [], kind.__name__

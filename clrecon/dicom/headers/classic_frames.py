@@ -36,14 +36,9 @@ EXACT_DIGITS = 15
 class FramePlaces:
     """Where the frames of one file lie.
 
-    Attributes
-    ----------
-    offsets_mm : ndarray, shape (n,), float64
-        From the first frame along the normal.
-    digits : int
-        Number of decimals with which they were written.
-    element : str
-        The element that states them.
+    offsets_mm: ndarray, shape (n,), float64. From the first frame along the normal.
+    digits: Number of decimals with which they were written.
+    element: The element that states them.
     """
 
     offsets_mm: NDArray[np.float64]
@@ -52,13 +47,7 @@ class FramePlaces:
 
 
 def count_frames(values: Values, sop_class: str) -> int:
-    """Return the number of frames of a classic image, 1 where none is stated.
-
-    Raises
-    ------
-    ValueProblem
-        The number is no number, or too large.
-    """
+    """Return the number of frames of a classic image, 1 where none is stated."""
     if "NumberOfFrames" not in values:
         return 1
     frames = values.whole_or_none("NumberOfFrames")
@@ -72,13 +61,7 @@ def count_frames(values: Values, sop_class: str) -> int:
 
 
 def find_places(values: Values, sop_class: str, frames: int) -> FramePlaces:
-    """Find the places of two frames or more.
-
-    Raises
-    ------
-    ValueProblem
-        The geometry is not whole; the message names what is missing or wrong.
-    """
+    """Find the places of two frames or more."""
     image = f"multi-frame image of {frames} frames, SOP class {sop_class}"
     needed = ("ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing")
     missing = [keyword for keyword in needed if keyword not in values]

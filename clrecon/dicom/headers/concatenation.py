@@ -21,14 +21,9 @@ CONCATENATION_TAGS = (UID, PART, PARTS, FIRST_FRAME)
 class Concatenation:
     """The place of a file in a concatenation: one multi-frame image written as several files.
 
-    Attributes
-    ----------
-    uid : str
-        Used only for comparison.
-    part, parts : int, int or None
-        InConcatenationNumber, from 1, and InConcatenationTotalNumber.
-    first_frame, frames : int or None, int
-        ConcatenationFrameOffsetNumber, and the number of frames in this file.
+    uid: Used only for comparison.
+    part, parts: InConcatenationNumber, from 1, and InConcatenationTotalNumber.
+    first_frame, frames: ConcatenationFrameOffsetNumber, and the number of frames in this file.
     """
 
     uid: str

@@ -59,22 +59,10 @@ def read_headers(
 ) -> list[SliceHeader] | OtherImage | None:
     """Read and validate the header of one file.
 
-    Parameters
-    ----------
-    path, start, force
-        See `read_elements`.
+    path, start, force: See `read_elements`.
 
-    Returns
-    -------
-    list of SliceHeader, OtherImage or None
-        One header for the slice, or one for each frame; None for a DICOMDIR, which only lists files that are found
+    Returns: One header for the slice, or one for each frame; None for a DICOMDIR, which only lists files that are found
         anyway.
-
-    Raises
-    ------
-    NotDicomError, CorruptFileError, OSError
-        As `read_elements`. A CT image is also corrupt when it ends before its pixel data, or when the bytes after them
-        are not elements.
     """
     elements = read_elements(path, WANTED_TAGS, start, force)
     values = Values(elements)

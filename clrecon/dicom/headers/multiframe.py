@@ -109,15 +109,9 @@ COMPUTED_CONTRAST = (
 class Groups:
     """The functional groups of one file, still undecoded.
 
-    Attributes
-    ----------
-    shared : Item
-    frames : list of Item
-        One for each frame.
-    dimensions : tuple of (int, str)
-        Index in DimensionIndexValues and name of each dimension that is not a place in the patient.
-    concatenation : Concatenation or None
-    warnings : tuple of str
+    frames: One for each frame.
+    dimensions: tuple of (int, str). Index in DimensionIndexValues and name of each dimension that is not a place in the
+        patient.
     """
 
     shared: Item
@@ -131,15 +125,9 @@ class Groups:
 class Frame:
     """One frame in the form of a classic image.
 
-    Attributes
-    ----------
-    elements : DicomElements
-        Elements of the file, replaced by the values of the frame's groups.
-    phase : tuple of (str, str)
-        Keyword and value, see `SliceHeader`.
-    warnings : tuple of str
-    problem : ValueProblem or None
-        The problem of its groups; if there is one, do not use the elements.
+    elements: Elements of the file, replaced by the values of the frame's groups.
+    phase: tuple of (str, str). Keyword and value, see `SliceHeader`.
+    problem: The problem of its groups; if there is one, do not use the elements.
     """
 
     elements: DicomElements
@@ -151,19 +139,7 @@ class Frame:
 def read_groups(path: Path, elements: DicomElements) -> Groups:
     """Read the functional groups of a multi-frame image, given the elements of its top level.
 
-    Parameters
-    ----------
-    path : Path
-    elements : DicomElements
-        Elements of the top level, with NumberOfFrames; the file has pixel data.
-
-    Raises
-    ------
-    ValueProblem
-        NumberOfFrames is implausible; the groups are missing, do not match the number of frames, or cannot be parsed;
-        or the file has no meta header.
-    OSError
-        The file cannot be read.
+    elements: Elements of the top level, with NumberOfFrames; the file has pixel data.
     """
     if elements.restored:
         raise ValueProblem("multi-frame image without preamble or meta header: convert it to a DICOM file first")
@@ -211,10 +187,7 @@ def split_frames(elements: DicomElements, groups: Groups) -> Iterator[Frame]:
     Where a value is given at several places, the first of these is used: macro of the frame, shared macro, unassigned
     attributes of the frame, shared unassigned attributes, top level.
 
-    Yields
-    ------
-    Frame
-        In the order of the file.
+    Yields: In the order of the file.
     """
     top_values = {tag: value for tag, value in elements.values.items() if tag not in GEOMETRY}
     top_vrs = {tag: vr for tag, vr in elements.vrs.items() if tag not in GEOMETRY}

@@ -25,14 +25,10 @@ class SeriesIdentity:
 class OtherImage:
     """A DICOM object that cannot be a slice, and the reason.
 
-    Attributes
-    ----------
-    frames : int
-        Number of per-frame functional groups, 1 where it has none.
-    kind : {"broken", "capture", "other"}
-        "broken": a CT image with a wrong header.  "capture": a secondary capture.  "other": any other object.
-    problem : str
-        One line, which names the file and, if there is one, the tag.
+    frames: Number of per-frame functional groups, 1 where it has none.
+    kind: {"broken", "capture", "other"}. "broken": a CT image with a wrong header.  "capture": a secondary capture.
+        "other": any other object.
+    problem: One line, which names the file and, if there is one, the tag.
     """
 
     series: SeriesIdentity
@@ -47,53 +43,30 @@ class OtherImage:
 class SliceHeader:
     """All facts about one CT slice before its pixels are read.  All values are validated.
 
-    Attributes
-    ----------
-    file, name : Path, str
-        Path of the file; its base name, escaped for messages, with the frame number (from 1) where there are several.
-    frame, frames : int
-        Frame index in the file, from 0, and number of frames in the file.
-    localizer : bool
-        True: ImageType contains LOCALIZER.
-    concatenation : Concatenation or None
-        The part of a concatenation that the slice belongs to.
-    phase : tuple of (str, str)
-        Keyword and value of the elements that can distinguish this slice from others at the same place, the most
-        specific first: see `clrecon.dicom.headers.phase_tags.PHASE_KEYWORDS`.
-    rows, columns : int
-    row_cosines, column_cosines : tuple of 3 float
-        ImageOrientationPatient as stored.
-    position_mm : tuple of 3 float
-        ImagePositionPatient, LPS mm, centre of the first voxel.
-    position_digits : tuple of 3 int
-        Number of decimals of each number of ImagePositionPatient, as it was written.
-    di_mm, dj_mm : float
-        Column spacing (PixelSpacing[1]) and row spacing (PixelSpacing[0]).
-    slice_thickness_mm, stated_gap_mm : float or None
-        SliceThickness and SpacingBetweenSlices; never used for geometry.
-    padding : tuple of two numbers or None
-        Lowest and highest stored value that mean "no measurement".
-    float_pixels : bool
-        Float or Double Float Pixel Data, which are HU without rescale.
-    slope, intercept : float
-        1 and 0 where the file has none, see `has_slope` and `has_intercept`.
-    patient_hash : str or None
-        Used only for comparison, never written to messages or reports.
-    pixel_offset, pixel_length, inflate_from, file_bytes : int
-        See `DicomElements`.
-    warnings : tuple of str
-    patient_position : str
-        Position of the patient in the scanner, for example HFS; empty if it is not one of `PATIENT_POSITIONS`.
-    derived : tuple of str
-        The `DERIVED_WORDS` of a derived image; empty for an image that was measured.
-    instance_number : int or None
-        InstanceNumber; None for a frame of a multi-frame image.
-    stated_images, stated_files : int or None
-        ImagesInAcquisition and NumberOfSeriesRelatedInstances.
-    modality_lut : bool
-        True: a table, not slope and intercept, gives the measured values.
-    quadruped : bool
-        True: AnatomicalOrientationType says that the directions are those of an animal on four legs.
+    file, name: Path of the file; its base name, escaped for messages, with the frame number (from 1) where there are
+        several.
+    frame, frames: Frame index in the file, from 0, and number of frames in the file.
+    localizer: ImageType contains LOCALIZER.
+    concatenation: The part of a concatenation that the slice belongs to.
+    phase: tuple of (str, str). Keyword and value of the elements that can distinguish this slice from others at the
+        same place, the most specific first: see `clrecon.dicom.headers.phase_tags.PHASE_KEYWORDS`.
+    row_cosines, column_cosines: ImageOrientationPatient as stored.
+    position_mm: ImagePositionPatient, LPS mm, centre of the first voxel.
+    position_digits: Number of decimals of each number of ImagePositionPatient, as it was written.
+    di_mm, dj_mm: Column spacing (PixelSpacing[1]) and row spacing (PixelSpacing[0]).
+    slice_thickness_mm, stated_gap_mm: SliceThickness and SpacingBetweenSlices; never used for geometry.
+    padding: Lowest and highest stored value that mean "no measurement".
+    float_pixels: Float or Double Float Pixel Data, which are HU without rescale.
+    slope, intercept: 1 and 0 where the file has none, see `has_slope` and `has_intercept`.
+    patient_hash: Used only for comparison, never written to messages or reports.
+    pixel_offset, pixel_length, inflate_from, file_bytes: See `DicomElements`.
+    patient_position: Position of the patient in the scanner, for example HFS; empty if it is not one of
+        `PATIENT_POSITIONS`.
+    derived: The `DERIVED_WORDS` of a derived image; empty for an image that was measured.
+    instance_number: InstanceNumber; None for a frame of a multi-frame image.
+    stated_images, stated_files: ImagesInAcquisition and NumberOfSeriesRelatedInstances.
+    modality_lut: A table, not slope and intercept, gives the measured values.
+    quadruped: AnatomicalOrientationType says that the directions are those of an animal on four legs.
     """
 
     series: SeriesIdentity

@@ -44,27 +44,10 @@ _CHUNK = 2**20
 def check_surplus(elements: DicomElements, header: SliceHeader, force: bool = False) -> tuple[str, ...]:
     """Examine the surplus bytes of a file with uncompressed pixels.
 
-    Parameters
-    ----------
-    elements : DicomElements
-    header : SliceHeader
-        The file's only or first slice; the file holds its pixels.
-    force : bool
-        True: accept surplus bytes other than zeros as padding.
+    header: The file's only or first slice; the file holds its pixels.
+    force: Accept surplus bytes other than zeros as padding.
 
-    Returns
-    -------
-    tuple of str
-        Warnings.
-
-    Raises
-    ------
-    ValueProblem
-        There are more pixels than Rows, Columns, bits and frames say.
-    CorruptFileError
-        The bytes after the pixel data are not elements.
-    OSError
-        The file cannot be read.
+    Returns: Warnings.
     """
     if is_encapsulated(header.transfer_syntax):
         return _check_encapsulated(elements, header, force)
@@ -178,15 +161,7 @@ def _judge_tail(file: BinaryIO, elements: DicomElements, end: int, size: int, fo
 
 
 def _check_tail(file: BinaryIO, start: int, size: int, *, implicit: bool, little_endian: bool) -> None:
-    """Walk over the bytes after the pixel data, from `start` to the end of the file at `size`.
-
-    Raises
-    ------
-    CorruptFileError
-        They are not elements with rising tags.
-    OSError
-        The file cannot be read.
-    """
+    """Walk over the bytes after the pixel data, from `start` to the end of the file at `size`."""
     wrong = CorruptFileError(f"{size - start} bytes behind the pixel data are no elements of DICOM")
     place, last = start, PIXEL_TAGS[-1]
     for _ in range(MOST_ELEMENTS):

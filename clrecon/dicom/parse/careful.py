@@ -45,19 +45,9 @@ for each MiB. For other values of undefined length it searches the whole rest of
 def parse_carefully(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -> DicomElements:
     """Parse a file, or the start of one.
 
-    Parameters
-    ----------
-    file : binary file
-        Begins with the preamble; seekable.
-    size : int
-        Bytes of the whole file.
-    wanted : tuple of int or None
-        Tags to keep; None keeps all.
-
-    Raises
-    ------
-    CorruptFileError
-    OSError
+    file: Begins with the preamble; seekable.
+    size: Bytes of the whole file.
+    wanted: Tags to keep; None keeps all.
     """
     try:
         return _parse_file(cast(BinaryIO, _MeteredFile(file)), size, wanted)
@@ -89,13 +79,7 @@ class _MeteredFile:
         self._read, self._left = file.read, READ_LIMIT
 
     def read(self, count: int) -> bytes:
-        """Read as the file does.
-
-        Raises
-        ------
-        CorruptFileError
-            The limit is exceeded.
-        """
+        """Read as the file does."""
         self._left -= count
         if self._left < 0:
             raise CorruptFileError(f"its header takes more than {READ_LIMIT} bytes to read")
@@ -189,13 +173,7 @@ class _Order:
         self._last = 0
 
     def add(self, tag: int, value: bytes) -> None:
-        """Add the next element.
-
-        Raises
-        ------
-        CorruptFileError
-            The element occurred before, with another value.
-        """
+        """Add the next element."""
         from pydicom.datadict import keyword_for_tag
 
         place = f"{keyword_for_tag(tag)} ({tag >> 16:04X},{tag & 0xFFFF:04X})".lstrip()

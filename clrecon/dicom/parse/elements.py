@@ -49,13 +49,7 @@ class FileStart(NamedTuple):
 
 
 def read_start(path: str | Path, limit: int = PREFIX_BYTES) -> FileStart:
-    """Read the start of a regular file.
-
-    Raises
-    ------
-    OSError
-        The file cannot be opened or read, or is not a regular file.
-    """
+    """Read the start of a regular file."""
     descriptor = os.open(path, _OPEN_FLAGS)
     try:
         facts = os.fstat(descriptor)
@@ -76,24 +70,9 @@ def read_elements(
 ) -> DicomElements:
     """Read the raw elements of one DICOM file.
 
-    Parameters
-    ----------
-    path : Path
-    wanted : tuple of int or None
-        Tags to keep; None keeps all whose length is defined.
-    start : FileStart, optional
-        The result of `read_start` for this file, so that it is not read twice.
-    force : bool
-        True: also read a data set without preamble or meta header.
-
-    Raises
-    ------
-    NotDicomError
-        There is no "DICM" after the preamble.
-    CorruptFileError
-        The file cannot be parsed.
-    OSError
-        The file cannot be opened or read.
+    wanted: Tags to keep; None keeps all whose length is defined.
+    start: The result of `read_start` for this file, so that it is not read twice.
+    force: Also read a data set without preamble or meta header.
     """
     prefix, size = start or read_start(path)
     restored = restore_start(prefix)

@@ -29,24 +29,10 @@ _STARTS = (b"\xff\xd8\xff", b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP")
 def find_frames(file: BinaryIO, start: int, file_bytes: int, frames: int, transfer_syntax: str) -> list[Pieces]:
     """Find the fragments of every frame.
 
-    Parameters
-    ----------
-    file : binary file
-        Buffered, opened for reading.
-    start : int
-        Offset of the first item, bytes.
-    file_bytes : int
-        Size of the file.
-    frames : int
-        Number of frames according to the header.
-    transfer_syntax : str
-
-    Raises
-    ------
-    RefusedInputError
-        The items are damaged or cut off, or do not tell the frames apart.  The message names no file.
-    OSError
-        The file cannot be read.
+    file: Buffered, opened for reading.
+    start: Offset of the first item, bytes.
+    file_bytes: Size of the file.
+    frames: Number of frames according to the header.
     """
     table, fragments, _ = _walk_items(file, start, file_bytes, min(MAX_FRAGMENTS, FRAGMENTS_PER_FRAME * (frames + 1)))
     if not fragments:

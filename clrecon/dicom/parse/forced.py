@@ -59,15 +59,9 @@ def find_program(start: bytes) -> str:
 def restore_start(data: bytes) -> Start | None:
     """Return the standard start for a file that has none.
 
-    Parameters
-    ----------
-    data : bytes
-        The first bytes of the file.
+    data: The first bytes of the file.
 
-    Returns
-    -------
-    Start or None
-        None where the file has a meta header after its preamble, or does not begin like a data set.
+    Returns: None where the file has a meta header after its preamble, or does not begin like a data set.
     """
     marked = data[128:MARK_END] == b"DICM"
     skip = MARK_END if marked else 4 if data[:4] == b"DICM" else 0

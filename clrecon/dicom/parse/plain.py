@@ -85,19 +85,11 @@ class _Everything(dict[int, int]):
 def parse_plainly(data: bytes, size: int, wanted: tuple[int, ...] | None) -> DicomElements | None:
     """Parse the start of a file.
 
-    Parameters
-    ----------
-    data : bytes
-        Begins with the preamble.
-    size : int
-        Bytes of the whole file.
-    wanted : tuple of int or None
-        Tags to keep; SpecificCharacterSet (0008,0005) is among them.  None keeps all of defined length.
+    data: Begins with the preamble.
+    size: Bytes of the whole file.
+    wanted: Tags to keep; SpecificCharacterSet (0008,0005) is among them.  None keeps all of defined length.
 
-    Returns
-    -------
-    DicomElements or None
-        None where the header has another form, or its end is not in `data`.
+    Returns: None where the header has another form, or its end is not in `data`.
     """
     try:
         return _parse(data, size, wanted)

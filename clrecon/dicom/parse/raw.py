@@ -25,10 +25,7 @@ PIXEL_VRS = (b"OB", b"OW", b"OF", b"OD", b"OL", b"OV", b"UN")
 class NotDicomError(RefusedInputError):
     """The file is not a DICOM file: there is no "DICM" at byte 128.
 
-    Attributes
-    ----------
-    start : bytes
-        The first bytes of the file; all of them where it is no longer than `PREFIX_BYTES`.
+    start: The first bytes of the file; all of them where it is no longer than `PREFIX_BYTES`.
     """
 
     def __init__(self, message: str, start: bytes):
@@ -43,31 +40,17 @@ class CorruptFileError(RefusedInputError):
 class DicomElements(NamedTuple):
     """Raw data elements of one file.
 
-    Attributes
-    ----------
-    transfer_syntax, media_class : str
-        (0002,0010) and (0002,0002).
-    values : dict of int to bytes
-        Tag to undecoded value, of the wanted tags that are present and not empty.
-    vrs : dict of int to str or None
-        Value representations of these elements; None in implicit VR.
-    little_endian : bool
-    encoding_differs : bool
-        True: implicit VR where the transfer syntax says explicit, or explicit where it says implicit; parsed as found.
-    pixel_tag : int or None
-        None where the file ends without pixel data.
-    pixel_offset, pixel_length : int
-        First byte and count of bytes of the pixel data value in the file, or, in deflated files, in the inflated
-        data set.  The length is -1 where it is undefined (encapsulated).
-    pixel_vr : str
-        Empty in implicit VR.
-    inflate_from : int
-        Offset in the file of the deflated data set, -1 where it is not deflated.
-    file_bytes : int
-    remarks : tuple of str
-        Unusual points of the start of the file.
-    restored : bool
-        The file lacks the start of a DICOM file.
+    values: Tag to undecoded value, of the wanted tags that are present and not empty.
+    vrs: Value representations of these elements; None in implicit VR.
+    encoding_differs: Implicit VR where the transfer syntax says explicit, or explicit where it says implicit; parsed as
+        found.
+    pixel_tag: None where the file ends without pixel data.
+    pixel_offset, pixel_length: First byte and count of bytes of the pixel data value in the file, or, in deflated
+        files, in the inflated data set.  The length is -1 where it is undefined (encapsulated).
+    pixel_vr: Empty in implicit VR.
+    inflate_from: Offset in the file of the deflated data set, -1 where it is not deflated.
+    remarks: Unusual points of the start of the file.
+    restored: The file lacks the start of a DICOM file.
     """
 
     transfer_syntax: str
@@ -95,23 +78,12 @@ def decode_uid(value: bytes | None) -> str:
 def read_pixel_head(head: bytes, start: int, implicit: bool, little: bool) -> tuple[int | None, int, int, str]:
     """Read the head of the pixel data element.
 
-    Parameters
-    ----------
-    head : bytes
-        12 bytes of the data set from byte `start` on, fewer at its end.
+    head: 12 bytes of the data set from byte `start` on, fewer at its end.
 
-    Returns
-    -------
-    tag : int or None
-        None where this is another element, or the end.
-    offset, length : int
-        Place and length of the value; the length is -1 where it is undefined.
-    vr : str
-        Empty in implicit VR.
-
-    Raises
-    ------
-    CorruptFileError
+    Returns:
+    tag: None where this is another element, or the end.
+    offset, length: Place and length of the value; the length is -1 where it is undefined.
+    vr: Empty in implicit VR.
     """
     if len(head) < 8:
         return None, -1, 0, ""

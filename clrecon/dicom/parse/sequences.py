@@ -33,15 +33,9 @@ VR_NAMES = {name.encode(): name for name in "AE AS AT CS DA DS DT FD FL IS LO SH
 class Item:
     """The wanted elements of one item (or of the whole data set).
 
-    Attributes
-    ----------
-    values : dict of int to bytes
-        Tag to undecoded value, of those that are not empty.
-    vrs : dict of int to str or None
-        Value representations of these elements; None in implicit VR.
-    sequences : dict of int to list of Item
-    repeated : set of int
-        For the whole data set only: wanted tags that occur twice in one of its items, with the same value.
+    values: Tag to undecoded value, of those that are not empty.
+    vrs: Value representations of these elements; None in implicit VR.
+    repeated: For the whole data set only: wanted tags that occur twice in one of its items, with the same value.
     """
 
     values: dict[int, bytes] = field(default_factory=dict)
@@ -74,22 +68,9 @@ def read_sequences(
 ) -> Item:
     """Read the wanted values and sequences of one data set, up to its pixel data.
 
-    Parameters
-    ----------
-    data : bytes
-        Bytes that hold the data set from `start` on; may end within its pixel data.
-    start : int
-    schema : Schema
-    implicit, little_endian : bool
-        Encoding of the data set.
-    items_limit : int
-        Most items that all wanted sequences may hold together.
-
-    Raises
-    ------
-    ValueProblem
-        A length exceeds its container, a sequence is nested too deep or holds too many items; a wanted sequence occurs
-        twice in one data set, or a wanted value twice with different contents.
+    data: Bytes that hold the data set from `start` on; may end within its pixel data.
+    implicit, little_endian: Encoding of the data set.
+    items_limit: Most items that all wanted sequences may hold together.
     """
     walk = _Walk(data, items_limit)
     top, _ = walk.read_data_set(start, len(data), schema, _make_encoding(implicit, little_endian), "", top=True)
@@ -98,13 +79,7 @@ def read_sequences(
 
 
 def skip_sequence(data: bytes, *, implicit: bool, little_endian: bool) -> int:
-    """Return the bytes of a sequence of undefined length, from its first item to the end of its delimiter.
-
-    Raises
-    ------
-    ValueProblem
-        The sequence does not end within `data`, holds something other than items, or is nested too deep.
-    """
+    """Return the bytes of a sequence of undefined length, from its first item to the end of its delimiter."""
     return _Walk(data, 0).skip(0, len(data), _make_encoding(implicit, little_endian))
 
 

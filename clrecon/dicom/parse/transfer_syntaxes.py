@@ -79,13 +79,7 @@ def describe_undecodable(transfer_syntax: str) -> str:
 
 
 def choose_decoder(transfer_syntax: str) -> str:
-    """Return the name of the decoder for a compressed transfer syntax, one of `decoder_process.DECODERS`.
-
-    Raises
-    ------
-    RefusedInputError
-        No decoder is installed; the message names the transfer syntax and what to install.
-    """
+    """Return the name of the decoder for a compressed transfer syntax, one of `decoder_process.DECODERS`."""
     reason = describe_undecodable(transfer_syntax)
     if reason:
         raise RefusedInputError(reason)

@@ -136,10 +136,7 @@ class ValueProblem(RefusedInputError):
 class Values:
     """Typed access to raw elements; every accessor checks what it returns.
 
-    Attributes
-    ----------
-    warnings : list of str
-        Doubtful points of the numbers that were asked for.
+    warnings: Doubtful points of the numbers that were asked for.
     """
 
     def __init__(self, elements: DicomElements):

@@ -34,13 +34,8 @@ _NO_FRAMES = (0xC4, 0xC8, 0xCC)  # tables, though within the range of starts of 
 class Codestream:
     """A compressed frame and the facts in its head.
 
-    Attributes
-    ----------
-    data : bytes
-        The codestream alone, without a container around it.
-    rows, columns, bits : int
-    signed : bool or None
-        None where the format does not tell.
+    data: The codestream alone, without a container around it.
+    signed: None where the format does not tell.
     """
 
     data: bytes
@@ -59,20 +54,9 @@ class Codestream:
 def read_codestream(data: bytes, transfer_syntax: str, rows: int, columns: int, bits_allocated: int) -> Codestream:
     """Read the head of a frame and compare it with the header of the image.
 
-    Parameters
-    ----------
-    data : bytes
-        One frame; bytes after its end mark are allowed.
-    transfer_syntax : str
-        A compressed transfer syntax.
-    rows, columns, bits_allocated : int
-        From the header.
-
-    Raises
-    ------
-    RefusedInputError
-        The frame has another format, size, number of components or depth, is cut off, or would become implausibly
-        large.  The message names no file.
+    data: One frame; bytes after its end mark are allowed.
+    transfer_syntax: A compressed transfer syntax.
+    rows, columns, bits_allocated: From the header.
     """
     if transfer_syntax == RLE:
         frame = _read_rle(data, rows, columns, bits_allocated)

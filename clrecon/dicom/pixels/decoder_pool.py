@@ -68,15 +68,10 @@ class DecoderError(RefusedInputError):
 class DecoderPool(Closing):
     """Processes that decode frames of one size; a context manager, safe to use from several threads at once.
 
-    Parameters
-    ----------
-    decoders : sequence of str
-        Names of `decoder_process.DECODERS` that will be asked for, or MODULE:FUNCTION.
-    frame_bytes : int
-        Bytes of the pixels of one frame.
-    seconds, memory_bytes : optional
-        Limits for one frame; by default they grow with `frame_bytes`.  The limit on memory holds on Linux and other
-        systems that know RLIMIT_AS; Windows and macOS have the limit on time alone.
+    decoders: Names of `decoder_process.DECODERS` that will be asked for, or MODULE:FUNCTION.
+    frame_bytes: Bytes of the pixels of one frame.
+    seconds, memory_bytes: Limits for one frame; by default they grow with `frame_bytes`.  The limit on memory holds on
+        Linux and other systems that know RLIMIT_AS; Windows and macOS have the limit on time alone.
     """
 
     def __init__(
@@ -102,20 +97,10 @@ class DecoderPool(Closing):
     def decode(self, data: bytes, decoder: str, out: NDArray[Any]) -> None:
         """Decode one frame into `out`.
 
-        Parameters
-        ----------
-        data : bytes
-            One codestream.
-        decoder : str
-            One of the names that the pool was made for.
-        out : ndarray, shape (rows, columns), C-contiguous
-            Receives the pixels, in the type that the decoder returns for this codestream.
-
-        Raises
-        ------
-        DecoderError
-            The frame cannot be decoded, or has another shape or width; the decoder crashes or exceeds its time or
-            memory; or the process cannot be started.
+        data: One codestream.
+        decoder: One of the names that the pool was made for.
+        out: ndarray, shape (rows, columns), C-contiguous. Receives the pixels, in the type that the decoder returns for
+            this codestream.
         """
         request = {
             "decoder": decoder,

@@ -30,15 +30,10 @@ and fewest values there.
 def fill_disc_padding(voxels: NDArray[Any]) -> tuple[float, int, float] | None:
     """Fill the outside of a round field of view of one value above air, as declared padding is filled.
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni)
-        Changed in place.
+    voxels: ndarray, shape (nk, nj, ni). Changed in place.
 
-    Returns
-    -------
-    (float, int, float) or None
-        The value, the number of its voxels outside, and what they were filled with; None where there is no such disc.
+    Returns: (float, int, float) or None. The value, the number of its voxels outside, and what they were filled with;
+        None where there is no such disc.
     """
     nk, nj, ni = voxels.shape
     value = voxels[0, 0, 0]

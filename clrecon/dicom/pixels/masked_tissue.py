@@ -20,12 +20,8 @@ __all__ = ["count_masked_tissue", "describe_masked_tissue"]
 def count_masked_tissue(header: SliceHeader, stored: NDArray[Any], padding: NDArray[np.bool_]) -> int:
     """Count voxels of the padding of a slice that are tissue by value and place.
 
-    Parameters
-    ----------
-    header : SliceHeader
-    stored : ndarray, shape (rows, columns)
-        Before padding is replaced.
-    padding : ndarray of bool, shape (rows, columns)
+    stored: ndarray, shape (rows, columns). Before padding is replaced.
+    padding: ndarray of bool, shape (rows, columns)
     """
     assert header.padding is not None
     low, high = header.padding

@@ -65,15 +65,9 @@ class PaddingMasks:
     def fill(self, run: Map = map) -> float | None:
         """Set all padding to the value of the air beside it, or to `AIR_HU` where there is no air beside it.
 
-        Parameters
-        ----------
-        run : callable
-            Processes several slices at once: the ``map`` of a pool.
+        run: Processes several slices at once: the ``map`` of a pool.
 
-        Returns
-        -------
-        float or None
-            The value in HU; None without padding.
+        Returns: The value in HU; None without padding.
         """
         if not self._packed:
             return None

@@ -40,20 +40,9 @@ Known = TypeVar("Known")
 class StoredPixels(Closing):
     """Reads stored pixel values of the slices of one stack; a context manager, to be used from several threads.
 
-    Parameters
-    ----------
-    slices : sequence of SliceHeader
-        All of one size.
+    slices: All of one size.
 
-    Raises
-    ------
-    RefusedInputError
-        A decoder that the slices need is not installed.
-
-    Attributes
-    ----------
-    compressed : bool
-        True: some of the slices are compressed.
+    compressed: Some of the slices are compressed.
     """
 
     def __init__(self, slices: Sequence[SliceHeader]):
@@ -76,21 +65,11 @@ class StoredPixels(Closing):
     def load(self, header: SliceHeader, out: NDArray[Any]) -> NDArray[Any]:
         """Read one slice.
 
-        Parameters
-        ----------
-        header : SliceHeader
-        out : ndarray, shape (rows, columns), C-contiguous
-            Memory that may be used for the result where its type has the same width.
+        out: ndarray, shape (rows, columns), C-contiguous. Memory that may be used for the result where its type has the
+            same width.
 
-        Returns
-        -------
-        ndarray, shape (rows, columns)
-            Stored values in the type that the header declares, unused bits included, in native byte order.
-
-        Raises
-        ------
-        RefusedInputError
-            The file cannot be read, is cut off, or cannot be decoded; the message names it.
+        Returns: ndarray, shape (rows, columns). Stored values in the type that the header declares, unused bits
+            included, in native byte order.
         """
         dtype = stored_dtype(header.float_pixels, header.signed, header.bits_allocated)
         fits = out.dtype.itemsize == dtype.itemsize and (out.dtype.kind == "f") == (dtype.kind == "f")

@@ -24,16 +24,10 @@ OVERLAY_BITS = tuple(0x60000102 + (group << 16) for group in range(0, 32, 2))
 class StrayBits(NamedTuple):
     """Figures about the bits of one slice before they are cut.
 
-    Attributes
-    ----------
-    odd : int
-        Number of values with bits above HighBit that are neither sign nor overlay.
-    plain : int
-        Number of values that are negative if HighBit is their sign, but have no bits above it.
-    signs : bool
-        True: some values have their sign extended to the highest bit, so the plain ones are large and not negative.
-    example : tuple of two int, optional
-        The first odd value, else the first plain one, as stored and as read.
+    odd: Number of values with bits above HighBit that are neither sign nor overlay.
+    plain: Number of values that are negative if HighBit is their sign, but have no bits above it.
+    signs: Some values have their sign extended to the highest bit, so the plain ones are large and not negative.
+    example: The first odd value, else the first plain one, as stored and as read.
     """
 
     odd: int = 0
@@ -45,17 +39,10 @@ class StrayBits(NamedTuple):
 def find_stray_bits(header: SliceHeader, stored: NDArray[Any], left_out: NDArray[np.bool_] | None) -> StrayBits | None:
     """Examine the stored values of a slice, (rows, columns), as they are in the file.
 
-    Parameters
-    ----------
-    header : SliceHeader
-    stored : ndarray of int, shape (rows, columns)
-    left_out : ndarray of bool, same shape, or None
-        Padding that fills unused bits too.
+    stored: ndarray of int, shape (rows, columns)
+    left_out: ndarray of bool, same shape, or None. Padding that fills unused bits too.
 
-    Returns
-    -------
-    StrayBits or None
-        None where no bit can be stray.
+    Returns: None where no bit can be stray.
     """
     spare = header.bits_allocated - 1 - header.high_bit
     if header.float_pixels or spare == 0:

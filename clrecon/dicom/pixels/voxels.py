@@ -60,25 +60,12 @@ def read_voxels(
 ) -> tuple[NDArray[Any], PixelFacts]:
     """Read the pixels of sorted slices of one size into one volume.
 
-    Parameters
-    ----------
-    slices : sequence of SliceHeader
-        In the order of k.
-    progress : callable, optional
-        Called as ``progress("read", done, total)``.
-    source : StoredPixels, optional
-        An open source for these slices, which stays open; without it the call opens its own.
+    slices: In the order of k.
+    progress: Called as ``progress("read", done, total)``.
+    source: An open source for these slices, which stays open; without it the call opens its own.
 
-    Returns
-    -------
-    voxels : ndarray, shape (n, rows, columns), int16, int32 or float32
-        HU.
-    facts : PixelFacts
-
-    Raises
-    ------
-    RefusedInputError
-        A file is cut off, cannot be read or decoded, or the volume does not fit into memory.
+    Returns:
+    voxels: ndarray, shape (n, rows, columns), int16, int32 or float32. HU.
     """
     integral = all(
         float(h.slope).is_integer() and float(h.intercept).is_integer() and not h.float_pixels for h in slices

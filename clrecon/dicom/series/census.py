@@ -39,16 +39,10 @@ PROPORTIONAL = 0.05
 class Census:
     """Numbers and counts in the files of one SeriesInstanceUID, localizers and all phases included.
 
-    Attributes
-    ----------
-    numbers : frozenset of int
-        InstanceNumber of its images.
-    images, files : int
-        Images and files that are there.
-    stated_images, stated_files : int or None
-        ImagesInAcquisition and NumberOfSeriesRelatedInstances, the largest value of each.
-    ends_before : frozenset of int
-        Last numbers of the other series of the study, from where this one may be numbered on.
+    numbers: InstanceNumber of its images.
+    images, files: Images and files that are there.
+    stated_images, stated_files: ImagesInAcquisition and NumberOfSeriesRelatedInstances, the largest value of each.
+    ends_before: Last numbers of the other series of the study, from where this one may be numbered on.
     """
 
     numbers: frozenset[int] = frozenset()
@@ -91,13 +85,8 @@ def take_census(
 def judge_numbers(census: Census, stack: Stack, copies: int) -> Gate:
     """Judge the gate ``complete_series``.
 
-    Parameters
-    ----------
-    census : Census
-    stack : Stack
-        The slices that are or would be read.
-    copies : int
-        Number of images that are copies of others.
+    stack: The slices that are or would be read.
+    copies: Number of images that are copies of others.
     """
     what = "slices missing according to the numbers and counts in the headers"
     numbers = _ordered_numbers(stack)

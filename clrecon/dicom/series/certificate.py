@@ -180,24 +180,11 @@ def certify(
 ) -> Certificate:
     """Build the certificate of a series: the report of its volume, and what ``clrecon info`` shows.
 
-    Parameters
-    ----------
-    series, stack : Series, Stack
-        The series that was or would be read, and its stack.
-    facts : PixelFacts or None
-        None: the pixels were not read, and entries that depend on them are None.
-    scan : Scan
-    affine : ndarray, shape (4, 4), or None
-        None: the series is refused.
-    warnings : sequence of str
-    likeness : Likeness or None
-        Likeness of the slices; None: the pixels were not read, or there are too few slices.
-    findings : VoxelFindings or None
-        What the voxels say of their values; None: the pixels were not read.
-
-    Returns
-    -------
-    Certificate
+    series, stack: The series that was or would be read, and its stack.
+    facts: None: the pixels were not read, and entries that depend on them are None.
+    affine: ndarray, shape (4, 4), or None. None: the series is refused.
+    likeness: Likeness of the slices; None: the pixels were not read, or there are too few slices.
+    findings: What the voxels say of their values; None: the pixels were not read.
     """
     headers, first, line = stack.slices, stack.slices[0], stack.line
     stated = next((h.stated_gap_mm for h in headers if h.stated_gap_mm is not None), None)

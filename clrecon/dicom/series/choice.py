@@ -35,25 +35,11 @@ class Choice(NamedTuple):
 def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> Choice:
     """Choose the series to read.
 
-    Parameters
-    ----------
-    found : sequence of Series
-    wanted : int or str, optional
-        Number in the listing, SeriesInstanceUID, its hash, the start of one of these (`SHORTEST_START` characters), or
-        the description (whole, or a part that only one series has).  None takes the CT stack with most slices.  Of
+    wanted: Number in the listing, SeriesInstanceUID, its hash, the start of one of these (`SHORTEST_START` characters),
+        or the description (whole, or a part that only one series has).  None takes the CT stack with most slices.  Of
         those with a similar number (`SIMILAR`) original images come before derived ones, then the thinnest slices, then
         most slices; of equal ones the usable one is taken.  With CT stacks of several patients, or with similar ones in
         different directions, there is no such choice.
-
-    Raises
-    ------
-    UsageError
-        `wanted` matches no series or several; the message lists those that match, or all.
-    NoDicomError
-        There is no CT series, or the one that is named is not CT.
-    RefusedInputError
-        Several usable CT stacks, or only unusable ones, are as good as each other; there is no stack; or there are
-        stacks of several patients or directions.
     """
     if wanted is None:
         ct = [series for series in found if series.kind != "other"]
@@ -142,13 +128,7 @@ def _take_best(candidates: Sequence[Series]) -> Choice:
 
 
 def _sift(near: Sequence[tuple[Series, Rank]]) -> tuple[list[Series], str]:
-    """Keep the best of similar series, step by step; returns those that are equally good and the last reason.
-
-    Raises
-    ------
-    RefusedInputError
-        Original images, or derived ones where there are no others, run in different directions.
-    """
+    """Keep the best of similar series, step by step; returns those that are equally good and the last reason."""
     why = "with the most slices"
     kept = [each for each in near if each[1].original]
     if kept and len(kept) < len(near):

@@ -36,15 +36,10 @@ MOST_THREADS = 16
 class DiskReader:
     """Reads in separate threads while the caller waits; for use in a ``with`` statement.
 
-    Parameters
-    ----------
-    progress : callable, optional
-        Called by the thread of the caller as ``progress("no answer yet from NAME", done, total)`` where the disk hangs.
+    progress: Called by the thread of the caller as ``progress("no answer yet from NAME", done, total)`` where the disk
+        hangs.
 
-    Attributes
-    ----------
-    touched : str
-        Path that was read last, for the message when it hangs.
+    touched: Path that was read last, for the message when it hangs.
     """
 
     def __init__(self, progress: Progress | None = None):
@@ -64,24 +59,12 @@ class DiskReader:
             self._jobs.put(None)
 
     def run(self, job: Callable[[], T]) -> T:
-        """Run one job and wait for it.
-
-        Raises
-        ------
-        RefusedInputError
-            The disk did not answer for `GIVE_UP_S`.
-        """
+        """Run one job and wait for it."""
         result: T = self._run_all([job])[0]
         return result
 
     def read_starts(self, files: Sequence[str]) -> Iterator[FileStart | OSError]:
-        """Yield the start of every file, or the error of reading it, in order; `CHUNK` files are held at a time.
-
-        Raises
-        ------
-        RefusedInputError
-            The disk did not answer for `GIVE_UP_S`.
-        """
+        """Yield the start of every file, or the error of reading it, in order; `CHUNK` files are held at a time."""
         for first in range(0, len(files), CHUNK):
             self._place = (first, len(files))
             chunk = files[first : first + CHUNK]

@@ -52,22 +52,12 @@ def judge_series(
 ) -> list[Gate]:
     """Judge a series by the gates.
 
-    Parameters
-    ----------
-    series : Series
-    stack : Stack or None
-        Its slices as they are or would be read.
-    facts : PixelFacts, optional
-        Figures of its pixels; without them the gates on pixels are not measured.
-    likeness : Likeness, optional
-        Likeness of its slices; also None where they are too few or too small.
-    value_gates : sequence of Gate, optional
-        Gates of the values of the voxels, see `clrecon.sources.plausibility.examine_voxels`.
+    stack: Its slices as they are or would be read.
+    facts: Figures of its pixels; without them the gates on pixels are not measured.
+    likeness: Likeness of its slices; also None where they are too few or too small.
+    value_gates: Gates of the values of the voxels, see `clrecon.sources.plausibility.examine_voxels`.
 
-    Returns
-    -------
-    list of dict
-        See `clrecon.system.gates.Gate`.  The texts hold no file names.
+    Returns: See `clrecon.system.gates.Gate`.  The texts hold no file names.
     """
     refused = len(series.problems)
     gates = [

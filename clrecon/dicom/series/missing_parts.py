@@ -15,10 +15,7 @@ __all__ = ["describe_missing_parts"]
 def describe_missing_parts(slices: Iterable[SliceHeader]) -> list[str]:
     """Describe missing files of concatenations: at an end of the stack they would leave no hole.
 
-    Parameters
-    ----------
-    slices : iterable of SliceHeader
-        All slices of a series.
+    slices: All slices of a series.
     """
     found: dict[str, set[Concatenation]] = defaultdict(set)
     for header in slices:

@@ -63,13 +63,9 @@ RANK_KEYWORDS = (
 class Phase:
     """One of several volumes in a series.
 
-    Attributes
-    ----------
-    number : int
-        From 1; the value that ``phase=`` takes.
-    keyword, value : str
-        The element that distinguishes the phases, and its value for this phase; times count from the first phase.
-    headers : tuple of SliceHeader
+    number: From 1; the value that ``phase=`` takes.
+    keyword, value: The element that distinguishes the phases, and its value for this phase; times count from the first
+        phase.
     """
 
     number: int
@@ -86,20 +82,12 @@ class Phase:
 class Places:
     """Slices grouped by their places.
 
-    Attributes
-    ----------
-    headers : tuple of SliceHeader
-        The slices without copies.
-    copies : int
-        Number of slices that were left out as copies.
-    phases : tuple of Phase
-        Empty where each place has one slice; none is chosen yet.
-    problem : str
-        Why the slices are no volume and no phase of them is one; empty if there is no problem.
-    interleaved : bool
-        True: the phases share no place, and the slices of one lie between those of another.
-    doubt : str
-        Description of an alternation along the stack that may still be one volume; empty if there is none.
+    headers: The slices without copies.
+    copies: Number of slices that were left out as copies.
+    phases: Empty where each place has one slice; none is chosen yet.
+    problem: Why the slices are no volume and no phase of them is one; empty if there is no problem.
+    interleaved: The phases share no place, and the slices of one lie between those of another.
+    doubt: Description of an alternation along the stack that may still be one volume; empty if there is none.
     """
 
     headers: tuple[SliceHeader, ...]
@@ -113,12 +101,8 @@ class Places:
 def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHeader, SliceHeader], bool]) -> Places:
     """Leave out copies and find phases.
 
-    Parameters
-    ----------
-    places : sequence of sequences of SliceHeader
-        The slices at each place, in the order of the places.
-    same : callable
-        Function that is true for two slices with the same pixels.
+    places: The slices at each place, in the order of the places.
+    same: Function that is true for two slices with the same pixels.
     """
     sorted_out = [_sort_copies(slices, same) for slices in places]
     kept = [[copies[0] for copies in found] for found in sorted_out]
@@ -181,11 +165,7 @@ def _describe_one_place(count: int, headers: Sequence[SliceHeader], phases: Sequ
 def part_alternating(places: Places, found: Alternation) -> Places:
     """Divide the same slices into phases by an alternation along them; the phases share no place.
 
-    Parameters
-    ----------
-    places : Places
-        Places with one slice each.
-    found : Alternation
+    places: Places with one slice each.
     """
     members = [tuple(places.headers[k] for k in group) for group in found.groups]
     if not found.tag:
@@ -225,13 +205,7 @@ def _is_near(one: Sequence[float], other: Sequence[float], tolerance: float) -> 
 
 
 def have_same_pixels(one: SliceHeader, other: SliceHeader, source: StoredPixels | None = None) -> bool:
-    """True when two slices hold the same HU; reads both, from `source` where many are compared.
-
-    Raises
-    ------
-    RefusedInputError
-        The pixels of one slice cannot be read.
-    """
+    """True when two slices hold the same HU; reads both, from `source` where many are compared."""
     if (one.rows, one.columns) != (other.rows, other.columns):
         return False
     return bool(np.array_equal(read_voxels([one], source=source)[0], read_voxels([other], source=source)[0]))
@@ -408,13 +382,7 @@ def describe_spacing(phases: Sequence[Phase], chosen: Phase) -> str:
 
 
 def choose_phase(places: Places, wanted: int) -> Phase:
-    """Return the phase of that number.
-
-    Raises
-    ------
-    UsageError
-        The phase does not exist.
-    """
+    """Return the phase of that number."""
     for phase in places.phases:
         if phase.number == wanted:
             return phase

@@ -19,14 +19,9 @@ C.7.6.1.1.2)."""
 class Rank(NamedTuple):
     """What a series is chosen by.
 
-    Attributes
-    ----------
-    original : bool
-        False where ImageType says that the images are derived or secondary; True where it says nothing.
-    direction : str
-        "axial", "coronal" or "sagittal", the nearest.
-    thickness_mm : float or None
-        As stated, to a hundredth of a millimetre; None where no slice states it.
+    original: False where ImageType says that the images are derived or secondary; True where it says nothing.
+    direction: "axial", "coronal" or "sagittal", the nearest.
+    thickness_mm: As stated, to a hundredth of a millimetre; None where no slice states it.
     """
 
     original: bool

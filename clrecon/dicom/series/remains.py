@@ -86,10 +86,7 @@ def _pattern(name: str) -> str:
 def describe_start(start: bytes) -> str:
     """Describe a file by its first bytes, which lack the mark of DICOM.
 
-    Parameters
-    ----------
-    start : bytes
-        Some kB, or the whole file.
+    start: Some kB, or the whole file.
     """
     if not start:
         return EMPTY
@@ -108,16 +105,10 @@ def describe_start(start: bytes) -> str:
 def find_remains(strangers: Sequence[Stranger], slices: Iterable[tuple[str, int | None]]) -> list[tuple[Path, str]]:
     """Find the files that may be remains of a slice.
 
-    Parameters
-    ----------
-    strangers : sequence of Stranger
-    slices : iterable of (str, int or None)
-        Path and bytes of the files that hold CT slices; None where they are no measure for others.
+    slices: iterable of (str, int or None). Path and bytes of the files that hold CT slices; None where they are no
+        measure for others.
 
-    Returns
-    -------
-    list of (Path, str)
-        Each file with the reason; the reasons contain no names.
+    Returns: list of (Path, str). Each file with the reason; the reasons contain no names.
     """
     if not strangers:
         return []

@@ -58,27 +58,16 @@ class CorruptFile:
 class Scan:
     """The contents of a folder.
 
-    Attributes
-    ----------
-    slices : list of SliceHeader
-        Valid CT slices, in the order of their paths.
-    others : list of OtherImage
-        DICOM objects that are not CT slices.
-    skipped : Counter
-        Maps a reason to the number of files (or folders) passed over.
-    corrupt : list of CorruptFile
-        Files that claim to be DICOM but cannot be parsed; files and folders that cannot be read at all.
-    suspects : list of CorruptFile
-        Files that are not DICOM by their content, but look like remains of a slice; links that are not followed or lead
-        nowhere.
-    strangers : list of Stranger
-        All other files that are not DICOM.
-    files : int
-        Number of regular files examined.
-    rescale : Rescale or None
-        Slope and intercept that the user gave for all slices.
-    is_file : bool
-        True: the path names one file and no folder.
+    slices: Valid CT slices, in the order of their paths.
+    others: DICOM objects that are not CT slices.
+    skipped: Maps a reason to the number of files (or folders) passed over.
+    corrupt: Files that claim to be DICOM but cannot be parsed; files and folders that cannot be read at all.
+    suspects: Files that are not DICOM by their content, but look like remains of a slice; links that are not followed
+        or lead nowhere.
+    strangers: All other files that are not DICOM.
+    files: Number of regular files examined.
+    rescale: Slope and intercept that the user gave for all slices.
+    is_file: The path names one file and no folder.
     """
 
     slices: list[SliceHeader] = field(default_factory=list)
@@ -95,24 +84,11 @@ class Scan:
 def scan_path(path: Path, progress: Progress | None = None, force: bool = False, follow_links: bool = False) -> Scan:
     """Read the headers of all DICOM files at `path`.
 
-    Parameters
-    ----------
-    path : Path
-        A folder, searched with its subfolders, or one file.
-    progress : callable, optional
-        Called as ``progress("scan", done, total)``, about `PROGRESS_STEPS` times in all, and as
-        ``progress("no answer yet from NAME", done, total)`` where the disk hangs.
-    force : bool
-        True: also accept data sets without preamble or meta header.
-    follow_links : bool
-        True: also read the files and folders that links out of the folder lead to.
-
-    Raises
-    ------
-    NoDicomError
-        `path` does not exist, cannot be read, or is neither a folder nor a regular file.
-    RefusedInputError
-        The disk or network drive does not answer.
+    path: A folder, searched with its subfolders, or one file.
+    progress: Called as ``progress("scan", done, total)``, about `PROGRESS_STEPS` times in all, and as ``progress("no
+        answer yet from NAME", done, total)`` where the disk hangs.
+    force: Also accept data sets without preamble or meta header.
+    follow_links: Also read the files and folders that links out of the folder lead to.
     """
     scan = Scan()
     with DiskReader(progress) as disk:

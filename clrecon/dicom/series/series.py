@@ -41,30 +41,17 @@ SLICE_MODALITIES = ("MR", "NM", "PT")
 class Series:
     """One stack of a series, or a series that cannot be one.
 
-    Attributes
-    ----------
-    kind : {"stack", "localizer", "capture", "other"}
-        Only stacks are ever chosen; "other" is not CT.
-    headers : list of SliceHeader
-        Valid slices, unsorted.
-    others : list of OtherImage
-        Its files that cannot be slices.
-    corrupt : list of CorruptFile
-        Files and folders that cannot be read and may be or contain slices of it.
-    lost : list of str
-        Descriptions of missing files that leave no hole: parts of concatenations.
-    census : Census
-        Numbers and counts of all parts of the series.
-    number : int
-        Place in the listing, from 1.
-    patient, study : int
-        Numbers of the patient and the study among those scanned, from 1; 0 where the files do not tell.
-    phase : int, optional
-        Number of the wanted phase.
-    allow_gaps : bool
-        True: missing slices give a warning and are not a problem.
-    is_file : bool
-        True: one file was named, and not the folder of the series.
+    kind: {"stack", "localizer", "capture", "other"}. Only stacks are ever chosen; "other" is not CT.
+    headers: Valid slices, unsorted.
+    others: Its files that cannot be slices.
+    corrupt: Files and folders that cannot be read and may be or contain slices of it.
+    lost: Descriptions of missing files that leave no hole: parts of concatenations.
+    census: Numbers and counts of all parts of the series.
+    number: Place in the listing, from 1.
+    patient, study: Numbers of the patient and the study among those scanned, from 1; 0 where the files do not tell.
+    phase: Number of the wanted phase.
+    allow_gaps: Missing slices give a warning and are not a problem.
+    is_file: One file was named, and not the folder of the series.
     """
 
     identity: SeriesIdentity
@@ -145,11 +132,6 @@ class Series:
         Interleaved volumes are found by any element that alternates in the headers, which are read again for this.
         Where the alternation may occur within one volume, or a phase is wanted that no header distinguishes, the pixels
         are compared as well.
-
-        Raises
-        ------
-        UsageError
-            The series has no phase of this number.
         """
         chosen = replace(self, phase=phase, allow_gaps=allow_gaps)
         try:

@@ -54,18 +54,11 @@ WINDOW_TAGS = frozenset({0x00281050, 0x00281051, 0x00281055})
 class Alternation:
     """An element whose values alternate along a stack.
 
-    Attributes
-    ----------
-    tag : int
-        0 where the groups do not come from an element.
-    groups : tuple of tuple of int
-        The places, from 0, of each volume, in the order of the values.
-    certain : bool
-        True: the element is constant within one volume, see `clrecon.dicom.stack.element_kinds`.
-    heaps : bool
-        True: the groups are heaps of close numbers, and each slice has its own number.
-    absent : int or None
-        The group that lacks the element.
+    tag: 0 where the groups do not come from an element.
+    groups: The places, from 0, of each volume, in the order of the values.
+    certain: The element is constant within one volume, see `clrecon.dicom.stack.element_kinds`.
+    heaps: The groups are heaps of close numbers, and each slice has its own number.
+    absent: The group that lacks the element.
     """
 
     tag: int
@@ -87,17 +80,10 @@ class Alternation:
 def find_alternation(headers: Sequence[SliceHeader], even: bool) -> Alternation | None:
     """Find an element that alternates along a stack; reads the headers of its files again.
 
-    Parameters
-    ----------
-    headers : sequence of SliceHeader
-        One slice for each place, in the order of the places.
-    even : bool
-        True: all gaps are equal.  Fewer elements are certain then, and in a long stack some windows are examined first.
+    headers: One slice for each place, in the order of the places.
+    even: All gaps are equal.  Fewer elements are certain then, and in a long stack some windows are examined first.
 
-    Returns
-    -------
-    Alternation or None
-        A certain one before a doubtful one.  None for multi-frame images too, whose frames share one header.
+    Returns: A certain one before a doubtful one.  None for multi-frame images too, whose frames share one header.
     """
     count = len(headers)
     if count < FEWEST_SLICES or any(header.frames > 1 for header in headers):
@@ -216,12 +202,8 @@ def _number(raw: bytes) -> float | None:
 def alternates(codes: Sequence[int], gaps: Sequence[float]) -> bool:
     """True where values repeat in a fixed order, along the whole stack or where its slices are closer together.
 
-    Parameters
-    ----------
-    codes : sequence of int
-        A number for the value of each slice.
-    gaps : sequence of float
-        Distances to the next slice, mm; one fewer than slices.
+    codes: A number for the value of each slice.
+    gaps: Distances to the next slice, mm; one fewer than slices.
     """
     counts = Counter(codes)
     if len(counts) < 2 or min(counts.values()) < SMALLEST_VOLUME:

@@ -26,14 +26,12 @@ ORIENTATION_SPREAD_RAD = 1e-4
 class Directions:
     """Mean directions of a stack.
 
-    Attributes
-    ----------
-    row, column : ndarray, shape (3,), float64
-        Orthonormal, LPS.  Where a slice exceeds `ORIENTATION_LIMIT`, x and y, used only for sorting.
-    deviations : ndarray, shape (n,), float64
-        Deviation of each slice's stored directions from unit length and right angle.
-    angles_rad : ndarray, shape (n,), float64
-        Angle between the directions of each slice and the mean; NaN where there is no mean.
+    row, column: ndarray, shape (3,), float64. Orthonormal, LPS.  Where a slice exceeds `ORIENTATION_LIMIT`, x and y,
+        used only for sorting.
+    deviations: ndarray, shape (n,), float64. Deviation of each slice's stored directions from unit length and right
+        angle.
+    angles_rad: ndarray, shape (n,), float64. Angle between the directions of each slice and the mean; NaN where there
+        is no mean.
     """
 
     row: Float64Array

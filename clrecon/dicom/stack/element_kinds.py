@@ -19,13 +19,8 @@ Verdict = Literal["phases", "pixels", "nothing"]
 class ElementKind:
     """Elements that alternate for one reason.
 
-    Attributes
-    ----------
-    verdict : {"phases", "pixels", "nothing"}
-        What follows from an alternation in an even stack: phases; phases if the pixels show two volumes, else a doubt;
-        or nothing, since one volume alternates in it.
-    reason : str
-    tags : frozenset of int
+    verdict: {"phases", "pixels", "nothing"}. What follows from an alternation in an even stack: phases; phases if the
+        pixels show two volumes, else a doubt; or nothing, since one volume alternates in it.
     """
 
     verdict: Verdict

@@ -43,20 +43,12 @@ class Line:
     """Evenly spaced places fitted to the slices, and the distances of the slices from them.  Figures are None for one
     slice.
 
-    Attributes
-    ----------
-    step, origin : ndarray, shape (3,), float64
-        LPS mm, by least squares.
-    gap_min_mm, gap_max_mm, gap_median_mm : float
-        Distances of neighbours along the normal.
-    residual_max_mm, residual_rms_mm : float
-        Distance of the positions from their places.
-    tolerance_mm : float
-        Largest residual that counts as rounding; the unit of the last digit where few digits were written.
-    worst_slice : int
-        Index of the slice with the largest residual.
-    uneven : bool
-        True: the residual exceeds the tolerance, so slices keep their own positions and the line is only nominal.
+    step, origin: ndarray, shape (3,), float64. LPS mm, by least squares.
+    gap_min_mm, gap_max_mm, gap_median_mm: Distances of neighbours along the normal.
+    residual_max_mm, residual_rms_mm: Distance of the positions from their places.
+    tolerance_mm: Largest residual that counts as rounding; the unit of the last digit where few digits were written.
+    worst_slice: Index of the slice with the largest residual.
+    uneven: The residual exceeds the tolerance, so slices keep their own positions and the line is only nominal.
     """
 
     step: Float64Array | None = None
@@ -75,23 +67,13 @@ class Line:
 class Stack:
     """The measured geometry of one stack of slices.
 
-    Attributes
-    ----------
-    slices : tuple of SliceHeader
-        Sorted by ascending position along the normal.
-    positions_mm : ndarray, shape (n, 3), float64
-        LPS mm.
-    distances_mm : ndarray, shape (n,), float64
-        Positions along the normal.
-    affine : ndarray, shape (4, 4), float64, or None
-        Index (i, j, k) to LPS mm; None for a stack with problems.
-    line : Line
-    tilt_deg : float or None
-        See `signed_tilt`; None where there is no affine.
-    problems, warnings : tuple of str
-        A stack with problems is refused.
-    missing : int
-        Number of missing slices, computed from the usual gap; they are either allowed or one of the problems.
+    slices: Sorted by ascending position along the normal.
+    positions_mm: ndarray, shape (n, 3), float64. LPS mm.
+    distances_mm: ndarray, shape (n,), float64. Positions along the normal.
+    affine: ndarray, shape (4, 4), float64, or None. Index (i, j, k) to LPS mm; None for a stack with problems.
+    tilt_deg: See `signed_tilt`; None where there is no affine.
+    problems, warnings: A stack with problems is refused.
+    missing: Number of missing slices, computed from the usual gap; they are either allowed or one of the problems.
     """
 
     slices: tuple[SliceHeader, ...]
@@ -113,17 +95,10 @@ class Stack:
 def measure_stack(headers: Sequence[SliceHeader], allow_gaps: bool = False) -> Stack:
     """Sort slices, find their problems, and fit the affine.
 
-    Parameters
-    ----------
-    headers : sequence of SliceHeader
-        One or more, with at most one slice at each place.
-    allow_gaps : bool
-        True: missing slices give a warning and are not a problem.
+    headers: One or more, with at most one slice at each place.
+    allow_gaps: Missing slices give a warning and are not a problem.
 
-    Returns
-    -------
-    Stack
-        Bad geometry raises no error; it is described in ``problems``.
+    Returns: Bad geometry raises no error; it is described in ``problems``.
     """
     problems = find_mixed_values(headers)
     warnings: list[str] = []

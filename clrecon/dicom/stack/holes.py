@@ -27,15 +27,9 @@ PLACES_SHOWN = 4
 class Holes:
     """Gaps in a stack that are too wide, by the rule at `MISSING_RATIO`.
 
-    Attributes
-    ----------
-    places : tuple of int
-        The gap k lies between the slices k and k + 1.
-    gaps_mm : tuple of float
-    ends_mm : tuple of (float, float)
-        Positions along the normal of the slices before and after the gap.
-    usual_mm : tuple of float
-        The gap that would be there without a hole.
+    places: The gap k lies between the slices k and k + 1.
+    ends_mm: tuple of (float, float). Positions along the normal of the slices before and after the gap.
+    usual_mm: The gap that would be there without a hole.
     """
 
     places: tuple[int, ...] = ()

@@ -35,11 +35,8 @@ def measure_extent(stack: Stack) -> list[float] | None:
 def summarise_gaps(distances: Float64Array) -> list[dict[str, Any]]:
     """Return the runs of equal gaps between sorted positions (mm along the normal), in order.
 
-    Returns
-    -------
-    list of dict
-        ``count`` gaps of ``gap_mm``, their mean; a gap belongs to a run as long as it equals the first of it within
-        the tolerance of an even stack.
+    Returns: ``count`` gaps of ``gap_mm``, their mean; a gap belongs to a run as long as it equals the first of it
+        within the tolerance of an even stack.
     """
     runs: list[list[float]] = []
     for gap in np.diff(distances).tolist():
@@ -63,13 +60,10 @@ def _thicknesses(headers: Sequence[SliceHeader]) -> list[float]:
 def describe_thickness(headers: Sequence[SliceHeader], distances: Float64Array) -> dict[str, Any] | None:
     """Compare SliceThickness with the distances of the slices along the normal.
 
-    Returns
-    -------
-    dict or None
-        ``min_mm``, ``max_mm``, ``median_mm`` of the thickness; ``overlap_mm``: ``min``, ``max`` and ``median`` of what
-        neighbouring slices share, (t_k + t_k+1) / 2 less their distance, below zero where tissue between them was
-        not measured; ``overlap_percent``: its median in percent of the median distance.  None unless every slice
-        states a thickness and there are two slices.
+    Returns: ``min_mm``, ``max_mm``, ``median_mm`` of the thickness; ``overlap_mm``: ``min``, ``max`` and ``median`` of
+        what neighbouring slices share, (t_k + t_k+1) / 2 less their distance, below zero where tissue between them was
+        not measured; ``overlap_percent``: its median in percent of the median distance.  None unless every slice states
+        a thickness and there are two slices.
     """
     thickness = np.array(_thicknesses(headers))
     if len(thickness) != len(headers) or len(headers) < 2:

@@ -55,15 +55,10 @@ def find_mixture(
 ) -> tuple[tuple[str, ...], Mapping[tuple[str, ...], Sequence[SliceHeader]]] | None:
     """Find the element that divides a stack into volumes whose slices lie between each other.
 
-    Parameters
-    ----------
-    headers : sequence of SliceHeader
-        One slice for each place, in the order of the places.
+    headers: One slice for each place, in the order of the places.
 
-    Returns
-    -------
-    (keywords, groups) or None
-        The slices by their value of the keyword: each group has at least three slices and all have a value.
+    Returns: (keywords, groups) or None. The slices by their value of the keyword: each group has at least three slices
+        and all have a value.
     """
     for keyword, values in _values_along(headers, (*CERTAIN, *POSSIBLE)):
         groups = _find_interleaved(values, headers)
@@ -102,15 +97,9 @@ def _is_even(headers: Sequence[SliceHeader]) -> bool:
 def describe_differences(headers: Sequence[SliceHeader]) -> Iterator[tuple[str, Callable[[SliceHeader], bool]]]:
     """Describe values that differ within a stack but should be equal, and the slices that differ from the first one.
 
-    Parameters
-    ----------
-    headers : sequence of SliceHeader
-        In the order of their places.
+    headers: In the order of their places.
 
-    Yields
-    ------
-    (text, is_so)
-        Keywords and slices, without values that could tell of the patient.
+    Yields: (text, is_so). Keywords and slices, without values that could tell of the patient.
     """
     first = headers[0]
     for keyword, values in _values_along(headers, ("KVP", *ALTERNATING)):

@@ -30,15 +30,9 @@ WHOLE = 1e-3
 class Rounding:
     """Even steps that explain the written positions.
 
-    Attributes
-    ----------
-    unit_mm : float
-        Unit of the last digit, along the normal.
-    digits : int
-        Number of decimals of the positions.
-    keyword : str
-        The element that states the distance of the slices.
-    stated_mm : float
+    unit_mm: Unit of the last digit, along the normal.
+    digits: Number of decimals of the positions.
+    keyword: The element that states the distance of the slices.
     """
 
     unit_mm: float
@@ -68,20 +62,12 @@ def find_rounding(
 ) -> Rounding | None:
     """Explain uneven positions by their digits.
 
-    Parameters
-    ----------
-    headers : sequence of SliceHeader
-        In the order of their places.
-    distances : ndarray, shape (n,)
-        Positions along the normal, mm, n >= 2.
-    normal : ndarray, shape (3,)
-    tolerance : float
-        Largest distance in mm that counts as rounding anyway.
+    headers: In the order of their places.
+    distances: ndarray, shape (n,). Positions along the normal, mm, n >= 2.
+    normal: ndarray, shape (3,)
+    tolerance: Largest distance in mm that counts as rounding anyway.
 
-    Returns
-    -------
-    Rounding or None
-        None where positions have digits enough, no distance is stated, or a stated one does not explain them.
+    Returns: None where positions have digits enough, no distance is stated, or a stated one does not explain them.
     """
     unit, digits = measure_unit(headers, normal)
     if len(headers) < 3 or unit / 2.0 <= SLACK or np.ptp(np.diff(distances)) < min(unit / 2.0, tolerance):

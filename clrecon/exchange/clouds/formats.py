@@ -39,13 +39,7 @@ class WritableCloud(Protocol):
 
 
 def check_cloud_format(path: str | os.PathLike[str]) -> str:
-    """Return the extension of a cloud file in lower case, such as ``.ply``.
-
-    Raises
-    ------
-    UsageError
-        The extension is missing, or no writer has it; or it is ``.las`` and laspy is not installed.
-    """
+    """Return the extension of a cloud file in lower case, such as ``.ply``."""
     extension = find_extension(path, CLOUD_FORMATS, "cloud")
     if extension == ".las":
         las.import_laspy()
@@ -70,10 +64,7 @@ def write_cloud(
 ) -> int:
     """Write a cloud to a file; what `PointCloud.save` does.
 
-    Returns
-    -------
-    int
-        Size of the file in bytes.
+    Returns: Size of the file in bytes.
     """
     with stage_cloud(cloud, path, space, keep_ids=keep_ids) as staged:
         staged.commit()

@@ -33,13 +33,7 @@ _LONGEST_RECORD = 65535
 
 
 def import_laspy() -> Any:
-    """Import laspy.
-
-    Raises
-    ------
-    UsageError
-        It is not installed; the message says how to install it.
-    """
+    """Import laspy."""
     try:
         import laspy
     except ImportError as error:
@@ -124,15 +118,7 @@ def _check_records(data: bytes, start: int) -> None:
 
 
 def read(path: Path) -> RawCloud:
-    """Read the points of a file without compression, with its extra dimensions.
-
-    Raises
-    ------
-    UsageError
-        laspy is not installed.
-    RefusedInputError
-        The file is cut, corrupt or compressed (LAZ).
-    """
+    """Read the points of a file without compression, with its extra dimensions."""
     name = escape_text(path.name)
     laspy = import_laspy()
     try:

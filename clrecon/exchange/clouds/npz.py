@@ -102,11 +102,6 @@ def read(path: Path) -> RawCloud:
     """Read points and what is known of them.
 
     The points are the entry ``points``, ``xyz``, ``pos`` or ``arr_0``, the others as this module writes them.
-
-    Raises
-    ------
-    RefusedInputError
-        The file is cut or corrupt, or has no points.
     """
     name = escape_text(path.name)
     try:

@@ -25,20 +25,12 @@ UNIT_TOLERANCE = 1e-3
 class RawCloud:
     """A file's points, in the file's own frame.
 
-    Attributes
-    ----------
-    kind : str
-        "PLY", "XYZ", "NPZ", "VTP" or "LAS".
-    points : ndarray, shape (n, 3), of any real type
-        mm; perhaps not finite.
-    columns : dict of str to ndarray, shape (n,)
-        Further values of each point by the name that the file gives them, in the order of the file.
-    space : str or None
-        Frame that the file names.
-    affine : ndarray, shape (4, 4), or None
-    iso_value_hu : float or None
-    certificate : sequence of str
-    warnings : list of str
+    kind: "PLY", "XYZ", "NPZ", "VTP" or "LAS".
+    points: ndarray, shape (n, 3), of any real type. mm; perhaps not finite.
+    columns: dict of str to ndarray, shape (n,). Further values of each point by the name that the file gives them, in
+        the order of the file.
+    space: Frame that the file names.
+    affine: ndarray, shape (4, 4), or None
     """
 
     kind: str

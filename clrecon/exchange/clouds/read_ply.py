@@ -61,13 +61,7 @@ class Header:
 
 
 def read(path: Path) -> RawCloud:
-    """Read the vertices of a PLY file; other elements, such as faces, are left out with a warning.
-
-    Raises
-    ------
-    RefusedInputError
-        The file is cut or corrupt, or has no vertices with x, y and z.
-    """
+    """Read the vertices of a PLY file; other elements, such as faces, are left out with a warning."""
     name = escape_text(path.name)
     try:
         with open_regular(path) as stream:

@@ -48,13 +48,7 @@ class Document:
 
 
 def read(path: Path) -> RawCloud:
-    """Read the points, the point arrays and the field arrays ``SPACE``, ``ISO_VALUE_HU`` and so on.
-
-    Raises
-    ------
-    RefusedInputError
-        The file is cut or corrupt, or packed by another method than zlib.
-    """
+    """Read the points, the point arrays and the field arrays ``SPACE``, ``ISO_VALUE_HU`` and so on."""
     name = escape_text(path.name)
     try:
         with open_regular(path) as stream:

@@ -17,15 +17,7 @@ _START_BYTES = 512
 
 
 def read_raw_cloud(path: str | os.PathLike[str]) -> RawCloud:
-    """Read a cloud file: PLY, VTP, NPZ, LAS, or a table of numbers.
-
-    Raises
-    ------
-    UsageError
-        There is no such file; LAS, and laspy is not installed.
-    RefusedInputError
-        The file cannot be read, or is cut, corrupt or of another kind.
-    """
+    """Read a cloud file: PLY, VTP, NPZ, LAS, or a table of numbers."""
     file = Path(path)
     name = escape_text(file.name)
     try:

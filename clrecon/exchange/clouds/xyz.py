@@ -79,11 +79,6 @@ def read(path: Path) -> RawCloud:
     if it has a word for each of them, with or without a mark of a comment: ``//X Y Z scalar_HU``.  Columns
     without names beyond the third are left out.  Another line there with words and numbers is refused if a number comes
     first, else warned of.
-
-    Raises
-    ------
-    RefusedInputError
-        The file is no such table; the message says where.
     """
     name = escape_text(path.name)
     head: list[str] = []

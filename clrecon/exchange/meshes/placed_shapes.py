@@ -28,12 +28,9 @@ _SNAP = 1e-12
 class Shape:
     """Triangles in a frame of their own.
 
-    Attributes
-    ----------
-    vertices : ndarray, shape (n, 3), float32 or float64
-    triangles : ndarray, shape (m, 3), integer
-        Perhaps of vertices that are not there.
-    normals : ndarray, shape (n, 3), float32, or None
+    vertices: ndarray, shape (n, 3), float32 or float64
+    triangles: ndarray, shape (m, 3), integer. Perhaps of vertices that are not there.
+    normals: ndarray, shape (n, 3), float32, or None
     """
 
     vertices: NDArray[np.floating]
@@ -60,13 +57,7 @@ class PlacedShapes:
             raise ValueError(f"more than {10 * MOST_SHAPES:,} objects within objects")
 
     def add(self, shape: Shape, matrix: NDArray[np.float64], part: Part) -> None:
-        """Add a shape that `matrix`, shape (4, 4), places; a mirror turns its triangles round.
-
-        Raises
-        ------
-        ValueError
-            The matrix places nothing, or there is too much to place.
-        """
+        """Add a shape that `matrix`, shape (4, 4), places; a mirror turns its triangles round."""
         self._corners += max(shape.triangles.size, shape.vertices.size)
         if len(self.parts) == MOST_SHAPES or self._corners > _MOST_CORNERS:
             raise ValueError(f"more than {MOST_SHAPES:,} shapes or {_MOST_CORNERS:,} corners")

@@ -61,13 +61,7 @@ class _Model:
 
 
 def read(path: Path) -> RawMesh:
-    """Read the objects of a 3MF file that its build places; the triangles of each are a part.
-
-    Raises
-    ------
-    RefusedInputError
-        The file is cut or corrupt, unpacks to more than a model can have, or has parts in other files.
-    """
+    """Read the objects of a 3MF file that its build places; the triangles of each are a part."""
     name = escape_text(path.name)
     try:
         with open_regular(path) as stream, zipfile.ZipFile(stream) as package:

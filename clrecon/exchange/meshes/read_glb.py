@@ -69,13 +69,7 @@ class _File:
 
 
 def read(path: Path) -> RawMesh:
-    """Read the triangles of a GLB file; those of each node are a part.
-
-    Raises
-    ------
-    RefusedInputError
-        The file is cut or corrupt, or compressed by an extension.
-    """
+    """Read the triangles of a GLB file; those of each node are a part."""
     name = escape_text(path.name)
     try:
         with open_regular(path) as stream:

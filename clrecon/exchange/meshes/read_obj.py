@@ -27,13 +27,7 @@ _NAMES = (b"o", b"g")
 
 
 def read(path: Path) -> RawMesh:
-    """Read an OBJ file; each object (``o``, else ``g``) that has faces is a part.
-
-    Raises
-    ------
-    RefusedInputError
-        The file is cut or corrupt, or has faces that are no triangles.
-    """
+    """Read an OBJ file; each object (``o``, else ``g``) that has faces is a part."""
     name = escape_text(path.name)
     try:
         with open_regular(path) as stream:

@@ -24,13 +24,7 @@ _CORNERS = ("vertex_indices", "vertex_index")
 
 
 def read(path: Path) -> RawMesh:
-    """Read the vertices, their normals and the triangles of a PLY file.
-
-    Raises
-    ------
-    RefusedInputError
-        The file is cut or corrupt, has no faces right after its vertices, or faces that are not triangles.
-    """
+    """Read the vertices, their normals and the triangles of a PLY file."""
     name = escape_text(path.name)
     try:
         with open_regular(path) as stream:

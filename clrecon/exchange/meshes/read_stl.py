@@ -31,13 +31,7 @@ _END = re.compile(rb"^[ \t]*end[ \t]?facet\b", re.MULTILINE | re.IGNORECASE)
 
 
 def read(path: Path) -> RawMesh:
-    """Read an STL file; one whose length is that of its count is binary, whatever it begins with.
-
-    Raises
-    ------
-    RefusedInputError
-        The file is cut or corrupt.
-    """
+    """Read an STL file; one whose length is that of its count is binary, whatever it begins with."""
     name = escape_text(path.name)
     try:
         with open_regular(path) as stream:
@@ -77,15 +71,11 @@ def _make(corners: NDArray[np.floating], said: re.Match[bytes] | None) -> RawMes
 def join_corners(corners: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
     """Join corners that coincide.
 
-    Parameters
-    ----------
-    corners : ndarray, shape (3 m, 3)
+    corners: ndarray, shape (3 m, 3)
 
-    Returns
-    -------
-    vertices : ndarray, shape (n, 3)
-        In the order in which they occur first.
-    triangles : ndarray, shape (m, 3), int64
+    Returns:
+    vertices: ndarray, shape (n, 3). In the order in which they occur first.
+    triangles: ndarray, shape (m, 3), int64
     """
     first, place = find_places(corners)
     return corners[first], place.reshape(-1, 3)

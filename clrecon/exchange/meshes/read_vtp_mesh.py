@@ -22,13 +22,7 @@ __all__ = ["read"]
 
 
 def read(path: Path) -> RawMesh:
-    """Read the triangles of a VTP file; those of one number in the cell array ``PART`` are a part.
-
-    Raises
-    ------
-    RefusedInputError
-        The file is cut or corrupt, packed by another method than zlib, or has no triangles but others.
-    """
+    """Read the triangles of a VTP file; those of one number in the cell array ``PART`` are a part."""
     name = escape_text(path.name)
     try:
         with open_regular(path) as stream:

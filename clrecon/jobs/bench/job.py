@@ -50,35 +50,17 @@ def run_bench(
     The surface is open at the border of the volume, like that of flying edges.  Both programs work in turn, on the same
     voxels at the same level.
 
-    Parameters
-    ----------
-    source : path, optional
-        DICOM folder or file; None makes a phantom of the spine, 512 x 512 x 149 voxels.
-    iso_value : float, optional
-        HU; default: that of the preset "bone", for the phantom its suggested value.
-    device : str, optional
-        As in `choose_device`; "all" means every usable device except simulators, one after the other.
-    runs : int
-        Timed pairs of clrecon and flying edges, 1 to 1000.
-    series : str, optional
-        The series of `source` to read.
-    report_path : path, optional
-        JSON file for the result.
-    no_clobber : bool
-        True: a report that exists stays and is an `OutputError`, before any work.
-    progress : callable, optional
-        ``progress(stage, done, total)``.
+    source: DICOM folder or file; None makes a phantom of the spine, 512 x 512 x 149 voxels.
+    iso_value: HU; default: that of the preset "bone", for the phantom its suggested value.
+    device: As in `choose_device`; "all" means every usable device except simulators, one after the other.
+    runs: Timed pairs of clrecon and flying edges, 1 to 1000.
+    series: The series of `source` to read.
+    report_path: JSON file for the result.
+    no_clobber: A report that exists stays and is an `OutputError`, before any work.
+    progress: ``progress(stage, done, total)``.
 
-    Returns
-    -------
-    dict
-        ``input, iso_value_hu, iso_level_hu, runs, seconds, devices, processor, cores, free_cores, platform, version,
-        warnings``, see docs/contract.md.  It holds no patient data and no name of a file.
-
-    Raises
-    ------
-    UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError, NoSurfaceError
-        The arguments are wrong, the report cannot be written, no device works, or the input has no surface.
+    Returns: ``input, iso_value_hu, iso_level_hu, runs, seconds, devices, processor, cores, free_cores, platform,
+        version, warnings``, see docs/contract.md.  It holds no patient data and no name of a file.
     """
     progress = progress or ignore_progress
     _check_arguments(source, iso_value, runs, series)
@@ -162,13 +144,7 @@ def _describe_input(volume: Volume, is_phantom: bool) -> dict[str, Any]:
 def _measure_devices(
     devices: Sequence[Device], volume: Volume, hu: float, runs: int, progress: Progress
 ) -> list[dict[str, Any]]:
-    """Return one entry per device; the entry of a device that fails has its error.
-
-    Raises
-    ------
-    DeviceError
-        All devices failed.
-    """
+    """Return one entry per device; the entry of a device that fails has its error."""
     measured, first_error = [], None
     for number, device in enumerate(devices):
         progress("bench", number, len(devices))

@@ -16,10 +16,7 @@ FEWEST_PAIRS = 3
 def spread(values: Sequence[float]) -> dict[str, float]:
     """Median, quartiles, minimum and maximum of at least one value.
 
-    Returns
-    -------
-    dict
-        ``median, q1, q3, min, max``; quartiles are interpolated between the values (inclusive method).
+    Returns: ``median, q1, q3, min, max``; quartiles are interpolated between the values (inclusive method).
     """
     if len(values) == 1:
         q1 = median = q3 = float(values[0])
@@ -39,23 +36,14 @@ def alternate(
 ) -> tuple[list[float], list[float]]:
     """Run two programs in turn; their order changes with every pair, so that neither profits from its place.
 
-    Parameters
-    ----------
-    candidate, peer : callable
-        Functions that run once and return the seconds to compare.
-    pairs : int
-        Number of timed runs of each.
-    warm : bool
-        Run each once before, untimed.
-    limit_s : float, optional
-        Start no further pair after so many seconds, warm-up included; `FEWEST_PAIRS` are always run.
-    clock : callable
-        Clock for the limit, in seconds.
+    candidate, peer: Functions that run once and return the seconds to compare.
+    pairs: Number of timed runs of each.
+    warm: Run each once before, untimed.
+    limit_s: Start no further pair after so many seconds, warm-up included; `FEWEST_PAIRS` are always run.
+    clock: Clock for the limit, in seconds.
 
-    Returns
-    -------
-    candidate_s, peer_s : list of float
-        Both of the same length.
+    Returns:
+    candidate_s, peer_s: Both of the same length.
     """
     start = clock()
     if warm:
@@ -77,10 +65,7 @@ def alternate(
 def summarise(ours: Sequence[float], theirs: Sequence[float]) -> dict[str, Any]:
     """Spreads of both sides and of the ratio of each pair (above 1: clrecon is faster).
 
-    Returns
-    -------
-    dict
-        ``pairs`` (int); ``clrecon_s``, ``peer_s`` and ``ratio``, each from `spread`.
+    Returns: ``pairs`` (int); ``clrecon_s``, ``peer_s`` and ``ratio``, each from `spread`.
     """
     ratios = [theirs_s / ours_s for ours_s, theirs_s in zip(ours, theirs, strict=True)]
     return {"pairs": len(ratios), "clrecon_s": spread(ours), "peer_s": spread(theirs), "ratio": spread(ratios)}

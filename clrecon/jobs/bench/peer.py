@@ -31,16 +31,7 @@ class FlyingEdges:
     default.  Spacing and origin of the grid are set, its direction is not: VTK would turn an oblique surface in a
     second pass, while clrecon does so in the same pass.
 
-    Parameters
-    ----------
-    volume : Volume
-    threads : int
-        1: VTK's backend "Sequential"; more: "STDThread" with so many threads.
-
-    Raises
-    ------
-    ImportError
-        VTK is not installed.
+    threads: 1: VTK's backend "Sequential"; more: "STDThread" with so many threads.
     """
 
     def __init__(self, volume: Volume, threads: int):

@@ -21,20 +21,8 @@ def run_steps(
 ) -> None:
     """Run the steps that are asked for, from the clusters to the spacing.
 
-    Parameters
-    ----------
-    trail : Trail
-        Gets the result of each step.
-    settings : CloudSettings
-    device : Device
-    resident : DeviceVolume, optional
-        The volume of the points; None for clouds that were read.
-    progress : callable
-
-    Raises
-    ------
-    UsageError, NoSurfaceError, DeviceError
-        A step refuses its parameters, leaves nothing, or the device fails.
+    trail: Gets the result of each step.
+    resident: The volume of the points; None for clouds that were read.
     """
     shared: dict[str, Any] = {"device": device.current, "memory": settings.memory, "progress": progress}
     for run in (_cluster, _remove_sparse, _remove_outliers, _denoise, _find_normals, _thin):

@@ -14,16 +14,10 @@ __all__ = ["CloudFiles"]
 class CloudFiles:
     """Files that a cloud job writes.
 
-    Attributes
-    ----------
-    output : path
-        The cloud: ``.ply``, ``.vtp``, ``.npz``, ``.xyz`` or ``.las``.
-    removed : path, optional
-        The points as they were extracted, each with the number of the reason why it went as its label; 0 is kept.
-    surface : path, optional
-        A closed mesh around the cloud, in a format of meshes.
-    report : path, optional
-        The report as JSON.
+    output: The cloud: ``.ply``, ``.vtp``, ``.npz``, ``.xyz`` or ``.las``.
+    removed: The points as they were extracted, each with the number of the reason why it went as its label; 0 is kept.
+    surface: A closed mesh around the cloud, in a format of meshes.
+    report: The report as JSON.
     """
 
     output: str | Path
@@ -34,17 +28,7 @@ class CloudFiles:
     def check(self) -> list[tuple[str, str | Path]]:
         """Refuse outputs that cannot be written, before any work is done.
 
-        Returns
-        -------
-        list of (str, path)
-            Description and path of each output.
-
-        Raises
-        ------
-        UsageError
-            An extension is unknown, or two outputs are the same file.
-        OutputError
-            A folder is missing or cannot be written, or a target is no regular file.
+        Returns: list of (str, path). Description and path of each output.
         """
         from clrecon.exchange.clouds.formats import check_cloud_format
         from clrecon.system.files import check_writable

@@ -23,13 +23,7 @@ MOST_NAMED = 10
 
 
 def find_ghosts(resident: DeviceVolume, level: float, settings: CloudSettings, progress: Progress) -> GhostSlices:
-    """Test the slices of a scan by the voxels of the band, or of the iso value `level` and above.
-
-    Raises
-    ------
-    NoSurfaceError, DeviceError
-        As `clrecon.find_ghost_slices`.
-    """
+    """Test the slices of a scan by the voxels of the band, or of the iso value `level` and above."""
     from clrecon.operators.points.slice_overlap import find_ghost_slices
 
     band = settings.hu if isinstance(settings.hu, Sequence) else (level, math.inf)

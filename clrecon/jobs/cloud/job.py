@@ -59,25 +59,9 @@ def make_cloud(
     then the input.  All files are written under temporary names and renamed when all are done; the report comes last,
     as the commit mark.
 
-    Parameters
-    ----------
-    source : path
-        DICOM folder or file, a file of another format, or a file of points, see `clrecon.read_points`.
-    files : CloudFiles
-    settings : CloudSettings, optional
-    no_clobber : bool
-        True: files that exist stay and are an `OutputError`, before any work.
-    progress : callable, optional
-        ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    CloudReport
-
-    Raises
-    ------
-    UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError, NoSurfaceError
-        After an error nothing is written, and older files are intact.
+    source: DICOM folder or file, a file of another format, or a file of points, see `clrecon.read_points`.
+    no_clobber: Files that exist stay and are an `OutputError`, before any work.
+    progress: ``progress(stage, done, total)``.
     """
     settings = settings or CloudSettings()
     progress = progress or ignore_progress
@@ -175,13 +159,7 @@ def _read_map(settings: CloudSettings, volume: Volume | None) -> LabelMap | None
 def _reconstruct(
     trail: Trail, files: CloudFiles, settings: CloudSettings, device: Device, progress: Progress
 ) -> Mesh | None:
-    """Make the mesh around the points, if its file is named.
-
-    Raises
-    ------
-    UsageError
-        The points have no normals, or those of a cloud that nothing has turned outward.
-    """
+    """Make the mesh around the points, if its file is named."""
     if files.surface is None:
         return None
     of_scan = any(step["step"] == "points" for step in trail.steps)

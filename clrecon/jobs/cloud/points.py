@@ -33,22 +33,7 @@ def take_points(
 ) -> Trail:
     """Make the cloud of a volume, or take one that was read, and run the steps on it.
 
-    Parameters
-    ----------
-    subject : Volume or PointCloud
-    labels : LabelMap, optional
-    device : Device
-    settings : CloudSettings
-    progress : callable
-    ghosts : GhostSlices, optional
-        Of the scan before it was masked; None: they are looked for in the volume.
-
-    Raises
-    ------
-    NoSurfaceError
-        There are no points, or none is left.
-    UsageError, RefusedInputError, DeviceError
-        As the functions of the steps.
+    ghosts: Of the scan before it was masked; None: they are looked for in the volume.
     """
     from clrecon.geometry import Volume
     from clrecon.operators.resident.device_volume import DeviceVolume

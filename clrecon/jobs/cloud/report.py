@@ -30,35 +30,19 @@ __all__ = ["CloudReport", "describe_clouds", "describe_file"]
 class CloudReport(RunReport):
     """The report of a cloud job: a `RunReport` with further entries, which docs/contract.md explains.
 
-    Attributes
-    ----------
-    kind : str or None
-        Kind of the points; None for a cloud that was read.
-    iso_value_hu : float or None
-    hu : [low, high] or None
-    label : mapping or None
-    cloud_read : mapping or None
-        The cloud that was read, see `clrecon.jobs.shared.clouds.describe_cloud`.
-    points, points_first : int
-        Points of the written cloud, and before any step.
-    removed : mapping of str to int
-        Points that went, by reason.
-    normals, has_hu, labels : bool
-        What the written cloud knows of its points.
-    bounds_mm : [[x, y, z], [x, y, z]]
-    space, unit : str
-    paper : bool
-    steps : list of mapping
-        In the order in which they ran: ``step``, ``points_before``, ``points_after``, ``removed``, ``seconds`` and
+    kind: Kind of the points; None for a cloud that was read.
+    hu: [low, high] or None
+    cloud_read: The cloud that was read, see `clrecon.jobs.shared.clouds.describe_cloud`.
+    points, points_first: Points of the written cloud, and before any step.
+    removed: Points that went, by reason.
+    normals, has_hu, labels: What the written cloud knows of its points.
+    bounds_mm: [[x, y, z], [x, y, z]]
+    steps: In the order in which they ran: ``step``, ``points_before``, ``points_after``, ``removed``, ``seconds`` and
         figures of their own.
-    gates : list of mapping
-    removed_labels : list of mapping or None
-        The labels of the file of removed points.
-    surface : mapping or None
-        The mesh around the cloud: ``vertices``, ``triangles``, ``spacing_mm``, ``bridge_mm``, ``votes_against_share``,
-        ``wall_share``, ``lost_share``, ``open_cubes``, ``warnings``.
-    outputs : list of mapping
-        ``what``, ``format`` and ``bytes`` of each file but the report.
+    removed_labels: The labels of the file of removed points.
+    surface: The mesh around the cloud: ``vertices``, ``triangles``, ``spacing_mm``, ``bridge_mm``,
+        ``votes_against_share``, ``wall_share``, ``lost_share``, ``open_cubes``, ``warnings``.
+    outputs: ``what``, ``format`` and ``bytes`` of each file but the report.
     """
 
     affine_ijk_to_lps_mm: list[list[float]] | None  # type: ignore[assignment]
@@ -112,21 +96,10 @@ def describe_clouds(
 ) -> CloudReport:
     """Compose the report of a job.
 
-    Parameters
-    ----------
-    subject : Volume or PointCloud
-        What was read.
-    trail : Trail
-    settings : CloudSettings
-    device : Device
-    surface : Mesh, optional
-    has_removed : bool
-        True: the points that went were written too.
-    outputs : list of dict
-        Results of `describe_file`.
-    warnings : sequence of str
-        Those of the job; those of the input come before them.
-    seconds : mapping
+    subject: What was read.
+    has_removed: The points that went were written too.
+    outputs: Results of `describe_file`.
+    warnings: Those of the job; those of the input come before them.
     """
     from clrecon.geometry import Volume
 

@@ -47,11 +47,8 @@ LARGEST_MM = 1e4
 class Clustering:
     """Parameters of DBSCAN, see `clrecon.cluster_points`.
 
-    Parameters
-    ----------
-    eps : float, optional
-        Mm.
-    min_samples : int or "plane+1"
+    eps: Mm.
+    min_samples: int or "plane+1"
     """
 
     eps: float | None = None
@@ -70,47 +67,25 @@ class Clustering:
 class CloudSettings(InputSettings):
     """Settings of the cloud job.
 
-    Parameters
-    ----------
-    points : {"surface", "shell", "voxels"}, optional
-        Default: "voxels" where a band is given, else "surface".
-    hu : float or (low, high), optional
-        One number is an iso value, inside is that and above; two are a band, both ends included.  Default: the iso
-        value of the mesh job.
-    labels : path, optional
-        Label map; only points of one label are taken.
-    label : str, optional
-        Number or name of that label.
-    ghost_slices : {"keep", "drop"}
-        What becomes of the points of slices that are unlike both neighbours, see `clrecon.find_ghost_slices`.  With
-        "keep" there is a warning that names them.
-    clusters : Clustering, optional
-    keep : sequence of str
-        Keep rules, see `clrecon.keep_clusters`; they need clusters, which then have the default parameters.
-    outliers : float, optional
-        Standard deviations of the mean distance to the neighbours beyond which a point goes.
-    denoise : sequence of {"grid", "bilateral"}
-    viewpoint : (x, y, z), optional
-        A point inside of the object, mm in the frame of the output: normals of a cloud from a file point away from it.
-    normals : bool
-        Points without normals get them, and points that were moved new ones.
-    spacing : float, optional
-        Mm; one point for each cell of that size stays.
-    paper : bool
-        The formulas as the papers print them, with what that does.
-    allow_point_loss : bool
-        Go on where a step that should take noise only takes more than half of its points.
-    space : {"lps", "ras"}
-        Patient frame of the written files, and of the seeds.
-    input_space : {"lps", "ras"}, optional
-        Patient frame of a cloud file that does not say its own.
-    **shared
-        See `clrecon.jobs.shared.settings.InputSettings`.
-
-    Raises
-    ------
-    UsageError
-        A value is impossible, or two exclude each other.
+    points: {"surface", "shell", "voxels"}. Default: "voxels" where a band is given, else "surface".
+    hu: float or (low, high). One number is an iso value, inside is that and above; two are a band, both ends included.
+        Default: the iso value of the mesh job.
+    labels: Label map; only points of one label are taken.
+    label: Number or name of that label.
+    ghost_slices: {"keep", "drop"}. What becomes of the points of slices that are unlike both neighbours, see
+        `clrecon.find_ghost_slices`.  With "keep" there is a warning that names them.
+    keep: Keep rules, see `clrecon.keep_clusters`; they need clusters, which then have the default parameters.
+    outliers: Standard deviations of the mean distance to the neighbours beyond which a point goes.
+    denoise: sequence of {"grid", "bilateral"}
+    viewpoint: (x, y, z). A point inside of the object, mm in the frame of the output: normals of a cloud from a file
+        point away from it.
+    normals: Points without normals get them, and points that were moved new ones.
+    spacing: Mm; one point for each cell of that size stays.
+    paper: The formulas as the papers print them, with what that does.
+    allow_point_loss: Go on where a step that should take noise only takes more than half of its points.
+    space: {"lps", "ras"}. Patient frame of the written files, and of the seeds.
+    input_space: {"lps", "ras"}. Patient frame of a cloud file that does not say its own.
+    **shared: See `clrecon.jobs.shared.settings.InputSettings`.
     """
 
     points: str | None = None

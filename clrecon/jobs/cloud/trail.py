@@ -44,25 +44,13 @@ _TAKEN_BY_RULE = ("small cluster", "other cluster")
 class Trail:
     """The points of a job, from the first cloud to the last.
 
-    Parameters
-    ----------
-    cloud : PointCloud
-        As it was extracted or read.
-    began : float, optional
-        When its extraction began, see `clock`; None for a cloud that was read.
+    cloud: As it was extracted or read.
+    began: When its extraction began, see `clock`; None for a cloud that was read.
 
-    Attributes
-    ----------
-    first, cloud : PointCloud
-        The first cloud, and what is left of it.
-    steps : list of dict
-        The report's entry of each step.
-    reasons : list of str
-        All reasons so far for which a point went: number r of `fate` is ``reasons[r - 1]``.
-    fate : ndarray, shape (n,), uint8
-        For each point of the first cloud 0, or the number of the reason why it went.
-    gates : list of Gate
-    warnings : list of str
+    first, cloud: The first cloud, and what is left of it.
+    steps: The report's entry of each step.
+    reasons: All reasons so far for which a point went: number r of `fate` is ``reasons[r - 1]``.
+    fate: ndarray, shape (n,), uint8. For each point of the first cloud 0, or the number of the reason why it went.
     """
 
     def __init__(self, cloud: PointCloud, began: float | None = None):
@@ -94,13 +82,9 @@ class Trail:
     def add(self, name: str, step: PointStep, *, takes_noise: bool = False) -> None:
         """Take the result of a step over.
 
-        Parameters
-        ----------
-        name : str
-            One of `clrecon.jobs.cloud.settings.STEPS`.
-        step : PointStep
-        takes_noise : bool
-            True: a step that takes more than half of the points by reasons that are no rule of the caller fails a gate.
+        name: One of `clrecon.jobs.cloud.settings.STEPS`.
+        takes_noise: A step that takes more than half of the points by reasons that are no rule of the caller fails a
+            gate.
         """
         numbers = [0]
         for reason, count in step.counts.items():
@@ -130,13 +114,7 @@ class Trail:
         )
 
     def check(self, allow_point_loss: bool) -> None:
-        """Refuse the loss of more points than noise can be.
-
-        Raises
-        ------
-        RefusedInputError
-            A gate failed, and the loss is not allowed.
-        """
+        """Refuse the loss of more points than noise can be."""
         failed = [gate for gate in self.gates if gate.ok is False]
         if not failed:
             return

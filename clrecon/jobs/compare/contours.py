@@ -32,17 +32,10 @@ Segments = NDArray[np.float64]
 class Plane:
     """A plane across an axis of the volume.
 
-    Attributes
-    ----------
-    name : str
-    axis : int
-        Of (i, j, k).
-    at : float
-        Index coordinate along it.
-    across, down : int
-        The axes that run to the right and down in the picture.
-    flip : bool
-        True: the axis `down` runs upward instead.
+    axis: Of (i, j, k).
+    at: Index coordinate along it.
+    across, down: The axes that run to the right and down in the picture.
+    flip: The axis `down` runs upward instead.
     """
 
     name: str
@@ -56,11 +49,8 @@ class Plane:
 def find_planes(volume: Volume, iso_value: float) -> tuple[list[Plane], NDArray[np.float64]]:
     """Choose two planes through the middle of what is inside.
 
-    Returns
-    -------
-    planes : list of Plane
-    box : ndarray, shape (2, 3)
-        Lowest and highest index (i, j, k) of the voxels that are inside.
+    Returns:
+    box: ndarray, shape (2, 3). Lowest and highest index (i, j, k) of the voxels that are inside.
     """
     box = inside_box(volume, iso_value)
     middle = np.floor(box.mean(axis=0))
@@ -134,12 +124,7 @@ def draw_plane(
     colors: Mapping[str, str],
     reference: str,
 ) -> tuple[Any, Any]:
-    """Draw a plane with the contours of all methods, as a whole and the detail where there is most to see.
-
-    Returns
-    -------
-    whole, detail : PIL.Image.Image
-    """
+    """Draw a plane with the contours of all methods, as a whole and the detail where there is most to see."""
     grey = read_plane(volume, plane)
     steps = np.array([volume.spacing[plane.across], volume.spacing[plane.down]])
     axes = [plane.across, plane.down]

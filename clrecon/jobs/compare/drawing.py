@@ -22,9 +22,7 @@ BACKGROUND = "black"
 def draw_mesh(mesh: Mesh, camera: Camera, size: tuple[int, int], *, device: Device | None = None) -> Image:
     """Draw a mesh, shaded by the normals of its triangles alone, so that pictures differ only where surfaces do.
 
-    Returns
-    -------
-    ndarray, shape (height, width, 3), uint8
+    Returns: ndarray, shape (height, width, 3), uint8
     """
     from clrecon.operators.rays.render import render
     from clrecon.rendering.pictures.mesh_look import MeshLook
@@ -37,9 +35,7 @@ def draw_mesh(mesh: Mesh, camera: Camera, size: tuple[int, int], *, device: Devi
 def draw_points(cloud: PointCloud, camera: Camera, size: tuple[int, int], *, device: Device | None = None) -> Image:
     """Draw a cloud as discs.
 
-    Returns
-    -------
-    ndarray, shape (height, width, 3), uint8
+    Returns: ndarray, shape (height, width, 3), uint8
     """
     from clrecon.operators.rays.point_pictures import PointPictures
     from clrecon.rendering.pictures.point_look import PointLook

@@ -36,24 +36,12 @@ COLORS = dict(
 class Figures:
     """The pictures of a comparison.
 
-    Attributes
-    ----------
-    work : Path
-        Folder with the arrays of the methods.
-    volume : Volume
-    level : float
-    reference : str
-    planes : list of Plane
-    box : ndarray, shape (2, 3)
-    views : dict of str to ndarray
-        The picture of each method from the one camera.
-    contours : list of dict
-        For each plane the lines of each method.
-    images : dict of str to image
-        What is written as PNG, by file name without extension.
-    same : set of str
-        Methods whose surface is that of the reference.
-    paper : dict or None
+    work: Folder with the arrays of the methods.
+    box: ndarray, shape (2, 3)
+    views: The picture of each method from the one camera.
+    contours: For each plane the lines of each method.
+    images: What is written as PNG, by file name without extension.
+    same: Methods whose surface is that of the reference.
     """
 
     work: Path

@@ -25,12 +25,7 @@ WIDER_MM = 5e-3
 def find_findings(methods: Sequence[MethodRecord], reference: str, *, with_truth: bool) -> list[str]:
     """Return the findings, each a sentence.
 
-    Parameters
-    ----------
-    methods : sequence of MethodRecord
-    reference : str
-        Name of the method that others are compared with.
-    with_truth : bool
+    reference: Name of the method that others are compared with.
     """
     done = {method.name: method for method in methods if method.is_done}
     found = [*_of_time(done, reference), *_of_same(done, reference), *_of_golden(done), *_of_growing(done, reference)]

@@ -25,15 +25,7 @@ _OWN = re.compile(rf"index\.html|report\.json|(?:{_NAMES})(?:-difference|-along)
 
 
 def check_report_folder(path: str | os.PathLike[str]) -> Path:
-    """Return the folder that will be made, or that of an earlier comparison, which will be replaced.
-
-    Raises
-    ------
-    UsageError
-        It holds something else.
-    OutputError
-        See `clrecon.system.folders.check_folder`.
-    """
+    """Return the folder that will be made, or that of an earlier comparison, which will be replaced."""
     folder = check_folder(path, _OWN, "report")
     names = set(os.listdir(folder)) if folder.is_dir() else set()
     if names and not {PAGE, REPORT} <= names:
@@ -46,10 +38,7 @@ def check_report_folder(path: str | os.PathLike[str]) -> Path:
 class MadeFolder(StagedFolder):
     """The folder while it is filled.
 
-    Attributes
-    ----------
-    path : Path
-        Its temporary place.
+    path: Its temporary place.
     """
 
     def __init__(self, path: str | os.PathLike[str], made: Path, folder: Path):
@@ -57,13 +46,7 @@ class MadeFolder(StagedFolder):
         self._shown, self.path = path, made
 
     def write(self, name: str, text: str) -> None:
-        """Write a file of text.
-
-        Raises
-        ------
-        OutputError
-            The system refuses.
-        """
+        """Write a file of text."""
         with system_errors(self._shown), open(self.path / name, "x", encoding="utf-8", newline="\n") as stream:
             stream.write(text)
 

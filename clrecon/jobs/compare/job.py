@@ -60,27 +60,11 @@ def make_comparison(
     Each method runs in a process of its own, one after another: the first run in a new process, then warm ones.  A
     method that fails, or whose library is not installed, is a row that says so.
 
-    Parameters
-    ----------
-    source : path
-        DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
-    output : path
-        Folder for ``index.html``, ``report.json`` and pictures: a new or empty one, or that of an earlier comparison,
-        which is replaced.
-    settings : CompareSettings, optional
-    no_clobber : bool
-        True: a folder that holds anything stays and is an `OutputError`.
-    progress : callable, optional
-        ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    CompareReport
-
-    Raises
-    ------
-    UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError, NoSurfaceError
-        After an error nothing is written, and an older folder is intact.
+    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
+    output: Folder for ``index.html``, ``report.json`` and pictures: a new or empty one, or that of an earlier
+        comparison, which is replaced.
+    no_clobber: A folder that holds anything stays and is an `OutputError`.
+    progress: ``progress(stage, done, total)``.
     """
     settings = settings or CompareSettings()
     progress = progress or ignore_progress
@@ -125,13 +109,7 @@ def make_comparison(
 
 
 def _check_truth(path: Path) -> str:
-    """Return the folder of a phantom's truth, which can be read.
-
-    Raises
-    ------
-    UsageError
-        It is none.
-    """
+    """Return the folder of a phantom's truth, which can be read."""
     from clrecon.phantom import phantom_truth
 
     folder = path.parent if path.name == "truth.json" and not path.is_dir() else path
@@ -160,13 +138,7 @@ def _open(
 def _prepare(
     volume: Volume, settings: CompareSettings, device: Device, progress: Progress
 ) -> tuple[Volume, float, str, list[str]]:
-    """Return the volume that all methods get, the level, why it is that, and warnings.
-
-    Raises
-    ------
-    NoSurfaceError
-        Nothing lies at the level, or everything does.
-    """
+    """Return the volume that all methods get, the level, why it is that, and warnings."""
     wanted = settings.as_mesh()
     surfaces = plan_surfaces(wanted.levels)
     volume = mask_parts(volume, surfaces, wanted, device, progress)
@@ -187,13 +159,7 @@ def _prepare(
 def _run_methods(
     figures: Figures, settings: CompareSettings, device: Device, progress: Progress
 ) -> dict[str, dict[str, Any]]:
-    """Run the methods one after another; those on a device that hangs are not tried any more.
-
-    Raises
-    ------
-    ClreconError
-        None of them works.
-    """
+    """Run the methods one after another; those on a device that hangs are not tried any more."""
     volume, chosen = figures.volume, settings.chosen
     camera = choose_camera(volume, figures.box)
     along = along_slices(volume) if settings.paper else None

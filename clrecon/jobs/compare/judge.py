@@ -29,10 +29,7 @@ MEASURES = ("quality", "cells", "slices", "surfaces", "truth", "points")
 class Judge:
     """Measures of one scan, one level and one reference.
 
-    Parameters
-    ----------
-    told : mapping
-        ``folder`` with the arrays; ``reference``, name of a method, None where it failed; ``iso_value``; ``closed``;
+    told: ``folder`` with the arrays; ``reference``, name of a method, None where it failed; ``iso_value``; ``closed``;
         ``truth``, the folder of a phantom, or None.
     """
 
@@ -63,10 +60,7 @@ class Judge:
     def measure(self, method: str) -> dict[str, Any]:
         """Measure what a method made.
 
-        Returns
-        -------
-        dict
-            An entry for each of `MEASURES`, None where it does not apply; and ``reasons``, why a measure failed.
+        Returns: An entry for each of `MEASURES`, None where it does not apply; and ``reasons``, why a measure failed.
         """
         mesh, points = load_mesh(self._folder, method), load_array(self._folder, method, "points")
         found: dict[str, Any] = dict.fromkeys(MEASURES)

@@ -42,12 +42,7 @@ class Scene:
 class Made:
     """What one run made.
 
-    Attributes
-    ----------
-    product : Mesh, PointCloud or Rendering
-    seconds : dict of str to float
-        By part, without drawing.
-    report : mapping
+    seconds: By part, without drawing.
     """
 
     product: Any
@@ -57,13 +52,7 @@ class Made:
 
 
 def make(scene: Scene) -> Made:
-    """Run the method once, and time it.
-
-    Raises
-    ------
-    ClreconError, ImportError
-        It cannot, or its library is not installed.
-    """
+    """Run the method once, and time it."""
     maker = _MAKERS[scene.request.method]
     start = perf_counter()
     product, reports = maker(scene)
@@ -182,17 +171,9 @@ _MAKERS: dict[str, Callable[[Scene], Product]] = {
 def draw(scene: Scene, product: Any, view: str) -> Any:
     """Draw what a method made.
 
-    Parameters
-    ----------
-    scene : Scene
-    product : Mesh, PointCloud or Rendering
-    view : {"view", "along"}
-        Name of `Request.views`.
+    view: {"view", "along"}. Name of `Request.views`.
 
-    Returns
-    -------
-    ndarray, shape (height, width, 3), uint8
-        Before black.
+    Returns: ndarray, shape (height, width, 3), uint8. Before black.
     """
     from clrecon.jobs.compare.drawing import draw_mesh, draw_points, flatten
 

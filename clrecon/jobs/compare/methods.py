@@ -17,19 +17,12 @@ MESH, CLOUD, PICTURE = "mesh", "cloud", "picture"
 class Compared:
     """A method that is compared.
 
-    Attributes
-    ----------
-    name : str
-        As the user names it.
-    title : str
-        In tables and plots.
-    what : str
-        In words.
-    makes : {"mesh", "cloud", "picture"}
-    on_device : bool
-        True: its kernels run on the OpenCL device; False: on the CPU alone.
-    peer : str
-        The library of somebody else that does the work; empty for clrecon's own.
+    name: As the user names it.
+    title: In tables and plots.
+    what: In words.
+    makes: {"mesh", "cloud", "picture"}
+    on_device: True: its kernels run on the OpenCL device; False: on the CPU alone.
+    peer: The library of somebody else that does the work; empty for clrecon's own.
     """
 
     name: str
@@ -63,16 +56,7 @@ COMPARED = {
 def choose_methods(names: Sequence[str], reference: str) -> tuple[Compared, ...]:
     """Return the methods that run, in the order of the table, the reference among them.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Empty: all.
-    reference : str
-
-    Raises
-    ------
-    UsageError
-        There is no such method, one is named twice, or the reference makes no mesh.
+    names: Empty: all.
     """
     for name in (*names, reference):
         if name not in COMPARED:

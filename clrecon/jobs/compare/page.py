@@ -22,11 +22,7 @@ __all__ = ["make_page"]
 def make_page(report: CompareReport, figures: Figures) -> str:
     """Return the page.
 
-    Parameters
-    ----------
-    report : CompareReport
-    figures : Figures
-        The pictures of the report.
+    figures: The pictures of the report.
     """
     parts = (
         _section("What the numbers say", _findings(report)),

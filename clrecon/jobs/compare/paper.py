@@ -78,16 +78,10 @@ def measure_against_slice(
 ) -> dict[str, Any]:
     """Compare pictures of methods with the middle slice, and pictures that show what that is worth.
 
-    Parameters
-    ----------
-    volume : Volume
-    pictures : mapping of str to ndarray, shape (height, width, 3), uint8
-    size : (width, height)
+    pictures: mapping of str to ndarray, shape (height, width, 3), uint8
+    size: (width, height)
 
-    Returns
-    -------
-    dict
-        ``window_hu``, ``slice``; ``methods`` and ``controls``: ``ssim`` and ``mse`` by name.
+    Returns: ``window_hu``, ``slice``; ``methods`` and ``controls``: ``ssim`` and ``mse`` by name.
     """
     wanted = middle_slice(volume, size)
     controls = make_control_pictures(wanted, middle_slice(volume, size, 1))

@@ -23,26 +23,11 @@ FILTERS = {"vtk-mc": "vtkMarchingCubes", "vtk-fe": "vtkFlyingEdges3D"}
 def extract_by_vtk(volume: Volume, iso_value: float, name: str, closed: bool) -> Mesh:
     """Extract a surface by one of VTK's filters, with its own normals on, on all cores where it can.
 
-    Parameters
-    ----------
-    volume : Volume
-    iso_value : float
-        HU.
-    name : {"vtk-mc", "vtk-fe"}
-    closed : bool
-        As `clrecon.extract_isosurface`: a layer of air lies around the volume.
+    iso_value: HU.
+    name: {"vtk-mc", "vtk-fe"}
+    closed: As `clrecon.extract_isosurface`: a layer of air lies around the volume.
 
-    Returns
-    -------
-    Mesh
-        In LPS mm; its report has ``cells`` and ``seconds`` {extract, place}.
-
-    Raises
-    ------
-    ImportError
-        VTK is not installed.
-    NoSurfaceError
-        Nothing crosses the iso value.
+    Returns: In LPS mm; its report has ``cells`` and ``seconds`` {extract, place}.
     """
     from vtkmodules import vtkFiltersCore
     from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy

@@ -30,11 +30,7 @@ Image = NDArray[np.uint8]
 def choose_camera(volume: Volume, box: NDArray[np.float64]) -> dict[str, Any]:
     """Return the parameters of the camera that looks at what is inside.
 
-    Parameters
-    ----------
-    volume : Volume
-    box : ndarray, shape (2, 3)
-        Lowest and highest index (i, j, k), see `clrecon.jobs.compare.contours.find_planes`.
+    box: ndarray, shape (2, 3). Lowest and highest index (i, j, k), see `clrecon.jobs.compare.contours.find_planes`.
     """
     low, high = box
     ends = np.stack([low - 1.0, high + 1.0])

@@ -43,10 +43,7 @@ CUT = 2.2
 def plot_times(report: CompareReport, which: str) -> str:
     """Return stacked bars of the parts of each method's time.
 
-    Parameters
-    ----------
-    report : CompareReport
-    which : {"first", "warm"}
+    which: {"first", "warm"}
     """
     done = [record for record in report.methods if record.is_done]
     parts = {record.name: getattr(record, f"{which}_parts_s") for record in done}

@@ -49,15 +49,9 @@ def make_record(
 ) -> MethodRecord:
     """Compose the row of a method.
 
-    Parameters
-    ----------
-    method : Compared
-    told : mapping
-        See `clrecon.jobs.compare.child.run_method`.
-    measured : mapping
-        See `clrecon.jobs.compare.judge.Judge.measure`.
-    read_s : mapping
-        ``first`` and ``warm`` seconds of reading.
+    told: See `clrecon.jobs.compare.child.run_method`.
+    measured: See `clrecon.jobs.compare.judge.Judge.measure`.
+    read_s: ``first`` and ``warm`` seconds of reading.
     """
     done = told["state"] == "done"
     first, runs = (told["first"], told["warm"]) if done else ({}, [])
@@ -132,20 +126,10 @@ def compose_report(
 ) -> CompareReport:
     """Compose the report.
 
-    Parameters
-    ----------
-    volume : Volume
-        What the methods got.
-    records : sequence of MethodRecord
-    figures : Figures
-    level : float
-        HU.
-    reason : str
-        Why it is that level.
-    read_s : mapping
-    warnings : sequence of str
-        Those of the volume come before them.
-    watch : Laps
+    volume: What the methods got.
+    level: HU.
+    reason: Why it is that level.
+    warnings: Those of the volume come before them.
     """
     certificate = dict(volume.report) if settings.keep_ids else dict(without_ids(volume.report))
     said = [str(text) for text in certificate.pop("warnings", [])]

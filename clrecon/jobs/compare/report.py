@@ -16,39 +16,23 @@ __all__ = ["CompareReport", "MethodRecord"]
 class MethodRecord(Record):
     """A row of the comparison.
 
-    Attributes
-    ----------
-    name, title, what : str
-        See `clrecon.jobs.compare.methods.Compared`.
-    makes : {"mesh", "cloud", "picture"}
-    peer : str
-        Library of somebody else; empty for clrecon's own.
-    state : {"done", "failed", "declined", "missing"}
-    error : str or None
-    triangles, vertices, points : int or None
-    first_s, warm_s : float or None
-        From voxels in memory to the result in memory, in a new process and again (median); no reading, no drawing.
-    warm_runs : int
-    first_parts_s, warm_parts_s : mapping of str to float
-        By part: ``read``, ``build``, ``upload``, ``kernels``, ``host``, ``download``, ``draw``.
-    kernels_ms : float or None
-        Of the warm run, as the device tells it; None without kernels.
-    memory_bytes : int or None
-        Most memory of its process, the interpreter and the scan included.
-    memory_own_bytes : int or None
-        The same beyond what the process had before it began.
-    cells_visited, cells_all : int or None
-    growing : mapping or None
-        What was left out, see `clrecon.extract_isosurface`.
-    quality, cells, slices, surfaces, truth, points_mm, pictures : mapping or None
-        Measures, see docs/compare.md.
-    reasons : mapping of str to str
-        Why a measure is missing.
-    small : mapping or None
-        Of ray casting: ``size``, ``first_s``, ``warm_s`` of a small picture, and ``scaled_s``, those of the full one
+    name, title, what: See `clrecon.jobs.compare.methods.Compared`.
+    makes: {"mesh", "cloud", "picture"}
+    peer: Library of somebody else; empty for clrecon's own.
+    state: {"done", "failed", "declined", "missing"}
+    first_s, warm_s: From voxels in memory to the result in memory, in a new process and again (median); no reading, no
+        drawing.
+    first_parts_s, warm_parts_s: By part: ``read``, ``build``, ``upload``, ``kernels``, ``host``, ``download``,
+        ``draw``.
+    kernels_ms: Of the warm run, as the device tells it; None without kernels.
+    memory_bytes: Most memory of its process, the interpreter and the scan included.
+    memory_own_bytes: The same beyond what the process had before it began.
+    growing: What was left out, see `clrecon.extract_isosurface`.
+    quality, cells, slices, surfaces, truth, points_mm, pictures: Measures, see docs/compare.md.
+    reasons: Why a measure is missing.
+    small: Of ray casting: ``size``, ``first_s``, ``warm_s`` of a small picture, and ``scaled_s``, those of the full one
         reckoned from it where it was not made.
-    picture, difference : str or None
-        Files.
+    picture, difference: Files.
     """
 
     name: str
@@ -94,34 +78,13 @@ class MethodRecord(Record):
 class CompareReport(RunReport):
     """The report of a comparison: a `RunReport` with further entries, which docs/compare.md explains.
 
-    Attributes
-    ----------
-    date : str
-        Day, ISO 8601.
-    shape_ijk, spacing_mm : sequence
-    iso_value_hu, iso_level_hu : float
-        The level, and where the surface lies between integers.
-    iso_value_reason : str
-    closed_at_border : bool
-    reference : str
-    repeat : int
-    with_truth : bool
-    processor : str
-    cores : int
-    free_cores : float
-    versions : mapping of str to str
-        Of Python and of each library that works.
-    read_s : mapping
-        ``first`` and ``warm`` seconds of reading the input.
-    findings : list of str
-    methods : list of MethodRecord
-    view : str
-    size : [int, int]
-        Width and height of the pictures.
-    slices : list of mapping
-        Pictures of slices with contours: ``axis``, ``index``, ``file``, ``detail``.
-    paper : mapping or None
-        The table against the middle slice.
+    date: Day, ISO 8601.
+    iso_value_hu, iso_level_hu: The level, and where the surface lies between integers.
+    versions: Of Python and of each library that works.
+    read_s: ``first`` and ``warm`` seconds of reading the input.
+    size: [int, int]. Width and height of the pictures.
+    slices: Pictures of slices with contours: ``axis``, ``index``, ``file``, ``detail``.
+    paper: The table against the middle slice.
     """
 
     affine_ijk_to_lps_mm: list[list[float]]

@@ -22,27 +22,14 @@ _VOXELS, _PLACE = "voxels.npy", "place.npz"
 class Request:
     """What one process does.
 
-    Attributes
-    ----------
-    method : str
-        Name in `COMPARED`.
-    folder : str
-        Has the volume; gets the results.
-    iso_value : float
-    closed : bool
-    device : int
-        Index of the OpenCL device.
-    memory : int or None
-    repeat : int
-        Warm runs.
-    timeout : float
-        Seconds after which a device that finishes nothing hangs.
-    camera : dict
-        Parameters of the `Camera` of the picture.
-    size : [int, int]
-        Width and height of the picture.
-    along : dict or None
-        Camera and size of a picture along the slices, for the table of the paper.
+    method: Name in `COMPARED`.
+    folder: Has the volume; gets the results.
+    device: Index of the OpenCL device.
+    repeat: Warm runs.
+    timeout: Seconds after which a device that finishes nothing hangs.
+    camera: Parameters of the `Camera` of the picture.
+    size: [int, int]. Width and height of the picture.
+    along: Camera and size of a picture along the slices, for the table of the paper.
     """
 
     method: str

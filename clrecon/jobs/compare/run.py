@@ -27,13 +27,7 @@ MOST_JUDGES = 4
 
 
 def _start(command: Sequence[str], told: Mapping[str, Any]) -> subprocess.Popen[bytes]:
-    """Start a process of this interpreter, and tell it what to do.
-
-    Raises
-    ------
-    DeviceError
-        It cannot be started.
-    """
+    """Start a process of this interpreter, and tell it what to do."""
     if getattr(sys, "frozen", False) or not sys.executable:
         raise DeviceError("methods are compared in processes of a Python interpreter, and this program has none")
     try:
@@ -56,13 +50,7 @@ def _start(command: Sequence[str], told: Mapping[str, Any]) -> subprocess.Popen[
 
 
 def run_in_process(request: Request) -> dict[str, Any]:
-    """Run a method in a process of its own, and return what `clrecon.jobs.compare.child.run_method` tells.
-
-    Raises
-    ------
-    DeviceError
-        No process can be started.
-    """
+    """Run a method in a process of its own, and return what `clrecon.jobs.compare.child.run_method` tells."""
     process = _start(METHOD, request.as_dict())
     assert process.stdout is not None
     try:
@@ -91,23 +79,11 @@ def _describe_end(code: int) -> str:
 def measure_in_processes(told: Mapping[str, Any], methods: Mapping[str, int]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Measure what methods made in a process a core, and yield the figures of each method.
 
-    Parameters
-    ----------
-    told : mapping
-        See `clrecon.jobs.compare.judge.Judge`.
-    methods : mapping of str to int
-        Names, and how much there is to measure of each.
+    told: See `clrecon.jobs.compare.judge.Judge`.
+    methods: Names, and how much there is to measure of each.
 
-    Yields
-    ------
-    name : str
-    figures : dict
-        See `Judge.measure`; only ``reasons`` where the process ended before.
-
-    Raises
-    ------
-    DeviceError
-        No process can be started.
+    Yields:
+    figures: See `Judge.measure`; only ``reasons`` where the process ended before.
     """
     parts = _share(methods, min(usable_cores(), MOST_JUDGES))
     lines: queue.Queue[tuple[int, bytes]] = queue.Queue()

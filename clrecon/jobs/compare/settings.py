@@ -20,27 +20,13 @@ MOST_REPEATS = 100
 class CompareSettings(InputSettings):
     """Settings of the compare job.
 
-    Parameters
-    ----------
-    methods : sequence of str
-        Names of `clrecon.jobs.compare.methods.COMPARED`; empty: all of them.
-    reference : str
-        The method whose mesh the others are compared with; it always runs.
-    truth : path, optional
-        ``truth.json`` of a phantom: what is made is compared with the true surface too.
-    paper : bool
-        Also compare a picture of each method with the middle slice, as a paper does, beside controls.
-    repeat : int
-        Warm runs of each method, of which the median counts.
-    iso_value, preset, half_way, closed
-        See `MeshSettings`; one level, above which is inside.
-    **shared
-        See `clrecon.jobs.shared.settings.InputSettings`.
-
-    Raises
-    ------
-    UsageError
-        A value is impossible, or two exclude each other.
+    methods: Names of `clrecon.jobs.compare.methods.COMPARED`; empty: all of them.
+    reference: The method whose mesh the others are compared with; it always runs.
+    truth: ``truth.json`` of a phantom: what is made is compared with the true surface too.
+    paper: Also compare a picture of each method with the middle slice, as a paper does, beside controls.
+    repeat: Warm runs of each method, of which the median counts.
+    iso_value, preset, half_way, closed: See `MeshSettings`; one level, above which is inside.
+    **shared: See `clrecon.jobs.shared.settings.InputSettings`.
     """
 
     methods: Sequence[str] = ()

@@ -26,19 +26,11 @@ GROUPS = {"mesh": "surfaces", "cloud": "clouds", "picture": "pictures of the vox
 class Column:
     """A column of the main table.
 
-    Attributes
-    ----------
-    head, unit : str
-    take : callable
-        The number of a row, or None.
-    write : callable
-        Its text.
-    best : {"", "low", "high"}
-        Which end of the numbers of meshes is set in bold.
-    meaning : str
-        One line.
-    truth : bool
-        Only with the truth of a phantom.
+    take: The number of a row, or None.
+    write: Its text.
+    best: {"", "low", "high"}. Which end of the numbers of meshes is set in bold.
+    meaning: One line.
+    truth: Only with the truth of a phantom.
     """
 
     head: str

@@ -51,26 +51,9 @@ def make_corridors(
 ) -> CorridorReport:
     """Find the corridors through the pedicles of labelled vertebrae, and grade given screws.
 
-    Parameters
-    ----------
-    source : path
-        DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
-    settings : CorridorSettings
-    files : CorridorFiles, optional
-    no_clobber : bool
-        True: files that exist stay and are an `OutputError`, before any work.
-    progress : callable, optional
-        ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    CorridorReport
-
-    Raises
-    ------
-    UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError, NoSurfaceError
-        After an error nothing is written, and older files are intact.  A label that is not that of a whole vertebra is
-        a `RefusedInputError`.
+    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
+    no_clobber: Files that exist stay and are an `OutputError`, before any work.
+    progress: ``progress(stage, done, total)``.
     """
     files, progress, watch = files or CorridorFiles(), progress or ignore_progress, Laps()
     with keep_existing(no_clobber):
@@ -171,12 +154,7 @@ def _choose(volume: Volume, settings: CorridorSettings, progress: Progress) -> t
 
 
 def _check_inside(share: float, name: str) -> None:
-    """Refuse a label that goes on beyond the scan.
-
-    Raises
-    ------
-    RefusedInputError
-    """
+    """Refuse a label that goes on beyond the scan."""
     if share < 1.0:
         raise RefusedInputError(
             f"{name} is cut off: {100.0 * (1.0 - share):.3g} % of its label lie outside of the scan; corridors need the"

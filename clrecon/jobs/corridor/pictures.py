@@ -74,16 +74,9 @@ def draw_corridors(
     and the one square to the line at the narrowest section of the pedicle.  A side without corridor shows the slices
     through the vertebra's middle.
 
-    Parameters
-    ----------
-    volume : Volume
-    found : VertebraCorridors
-    screws : sequence of Screw
-        Given screws of this vertebra.
-    margin : float
-        mm.
-    footer : sequence of str
-        Lines of text below.
+    screws: Given screws of this vertebra.
+    margin: mm.
+    footer: Lines of text below.
     """
     rows = [
         _row(volume, found, corridor, [screw for screw in screws if _side_of(found, screw) == corridor.side], margin)

@@ -38,31 +38,14 @@ KNOWN_BIAS = (
 class CorridorReport(Record):
     """The report of the corridor job; the fields are the entries of its JSON.
 
-    Attributes
-    ----------
-    notice : str
-        What the figures are not for.
-    level_bias : str
-        What is known of how far the surface at the level lies from that of the bone.
-    iso_value_hu : float
-    iso_value_reason : str
-    iso_value_choice : mapping or None
-        As in the report of a mesh.
-    space : str
-        Patient frame of all points.
-    margin_mm : float
-    grade_scale : str or None
-        The scale of `screws`, None without any.
-    vertebrae : list of dict
-    outputs : list of dict
-        Files with what they hold.
-    affine_ijk_to_lps_mm : nested list (4, 4)
-    version, platform : str
-    warnings : list of str
-    volume : mapping
-        The certificate of the volume without its warnings.
-    seconds : mapping of str to float
-    peak_memory_bytes : int or None
+    notice: What the figures are not for.
+    level_bias: What is known of how far the surface at the level lies from that of the bone.
+    iso_value_choice: As in the report of a mesh.
+    space: Patient frame of all points.
+    grade_scale: The scale of `screws`, None without any.
+    outputs: Files with what they hold.
+    affine_ijk_to_lps_mm: nested list (4, 4)
+    volume: The certificate of the volume without its warnings.
     """
 
     notice: str

@@ -26,13 +26,7 @@ LARGEST_FILE = 1 << 20
 
 
 def parse_screw(text: str, space: str, number: int = 1) -> Screw:
-    """Read ``X,Y,Z,X,Y,Z,D``: entry, tip and diameter in mm.
-
-    Raises
-    ------
-    UsageError
-        These are not seven numbers that a screw can have.
-    """
+    """Read ``X,Y,Z,X,Y,Z,D``: entry, tip and diameter in mm."""
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
@@ -53,11 +47,6 @@ def read_screws(path: str | Path, space: str) -> tuple[Screw, ...]:
 
     JSON is a list of objects with ``entry`` and ``tip`` (three numbers each, mm of `space`), ``diameter`` and, if
     wanted, ``name`` and ``label``; or an object with such a list as ``screws``.  CSV has a header with `CSV_COLUMNS`.
-
-    Raises
-    ------
-    UsageError
-        The file cannot be read, is neither, or has no screw in it.
     """
     shown = escape_text(Path(path).name)
     try:

@@ -21,14 +21,9 @@ LARGEST_MARGIN_MM = 5.0
 class CorridorFiles:
     """Outputs of the job.
 
-    Parameters
-    ----------
-    output : path, optional
-        Meshes: the vertebra and a cylinder a side, in files of its name with those of label and side.
-    picture : path, optional
-        .png, .jpg or .tif; one for each vertebra.
-    report : path, optional
-        JSON.
+    output: Meshes: the vertebra and a cylinder a side, in files of its name with those of label and side.
+    picture: .png, .jpg or .tif; one for each vertebra.
+    report: JSON.
     """
 
     output: str | Path | None = None
@@ -40,33 +35,16 @@ class CorridorFiles:
 class CorridorSettings(Selection):
     """Settings of the corridor job.
 
-    Parameters
-    ----------
-    series, phase, allow_gaps, force, follow_links, rescale
-        See `clrecon.reading.Selection`.
-    labels : path
-        Label map of the vertebrae.
-    only : tuple of str or int
-        Labels of the vertebrae that are looked at; at least one.
-    iso_value : float, optional
-        HU of the bone's surface; None: half way, measured in the scan.
-    margin : float
-        Distance in mm that a screw of the largest diameter keeps from the surface.
-    screws : sequence of Screw
-        Given screws, in mm of the frame `space` where they came from a command, else LPS.
-    space : {"lps", "ras"}
-        Patient frame of the points in the report, of given screws, and of the meshes.
-    keep_ids : bool
-        Write the hashes of the UIDs of series and frame of reference into the report.
-    device : str, optional
-        For the mesh of the vertebra alone.
-    memory : int, optional
-        Bytes that may be taken on the device.
-
-    Raises
-    ------
-    UsageError
-        A value is impossible.
+    series, phase, allow_gaps, force, follow_links, rescale: See `clrecon.reading.Selection`.
+    labels: Label map of the vertebrae.
+    only: Labels of the vertebrae that are looked at; at least one.
+    iso_value: HU of the bone's surface; None: half way, measured in the scan.
+    margin: Distance in mm that a screw of the largest diameter keeps from the surface.
+    screws: Given screws, in mm of the frame `space` where they came from a command, else LPS.
+    space: {"lps", "ras"}. Patient frame of the points in the report, of given screws, and of the meshes.
+    keep_ids: Write the hashes of the UIDs of series and frame of reference into the report.
+    device: For the mesh of the vertebra alone.
+    memory: Bytes that may be taken on the device.
     """
 
     labels: str | Path

@@ -19,13 +19,7 @@ _OTHER_UNIT = 100.0
 
 
 def read_side(path: str | Path, space: str | None) -> Mesh:
-    """Read a mesh; `space` is the frame of its coordinates if the file does not name one.
-
-    Raises
-    ------
-    UsageError, RefusedInputError
-        See `clrecon.read_mesh`.
-    """
+    """Read a mesh; `space` is the frame of its coordinates if the file does not name one."""
     mesh = read_mesh(path)
     if space is not None and mesh.report["file"]["space_from"] == "assumed":
         return read_mesh(path, space=space)

@@ -44,14 +44,9 @@ _LEAST_RANGE_MM = 1e-3
 class DistanceFiles:
     """Files that a job writes.
 
-    Attributes
-    ----------
-    output : path or None
-        A coloured by its distance from B, ``.ply``.
-    picture : path or None
-        A picture of it with the scale of its colours.
-    report : path or None
-        JSON.
+    output: A coloured by its distance from B, ``.ply``.
+    picture: A picture of it with the scale of its colours.
+    report: JSON.
     """
 
     output: str | Path | None = None
@@ -70,25 +65,9 @@ def measure_meshes(
 ) -> DistanceReport:
     """Measure how far two meshes lie apart.
 
-    Parameters
-    ----------
-    mesh, reference : path
-        Files A and B, see `clrecon.read_mesh`.
-    files : DistanceFiles, optional
-    settings : DistanceSettings, optional
-    no_clobber : bool
-        True: files that exist stay and are an `OutputError`, before any work.
-    progress : callable, optional
-        ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    DistanceReport
-
-    Raises
-    ------
-    UsageError, OutputError, RefusedInputError, NoSurfaceError, DeviceError
-        After an error nothing is written, and older files are intact.
+    mesh, reference: Files A and B, see `clrecon.read_mesh`.
+    no_clobber: Files that exist stay and are an `OutputError`, before any work.
+    progress: ``progress(stage, done, total)``.
     """
     files, settings = files or DistanceFiles(), settings or DistanceSettings()
     progress = progress or ignore_progress

@@ -15,27 +15,14 @@ __all__ = ["DistanceReport"]
 class DistanceReport(Record):
     """Report of `measure_meshes`; distances are mm.
 
-    Attributes
-    ----------
-    a, b : mapping
-        Each mesh: ``name``, ``kind``, ``space`` and ``space_from`` of its file, ``vertices``, ``triangles``,
+    a, b: Each mesh: ``name``, ``kind``, ``space`` and ``space_from`` of its file, ``vertices``, ``triangles``,
         ``closed``, ``area_mm2``, ``volume_ml``, ``bounds_mm`` (LPS).
-    hausdorff_mm, hd95_mm, assd_mm : float
-    a_to_b_mm, b_to_a_mm : mapping
-        ``mean``, ``rms``, ``p95`` and ``max`` of the distances without sign.
-    a_to_b_signed_mm, b_to_a_signed_mm : mapping or None
-        See `clrecon.mesh.compare.signed.SideDistance`; None where the other mesh is not closed.
-    samples : int
-    colors : mapping or None
-        ``range_mm``, ``signed`` and ``beyond_share`` of vertices of A: how distances became colours.
-    outputs : list of mapping
-        ``kind``, ``name`` and ``bytes`` of each file.
-    device : str or None
-        Where a picture was drawn.
-    version, platform : str
-    warnings : list of str
-    seconds : mapping
-    peak_memory_bytes : int or None
+    a_to_b_mm, b_to_a_mm: ``mean``, ``rms``, ``p95`` and ``max`` of the distances without sign.
+    a_to_b_signed_mm, b_to_a_signed_mm: See `clrecon.mesh.compare.signed.SideDistance`; None where the other mesh is not
+        closed.
+    colors: ``range_mm``, ``signed`` and ``beyond_share`` of vertices of A: how distances became colours.
+    outputs: ``kind``, ``name`` and ``bytes`` of each file.
+    device: Where a picture was drawn.
     """
 
     a: Mapping[str, Any]

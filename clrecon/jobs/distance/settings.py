@@ -19,27 +19,13 @@ MOST_SAMPLES = 10_000_000
 class DistanceSettings:
     """Settings of the job.
 
-    Parameters
-    ----------
-    mesh_space : {"lps", "ras"}, optional
-        Patient frame of files that do not name theirs; None: LPS, with a warning.
-    samples : int
-        Points on each surface.
-    range_mm : float, optional
-        Distance at which the colours end; None: chosen from the distances.
-    view : str
-        View of the picture, see `clrecon.Camera.fit`.
-    space : {"lps", "ras"}
-        Patient frame of the coloured mesh.
-    device : str, optional
-        Name or index of an OpenCL device, for the picture.
-    memory : int, optional
-        Most bytes on the device.
-
-    Raises
-    ------
-    UsageError
-        A value is impossible.
+    mesh_space: {"lps", "ras"}. Patient frame of files that do not name theirs; None: LPS, with a warning.
+    samples: Points on each surface.
+    range_mm: Distance at which the colours end; None: chosen from the distances.
+    view: View of the picture, see `clrecon.Camera.fit`.
+    space: {"lps", "ras"}. Patient frame of the coloured mesh.
+    device: Name or index of an OpenCL device, for the picture.
+    memory: Most bytes on the device.
     """
 
     mesh_space: str | None = None

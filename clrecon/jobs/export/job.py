@@ -53,28 +53,11 @@ def export_volume(
     A device is opened for a region and for preprocessing only.  Where the format cannot hold the volume and it is not
     resampled, that is refused before the device works.
 
-    Parameters
-    ----------
-    source : path
-        DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
-    output : path
-        .nii.gz, .nii, .nrrd or .mha, see `clrecon.write_volume`.
-    settings : ExportSettings, optional
-    report_path : path, optional
-        File for the report as JSON.
-    no_clobber : bool
-        True: files that exist stay and are an `OutputError`, before any work.
-    progress : callable, optional
-        ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    ExportReport
-
-    Raises
-    ------
-    UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError
-        After an error nothing is written, and older files are intact.
+    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
+    output: .nii.gz, .nii, .nrrd or .mha, see `clrecon.write_volume`.
+    report_path: File for the report as JSON.
+    no_clobber: Files that exist stay and are an `OutputError`, before any work.
+    progress: ``progress(stage, done, total)``.
     """
     settings = settings or ExportSettings()
     progress = progress or ignore_progress
@@ -118,12 +101,7 @@ def export_volume(
 
 
 def _check_files(source: str | Path, output: str | Path, report_path: str | Path | None) -> str:
-    """Refuse outputs that cannot be written, before any work; return the extension of the volume file.
-
-    Raises
-    ------
-    UsageError, OutputError
-    """
+    """Refuse outputs that cannot be written, before any work; return the extension of the volume file."""
     extension = check_volume_format(output)
     outputs: list[tuple[str, str | Path]] = [("the volume", output)]
     if report_path is not None:

@@ -22,20 +22,11 @@ __all__ = ["ExportReport", "describe_export"]
 class ExportReport(Record):
     """Report of `export_volume`.
 
-    Attributes
-    ----------
-    output : dict
-        ``format``, ``bytes``, ``type`` of the values, ``shape_ijk``, ``affine_ijk_to_lps_mm``, ``corners_lps_mm``
+    output: ``format``, ``bytes``, ``type`` of the values, ``shape_ijk``, ``affine_ijk_to_lps_mm``, ``corners_lps_mm``
         (lowest and highest centre of a voxel), ``space`` of the file and ``outside_hu``: HU of what lies outside of the
         region, None without one.
-    device : str or None
-        None where the job needed none.
-    version, platform : str
-    warnings : list of str
-    volume : mapping
-        The certificate of the volume that was written, without its warnings.
-    seconds : mapping
-    peak_memory_bytes : int or None
+    device: None where the job needed none.
+    volume: The certificate of the volume that was written, without its warnings.
     """
 
     output: Mapping[str, Any]

@@ -13,20 +13,11 @@ __all__ = ["ExportSettings"]
 class ExportSettings(InputSettings):
     """Settings of the export job.
 
-    Parameters
-    ----------
-    resample : float, optional
-        Resample to a regular grid with this step in mm, see `clrecon.geometry.resample.resample_volume`; None: voxels
-        stay as they are.
-    space : {"lps", "ras"}
-        Patient frame of the numbers of crop and region.  The frame of the file is that of its format.
-    **shared
-        See `clrecon.jobs.shared.settings.InputSettings`.
-
-    Raises
-    ------
-    UsageError
-        A value is impossible.
+    resample: Resample to a regular grid with this step in mm, see `clrecon.geometry.resample.resample_volume`; None:
+        voxels stay as they are.
+    space: {"lps", "ras"}. Patient frame of the numbers of crop and region.  The frame of the file is that of its
+        format.
+    **shared: See `clrecon.jobs.shared.settings.InputSettings`.
     """
 
     resample: float | None = None

@@ -60,30 +60,12 @@ def make_inside(
     with several vertebrae ``inside_L3_solid.stl``.  All are written under temporary names, then renamed; the report
     comes last, as the commit mark.
 
-    Parameters
-    ----------
-    source : path
-        DICOM folder or file, or a file of another format, see `clrecon.read_volume`.
-    output : path
-        Mesh file; its extension gives the format.
-    settings : InsideSettings
-    picture : path, optional
-        Picture, .png, .jpg or .tif: one of each part, with names like those of the meshes.
-    report_path : path, optional
-        File for the report as JSON.
-    no_clobber : bool
-        True: files that exist stay and are an `OutputError`.
-    progress : callable, optional
-        ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    InsideReport
-
-    Raises
-    ------
-    UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError, NoSurfaceError
-        After an error nothing is written, and older files are intact.
+    source: DICOM folder or file, or a file of another format, see `clrecon.read_volume`.
+    output: Mesh file; its extension gives the format.
+    picture: Picture, .png, .jpg or .tif: one of each part, with names like those of the meshes.
+    report_path: File for the report as JSON.
+    no_clobber: Files that exist stay and are an `OutputError`.
+    progress: ``progress(stage, done, total)``.
     """
     from clrecon.operators.vertebrae.inside import PARTS
 

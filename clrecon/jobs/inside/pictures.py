@@ -31,13 +31,7 @@ FADED_OPACITY = 0.15
 
 
 def check_pictures(picture: str | Path, view: str) -> None:
-    """Refuse pictures that cannot be made, before any work is done.
-
-    Raises
-    ------
-    UsageError
-        The extension or the view is unknown, or Pillow is not installed.
-    """
+    """Refuse pictures that cannot be made, before any work is done."""
     from clrecon.rendering.pictures.image_files import check_image_path
     from clrecon.rendering.pictures.pillow import load_pillow
     from clrecon.rendering.views.directions import find_view
@@ -52,20 +46,9 @@ def draw_parts(
 ) -> dict[str, Rendering]:
     """Draw each part opaque, with others faded, all from one camera.
 
-    Parameters
-    ----------
-    meshes : mapping of str to Mesh
-        By the names of `clrecon.operators.vertebrae.inside.PARTS`.
-    view : str
-        See `clrecon.Camera.fit`.
-    device : Device
-    memory : int, optional
-        Most bytes on the device.
-
-    Raises
-    ------
-    DeviceError
-        Not enough memory, or the device fails.
+    meshes: By the names of `clrecon.operators.vertebrae.inside.PARTS`.
+    view: See `clrecon.Camera.fit`.
+    memory: Most bytes on the device.
     """
     from clrecon.operators.rays.mesh_pictures import box_around, mesh_corners
     from clrecon.operators.rays.scene import ScenePictures

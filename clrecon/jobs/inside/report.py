@@ -26,13 +26,8 @@ __all__ = ["InsideReport", "describe_job", "describe_mesh_file"]
 class InsideReport(RunReport):
     """The report of the job: a `RunReport` with further entries, which docs/contract.md explains.
 
-    Attributes
-    ----------
-    vertebrae : list of mapping
-        One for each label, see `clrecon.VertebraInside.as_dict`, with ``meshes`` beside: ``part``, ``vertices``,
+    vertebrae: One for each label, see `clrecon.VertebraInside.as_dict`, with ``meshes`` beside: ``part``, ``vertices``,
         ``triangles``, ``format`` and ``bytes`` of each file, and ``pictures``.
-    close_mm : float
-    space, unit : str
     """
 
     affine_ijk_to_lps_mm: list[list[float]]
@@ -74,15 +69,7 @@ def describe_job(
 ) -> InsideReport:
     """Compose the report of a job.
 
-    Parameters
-    ----------
-    volume : Volume
-    vertebrae : sequence of dict
-        Entries of each vertebra; their warnings become those of the job.
-    settings : InsideSettings
-    device : Device
-    close_mm : float
-    seconds : mapping
+    vertebrae: Entries of each vertebra; their warnings become those of the job.
     """
     certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
     told = [*certificate.pop("warnings", []), *device.warnings]

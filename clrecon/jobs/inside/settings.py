@@ -18,37 +18,19 @@ __all__ = ["InsideSettings"]
 class InsideSettings(Selection):
     """Settings of the job.
 
-    Parameters
-    ----------
-    series, phase, allow_gaps, force, follow_links, rescale
-        See `clrecon.reading.Selection`.
-    labels : path
-        Label map: NIfTI, NRRD, MetaImage, DICOM SEG or RTSTRUCT.
-    only : sequence of str or int
-        The vertebrae, by numbers or names of their labels.
-    iso_value : float, optional
-        HU of the solid bone; None: the labels' own voxels.
-    dense : (low, high), optional
-        Band of dense bone, HU; None leaves an end open.  Default: `clrecon.operators.vertebrae.inside.DENSE_HU`.
-    close_mm : float, optional
-        Radius that closes the solid bone.  Default: `clrecon.operators.vertebrae.solid.CLOSE_MM`.
-    grow_mm : float, optional
-        Distance of growth with an iso value, see `clrecon.extract_labels`.
-    space : {"lps", "ras"}
-        Patient frame of the meshes.
-    view : str
-        View of the pictures, see `clrecon.Camera.fit`.
-    keep_ids : bool
-        Write the hashes of the UIDs of series and frame of reference into the report and the mesh files.
-    device : str, optional
-        Name or index of an OpenCL device.
-    memory : int, optional
-        Most bytes on the device.
-
-    Raises
-    ------
-    UsageError
-        A value is impossible.
+    series, phase, allow_gaps, force, follow_links, rescale: See `clrecon.reading.Selection`.
+    labels: Label map: NIfTI, NRRD, MetaImage, DICOM SEG or RTSTRUCT.
+    only: The vertebrae, by numbers or names of their labels.
+    iso_value: HU of the solid bone; None: the labels' own voxels.
+    dense: (low, high). Band of dense bone, HU; None leaves an end open.  Default:
+        `clrecon.operators.vertebrae.inside.DENSE_HU`.
+    close_mm: Radius that closes the solid bone.  Default: `clrecon.operators.vertebrae.solid.CLOSE_MM`.
+    grow_mm: Distance of growth with an iso value, see `clrecon.extract_labels`.
+    space: {"lps", "ras"}. Patient frame of the meshes.
+    view: View of the pictures, see `clrecon.Camera.fit`.
+    keep_ids: Write the hashes of the UIDs of series and frame of reference into the report and the mesh files.
+    device: Name or index of an OpenCL device.
+    memory: Most bytes on the device.
     """
 
     labels: str | Path

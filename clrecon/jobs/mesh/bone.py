@@ -44,21 +44,10 @@ def find_bone(
 ) -> NDArray[np.bool_]:
     """Find the components that look like bone or, if none does, the one that holds the spinal canal.
 
-    Parameters
-    ----------
-    mesh, volume, surface, labelled
-        The components of `surface` in `volume`.
-    without_table : bool
-        True: the table was already removed, so the message does not advise it.
+    mesh, volume, surface, labelled: The components of `surface` in `volume`.
+    without_table: The table was already removed, so the message does not advise it.
 
-    Returns
-    -------
-    ndarray, shape (count,), bool
-
-    Raises
-    ------
-    NoSurfaceError
-        No component is bone; the message has the figures of the largest, and advice.
+    Returns: ndarray, shape (count,), bool
     """
     import numpy as np
 
@@ -213,13 +202,8 @@ def _is_of_bone(surface: Surface, lowest: float) -> bool:
 def warn_of_walls(parts: Sequence[Part], settings: MeshSettings, choice: IsoChoice | None = None) -> list[str]:
     """Return warnings for a surface that should be bone but is contrast medium, joined to it, or something else.
 
-    Parameters
-    ----------
-    parts : sequence of Part
-        Parts that `judge_surfaces` has judged.
-    settings : MeshSettings
-    choice : IsoChoice, optional
-        The choice of the iso value; warnings about contrast medium at its edges are included.
+    parts: Parts that `judge_surfaces` has judged.
+    choice: The choice of the iso value; warnings about contrast medium at its edges are included.
     """
     contrast = [] if choice is None else warn_of_contrast(choice)
     warnings = []

@@ -18,24 +18,12 @@ __all__ = ["settings_for"]
 def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
     """Return the fields of `MeshSettings` that a purpose sets, with the given fields, which win.
 
-    Parameters
-    ----------
-    name : str, optional
-    given : dict
-        Fields; None, False and empty values count as not given.
+    given: Fields; None, False and empty values count as not given.
 
-    Returns
-    -------
-    dict
-        The given fields, and ``purpose``.  If components are chosen in another way, the purpose leaves none out.  Bone
-        is distinguished from other material only if all iso values are those of bone, from 100 to 1500 HU or
+    Returns: The given fields, and ``purpose``.  If components are chosen in another way, the purpose leaves none out.
+        Bone is distinguished from other material only if all iso values are those of bone, from 100 to 1500 HU or
         ``"auto"``; it is made solid if there is one of them, and ``solid`` is not given as False.  Labels whose surface
         HU place are made solid one by one.
-
-    Raises
-    ------
-    UsageError
-        Unknown purpose, or a surface that is left open.
     """
     if name is None:
         return dict(given)

@@ -32,12 +32,7 @@ def check_growing(
     inside: str,
     labels: LabelChoice | None,
 ) -> None:
-    """Check the seeds, the method and the vertex rule of a mesh job, each and with its other settings.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Check the seeds, the method and the vertex rule of a mesh job, each and with its other settings."""
     for seed in grow_from:
         _check_seed(seed)
     if method == "t-mc" and not grow_from and vertex_rule == "linear":

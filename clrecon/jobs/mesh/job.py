@@ -66,30 +66,12 @@ def make_mesh(
     its kernels are built while the input is read.  All files are written under temporary names, then renamed; the
     report comes last, as the commit mark.
 
-    Parameters
-    ----------
-    source : path
-        DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
-    output : path
-        Mesh file; its extension gives the format.
-    settings : MeshSettings, optional
-    report_path : path, optional
-        File for the report as JSON.
-    measure : bool, optional
-        Measure the meshes, which costs time; without it those entries are None.  Default: with a `report_path`.
-    no_clobber : bool
-        True: files that exist stay and are an `OutputError`, before any work where their names are known then.
-    progress : callable, optional
-        ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    MeshReport
-
-    Raises
-    ------
-    UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError, NoSurfaceError
-        After an error nothing is written, and older files are intact.
+    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
+    output: Mesh file; its extension gives the format.
+    report_path: File for the report as JSON.
+    measure: Measure the meshes, which costs time; without it those entries are None.  Default: with a `report_path`.
+    no_clobber: Files that exist stay and are an `OutputError`, before any work where their names are known then.
+    progress: ``progress(stage, done, total)``.
     """
     settings, progress = _combine_parts(settings or MeshSettings(), output), progress or ignore_progress
     measure = report_path is not None if measure is None else measure

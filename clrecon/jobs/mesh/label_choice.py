@@ -20,28 +20,14 @@ __all__ = ["LabelChoice"]
 class LabelChoice:
     """The labels of a map that become meshes, and the kind of their surfaces.
 
-    Parameters
-    ----------
-    path : path
-        NIfTI, NRRD, DICOM SEG or RTSTRUCT.
-    wanted : tuple of str or int
-        Numbers or names; empty means all that have a surface.
-    grow_mm : float, optional
-        See `clrecon.operators.surface.labels.extract_labels`.
-    solid : bool
-        True: fill less dense parts within a label.
-    surface : {"hu", "mask"}
-        HU place the vertices (`clrecon.operators.surface.labels.extract_labels`), or each label has its own surface
-        (`clrecon.operators.surface.label_masks.extract_label_masks`).
-    hidden : tuple of str or int
-        Labels that become no mesh.
-    colors : tuple of (str or int, str)
-        Labels and their colours, for PLY, GLB and 3MF.
-
-    Raises
-    ------
-    UsageError
-        `surface` is unknown, or growth or filling by HU is asked for although HU are not used.
+    path: NIfTI, NRRD, DICOM SEG or RTSTRUCT.
+    wanted: Numbers or names; empty means all that have a surface.
+    grow_mm: See `clrecon.operators.surface.labels.extract_labels`.
+    solid: Fill less dense parts within a label.
+    surface: {"hu", "mask"}. HU place the vertices (`clrecon.operators.surface.labels.extract_labels`), or each label
+        has its own surface (`clrecon.operators.surface.label_masks.extract_label_masks`).
+    hidden: Labels that become no mesh.
+    colors: tuple of (str or int, str). Labels and their colours, for PLY, GLB and 3MF.
     """
 
     path: str | Path
@@ -66,13 +52,7 @@ class LabelChoice:
             )
 
     def numbers_of(self, labels: LabelMap) -> list[int]:
-        """Return the numbers of the labels that become meshes.
-
-        Raises
-        ------
-        UsageError
-            A label is not in the map, or none is left.
-        """
+        """Return the numbers of the labels that become meshes."""
         hidden = {labels.find(label) for label in self.hidden}
         wanted = [labels.find(label) for label in self.wanted] or list(labels.numbers)
         left = [number for number in wanted if number not in hidden]
@@ -83,13 +63,7 @@ class LabelChoice:
     def colors_of(
         self, labels: LabelMap, numbers: Sequence[int], distinct: bool
     ) -> dict[int, tuple[float, float, float]]:
-        """Return the colours of labels: those given, and where wanted distinct ones for all others.
-
-        Raises
-        ------
-        UsageError
-            A label is not in the map, or has two colours.
-        """
+        """Return the colours of labels: those given, and where wanted distinct ones for all others."""
         from clrecon.rendering.looks.colors import find_color
         from clrecon.rendering.looks.label_style import distinct_colors
 

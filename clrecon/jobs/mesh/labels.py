@@ -33,13 +33,7 @@ _FACTS = (
 
 
 def open_labels(choice: LabelChoice | None, volume: Volume | None = None) -> LabelMap | None:
-    """Read the label map, None if the job has none; with the scan, a large one is held against its grid first.
-
-    Raises
-    ------
-    UsageError, RefusedInputError
-        As `clrecon.read_labels`.
-    """
+    """Read the label map, None if the job has none; with the scan, a large one is held against its grid first."""
     if choice is None:
         return None
     from clrecon.labels.reader import read_all_labels
@@ -68,21 +62,11 @@ def extract_label_surfaces(
 ) -> tuple[list[Surface], list[Mesh]]:
     """Extract each label at each iso value, or only once if its own surface is asked for.
 
-    Parameters
-    ----------
-    surfaces : sequence of Surface
-        One for each iso value.
+    surfaces: One for each iso value.
 
-    Returns
-    -------
-    surfaces : list of Surface
-        One for each label and iso value with a surface; named by the label and, if there are several, the iso value.
-    meshes : list of Mesh
-
-    Raises
-    ------
-    NoSurfaceError, UsageError, RefusedInputError, DeviceError
-        As `clrecon.operators.surface.labels.extract_labels`.
+    Returns:
+    surfaces: One for each label and iso value with a surface; named by the label and, if there are several, the iso
+        value.
     """
     from clrecon.labels import file_suffixes
     from clrecon.operators.surface.labels import extract_labels
@@ -176,10 +160,7 @@ def judge_label_volumes(parts: Sequence[Part], closed: bool) -> list[dict[str, A
     `closed` says that surfaces are closed at the border of the scan.  Each part of a label gets ``label_mesh_ml`` and
     ``label_compared_ml`` among its `facts`.
 
-    Returns
-    -------
-    list of dict
-        A gate for each label and iso value, see `clrecon.mesh.compare.gates.judge_label_volume`.
+    Returns: A gate for each label and iso value, see `clrecon.mesh.compare.gates.judge_label_volume`.
     """
     from clrecon.mesh.compare.gates import judge_label_volume
     from clrecon.mesh.triangles import enclosed_ml

@@ -35,13 +35,7 @@ def list_failed_values(volume: Volume) -> list[dict[str, Any]]:
 
 
 def check_known_values(volume: Volume, settings: MeshSettings) -> None:
-    """Refuse to choose the level of a print where the values are not HU; one in the values' own units is taken.
-
-    Raises
-    ------
-    RefusedInputError
-        A gate of the values failed, and the level is a preset or left to the measurement.
-    """
+    """Refuse to choose the level of a print where the values are not HU; one in the values' own units is taken."""
     named = settings.iso_value is not None or isinstance(settings.half_way, Sequence) and settings.half_way != "auto"
     if settings.purpose is None or not find_purpose(settings.purpose).is_for_print or named or not settings.follows_hu:
         return
@@ -56,13 +50,7 @@ def check_known_values(volume: Volume, settings: MeshSettings) -> None:
 
 
 def choose_level(volume: Volume, settings: MeshSettings, progress: Progress = ignore_progress) -> IsoChoice | None:
-    """Return the iso value half way between two materials, measured or given; None if the settings name levels.
-
-    Raises
-    ------
-    NoSurfaceError
-        "auto" finds no two materials.
-    """
+    """Return the iso value half way between two materials, measured or given; None if the settings name levels."""
     from clrecon.anatomy.iso_choice import choose_iso_value, half_iso_value
 
     if settings.half_way is None:

@@ -34,19 +34,11 @@ __all__ = ["MadeParts", "make_parts"]
 class MadeParts:
     """What `make_parts` made.
 
-    Attributes
-    ----------
-    volume : Volume
-        The scan, masked and cropped as the settings say.
-    solid : Volume
-        The same with what is filled, of which the surfaces were extracted.
-    parts : list of Part
-    device : Device
-        Its `current` is the one that works: a stand-in may have taken over.
-    choice : IsoChoice or None
-        The choice of the iso value, if it was neither given nor a preset.
-    origins : list of dict
-        The report of each surface as it was extracted.
+    volume: The scan, masked and cropped as the settings say.
+    solid: The same with what is filled, of which the surfaces were extracted.
+    device: Its `current` is the one that works: a stand-in may have taken over.
+    choice: The choice of the iso value, if it was neither given nor a preset.
+    origins: The report of each surface as it was extracted.
     """
 
     volume: Volume
@@ -66,19 +58,8 @@ def make_parts(
 ) -> MadeParts:
     """Read a scan, extract its surfaces and select components.
 
-    Parameters
-    ----------
-    source : path
-    settings : MeshSettings
-    progress : callable
-    watch : Laps
-        Gets the times of the parts.
-    check_map : callable, optional
-        Called with the label map whose labels become meshes, before the device works.
-
-    Raises
-    ------
-    UsageError, DeviceError, NoDicomError, RefusedInputError, NoSurfaceError
+    watch: Gets the times of the parts.
+    check_map: Called with the label map whose labels become meshes, before the device works.
     """
     surfaces = plan_surfaces(settings.levels, below=settings.below is not None)
     volume, labels, device = _open(source, settings, progress, watch, check_map)

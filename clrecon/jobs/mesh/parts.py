@@ -43,13 +43,7 @@ SELECT_STEPS = 4
 
 
 def check_levels(volume: Volume, surfaces: Sequence[Surface]) -> None:
-    """Refuse levels at which every voxel is inside.
-
-    Raises
-    ------
-    NoSurfaceError
-        All voxels are inside at one of the levels.
-    """
+    """Refuse levels at which every voxel is inside."""
     low, high = volume.hu_range or (math.nan, math.nan)
     for surface in surfaces:
         level = surface.iso_value
@@ -74,13 +68,7 @@ def extract_surfaces(
     progress: Progress,
     labels: LabelMap | None = None,
 ) -> list[Mesh]:
-    """Extract all surfaces with one mesh each; `labels` are those that they may grow from.
-
-    Raises
-    ------
-    NoSurfaceError
-        One of the iso values crosses nothing.
-    """
+    """Extract all surfaces with one mesh each; `labels` are those that they may grow from."""
     from clrecon.operators.surface.extract import extract_isosurfaces
 
     levels = [surface.iso_value for surface in surfaces if surface.iso_value is not None]
@@ -104,11 +92,6 @@ def select_parts(
     """Keep the components that the settings ask for, and measure what the purpose of the mesh needs.
 
     `steps` counts `SELECT_STEPS`, or fewer.
-
-    Raises
-    ------
-    NoSurfaceError, UsageError
-        As `_select_parts`.
     """
     if not settings.is_for_print:
         return _select_parts(surface, mesh, settings, device, volume, steps)
@@ -126,15 +109,7 @@ def select_parts(
 def _select_parts(
     surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device, volume: Volume, steps: Steps
 ) -> list[Part]:
-    """Keep the components that the settings ask for, together or one by one.
-
-    Raises
-    ------
-    NoSurfaceError
-        No component is large enough, or none is bone.
-    UsageError
-        A seed is near no component, or more components are to be written one by one than is plausible.
-    """
+    """Keep the components that the settings ask for, together or one by one."""
     if not settings.selects:
         return [Part(surface, surface.name, mesh)]
     from clrecon.geometry import frame_from_lps

@@ -75,11 +75,6 @@ def mask_parts(
     """Return the volume with air outside of the body, the field of view and the region, as the settings ask for it.
 
     Where the surfaces lie below a level, the region comes later: the air around the patient has to go before.
-
-    Raises
-    ------
-    ClreconError
-        As `mask_volume` and `restrict_volume`.
     """
     volume = mask_volume(volume, settings, progress)
     if settings.below is not None:
@@ -92,11 +87,6 @@ def narrow_volume(
 ) -> Volume:
     """Return the volume without what the surfaces shall not hold: outside air, where they lie below a level, what is
     outside of the region, and what preprocessing takes.
-
-    Raises
-    ------
-    ClreconError
-        As `leave_outside`, `restrict_volume` and `preprocess_volume`.
     """
     bands = _bands_of(surfaces)
     volume = leave_outside(volume, settings, progress)
@@ -117,11 +107,6 @@ def fill_solid(
 
     At levels of bone, spaces that are too wide for marrow stay open, and such that hold air; at others, as that of
     skin, all is filled.
-
-    Raises
-    ------
-    ClreconError
-        As `clrecon.fill_enclosed`.
     """
     if not settings.solid:
         return volume
@@ -139,15 +124,7 @@ def fill_solid(
 
 
 def leave_outside(volume: Volume, settings: MeshSettings, progress: Progress) -> Volume:
-    """Return the volume without the air around the patient, if the settings ask for the values below an iso value.
-
-    Raises
-    ------
-    RefusedInputError
-        No body was found.
-    NoSurfaceError
-        All voxels below the iso value are outside of the body.
-    """
+    """Return the volume without the air around the patient, if the settings ask for the values below an iso value."""
     if settings.below is None or settings.keep_outside:
         return volume
     from clrecon.anatomy.outside_air import leave_outside_air

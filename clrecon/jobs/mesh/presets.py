@@ -14,15 +14,9 @@ __all__ = ["DEFAULT_PRESET", "HIGHEST_BONE_HU", "LOWEST_BONE_HU", "PRESETS", "Pr
 class Preset:
     """An iso value with its name and its reason.
 
-    Attributes
-    ----------
-    name : str
-    iso_value : float
-        HU.
-    description : str
-        One line about the surface.
-    source : str
-        Origin of the value.
+    iso_value: HU.
+    description: One line about the surface.
+    source: Origin of the value.
     """
 
     name: str
@@ -62,13 +56,7 @@ PRESETS: dict[str, Preset] = {
 
 
 def find_preset(name: str) -> Preset:
-    """Return the preset called `name`, in upper or lower case.
-
-    Raises
-    ------
-    UsageError
-        There is no preset of this name; the message lists all names.
-    """
+    """Return the preset called `name`, in upper or lower case."""
     try:
         return PRESETS[name.lower()]
     except (KeyError, AttributeError):

@@ -28,11 +28,8 @@ THIN_SHARE = 0.05
 def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> dict[str, float]:
     """Measure the volumes that components enclose; `vertices` have shape (n, 3), in mm, `triangles` (m, 3).
 
-    Returns
-    -------
-    dict
-        ``pieces``, ``pieces_ml`` : components that enclose something, and how much
-        ``cavities``, ``cavities_ml`` : walls of cavities, and what they enclose
+    Returns: ``pieces``, ``pieces_ml`` : components that enclose something, and how much ``cavities``, ``cavities_ml`` :
+        walls of cavities, and what they enclose
     """
     from clrecon.mesh.refine.shifts import measure_volumes
     from clrecon.system.pieces import local_origin
@@ -49,22 +46,13 @@ def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
 def describe_print(mesh: Mesh, found: dict[str, float], kept: dict[str, float]) -> dict[str, Any]:
     """Return the facts for people who print a mesh: ``print`` of the report.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        The mesh as it is written.
-    found, kept : dict
-        `measure_pieces` of the surface as it was extracted, and of what was kept of it.
+    mesh: The mesh as it is written.
+    found, kept: `measure_pieces` of the surface as it was extracted, and of what was kept of it.
 
-    Returns
-    -------
-    dict
-        ``size_mm`` : x, y, z of the box around it
-        ``wall`` : see `clrecon.mesh.compare.thickness.measure_walls`
+    Returns: ``size_mm`` : x, y, z of the box around it ``wall`` : see `clrecon.mesh.compare.thickness.measure_walls`
         ``left_out`` : pieces and cavities as in `measure_pieces`; cavities that are left out are filled; and
         ``not_bone``, ``not_bone_ml``, the pieces whose walls are not like bone or that are crumbs, None where that was
-        not asked
-        ``pieces``, ``pieces_ml``, ``cavities``, ``cavities_ml`` : those that are in it
+        not asked ``pieces``, ``pieces_ml``, ``cavities``, ``cavities_ml`` : those that are in it
     """
     from clrecon.mesh.compare.thickness import measure_walls
 

@@ -15,15 +15,9 @@ __all__ = ["PURPOSES", "Purpose", "find_purpose"]
 class Purpose:
     """A name that stands for settings.
 
-    Attributes
-    ----------
-    name : str
-    settings : dict
-        Fields of `MeshSettings` that it sets if they are not given.
-    description : str
-        One line.
-    is_for_print : bool
-        The surface has to be closed and of bone, and what a printer needs to know of it is measured.
+    settings: Fields of `MeshSettings` that it sets if they are not given.
+    description: One line.
+    is_for_print: The surface has to be closed and of bone, and what a printer needs to know of it is measured.
     """
 
     name: str
@@ -51,13 +45,7 @@ PURPOSES: dict[str, Purpose] = {
 
 
 def find_purpose(name: str) -> Purpose:
-    """Return the purpose of this name.
-
-    Raises
-    ------
-    UsageError
-        There is no purpose of this name.
-    """
+    """Return the purpose of this name."""
     if name not in PURPOSES:
         raise UsageError(f"a mesh can be for {', '.join(PURPOSES)}, not for {name!r}{guess_word(name, PURPOSES)}")
     return PURPOSES[name]

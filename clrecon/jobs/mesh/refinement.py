@@ -26,10 +26,7 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress:
 
     Distances are bounded on the device, unless the settings limit its memory: what they allow is for the surface.
 
-    Returns
-    -------
-    Mesh
-        Its report: ``refinement``: ``smooth``, ``decimate`` (see `clrecon.mesh.refine.decimation`), ``deviation``,
+    Returns: Its report: ``refinement``: ``smooth``, ``decimate`` (see `clrecon.mesh.refine.decimation`), ``deviation``,
         which is `clrecon.mesh.compare_meshes` with the surface before, and ``voxel_mm``.
     """
     if not settings.refines:
@@ -67,18 +64,11 @@ def measure_parts(
 
     The device looks for these while the host measures all else, the distance from the scan too.
 
-    Parameters
-    ----------
-    parts : sequence of Part
-        As they are written; the result is their `quality`.
-    volume : Volume
-        The volume that they were made from.
-    settings : MeshSettings
-    device : Device, optional
-        Helps with the search; without one the host finds the same.
-    progress : callable, optional
-        Called as ``progress("measure", parts done, parts)``, with `strict` as ``progress("crossings", triangles done,
-        triangles)``.
+    parts: As they are written; the result is their `quality`.
+    volume: The volume that they were made from.
+    device: Helps with the search; without one the host finds the same.
+    progress: Called as ``progress("measure", parts done, parts)``, with `strict` as ``progress("crossings", triangles
+        done, triangles)``.
     """
     if not settings.strict:
         steps = Steps(progress, "measure", len(parts))
@@ -112,21 +102,12 @@ def judge_parts(
 ) -> list[dict[str, Any]]:
     """Judge the parts of a job by the gates; the measures are stored in the `facts` of each.
 
-    Parameters
-    ----------
-    parts : sequence of Part
-        Parts as they are written, after `measure_parts`.  A part that was not measured has only the gates of
+    parts: Parts as they are written, after `measure_parts`.  A part that was not measured has only the gates of
         refinement.
-    volume : Volume
-        The volume that they were made from.
-    settings : MeshSettings
-    progress : callable, optional
-        Called as ``progress("distance", parts done, parts)``.
+    volume: The volume that they were made from.
+    progress: Called as ``progress("distance", parts done, parts)``.
 
-    Returns
-    -------
-    list of dict
-        All gates, see `clrecon.mesh.compare.gates.judge_mesh`, each with ``mesh``, the name of its part or None.
+    Returns: All gates, see `clrecon.mesh.compare.gates.judge_mesh`, each with ``mesh``, the name of its part or None.
     """
     if not (settings.refines or any(part.quality for part in parts)):
         for part in parts:

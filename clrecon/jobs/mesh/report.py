@@ -77,34 +77,19 @@ class MeshReport(RunReport):
     are written one by one were found together, and count once), `bounds_mm` is the box around all, `closed` and
     `manifold` are true if they are for each mesh, and entries that differ or cannot be summed are None.
 
-    Attributes
-    ----------
-    iso_value_hu, iso_level_hu : float or None
-        The iso value as asked for, and the level of the surface.
-    inside, inside_hu, inside_levels_hu, outside_hu
-        The values that the surfaces enclose, and the value beyond the border of the volume.
-    iso_value_reason, iso_value_choice, preset, preset_reason
-        Origin of the iso value: in words, the `IsoChoice` without its value, the preset and its source.
-    space, unit : str
-    vertices, triangles, components, components_found, components_kept : int or None
-    closed, manifold : bool or None
-    area_mm2, volume_ml : float or None
-    bounds_mm : [[x, y, z], [x, y, z]] or None
-    closed_at_border, topology, method, grow_from, vertex_rule
-    keep, keep_largest, min_volume_ml, seeds_mm, all_parts, split, purpose
-        The settings.
-    slabs : int
-        Largest number for a surface.
-    device_bytes : mapping of str to int
-        Most bytes taken on the device, by purpose.
-    quality, walls, iso_distance, refinement, print, cells, growing : mapping or None
-        Entries of the only mesh.
-    meshes : list of mapping
-        One for each file, see `describe_part`.
-    output : mapping
-        ``format`` and ``bytes`` of all files.
-    gates : list of mapping
-        `Gate`, each with ``mesh``, the name of its part or None.
+    iso_value_hu, iso_level_hu: The iso value as asked for, and the level of the surface.
+    inside, inside_hu, inside_levels_hu, outside_hu: The values that the surfaces enclose, and the value beyond the
+        border of the volume.
+    iso_value_reason, iso_value_choice, preset, preset_reason: Origin of the iso value: in words, the `IsoChoice`
+        without its value, the preset and its source.
+    bounds_mm: [[x, y, z], [x, y, z]] or None
+    keep, keep_largest, min_volume_ml, seeds_mm, all_parts, split, purpose: The settings.
+    slabs: Largest number for a surface.
+    device_bytes: Most bytes taken on the device, by purpose.
+    quality, walls, iso_distance, refinement, print, cells, growing: Entries of the only mesh.
+    meshes: One for each file, see `describe_part`.
+    output: ``format`` and ``bytes`` of all files.
+    gates: `Gate`, each with ``mesh``, the name of its part or None.
     """
 
     _LEFT_OUT = ("preset_reason",)
@@ -181,20 +166,9 @@ def describe_job(
 ) -> MeshReport:
     """Make the report of a job.
 
-    Parameters
-    ----------
-    volume : Volume
-    parts : sequence of Part
-    meshes : sequence of dict
-        Result of `describe_part` for each part.
-    settings : MeshSettings
-    device : Device
-    choice : IsoChoice or None
-        The choice of the iso value if it was neither given nor a preset.
-    gates : list of dict
-    warnings : sequence of str
-        Warnings of the job; those of the volume and the meshes come before them.
-    seconds : mapping
+    meshes: Result of `describe_part` for each part.
+    choice: The choice of the iso value if it was neither given nor a preset.
+    warnings: Warnings of the job; those of the volume and the meshes come before them.
     """
     certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
     told = [*certificate.pop("warnings", []), *_warn_of_meshes(parts, meshes)]

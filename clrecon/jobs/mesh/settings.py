@@ -26,72 +26,42 @@ def name_level(level: float | Sequence[float]) -> str:
 class MeshSettings(InputSettings):
     """Settings of the mesh job.
 
-    Parameters
-    ----------
-    iso_value : float or sequence of float or (low, high), optional
-        HU; inside is ``>= iso_value``.  Several make one mesh each.  A pair in the sequence is a range, both ends
-        included: ``((100, 300),)``.
-    below : float or sequence of float, optional
-        In place of an iso value: inside is ``< below``, HU.  The air around the patient is left out.
-    keep_outside : bool
-        With `below`: keep the air around the patient.
-    preset : str, optional
-        Name of an iso value, see `clrecon.jobs.mesh.presets`. If neither is given, the preset is "bone".
-    half_way : "auto" or (bone, tissue), optional
-        In place of an iso value: half way between the two materials, measured in the scan or given in HU.
-    space : {"lps", "ras"}
-        Patient frame of the written mesh.
-    closed : bool
-        Close the surface where it meets the border of the volume (outside is air).
-    topology : {"separated", "trilinear"}
-        Rule where the voxels around a cell do not tell which of them are joined, see `extract_isosurface`.
-    method : str, optional
-        One of `clrecon.operators.surface.methods.METHODS`; None: "i-mc" with seeds in `grow_from`, else "t-mc".
-    grow_from : sequence of str or (x, y, z)
-        Seeds of the method "i-mc": "auto", points in mm of the frame `space`, and ``label:NAME`` of the label map
-        `labels`, which then makes no meshes of its own.
-    vertex_rule : {"linear", "golden", "golden-search"}
-        Where on an edge a vertex lies, see `extract_isosurface`.
-    keep : "bone", optional
-        Keep only components that look like bone, see `clrecon.mesh.compare.walls`.  With `keep_largest`: of these the
-        largest.
-    keep_largest : int, optional
-        Keep only this many components, the largest by area.
-    min_volume_ml : float, optional
-        Keep only components of at least this volume.  With `keep_largest`: of these the largest.
-    seeds : sequence of (x, y, z)
-        Keep only the components whose surface lies nearest to these points, in mm of the frame `space`.
-    solid : bool
-        Fill what the surface encloses, such as marrow, see `clrecon.fill_enclosed`.
-    seal_mm : float, optional
-        With `solid`: radius of the balls that close pores, mm; None: 2.5 to 3, by the voxels.
-    all_parts : bool
-        With the purpose ``"print"``: keep all components that look like bone, not the largest alone.  They are named
-        objects of a .3mf, and one mesh in other formats.
-    split : bool
-        Write one mesh for each component, the largest first.
-    one_file : bool
-        Write all meshes (labels, components, iso values) as named objects of one file, each in a colour of its own.
-    labels : LabelChoice, optional
-        A label map: one mesh for each label, see `LabelChoice`.
-    smooth : int, optional
-        Iterations of smoothing, see `clrecon.mesh.smooth_mesh`; None: none.
-    decimate : float, optional
-        Share of the triangles to remove, see `clrecon.mesh.decimate_mesh`; None: none.
-    max_deviation_mm : float, optional
-        Bound of smoothing and of decimation, mm; None: a quarter of the shortest voxel step.
-    purpose : str, optional
-        Purpose of the mesh, for which more is measured.  It sets nothing here, see
+    iso_value: float or sequence of float or (low, high). HU; inside is ``>= iso_value``.  Several make one mesh each.
+        A pair in the sequence is a range, both ends included: ``((100, 300),)``.
+    below: In place of an iso value: inside is ``< below``, HU.  The air around the patient is left out.
+    keep_outside: With `below`: keep the air around the patient.
+    preset: Name of an iso value, see `clrecon.jobs.mesh.presets`. If neither is given, the preset is "bone".
+    half_way: "auto" or (bone, tissue). In place of an iso value: half way between the two materials, measured in the
+        scan or given in HU.
+    space: {"lps", "ras"}. Patient frame of the written mesh.
+    closed: Close the surface where it meets the border of the volume (outside is air).
+    topology: {"separated", "trilinear"}. Rule where the voxels around a cell do not tell which of them are joined, see
+        `extract_isosurface`.
+    method: One of `clrecon.operators.surface.methods.METHODS`; None: "i-mc" with seeds in `grow_from`, else "t-mc".
+    grow_from: sequence of str or (x, y, z). Seeds of the method "i-mc": "auto", points in mm of the frame `space`, and
+        ``label:NAME`` of the label map `labels`, which then makes no meshes of its own.
+    vertex_rule: {"linear", "golden", "golden-search"}. Where on an edge a vertex lies, see `extract_isosurface`.
+    keep: "bone". Keep only components that look like bone, see `clrecon.mesh.compare.walls`.  With `keep_largest`: of
+        these the largest.
+    keep_largest: Keep only this many components, the largest by area.
+    min_volume_ml: Keep only components of at least this volume.  With `keep_largest`: of these the largest.
+    seeds: sequence of (x, y, z). Keep only the components whose surface lies nearest to these points, in mm of the
+        frame `space`.
+    solid: Fill what the surface encloses, such as marrow, see `clrecon.fill_enclosed`.
+    seal_mm: With `solid`: radius of the balls that close pores, mm; None: 2.5 to 3, by the voxels.
+    all_parts: With the purpose ``"print"``: keep all components that look like bone, not the largest alone.  They are
+        named objects of a .3mf, and one mesh in other formats.
+    split: Write one mesh for each component, the largest first.
+    one_file: Write all meshes (labels, components, iso values) as named objects of one file, each in a colour of its
+        own.
+    labels: A label map: one mesh for each label, see `LabelChoice`.
+    smooth: Iterations of smoothing, see `clrecon.mesh.smooth_mesh`; None: none.
+    decimate: Share of the triangles to remove, see `clrecon.mesh.decimate_mesh`; None: none.
+    max_deviation_mm: Bound of smoothing and of decimation, mm; None: a quarter of the shortest voxel step.
+    purpose: Purpose of the mesh, for which more is measured.  It sets nothing here, see
         `clrecon.jobs.mesh.for_purpose.settings_for`.
-    strict : bool
-        Measure everything that a gate needs, triangles that cut each other included.
-    **shared
-        See `clrecon.jobs.shared.settings.InputSettings`.
-
-    Raises
-    ------
-    UsageError
-        A value is impossible, or two exclude each other.
+    strict: Measure everything that a gate needs, triangles that cut each other included.
+    **shared: See `clrecon.jobs.shared.settings.InputSettings`.
     """
 
     iso_value: float | Sequence[float | Sequence[float]] | None = None

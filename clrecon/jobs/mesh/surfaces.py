@@ -19,17 +19,11 @@ __all__ = ["Bones", "Part", "Surface", "plan_surfaces"]
 class Surface:
     """A surface to extract.
 
-    Attributes
-    ----------
-    name : str
-        Part of its file names that distinguishes it from other surfaces, for example ``"200hu"``; empty if it is the
+    name: Part of its file names that distinguishes it from other surfaces, for example ``"200hu"``; empty if it is the
         only one.
-    iso_value : float or (float, float) or None
-        HU; or the two ends of a range; None: it is a label's own.
-    below : bool
-        True: it encloses the values below the iso value.
-    label : str or int or None
-        Label that selects its cells, if there is a label map.
+    iso_value: float or (float, float) or None. HU; or the two ends of a range; None: it is a label's own.
+    below: It encloses the values below the iso value.
+    label: Label that selects its cells, if there is a label map.
     """
 
     name: str
@@ -61,21 +55,13 @@ class Bones(NamedTuple):
 class Part:
     """A mesh that becomes a file: a surface, or a component of one.
 
-    Attributes
-    ----------
-    surface : Surface
-    name : str
-        Text between the stem of the output and its extension, for example ``"200hu_001"``; empty if the part is the
+    name: Text between the stem of the output and its extension, for example ``"200hu_001"``; empty if the part is the
         only one.
-    mesh : Mesh
-    quality : MeshQuality, optional
-        Its quality, if measured.
-    facts : dict
-        Further entries of its object in the report.
-    pieces : (dict, dict), optional
-        Enclosed volumes of the components of its surface, as extracted and as kept, if the purpose needs them.
-    bones : Bones, optional
-        Number of its components that are bone, if it does not look like bone as a whole.
+    quality: Its quality, if measured.
+    facts: Further entries of its object in the report.
+    pieces: (dict, dict). Enclosed volumes of the components of its surface, as extracted and as kept, if the purpose
+        needs them.
+    bones: Number of its components that are bone, if it does not look like bone as a whole.
     """
 
     surface: Surface

@@ -28,21 +28,10 @@ OPAQUE_ONLY = (".jpg", ".jpeg", ".mp4", ".gif")
 class PictureFiles:
     """Paths of the outputs of a job; with several views each picture gets its own file names.
 
-    Parameters
-    ----------
-    picture : path, optional
-        .png, .jpg or .tif.
-    depth, values : path, optional
-        .npy or .tif, with the distances to the first hit in mm, and with HU.
-    turntable : path, optional
-        See `clrecon.rendering.movies.movie.check_animation`.
-    report : path, optional
-        JSON.
-
-    Raises
-    ------
-    UsageError
-        There is nothing to write, or depths or values are asked for without a picture.
+    picture: .png, .jpg or .tif.
+    depth, values: .npy or .tif, with the distances to the first hit in mm, and with HU.
+    turntable: See `clrecon.rendering.movies.movie.check_animation`.
+    report: JSON.
     """
 
     picture: str | Path | None = None
@@ -66,10 +55,7 @@ class PictureFiles:
 def name_view(view: str, views: Sequence[str]) -> str:
     """Name of a view between the stem of a file and its extension; empty for a single view.
 
-    Returns
-    -------
-    str
-        The view's own name, or ``az30_el-15`` for angles.
+    Returns: The view's own name, or ``az30_el-15`` for angles.
     """
     if len(views) == 1:
         return ""
@@ -91,19 +77,7 @@ def format_of(path: str | Path) -> str:
 def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[str, str | Path]]:
     """Refuse outputs that cannot be written, before any work is done.
 
-    Returns
-    -------
-    list of (str, path)
-        A description of each output, and its path.
-
-    Raises
-    ------
-    UsageError
-        An extension is unknown, two outputs are the same file, an output lies in the folder of frames, a format cannot
-        store what is asked for, there is no encoder for a moving picture, a caption cannot be drawn, or Pillow is not
-        installed.
-    OutputError
-        A folder is missing or cannot be written to, or a target is not a regular file.
+    Returns: list of (str, path). A description of each output, and its path.
     """
     from clrecon.rendering.movies.movie import animation_kind, check_animation
     from clrecon.rendering.pictures.annotations import check_caption
@@ -157,15 +131,8 @@ def stage_picture(
 ) -> dict[str, tuple[str | Path, StagedFile]]:
     """Write a picture, and its depths and values if asked for, under temporary names.
 
-    Returns
-    -------
-    dict
-        ``output`` and, if asked for, ``depth_output`` and ``values_output``: each with its path and its staged file.
-
-    Raises
-    ------
-    OutputError
-        A file cannot be written; all older files are intact.
+    Returns: ``output`` and, if asked for, ``depth_output`` and ``values_output``: each with its path and its staged
+        file.
     """
     from clrecon.rendering.pictures.image_files import encode_floats, encode_image
     from clrecon.system.files import stage_file

@@ -65,26 +65,10 @@ def make_pictures(
     input.  Pictures and turntable are written under temporary names and renamed when all are done.  The report is
     renamed last: it marks that everything is complete.
 
-    Parameters
-    ----------
-    source : path
-        DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`; for mode points a file of
-        points, see `clrecon.read_points`, and for mode mesh one of a mesh, see `clrecon.read_mesh`.
-    files : PictureFiles
-    settings : RenderSettings, optional
-    no_clobber : bool
-        True: what exists stays and is an `OutputError`, before any work; an empty folder of frames is filled.
-    progress : callable, optional
-        ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    PictureReport
-
-    Raises
-    ------
-    UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError
-        After any of these no picture is written, and older files are intact.
+    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`; for mode points a file
+        of points, see `clrecon.read_points`, and for mode mesh one of a mesh, see `clrecon.read_mesh`.
+    no_clobber: What exists stays and is an `OutputError`, before any work; an empty folder of frames is filled.
+    progress: ``progress(stage, done, total)``.
     """
     settings = settings or RenderSettings()
     progress = progress or ignore_progress
@@ -124,13 +108,7 @@ def make_pictures(
 def _open(
     source: str | Path, settings: RenderSettings, progress: Progress, watch: Laps
 ) -> tuple[Volume | PointCloud | Mesh, LabelMap | None, Device]:
-    """Read the scan and its labels, the cloud or the mesh, while the device opens and builds its kernels.
-
-    Raises
-    ------
-    UsageError
-        The mode shows a cloud and the input is a scan, or the other way round.
-    """
+    """Read the scan and its labels, the cloud or the mesh, while the device opens and builds its kernels."""
     is_mesh = settings.mode == "mesh"
     is_cloud = is_cloud_file(source) and not is_mesh
     if is_mesh:

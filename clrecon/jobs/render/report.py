@@ -138,28 +138,14 @@ def warn_of_picture(picture: Rendering, known: Collection[str] = ()) -> list[str
 class PictureReport(RunReport):
     """Report of a render job, in addition to the entries of every `RunReport`.  See docs/contract.md.
 
-    Attributes
-    ----------
-    mode : str
-    preset : str or None
-    transfer_function, lighting : mapping or None
-        As they were used for the pictures.
-    iso_value_hu, color, depth_cue
-        Settings of a surface; None in other modes.
-    shadows, jitter : bool
-    background : str or None
-    clip_planes_lps_mm : nested list (n, 4)
-    thickness_mm, combine, offset_mm
-        Settings of slices and reformations; None in other modes.
-    labels : list of mapping or None
-        The labels with a look of their own.
-    meshes : list of mapping
-        Each mesh: ``triangles``, ``color``, ``opacity``; ``file``: what its file says.
-    cloud : mapping or None
-        Of a cloud: ``points``, and whether it has ``normals``, ``hu``, ``labels``; ``file``: what its file says.
-    pictures : list of mapping
-        See `describe_picture`, with the files.
-    turntable : mapping or None
+    transfer_function, lighting: As they were used for the pictures.
+    iso_value_hu, color, depth_cue: Settings of a surface; None in other modes.
+    clip_planes_lps_mm: nested list (n, 4)
+    thickness_mm, combine, offset_mm: Settings of slices and reformations; None in other modes.
+    labels: The labels with a look of their own.
+    meshes: Each mesh: ``triangles``, ``color``, ``opacity``; ``file``: what its file says.
+    cloud: Of a cloud: ``points``, and whether it has ``normals``, ``hu``, ``labels``; ``file``: what its file says.
+    pictures: See `describe_picture`, with the files.
     """
 
     affine_ijk_to_lps_mm: list[list[float]] | None  # type: ignore[assignment]
@@ -204,17 +190,8 @@ def describe_pictures(
 ) -> PictureReport:
     """Compose the report of a job.
 
-    Parameters
-    ----------
-    subject : Volume, PointCloud or Mesh
-    settings : RenderSettings
-    studio : Studio
-        The studio of the pictures: it knows their transfer function, light and warnings.
-    device : Device
-    pictures : sequence of dict
-        The entry of each picture from `describe_picture`, with its files.
-    turntable : dict, optional
-    seconds : mapping
+    studio: The studio of the pictures: it knows their transfer function, light and warnings.
+    pictures: The entry of each picture from `describe_picture`, with its files.
     """
     from clrecon.geometry import Volume
     from clrecon.points import PointCloud

@@ -74,13 +74,8 @@ _CALLED = {"light": "lighting", "labels": "labels", "clip_planes": "clip"}
 class Turntable:
     """Settings of a turntable, a moving picture of a turning volume.
 
-    Parameters
-    ----------
-    frames : int
-    fps : float
-        Frames per second.
-    degrees : float
-        Angle from the first frame to the last, towards the patient's left.
+    fps: Frames per second.
+    degrees: Angle from the first frame to the last, towards the patient's left.
     """
 
     frames: int = 100
@@ -92,14 +87,9 @@ class Turntable:
 class LabelLook:
     """A label map and the look of its labels.
 
-    Parameters
-    ----------
-    path : path
-        NIfTI, NRRD, MetaImage, DICOM SEG or RTSTRUCT.
-    colors : mapping of str to str
-        Colour by number or name of the label, see `clrecon.rendering.looks.colors.find_color`.
-    opacities : mapping of str to float
-        Factor on the opacity, by number or name of the label; "0" stands for all that has no label.
+    path: NIfTI, NRRD, MetaImage, DICOM SEG or RTSTRUCT.
+    colors: Colour by number or name of the label, see `clrecon.rendering.looks.colors.find_color`.
+    opacities: Factor on the opacity, by number or name of the label; "0" stands for all that has no label.
     """
 
     path: str
@@ -120,13 +110,9 @@ class LabelLook:
 class MeshFile:
     """A mesh that is shown with the input.
 
-    Parameters
-    ----------
-    path : path
-        See `clrecon.read_mesh`.
-    color : str or (float, float, float), optional
-        See `clrecon.rendering.looks.colors.find_color`; default: "bone" for one mesh, a colour for each of several.
-    opacity : float
+    path: See `clrecon.read_mesh`.
+    color: str or (float, float, float). See `clrecon.rendering.looks.colors.find_color`; default: "bone" for one mesh,
+        a colour for each of several.
     """
 
     path: str
@@ -154,43 +140,21 @@ def color_apart(meshes: Sequence[MeshFile]) -> list[MeshFile]:
 class RenderSettings(InputSettings):
     """Settings of the render job, which makes pictures from a CT series.
 
-    Parameters
-    ----------
-    style : Style
-        What the pictures show.  The files below add to it, see `style_with`.
-    preset : str, optional
-        The preset that the style was made from.
-    transfer_function : str, optional
-        ``FILE`` or ``FILE:NAME``, see `clrecon.rendering.looks.transfer_files.load_transfer_function`.
-    curve : str, optional
-        File with the centre line; "spine" (or "auto") and None mean the curve of the style.
-    labels : LabelLook, optional
-    meshes : sequence of MeshFile
-        Shown with the input.
-    mesh_space : {"lps", "ras"}, optional
-        Patient frame of meshes that do not name theirs; default: LPS, with a warning.
-    light : "head", "none", side of the patient or (x, y, z), optional
-        Origin of the light: the camera, nowhere (no shading), or a direction in LPS as seen from the patient.  Default:
-        that of the style and its transfer function.
-    views : sequence of str
-        One picture is taken per view, see `clrecon.rendering.views.camera.Camera.fit`.  Slices also know axial, coronal
-        and sagittal.
-    up, zoom, size, view_angle, center
-        As in `Camera.fit`.  The default size is 1024 x 1024, of a contact sheet 1600 x 1200; for a curved reformation
-        it depends on the curve.
-    background : str
-        Colour, or "transparent".
-    letters, scale_bar : bool
-    caption : str, optional
-        Text that is drawn into the pictures.
-    turntable : Turntable, optional
-    **shared
-        See `clrecon.jobs.shared.settings.InputSettings`.
-
-    Raises
-    ------
-    UsageError
-        A value is impossible or has no meaning in the mode, or two values exclude each other.
+    style: What the pictures show.  The files below add to it, see `style_with`.
+    preset: The preset that the style was made from.
+    transfer_function: ``FILE`` or ``FILE:NAME``, see `clrecon.rendering.looks.transfer_files.load_transfer_function`.
+    curve: File with the centre line; "spine" (or "auto") and None mean the curve of the style.
+    meshes: Shown with the input.
+    mesh_space: {"lps", "ras"}. Patient frame of meshes that do not name theirs; default: LPS, with a warning.
+    light: "head", "none", side of the patient or (x, y, z). Origin of the light: the camera, nowhere (no shading), or a
+        direction in LPS as seen from the patient.  Default: that of the style and its transfer function.
+    views: One picture is taken per view, see `clrecon.rendering.views.camera.Camera.fit`.  Slices also know axial,
+        coronal and sagittal.
+    up, zoom, size, view_angle, center: As in `Camera.fit`.  The default size is 1024 x 1024, of a contact sheet 1600 x
+        1200; for a curved reformation it depends on the curve.
+    background: Colour, or "transparent".
+    caption: Text that is drawn into the pictures.
+    **shared: See `clrecon.jobs.shared.settings.InputSettings`.
     """
 
     style: Style = VolumeLook()
@@ -224,19 +188,11 @@ class RenderSettings(InputSettings):
     ) -> RenderSettings:
         """Make settings from the keywords of `clrecon.rendering.pictures.modes.make_style`.
 
-        Parameters
-        ----------
-        mode, preset : str, optional
-        clip_planes : sequence of (px, py, pz, nx, ny, nz)
-            Planes by point and normal; the side to which the normal points is kept.
-        **given
-            Fields of `RenderSettings`, and of the mode's style.  The box of `clip_box`, `between` and `around` crops a
-            scan, and where the style can be clipped it ends exactly at the box; clouds and meshes are clipped alone.
-
-        Raises
-        ------
-        UsageError
-            `RenderSettings` or `make_style` refuses a value.
+        clip_planes: sequence of (px, py, pz, nx, ny, nz). Planes by point and normal; the side to which the normal
+            points is kept.
+        **given: Fields of `RenderSettings`, and of the mode's style.  The box of `clip_box`, `between` and `around`
+            crops a scan, and where the style can be clipped it ends exactly at the box; clouds and meshes are clipped
+            alone.
         """
         own = {name: given.pop(name) for name in [*given] if name in {each.name for each in fields(cls)}}
         curve = None if own.get("curve") is None else SPINE  # files are read later: placeholders until then
@@ -324,13 +280,7 @@ class RenderSettings(InputSettings):
         curve: Float64Array | None = None,
         labels: LabelMap | None = None,
     ) -> Style:
-        """Return the style with the light and the contents of the files; None stands for a file that was not given.
-
-        Raises
-        ------
-        UsageError
-            The style refuses a value.
-        """
+        """Return the style with the light and the contents of the files; None stands for a file that was not given."""
         style = self.style
         if function is not None and isinstance(style, VolumeLook | SlicesInSpace):
             style = replace(style, transfer_function=function)
@@ -383,13 +333,7 @@ class RenderSettings(InputSettings):
         return looks
 
     def camera(self, volume: Grid, view: str, turning: bool = False) -> Camera:
-        """Place the camera of one view; with `turning` the whole volume stays in the picture while the camera orbits.
-
-        Raises
-        ------
-        UsageError
-            `Camera.fit` refuses a value.
-        """
+        """Place the camera of one view; with `turning` the whole volume stays in the picture while the camera orbits."""
         if isinstance(self.style, PlaneCut):
             return find_plane(volume, view, self.size_used, zoom=self.zoom, up=self.up, center=self.center)
         return Camera.fit(
@@ -402,13 +346,7 @@ _DEFAULTS = {own.name: own.default for own in fields(RenderSettings)}
 
 
 def _turn_light(light: str | Sequence[float], lighting: Lighting) -> Lighting:
-    """Return a lighting with its light at the given place.
-
-    Raises
-    ------
-    UsageError
-        The place is not one of `LIGHTS`, nor a side of the patient, nor three numbers.
-    """
+    """Return a lighting with its light at the given place."""
     if light == "none":
         return UNSHADED
     direction: Any = light

@@ -41,13 +41,7 @@ __all__ = ["Studio", "read_curve", "read_function", "read_look"]
 
 
 def read_function(named: str | None) -> TransferFunction | None:
-    """Read the transfer function ``FILE`` or ``FILE:NAME``; None if no file is given.
-
-    Raises
-    ------
-    UsageError, RefusedInputError
-        See `clrecon.rendering.looks.transfer_files.load_transfer_function`.
-    """
+    """Read the transfer function ``FILE`` or ``FILE:NAME``; None if no file is given."""
     if named is None:
         return None
     from clrecon.rendering.looks.transfer_files import load_transfer_function
@@ -59,13 +53,7 @@ def read_function(named: str | None) -> TransferFunction | None:
 
 
 def read_curve(named: str | None) -> Float64Array | None:
-    """Read the points (n, 3) in LPS mm of a centre line; None if no file is given or the spinal canal is meant.
-
-    Raises
-    ------
-    UsageError, RefusedInputError
-        See `clrecon.rendering.views.centre_line_files.read_curve_points`.
-    """
+    """Read the points (n, 3) in LPS mm of a centre line; None if no file is given or the spinal canal is meant."""
     if named is None or named in SPINES:
         return None
     from clrecon.rendering.views.centre_line_files import read_curve_points
@@ -74,13 +62,7 @@ def read_curve(named: str | None) -> Float64Array | None:
 
 
 def read_look(look: LabelLook | None, volume: Volume | None = None) -> LabelMap | None:
-    """Read the label map; None if no file is given.  With the scan, a large one is held against its grid first.
-
-    Raises
-    ------
-    UsageError, RefusedInputError
-        See `clrecon.labels.read_labels`; a label that the map lacks is refused too.
-    """
+    """Read the label map; None if no file is given.  With the scan, a large one is held against its grid first."""
     if look is None:
         return None
     from clrecon.labels.reader import read_all_labels
@@ -96,19 +78,9 @@ def read_look(look: LabelLook | None, volume: Volume | None = None) -> LabelMap 
 class Studio(Closing):
     """Taker of the pictures that settings ask for; a context manager that frees the memory of the device.
 
-    Parameters
-    ----------
-    subject : Volume, PointCloud or Mesh
-    device : Device
-    settings : RenderSettings
-    function : TransferFunction, optional
-        Transfer function from a file; None means that of the preset.
-    curve : ndarray, shape (n, 3), optional
-        Centre line of curved reformations in LPS mm; None means that of the style.
-    labels : LabelMap, optional
-    meshes : sequence of Mesh
-        Those of the settings.
-    progress : callable
+    function: Transfer function from a file; None means that of the preset.
+    curve: ndarray, shape (n, 3). Centre line of curved reformations in LPS mm; None means that of the style.
+    meshes: Those of the settings.
     """
 
     def __init__(
@@ -146,13 +118,7 @@ class Studio(Closing):
 
     @property
     def box(self) -> Grid:
-        """The grid that cameras fit: the volume or the box of what is left of it, or the box of the cloud.
-
-        Raises
-        ------
-        UsageError
-            The centre of the pictures lies outside of it.
-        """
+        """The grid that cameras fit: the volume or the box of what is left of it, or the box of the cloud."""
         if self._box is None:
             self._box = self._find_box()
             if self._settings.center is not None:

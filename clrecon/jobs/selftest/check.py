@@ -22,16 +22,10 @@ LEAST_ITEMS = 501
 class Check:
     """One check of the self-test.
 
-    Attributes
-    ----------
-    name : str
-        What is tested, for people.
-    kernels : tuple of str
-        Kernels that it launches and whose results it compares.
-    run : callable
-        Takes the device, returns what was compared.  Raises `DeviceError` with what is wrong.
-    variants : mapping of str to tuple of str
-        For a kernel file the ``-D`` macros, other than types and those of the device, that it is built with.
+    name: What is tested, for people.
+    kernels: Kernels that it launches and whose results it compares.
+    run: Takes the device, returns what was compared.  Raises `DeviceError` with what is wrong.
+    variants: For a kernel file the ``-D`` macros, other than types and those of the device, that it is built with.
     """
 
     name: str
@@ -41,13 +35,7 @@ class Check:
 
 
 def require_equal(found: ArrayLike, expected: ArrayLike, what: str) -> None:
-    """Refuse arrays that are not equal element by element.
-
-    Raises
-    ------
-    DeviceError
-        The message counts the elements that differ.
-    """
+    """Refuse arrays that are not equal element by element."""
     one, other = np.asarray(found), np.asarray(expected)
     if one.shape != other.shape:
         raise DeviceError(f"{what}: {_describe_shape(one)} in place of {_describe_shape(other)}")
@@ -60,10 +48,6 @@ def require_close(found: ArrayLike, expected: ArrayLike, allowed: float, what: s
     """Refuse numbers that are more than `allowed` apart; return the largest distance.
 
     NaN must be where NaN is expected.
-
-    Raises
-    ------
-    DeviceError
     """
     return require_share(found, expected, allowed, 0.0, what)
 
@@ -72,14 +56,7 @@ def require_share(found: ArrayLike, expected: ArrayLike, allowed: float, share: 
     """Refuse numbers of which more than a share is more than `allowed` apart; return the largest distance of the
     others.
 
-    Parameters
-    ----------
-    share : float
-        Between 0 and 1: float32 takes the other side of an edge at some elements.
-
-    Raises
-    ------
-    DeviceError
+    share: Between 0 and 1: float32 takes the other side of an edge at some elements.
     """
     one, other = np.asarray(found, dtype=np.float64), np.asarray(expected, dtype=np.float64)
     if one.shape != other.shape:
@@ -101,10 +78,6 @@ def require_whole(report: Mapping[str, Any]) -> None:
 
     Wrong sums look like a lack of memory.  An operator then goes on with thinner slabs, perhaps so thin that a kernel's
     fault does not show.
-
-    Raises
-    ------
-    DeviceError
     """
     words = [text for text in report["warnings"] if "continued with" in text]
     if words or report.get("slabs", 1) != 1:

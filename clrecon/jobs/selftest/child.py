@@ -23,11 +23,8 @@ __all__ = ["main", "run_check"]
 def run_check(device: Device, check: Check) -> dict[str, Any]:
     """Run one check.
 
-    Returns
-    -------
-    dict
-        ``operator`` (str: name of the check), ``passed`` (bool), ``detail`` (str: what was compared, or what is wrong)
-        and ``seconds`` (float, kernel builds included).
+    Returns: ``operator`` (str: name of the check), ``passed`` (bool), ``detail`` (str: what was compared, or what is
+        wrong) and ``seconds`` (float, kernel builds included).
     """
     start = time.perf_counter()
     try:

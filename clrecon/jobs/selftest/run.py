@@ -35,24 +35,10 @@ def run_selftest(
     After a crash the checks that are left to a process run in a new one.  After a hang they count as failed: each of
     them would take as long.
 
-    Parameters
-    ----------
-    device : Device
-    checks : sequence of Check
-    silent_seconds : float
-        Time without a line after which a process counts as hanging.
-    processes : int, optional
-        Default: one for each core of this computer, up to four.
+    silent_seconds: Time without a line after which a process counts as hanging.
+    processes: Default: one for each core of this computer, up to four.
 
-    Yields
-    ------
-    dict
-        As `clrecon.jobs.selftest.child.run_check`.
-
-    Raises
-    ------
-    DeviceError
-        No process can be started.
+    Yields: As `clrecon.jobs.selftest.child.run_check`.
     """
     many = min(processes or _count_cores(), MOST_PROCESSES, len(checks))
     if many <= 1:

@@ -52,13 +52,7 @@ def is_mesh_file(source: str | Path) -> bool:
 
 
 def refuse_other_clouds(source: str | Path) -> None:
-    """Refuse a file whose extension is that of a cloud of another kind; it would be looked through for a scan.
-
-    Raises
-    ------
-    UsageError
-        With the kinds that are read.
-    """
+    """Refuse a file whose extension is that of a cloud of another kind; it would be looked through for a scan."""
     extension = os.path.splitext(os.fspath(source))[1].lower()
     if extension in OTHER_CLOUDS and os.path.isfile(source):
         raise UsageError(
@@ -70,18 +64,8 @@ def refuse_other_clouds(source: str | Path) -> None:
 def refuse_scan_settings(settings: InputSettings, also: Sequence[str] = (), noun: str = "a cloud of points") -> None:
     """Refuse settings that have no meaning where the input is a cloud or a mesh.
 
-    Parameters
-    ----------
-    settings : InputSettings
-    also : sequence of str
-        Further settings that are about a scan.
-    noun : str
-        What the input is.
-
-    Raises
-    ------
-    UsageError
-        One of them was given.
+    also: Further settings that are about a scan.
+    noun: What the input is.
     """
     defaults = {own.name: own.default for own in fields(settings)}
     of_scans = [own.name for own in fields(InputSettings) if own.name not in _OF_BOTH]

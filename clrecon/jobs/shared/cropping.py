@@ -15,13 +15,7 @@ __all__ = ["crop_labels", "crop_scan"]
 
 
 def crop_scan(volume: Volume, box: Box | None, space: str, *, margin: int = 0) -> Volume:
-    """Return the part of a scan in a box, in mm of the frame `space`; all of it without a box.
-
-    Raises
-    ------
-    UsageError
-        No voxel lies in the box.
-    """
+    """Return the part of a scan in a box, in mm of the frame `space`; all of it without a box."""
     if box is None:
         return volume
     from clrecon.geometry.crop import crop_volume
@@ -30,13 +24,7 @@ def crop_scan(volume: Volume, box: Box | None, space: str, *, margin: int = 0) -
 
 
 def crop_labels(labels: LabelMap, box: Box | None, space: str) -> LabelMap:
-    """Return the part of a label map in a box, as `crop_scan` does a scan.
-
-    Raises
-    ------
-    UsageError
-        No labelled voxel lies in the box.
-    """
+    """Return the part of a label map in a box, as `crop_scan` does a scan."""
     if box is None:
         return labels
     import numpy as np

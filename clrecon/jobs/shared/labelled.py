@@ -18,13 +18,8 @@ def read_with_labels(
 ) -> tuple[Volume, LabelMap | None]:
     """Read the labels, then the scan; but labels that take long to unpack after it, to be held against its grid.
 
-    Parameters
-    ----------
-    read_scan : callable
-    path : path or None
-        File of the labels.
-    read_map : callable
-        Reads the labels; gets the scan if it was read first.
+    path: File of the labels.
+    read_map: Reads the labels; gets the scan if it was read first.
     """
     if path is None:
         return read_scan(), None

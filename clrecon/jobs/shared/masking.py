@@ -15,15 +15,7 @@ __all__ = ["mask_volume"]
 
 
 def mask_volume(volume: Volume, settings: InputSettings, progress: Progress) -> Volume:
-    """Return the volume with air outside the field of view and the body, as the settings ask for it.
-
-    Raises
-    ------
-    UsageError
-        The field of view holds nothing.
-    RefusedInputError
-        There is no body to be told from its table, or bone would go with it.
-    """
+    """Return the volume with air outside the field of view and the body, as the settings ask for it."""
     if settings.field_of_view is None and not settings.remove_table:
         return volume
     from clrecon.anatomy.body import describe_pieces, mask_field_of_view, remove_table

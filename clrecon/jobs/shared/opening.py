@@ -33,12 +33,8 @@ class DeviceOpening:
     The order of errors does not depend on which side is faster: if both the block and the device fail, the device's
     error is raised.  Only a cancellation by the caller is passed on in any case.
 
-    Parameters
-    ----------
-    name : str, int, Device or None
-        As `clrecon.device` takes it.
-    prepare : callable
-        Function that builds the kernels on a device.
+    name: As `clrecon.device` takes it.
+    prepare: Function that builds the kernels on a device.
     """
 
     def __init__(self, name: str | int | Device | None, prepare: Callable[[Device], None]):
@@ -47,13 +43,7 @@ class DeviceOpening:
         self._prepared = self._pool.submit(_prepare, self._chosen, prepare)
 
     def wait(self) -> Device:
-        """Return the device, ready to work; its stand-in may have taken over.
-
-        Raises
-        ------
-        DeviceError
-            There is no device of that name, it cannot be opened, or its compiler refuses.
-        """
+        """Return the device, ready to work; its stand-in may have taken over."""
         device = self._chosen.result()
         self._prepared.result()
         return device

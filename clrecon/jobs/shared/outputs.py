@@ -38,22 +38,7 @@ MOST_FILES = 1000
 def name_outputs(output: str | Path, names: Sequence[str], report_path: str | Path | None = None) -> list[str | Path]:
     """Name the files of several meshes: ``bone.stl`` and ``200hu`` give ``bone_200hu.stl``; an empty name adds nothing.
 
-    Parameters
-    ----------
-    output : path
-    names : sequence of str
-        One for each mesh, see `clrecon.jobs.mesh.parts.Part`.
-    report_path : path, optional
-
-    Returns
-    -------
-    list of path
-
-    Raises
-    ------
-    UsageError
-        There are too many, a name cannot be part of a file name, or two of the files (the report included) are the
-        same.
+    names: One for each mesh, see `clrecon.jobs.mesh.parts.Part`.
     """
     if len(names) > MOST_FILES:
         raise UsageError(
@@ -74,14 +59,7 @@ def name_outputs(output: str | Path, names: Sequence[str], report_path: str | Pa
 def check_distinct(*owned: Sequence[tuple[str, str | Path]]) -> None:
     """Refuse two outputs that are the same file.
 
-    Parameters
-    ----------
-    *owned : sequence of (str, path)
-        Description and path of each file.
-
-    Raises
-    ------
-    UsageError
+    *owned: sequence of (str, path). Description and path of each file.
     """
     owners: dict[str, str] = {}
     for own, path in chain(*owned):
@@ -97,16 +75,9 @@ def check_kept(outputs: Sequence[tuple[str, str | Path | None]], *inputs: str | 
     Files with the mark of DICOM are never replaced (`clrecon.system.files`). This function protects data sets without
     the mark, files of other formats with their voxel files, and files with settings.
 
-    Parameters
-    ----------
-    outputs : sequence of (str, path or None)
-        Description and path of an output: a file, or a folder that is replaced as a whole.
-    *inputs : path or None
-        Files and folders that are read; None and "" are ignored.
-
-    Raises
-    ------
-    UsageError
+    outputs: sequence of (str, path or None). Description and path of an output: a file, or a folder that is replaced as
+        a whole.
+    *inputs: Files and folders that are read; None and "" are ignored.
     """
     there = [(what, path) for what, path in outputs if path is not None and os.path.exists(path)]
     read = [path for one in inputs if one and there for path in (one, _find_voxels(one)) if path]
@@ -189,17 +160,7 @@ def check_outputs(
 ) -> list[tuple[str, str | Path]]:
     """Refuse outputs that cannot be written, before any work is done.
 
-    Returns
-    -------
-    list of (str, path)
-        Description and path of each output.
-
-    Raises
-    ------
-    UsageError
-        An extension is unknown, or two outputs are the same file.
-    OutputError
-        A folder is missing or cannot be written, or a target is not a regular file, or is a DICOM file.
+    Returns: list of (str, path). Description and path of each output.
     """
     from clrecon.exchange.formats import check_format
     from clrecon.system.files import check_writable
@@ -222,13 +183,7 @@ def stage_meshes(
     *,
     keep_ids: bool = False,
 ) -> list[StagedFile]:
-    """Write all meshes under temporary names that `stack` removes unless they are committed.
-
-    Raises
-    ------
-    OutputError
-        One of them cannot be written; all older files are intact.
-    """
+    """Write all meshes under temporary names that `stack` removes unless they are committed."""
     from clrecon.exchange.formats import stage_mesh
     from clrecon.system.files import allow_open_files
 
@@ -257,13 +212,7 @@ def stage_together(
 
 
 def commit_all(files: Sequence[Staged]) -> None:
-    """Move staged files to their places, one after the other; Ctrl-C waits until all are there.
-
-    Raises
-    ------
-    OutputError
-        The system refuses one of them; the message says how many are in place already.
-    """
+    """Move staged files to their places, one after the other; Ctrl-C waits until all are there."""
     from clrecon.system.files import hold_interrupts
 
     with hold_interrupts():

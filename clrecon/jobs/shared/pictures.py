@@ -15,13 +15,7 @@ __all__ = ["stage_picture"]
 
 
 def stage_picture(stack: ExitStack, picture: Rendering, path: str | Path) -> StagedFile:
-    """Write a picture under a temporary name that `stack` removes unless it is committed.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written; an older one is intact.
-    """
+    """Write a picture under a temporary name that `stack` removes unless it is committed."""
     from clrecon.rendering.pictures.image_files import encode_image
     from clrecon.system.files import stage_file
 

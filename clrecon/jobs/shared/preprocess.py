@@ -38,30 +38,9 @@ def preprocess_volume(
     Voxels that morphology takes get the HU as far below the level as the mean of all voxels at the level and above lies
     above it, voxels that it adds get that mean: the surface then runs half way between what stays and what went.
 
-    Parameters
-    ----------
-    volume : Volume
-    settings : InputSettings
-    device : Device
-    bands : sequence of Band
-        What the job takes as inside; morphology works on the only one, or on that of a step ``level:HU``.
-    progress : callable
+    bands: What the job takes as inside; morphology works on the only one, or on that of a step ``level:HU``.
 
-    Returns
-    -------
-    Volume
-        With ``report["preprocess"]``, an entry a step: its name, parameters, what it took and added, seconds.
-
-    Raises
-    ------
-    UsageError
-        There is no level for morphology, or a filter refuses its parameters.
-    RefusedInputError
-        The steps take more than half of the voxels at the level and above.
-    NoSurfaceError
-        No voxel is at the level or above, or none is left.
-    DeviceError
-        The device has no room, or fails.
+    Returns: With ``report["preprocess"]``, an entry a step: its name, parameters, what it took and added, seconds.
     """
     if settings.preprocess is None:
         return volume

@@ -52,19 +52,11 @@ class PreprocessStep:
 def parse_preprocess(steps: str | Sequence[str]) -> tuple[PreprocessStep, ...]:
     """Read the steps of preprocessing, which run in this order.
 
-    Parameters
-    ----------
-    steps : str or sequence of str
-        A text with commas, or its parts.  Filters of HU may have parameters: spatial sigma in mm and range sigma in HU
-        of the bilateral filters, and so on as `FILTERS` says.  ``erode:MM``, ``dilate:MM``, ``open:MM`` and
+    steps: A text with commas, or its parts.  Filters of HU may have parameters: spatial sigma in mm and range sigma in
+        HU of the bilateral filters, and so on as `FILTERS` says.  ``erode:MM``, ``dilate:MM``, ``open:MM`` and
         ``close:MM`` take a ball of this radius, ``fill`` and ``fill-slices`` fill holes: all of the voxels at the level
         of the job and above, or of ``level:HU`` if that stands before.  ``region`` is the place of the region of
         interest, which else comes first.
-
-    Raises
-    ------
-    UsageError
-        A step has another form, or comes twice where that means nothing.
     """
     words = steps.split(",") if isinstance(steps, str) else [str(step) for step in steps]
     parsed = tuple(_parse(word.strip()) for word in words)

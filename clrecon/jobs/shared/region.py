@@ -36,19 +36,7 @@ def restrict_volume(
 ) -> Volume:
     """Crop the volume, and turn what lies outside of the region of interest into air where that is asked for here.
 
-    Parameters
-    ----------
-    volume : Volume
-    settings : InputSettings
-    device : Device
-    bands : sequence of Band
-        What the job will take as inside, so that what lies outside of the region never is.
-    progress : callable
-
-    Raises
-    ------
-    UsageError, RefusedInputError, NoSurfaceError
-        As `apply_region`.
+    bands: What the job will take as inside, so that what lies outside of the region never is.
     """
     volume = crop_scan(volume, settings.crop, settings.space_of_points, margin=settings.crop_margin)
     if not settings.region or settings.region_later:
@@ -64,15 +52,7 @@ def restrict_volume(
 def apply_region(
     resident: DeviceVolume, settings: InputSettings, bands: Sequence[Band], progress: Progress
 ) -> DeviceVolume:
-    """Return the volume with air outside of the region of interest; ``report["region"]`` has its figures.
-
-    Raises
-    ------
-    UsageError
-        The region holds no voxel, a seed lies in no part of it, a file cannot be used.
-    RefusedInputError
-        A file is corrupt, or no spinal canal is found for a tube.
-    """
+    """Return the volume with air outside of the region of interest; ``report["region"]`` has its figures."""
     rules = parse_region_rules(settings.region or ())
     progress("region", 0, 0)
     volume = resident.volume
@@ -108,13 +88,7 @@ def carry_report(before: Volume, after: Volume) -> dict[str, Any]:
 
 
 def value_outside(bands: Sequence[Band], dtype: np.dtype[Any]) -> float:
-    """Return the HU of what lies outside of a region: air, or where air is inside of a band, a value beyond the bands.
-
-    Raises
-    ------
-    UsageError
-        The type of the voxels has no value outside of all bands.
-    """
+    """Return the HU of what lies outside of a region: air, or where air is inside of a band, a value beyond the bands."""
     air = float(AIR_HU) if dtype.kind == "f" else float(max(AIR_HU, np.iinfo(dtype).min))
     if not any(low <= air <= high for low, high in bands):
         return air

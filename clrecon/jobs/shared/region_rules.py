@@ -20,16 +20,11 @@ _COUNTS = {"box": 6, "hu": 2, "seed": 3, "tube": 1}
 class RegionRule:
     """One rule.
 
-    Attributes
-    ----------
-    kind : {"box", "hu", "label", "mask", "seed", "tube"}
-    numbers : tuple of float
-        Of a box (x0, x1, y0, y1, z0, z1), infinite where a side is open; of HU the lowest and the highest; of a seed a
-        point; of a tube its radius.  Lengths are mm.
-    path : str, optional
-        Label map, or file of a centre line; a tube without one goes along the spinal canal.
-    name : str, optional
-        Label in the map.
+    kind: {"box", "hu", "label", "mask", "seed", "tube"}
+    numbers: Of a box (x0, x1, y0, y1, z0, z1), infinite where a side is open; of HU the lowest and the highest; of a
+        seed a point; of a tube its radius.  Lengths are mm.
+    path: Label map, or file of a centre line; a tube without one goes along the spinal canal.
+    name: Label in the map.
     """
 
     kind: str
@@ -49,18 +44,10 @@ class RegionRule:
 def parse_region_rules(rules: str | Sequence[str]) -> tuple[RegionRule, ...]:
     """Read region rules.
 
-    Parameters
-    ----------
-    rules : str or sequence of str
-        ``box:X0,X1,Y0,Y1,Z0,Z1`` in mm, where an empty side is open; ``hu:LO,HI``, both ends included;
+    rules: ``box:X0,X1,Y0,Y1,Z0,Z1`` in mm, where an empty side is open; ``hu:LO,HI``, both ends included;
         ``label:FILE:NAME``, a label of a label map by name or number; ``mask:FILE``, all labels of a label map;
         ``seed:X,Y,Z``, what is joined to this point; ``tube:MM``, what lies so near to the middle of the spinal canal,
         or with ``tube:MM:FILE`` to another centre line.
-
-    Raises
-    ------
-    UsageError
-        A rule has another form, or a seed has no band of HU to grow in.
     """
     parsed = tuple(_parse(str(rule).strip()) for rule in ([rules] if isinstance(rules, str) else rules))
     kinds = {rule.kind for rule in parsed}
@@ -107,12 +94,7 @@ def _numbers(text: str, *, ends: bool) -> tuple[float, ...] | None:
 
 
 def _check(rule: str, kind: str, numbers: tuple[float, ...]) -> None:
-    """Refuse numbers that no region can have.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse numbers that no region can have."""
     has_ends = kind in ("box", "hu")
     if any(math.isnan(number) or (math.isinf(number) and not has_ends) for number in numbers):
         raise UsageError(f"the region rule {rule!r:.200} needs finite numbers")

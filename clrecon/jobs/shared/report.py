@@ -22,13 +22,7 @@ __all__ = ["error_as_dict", "peak_memory_bytes", "platform_name", "to_json", "st
 
 
 def to_json(value: Any, indent: int | None = 2) -> str:
-    """Return strict JSON (ASCII): numpy values become plain ones, NaN and infinities become null.
-
-    Raises
-    ------
-    TypeError
-        `value` contains something that JSON cannot hold.
-    """
+    """Return strict JSON (ASCII): numpy values become plain ones, NaN and infinities become null."""
     return json.dumps(_plain(value), indent=indent, allow_nan=False)
 
 
@@ -49,13 +43,7 @@ def _plain(value: Any) -> Any:
 
 
 def stage_report(path: str | Path, report: Mapping[str, Any]) -> AbstractContextManager[StagedFile]:
-    """Write `report` as JSON under a temporary name, to be committed after the files that it describes.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written; an older one of that name is intact.
-    """
+    """Write `report` as JSON under a temporary name, to be committed after the files that it describes."""
     from clrecon.system.files import stage_file
 
     content = (to_json(report) + "\n").encode("ascii")

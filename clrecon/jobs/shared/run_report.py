@@ -13,21 +13,12 @@ __all__ = ["RunReport"]
 class RunReport(Record):
     """The entries that all reports share; each report is a dataclass with these fields and its own, in JSON order.
 
-    Attributes
-    ----------
-    affine_ijk_to_lps_mm : nested list (4, 4)
-    device, driver : str
-    memory_allowed_bytes : int or None
-        Most bytes that may be taken on the device; None: all.
-    version, platform : str
-        Version of clrecon; system, machine and Python.
-    warnings : list of str
-        Those of the volume first, each once.
-    volume : mapping
-        The `Certificate` of the volume without its warnings.
-    seconds : mapping of str to float
-        Seconds by part of the job, with ``other`` and ``total``.
-    peak_memory_bytes : int or None
+    affine_ijk_to_lps_mm: nested list (4, 4)
+    memory_allowed_bytes: Most bytes that may be taken on the device; None: all.
+    version, platform: Version of clrecon; system, machine and Python.
+    warnings: Those of the volume first, each once.
+    volume: The `Certificate` of the volume without its warnings.
+    seconds: Seconds by part of the job, with ``other`` and ``total``.
     """
 
     affine_ijk_to_lps_mm: list[list[float]]

@@ -20,41 +20,24 @@ __all__ = ["InputSettings"]
 class InputSettings(Selection):
     """Settings of the input: what is read, which parts become air, and the device for the computation.
 
-    Parameters
-    ----------
-    series, phase, allow_gaps, force, follow_links, rescale
-        See `clrecon.reading.Selection`.
-    remove_table : bool
-        First turn everything except the patient's body into air, see `clrecon.anatomy.body.remove_table`.
-    allow_bone_loss : bool
-        Continue even if this removes more than 2 % of the bone, or `preprocess` more than half of what is at the level
-        and above.
-    field_of_view : float or "auto", optional
-        First turn everything farther from the centre of the slices (mm) into air; "auto": the circle that fits them.
-    clip_box : (x0, x1, y0, y1, z0, z1), optional
-        Crop the scan to a box by whole voxels, see `clrecon.geometry.crop.crop_volume`; infinite numbers leave a side
-        open.  mm of the frame `space` where the job has one, else LPS; so are the next two.
-    between : (z0, z1), optional
-        Crop it to these heights.
-    around : (x, y, z, r), optional
-        Crop it to a cube around a point; `r` is half of its side.
-    region : sequence of str, optional
-        Rules of the region of interest, outside of which everything becomes air, see
+    series, phase, allow_gaps, force, follow_links, rescale: See `clrecon.reading.Selection`.
+    remove_table: First turn everything except the patient's body into air, see `clrecon.anatomy.body.remove_table`.
+    allow_bone_loss: Continue even if this removes more than 2 % of the bone, or `preprocess` more than half of what is
+        at the level and above.
+    field_of_view: float or "auto". First turn everything farther from the centre of the slices (mm) into air; "auto":
+        the circle that fits them.
+    clip_box: (x0, x1, y0, y1, z0, z1). Crop the scan to a box by whole voxels, see `clrecon.geometry.crop.crop_volume`;
+        infinite numbers leave a side open.  mm of the frame `space` where the job has one, else LPS; so are the next
+        two.
+    between: (z0, z1). Crop it to these heights.
+    around: (x, y, z, r). Crop it to a cube around a point; `r` is half of its side.
+    region: Rules of the region of interest, outside of which everything becomes air, see
         `clrecon.jobs.shared.region_rules.parse_region_rules`; mm of the frame `space` where the job has one, else LPS.
-    preprocess : str or sequence of str, optional
-        Steps before the surface, see `clrecon.jobs.shared.preprocess_steps.parse_preprocess`.
-    keep_ids : bool
-        Write the hashes of the UIDs of series and frame of reference into reports and mesh files.
-    device : str, optional
-        Name or index of an OpenCL device; None leaves the choice to `choose_device`.
-    memory : int, optional
-        Bytes that may be taken on the device; None is all that it has.  A volume that does not fit is processed in
+    preprocess: Steps before the surface, see `clrecon.jobs.shared.preprocess_steps.parse_preprocess`.
+    keep_ids: Write the hashes of the UIDs of series and frame of reference into reports and mesh files.
+    device: Name or index of an OpenCL device; None leaves the choice to `choose_device`.
+    memory: Bytes that may be taken on the device; None is all that it has.  A volume that does not fit is processed in
         slabs.
-
-    Raises
-    ------
-    UsageError
-        A value is impossible.
     """
 
     remove_table: bool = False

@@ -39,28 +39,11 @@ def measure_stats(
 
     No device is needed.
 
-    Parameters
-    ----------
-    source : path
-        DICOM folder or file, or a file of another format, see `clrecon.read_volume`.
-    settings : StatsSettings
-    report_path : path, optional
-        File for the report as JSON.
-    csv_path : path, optional
-        File for the figures, one line a label.
-    no_clobber : bool
-        True: files that exist stay and are an `OutputError`, before any work.
-    progress : callable, optional
-        ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    StatsReport
-
-    Raises
-    ------
-    UsageError, OutputError, NoDicomError, RefusedInputError
-        After an error nothing is written, and older files are intact.
+    source: DICOM folder or file, or a file of another format, see `clrecon.read_volume`.
+    report_path: File for the report as JSON.
+    csv_path: File for the figures, one line a label.
+    no_clobber: Files that exist stay and are an `OutputError`, before any work.
+    progress: ``progress(stage, done, total)``.
     """
     progress = progress or ignore_progress
     watch = Laps()

@@ -26,19 +26,9 @@ __all__ = ["StatsReport", "as_csv", "describe_stats"]
 class StatsReport(Record):
     """Report of `measure_stats`.
 
-    Attributes
-    ----------
-    labels : list of LabelFigures
-    percentiles : list of float
-    resampled : bool
-        The map was brought to the grid of the scan, and its voxels do not all coincide with those of the scan.
-    affine_ijk_to_lps_mm : nested list (4, 4)
-    version, platform : str
-    warnings : list of str
-    volume : mapping
-        The certificate of the volume without its warnings.
-    seconds : mapping
-    peak_memory_bytes : int or None
+    resampled: The map was brought to the grid of the scan, and its voxels do not all coincide with those of the scan.
+    affine_ijk_to_lps_mm: nested list (4, 4)
+    volume: The certificate of the volume without its warnings.
     """
 
     labels: list[Any]

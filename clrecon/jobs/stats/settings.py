@@ -16,23 +16,11 @@ __all__ = ["StatsSettings"]
 class StatsSettings(Selection):
     """Settings of the job.
 
-    Parameters
-    ----------
-    series, phase, allow_gaps, force, follow_links, rescale
-        See `clrecon.reading.Selection`.
-    labels : path
-        Label map: NIfTI, NRRD, MetaImage, DICOM SEG or RTSTRUCT.
-    only : sequence of str or int
-        Labels that are measured; none: all.
-    percentiles : sequence of float
-        From 0 to 100.
-    keep_ids : bool
-        Write the hashes of the UIDs of series and frame of reference into the report.
-
-    Raises
-    ------
-    UsageError
-        A percentile is not one.
+    series, phase, allow_gaps, force, follow_links, rescale: See `clrecon.reading.Selection`.
+    labels: Label map: NIfTI, NRRD, MetaImage, DICOM SEG or RTSTRUCT.
+    only: Labels that are measured; none: all.
+    percentiles: From 0 to 100.
+    keep_ids: Write the hashes of the UIDs of series and frame of reference into the report.
     """
 
     labels: str | Path

@@ -14,13 +14,7 @@ NIFTI, SEGMENTATION = ("nii", "nii.gz"), ("dcm",)
 
 
 def map_format(path: str | Path) -> str:
-    """Return ``nii``, ``nii.gz`` or ``dcm``.
-
-    Raises
-    ------
-    UsageError
-        The name ends otherwise.
-    """
+    """Return ``nii``, ``nii.gz`` or ``dcm``."""
     name = os.path.basename(os.fspath(path)).lower()
     for kind in (*NIFTI[::-1], *SEGMENTATION):
         if name.endswith(f".{kind}") and name != f".{kind}":
@@ -37,15 +31,7 @@ def picture_beside(output: str | Path) -> str:
 def check_files(
     source: str | Path, output: str | Path, picture: str | Path | None, report: str | Path | None
 ) -> list[tuple[str, str | Path]]:
-    """Refuse outputs that cannot be written, before any work is done; return what each is, and its path.
-
-    Raises
-    ------
-    UsageError
-        An extension is unknown, a package is missing, two outputs are the same file, or one would replace the input.
-    OutputError
-        A folder is missing or cannot be written to, or a target is not a regular file.
-    """
+    """Refuse outputs that cannot be written, before any work is done; return what each is, and its path."""
     from clrecon.labels.write_nifti import load_nibabel
     from clrecon.reading import tell_format
     from clrecon.rendering.pictures.pillow import load_pillow

@@ -43,32 +43,13 @@ def make_vertebrae(
 
     No device is needed.
 
-    Parameters
-    ----------
-    source : path
-        DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
-    output : path
-        Label map: .nii.gz or .nii; .dcm is a DICOM SEG, for a scan in DICOM.
-    settings : VertebraeSettings, optional
-    picture_path : path, optional
-        PNG; by default beside the label map, with its name.
-    with_picture : bool
-        False: without `picture_path` there is no picture.
-    report_path : path, optional
-        File for the report as JSON.
-    no_clobber : bool
-        True: files that exist stay and are an `OutputError`, before any work.
-    progress : callable, optional
-        ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    VertebraeReport
-
-    Raises
-    ------
-    UsageError, OutputError, NoDicomError, RefusedInputError
-        After an error nothing is written, and older files are intact.
+    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
+    output: Label map: .nii.gz or .nii; .dcm is a DICOM SEG, for a scan in DICOM.
+    picture_path: PNG; by default beside the label map, with its name.
+    with_picture: False: without `picture_path` there is no picture.
+    report_path: File for the report as JSON.
+    no_clobber: Files that exist stay and are an `OutputError`, before any work.
+    progress: ``progress(stage, done, total)``.
     """
     from clrecon.jobs.vertebrae.picture import draw_vertebrae
     from clrecon.vertebrae import split_vertebrae

@@ -23,26 +23,12 @@ __all__ = ["VertebraeReport", "describe_split"]
 class VertebraeReport(Record):
     """Report of `make_vertebrae`.
 
-    Attributes
-    ----------
-    vertebrae : list of Vertebra
-        All that were found, from the head downwards, see `clrecon.vertebrae.result.Vertebra`.
-    low_confidence : int
-        How many of them have a confidence below 0.5.
-    written : int
-        How many the label map has.
-    discs : list of dict
-        ``centre_mm`` and ``normal`` (downwards) of each disc, LPS.
-    left_out : list of str
-    level_hu : float
-    output : dict
-        ``format`` and ``bytes`` of the label map.
-    version, platform : str
-    warnings : list of str
-    volume : mapping
-        The certificate of the volume without its warnings.
-    seconds : mapping
-    peak_memory_bytes : int or None
+    vertebrae: All that were found, from the head downwards, see `clrecon.vertebrae.result.Vertebra`.
+    low_confidence: How many of them have a confidence below 0.5.
+    written: How many the label map has.
+    discs: ``centre_mm`` and ``normal`` (downwards) of each disc, LPS.
+    output: ``format`` and ``bytes`` of the label map.
+    volume: The certificate of the volume without its warnings.
     """
 
     vertebrae: list[Any]

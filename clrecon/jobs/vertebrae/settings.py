@@ -16,27 +16,13 @@ __all__ = ["VertebraeSettings"]
 class VertebraeSettings(Selection):
     """Settings of the search for vertebrae.
 
-    Parameters
-    ----------
-    series, phase, allow_gaps, force, follow_links, rescale
-        See `clrecon.reading.Selection`.
-    level : float, optional
-        HU from which on a voxel is bone, see `clrecon.split_vertebrae`.
-    seeds : sequence of (x, y, z)
-        Points in LPS mm, one in the body of each vertebra, in place of the search for discs.
-    name_at : ((x, y, z), str), optional
-        A point in LPS mm and the level of the vertebra there.
-    first : str, optional
-        Level of the uppermost vertebra that is found; not together with `name_at`.
-    keep_unsure : bool
-        Write vertebrae of low confidence too.
-    keep_ids : bool
-        Write the hashes of the UIDs of series and frame of reference into the report.
-
-    Raises
-    ------
-    UsageError
-        A value is impossible.
+    series, phase, allow_gaps, force, follow_links, rescale: See `clrecon.reading.Selection`.
+    level: HU from which on a voxel is bone, see `clrecon.split_vertebrae`.
+    seeds: sequence of (x, y, z). Points in LPS mm, one in the body of each vertebra, in place of the search for discs.
+    name_at: ((x, y, z), str). A point in LPS mm and the level of the vertebra there.
+    first: Level of the uppermost vertebra that is found; not together with `name_at`.
+    keep_unsure: Write vertebrae of low confidence too.
+    keep_ids: Write the hashes of the UIDs of series and frame of reference into the report.
     """
 
     level: float | None = None

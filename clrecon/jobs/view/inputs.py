@@ -39,12 +39,8 @@ _LEAST_EMPTY = 0.2
 class OpenedInput:
     """What was read of an input.
 
-    Attributes
-    ----------
-    subject : Volume, Mesh, PointCloud or LabelMap
-        In LPS mm.
-    said : tuple of str
-        What has to be said of it: its certificate's warnings, the frame that it was turned from.
+    subject: In LPS mm.
+    said: What has to be said of it: its certificate's warnings, the frame that it was turned from.
     """
 
     subject: Volume | Mesh | PointCloud | LabelMap
@@ -61,21 +57,10 @@ def open_inputs(
 ) -> list[OpenedInput]:
     """Read the inputs of a view, and the label map of its settings as the last one.
 
-    Parameters
-    ----------
-    inputs : sequence of path
-        Scans as `clrecon.read_volume` takes them, meshes as `clrecon.read_mesh`, clouds as `clrecon.read_points`, and
-        label maps in files of volumes.
-    settings : ViewSettings, optional
-        How scans are read, masked and cropped, and the label map.
-    progress : callable, optional
-    ready : callable, optional
-        Called with each input as soon as it is read.
-
-    Raises
-    ------
-    UsageError, NoDicomError, RefusedInputError, DeviceError
-        An input cannot be read; files of meshes and clouds are read before scans, so that a wrong one is said at once.
+    inputs: Scans as `clrecon.read_volume` takes them, meshes as `clrecon.read_mesh`, clouds as `clrecon.read_points`,
+        and label maps in files of volumes.
+    settings: How scans are read, masked and cropped, and the label map.
+    ready: Called with each input as soon as it is read.
     """
     settings, tell = settings or ViewSettings(), progress or ignore_progress
     labels = settings.scan.labels

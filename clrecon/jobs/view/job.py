@@ -71,26 +71,10 @@ def write_view(
     The surface of one mesh without labels is divided into its components, which can be switched; of several meshes each
     is a part.
 
-    Parameters
-    ----------
-    inputs : sequence of path
-        Scans, as `clrecon.read_volume` takes them, and mesh files, as `clrecon.read_mesh` takes them.
-    output : path
-        ``.html``.
-    settings : ViewSettings, optional
-    no_clobber : bool
-        True: a file of that name stays and is an `OutputError`, before any work.
-    progress : callable, optional
-        ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    ViewReport
-
-    Raises
-    ------
-    UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError, NoSurfaceError
-        After an error nothing is written, and an older file is intact.
+    inputs: Scans, as `clrecon.read_volume` takes them, and mesh files, as `clrecon.read_mesh` takes them.
+    output: ``.html``.
+    no_clobber: A file of that name stays and is an `OutputError`, before any work.
+    progress: ``progress(stage, done, total)``.
     """
     settings, progress = settings or ViewSettings(), progress or ignore_progress
     watch = Laps()

@@ -15,26 +15,13 @@ __all__ = ["ViewReport"]
 class ViewReport(Record):
     """Report of `write_view`.
 
-    Attributes
-    ----------
-    inputs : list of mapping
-        Each input: ``name`` of the file or folder without those above it, ``kind`` ("scan", "STL" ...), ``space`` and
-        ``space_from`` of a mesh (None for a scan), ``triangles``; of a scan ``volume``, its certificate, and
+    inputs: Each input: ``name`` of the file or folder without those above it, ``kind`` ("scan", "STL" ...), ``space``
+        and ``space_from`` of a mesh (None for a scan), ``triangles``; of a scan ``volume``, its certificate, and
         ``surface``, the values that it encloses.
-    parts : list of mapping
-        ``name``, ``triangles``, ``ml`` and ``color`` of each part that can be switched.
-    vertices, triangles : int
-    half_step_mm : float
-        Largest distance along an axis that a vertex is moved by.
-    space : str
-    output : mapping
-        ``format`` and ``bytes``.
-    device : str or None
-        None where no input is a scan.
-    version, platform : str
-    warnings : list of str
-    seconds : mapping
-    peak_memory_bytes : int or None
+    parts: ``name``, ``triangles``, ``ml`` and ``color`` of each part that can be switched.
+    half_step_mm: Largest distance along an axis that a vertex is moved by.
+    output: ``format`` and ``bytes``.
+    device: None where no input is a scan.
     """
 
     inputs: list[dict[str, Any]]

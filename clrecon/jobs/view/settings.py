@@ -17,20 +17,10 @@ MOST_NAME = 80
 class ViewSettings:
     """Settings of the job.
 
-    Parameters
-    ----------
-    scan : MeshSettings
-        How surfaces are made of inputs that are scans; its `space` is the frame in which places are shown.
-    mesh_space : {"lps", "ras"}, optional
-        Patient frame of mesh files that do not name theirs; None: LPS, with a warning.
-    names : sequence of str
-        Names of the inputs, in their order, to be shown; those without one are numbered.  File names are not shown:
+    scan: How surfaces are made of inputs that are scans; its `space` is the frame in which places are shown.
+    mesh_space: {"lps", "ras"}. Patient frame of mesh files that do not name theirs; None: LPS, with a warning.
+    names: Names of the inputs, in their order, to be shown; those without one are numbered.  File names are not shown:
         they can hold the name of a patient.
-
-    Raises
-    ------
-    UsageError
-        A value is impossible, or means nothing where nothing but a page is made.
     """
 
     scan: MeshSettings = field(default_factory=MeshSettings)

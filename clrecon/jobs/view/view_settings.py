@@ -17,12 +17,7 @@ _OF_A_VIEW = {"iso_value", "preset", "half_way", "space", "labels", "one_file"}
 
 
 def check_view_settings(settings: ViewSettings) -> None:
-    """Refuse settings that a view has no meaning for, before anything is read.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse settings that a view has no meaning for, before anything is read."""
     scan = settings.scan
     ignored = {own.name for own in fields(InputSettings)} | _OF_A_VIEW
     for own in fields(scan):

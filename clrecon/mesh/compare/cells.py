@@ -107,21 +107,13 @@ def _unpack(keys: IntArray) -> IntArray:
 class CellOverlap(Record):
     """How far the cells of a surface agree with those of a reference.
 
-    Attributes
-    ----------
-    reference : str
-        Name of the reference set.
-    cells, reference_cells, common_cells : int
-        Cells of the surface, of the reference, and of both.
-    cells_outside : int
-        Cells of the surface outside of the grid and its border of one voxel.
-    recall : float
-        Share of the reference's cells that the surface passes through: the repetition rate of characteristic voxels
+    reference: Name of the reference set.
+    cells, reference_cells, common_cells: Cells of the surface, of the reference, and of both.
+    cells_outside: Cells of the surface outside of the grid and its border of one voxel.
+    recall: Share of the reference's cells that the surface passes through: the repetition rate of characteristic voxels
         of Liu et al. 2019.
-    precision : float
-        Share of the surface's cells that are the reference's too.
-    dice, jaccard : float
-        2 common / (cells + reference cells); common / all cells of either.
+    precision: Share of the surface's cells that are the reference's too.
+    dice, jaccard: 2 common / (cells + reference cells); common / all cells of either.
     """
 
     reference: str

@@ -39,20 +39,10 @@ Points = NDArray[np.float64]
 def sample_surface(vertices: NDArray[np.floating], triangles: NDArray[np.uint32], count: int = SAMPLES) -> Points:
     """Return points that cover a surface evenly by area, the same points at every call.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), mm
-    triangles : ndarray, shape (m, 3), uint32
-    count : int
+    vertices: ndarray, shape (n, 3), mm
+    triangles: ndarray, shape (m, 3), uint32
 
-    Returns
-    -------
-    ndarray, shape (count, 3), float64, mm
-
-    Raises
-    ------
-    NoSurfaceError
-        The surface has no area.
+    Returns: ndarray, shape (count, 3), float64, mm
     """
     return sample_surface_points(vertices, triangles, count)[0]
 
@@ -81,10 +71,8 @@ def sample_surface_points(
 class SurfaceDistance:
     """Exact distances from points to the nearest triangle of a surface.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), mm
-    triangles : ndarray, shape (m, 3), uint32, at least one
+    vertices: ndarray, shape (n, 3), mm
+    triangles: ndarray, shape (m, 3), uint32, at least one
     """
 
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
@@ -120,20 +108,13 @@ def summarise_distances(distances: NDArray[np.float64]) -> DistanceSummary:
 class MeshDistance(Record):
     """How far two surfaces lie apart.
 
-    Attributes
-    ----------
-    hd95_mm : float
-        The larger of the two 95th percentiles (robust Hausdorff distance).
-    assd_mm : float
-        Mean of both sides (average symmetric surface distance).
-    max_mm : float
-        Largest distance found; what lies between the points can be a little further.
-    to_reference_mm, from_reference_mm : DistanceSummary
-        Of each side.
-    volume_change_percent : float or None
-        Enclosed volume against that of the reference; None where that is zero, and without meaning for open surfaces.
-    samples : int
-        Number of points on each surface.
+    hd95_mm: The larger of the two 95th percentiles (robust Hausdorff distance).
+    assd_mm: Mean of both sides (average symmetric surface distance).
+    max_mm: Largest distance found; what lies between the points can be a little further.
+    to_reference_mm, from_reference_mm: Of each side.
+    volume_change_percent: Enclosed volume against that of the reference; None where that is zero, and without meaning
+        for open surfaces.
+    samples: Number of points on each surface.
     """
 
     hd95_mm: float

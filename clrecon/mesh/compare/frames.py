@@ -22,10 +22,8 @@ def rounding_of_bounds(largest: float) -> float:
 class FaceFrames:
     """A frame in each triangle: a corner, two edges, and what gives the coordinates along them.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), mm, near zero
-    triangles : ndarray, shape (m, 3), uint32
+    vertices: ndarray, shape (n, 3), mm, near zero
+    triangles: ndarray, shape (m, 3), uint32
     """
 
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
@@ -48,15 +46,10 @@ class FaceFrames:
 
         The square root is an upper bound of the distance, but for `slack` mm by rounding.
 
-        Parameters
-        ----------
-        points : ndarray, shape (3, k), float32, mm
-        rows : ndarray, shape (k,), int
-            Triangle of each point.
+        points: ndarray, shape (3, k), float32, mm
+        rows: ndarray, shape (k,), int. Triangle of each point.
 
-        Returns
-        -------
-        ndarray, shape (k,), float32, mm2
+        Returns: ndarray, shape (k,), float32, mm2
         """
         frames = np.ascontiguousarray(self._rows.take(rows, axis=0, mode="clip").T)
         away = points - frames[0:3]

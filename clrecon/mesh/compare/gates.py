@@ -40,25 +40,14 @@ def judge_mesh(
 ) -> list[Gate]:
     """Judge the measures of a mesh by the gates.
 
-    Parameters
-    ----------
-    quality : dict, optional
-        Result of `measure_quality`, for the gates of the mesh itself.
-    closed : bool
-        True: the surface should be closed.  A surface left open at the border of the scan has no gates on closedness,
+    quality: Result of `measure_quality`, for the gates of the mesh itself.
+    closed: The surface should be closed.  A surface left open at the border of the scan has no gates on closedness,
         outside and volume.
-    outward : bool
-        True: the surface should enclose a volume above zero, unlike the wall of a cavity by itself.
-    iso_distance : dict, optional
-        Result of `measure_iso_distance`, for the gates on the vertices.
-    deviation : dict, optional
-        Result of `compare_meshes` with the surface before smoothing and decimation, for the gates on their changes.
-    voxel_mm : float, optional
-        Shortest voxel step, the unit of the bounds; needed with `deviation`.
-
-    Returns
-    -------
-    list of Gate
+    outward: The surface should enclose a volume above zero, unlike the wall of a cavity by itself.
+    iso_distance: Result of `measure_iso_distance`, for the gates on the vertices.
+    deviation: Result of `compare_meshes` with the surface before smoothing and decimation, for the gates on their
+        changes.
+    voxel_mm: Shortest voxel step, the unit of the bounds; needed with `deviation`.
     """
     gates: list[Gate] = []
     if quality:
@@ -73,16 +62,10 @@ def judge_mesh(
 def judge_label_volume(mesh_ml: float | None, label_ml: float, advice: str = "", *, by_hu: bool = True) -> Gate:
     """Compare the volume of a label's mesh with that of its voxels.
 
-    Parameters
-    ----------
-    mesh_ml : float or None
-        None: the mesh is open at the border of the scan and encloses no volume.
-    label_ml : float
-        Volume of the label's voxels, above 0.
-    advice : str
-        Advice for the message where they differ by more than the bound.
-    by_hu : bool
-        True: HU place the surface.  False: it is the label's own surface, which should have the label's volume.
+    mesh_ml: None: the mesh is open at the border of the scan and encloses no volume.
+    label_ml: Volume of the label's voxels, above 0.
+    advice: Advice for the message where they differ by more than the bound.
+    by_hu: True: HU place the surface.  False: it is the label's own surface, which should have the label's volume.
     """
     name, bound = "label_volume", LABEL_VOLUME_PERCENT if by_hu else MASK_VOLUME_PERCENT
     if mesh_ml is None:

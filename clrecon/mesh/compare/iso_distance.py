@@ -59,10 +59,7 @@ def smallest_voxel_mm(volume: Volume) -> float:
 def rule_of_report(report: dict[str, Any]) -> IsoRule | None:
     """Return the iso rule of a mesh, as far as distances need it; None for a mesh that is not an iso surface.
 
-    Parameters
-    ----------
-    report : dict
-        Report of a mesh: ``iso_level_hu`` or ``inside_levels_hu``, ``outside_hu``, ``closed_at_border``.
+    report: Report of a mesh: ``iso_level_hu`` or ``inside_levels_hu``, ``outside_hu``, ``closed_at_border``.
     """
     ends = report.get("inside_levels_hu") or [report.get("iso_level_hu")]
     levels = [float(level) for level in ends if level is not None]
@@ -77,20 +74,13 @@ def rule_of_report(report: dict[str, Any]) -> IsoRule | None:
 def trilinear_field(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Return value and gradient of the trilinear field.
 
-    Parameters
-    ----------
-    volume : Volume
-    rule : IsoRule
-        Gives the value beyond the border: `outside` for a closed volume.  For an open one, points beyond the border are
-        moved to it.
-    ijk : ndarray, shape (n, 3), float64
-        Index coordinates.
+    rule: Gives the value beyond the border: `outside` for a closed volume.  For an open one, points beyond the border
+        are moved to it.
+    ijk: ndarray, shape (n, 3), float64. Index coordinates.
 
-    Returns
-    -------
-    value : ndarray, shape (n,), float64, HU
-    gradient : ndarray, shape (n, 3), float64
-        HU per step along i, j, k.
+    Returns:
+    value: ndarray, shape (n,), float64, HU
+    gradient: ndarray, shape (n, 3), float64. HU per step along i, j, k.
     """
     value = np.zeros(len(ijk))
     gradient = np.zeros((len(ijk), 3))
@@ -144,17 +134,11 @@ def distances_to_iso_surface(volume: Volume, rule: IsoRule, points: Float64Array
     is also correct for sheared and unevenly spaced stacks.  The result is the distance to a point of the surface: never
     less than the true distance, and equal to it where the surface is smooth.
 
-    Parameters
-    ----------
-    volume : Volume
-    rule : IsoRule
-        Gives the levels and the value beyond the border.
-    points : ndarray, shape (n, 3), float64, LPS mm
+    rule: Gives the levels and the value beyond the border.
+    points: ndarray, shape (n, 3), float64, LPS mm
 
-    Returns
-    -------
-    ndarray, shape (n,), float64, mm
-        NaN where no surface was found, neither along the gradient nor along lines to the surrounding voxels.
+    Returns: ndarray, shape (n,), float64, mm. NaN where no surface was found, neither along the gradient nor along
+        lines to the surrounding voxels.
     """
     distances = _distances_to_level(volume, rule, rule.iso_level, points)
     for level in rule.levels[1:]:
@@ -231,22 +215,13 @@ def _distances_along_lines(volume: Volume, rule: IsoRule, level: float, points: 
 class IsoDistance(Record):
     """How far a mesh lies from the trilinear iso surface.
 
-    Attributes
-    ----------
-    voxel_mm : float
-        Shortest voxel step.
-    samples : mapping
-        ``vertices`` and ``centres`` that were measured.
-    not_found : int
-        Points from which no surface was reached; the figures are of the others.
-    vertices_mm, centres_mm : DistanceSummary or None
-        None where none was found.
-    vertices_voxel, centres_voxel : DistanceSummary or None
-        The same in units of `voxel_mm`.
-    near_metal : int
-        Measured vertices within `METAL_REACH` voxels of a voxel above `METAL_HU`.
-    away_from_metal_voxel : DistanceSummary or None
-        As `vertices_voxel`, without those near metal; None where these are none, or more than half.
+    voxel_mm: Shortest voxel step.
+    samples: ``vertices`` and ``centres`` that were measured.
+    not_found: Points from which no surface was reached; the figures are of the others.
+    vertices_mm, centres_mm: None where none was found.
+    vertices_voxel, centres_voxel: The same in units of `voxel_mm`.
+    near_metal: Measured vertices within `METAL_REACH` voxels of a voxel above `METAL_HU`.
+    away_from_metal_voxel: As `vertices_voxel`, without those near metal; None where these are none, or more than half.
     """
 
     voxel_mm: float
@@ -266,20 +241,10 @@ def measure_iso_distance(mesh: Mesh, volume: Volume, rule: IsoRule, samples: int
     The vertices of an extracted surface lie on it, up to the rounding of float32; the centres show the error of flat
     triangles.  After smoothing and decimation both show the error that these have added.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        With at least one triangle.
-    volume : Volume
-        The mesh was made from it.
-    rule : IsoRule
-        The mesh was made with it, see `clrecon.geometry.iso_rule.choose_iso_rule`.
-    samples : int
-        Most vertices and triangles that are measured; of more, every n-th.
-
-    Returns
-    -------
-    IsoDistance
+    mesh: With at least one triangle.
+    volume: The mesh was made from it.
+    rule: The mesh was made with it, see `clrecon.geometry.iso_rule.choose_iso_rule`.
+    samples: Most vertices and triangles that are measured; of more, every n-th.
     """
     voxel = smallest_voxel_mm(volume)
     vertices = mesh.vertices[:: -(-mesh.vertex_count // samples) or 1].astype(np.float64)

@@ -31,16 +31,10 @@ Keys = NDArray[np.int64]
 class Lattice:
     """Points that divide each cell between voxel centres alike.
 
-    Attributes
-    ----------
-    finer : int
-        Points in a cell along each axis.
-    offsets : (float, float, float)
-        Where the points of a cell begin, in steps of the lattice, from 0 to below 1.
-    border : int
-        Layers of samples around the voxels.
-    cells_ijk : (int, int, int)
-        Cells along each axis, those of the border included.
+    finer: Points in a cell along each axis.
+    offsets: Where the points of a cell begin, in steps of the lattice, from 0 to below 1.
+    border: Layers of samples around the voxels.
+    cells_ijk: Cells along each axis, those of the border included.
     """
 
     finer: int
@@ -94,19 +88,10 @@ def find_level_runs(volume: Volume, rule: IsoRule, lattice: Lattice, told: Calla
     A trilinear field has its extremes at the corners of a cell: only cells with corners on both sides have points on
     both sides.
 
-    Parameters
-    ----------
-    volume : Volume
-    rule : IsoRule
-        Of one level, with what lies above it inside.
-    lattice : Lattice
-    told : callable
-        Called with the number of layers of cells that are done.
+    rule: Of one level, with what lies above it inside.
+    told: Called with the number of layers of cells that are done.
 
-    Returns
-    -------
-    ndarray, shape (n,), int64, ascending
-        Ends of runs.
+    Returns: ndarray, shape (n,), int64, ascending. Ends of runs.
     """
     layers = lattice.cells_ijk[2]
     ni, nj, _ = volume.shape_ijk

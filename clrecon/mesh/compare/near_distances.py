@@ -33,12 +33,9 @@ class NearDistance:
     If a triangle around that vertex is near enough, its distance is returned; it is never less than the distance to the
     surface.  For the other points all triangles are searched, and the result is exact.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), mm
-    triangles : ndarray, shape (m, 3), uint32
-    fans : Fans, optional
-        Fans of the triangles if they are known.
+    vertices: ndarray, shape (n, 3), mm
+    triangles: ndarray, shape (m, 3), uint32
+    fans: Fans of the triangles if they are known.
     """
 
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], fans: Fans | None = None):
@@ -52,13 +49,9 @@ class NearDistance:
         """Return distances in mm, shape (k,); up to `limit` they may be too large, as only nearby triangles are
         examined.
 
-        Parameters
-        ----------
-        points : ndarray, shape (k, 3), float64, mm
-        near : ndarray, shape (k,), int
-            A vertex near each point.
-        limit : float
-            mm.
+        points: ndarray, shape (k, 3), float64, mm
+        near: ndarray, shape (k,), int. A vertex near each point.
+        limit: mm.
         """
         found, _ = self.find_within(points, near, limit)
         rest = np.flatnonzero(~(found <= limit))
@@ -73,10 +66,7 @@ class NearDistance:
         """Return distances to the triangles around one vertex only, and the rows of these; up to `limit` as for
         `__call__`.
 
-        Parameters
-        ----------
-        points, near, limit
-            As in `__call__`.
+        points, near, limit: As in `__call__`.
         """
         found, rows = self._around(points, near, _perpendicular)
         rest = np.flatnonzero(~(found <= limit))
@@ -89,10 +79,7 @@ class NearDistance:
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """As `find_within`, but by upper bounds first: up to `limit` distances may be too large and rows others.
 
-        Parameters
-        ----------
-        points, near, limit
-            As in `__call__`.
+        points, near, limit: As in `__call__`.
         """
         found, rows = self.find_upper_bounds(points, near)
         rest = np.flatnonzero(~(found <= limit))
@@ -105,10 +92,7 @@ class NearDistance:
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return upper bounds of the distances to the triangles around one vertex, and the rows of these.
 
-        Parameters
-        ----------
-        points, near
-            As in `__call__`.
+        points, near: As in `__call__`.
         """
         found, rows = np.full(len(points), np.inf), np.full(len(points), -1)
         self.prepare()
@@ -155,11 +139,8 @@ class NearDistance:
         """Return distances to the triangles around some vertices only; infinity and row -1 where there are no
         triangles.
 
-        Parameters
-        ----------
-        points : ndarray, shape (k, 3), float64, mm
-        near : ndarray, shape (k, v), int
-            Several vertices for each point.
+        points: ndarray, shape (k, 3), float64, mm
+        near: ndarray, shape (k, v), int. Several vertices for each point.
         """
         found, rows = self._around(points, near[:, 0], triangle_distances)
         for others in near.T[1:]:
@@ -224,14 +205,9 @@ def _perpendicular(points: Columns, a: Columns, b: Columns, c: Columns) -> NDArr
 def triangle_distances(points: Columns, a: Columns, b: Columns, c: Columns) -> NDArray[np.float64]:
     """Return the distance of each point from its triangle: to the face by the perpendicular, else to the nearest edge.
 
-    Parameters
-    ----------
-    points, a, b, c : ndarray, shape (3, k), float64, mm
-        Points and corners of the triangles, one row each for x, y, z.
+    points, a, b, c: ndarray, shape (3, k), float64, mm. Points and corners of the triangles, one row each for x, y, z.
 
-    Returns
-    -------
-    ndarray, shape (k,), float64, mm
+    Returns: ndarray, shape (k,), float64, mm
     """
     shortest = _perpendicular(points, a, b, c)
     beside = np.flatnonzero(np.isinf(shortest))

@@ -25,18 +25,11 @@ def find_piercings(ijk: Float64Array, triangles: NDArray[np.uint32], lattice: La
     triangles at an edge compute the same point there, in the same order of operations: a closed mesh is pierced an
     even number of times by every row, whatever the rounding.
 
-    Parameters
-    ----------
-    ijk : ndarray, shape (n, 3), float64
-        Vertices in index coordinates of the voxels.
-    triangles : ndarray, shape (m, 3), uint32
-    lattice : Lattice
+    ijk: ndarray, shape (n, 3), float64. Vertices in index coordinates of the voxels.
+    triangles: ndarray, shape (m, 3), uint32
 
-    Returns
-    -------
-    ndarray, shape (p,), int64, ascending
-        Ends of runs of points inside, see `clrecon.mesh.compare.lattice`; those that would be there an even number of
-        times are not.
+    Returns: ndarray, shape (p,), int64, ascending. Ends of runs of points inside, see `clrecon.mesh.compare.lattice`;
+        those that would be there an even number of times are not.
     """
     points = lattice.number(ijk)
     found = [np.zeros(0, dtype=np.int64)]

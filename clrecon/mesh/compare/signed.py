@@ -47,19 +47,10 @@ _PIECE = 1 << 14
 class SignedDistance:
     """Exact distances from points to the nearest triangle of a closed surface, below zero inside.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), mm
-    triangles : ndarray, shape (m, 3), uint32
-        Every edge in two triangles, which run along it in opposite directions; triangles with a corner twice, which
-        are no surface, are left out.
-    outward : bool
-        False: the triangles face inward, and the sign is turned.
-
-    Raises
-    ------
-    UsageError
-        The surface is open, or its triangles do not agree which side is outside.
+    vertices: ndarray, shape (n, 3), mm
+    triangles: ndarray, shape (m, 3), uint32. Every edge in two triangles, which run along it in opposite directions;
+        triangles with a corner twice, which are no surface, are left out.
+    outward: False: the triangles face inward, and the sign is turned.
     """
 
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], *, outward: bool = True):
@@ -120,11 +111,7 @@ class SignedDistance:
 class SideDistance(Record):
     """Signed distances of points of one surface from another, mm; positive outside of the other.
 
-    Attributes
-    ----------
-    mean, sd, p5, median, p95, min, max : float
-    outside_share : float
-        Share of the points at a distance above 0.
+    outside_share: Share of the points at a distance above 0.
     """
 
     mean: float
@@ -141,24 +128,14 @@ class SideDistance(Record):
 class MeshDeviation(Record):
     """How far two surfaces lie apart, and on which side.
 
-    Attributes
-    ----------
-    hausdorff_mm : float
-        Largest distance found, of both sides; what lies between the points can be a little further.
-    hd95_mm : float
-        The larger of the two 95th percentiles (robust Hausdorff distance).
-    assd_mm : float
-        Mean of both sides (average symmetric surface distance).
-    to_reference_mm, from_reference_mm : DistanceSummary
-        Of each side, without sign: from points of the mesh to the reference, and back.
-    to_reference_signed_mm : SideDistance or None
-        Positive where the mesh lies outside the reference; None where the reference is not closed.
-    from_reference_signed_mm : SideDistance or None
-        Positive where the reference lies outside the mesh; None where the mesh is not closed.
-    warnings : list of str
-        Why a side has no sign, or that one was turned.
-    samples : int
-        Number of points on each surface.
+    hausdorff_mm: Largest distance found, of both sides; what lies between the points can be a little further.
+    hd95_mm: The larger of the two 95th percentiles (robust Hausdorff distance).
+    assd_mm: Mean of both sides (average symmetric surface distance).
+    to_reference_mm, from_reference_mm: Of each side, without sign: from points of the mesh to the reference, and back.
+    to_reference_signed_mm: Positive where the mesh lies outside the reference; None where the reference is not closed.
+    from_reference_signed_mm: Positive where the reference lies outside the mesh; None where the mesh is not closed.
+    warnings: Why a side has no sign, or that one was turned.
+    samples: Number of points on each surface.
     """
 
     hausdorff_mm: float

@@ -35,18 +35,12 @@ _MOST_ODD = 0.01
 class SliceOverlap(Record):
     """How far a mesh, filled in slices, agrees with the voxels' trilinear HU.
 
-    Attributes
-    ----------
-    dice : float
-        2 common / (points in the mesh + points in the HU) on the fine lattice.
-    voxel_dice : float
-        The same on the voxels' own lattice.  It cannot see where on its edge a vertex lies.
-    finer : int
-        Points of the fine lattice for each voxel and axis.
-    points_mesh, points_hu, points_common : int
-        Points of the fine lattice inside of the mesh, at the level or above, and both.
-    rows_odd : int
-        Rows of the fine lattice that the mesh pierces an odd number of times, where it is open; left out.
+    dice: 2 common / (points in the mesh + points in the HU) on the fine lattice.
+    voxel_dice: The same on the voxels' own lattice.  It cannot see where on its edge a vertex lies.
+    finer: Points of the fine lattice for each voxel and axis.
+    points_mesh, points_hu, points_common: Points of the fine lattice inside of the mesh, at the level or above, and
+        both.
+    rows_odd: Rows of the fine lattice that the mesh pierces an odd number of times, where it is open; left out.
     """
 
     dice: float

@@ -28,22 +28,11 @@ def wall_thickness(
 
     From each point a ray goes inward, against the normal of its triangle, to the first triangle that it meets.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), mm
-    triangles : ndarray, shape (m, 3), uint32
-        Triangles of a closed surface, facing outward.
-    samples : int
+    vertices: ndarray, shape (n, 3), mm
+    triangles: ndarray, shape (m, 3), uint32. Triangles of a closed surface, facing outward.
 
-    Returns
-    -------
-    ndarray, shape (samples,), float64, mm
-        NaN where the ray meets nothing: between triangles that do not close, or on an edge.
-
-    Raises
-    ------
-    NoSurfaceError
-        The surface has no area.
+    Returns: ndarray, shape (samples,), float64, mm. NaN where the ray meets nothing: between triangles that do not
+        close, or on an edge.
     """
     origin = local_origin(vertices)
     near = vertices - origin
@@ -60,15 +49,9 @@ def wall_thickness(
 class WallFigures(Record):
     """How thick the walls of a surface are.
 
-    Attributes
-    ----------
-    min_mm, p5_mm, median_mm : float or None
-        None where no ray met anything.
-    thin_share : float or None
-        Share of the surface whose wall is below `thin_mm`.
-    thin_mm : float
-    samples, not_measured : int
-        Points, and those whose ray met nothing.
+    min_mm, p5_mm, median_mm: None where no ray met anything.
+    thin_share: Share of the surface whose wall is below `thin_mm`.
+    samples, not_measured: Points, and those whose ray met nothing.
     """
 
     min_mm: float | None
@@ -85,16 +68,8 @@ def measure_walls(
 ) -> WallFigures:
     """Summarise `wall_thickness`.
 
-    Parameters
-    ----------
-    vertices, triangles, samples
-        As for `wall_thickness`.
-    thin_mm : float
-        Walls below this are thin.
-
-    Returns
-    -------
-    WallFigures
+    vertices, triangles, samples: As for `wall_thickness`.
+    thin_mm: Walls below this are thin.
     """
     thickness = wall_thickness(vertices, triangles, samples)
     measured = thickness[np.isfinite(thickness)]

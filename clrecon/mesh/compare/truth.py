@@ -32,22 +32,14 @@ _STEP_MM = 0.2
 class TruthDistance(Record):
     """How far the outer side of a mesh lies from the true surface.
 
-    Attributes
-    ----------
-    bias_mm : float
-        Mean of the signed distances, positive outside: what the level does.
-    scatter_mm : float
-        Standard deviation of the signed distances about their mean: what the method does.
-    p95_mm, max_mm : float
-        95th percentile and largest of the distances without their sign.
-    normals_median_deg, normals_p95_deg : float
-        Angle between the triangles' normals and those of the true surface: median, 95th percentile.
-    outer_share : float
-        Share of the points that are of the outer side: within reach of the true surface, and facing as it does.
-    reach_mm : float
-        The reach.
-    samples : int
-        Points on the whole mesh.
+    bias_mm: Mean of the signed distances, positive outside: what the level does.
+    scatter_mm: Standard deviation of the signed distances about their mean: what the method does.
+    p95_mm, max_mm: 95th percentile and largest of the distances without their sign.
+    normals_median_deg, normals_p95_deg: Angle between the triangles' normals and those of the true surface: median,
+        95th percentile.
+    outer_share: Share of the points that are of the outer side: within reach of the true surface, and facing as it
+        does.
+    samples: Points on the whole mesh.
     """
 
     bias_mm: float

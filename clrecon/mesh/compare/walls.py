@@ -65,15 +65,10 @@ RAIL_SHIFT_MM = 1.0
 class Walls:
     """Values below some vertices of a surface; shapes (n,).
 
-    Attributes
-    ----------
-    points : ndarray, shape (n, 3), float64, LPS mm
-    wall : ndarray, HU
-        Highest value at the depths `WALL_MM`.
-    flat : ndarray, bool
-        True: values below the wall are equal, below `COMPACT_HU`, and inside down to the last depth.
-    near_mm : float
-        Largest distance of a compact wall.
+    points: ndarray, shape (n, 3), float64, LPS mm
+    wall: ndarray, HU. Highest value at the depths `WALL_MM`.
+    flat: Values below the wall are equal, below `COMPACT_HU`, and inside down to the last depth.
+    near_mm: Largest distance of a compact wall.
     """
 
     points: NDArray[np.float64]
@@ -89,13 +84,8 @@ class Walls:
 def sample_walls(vertices: NDArray[np.floating], normals: NDArray[np.floating], volume: Volume, rule: IsoRule) -> Walls:
     """Sample values below the vertices of a surface, along their normals.
 
-    Parameters
-    ----------
-    vertices, normals : ndarray, shape (n, 3)
-        Vertices and normals of a mesh that was extracted from `volume`, LPS mm.
-    volume : Volume
-    rule : IsoRule
-        The rule that the mesh was made with.
+    vertices, normals: ndarray, shape (n, 3). Vertices and normals of a mesh that was extracted from `volume`, LPS mm.
+    rule: The rule that the mesh was made with.
     """
     points, inward = vertices.astype(np.float64), -normals.astype(np.float64)
     longer = np.maximum(_step_along(inward, volume), 1.0)
@@ -123,21 +113,13 @@ def _step_along(directions: NDArray[np.float64], volume: Volume) -> NDArray[np.f
 class WallLook(Record):
     """The judgement of a surface by the values below it.
 
-    Attributes
-    ----------
-    looks_like : str
-        "bone", "faint bone", "metal", "contrast medium" (or another even body) or "no bone" (a thin shell of a table,
-        noise).
-    compact_share : float
-        Share of the surface that has a wall of `COMPACT_HU` or more.
-    contrast_share : float
-        Share that is flat beneath and has no compact wall within about ``near_mm``.
-    metal_share : float
-        Share that has a wall above `METAL_HU`.
-    wall_hu : mapping
-        ``median``, ``p90`` and ``p99`` of the walls.
-    samples : int
-        Vertices looked at.
+    looks_like: "bone", "faint bone", "metal", "contrast medium" (or another even body) or "no bone" (a thin shell of a
+        table, noise).
+    compact_share: Share of the surface that has a wall of `COMPACT_HU` or more.
+    contrast_share: Share that is flat beneath and has no compact wall within about ``near_mm``.
+    metal_share: Share that has a wall above `METAL_HU`.
+    wall_hu: ``median``, ``p90`` and ``p99`` of the walls.
+    samples: Vertices looked at.
     """
 
     looks_like: str
@@ -149,12 +131,7 @@ class WallLook(Record):
 
 
 def judge_walls(walls: Walls) -> WallLook:
-    """Judge the material of a surface by its walls.
-
-    Returns
-    -------
-    WallLook
-    """
+    """Judge the material of a surface by its walls."""
     median, p90, p99 = (float(value) for value in np.percentile(walls.wall, (50, 90, 99)))
     compact = walls.wall >= COMPACT_HU
     compact_share = float(compact.mean())
@@ -188,14 +165,9 @@ def judge_components(
 ) -> list[WallLook | None]:
     """Judge each component of a surface; None for crumbs of less than `FEWEST_VERTICES`.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        With normals.
-    volume, rule
-        As `sample_walls`.
-    count, label_of_vertex
-        What `clrecon.mesh.connectivity.label_components` returns.
+    mesh: With normals.
+    volume, rule: As `sample_walls`.
+    count, label_of_vertex: What `clrecon.mesh.connectivity.label_components` returns.
     """
     order = np.argsort(label_of_vertex, kind="stable")
     ends = np.searchsorted(label_of_vertex[order], np.arange(count + 1))
@@ -222,19 +194,11 @@ def find_rails(
     A table moves through the scanner along the step of the slices; bones taper and bend, and shafts are thicker than
     `RAIL_MM`. In scans shorter than `STRAIGHT_MM` bones are just as straight, so nothing is found.
 
-    Parameters
-    ----------
-    mesh : Mesh
-    volume : Volume
-        The mesh was extracted from it.
-    label_of_vertex : ndarray, shape (n,), int64
-        The component of each vertex, below 0 for none.
-    chosen : ndarray, shape (count,), bool
-        Components that are examined.
+    volume: The mesh was extracted from it.
+    label_of_vertex: ndarray, shape (n,), int64. The component of each vertex, below 0 for none.
+    chosen: ndarray, shape (count,), bool. Components that are examined.
 
-    Returns
-    -------
-    ndarray, shape (count,), bool
+    Returns: ndarray, shape (count,), bool
     """
     rails = np.zeros(len(chosen), dtype=bool)
     last = volume.shape_ijk[2] - 1
@@ -282,13 +246,7 @@ def _measure_section(
 
 
 def normals_of(mesh: Mesh) -> NDArray[np.float32]:
-    """Return the normals of a mesh.
-
-    Raises
-    ------
-    UsageError
-        The mesh has no normals.
-    """
+    """Return the normals of a mesh."""
     if mesh.normals is None:
         raise UsageError("walls are looked for along normals: the mesh has none")
     return mesh.normals

@@ -32,10 +32,8 @@ class SurfaceBounds(NearDistance):
 
     `clrecon.operators.surface.near_faces.DeviceBounds` does the same on a device.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), mm, near zero
-    triangles : ndarray, shape (m, 3), uint32
+    vertices: ndarray, shape (n, 3), mm, near zero
+    triangles: ndarray, shape (m, 3), uint32
     """
 
     def find_bounds(
@@ -46,22 +44,14 @@ class SurfaceBounds(NearDistance):
         The triangles around each of the vertices near a point are measured, and then, some times, those around the
         nearest corner of the nearest triangle.  Nothing nearer than `limit` is looked for.
 
-        Parameters
-        ----------
-        points : ndarray, shape (k, 3), float64, mm
-        near : ndarray, shape (k, v), int
-            Vertices near each point.
-        limit : float
-            mm.
-        walks : int
-            Most steps from triangle to triangle.
+        points: ndarray, shape (k, 3), float64, mm
+        near: ndarray, shape (k, v), int. Vertices near each point.
+        limit: mm.
+        walks: Most steps from triangle to triangle.
 
-        Returns
-        -------
-        length : ndarray, shape (k,), float32, mm
-            Infinity where no triangle was measured.
-        rows : ndarray, shape (k,), int
-            -1 where no triangle was measured.
+        Returns:
+        length: ndarray, shape (k,), float32, mm. Infinity where no triangle was measured.
+        rows: ndarray, shape (k,), int. -1 where no triangle was measured.
         """
         found: tuple[Float32Array, IntArray] = (np.full(len(points), np.inf, np.float32), np.full(len(points), -1))
         self.prepare()
@@ -95,26 +85,18 @@ class SurfaceBounds(NearDistance):
         of the triangle and of its edges are compared with the triangles nearest to the corners, then with all around
         the names.
 
-        Parameters
-        ----------
-        places : ndarray, shape (v, 3), float32, mm
-            Vertices of the other surface.
-        triangles : ndarray, shape (k, 3), uint32
-            Its triangles that are examined.
-        names : ndarray, shape (v,), int
-            For each vertex one of this surface near it.
-        beside : ndarray, shape (v,), int32
-            For each vertex a triangle of this surface that is within the limit; -1 where there is none.
-        limit : float
-            mm.
+        places: ndarray, shape (v, 3), float32, mm. Vertices of the other surface.
+        triangles: ndarray, shape (k, 3), uint32. Its triangles that are examined.
+        names: ndarray, shape (v,), int. For each vertex one of this surface near it.
+        beside: ndarray, shape (v,), int32. For each vertex a triangle of this surface that is within the limit; -1
+            where there is none.
+        limit: mm.
 
-        Returns
-        -------
-        witnesses : ndarray, shape (7, k), int32
-            For the corners, the middle and the middles of the edges of each; -1 for corners without one.
-        left : ndarray, shape (k,), uint8
-            Bit b says that nothing shows middle b of `MIDDLES` to be within the limit.  Triangles that have a corner
-            without witness are not examined.
+        Returns:
+        witnesses: ndarray, shape (7, k), int32. For the corners, the middle and the middles of the edges of each; -1
+            for corners without one.
+        left: ndarray, shape (k,), uint8. Bit b says that nothing shows middle b of `MIDDLES` to be within the limit.
+            Triangles that have a corner without witness are not examined.
         """
         witnesses: NDArray[np.int32] = np.empty((WITNESSES, len(triangles)), dtype=np.int32)
         witnesses[:3] = beside[triangles].T
@@ -165,14 +147,9 @@ class SurfaceBounds(NearDistance):
     ) -> None:
         """Look at the middles of triangles and edges, see `find_witnesses`, of a piece.
 
-        Parameters
-        ----------
-        corners, near, names
-            Places in columns, faces nearest to them, shape (3, k), names, shape (k, 3).
-        rest : ndarray, shape (r,), int
-            Triangles of this piece that are looked at.
-        witnesses, left : ndarray
-            Of this piece; changed in place.
+        corners, near, names: Places in columns, faces nearest to them, shape (3, k), names, shape (k, 3).
+        rest: ndarray, shape (r,), int. Triangles of this piece that are looked at.
+        witnesses, left: Of this piece; changed in place.
         """
         one, two, three = (corner[:, rest] for corner in corners)
         half = np.float32(0.5)

@@ -32,14 +32,10 @@ class Clusters:
     collapses is a name for each vertex and a place for each name.  The collapses are kept in their order: a cluster is
     undone from the last one on, and what it comes apart into gets places of its own.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), float64, mm, relative to `origin`
-    triangles : ndarray, shape (m, 3), uint32
-    origin : ndarray, shape (3,), float64, mm
-        Places are rounded as a `Mesh` stores them after this is added.
-    find_crossings : callable
-        `find_self_intersections`, or what finds the same elsewhere.
+    vertices: ndarray, shape (n, 3), float64, mm, relative to `origin`
+    triangles: ndarray, shape (m, 3), uint32
+    origin: ndarray, shape (3,), float64, mm. Places are rounded as a `Mesh` stores them after this is added.
+    find_crossings: `find_self_intersections`, or what finds the same elsewhere.
     """
 
     def __init__(
@@ -79,17 +75,9 @@ class Clusters:
     def collapse(self, collapses: IntArray, points: Float64Array, faces: IntArray) -> None:
         """Apply a round of collapses.
 
-        Parameters
-        ----------
-        collapses : ndarray, shape (c, 2)
-            In each, the second vertex of the present `surface` is merged into the first, which remains.
-        points, faces : ndarray
-            The mesh afterwards; its vertices are those that remain and have faces, in their order.
-
-        Raises
-        ------
-        RuntimeError
-            The mesh afterwards does not match the collapses.
+        collapses: ndarray, shape (c, 2). In each, the second vertex of the present `surface` is merged into the first,
+            which remains.
+        points, faces: The mesh afterwards; its vertices are those that remain and have faces, in their order.
         """
         standing = self.standing()
         into = last_of_collapses(collapses, len(standing))
@@ -233,11 +221,8 @@ class Clusters:
         These are clusters at non-manifold edges and vertices, at faces without area or doubled, at places that two
         vertices share, of components that have vanished or come apart, and where tunnels were closed or opened.
 
-        Parameters
-        ----------
-        everywhere : bool
-            Examine all of the surface.  If not, only the surroundings of what was undone are examined once all of it
-            has been, until they are sound, and then all of it until it is so once in this round.
+        everywhere: Examine all of the surface.  If not, only the surroundings of what was undone are examined once all
+            of it has been, until they are sound, and then all of it until it is so once in this round.
         """
         found: IntArray = np.zeros(0, dtype=np.int64)
         if self._examined and self._new_to_faults.any():
@@ -321,10 +306,7 @@ class Clusters:
         Only faces that changed since the last call are examined.  Of the corners of a triangle that is too far away,
         the one with the last collapse is named: collapses come in order of their error.
 
-        Parameters
-        ----------
-        deviation : Deviation
-            The original surface, with the same triangles, and the bound.
+        deviation: The original surface, with the same triangles, and the bound.
         """
         if not self._new_to_distances.any():
             return np.zeros(0, dtype=np.int64)
@@ -362,10 +344,7 @@ class Clusters:
 
         Only vertices with changed faces around their name are examined, and no triangles: `find_far` is exact.
 
-        Parameters
-        ----------
-        deviation
-            As in `find_far`.
+        deviation: As in `find_far`.
         """
         beside, near = (np.zeros(len(self._names), dtype=bool) for _ in range(2))
         beside[self._named[self._face_rows(self._new_to_vertices)]] = True

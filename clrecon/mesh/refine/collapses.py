@@ -25,16 +25,10 @@ _PULL = 1e-3
 def last_of_collapses(collapses: NDArray[np.integer], count: int) -> NDArray[np.int64]:
     """Return for each vertex the one that it was merged into in the end.
 
-    Parameters
-    ----------
-    collapses : ndarray, shape (c, 2), int
-        In each, the second vertex is merged into the first.
-    count : int
-        Number of vertices.
+    collapses: ndarray, shape (c, 2), int. In each, the second vertex is merged into the first.
+    count: Number of vertices.
 
-    Returns
-    -------
-    ndarray, shape (count,), int64
+    Returns: ndarray, shape (count,), int64
     """
     into = np.arange(count)
     into[collapses[:, 1]] = collapses[:, 0]
@@ -51,10 +45,7 @@ class Collapses:
     Every collapse joins two clusters, so those of a cluster form a tree: without the last of them it is two clusters
     again, each as it was before.
 
-    Parameters
-    ----------
-    count : int
-        Number of vertices.
+    count: Number of vertices.
     """
 
     def __init__(self, count: int):
@@ -70,10 +61,7 @@ class Collapses:
     def latest(self, names: IntArray) -> IntArray:
         """Return for each cluster the number of its last collapse, shape (n,); -1 where there is none.
 
-        Parameters
-        ----------
-        names : ndarray, shape (n,), int
-            Cluster of each vertex.
+        names: ndarray, shape (n,), int. Cluster of each vertex.
         """
         found = np.full(len(names), -1)
         found[names[self._into]] = np.arange(len(self._into))  # the last of equals stays
@@ -82,19 +70,12 @@ class Collapses:
     def undo(self, marked: NDArray[np.bool_], names: IntArray) -> tuple[NDArray[np.bool_], IntArray]:
         """Undo the last collapses of clusters: one of each, and more where a cluster of this round is undone often.
 
-        Parameters
-        ----------
-        marked : ndarray, shape (n,), bool
-            Clusters by their names.
-        names : ndarray, shape (n,), int
-            Cluster of each vertex.
+        marked: ndarray, shape (n,), bool. Clusters by their names.
+        names: ndarray, shape (n,), int. Cluster of each vertex.
 
-        Returns
-        -------
-        undone : ndarray, shape (n,), bool
-            Clusters that had collapses.
-        left : ndarray, shape (k, 2), int
-            Collapses of these clusters that stay.
+        Returns:
+        undone: ndarray, shape (n,), bool. Clusters that had collapses.
+        left: ndarray, shape (k, 2), int. Collapses of these clusters that stay.
         """
         undone = np.zeros(len(marked), dtype=bool)
         # "clip" avoids checking each index, which takes longer than the look-up.
@@ -126,10 +107,8 @@ class Collapses:
 class Quadrics:
     """Squared distances to the planes of the triangles around each vertex (Garland and Heckbert 1997).
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), float64, mm, near zero
-    triangles : ndarray, shape (m, 3), uint32
+    vertices: ndarray, shape (n, 3), float64, mm, near zero
+    triangles: ndarray, shape (m, 3), uint32
     """
 
     def __init__(self, vertices: Float64Array, triangles: NDArray[np.uint32]):
@@ -153,18 +132,11 @@ class Quadrics:
     def best_places(self, clusters: IntArray, members: IntArray, count: int) -> Float64Array:
         """Return the places with the least sum of squares for clusters of vertices.
 
-        Parameters
-        ----------
-        clusters : ndarray, shape (k,), int
-            Cluster of each member, from 0 to ``count - 1``; each cluster has members.
-        members : ndarray, shape (k,), int
-            Vertices.
-        count : int
-            Number of clusters.
+        clusters: ndarray, shape (k,), int. Cluster of each member, from 0 to ``count - 1``; each cluster has members.
+        members: ndarray, shape (k,), int. Vertices.
+        count: Number of clusters.
 
-        Returns
-        -------
-        ndarray, shape (count, 3), float64, mm
+        Returns: ndarray, shape (count, 3), float64, mm
         """
         from scipy.sparse import csr_array
 

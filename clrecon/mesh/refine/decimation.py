@@ -70,13 +70,7 @@ _SHARE_FOR_VOLUME = 0.1
 
 
 def default_deviation(mesh: Mesh) -> float:
-    """Return the default bound in mm: a quarter of the shortest voxel step that the mesh was made from.
-
-    Raises
-    ------
-    UsageError
-        The report of the mesh has no ``affine_ijk_to_lps_mm``.
-    """
+    """Return the default bound in mm: a quarter of the shortest voxel step that the mesh was made from."""
     affine = mesh.report.get("affine_ijk_to_lps_mm")
     if affine is None:
         raise UsageError("this mesh does not say how large its voxels were: give max_deviation_mm")
@@ -85,15 +79,7 @@ def default_deviation(mesh: Mesh) -> float:
 
 
 def check_refinement(mesh: Mesh, max_deviation_mm: float | None) -> float:
-    """Check a mesh before refinement and return the bound in mm.
-
-    Raises
-    ------
-    UsageError
-        The bound is not a length, or the mesh is too large or fails its check.
-    NoSurfaceError
-        The mesh is empty.
-    """
+    """Check a mesh before refinement and return the bound in mm."""
     bound = default_deviation(mesh) if max_deviation_mm is None else float(max_deviation_mm)
     if not (math.isfinite(bound) and bound > 0.0):
         raise UsageError(f"the largest deviation is a length in mm above 0, not {bound:g}")
@@ -138,34 +124,17 @@ def decimate_mesh(
     far as a collapse is the cause, their Euler numbers.  Further rounds follow until the share is reached or hardly any
     more triangles can be removed within the bound.
 
-    Parameters
-    ----------
-    mesh : Mesh
-    fraction : float
-        Share of the triangles to remove, above 0 and below 1. The bound may allow only less.
-    max_deviation_mm : float, optional
-        No vertex and no middle of an edge or a triangle of either surface lies farther than this from the other.
-        Default: a quarter of the shortest voxel step.
-    progress : callable, optional
-        Called as ``progress("decimate", triangles removed, triangles to remove)``, several times in a round.
-    make_bounds : callable
-        `SurfaceBounds`, or what does the same elsewhere.
-    find_crossings : callable
-        `find_self_intersections`, or what finds the same elsewhere.
+    fraction: Share of the triangles to remove, above 0 and below 1. The bound may allow only less.
+    max_deviation_mm: No vertex and no middle of an edge or a triangle of either surface lies farther than this from the
+        other. Default: a quarter of the shortest voxel step.
+    progress: Called as ``progress("decimate", triangles removed, triangles to remove)``, several times in a round.
+    make_bounds: `SurfaceBounds`, or what does the same elsewhere.
+    find_crossings: `find_self_intersections`, or what finds the same elsewhere.
 
-    Returns
-    -------
-    Mesh
-        Normals from the faces; the report is taken over, with ``refinement["decimate"]``: ``fraction`` (asked for),
-        ``reached``, ``ended_by`` (``"share"`` or ``"bound"``), ``rounds``, ``max_deviation_mm``, ``triangles_before``,
-        ``vertices_taken_back``, ``topology`` (measured: `clrecon.mesh.refine.topology.TopologyChange`).
-
-    Raises
-    ------
-    UsageError
-        A value cannot be used, or there is neither a bound nor a voxel size in the report of the mesh.
-    NoSurfaceError
-        The mesh is empty.
+    Returns: Normals from the faces; the report is taken over, with ``refinement["decimate"]``: ``fraction`` (asked
+        for), ``reached``, ``ended_by`` (``"share"`` or ``"bound"``), ``rounds``, ``max_deviation_mm``,
+        ``triangles_before``, ``vertices_taken_back``, ``topology`` (measured:
+        `clrecon.mesh.refine.topology.TopologyChange`).
     """
     check_share(fraction)
     bound = check_refinement(mesh, max_deviation_mm)
@@ -207,11 +176,8 @@ def _collapse_in_rounds(
 ) -> tuple[int, int]:
     """Collapse edges and repair until few triangles are left, or hardly any more can be removed.
 
-    Returns
-    -------
-    rounds : int
-    taken_back : int
-        Number of collapses that were undone.
+    Returns:
+    taken_back: Number of collapses that were undone.
     """
     left, rounds, taken_back, is_last = len(clusters.faces()), 0, 0, False
     while left > _nearly(wanted) and rounds < _ROUNDS:

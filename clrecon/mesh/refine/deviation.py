@@ -34,16 +34,11 @@ MakeBounds = Callable[..., SurfaceBounds]
 class Deviation:
     """The original surface, and the bound.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), float64, mm
-    triangles : ndarray, shape (m, 3), uint32
-    bound : float
-        mm.
-    make_bounds : callable
-        `SurfaceBounds`, or what does the same elsewhere.
-    fans : Fans, optional
-        Fans of the triangles if they are known.
+    vertices: ndarray, shape (n, 3), float64, mm
+    triangles: ndarray, shape (m, 3), uint32
+    bound: mm.
+    make_bounds: `SurfaceBounds`, or what does the same elsewhere.
+    fans: Fans of the triangles if they are known.
     """
 
     def __init__(
@@ -74,14 +69,9 @@ class Deviation:
 
         In the others no point has moved farther than the corners.
 
-        Parameters
-        ----------
-        rows, names, places : ndarray
-            As in `is_far_from`.
+        rows, names, places: As in `is_far_from`.
 
-        Returns
-        -------
-        ndarray, shape (k,), bool
+        Returns: ndarray, shape (k,), bool
         """
         triangles = self._triangles[rows]
         a, b, c = names[triangles].T
@@ -104,22 +94,15 @@ class Deviation:
         the edges are measured.  Distances are measured only to the triangles around the names of the corners, the part
         of the surface that came from this triangle.  They are never less than those to the whole surface.
 
-        Parameters
-        ----------
-        rows : ndarray, shape (k,), int
-            Triangles to examine.
-        names : ndarray, shape (n,), int
-            For each vertex a near vertex of the present surface.
-        places : ndarray, shape (n, 3), float64, mm
-        faces : ndarray, shape (f, 3), uint32
-            The present surface, at least all faces around the names of the corners.
+        rows: ndarray, shape (k,), int. Triangles to examine.
+        names: ndarray, shape (n,), int. For each vertex a near vertex of the present surface.
+        places: ndarray, shape (n, 3), float64, mm
+        faces: ndarray, shape (f, 3), uint32. The present surface, at least all faces around the names of the corners.
 
-        Returns
-        -------
-        far : ndarray, shape (k,), bool
-        witnesses : ndarray, shape (7, k), int
-            Rows of `faces` that show that a triangle is within the bound; it is so as long as these faces stay.  -1
-            where it is not.
+        Returns:
+        far: ndarray, shape (k,), bool
+        witnesses: ndarray, shape (7, k), int. Rows of `faces` that show that a triangle is within the bound; it is so
+            as long as these faces stay.  -1 where it is not.
         """
         triangles = self._triangles[rows]
         used = np.zeros(len(names), dtype=bool)
@@ -148,16 +131,10 @@ class Deviation:
     ) -> NDArray[np.bool_]:
         """Mark vertices of the original surface for which no upper bound shows that they lie within the bound.
 
-        Parameters
-        ----------
-        vertices : ndarray, shape (k,), int
-            Vertices to examine.
-        names, places, faces : ndarray
-            As in `is_far_from`.
+        vertices: ndarray, shape (k,), int. Vertices to examine.
+        names, places, faces: As in `is_far_from`.
 
-        Returns
-        -------
-        ndarray, shape (k,), bool
+        Returns: ndarray, shape (k,), bool
         """
         length, _ = self._make(places, faces).find_surely_within(self._vertices[vertices], names[vertices], self._bound)
         return np.asarray(length > self._bound)
@@ -168,17 +145,12 @@ class Deviation:
         Tested are the corners, the middle, and points of a lattice with steps of at most two mean edges of the original
         surface; the middle of each edge is one of them.
 
-        Parameters
-        ----------
-        places : ndarray, shape (n, 3), float64, mm
-        faces : ndarray, shape (f, 3), uint32
-            Their corners are numbers of vertices of the original surface too.
-        rows : ndarray, shape (f,), int
-            The triangle of the original surface that each face came from: its corners are near the face.
+        places: ndarray, shape (n, 3), float64, mm
+        faces: ndarray, shape (f, 3), uint32. Their corners are numbers of vertices of the original surface too.
+        rows: ndarray, shape (f,), int. The triangle of the original surface that each face came from: its corners are
+            near the face.
 
-        Returns
-        -------
-        ndarray, shape (f,), bool
+        Returns: ndarray, shape (f,), bool
         """
         far = np.zeros(len(faces), dtype=bool)
         if len(faces) == 0:

@@ -29,13 +29,9 @@ def any_corner(flags: NDArray[np.bool_], triangles: IntArray) -> NDArray[np.bool
 def find_sheets(faces: NDArray[np.uint32], size: int, edges: Edges) -> list[IntArray]:
     """Find the vertices at edges with several sheets, of doubled faces and of several fans of faces.
 
-    Parameters
-    ----------
-    faces : ndarray, shape (f, 3), uint32
-    size : int
-        Number of vertices.
-    edges : Edges
-        Edges of these faces.
+    faces: ndarray, shape (f, 3), uint32
+    size: Number of vertices.
+    edges: Edges of these faces.
     """
     faults = _find_ridges(faces, edges)
     opposite = opposite_half_edges(faces, edges)
@@ -58,16 +54,10 @@ def _find_ridges(faces: NDArray[np.uint32], edges: Edges) -> list[IntArray]:
 def find_faults_beside(faces: NDArray[np.uint32], new: NDArray[np.bool_]) -> IntArray:
     """Find the same faults as `find_sheets`, but only those that new vertices can have made.
 
-    Parameters
-    ----------
-    faces : ndarray, shape (f, 3), uint32
-        The whole surface.
-    new : ndarray, shape (n,), bool
-        Vertices that were not there, or elsewhere: every face that is new has one of them.
+    faces: ndarray, shape (f, 3), uint32. The whole surface.
+    new: ndarray, shape (n,), bool. Vertices that were not there, or elsewhere: every face that is new has one of them.
 
-    Returns
-    -------
-    ndarray, shape (k,), int
+    Returns: ndarray, shape (k,), int
     """
     touched = np.zeros(len(new), dtype=bool)
     touched[faces[any_corner(new, faces)]] = True
@@ -96,16 +86,10 @@ def find_torn(triangles: NDArray[np.uint32], names: IntArray) -> IntArray:
     It stays as it was where the triangles that shrank to a vertex form a disc, and those that shrank to an edge a strip
     from one side of it to the other: their vertices - edges + faces are then 1 and, as they have no vertices, -1.
 
-    Parameters
-    ----------
-    triangles : ndarray, shape (m, 3), uint32
-        Triangles before vertices were merged.
-    names : ndarray, shape (n,), int
-        For each vertex the one that it was merged into.
+    triangles: ndarray, shape (m, 3), uint32. Triangles before vertices were merged.
+    names: ndarray, shape (n,), int. For each vertex the one that it was merged into.
 
-    Returns
-    -------
-    ndarray, shape (k,), int
+    Returns: ndarray, shape (k,), int
     """
     size = len(names)
     edges = find_edges(triangles, size)

@@ -38,13 +38,10 @@ IntArray = NDArray[np.integer]
 class Volumes:
     """Components of a surface, and the volumes that they enclose.
 
-    Attributes
-    ----------
-    labels : ndarray, shape (n,), int64
-        Component of each vertex; -1 for vertices that no triangle uses.
-    mm3 : ndarray, shape (count,), float64
-        Enclosed volume, negative for walls of cavities; meaningless for open components.
-    is_open : ndarray, shape (count,), bool
+    labels: ndarray, shape (n,), int64. Component of each vertex; -1 for vertices that no triangle uses.
+    mm3: ndarray, shape (count,), float64. Enclosed volume, negative for walls of cavities; meaningless for open
+        components.
+    is_open: ndarray, shape (count,), bool
     """
 
     labels: NDArray[np.int64]
@@ -65,12 +62,10 @@ def measure_volumes(
 ) -> Volumes:
     """Measure the components of a surface.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), float64, mm from a point near them
-    triangles : ndarray, shape (m, 3), uint32
-    count, labels, border : int, ndarray, shape (n,), int64, and ndarray, shape (n,), bool, optional
-        Number of components, component of each vertex, and vertices at edges of one triangle, if they are known.
+    vertices: ndarray, shape (n, 3), float64, mm from a point near them
+    triangles: ndarray, shape (m, 3), uint32
+    count, labels, border: int, ndarray, shape (n,), int64, and ndarray, shape (n,), bool. Number of components,
+        component of each vertex, and vertices at edges of one triangle, if they are known.
     """
     if count is None or labels is None or border is None:
         edges = find_edges(triangles, len(vertices))
@@ -94,17 +89,11 @@ def restore_volumes(
     A small shift is a large share of the volume of a thin sheet: in a thin-walled bone at voxels of 3 mm, 6 % of the
     volume were 0.03 voxel.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), float64, mm
-    step : ndarray, shape (n, 3), float64, mm
-        Changed in place; no step becomes longer than `longest`.
-    triangles : ndarray, shape (m, 3), uint32
-    labels : ndarray, shape (n,), int64
-        Component of `wanted` that each vertex belongs to, -1 for none.
-    wanted : Volumes
-    longest : float
-        mm.
+    vertices: ndarray, shape (n, 3), float64, mm
+    step: ndarray, shape (n, 3), float64, mm. Changed in place; no step becomes longer than `longest`.
+    triangles: ndarray, shape (m, 3), uint32
+    labels: ndarray, shape (n,), int64. Component of `wanted` that each vertex belongs to, -1 for none.
+    longest: mm.
     """
     count = len(wanted.mm3)
     moving = np.flatnonzero((labels >= 0) & ~np.append(wanted.is_open, True)[labels])
@@ -153,20 +142,14 @@ def move_vertices(
 ) -> tuple[NDArray[np.floating], int]:
     """Move vertices, but by less or not at all where triangles would cut, lose their area or share a place.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), float32 or float64, mm
-    triangles : ndarray, shape (m, 3), uint32
-    step : ndarray, shape (n, 3), float64, mm
-    find_crossings : callable
-        `find_self_intersections`, or what finds the same elsewhere.
+    vertices: ndarray, shape (n, 3), float32 or float64, mm
+    triangles: ndarray, shape (m, 3), uint32
+    step: ndarray, shape (n, 3), float64, mm
+    find_crossings: `find_self_intersections`, or what finds the same elsewhere.
 
-    Returns
-    -------
-    vertices : ndarray, shape (n, 3)
-        Vertices as stored.  Faults that existed before may remain.
-    taken_back : int
-        Number of vertices that were not moved by the full step.
+    Returns:
+    vertices: ndarray, shape (n, 3). Vertices as stored.  Faults that existed before may remain.
+    taken_back: Number of vertices that were not moved by the full step.
     """
     share = np.ones(len(vertices))
     moved = as_stored(vertices + step)

@@ -20,13 +20,10 @@ LISTED = 20
 class Topology:
     """Euler numbers of the components of a surface.
 
-    Attributes
-    ----------
-    euler : ndarray, shape (count,), int64
-        Vertices - edges + faces of each component: 2 for a closed surface without tunnels, and 2 less for each tunnel.
-    faces : ndarray, shape (count,), int64
-    loose_edges : int
-        Edges that are not in two faces.
+    euler: ndarray, shape (count,), int64. Vertices - edges + faces of each component: 2 for a closed surface without
+        tunnels, and 2 less for each tunnel.
+    faces: ndarray, shape (count,), int64
+    loose_edges: Edges that are not in two faces.
     """
 
     euler: NDArray[np.int64]
@@ -38,18 +35,12 @@ class Topology:
 class TopologyChange(Record):
     """What became of the topology of a surface.
 
-    Attributes
-    ----------
-    euler_number_before, euler_number_after : int
-        Used vertices - edges + faces.
-    components_before, components_lost : int
-        Components of the surface before, and those of them that have no face any more.
-    loose_edges_before, loose_edges_after : int
-        Edges that are not in two faces: where the surface is open, or several sheets meet.
-    components_changed : int
-        Components that are still there with another Euler number.
-    changes : list of dict
-        The first of these: ``component`` (numbered in order of the first vertex), ``euler_number_before``,
+    euler_number_before, euler_number_after: Used vertices - edges + faces.
+    components_before, components_lost: Components of the surface before, and those of them that have no face any more.
+    loose_edges_before, loose_edges_after: Edges that are not in two faces: where the surface is open, or several sheets
+        meet.
+    components_changed: Components that are still there with another Euler number.
+    changes: The first of these: ``component`` (numbered in order of the first vertex), ``euler_number_before``,
         ``euler_number_after``.  In a closed and manifold component 2 more is a tunnel closed, 2 less a tunnel opened.
     """
 
@@ -68,15 +59,10 @@ def measure_topology(
 ) -> Topology:
     """Measure the Euler number of each component.
 
-    Parameters
-    ----------
-    triangles : ndarray, shape (m, 3), uint32
-    labels : ndarray, shape (n,), int64
-        Component of each vertex.
-    count : int
-        Number of components.
-    edges : Edges, optional
-        Edges of the triangles if they are known.
+    triangles: ndarray, shape (m, 3), uint32
+    labels: ndarray, shape (n,), int64. Component of each vertex.
+    count: Number of components.
+    edges: Edges of the triangles if they are known.
     """
     edges = find_edges(triangles, len(labels)) if edges is None else edges
     used = np.zeros(len(labels), dtype=bool)

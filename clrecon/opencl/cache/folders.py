@@ -60,18 +60,11 @@ _UNKNOWN_OWNER = 65534
 class Caches(NamedTuple):
     """Where this process keeps built kernels.
 
-    Attributes
-    ----------
-    pocl : Path
-        Folder of PoCL, only for kernels of clrecon.
-    is_lasting : bool
-        `pocl` is there for the next process too.
-    binaries : Path or None
-        Folder of `clrecon.opencl.cache.binaries`; None where nothing can be kept.
-    warnings : tuple of str
-        What the user should know, at most one text.
-    refusal : str
-        Why PoCL cannot build in `pocl`; empty if it can.
+    pocl: Folder of PoCL, only for kernels of clrecon.
+    is_lasting: `pocl` is there for the next process too.
+    binaries: Folder of `clrecon.opencl.cache.binaries`; None where nothing can be kept.
+    warnings: What the user should know, at most one text.
+    refusal: Why PoCL cannot build in `pocl`; empty if it can.
     """
 
     pocl: Path
@@ -229,13 +222,7 @@ def cache_warnings() -> tuple[str, ...]:
 
 
 def refuse_short_files() -> None:
-    """Refuse to build with a driver that ends the process when a file cannot be written.
-
-    Raises
-    ------
-    DeviceError
-        The limit of this process for the size of files is too low, or no folder has room.
-    """
+    """Refuse to build with a driver that ends the process when a file cannot be written."""
     if resource is not None:
         limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
         if limit != resource.RLIM_INFINITY and limit < LONGEST_FILE_BYTES:

@@ -56,15 +56,9 @@ _Files = dict[str, list[Any]]
 class KnownGood:
     """The records of one folder of PoCL.
 
-    Parameters
-    ----------
-    folder : Path
-        PoCL's folder; only this class and PoCL write to it.
+    folder: PoCL's folder; only this class and PoCL write to it.
 
-    Attributes
-    ----------
-    warnings : list of str
-        What was found and removed.
+    warnings: What was found and removed.
     """
 
     def __init__(self, folder: Path):

@@ -54,13 +54,7 @@ TAPS_A_LAUNCH = 1 << 32
 
 
 def prepare_bilateral(device: Device, dtype: DTypeLike = np.int16) -> Program:
-    """Build the kernels for volumes of `dtype`.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels for volumes of `dtype`."""
     variants = {**voxel_variants(dtype), "LANES": device.kernel_variants["LANES"]}
     return load_program(device, "filters/bilateral.cl", variants)
 
@@ -171,15 +165,9 @@ def _reach_ends(voxels: NDArray[Any], level: float) -> bool:
 class Filtered:
     """What a run of the filter made.
 
-    Attributes
-    ----------
-    voxels : ndarray, shape (nk, nj, ni)
-    voxels_d : buffer or None
-        The same on the device, where they fit as a whole.
-    share : float
-        Share of the voxels that were filtered.
-    slabs : int
-    warnings : tuple of str
+    voxels: ndarray, shape (nk, nj, ni)
+    voxels_d: The same on the device, where they fit as a whole.
+    share: Share of the voxels that were filtered.
     """
 
     voxels: NDArray[Any]
@@ -196,13 +184,7 @@ def run_bilateral(
     stopwatch: Stopwatch | None = None,
     progress: Progress | None = None,
 ) -> Filtered:
-    """Filter the voxels of a volume, slab by slab where they do not fit the device as a whole.
-
-    Raises
-    ------
-    DeviceError
-        Not even a slab of one slice fits, or the device fails.
-    """
+    """Filter the voxels of a volume, slab by slab where they do not fit the device as a whole."""
     run = _Run(resident, settings, stopwatch or Stopwatch(), progress or ignore_progress)
     nk = resident.volume.shape_ijk[2]
     slices = resident.plan(BILATERAL, nk, run.needs)

@@ -44,16 +44,10 @@ _INSTALLED_AS = {"skimage": "scikit-image"}
 class _Denoiser:
     """A filter of another package.
 
-    Attributes
-    ----------
-    package : str
-        Module that has it.
-    defaults : dict of str to number or None
-        Its parameters.
-    run : callable
-        Takes the package, the volume and all parameters; returns voxels as floats, and what it used.
-    needs_grid : bool
-        It takes the volume for a grid at right angles with even steps.
+    package: Module that has it.
+    defaults: Its parameters.
+    run: Takes the package, the volume and all parameters; returns voxels as floats, and what it used.
+    needs_grid: It takes the volume for a grid at right angles with even steps.
     """
 
     package: str

@@ -22,14 +22,8 @@ GROUP = kernel_constant("filters/near_level.cl", "GROUP")
 class SlicesThere:
     """Slices of a volume on the device, and those of them that are worked on.
 
-    Attributes
-    ----------
-    voxels_d : buffer, (count, nj, ni)
-        Slices `first` to ``first + count - 1``.
-    ni, nj : int
-    first, count : int
-    core_first, core_count : int
-        The slices that are worked on.
+    voxels_d: buffer, (count, nj, ni). Slices `first` to ``first + count - 1``.
+    core_first, core_count: The slices that are worked on.
     """
 
     voxels_d: Any
@@ -63,13 +57,7 @@ def mixed_group_bytes(ni: int, rows: int, core_rows: int) -> int:
 
 
 def prepare_near_level(device: Device, dtype: DTypeLike = np.int16) -> Program:
-    """Build the kernels for volumes of `dtype`.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels for volumes of `dtype`."""
     prepare_compact(device)
     return load_program(device, "filters/near_level.cl", voxel_variants(dtype))
 
@@ -85,29 +73,11 @@ def list_mixed_groups(
 ) -> Compacted:
     """List the groups of which some voxel has both sides of a level in the box around it.
 
-    Parameters
-    ----------
-    device : Device
-    there : SlicesThere
-        With all slices within reach of those that are worked on, as far as the volume has them.
-    dtype : dtype of the voxels
-    level : scalar of `dtype`
-        Lowest value inside; NaN is not.
-    reach : (int, int, int)
-        Half the size of the box along i, j, k, without the voxel in its middle; at most 16 along i.
-    stopwatch : Stopwatch, optional
+    there: With all slices within reach of those that are worked on, as far as the volume has them.
+    level: Lowest value inside; NaN is not.
+    reach: Half the size of the box along i, j, k, without the voxel in its middle; at most 16 along i.
 
-    Returns
-    -------
-    Compacted
-        Numbers ``32 * row_words(ni) * (core row) + group``, ascending.
-
-    Raises
-    ------
-    UsageError
-        There are more than 2^32 places for groups.
-    DeviceError
-        The device fails.
+    Returns: Numbers ``32 * row_words(ni) * (core row) + group``, ascending.
     """
     program, words = prepare_near_level(device, dtype), row_words(there.ni)
     count, core_count = words * there.rows, words * there.core_rows

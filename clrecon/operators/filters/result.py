@@ -17,15 +17,10 @@ __all__ = ["finish_result", "report_filter"]
 def report_filter(volume: Volume, voxels: NDArray[Any], facts: dict[str, Any], warnings: Sequence[str]) -> Volume:
     """Return a volume with filtered voxels, and one step more in ``report["filtered"]``.
 
-    Parameters
-    ----------
-    volume : Volume
-        As it was before.
-    voxels : ndarray, shape (nk, nj, ni)
-    facts : dict
-        The step, in plain JSON types.
-    warnings : sequence of str
-        Go to those of the report.
+    volume: As it was before.
+    voxels: ndarray, shape (nk, nj, ni)
+    facts: The step, in plain JSON types.
+    warnings: Go to those of the report.
     """
     made = volume.with_voxels(voxels)
     steps = (made.report.get("filtered") or {}).get("steps", [])
@@ -45,12 +40,8 @@ def finish_result(
 ) -> Volume | DeviceVolume:
     """Return the filtered volume; with `keep` on the device of `resident`.
 
-    Parameters
-    ----------
-    voxels_d : buffer or None
-        The voxels on the device, if they are there as a whole.
-    others
-        See `report_filter`.
+    voxels_d: The voxels on the device, if they are there as a whole.
+    others: See `report_filter`.
     """
     made = report_filter(resident.volume, voxels, facts, warnings)
     return resident.follow(made, voxels_d) if keep else made

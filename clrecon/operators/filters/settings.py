@@ -32,17 +32,8 @@ LEAST_SHARE = 0.9
 class BilateralSettings:
     """A filter of a volume.
 
-    Attributes
-    ----------
-    sigma_mm, sigma_hu : float
-    dimensions : int
-    near : float or None
-    rings : int
-        Rings of voxels around those that may change sides: 1, or 2 where normals count.
-    most_taps : int
-    window : Window
-    noise : Noise or None
-        Where it was measured.
+    rings: Rings of voxels around those that may change sides: 1, or 2 where normals count.
+    noise: Where it was measured.
     """
 
     sigma_mm: float
@@ -65,12 +56,7 @@ class BilateralSettings:
         normals: bool,
         taps: int | None,
     ) -> BilateralSettings:
-        """Check the parameters of `filter_bilateral`, and choose those that are not given.
-
-        Raises
-        ------
-        UsageError, NoSurfaceError
-        """
+        """Check the parameters of `filter_bilateral`, and choose those that are not given."""
         if dimensions not in (2, 3) or isinstance(dimensions, bool):
             raise UsageError(f"a filter has 2 dimensions, slice by slice, or 3, not {dimensions!r}")
         most_taps = _checked_taps(taps, dimensions)
@@ -124,13 +110,7 @@ class BilateralSettings:
 
 
 def inside_level(dtype: np.dtype[Any], near: float) -> Any:
-    """Return the lowest value inside as a scalar of the voxels' type.
-
-    Raises
-    ------
-    NoSurfaceError
-        No value of the type is.
-    """
+    """Return the lowest value inside as a scalar of the voxels' type."""
     if dtype.kind == "f":
         return np.float32(near)
     limits, level = np.iinfo(dtype), math.ceil(near)
@@ -166,13 +146,7 @@ def _positive(name: str, value: float, what: str) -> float:
 
 
 def checked_length(name: str, value: float, volume: Volume) -> float:
-    """Return a length in mm.
-
-    Raises
-    ------
-    UsageError
-        It is no number above 0, or longer than the volume.
-    """
+    """Return a length in mm."""
     length = _positive(name, value, "a length in mm above 0")
     sides = [n * step for n, step in zip(volume.shape_ijk, volume.spacing, strict=True)]
     if length > max(sides):

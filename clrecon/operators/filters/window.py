@@ -27,16 +27,11 @@ SAME_RING = 1e-6
 class Window:
     """Taps of a window, sorted by k, j and i.
 
-    Attributes
-    ----------
-    offsets : ndarray, shape (n, 3), int32
-        Steps along i, j, k, the voxel itself among them.
-    exponents : ndarray, shape (tables, n), float64
-        Logarithm to base 2 of the weight by distance: a row for each slice where they are uneven, else one.
-    share : float
-        Weight of these taps over that of the whole window.
-    whole_taps : int
-        Taps of the whole window.
+    offsets: ndarray, shape (n, 3), int32. Steps along i, j, k, the voxel itself among them.
+    exponents: ndarray, shape (tables, n), float64. Logarithm to base 2 of the weight by distance: a row for each slice
+        where they are uneven, else one.
+    share: Weight of these taps over that of the whole window.
+    whole_taps: Taps of the whole window.
     """
 
     offsets: NDArray[np.int32]
@@ -73,20 +68,11 @@ def choose_window(volume: Volume, sigma_mm: float, dimensions: int, most_taps: i
 
     Distances are those of the voxels' places, so that anisotropic, sheared and uneven volumes are filtered in mm.
 
-    Parameters
-    ----------
-    volume : Volume
-    sigma_mm : float
-    dimensions : {2, 3}
-        2: within a slice alone.
-    most_taps : int
-        If the box has more, the nearest voxels stay, in whole rings of equal distance: of square pixels 13 are the disc
-        of five that OpenCV has, and 5, 29 and 49 those of 3, 7 and 9.
+    dimensions: {2, 3}. 2: within a slice alone.
+    most_taps: If the box has more, the nearest voxels stay, in whole rings of equal distance: of square pixels 13 are
+        the disc of five that OpenCV has, and 5, 29 and 49 those of 3, 7 and 9.
 
-    Returns
-    -------
-    Window
-        The middle alone where `most_taps` is below the number of the first ring.
+    Returns: The middle alone where `most_taps` is below the number of the first ring.
     """
     box = _box(volume, RADIUS_OF_SIGMA * sigma_mm, dimensions)
     whole = _lattice(np.minimum(box, 3 * LARGEST_REACH))

@@ -33,13 +33,7 @@ ANY_NUMBER = 1 << 30
 
 
 def prepare_balls(device: Device) -> Program:
-    """Build the kernels.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels."""
     return load_program(device, "masks/balls.cl", {"LANES": device.kernel_variants["LANES"]})
 
 
@@ -48,18 +42,8 @@ def ball_of(volume: Volume, radius: float, *, by_slice: bool = False) -> Stencil
 
     The places of the voxels count: those of oblique, tilted and uneven stacks too.
 
-    Parameters
-    ----------
-    volume : Volume
-    radius : float
-        mm, above 0.
-    by_slice : bool
-        In the voxel's own slice alone: a disc.
-
-    Raises
-    ------
-    UsageError
-        The ball has so many rows that the work would take hours.
+    radius: mm, above 0.
+    by_slice: In the voxel's own slice alone: a disc.
     """
     return _checked(make_stencil(Lattice.of(volume), radius), volume, radius, by_slice)
 
@@ -156,21 +140,13 @@ def spread_bits(
 ) -> Any:
     """Return the words of a mask that is dilated or eroded.
 
-    Parameters
-    ----------
-    mask : VoxelMask
-        Without zeros behind its rows.
-    ball : Stencil
-        For each slice the rows that its voxels look at; not only balls, but the voxel itself is among them.
-    erode : bool
-        Keep the voxels whose ball has no voxel that is not set; else set those whose ball has one that is set.
-    beyond : bool
-        What lies beyond the volume is set, else it is not.  The ball must then have its rows beyond, see
+    mask: Without zeros behind its rows.
+    ball: For each slice the rows that its voxels look at; not only balls, but the voxel itself is among them.
+    erode: Keep the voxels whose ball has no voxel that is not set; else set those whose ball has one that is set.
+    beyond: What lies beyond the volume is set, else it is not.  The ball must then have its rows beyond, see
         `whole_ball_of`, where it matters: of erosion with False, of dilation with True.
 
-    Returns
-    -------
-    buffer, (nk, nj, words) uint32
+    Returns: buffer, (nk, nj, words) uint32
     """
     ni, nj, nk = mask.shape_ijk
     words = mask.words

@@ -45,16 +45,11 @@ BAND = "voxels of a band"
 class VoxelMask:
     """One bit for each voxel of a volume, on a device.
 
-    Attributes
-    ----------
-    mask_d : buffer, (nk, nj, words) uint32
-        Bit b of word w is voxel i = 32 w + b.
-    row_extents_d : buffer, (nk, nj, 2) uint16
-        First word of a row with a bit set, and the one after the last; 0, 0 in rows without.
-    shape_ijk : (ni, nj, nk)
-    words : int
-        Words in a row, of which the last `pad` are zeros.
-    pad : int
+    mask_d: buffer, (nk, nj, words) uint32. Bit b of word w is voxel i = 32 w + b.
+    row_extents_d: buffer, (nk, nj, 2) uint16. First word of a row with a bit set, and the one after the last; 0, 0 in
+        rows without.
+    shape_ijk: (ni, nj, nk)
+    words: Words in a row, of which the last `pad` are zeros.
     """
 
     mask_d: Any
@@ -83,13 +78,7 @@ OPEN_BAND = (-math.inf, math.inf)
 
 
 def checked_band(hu: ArrayLike | Sequence[float | None]) -> tuple[float, float]:
-    """Return the two ends of a band of HU, both included; None or infinity leaves an end open.
-
-    Raises
-    ------
-    UsageError
-        These are not two numbers, the lower one first.
-    """
+    """Return the two ends of a band of HU, both included; None or infinity leaves an end open."""
     try:
         ends = np.asarray(hu, dtype=object).tolist()
         low, high = (open_end if end is None else float(end) for end, open_end in zip(ends, OPEN_BAND, strict=True))
@@ -101,12 +90,7 @@ def checked_band(hu: ArrayLike | Sequence[float | None]) -> tuple[float, float]:
 
 
 def check_shape(shape_ijk: tuple[int, int, int], pad: int = 0) -> None:
-    """Refuse volumes whose masks are too large.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse volumes whose masks are too large."""
     ni, nj, nk = shape_ijk
     words = -(-ni // 32) + pad
     if ni > LONGEST_ROW or words * nj * nk > MOST_WORDS:
@@ -117,13 +101,7 @@ def check_shape(shape_ijk: tuple[int, int, int], pad: int = 0) -> None:
 
 
 def band_bounds(volume: Volume, hu: tuple[float, float]) -> tuple[Any, Any]:
-    """Return the band's ends as scalars of the voxels' type: for whole numbers the first and last within.
-
-    Raises
-    ------
-    NoSurfaceError
-        The type has no value within.
-    """
+    """Return the band's ends as scalars of the voxels' type: for whole numbers the first and last within."""
     dtype = volume.voxels.dtype
     if dtype.kind == "f":
         most = float(np.finfo(dtype).max)
@@ -148,27 +126,10 @@ def mark_band(
 
     The mask is that of the whole volume.  Where its voxels do not fit beside it, they go to the device slab by slab.
 
-    Parameters
-    ----------
-    resident : DeviceVolume
-    hu : (float, float)
-        See `checked_band`.
-    pad : int
-        Words of zeros behind each row.
-    beside : mapping of str to int, optional
-        Bytes on the device that are taken already, or will be as long as voxels are there.
-    stopwatch : Stopwatch, optional
-    progress : callable, optional
-        Called as ``progress("mask", slices done, all slices)`` where there are several slabs.
-
-    Raises
-    ------
-    UsageError
-        The volume is too large, see `check_shape`.
-    NoSurfaceError
-        The type of the voxels has no value in the band.
-    DeviceError
-        Not even the mask and one slice fit the device, or it fails.
+    hu: See `checked_band`.
+    pad: Words of zeros behind each row.
+    beside: Bytes on the device that are taken already, or will be as long as voxels are there.
+    progress: Called as ``progress("mask", slices done, all slices)`` where there are several slabs.
     """
     volume, stopwatch = resident.volume, stopwatch or Stopwatch()
     check_shape(volume.shape_ijk, pad)
@@ -261,22 +222,9 @@ def mark_voxels(
 ) -> VoxelMask:
     """Mark the voxels of a list.
 
-    Parameters
-    ----------
-    device : Device
-    voxels : ndarray, shape (n, 3), int32, or VoxelNumbers of uint32
-        Voxels within the volume, by index or by number.
-    shape_ijk : (ni, nj, nk)
-    pad : int
-        Words of zeros behind each row.
-    stopwatch : Stopwatch, optional
-
-    Raises
-    ------
-    UsageError
-        The volume is too large, see `check_shape`.
-    DeviceError
-        The device fails.
+    voxels: ndarray, shape (n, 3), int32, or VoxelNumbers of uint32. Voxels within the volume, by index or by number.
+    shape_ijk: (ni, nj, nk)
+    pad: Words of zeros behind each row.
     """
     check_shape(shape_ijk, pad)
     ni, nj, nk = shape_ijk

@@ -30,15 +30,7 @@ class MaskComponents(MaskShapes):
 
         Enclosed is what no way over faces of voxels that are not chosen joins with the border of the volume.
 
-        Parameters
-        ----------
-        by_slice : bool
-            In each slice alone: what its chosen voxels enclose in the slice.
-
-        Raises
-        ------
-        DeviceError
-            The device has no room for three masks and the runs of voxels, or it fails.
+        by_slice: In each slice alone: what its chosen voxels enclose in the slice.
         """
         self._check_budget(3)
         device, shape, size = self.device, self.shape_ijk, mask_bytes(self.shape_ijk)["mask of the voxels"]
@@ -54,18 +46,8 @@ class MaskComponents(MaskShapes):
     def grow(self: Bits, points_mm: ArrayLike) -> Bits:
         """Choose the components that hold a point: chosen voxels joined with it by faces of chosen voxels.
 
-        Parameters
-        ----------
-        points_mm : array_like, shape (n, 3)
-            LPS mm; each belongs to the voxel whose centre is nearest along the axes of the volume.
-
-        Raises
-        ------
-        UsageError
-            There are no points, or one lies outside of the volume or in a voxel that is not chosen; the message has the
-            distance to the nearest chosen voxel.
-        DeviceError
-            The device has no room for two masks and the runs of voxels, or it fails.
+        points_mm: array_like, shape (n, 3). LPS mm; each belongs to the voxel whose centre is nearest along the axes of
+            the volume.
         """
         points = checked_points(points_mm)
         if not len(points) or not np.isfinite(points).all():

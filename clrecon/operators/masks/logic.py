@@ -33,13 +33,7 @@ OPERATIONS = {
 
 
 def prepare_logic(device: Device, dtype: DTypeLike = np.int16) -> Program:
-    """Build the kernels; `dtype` is that of voxels.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels; `dtype` is that of voxels."""
     return load_program(device, "masks/logic.cl", voxel_variants(dtype))
 
 

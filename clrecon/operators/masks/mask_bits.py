@@ -23,15 +23,7 @@ Bits = TypeVar("Bits", bound="MaskBits")
 
 
 class MaskBits:
-    """One bit for each voxel of a volume, on a device; what `clrecon.Mask` is made of.
-
-    Attributes
-    ----------
-    volume : Volume
-    device : Device
-    memory : int or None
-    name : str
-    """
+    """One bit for each voxel of a volume, on a device; what `clrecon.Mask` is made of."""
 
     def __init__(self, volume: Volume, mask_d: Any, name: str, *, device: Device, memory: int | None = None):
         self.volume, self.device, self.memory, self.name = volume, device, memory, name

@@ -31,19 +31,8 @@ class MaskShapes(MaskBits):
         The distance is that of the voxels' centres in the patient: the result is that of a distance transform in mm
         that is at most `mm` (1 + 1e-6).  Tilted, oblique and uneven stacks are exact.
 
-        Parameters
-        ----------
-        mm : float
-            Above 0; below every step of the voxels nothing changes.
-        by_slice : bool
-            Within each slice alone, by discs.
-
-        Raises
-        ------
-        UsageError
-            `mm` is not a number above 0, or so large that the work would take hours.
-        DeviceError
-            The device has no room for two masks, or it fails.
+        mm: Above 0; below every step of the voxels nothing changes.
+        by_slice: Within each slice alone, by discs.
         """
         return self._made(self._spread(mm, by_slice), f"({self.name}) dilated by {mm:g} mm")
 
@@ -53,15 +42,7 @@ class MaskShapes(MaskBits):
 
         Nothing beyond the volume is chosen, so that what reaches its border is eroded from there too.
 
-        Parameters
-        ----------
-        mm, by_slice
-            As for `dilate`.
-
-        Raises
-        ------
-        UsageError, DeviceError
-            As for `dilate`.
+        mm, by_slice: As for `dilate`.
         """
         return self._made(self._erode(mm, by_slice), f"({self.name}) eroded by {mm:g} mm")
 
@@ -69,15 +50,7 @@ class MaskShapes(MaskBits):
     def open(self: Shapes, mm: float, *, by_slice: bool = False) -> Shapes:
         """Erode, then dilate: all balls of this radius that fit into what is chosen and into the volume.
 
-        Parameters
-        ----------
-        mm, by_slice
-            As for `dilate`.
-
-        Raises
-        ------
-        UsageError, DeviceError
-            As for `dilate`.
+        mm, by_slice: As for `dilate`.
         """
         eroded = self._made(self._erode(mm, by_slice), self.name)
         return self._made(eroded._spread(mm, by_slice), f"({self.name}) opened by {mm:g} mm")
@@ -88,15 +61,7 @@ class MaskShapes(MaskBits):
 
         What lies beyond the volume counts as chosen for the erosion, so that all that was chosen stays.
 
-        Parameters
-        ----------
-        mm, by_slice
-            As for `dilate`.
-
-        Raises
-        ------
-        UsageError, DeviceError
-            As for `dilate`.
+        mm, by_slice: As for `dilate`.
         """
         dilated = self._made(self._spread(mm, by_slice), self.name)
         return self._made(dilated._spread(mm, by_slice, erode=True, beyond=True), f"({self.name}) closed by {mm:g} mm")
@@ -108,19 +73,8 @@ class MaskShapes(MaskBits):
         A way takes a step along i, j or k at a time; along each axis it may be as long as `mm`, in whole steps rounded
         up.  Along an axis whose step is longer than `mm` there is none.
 
-        Parameters
-        ----------
-        room : Mask
-            Of the same volume.
-        mm : float
-            Above 0.
-
-        Raises
-        ------
-        UsageError
-            `mm` is not a number above 0, or the other mask is of another volume.
-        DeviceError
-            As for `dilate`.
+        room: Of the same volume.
+        mm: Above 0.
         """
         radius = checked_mm(mm, "the length of the ways")
         steps = np.array(self.volume.spacing)

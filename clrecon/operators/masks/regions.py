@@ -25,12 +25,8 @@ BOX_SLACK_MM = 1e-6
 class RowSpans:
     """Spans of voxels in rows of a volume.
 
-    Attributes
-    ----------
-    columns : ndarray, shape (n, 2), uint16
-        First and last voxel of each span.
-    row_counts : ndarray, shape (nj nk + 1,), uint32
-        First span of each row k nj + j, and n.
+    columns: ndarray, shape (n, 2), uint16. First and last voxel of each span.
+    row_counts: ndarray, shape (nj nk + 1,), uint32. First span of each row k nj + j, and n.
     """
 
     columns: NDArray[np.uint16]
@@ -50,26 +46,14 @@ class RowSpans:
 
 
 def checked_mm(mm: float, what: str) -> float:
-    """Return a length as a float.
-
-    Raises
-    ------
-    UsageError
-        It is not a finite number above 0.
-    """
+    """Return a length as a float."""
     if isinstance(mm, bool) or not isinstance(mm, (int, float, np.number)) or not 0.0 < float(mm) < np.inf:
         raise UsageError(f"{what} is {mm!r}: a number of mm above 0 is needed")
     return float(mm)
 
 
 def checked_box(box: Sequence[float | None] | ArrayLike) -> Float64Array:
-    """Return the sides of a box, shape (3, 2), open ones infinite.
-
-    Raises
-    ------
-    UsageError
-        These are not six numbers, x0, x1, y0, y1, z0, z1, the lower one of each pair first.
-    """
+    """Return the sides of a box, shape (3, 2), open ones infinite."""
     try:
         sides = np.array([np.nan if side is None else side for side in box], dtype=np.float64)  # type: ignore[union-attr]
         low, high = sides.reshape(3, 2).T
@@ -85,10 +69,7 @@ def checked_box(box: Sequence[float | None] | ArrayLike) -> Float64Array:
 def box_spans(volume: Volume, sides: Float64Array) -> RowSpans:
     """Find the voxels whose centres lie in a box.
 
-    Parameters
-    ----------
-    sides : ndarray, shape (3, 2)
-        LPS mm, see `checked_box`; see `BOX_SLACK_MM`.
+    sides: ndarray, shape (3, 2). LPS mm, see `checked_box`; see `BOX_SLACK_MM`.
     """
     _, nj, nk = volume.shape_ijk
     starts = volume.slice_origins()[:, None, :] + np.arange(nj)[:, None] * volume.affine[:3, 1]
@@ -104,17 +85,8 @@ def box_spans(volume: Volume, sides: Float64Array) -> RowSpans:
 def tube_spans(volume: Volume, points: ArrayLike, radius_mm: float) -> RowSpans:
     """Find the voxels whose centres lie within a distance of a line through points.
 
-    Parameters
-    ----------
-    points : array_like, shape (n, 3)
-        LPS mm; of one point the tube is a ball.
-    radius_mm : float
-        Distances up to ``radius_mm * (1 + 1e-6)`` are within.
-
-    Raises
-    ------
-    UsageError
-        There are no points, they are no numbers, or the radius is not above 0.
+    points: array_like, shape (n, 3). LPS mm; of one point the tube is a ball.
+    radius_mm: Distances up to ``radius_mm * (1 + 1e-6)`` are within.
     """
     line = checked_points(points)
     if not len(line) or not np.isfinite(line).all():

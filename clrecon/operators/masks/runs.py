@@ -36,13 +36,7 @@ PARTS_PER_CORE = 4
 
 
 def prepare_runs(device: Device) -> Program:
-    """Build the kernels.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels."""
     prepare_scan(device)
     prepare_components(device)
     return load_program(device, "masks/runs.cl")
@@ -71,17 +65,11 @@ class StencilTable:
 class RowRuns:
     """Runs of set voxels along i, on a device.
 
-    Attributes
-    ----------
-    runs_d : buffer, (count, 2) uint16
-        First and last column, row by row; None before `list_runs`.
-    row_counts_d : buffer, (2, rows + 1) uint32
-        First run of each row, and `count`; `count` and the voxels of all rows before.
-    count : int
-    voxels : int
-        Set voxels of the mask.
-    lone : bool
-        Each voxel is a run of its own.
+    runs_d: buffer, (count, 2) uint16. First and last column, row by row; None before `list_runs`.
+    row_counts_d: buffer, (2, rows + 1) uint32. First run of each row, and `count`; `count` and the voxels of all rows
+        before.
+    voxels: Set voxels of the mask.
+    lone: Each voxel is a run of its own.
     """
 
     runs_d: Any
@@ -96,18 +84,8 @@ def count_runs(
 ) -> RowRuns:
     """Count the runs of each row.
 
-    Parameters
-    ----------
-    mask : VoxelMask
-    bits_d : buffer, (nk, nj, words) uint32
-        Voxels of the mask whose runs are counted; may be the mask itself.
-    lone : bool
-        Each voxel is a run of its own.
-
-    Raises
-    ------
-    DeviceMemoryError
-        There are more voxels and runs than 32 bits can number.
+    bits_d: buffer, (nk, nj, words) uint32. Voxels of the mask whose runs are counted; may be the mask itself.
+    lone: Each voxel is a run of its own.
     """
     rows = mask.rows
     counts_d = allocate(device, 8 * (rows + 1))
@@ -148,30 +126,14 @@ def join_runs(
 ) -> tuple[int, Any]:
     """Number the components of runs that are neighbours by a stencil.
 
-    Parameters
-    ----------
-    listed : RowRuns
-        At least one run.
-    forward : StencilTable
-        Rows behind the voxel, see `Stencil.forward`.
-    check : callable
-        Called with the number of pairs of runs in different parts before memory is taken for them: 12 bytes a pair and
-        5 a run.
-    parts_per_core : int
-        Of CPU devices; the numbers do not depend on it.
+    listed: At least one run.
+    forward: Rows behind the voxel, see `Stencil.forward`.
+    check: Called with the number of pairs of runs in different parts before memory is taken for them: 12 bytes a pair
+        and 5 a run.
+    parts_per_core: Of CPU devices; the numbers do not depend on it.
 
-    Returns
-    -------
-    count : int
-    numbers_d : buffer, (runs,) int32
-        Component of each run, in the order of their first runs.
-
-    Raises
-    ------
-    DeviceMemoryError
-        There are more pairs than 32 bits can number.
-    DeviceError
-        The device fails or computes wrongly.
+    Returns:
+    numbers_d: buffer, (runs,) int32. Component of each run, in the order of their first runs.
     """
     program = prepare_runs(device)
     _, nj, nk = shape_ijk
@@ -224,13 +186,8 @@ def write_runs(
 class Components:
     """Components of the set voxels of a mask by the faces of voxels, run by run, on a device.
 
-    Attributes
-    ----------
-    runs : RowRuns
-    count : int
-        Number of components.
-    numbers_d : buffer, (runs.count,) int32
-        Component of each run, in the order of their first runs.
+    count: Number of components.
+    numbers_d: buffer, (runs.count,) int32. Component of each run, in the order of their first runs.
     """
 
     runs: RowRuns
@@ -249,15 +206,7 @@ def find_components(
 ) -> Components:
     """Find the components of set voxels that share a face, in the volume or within each slice.
 
-    Parameters
-    ----------
-    beside : int
-        Bytes that are taken on the device for other masks meanwhile.
-
-    Raises
-    ------
-    DeviceError
-        The device has no room for the runs, or it fails.
+    beside: Bytes that are taken on the device for other masks meanwhile.
     """
     needs = {"masks of the voxels": sum(mask.needs().values()) + beside, "counts of rows": 12 * (mask.rows + 1)}
     check_budget(device, needs, memory)
@@ -310,16 +259,11 @@ def mark_with_voxels(
 ) -> tuple[Any, NDArray[np.int32]]:
     """Return a buffer with a mark for each component, 1 where it holds a voxel of a list, and each voxel's component.
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (n, 3), int32
-        i, j, k within the volume.
+    voxels: ndarray, shape (n, 3), int32. i, j, k within the volume.
 
-    Returns
-    -------
-    marks_d : buffer, (components,) uint8
-    components : ndarray, shape (n,), int32
-        -1 where the voxel is not set.
+    Returns:
+    marks_d: buffer, (components,) uint8
+    components: ndarray, shape (n,), int32. -1 where the voxel is not set.
     """
     n = len(voxels)
     marks_d = zero_words(device, -(-found.count // 4), stopwatch=stopwatch)

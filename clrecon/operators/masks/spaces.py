@@ -25,13 +25,9 @@ WIDE_ML = 20.0
 class Spaces:
     """The components of what is not in a mask that it encloses, see `find_spaces`.
 
-    Attributes
-    ----------
-    numbers : ndarray, shape (n,)
-        Number of each among all components, ascending.
-    ml, mean_hu : ndarray, shape (n,)
-    at_ends : ndarray, shape (n,), bool
-        True where an end of the volume cuts the space.
+    numbers: ndarray, shape (n,). Number of each among all components, ascending.
+    ml, mean_hu: ndarray, shape (n,)
+    at_ends: ndarray, shape (n,), bool. True where an end of the volume cuts the space.
     """
 
     volume: Volume
@@ -149,11 +145,6 @@ def find_spaces(mask: Mask) -> Spaces:
     A space is a component, by faces of voxels, of what is not in the mask.  It is enclosed if it does not reach the
     border of the volume, or reaches it only within what the mask encloses in that end slice alone: there an end of the
     volume cuts it, as that of a scan cuts the canal of a long bone.
-
-    Raises
-    ------
-    DeviceError
-        The device has no room for the masks and the runs of voxels, or it fails.
     """
     device, shape, volume = mask.device, mask.shape_ijk, mask.volume
     rest = (~mask).bits
@@ -182,13 +173,7 @@ def find_spaces(mask: Mask) -> Spaces:
 
 
 def find_joints(mask: Mask, reach_mm: float, least_ml: float) -> Mask:
-    """Choose what lies within a distance of two pieces of a mask that are apart and have some volume each.
-
-    Raises
-    ------
-    DeviceError
-        As for `find_spaces`.
-    """
+    """Choose what lies within a distance of two pieces of a mask that are apart and have some volume each."""
     device, shape, volume = mask.device, mask.shape_ijk, mask.volume
     words = mask_bytes(shape)["mask of the voxels"]
     found = find_components(device, mask.bits, beside=3 * words, memory=mask.memory)

@@ -48,13 +48,7 @@ CELL_OF_SPACING = 2.0
 
 
 def prepare_bilateral(device: Device) -> Program:
-    """Build the kernels of `denoise_points`, but for those of neighbours and planes.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels of `denoise_points`, but for those of neighbours and planes."""
     return load_program(device, "points/bilateral.cl", {"LANES": device.kernel_variants["LANES"]})
 
 
@@ -143,12 +137,7 @@ class _Settings:
 
     @classmethod
     def checked(cls, k: int, range_factor: float, iterations: int, features: str | None, paper: bool) -> _Settings:
-        """Check the parameters of `denoise_points`.
-
-        Raises
-        ------
-        UsageError
-        """
+        """Check the parameters of `denoise_points`."""
         if isinstance(range_factor, bool) or not isinstance(range_factor, (int, float)):
             raise UsageError(f"range_factor is a positive number, not {range_factor!r}")
         if not 0.0 < range_factor < math.inf:

@@ -43,16 +43,9 @@ def choose_cell_edge(points: NDArray[np.floating], k: int) -> float:
     probability (1 - f)^c.  So a small sample tells the density of the whole cloud, in points of any dimension, and a
     dense spot does not outweigh the rest.
 
-    Parameters
-    ----------
-    points : ndarray, shape (n, 3)
-        At least one, finite.
-    k : int
+    points: ndarray, shape (n, 3). At least one, finite.
 
-    Returns
-    -------
-    float
-        mm.  Results do not depend on it.
+    Returns: mm.  Results do not depend on it.
     """
     n = len(points)
     low, high = find_box(points).astype(np.float64)

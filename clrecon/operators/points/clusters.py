@@ -353,13 +353,7 @@ def _corners(ijk: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int3
 
 
 def _order_voxels(ijk: NDArray[np.int32]) -> tuple[NDArray[np.int64] | None, NDArray[np.int32]]:
-    """Return the order k, j, i of voxels, None if they have it already, and the voxels in that order.
-
-    Raises
-    ------
-    UsageError
-        A voxel is there twice.
-    """
+    """Return the order k, j, i of voxels, None if they have it already, and the voxels in that order."""
     low, high = _corners(ijk)
     ni, nj, nk = (high.astype(np.int64) - low + 1).tolist()
     kind = np.int32 if ni * nj * nk < 1 << 31 else np.int64
@@ -391,13 +385,7 @@ def _restore_order(
 
 
 def _find_lattice(cloud: PointCloud, volume: Volume | None) -> tuple[Lattice, NDArray[np.int32]]:
-    """Return the lattice of a cloud's voxels, and the voxel that it begins with.
-
-    Raises
-    ------
-    UsageError
-        It is not known, or the points are not at their voxels.
-    """
+    """Return the lattice of a cloud's voxels, and the voxel that it begins with."""
     assert cloud.ijk is not None
     low, high = _corners(cloud.ijk)
     some = cloud.ijk[:: _stride(cloud)]

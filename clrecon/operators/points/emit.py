@@ -48,17 +48,11 @@ Points = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]
 class Selection:
     """The voxels that become points.
 
-    Attributes
-    ----------
-    low, high : scalar of the voxels' type
-        Lowest and highest value, both included.
-    shell : bool
-        True: only those with one of six neighbours outside; beyond the volume all is outside.
-    labels : ndarray, shape (nk, nj, ni), uint8 or uint16, or None
-        On the volume's grid: only voxels with `label`, or with any number but 0 where it is 0.
-    label : int
-    paper : bool
-        True: every slice is put where the first one lies.
+    low, high: Lowest and highest value, both included.
+    shell: Only those with one of six neighbours outside; beyond the volume all is outside.
+    labels: ndarray, shape (nk, nj, ni), uint8 or uint16, or None. On the volume's grid: only voxels with `label`, or
+        with any number but 0 where it is 0.
+    paper: Every slice is put where the first one lies.
     """
 
     low: Any
@@ -70,13 +64,7 @@ class Selection:
 
 
 def prepare_voxels(device: Device, dtype: DTypeLike, labels: DTypeLike | None = None) -> Program:
-    """Build the kernels for volumes of `dtype` and label maps of type `labels`.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels for volumes of `dtype` and label maps of type `labels`."""
     prepare_scan(device)
     prepare_classify(device, dtype, "between")
     own = {} if labels is None else label_variants(labels)
@@ -93,18 +81,9 @@ def _double_float(values: NDArray[np.float64]) -> NDArray[np.float64]:
 class VoxelEmission:
     """The points of one volume, slab by slab, with fewer slices in a slab if the device has no room for more.
 
-    Attributes
-    ----------
-    resident : DeviceVolume
-    selection : Selection
-    origin : ndarray, shape (3,), float64, or None
-        The point that positions are counted from, see `find_vertex_origin`.
-    marked : int
-        Voxels in the band, before labels and shells take some away.
-    slabs : int
-    largest : dict of str to int
-        Bytes on the device of the largest slab: "volume", "scratch", "output".
-    warnings : list of str
+    origin: ndarray, shape (3,), float64, or None. The point that positions are counted from, see `find_vertex_origin`.
+    marked: Voxels in the band, before labels and shells take some away.
+    largest: Bytes on the device of the largest slab: "volume", "scratch", "output".
     """
 
     resident: DeviceVolume
@@ -138,13 +117,7 @@ class VoxelEmission:
         return "shell of voxels" if self.selection.shell else "voxels"
 
     def run(self, progress: Progress | None = None) -> Points:
-        """Make the points of the whole volume.
-
-        Raises
-        ------
-        DeviceError
-            Not even one slice fits, there are 2^31 points or more, or the device fails.
-        """
+        """Make the points of the whole volume."""
         labels = self.selection.labels
         with self.stopwatch.timed("build"):
             prepare_voxels(self.resident.device, self.volume.voxels.dtype, None if labels is None else labels.dtype)

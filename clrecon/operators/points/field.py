@@ -68,14 +68,10 @@ class FieldSettings:
 class Nodes:
     """The nodes of a field: whole bricks, at least B and a spacing beyond the points on each side.
 
-    Attributes
-    ----------
-    corner : ndarray, shape (3,), float32
-        Node (0, 0, 0) in mm relative to `base`.
-    base : ndarray, shape (3,), float64
-        LPS mm, as of the grid.
-    spacing : numpy.float32
-    bricks : (x, y, z)
+    corner: ndarray, shape (3,), float32. Node (0, 0, 0) in mm relative to `base`.
+    base: ndarray, shape (3,), float64. LPS mm, as of the grid.
+    spacing: numpy.float32
+    bricks: (x, y, z)
     """
 
     corner: NDArray[np.float32]
@@ -134,13 +130,7 @@ class Nodes:
 
 
 def plan_nodes(points: GridPlan, settings: FieldSettings) -> Nodes:
-    """Lay nodes around the points of a grid.
-
-    Raises
-    ------
-    UsageError
-        There are more than `MOST_NODES`.
-    """
+    """Lay nodes around the points of a grid."""
     h = np.float32(settings.spacing)
     margin = settings.bridge + float(h)
     low, high = points.points.min(axis=0).astype(np.float64), points.points.max(axis=0).astype(np.float64)
@@ -178,24 +168,9 @@ class _Slab:
 class NodeField:
     """The field of a cloud on a device, for one set of lengths.
 
-    Parameters
-    ----------
-    device : Device
-    points : array_like, shape (n, 3)
-        LPS mm, or a `PointCloud`.
-    normals : ndarray, shape (n, 3), float32
-        Unit vectors that point outward.
-    settings : FieldSettings
-    memory : int, optional
-        Bytes that may be taken on the device; None is all of its memory.
-    stopwatch : Stopwatch, optional
-
-    Raises
-    ------
-    UsageError
-        The points or the spacing cannot be used.
-    DeviceMemoryError
-        The device has no room even for a slab of one layer of bricks.
+    points: array_like, shape (n, 3). LPS mm, or a `PointCloud`.
+    normals: ndarray, shape (n, 3), float32. Unit vectors that point outward.
+    memory: Bytes that may be taken on the device; None is all of its memory.
     """
 
     def __init__(

@@ -37,10 +37,8 @@ def prepare_signs(device: Device) -> Program:
 class Masks:
     """Masks of nodes on a device, cleared: a bit for each node, rows along x of whole words.
 
-    Attributes
-    ----------
-    near_d, core_d, negative_d : buffer, (nz, ny, words) uint32
-        Nodes within B of a point, those within one spacing, and near ones whose field is not positive.
+    near_d, core_d, negative_d: buffer, (nz, ny, words) uint32. Nodes within B of a point, those within one spacing, and
+        near ones whose field is not positive.
     """
 
     COUNT: ClassVar[int] = 6
@@ -73,16 +71,10 @@ class Masks:
 class Signs:
     """What `decide_signs` found.
 
-    Attributes
-    ----------
-    inside_d : buffer, (nz, ny, words) uint32
-        Nodes inside.
-    votes, against : int
-        Votes for far regions, and those against the winner.
-    regions : int
-        Number of far regions.
-    outside_is_inside : bool
-        The region around everything was voted inside: the normals point inward.
+    inside_d: buffer, (nz, ny, words) uint32. Nodes inside.
+    votes, against: Votes for far regions, and those against the winner.
+    regions: Number of far regions.
+    outside_is_inside: The region around everything was voted inside: the normals point inward.
     """
 
     inside_d: Any
@@ -197,24 +189,10 @@ def decide_signs(
 ) -> Signs:
     """Decide which nodes are inside; see `clrecon.reference.points.field.decide_signs`.
 
-    Parameters
-    ----------
-    masks : Masks
-        Its `negative_d` is used up.
-    limits : MemoryLimits
-    rounds : int
-        Nodes that signs flood from a far node on.
-    memory : int, optional
-        Bytes that may be taken on the device; None is all of its memory.
-    taken : int
-        Bytes that are taken already, those of the masks among them.
-
-    Raises
-    ------
-    DeviceMemoryError
-        The device has no room for the runs of far nodes.
-    DeviceError
-        The device fails or computes wrongly.
+    masks: Its `negative_d` is used up.
+    rounds: Nodes that signs flood from a far node on.
+    memory: Bytes that may be taken on the device; None is all of its memory.
+    taken: Bytes that are taken already, those of the masks among them.
     """
     decision = _Decision(masks, limits, memory, taken)
     runs = decision.find_runs()

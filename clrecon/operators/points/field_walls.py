@@ -25,15 +25,11 @@ _BITS = np.array([bin(number).count("1") for number in range(1 << 16)], np.uint8
 class Walls:
     """Faces between an inner and an outer node, by cube of `CUBE` nodes; arrays of shape (cubes_z, cubes_y, cubes_x).
 
-    Attributes
-    ----------
-    faces : int64
-        All faces whose lower node is in the cube.
-    walls : int64
-        Those that no points support: the field itself has one sign on both sides, or a side is far from all points.
-    enclosed : float64
-        Volume that the walls of the cube enclose, in cubes of the node spacing: ``sum((x - c) . n) / 3`` over their
-        middles x, with their mean c and normals n towards the inside.  It is near 0 for flat walls.
+    faces: int64. All faces whose lower node is in the cube.
+    walls: int64. Those that no points support: the field itself has one sign on both sides, or a side is far from all
+        points.
+    enclosed: float64. Volume that the walls of the cube enclose, in cubes of the node spacing: ``sum((x - c) . n) / 3``
+        over their middles x, with their mean c and normals n towards the inside.  It is near 0 for flat walls.
     """
 
     faces: NDArray[np.int64]
@@ -65,17 +61,9 @@ class Walls:
 def find_walls(near: Words, negative: Words, inside: Words, nx: int) -> Walls:
     """Count the faces of a surface and those without support; see `clrecon.reference.points.field.find_walls`.
 
-    Parameters
-    ----------
-    near, negative, inside : ndarray, shape (nz, ny, words), uint32
-        Masks of nodes, bit b of word w is node 32 w + b: within the bridge of a point, the sign of the field there, and
-        the decided sign.
-    nx : int
-        Nodes of a row.
-
-    Returns
-    -------
-    Walls
+    near, negative, inside: ndarray, shape (nz, ny, words), uint32. Masks of nodes, bit b of word w is node 32 w + b:
+        within the bridge of a point, the sign of the field there, and the decided sign.
+    nx: Nodes of a row.
     """
     nz, ny, words = near.shape
     shape = (-(-nz // CUBE), -(-ny // CUBE), words)

@@ -72,19 +72,12 @@ CELLS_AN_ITEM = 32
 class FreeClusters:
     """The result of `cluster_free_points`.
 
-    Attributes
-    ----------
-    labels : ndarray, shape (n,), int32
-        Cluster of each point, numbered by the first core point; -1 is noise.
-    cores : ndarray, shape (n,), bool
-        The core points.
-    count : int
-        Number of clusters.
-    facts : dict
-        For a report: eps, min_samples, clusters, core and noise points, edge and number of the grid's cells, the device
-        and the seconds of its kernels.
-    warnings : tuple of str
-        A line each.
+    labels: ndarray, shape (n,), int32. Cluster of each point, numbered by the first core point; -1 is noise.
+    cores: ndarray, shape (n,), bool. The core points.
+    count: Number of clusters.
+    facts: For a report: eps, min_samples, clusters, core and noise points, edge and number of the grid's cells, the
+        device and the seconds of its kernels.
+    warnings: A line each.
     """
 
     labels: NDArray[np.int32]
@@ -110,13 +103,7 @@ def _check(eps: float, min_samples: int) -> None:
 
 
 def plan_cells(points: ArrayLike, eps: float) -> GridPlan:
-    """Lay a grid over points whose cells are so small that all points of one are within eps of each other.
-
-    Raises
-    ------
-    UsageError
-        As `clrecon.operators.points.grid.plan_grid`.
-    """
+    """Lay a grid over points whose cells are so small that all points of one are within eps of each other."""
     places = np.asarray(points)
     low, high = find_box(places).astype(np.float64)
     extent = high - low
@@ -144,33 +131,13 @@ def cluster_free_points(
     `eps` of each other belong to one cluster.  Clusters are numbered by their first core point in the order of the
     points; other points near core points take the lowest number among these; all others are noise, -1.
 
-    Parameters
-    ----------
-    points : array_like, shape (n, 3)
-        LPS mm, finite, or a `PointCloud`.  Distances are those of the points as float32, of far clouds relative to
-        whole millimetres near their centre, and are compared as in exact arithmetic.
-    eps : float
-        mm.  Distances up to ``eps * (1 + 1e-6)`` are within.
-    min_samples : int
-        From 1 on; 1 gives connected components.
-    device : Device, str or int, optional
-        See `clrecon.device`; None is the best of the machine.
-    memory : int, optional
-        Bytes that may be taken on the device; None is all that it has.
-    progress : callable, optional
-        Called as ``progress("clusters", done, 4)`` after the grid, the core points, the links and the labels.
-
-    Returns
-    -------
-    FreeClusters
-
-    Raises
-    ------
-    UsageError
-        `eps` or `min_samples` cannot be used, a point is not finite, the grid would have too many cells, or more than
-        1e12 pairs of points would have to be compared.
-    DeviceError
-        No device, no room for the points, or the device fails.
+    points: array_like, shape (n, 3). LPS mm, finite, or a `PointCloud`.  Distances are those of the points as float32,
+        of far clouds relative to whole millimetres near their centre, and are compared as in exact arithmetic.
+    eps: mm.  Distances up to ``eps * (1 + 1e-6)`` are within.
+    min_samples: From 1 on; 1 gives connected components.
+    device: See `clrecon.device`; None is the best of the machine.
+    memory: Bytes that may be taken on the device; None is all that it has.
+    progress: Called as ``progress("clusters", done, 4)`` after the grid, the core points, the links and the labels.
 
     References
     ----------
@@ -223,21 +190,14 @@ def find_clusters(
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_], int, int]:
     """Cluster the points of a plan on one device; parameters are those of `cluster_free_points`.
 
-    Parameters
-    ----------
-    plan : GridPlan
-        As `plan_cells` makes it for `eps`.
-    per_chunk : int, optional
-        Cells of a chunk, a multiple of `CELLS_AN_ITEM`; the result does not depend on it.
+    plan: As `plan_cells` makes it for `eps`.
+    per_chunk: Cells of a chunk, a multiple of `CELLS_AN_ITEM`; the result does not depend on it.
 
-    Returns
-    -------
-    labels : ndarray, shape (n,), int32
-    cores : ndarray, shape (n,), bool
-    count : int
-        Number of clusters.
-    cells : int
-        Number of cells with points.
+    Returns:
+    labels: ndarray, shape (n,), int32
+    cores: ndarray, shape (n,), bool
+    count: Number of clusters.
+    cells: Number of cells with points.
     """
     tell = ignore_progress if progress is None else progress
     n = len(plan.points)
@@ -260,16 +220,10 @@ def find_clusters(
 class ClusterSearch:
     """The passes of cl/points/free_clusters.cl, in their order.
 
-    Attributes
-    ----------
-    core_x_d : buffer, (n + PADDING,) float32
-        x of core points, NaN for others.
-    labels_d : buffer, (cells,) uint32
-        After each step the cells' labels, all of them roots.
-    roots_d : buffer, (nz, ny, words) uint32
-        Roots of words, as the search noted them last.
-    count : int
-        Number of clusters, once `label` has run.
+    core_x_d: buffer, (n + PADDING,) float32. x of core points, NaN for others.
+    labels_d: buffer, (cells,) uint32. After each step the cells' labels, all of them roots.
+    roots_d: buffer, (nz, ny, words) uint32. Roots of words, as the search noted them last.
+    count: Number of clusters, once `label` has run.
     """
 
     def __init__(
@@ -311,13 +265,7 @@ class ClusterSearch:
         launch(self._device, (program or self._program)[kernel], items, stopwatch=self._stopwatch, **arguments)
 
     def check_pairs(self) -> None:
-        """Refuse clouds that are so dense that comparing their points would take many minutes.
-
-        Raises
-        ------
-        UsageError
-            More than `MOST_PAIRS` pairs may have to be compared.
-        """
+        """Refuse clouds that are so dense that comparing their points would take many minutes."""
         n, cells = self._grid.n, self._grid.cells
         if float(n) * n <= MOST_PAIRS:
             return

@@ -34,13 +34,7 @@ FARTHEST = 2.0**29
 
 
 def prepare_gradients(device: Device, dtype: np.dtype) -> Program:  # type: ignore[type-arg]
-    """Build the kernel for volumes of `dtype`.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernel for volumes of `dtype`."""
     return load_program(device, "points/gradients.cl", voxel_variants(dtype))
 
 
@@ -56,26 +50,12 @@ def find_gradients(
 
     A volume that does not fit the device goes through it slab by slab, with the same result.
 
-    Parameters
-    ----------
-    resident : DeviceVolume
-    points : ndarray, shape (n, 3), LPS mm
-    stopwatch : Stopwatch
-    progress : callable, optional
-        Called as ``progress("gradients", slices done, all slices)``.
-    warnings : list of str, optional
-        Gets a line each time that the device had no room for the planned slabs.
+    points: ndarray, shape (n, 3), LPS mm
+    progress: Called as ``progress("gradients", slices done, all slices)``.
+    warnings: Gets a line each time that the device had no room for the planned slabs.
 
-    Returns
-    -------
-    ndarray, shape (n, 3), float32
-        HU per mm, LPS.  Beyond the border the volume is surrounded by its lowest value, at least -1024 HU; farther
-        away the gradient is zero.
-
-    Raises
-    ------
-    DeviceError
-        Four slices do not fit the device beside the points, or it fails.
+    Returns: ndarray, shape (n, 3), float32. HU per mm, LPS.  Beyond the border the volume is surrounded by its lowest
+        value, at least -1024 HU; farther away the gradient is zero.
     """
     volume, nk = resident.volume, resident.volume.shape_ijk[2]
     places = np.clip(volume.lps_to_ijk(points), -FARTHEST, FARTHEST).astype(np.float32)

@@ -73,17 +73,13 @@ _CHUNK = 256
 class GridPlan:
     """A grid before its points are sorted: all that is known without a device.
 
-    Attributes
-    ----------
-    points : ndarray, shape (n, 3), float32
-        mm relative to `base`.
-    base : ndarray, shape (3,), float64
-        LPS mm: whole millimetres near the centre of a far cloud, see `clrecon.geometry.precision`, else zeros.
-    corner : ndarray, shape (3,), float32
-        Corner of cell (0, 0, 0) relative to `base`: the lowest coordinates less 1e-3 of the edge.
-    edge : numpy.float32
-        Edge of the cells in mm.
-    shape : (nx, ny, nz)
+    points: ndarray, shape (n, 3), float32. mm relative to `base`.
+    base: ndarray, shape (3,), float64. LPS mm: whole millimetres near the centre of a far cloud, see
+        `clrecon.geometry.precision`, else zeros.
+    corner: ndarray, shape (3,), float32. Corner of cell (0, 0, 0) relative to `base`: the lowest coordinates less 1e-3
+        of the edge.
+    edge: numpy.float32. Edge of the cells in mm.
+    shape: (nx, ny, nz)
     """
 
     points: NDArray[np.float32]
@@ -118,34 +114,20 @@ class GridPlan:
 class PointGrid:
     """A grid over points on a device: cubic cells, the points sorted by cell; cl/points/grid.h shows how it is read.
 
-    Attributes
-    ----------
-    device : Device
-    n : int
-        Number of points.
-    edge : float
-        Edge of the cells in mm, a float32.
-    origin : ndarray, shape (3,), float64
-        LPS mm of the corner of cell (0, 0, 0).
-    base : ndarray, shape (3,), float64
-        LPS mm; coordinates on the device are relative to it.
-    shape : (nx, ny, nz)
-        Number of cells; at most 2^31 in all, and 2^17 along an axis.
-    words : int
-        Words of 32 cells in a row along x.
-    mask_d : buffer, (nz, ny, words) uint32
-        A bit for each cell with points.
-    ranks_d : buffer, (nz, ny, words) uint32
-        Number of cells with points before each word.
-    cells : int
-        Number of cells with points.
-    starts_d : buffer, (cells + 1,) uint32
-        First sorted point of each cell with points, then `n`.
-    order_d : buffer, (n,) uint32
-        Number of the point at each place of the sorted order; points of a cell are in the order of the input.
-    x_d, y_d, z_d : buffer, (n + PADDING,) float32
-        Sorted coordinates in mm relative to `base`; the last ones are undefined, so that a vector can be read from any
-        point on.
+    n: Number of points.
+    edge: Edge of the cells in mm, a float32.
+    origin: ndarray, shape (3,), float64. LPS mm of the corner of cell (0, 0, 0).
+    base: ndarray, shape (3,), float64. LPS mm; coordinates on the device are relative to it.
+    shape: (nx, ny, nz). Number of cells; at most 2^31 in all, and 2^17 along an axis.
+    words: Words of 32 cells in a row along x.
+    mask_d: buffer, (nz, ny, words) uint32. A bit for each cell with points.
+    ranks_d: buffer, (nz, ny, words) uint32. Number of cells with points before each word.
+    cells: Number of cells with points.
+    starts_d: buffer, (cells + 1,) uint32. First sorted point of each cell with points, then `n`.
+    order_d: buffer, (n,) uint32. Number of the point at each place of the sorted order; points of a cell are in the
+        order of the input.
+    x_d, y_d, z_d: buffer, (n + PADDING,) float32. Sorted coordinates in mm relative to `base`; the last ones are
+        undefined, so that a vector can be read from any point on.
     """
 
     device: Device
@@ -195,17 +177,8 @@ def find_box(points: NDArray[np.floating]) -> NDArray[np.floating]:
 def plan_grid(points: ArrayLike, edge: float) -> GridPlan:
     """Lay a grid over points.
 
-    Parameters
-    ----------
-    points : array_like, shape (n, 3), float32 or float64
-        LPS mm, or a `PointCloud`; at least one point.
-    edge : float
-        Edge of the cells in mm.
-
-    Raises
-    ------
-    UsageError
-        There is no point, a coordinate is not finite, or the cells are too small for the box of the points.
+    points: array_like, shape (n, 3), float32 or float64. LPS mm, or a `PointCloud`; at least one point.
+    edge: Edge of the cells in mm.
     """
     places = np.asarray(points)
     if places.ndim != 2 or places.shape[1] != 3 or len(places) == 0:
@@ -227,13 +200,7 @@ def plan_grid(points: ArrayLike, edge: float) -> GridPlan:
 
 
 def _count_cells(box: NDArray[np.float32], corner: NDArray[np.float32], edge: np.float32) -> tuple[int, int, int]:
-    """Return the cells along each axis, counted as the kernels place points.
-
-    Raises
-    ------
-    UsageError
-        There are too many.
-    """
+    """Return the cells along each axis, counted as the kernels place points."""
     with np.errstate(over="ignore"):
         last = np.floor((box[1] - corner) * (np.float32(1.0) / edge)).astype(np.float64)
     counts = [int(min(value, 2.0**62)) + 1 for value in last]
@@ -258,30 +225,11 @@ def make_grid(
 ) -> PointGrid:
     """Sort points by the cubic cells of a grid: `plan_grid`, then `fill_grid`.
 
-    Parameters
-    ----------
-    device : Device
-    points : array_like, shape (n, 3), float32 or float64
-        LPS mm, or a `PointCloud`; at least one point.
-    edge : float
-        Edge of the cells in mm.
-    memory : int, optional
-        Bytes that may be taken on the device; None is all of its memory.
-    stopwatch : Stopwatch, optional
+    points: array_like, shape (n, 3), float32 or float64. LPS mm, or a `PointCloud`; at least one point.
+    edge: Edge of the cells in mm.
+    memory: Bytes that may be taken on the device; None is all of its memory.
 
-    Returns
-    -------
-    PointGrid
-        Equal on every device, and to `clrecon.reference.points.grid.make_grid`.
-
-    Raises
-    ------
-    UsageError
-        As `plan_grid`.
-    DeviceMemoryError
-        The device has no room for the grid.
-    DeviceError
-        The device fails.
+    Returns: Equal on every device, and to `clrecon.reference.points.grid.make_grid`.
     """
     return fill_grid(device, plan_grid(points, edge), memory=memory, stopwatch=stopwatch)
 

@@ -92,13 +92,7 @@ class Part(NamedTuple):
 
 
 def prepare_neighbours(device: Device) -> Program:
-    """Build the kernels of `find_neighbours`.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels of `find_neighbours`."""
     prepare_grid(device)
     return load_program(device, "points/neighbours.cl", {"LANES": "1" if _has_one_lane(device) else "8"})
 
@@ -109,13 +103,7 @@ def _has_one_lane(device: Device) -> bool:
 
 
 def take_points(points: PointCloud | ArrayLike) -> NDArray[np.floating]:
-    """Return the points of a cloud, or an array of points after the checks of a cloud; not empty.
-
-    Raises
-    ------
-    UsageError
-        Points cannot be used, see `PointCloud`, or there is none.
-    """
+    """Return the points of a cloud, or an array of points after the checks of a cloud; not empty."""
     cloud = points if isinstance(points, PointCloud) else PointCloud(points)
     if len(cloud) == 0:
         raise UsageError("the cloud is empty: there is no point whose neighbours could be found")
@@ -125,19 +113,9 @@ def take_points(points: PointCloud | ArrayLike) -> NDArray[np.floating]:
 def check_neighbours(k: int, points: int, fewest: int = 1) -> tuple[int, tuple[str, ...]]:
     """Return the number of neighbours that a cloud has for each point, at most ``k``, and a warning if it is less.
 
-    Parameters
-    ----------
-    k : int
-        Neighbours that are asked for, the point itself among them.
-    points : int
-        Points of the cloud.
-    fewest : int
-        Fewest that may be asked for.
-
-    Raises
-    ------
-    UsageError
-        ``k`` is not a whole number from `fewest` to `MOST_NEIGHBOURS`.
+    k: Neighbours that are asked for, the point itself among them.
+    points: Points of the cloud.
+    fewest: Fewest that may be asked for.
     """
     if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not fewest <= k <= MOST_NEIGHBOURS:
         raise UsageError(
@@ -152,30 +130,11 @@ def check_neighbours(k: int, points: int, fewest: int = 1) -> tuple[int, tuple[s
 class NeighbourSearch:
     """A grid over points and the kernel that lists neighbours by it.
 
-    Parameters
-    ----------
-    device : Device
-    points : ndarray, shape (n, 3)
-        At least one, finite.
-    k : int
-        At most n.
-    needs : dict of str to int
-        Bytes of further buffers, for the forecast.
-    memory : int, optional
-    stopwatch : Stopwatch
+    points: ndarray, shape (n, 3). At least one, finite.
+    k: At most n.
+    needs: Bytes of further buffers, for the forecast.
 
-    Attributes
-    ----------
-    grid : PointGrid
-    parts : list of Part
-        All cells, in parts of some `PART_POINTS` points.
-
-    Raises
-    ------
-    UsageError
-        So many points lie in one cell that more than `MOST_PAIRS` pairs would be compared.
-    DeviceMemoryError
-        There is no room for all buffers.
+    parts: All cells, in parts of some `PART_POINTS` points.
     """
 
     def __init__(

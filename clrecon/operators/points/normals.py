@@ -50,29 +50,16 @@ _STATES = {
 
 
 def prepare_normals(device: Device) -> Program:
-    """Build the kernels of `estimate_normals`, but for those that search neighbours.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels of `estimate_normals`, but for those that search neighbours."""
     return load_program(device, "points/normals.cl", {"LANES": device.kernel_variants["LANES"]})
 
 
 class PlaneFits:
     """Planes through the neighbours of the points of one part after another.
 
-    Parameters
-    ----------
-    search : NeighbourSearch
-    stopwatch : Stopwatch
-
-    Attributes
-    ----------
-    neighbours_d : buffer, (most places of a part, k) int32
-    normals_d : buffer, (3, place_count) float32
-    variations_d : buffer, (place_count,) float32
+    neighbours_d: buffer, (most places of a part, k) int32
+    normals_d: buffer, (3, place_count) float32
+    variations_d: buffer, (place_count,) float32
     """
 
     def __init__(self, search: NeighbourSearch, stopwatch: Stopwatch):

@@ -31,24 +31,12 @@ __all__ = ["DistanceMeasure", "prepare_outliers", "remove_outliers"]
 
 
 def prepare_outliers(device: Device) -> Program:
-    """Build the kernel of `remove_outliers`, but for those that search neighbours.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernel of `remove_outliers`, but for those that search neighbours."""
     return load_program(device, "points/outliers.cl", {"LANES": device.kernel_variants["LANES"]})
 
 
 class DistanceMeasure:
-    """Mean and nearest distance of each point to its neighbours, filled by one part after another.
-
-    Parameters
-    ----------
-    search : NeighbourSearch
-    stopwatch : Stopwatch
-    """
+    """Mean and nearest distance of each point to its neighbours, filled by one part after another."""
 
     def __init__(self, search: NeighbourSearch, stopwatch: Stopwatch):
         self._search, self._stopwatch = search, stopwatch

@@ -194,13 +194,7 @@ def _check_cloud(cloud: PointCloud) -> NDArray[np.float32]:
 def _choose_lengths(
     spacing: float, noisy: bool, reach: float | None, smoothing: float | None, bridge: float | None
 ) -> FieldSettings:
-    """Return the lengths, with those that are not given.
-
-    Raises
-    ------
-    UsageError
-        They do not go together.
-    """
+    """Return the lengths, with those that are not given."""
     shares = NOISY if noisy else CLEAN
     b = BRIDGE_SHARE * spacing if bridge is None else float(bridge)
     r = max(shares["reach"] * spacing, b) if reach is None else float(reach)

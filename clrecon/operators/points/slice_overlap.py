@@ -17,34 +17,14 @@ __all__ = ["count_overlaps", "find_ghost_slices", "prepare_slice_overlap"]
 
 
 def prepare_slice_overlap(device: Device) -> Program:
-    """Build the kernel of `count_overlaps`.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernel of `count_overlaps`."""
     return load_program(device, "points/slice_overlap.cl")
 
 
 def count_overlaps(device: Device, mask: VoxelMask, *, stopwatch: Stopwatch | None = None) -> NDArray[np.int64]:
     """Count the voxels of each slice, and those that it has in common with the next slice and with the one after.
 
-    Parameters
-    ----------
-    device : Device
-    mask : VoxelMask
-    stopwatch : Stopwatch, optional
-
-    Returns
-    -------
-    ndarray, shape (3, nk), int64
-        0 where there is no such slice.
-
-    Raises
-    ------
-    DeviceError
-        The device fails.
+    Returns: ndarray, shape (3, nk), int64. 0 where there is no such slice.
     """
     _, nj, nk = mask.shape_ijk
     counts_d = allocate(device, 12 * mask.rows)

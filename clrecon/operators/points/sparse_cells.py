@@ -57,15 +57,7 @@ def prepare_sparse_cells(device: Device) -> Program:
 
 
 def choose_edge(cloud: PointCloud, *, device: Device | str | int | None = None, memory: int | None = None) -> float:
-    """Return twice the median distance from a point to the 16th of its nearest points, itself counted, in mm.
-
-    Raises
-    ------
-    UsageError
-        The cloud is empty, or that distance is 0.
-    DeviceError
-        As `find_neighbours`.
-    """
+    """Return twice the median distance from a point to the 16th of its nearest points, itself counted, in mm."""
     if len(cloud) == 1:
         raise UsageError("the cloud has one point, so that no edge of cells can be chosen: leave it as it is")
     found = find_neighbours(cloud, NEIGHBOURS, device=device, memory=memory)
@@ -97,15 +89,7 @@ def grow_cells(
     memory: int | None = None,
     stopwatch: Stopwatch | None = None,
 ) -> _Grown:
-    """Find the cells that stay; parameters are those of `remove_sparse_cells`.
-
-    Raises
-    ------
-    DeviceMemoryError
-        The device has no room for the grid.
-    DeviceError
-        The device fails.
-    """
+    """Find the cells that stay; parameters are those of `remove_sparse_cells`."""
     needs = {**plan.needs(device), "labels of cells": 9 * len(plan.points), "marks of points": len(plan.points)}
     shortage = describe_shortage(memory_limits(device, memory), needs)
     if shortage:

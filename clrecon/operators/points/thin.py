@@ -42,15 +42,7 @@ def prepare_thin(device: Device) -> Program:
 def choose_points(
     device: Device, plan: GridPlan, *, memory: int | None = None, stopwatch: Stopwatch | None = None
 ) -> NDArray[np.uint32]:
-    """Return the number of the point nearest to the mean of each cell with points, in the order of the cells.
-
-    Raises
-    ------
-    DeviceMemoryError
-        The device has no room for the grid.
-    DeviceError
-        The device fails.
-    """
+    """Return the number of the point nearest to the mean of each cell with points, in the order of the cells."""
     needs = {**plan.needs(device), "chosen points": 4 * len(plan.points)}
     shortage = describe_shortage(memory_limits(device, memory), needs)
     if shortage:

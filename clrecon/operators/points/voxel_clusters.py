@@ -49,13 +49,7 @@ LARGEST_WORK = 1e11
 
 
 def checked_min_samples(min_samples: int) -> int:
-    """Return `min_samples`.
-
-    Raises
-    ------
-    UsageError
-        It is not a whole number from 1 to 255.
-    """
+    """Return `min_samples`."""
     whole = isinstance(min_samples, (int, np.integer)) and not isinstance(min_samples, bool)
     if not whole or not 1 <= min_samples <= MOST_SAMPLES:
         raise UsageError(
@@ -82,13 +76,7 @@ def search_bytes(mask_bytes: dict[str, int], stencil: Stencil, rows: int) -> dic
 
 
 def prepare_voxel_clusters(device: Device) -> Program:
-    """Build the kernels of `ClusterSearch`.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels of `ClusterSearch`."""
     prepare_runs(device)
     return load_program(device, "points/voxel_clusters.cl", {"LANES": device.kernel_variants["LANES"]})
 
@@ -96,37 +84,14 @@ def prepare_voxel_clusters(device: Device) -> Program:
 class ClusterSearch:
     """The clusters of the set voxels of a mask.
 
-    Parameters
-    ----------
-    device : Device
-    mask : VoxelMask
-        With `pad_for` words of zeros behind its rows.
-    stencil : Stencil
-        Of the same volume.
-    min_samples : int
-    memory : int, optional
-        Bytes that may be taken on the device; None is all of its memory.
-    parts_per_core : int
-        Of CPU devices; the labels do not depend on it.
-    stopwatch : Stopwatch, optional
+    mask: With `pad_for` words of zeros behind its rows.
+    stencil: Of the same volume.
+    memory: Bytes that may be taken on the device; None is all of its memory.
+    parts_per_core: Of CPU devices; the labels do not depend on it.
 
-    Attributes
-    ----------
-    points, runs, count : int
-        Number of set voxels, of runs of core voxels along i, and of clusters.
-    numbers_d : buffer, (runs,) int32
-        Cluster of each run, numbered by their first core voxel in the order k, j, i.
-    device_bytes : int
-        Most bytes on the device at a time.
-
-    Raises
-    ------
-    UsageError
-        `min_samples` is out of range, or the stencil is so large that the work would take hours.
-    DeviceMemoryError
-        The device has no room.
-    DeviceError
-        The device fails or computes wrongly.
+    points, runs, count: Number of set voxels, of runs of core voxels along i, and of clusters.
+    numbers_d: buffer, (runs,) int32. Cluster of each run, numbered by their first core voxel in the order k, j, i.
+    device_bytes: Most bytes on the device at a time.
     """
 
     def __init__(
@@ -230,14 +195,10 @@ class ClusterSearch:
     def label(self, numbers: NDArray[np.int32] | None = None) -> NDArray[np.int32]:
         """Return the cluster of each point in the order k, j, i, -1 for noise.
 
-        Parameters
-        ----------
-        numbers : ndarray, shape (runs,), int32, optional
-            Other numbers of the runs' clusters; border points take the lowest of these.
+        numbers: ndarray, shape (runs,), int32. Other numbers of the runs' clusters; border points take the lowest of
+            these.
 
-        Returns
-        -------
-        ndarray, shape (points,), int32
+        Returns: ndarray, shape (points,), int32
         """
         labels, labels_d = empty_output(self._device, (self.points,), np.int32)
         if not self.runs:

@@ -38,25 +38,8 @@ def _load_compact(device: Device) -> Program:
 def compact(device: Device, mask_d: Any, words: int, *, stopwatch: Stopwatch | None = None) -> Compacted:
     """Find the positions of the set bits of a bit mask.
 
-    Parameters
-    ----------
-    device : Device
-    mask_d : buffer, (words,) uint32
-        Bit b of word w is position ``32 * w + b``.
-    words : int
-        Number of words, 1 to 2^27, so that positions fit 32 bits.
-    stopwatch : Stopwatch, optional
-
-    Returns
-    -------
-    Compacted
-
-    Raises
-    ------
-    UsageError
-        `words` is out of range.
-    DeviceError
-        The device fails.
+    mask_d: buffer, (words,) uint32. Bit b of word w is position ``32 * w + b``.
+    words: Number of words, 1 to 2^27, so that positions fit 32 bits.
     """
     if not 1 <= words <= LARGEST_MASK:
         raise UsageError(f"{words:,} words: a mask has 1 to {LARGEST_MASK:,}, so that positions fit 32 bits")

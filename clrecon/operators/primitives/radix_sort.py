@@ -28,12 +28,8 @@ MOST_CHUNKS = 4096
 class Sorted:
     """Sorted keys on the device.
 
-    Attributes
-    ----------
-    keys_d : buffer, (n,) uint32
-        Ascending.
-    values_d : buffer, (n,) uint32
-        Number of each of them in the input; equal keys are in the order of the input.
+    keys_d: buffer, (n,) uint32. Ascending.
+    values_d: buffer, (n,) uint32. Number of each of them in the input; equal keys are in the order of the input.
     """
 
     keys_d: Any
@@ -74,27 +70,9 @@ def radix_sort(
 ) -> Sorted:
     """Sort keys, and find the number of each of them in the input; equal keys stay in the order of the input.
 
-    Parameters
-    ----------
-    device : Device
-    keys_d : buffer, (n,) uint32
-        They stay as they are.
-    n : int
-        Number of elements, 1 to 2^31.
-    bits : int
-        Bits of the keys that can be set, from the lowest: as many passes are made as they need.
-    stopwatch : Stopwatch, optional
-
-    Returns
-    -------
-    Sorted
-
-    Raises
-    ------
-    UsageError
-        `n` or `bits` is out of range.
-    DeviceError
-        The device fails.
+    keys_d: buffer, (n,) uint32. They stay as they are.
+    n: Number of elements, 1 to 2^31.
+    bits: Bits of the keys that can be set, from the lowest: as many passes are made as they need.
     """
     if not 1 <= n <= LARGEST_SCAN:
         raise UsageError(f"{n:,} elements: a sort takes 1 to {LARGEST_SCAN:,}")

@@ -44,26 +44,9 @@ def exclusive_scan(
 ) -> Scanned:
     """Compute the sum of all counts before each element.
 
-    Parameters
-    ----------
-    device : Device
-    counts_d : buffer, (n,) uint32
-    n : int
-        Number of elements, at least 1.
-    in_place : bool
-        True: the offsets overwrite the counts and need no memory of their own.
-    stopwatch : Stopwatch, optional
-
-    Returns
-    -------
-    Scanned
-
-    Raises
-    ------
-    UsageError
-        `n` is out of range.
-    DeviceError
-        The device fails.
+    counts_d: buffer, (n,) uint32
+    n: Number of elements, at least 1.
+    in_place: The offsets overwrite the counts and need no memory of their own.
     """
     _check_size(n)
     offsets_d = counts_d if in_place else allocate(device, 4 * n)
@@ -80,10 +63,8 @@ def _check_size(n: int) -> None:
 def enqueue_scan(device: Device, counts_d: Any, offsets_d: Any, n: int, *, stopwatch: Stopwatch | None = None) -> Any:
     """Enqueue the same for offsets in a buffer that is there, which may be that of the counts.
 
-    Returns
-    -------
-    total_d : buffer, (1,) uint64
-        The exact total; nothing is waited for.
+    Returns:
+    total_d: buffer, (1,) uint64. The exact total; nothing is waited for.
     """
     _check_size(n)
     scan = _load_scan(device)

@@ -34,13 +34,7 @@ MOST_PASSES = 1000
 
 
 def prepare_components(device: Device) -> Program:
-    """Build the kernels now, so that a later `label_components` does not wait for them.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels now, so that a later `label_components` does not wait for them."""
     prepare_compact(device)
     return load_program(device, "primitives/union_find.cl")
 
@@ -55,33 +49,15 @@ def label_components(
 ) -> tuple[int, NDArray[np.int64]]:
     """Number the components of a mesh: triangles that share a vertex belong to one.
 
-    Parameters
-    ----------
-    device : Device
-    triangles : array_like, shape (m, 3), uint32
-        Indices of vertices.
-    vertex_count : int
-    memory : int, optional
-        Bytes that may be taken on the device; None is all of its memory.
-    stopwatch : Stopwatch, optional
-        Records the time of the kernels.
+    triangles: array_like, shape (m, 3), uint32. Indices of vertices.
+    memory: Bytes that may be taken on the device; None is all of its memory.
+    stopwatch: Records the time of the kernels.
 
-    Returns
-    -------
-    count : int
-        Number of components, not counting vertices that no triangle uses.
-    labels : ndarray, shape (vertex_count,), int64
-        Component of each vertex, numbered in order of the first vertex; -1 for unused vertices.  Equal on every device,
-        and equal to the result of `clrecon.mesh.connectivity.label_components`.
-
-    Raises
-    ------
-    UsageError
-        A triangle refers to a vertex that does not exist, or there are more than 2^31 vertices or 2^32 - 1 triangles.
-    DeviceMemoryError
-        The device has no room for the mesh and its labels.
-    DeviceError
-        The device fails or computes wrongly.
+    Returns:
+    count: Number of components, not counting vertices that no triangle uses.
+    labels: ndarray, shape (vertex_count,), int64. Component of each vertex, numbered in order of the first vertex; -1
+        for unused vertices.  Equal on every device, and equal to the result of
+        `clrecon.mesh.connectivity.label_components`.
     """
     faces = np.ascontiguousarray(triangles, dtype=np.uint32).reshape(-1, 3)
     _check_mesh(faces, vertex_count)
@@ -105,32 +81,16 @@ def join_parts(
 ) -> tuple[int, Any]:
     """Number the components of nodes that are joined within parts already, once the parts are joined by pairs.
 
-    Parameters
-    ----------
-    device : Device
-    labels_d : buffer, (n,) uint32
-        The smallest node of each node's component within its part, a root; of a lone node its own number.  Overwritten.
-    spare_d : buffer, (n,) uint32
-        The same of roots; all else is arbitrary.  Overwritten.
-    n : int
-        Number of nodes, at least 1.
-    links_d : buffer, (links, 3) uint32
-        Pairs (a, b, b) of roots that belong together.
-    links : int
-        Number of pairs.
-    stopwatch : Stopwatch, optional
+    labels_d: buffer, (n,) uint32. The smallest node of each node's component within its part, a root; of a lone node
+        its own number.  Overwritten.
+    spare_d: buffer, (n,) uint32. The same of roots; all else is arbitrary.  Overwritten.
+    n: Number of nodes, at least 1.
+    links_d: buffer, (links, 3) uint32. Pairs (a, b, b) of roots that belong together.
+    links: Number of pairs.
 
-    Returns
-    -------
-    count : int
-        Number of components, lone nodes counted.
-    numbers_d : buffer, (n,) int32
-        Component of each node, numbered in order of the first node.
-
-    Raises
-    ------
-    DeviceError
-        The device fails or computes wrongly.
+    Returns:
+    count: Number of components, lone nodes counted.
+    numbers_d: buffer, (n,) int32. Component of each node, numbered in order of the first node.
     """
     rounds = _Rounds(device, stopwatch, labels_d, spare_d, n)
     if links:
@@ -151,31 +111,17 @@ def hook_in_rounds(
 ) -> tuple[Any, Any]:
     """Find components by a kernel that hooks roots to smaller ones, in rounds, until it hooks none.
 
-    Parameters
-    ----------
-    device : Device
-    labels_d : buffer, (n,) uint32
-        For each node a root, which is its own label, of its component and not above it; 2^32 - 1 for nodes that take
-        no part.
-    other_d : buffer, (n,) uint32
-        Overwritten.
-    n : int
-        Number of nodes, at least 1.
-    hook : callable
-        Called with the labels, all of them roots; with a copy, in which it lowers the label of a root by atomic_min()
+    labels_d: buffer, (n,) uint32. For each node a root, which is its own label, of its component and not above it; 2^32
+        - 1 for nodes that take no part.
+    other_d: buffer, (n,) uint32. Overwritten.
+    n: Number of nodes, at least 1.
+    hook: Called with the labels, all of them roots; with a copy, in which it lowers the label of a root by atomic_min()
         to another root of the same component; with two flags, of which it sets the second to the number that it is
         called with where it finds such a root; and with that number.
-    stopwatch : Stopwatch, optional
 
-    Returns
-    -------
-    labels_d, other_d : buffer, (n,) uint32
-        The same two: labels that are all roots, the least node of each component, and a free buffer.
-
-    Raises
-    ------
-    DeviceError
-        The device fails or computes wrongly.
+    Returns:
+    labels_d, other_d: buffer, (n,) uint32. The same two: labels that are all roots, the least node of each component,
+        and a free buffer.
     """
     rounds = _Rounds(device, stopwatch, labels_d, other_d, n)
     rounds.start()
@@ -214,10 +160,8 @@ class _Rounds:
     def number(self, labels_d: Any, spare_d: Any, n: int) -> tuple[int, Any]:
         """Number the components by their roots.
 
-        Returns
-        -------
-        count : int
-        numbers_d : buffer, (n,) int32
+        Returns:
+        numbers_d: buffer, (n,) int32
         """
         self.run("flag_roots", n, labels=labels_d, roots=spare_d, n=n)
         roots = exclusive_scan(self._device, spare_d, n, stopwatch=self._stopwatch)
@@ -325,10 +269,8 @@ class _Search(_Rounds):
     def find_roots(self) -> tuple[Any, Any]:
         """Run all rounds.
 
-        Returns
-        -------
-        labels_d, spare_d : buffer, (n,) uint32
-            Labels whose labels are all roots, and a free buffer.
+        Returns:
+        labels_d, spare_d: buffer, (n,) uint32. Labels whose labels are all roots, and a free buffer.
         """
         self.run("clear_labels", self._vertices, labels=self._other_d, flags=self._flags_d, n=self._vertices)
         self.run("hook_corners", self._faces, triangles=self._faces_d, labels=self._other_d, m=self._faces)

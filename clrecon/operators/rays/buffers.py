@@ -36,12 +36,8 @@ def count_queues(device: Device) -> int:
 class Between:
     """The part of the rays between two layers, for a ray caster that adds a volume to their states.
 
-    Attributes
-    ----------
-    states_d : buffer, (h, w, 2) float4
-        See cl/rays/layers.cl.
-    nearest_d, farthest_d : buffer, (h, w) float32
-        Mm along the ray where it begins and ends.
+    states_d: buffer, (h, w, 2) float4. See cl/rays/layers.cl.
+    nearest_d, farthest_d: buffer, (h, w) float32. Mm along the ray where it begins and ends.
     """
 
     states_d: Any
@@ -52,15 +48,8 @@ class Between:
 class DrawnVolume(NamedTuple):
     """A volume for a picture of layers.
 
-    Attributes
-    ----------
-    device : Device
-    sample : callable
-        Adds what the volume shows between two layers to the states of the rays, and waits.
-    near_mm : float
-        Where its rays begin, see `VIEW_NEAR` in cl/rays/view.h.
-    stopwatch : Stopwatch
-    warnings : list of str
+    sample: Adds what the volume shows between two layers to the states of the rays, and waits.
+    near_mm: Where its rays begin, see `VIEW_NEAR` in cl/rays/view.h.
     """
 
     device: Device
@@ -73,15 +62,10 @@ class DrawnVolume(NamedTuple):
 class PictureBuffers:
     """The picture that kernels write, slab by slab.
 
-    Attributes
-    ----------
-    image_d : buffer, (h, w, 4) uint8
-    depths_d, means_d : buffer, (h, w) float32
-        First hit, and expected depth or a value.
-    states_d : buffer, (h, w, 8) float32
-        State that a slab hands to the next slab; one entry if there is only one slab.
-    background : ndarray, shape (4,), float32
-        Red, green, blue, and 1; the last is 0 without a background.
+    image_d: buffer, (h, w, 4) uint8
+    depths_d, means_d: buffer, (h, w) float32. First hit, and expected depth or a value.
+    states_d: buffer, (h, w, 8) float32. State that a slab hands to the next slab; one entry if there is only one slab.
+    background: ndarray, shape (4,), float32. Red, green, blue, and 1; the last is 0 without a background.
     """
 
     def __init__(

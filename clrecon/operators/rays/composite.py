@@ -42,25 +42,17 @@ LOWEST_LOG = -1000.0
 class TransferTables:
     """A transfer function in tables for one ray step.
 
-    Attributes
-    ----------
-    colors_d : buffer, (NODES,) int32
-        Red, green and blue, 10 bits each.
-    opacities_d : buffer, (NODES,) float32
-        Opacities over one ray step.
-    clears_d : buffer, (NODES,) float32
-        Transparency of one of the `PARTS` parts of a ray step.
-    changes_d : buffer, (NODES,) float32
-        Sum of the changes of the opacity, up and down, from the first node to each node.
-    shown : ndarray, shape (NODES,), bool
-    steepness : Steepness
-        Steepness of `opacities_d`.
-    low, scale : float
-        Nearest node to v: ``floor((v - low) * scale + 0.5)``.
-    factors_d : buffer, (GRADIENT_NODES,) float32
-        Factors on the opacity, by magnitude of the gradient times `factor_scale`; used if it is `weighed`.
-    steps_per_unit : float
-        Number of ray steps in the unit distance.
+    colors_d: buffer, (NODES,) int32. Red, green and blue, 10 bits each.
+    opacities_d: buffer, (NODES,) float32. Opacities over one ray step.
+    clears_d: buffer, (NODES,) float32. Transparency of one of the `PARTS` parts of a ray step.
+    changes_d: buffer, (NODES,) float32. Sum of the changes of the opacity, up and down, from the first node to each
+        node.
+    shown: ndarray, shape (NODES,), bool
+    steepness: Steepness of `opacities_d`.
+    low, scale: Nearest node to v: ``floor((v - low) * scale + 0.5)``.
+    factors_d: buffer, (GRADIENT_NODES,) float32. Factors on the opacity, by magnitude of the gradient times
+        `factor_scale`; used if it is `weighed`.
+    steps_per_unit: Number of ray steps in the unit distance.
     """
 
     colors_d: Any
@@ -140,16 +132,12 @@ class TransferTables:
 class MainWay:
     """The main direction of a picture's rays through the bricks of a slab.
 
-    Attributes
-    ----------
-    axis : int
-        0, 1 or 2 for i, j or k.
-    ahead : int
-        1 or -1: the direction along the axis.
-    eye : ndarray, shape (4,), float32
-        The camera in bricks, and 1; or the direction of all rays in bricks, 1 along `axis`, and 0.
-    aside : float
-        Distance in bricks from the camera, or drift to the side per brick ahead, from which on rays count as drifting.
+    axis: 0, 1 or 2 for i, j or k.
+    ahead: 1 or -1: the direction along the axis.
+    eye: ndarray, shape (4,), float32. The camera in bricks, and 1; or the direction of all rays in bricks, 1 along
+        `axis`, and 0.
+    aside: Distance in bricks from the camera, or drift to the side per brick ahead, from which on rays count as
+        drifting.
     """
 
     axis: int
@@ -194,19 +182,11 @@ def composite_slab(
 ) -> None:
     """Blend one slab into a picture, and wait.
 
-    Parameters
-    ----------
-    view : RayView
-        With the slab's focus.
-    leaps : LeapMap
-        Of this slab, for the transfer function of `tables`.
-    labels : ResampledLabels, optional
-        Labels on the grid of the volume.
-    style : LabelStyle, optional
-    output : PictureBuffers
-        Picture with the results of earlier slabs.
-    between : Between, optional
-        The part of the rays that counts; only the states of `output` are written.
+    view: With the slab's focus.
+    leaps: Of this slab, for the transfer function of `tables`.
+    labels: Labels on the grid of the volume.
+    output: Picture with the results of earlier slabs.
+    between: The part of the rays that counts; only the states of `output` are written.
     """
     device = resident.device
     variants = {"GRADIENT_OPACITY": "1"} if tables.weighed else {}

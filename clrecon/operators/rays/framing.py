@@ -37,16 +37,10 @@ def framing_key(volume: Volume, style: Style) -> tuple[object, ...]:
 def shown_box(shown: Volume | DeviceVolume, style: Style) -> Grid:
     """Return the grid that cameras fit.
 
-    Parameters
-    ----------
-    shown : Volume or DeviceVolume
-        The latter brings labels to the grid of the volume once for all pictures.
-    style : Style
+    shown: The latter brings labels to the grid of the volume once for all pictures.
 
-    Returns
-    -------
-    Grid
-        The volume itself where all of it is shown, or nothing.  Else the box of what can be seen, see `find_seen_box`.
+    Returns: The volume itself where all of it is shown, or nothing.  Else the box of what can be seen, see
+        `find_seen_box`.
     """
     volume = shown.volume if isinstance(shown, DeviceVolume) else shown
     clip = getattr(style, "clip", None)

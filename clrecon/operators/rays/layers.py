@@ -50,15 +50,10 @@ class Still(NamedTuple):
 class LayeredPicture(NamedTuple):
     """A picture of layers.
 
-    Attributes
-    ----------
-    image : ndarray, shape (h, w, 4), uint8
-    depth, expected_depth : ndarray, shape (h, w), float32
-        Mm along the ray; NaN where nothing is.
-    layers : int
-        Layers that were drawn.
-    open_pixels : int
-        Pixels that may have further ones, which are left out.
+    image: ndarray, shape (h, w, 4), uint8
+    depth, expected_depth: ndarray, shape (h, w), float32. Mm along the ray; NaN where nothing is.
+    layers: Layers that were drawn.
+    open_pixels: Pixels that may have further ones, which are left out.
     """
 
     image: NDArray[np.uint8]
@@ -85,39 +80,16 @@ def draw_layers(
 ) -> LayeredPicture:
     """Draw triangles, with what lies before, between and behind them.
 
-    Parameters
-    ----------
-    device : Device
-    parts : sequence of MeshPart
-        The first triangles of the first part have the lowest numbers: of triangles at the same depth they are nearer.
-    camera : Camera
-    size : (width, height)
-    still : Still, optional
-        A picture of the same camera: one further layer at its depth.
-    volume : callable, optional
-        Adds what a volume shows between two layers to the states of the rays, and waits; called from front to back.
-    near_mm : float
-        Where the volume's rays begin, see `VIEW_NEAR` in cl/rays/view.h.
-    most : int
-        Most layers.
-    background : str or (float, float, float), optional
-        None: transparent.
-    memory : int, optional
-        Bytes that may be taken on the device.
-    stopwatch : Stopwatch, optional
-    progress : callable, optional
-        Called as ``progress("layers", done, most)`` before each layer.
-
-    Returns
-    -------
-    LayeredPicture
-
-    Raises
-    ------
-    UsageError
-        The triangles would cover too many pixels.
-    DeviceError
-        The device has no room for picture and triangles, or it fails.
+    parts: The first triangles of the first part have the lowest numbers: of triangles at the same depth they are
+        nearer.
+    size: (width, height)
+    still: A picture of the same camera: one further layer at its depth.
+    volume: Adds what a volume shows between two layers to the states of the rays, and waits; called from front to back.
+    near_mm: Where the volume's rays begin, see `VIEW_NEAR` in cl/rays/view.h.
+    most: Most layers.
+    background: str or (float, float, float). None: transparent.
+    memory: Bytes that may be taken on the device.
+    progress: Called as ``progress("layers", done, most)`` before each layer.
     """
     needs = {"picture": PIXEL_BYTES * size[0] * size[1], "triangles": sum(part.device_bytes for part in parts)}
     check_budget(device, needs, memory)

@@ -46,14 +46,9 @@ def find_leaps(
 ) -> LeapMap:
     """Return the leap map for visible values, or the map that was made for `key` before.
 
-    Parameters
-    ----------
-    key : hashable
-        Identifies the source of `shown`.
-    shown : ndarray, shape (nodes,), bool
-        Which nodes of a table of values are visible.
-    low, scale : float
-        Nearest node to a value v: ``floor((v - low) * scale + 0.5)``, within the table.
+    key: Identifies the source of `shown`.
+    shown: ndarray, shape (nodes,), bool. Which nodes of a table of values are visible.
+    low, scale: Nearest node to a value v: ``floor((v - low) * scale + 0.5)``, within the table.
     """
     known = slab.maps.get(key)
     if known is not None:

@@ -26,13 +26,7 @@ SMALLEST_SIDE_MM = 1e-3
 
 
 def mesh_corners(mesh: Mesh) -> Float64Array:
-    """Return the lowest and the highest corner of the box around the triangles of a mesh, (2, 3) in LPS mm.
-
-    Raises
-    ------
-    UsageError
-        The mesh has no triangle, a number that cannot be, or vertices that are too far away.
-    """
+    """Return the lowest and the highest corner of the box around the triangles of a mesh, (2, 3) in LPS mm."""
     mesh.check()
     if not mesh.triangle_count:
         raise UsageError("the mesh has no triangles: there is nothing to show")
@@ -51,10 +45,7 @@ def mesh_corners(mesh: Mesh) -> Float64Array:
 def box_around(corners: Sequence[Float64Array] | NDArray[np.float64]) -> Grid:
     """Return the box of points as a grid of one voxel, which `Camera.fit` places a camera for.
 
-    Parameters
-    ----------
-    corners : array_like, shape (n, 3)
-        LPS mm.
+    corners: array_like, shape (n, 3). LPS mm.
     """
     points = np.concatenate([np.atleast_2d(each) for each in corners])
     low, high = points.min(axis=0), points.max(axis=0)
@@ -64,13 +55,7 @@ def box_around(corners: Sequence[Float64Array] | NDArray[np.float64]) -> Grid:
 
 
 def make_part(mesh: Mesh, look: MeshLook) -> MeshPart:
-    """Return a mesh with its look; what was checked by `mesh_corners` is not checked again.
-
-    Raises
-    ------
-    UsageError
-        The number of colours is not that of the vertices, or there are too many triangles.
-    """
+    """Return a mesh with its look; what was checked by `mesh_corners` is not checked again."""
     if mesh.triangle_count > MOST_TRIANGLES:
         raise UsageError(f"a picture shows at most {MOST_TRIANGLES:,} triangles, the mesh has {mesh.triangle_count:,}")
     colors: NDArray[np.uint8] | None = None

@@ -42,16 +42,7 @@ MOST_NAMED = 24
 def cloud_box(cloud: PointCloud, margin: float = 0.0) -> Grid:
     """Return the box of a cloud as a grid of one voxel, which `Camera.fit` places a camera for.
 
-    Parameters
-    ----------
-    cloud : PointCloud
-    margin : float
-        Mm that the box is larger on every side.
-
-    Raises
-    ------
-    UsageError
-        The cloud has no points.
+    margin: Mm that the box is larger on every side.
     """
     if not len(cloud):
         raise UsageError("the cloud has no points: there is nothing to show")
@@ -76,21 +67,9 @@ class PointPictures(Closing):
 
     Use it as a context manager, or `close` it.
 
-    Parameters
-    ----------
-    cloud : PointCloud
-        Its arrays must not change as long as this object is open.
-    device : Device, str or int, optional
-        See `clrecon.device`; None is the best of the machine.
-    memory : int, optional
-        Bytes that may be taken on the device; a cloud over it goes through in parts.
-
-    Raises
-    ------
-    UsageError
-        The cloud has no points, or `memory` is not a number of bytes.
-    DeviceError
-        The device does not exist.
+    cloud: Its arrays must not change as long as this object is open.
+    device: See `clrecon.device`; None is the best of the machine.
+    memory: Bytes that may be taken on the device; a cloud over it goes through in parts.
     """
 
     def __init__(self, cloud: PointCloud, *, device: Device | str | int | None = None, memory: int | None = None):
@@ -126,22 +105,9 @@ class PointPictures(Closing):
     ) -> Rendering:
         """Take one picture.
 
-        Parameters
-        ----------
-        style : PointLook
-        camera : Camera
-        size : (width, height)
-        background : str or (float, float, float), optional
-            None: transparent.
-        progress : callable, optional
-            Called as ``progress("points", done, total)``.
-
-        Raises
-        ------
-        UsageError
-            The cloud has not what it is to be coloured by, or discs cover too many pixels.
-        DeviceError
-            Not enough memory, or the device fails.
+        size: (width, height)
+        background: str or (float, float, float). None: transparent.
+        progress: Called as ``progress("points", done, total)``.
         """
         radius = self._radius(style)
         colors = self._colors_of(style)
@@ -202,13 +168,7 @@ def _warn_of_radius(radius: float, camera: Camera, size: tuple[int, int]) -> lis
 
 
 def _color_points(cloud: PointCloud, style: PointLook) -> _Colors:
-    """Choose the colour of each point.
-
-    Raises
-    ------
-    UsageError
-        The cloud has not what it is to be coloured by.
-    """
+    """Choose the colour of each point."""
     by = style.color_by
     if by is None and style.color is None:
         if cloud.labels is not None:

@@ -33,9 +33,7 @@ def project_slab(
 ) -> None:
     """Add one slab to a projection; `output.means_d` receives the values.
 
-    Parameters
-    ----------
-    mode : {"mip", "minip", "mean", "drr"}
+    mode: {"mip", "minip", "mean", "drr"}
     """
     variants = {"LEAST_VALUE": f"({AIR_HU:g})"} if mode == "drr" else {}
     device = resident.device

@@ -48,25 +48,10 @@ def take_picture(
 ) -> Rendering:
     """Take one picture of a volume on a device.
 
-    Parameters
-    ----------
-    resident : DeviceVolume
-    style : VolumeLook or Projection
-    camera : Camera
-    size : (width, height)
-    ray_step : float
-        mm.
-    background : str or (float, float, float), optional
-        None: transparent.
-    progress : callable, optional
-        Called as ``progress("slabs", slices done, all slices)``.
-
-    Raises
-    ------
-    DeviceError
-        Not enough memory, or the device fails.
-    RefusedInputError
-        The labels do not lie on the volume.
+    size: (width, height)
+    ray_step: mm.
+    background: str or (float, float, float). None: transparent.
+    progress: Called as ``progress("slabs", slices done, all slices)``.
     """
 
     def take(told: list[str]) -> Rendering:
@@ -88,16 +73,8 @@ def take_with_layers(
 ) -> Rendering:
     """Take a picture of a volume with what lies in it.
 
-    Parameters
-    ----------
-    beside : mapping of str to int
-        Bytes of other buffers on the device.
-    draw : callable
-        Draws the picture; it is called again where the device has no room, or another one takes over.
-
-    Raises
-    ------
-    As `take_picture`.
+    beside: Bytes of other buffers on the device.
+    draw: Draws the picture; it is called again where the device has no room, or another one takes over.
     """
 
     def take(told: list[str]) -> Rendering:

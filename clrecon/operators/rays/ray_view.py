@@ -35,17 +35,12 @@ ENDLESS = 1e30
 class RayView:
     """The rays of a picture in the form for a device.
 
-    Attributes
-    ----------
-    camera : Camera
-    size : (width, height)
-    ray_step : float
-        mm.
-    table : ndarray, shape (rows, 4), float32
-    planes : int
-        Number of clip planes among the rows.
-    spread : ndarray, shape (3,), float64
-        Largest distance in field coordinates between a ray of a tile and the one in its middle, plus one ray step.
+    size: (width, height)
+    ray_step: mm.
+    table: ndarray, shape (rows, 4), float32
+    planes: Number of clip planes among the rows.
+    spread: ndarray, shape (3,), float64. Largest distance in field coordinates between a ray of a tile and the one in
+        its middle, plus one ray step.
     """
 
     camera: Camera
@@ -81,12 +76,9 @@ class RayView:
     ) -> RayView:
         """Set the table up.
 
-        Parameters
-        ----------
-        planes : ndarray, shape (n, 4), float64
-            Half-spaces in LPS mm that are kept: ``normal . p >= offset``.
-        box, focus : (low, high), each ndarray, shape (3,), float64
-            Field coordinates of the volume, and of its visible part.
+        planes: ndarray, shape (n, 4), float64. Half-spaces in LPS mm that are kept: ``normal . p >= offset``.
+        box, focus: (low, high), each ndarray, shape (3,), float64. Field coordinates of the volume, and of its visible
+            part.
         """
         frame = FieldFrame.of(volume)
         right, up, forward = camera.basis()

@@ -115,13 +115,7 @@ def render(
 def _name_objects(
     shown: PointCloud | Mesh | Sequence[Any], style: Style | str | None, look: dict[str, object]
 ) -> list[tuple[Any, Style]]:
-    """Return the objects of a picture, one at least, each with its style.
-
-    Raises
-    ------
-    UsageError
-        There is none, or a style is given where each object has its own, or has none of that mode.
-    """
+    """Return the objects of a picture, one at least, each with its style."""
     if isinstance(shown, Sequence):
         if style is not None or look:
             raise UsageError("of several objects each has its own style: give pairs (object, style)")

@@ -42,13 +42,7 @@ _VOLUME_LOOKS = (VolumeLook, SlicesInSpace, SurfaceLook)
 
 
 def check_objects(objects: Sequence[tuple[Any, Style]]) -> None:
-    """Refuse objects that one picture cannot show together.
-
-    Raises
-    ------
-    UsageError
-        There is none, one is of another kind, its style is not of its kind, or two volumes are translucent.
-    """
+    """Refuse objects that one picture cannot show together."""
     if not objects:
         raise UsageError("a picture shows at least one object")
     translucent = 0
@@ -79,26 +73,13 @@ class ScenePictures(Closing):
 
     Use it as a context manager, or `close` it.
 
-    Parameters
-    ----------
-    objects : sequence of (object, style)
-        Mesh and MeshLook; PointCloud and PointLook; Volume or DeviceVolume and VolumeLook, SlicesInSpace or
-        SurfaceLook.  Their arrays must not change as long as this object is open.  Of triangles at the same depth the
-        first is seen.
-    device : Device, str or int, optional
-        See `clrecon.device`; None is the best of the machine.
-    memory : int, optional
-        Bytes that may be taken on the device.
-    takers : dict, optional
-        What takes pictures of volumes and clouds alone, by the `id` of the object; the caller keeps it for its next
+    objects: sequence of (object, style). Mesh and MeshLook; PointCloud and PointLook; Volume or DeviceVolume and
+        VolumeLook, SlicesInSpace or SurfaceLook.  Their arrays must not change as long as this object is open.  Of
+        triangles at the same depth the first is seen.
+    device: See `clrecon.device`; None is the best of the machine.
+    memory: Bytes that may be taken on the device.
+    takers: What takes pictures of volumes and clouds alone, by the `id` of the object; the caller keeps it for its next
         scenes and closes what is in it.  Objects are not looked at then, and there is no `box`.
-
-    Raises
-    ------
-    UsageError
-        See `check_objects`; or an object is empty, has a number that cannot be, or `memory` is not a number of bytes.
-    DeviceError
-        The device does not exist.
     """
 
     def __init__(
@@ -148,21 +129,9 @@ class ScenePictures(Closing):
     ) -> Rendering:
         """Take one picture.
 
-        Parameters
-        ----------
-        camera : Camera
-        size : (width, height)
-        background : str or (float, float, float), optional
-            None: transparent.
-        progress : callable, optional
-            Called as ``progress("render", objects drawn, all objects)``, and as `draw_layers` says.
-
-        Raises
-        ------
-        UsageError
-            Triangles or discs cover too many pixels, or a style refuses its object.
-        DeviceError
-            Not enough memory, or the device fails.
+        size: (width, height)
+        background: str or (float, float, float). None: transparent.
+        progress: Called as ``progress("render", objects drawn, all objects)``, and as `draw_layers` says.
         """
         tell = progress or ignore_progress
         tell("render", 0, len(self._objects))

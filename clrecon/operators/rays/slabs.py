@@ -71,12 +71,8 @@ def entry_slice(volume: Volume, camera: Camera) -> float:
 class LeapMap:
     """The bricks of a slab that show something, and the distance of the next one from each brick.
 
-    Attributes
-    ----------
-    distances_d : buffer, (bk, bj, bi) uint8
-        Chebyshev distance in bricks, 0 for visible bricks.
-    box : (low, high) or None
-        Field coordinates of the box around all visible bricks; None if no brick is visible.
+    distances_d: buffer, (bk, bj, bi) uint8. Chebyshev distance in bricks, 0 for visible bricks.
+    box: (low, high) or None. Field coordinates of the box around all visible bricks; None if no brick is visible.
     """
 
     distances_d: Any
@@ -87,18 +83,12 @@ class LeapMap:
 class RaySlab:
     """Slices ``first_k`` to ``end_k - 1`` of a volume on the device, at least two along each axis.
 
-    Attributes
-    ----------
-    voxels_d : buffer, (end_k - first_k, nj, ni)
-    shape_ijk : (ni, nj, slices) of the buffer
-    low_k, high_k : float
-        Samples with ``low_k <= k < high_k`` are this slab's.
-    stage : int
-        Bit 0: the first slab that a picture goes through, bit 1: the last.
-    ranges_d : buffer, optional
-        See `clrecon.operators.rays.leaps.measure_cells`.
-    maps : dict of LeapMap
-        Leap maps by their keys.
+    voxels_d: buffer, (end_k - first_k, nj, ni)
+    shape_ijk: (ni, nj, slices) of the buffer
+    low_k, high_k: Samples with ``low_k <= k < high_k`` are this slab's.
+    stage: Bit 0: the first slab that a picture goes through, bit 1: the last.
+    ranges_d: See `clrecon.operators.rays.leaps.measure_cells`.
+    maps: Leap maps by their keys.
     """
 
     voxels_d: Any
@@ -162,18 +152,8 @@ def plan_ray_slabs(
 ) -> int:
     """Return the number of slices in a slab, all if everything fits.
 
-    Parameters
-    ----------
-    resident : DeviceVolume
-    others, extra : mapping of str to int
-        Bytes of other buffers on the device, and of those needed only with more than one slab.
-    labels : ResampledLabels, optional
-        Labels that are needed with the voxels.
-
-    Raises
-    ------
-    DeviceError
-        Not even the smallest slab fits.
+    others, extra: Bytes of other buffers on the device, and of those needed only with more than one slab.
+    labels: Labels that are needed with the voxels.
     """
     ni, nj, nk = resident.volume.shape_ijk
     cells, size = choose_brick_cells(resident.volume), resident.dtype.itemsize
@@ -199,12 +179,8 @@ def plan_ray_slabs(
 def ray_slabs(resident: DeviceVolume, slices: int, entry_k: float, stopwatch: Stopwatch) -> Iterator[RaySlab]:
     """Yield the volume in slabs of `slices` slices, starting where the rays come from.
 
-    Parameters
-    ----------
-    slices : int
-        Result of `plan_ray_slabs`.
-    entry_k : float
-        Slice coordinate of the camera.  Rays go away from it, so slabs are ordered by their distance from it.
+    slices: Result of `plan_ray_slabs`.
+    entry_k: Slice coordinate of the camera.  Rays go away from it, so slabs are ordered by their distance from it.
         Infinite: slabs begin at that end.
     """
     nk = resident.volume.shape_ijk[2]

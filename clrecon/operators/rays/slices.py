@@ -45,16 +45,7 @@ EDGE_ON = 1e-3
 def choose_slices(volume: Volume, slices: int | Sequence[int] | None = None) -> list[int]:
     """Return the numbers k of the slices to show, ascending.
 
-    Parameters
-    ----------
-    volume : Volume
-    slices : int or sequence of int, optional
-        As `SlicesInSpace.slices`.
-
-    Raises
-    ------
-    UsageError
-        One that the volume does not have.
+    slices: As `SlicesInSpace.slices`.
     """
     nk = volume.shape_ijk[2]
     if slices is None:
@@ -81,28 +72,11 @@ def overlay_slices(
     A volume that is already on the device is read there.  Else only the shown slices are uploaded, in parts if they do
     not fit together.
 
-    Parameters
-    ----------
-    resident : DeviceVolume
-    style : SlicesInSpace
-    camera : Camera
-    size : (width, height)
-    background : str or (float, float, float), optional
-        None: transparent.
-    progress : callable, optional
-        Called as ``progress("slabs", slices done, all that are shown)``.
+    size: (width, height)
+    background: str or (float, float, float). None: transparent.
+    progress: Called as ``progress("slabs", slices done, all that are shown)``.
 
-    Returns
-    -------
-    Rendering
-        ``depth`` is that of the first visible slice.
-
-    Raises
-    ------
-    UsageError
-        As `choose_slices`.
-    DeviceError
-        Not even one slice fits the device.
+    Returns: ``depth`` is that of the first visible slice.
     """
     chosen = choose_slices(resident.volume, style.slices)
 
@@ -124,16 +98,8 @@ def overlay_with_layers(
 ) -> Rendering:
     """Show slices of a volume in space with what lies between them.
 
-    Parameters
-    ----------
-    beside : mapping of str to int
-        Bytes of other buffers on the device.
-    draw : callable
-        Draws the picture; it is called again where the device has no room, or another one takes over.
-
-    Raises
-    ------
-    As `overlay_slices`.
+    beside: Bytes of other buffers on the device.
+    draw: Draws the picture; it is called again where the device has no room, or another one takes over.
     """
     chosen = choose_slices(resident.volume, style.slices)
 

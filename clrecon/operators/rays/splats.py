@@ -57,14 +57,10 @@ _SHADINGS = {
 class SplatPicture(NamedTuple):
     """A picture of points.
 
-    Attributes
-    ----------
-    image : ndarray, shape (h, w, 4), uint8
-    depth : ndarray, shape (h, w), float32
-        Mm along the ray; NaN where no point is.
-    shading : {"none", "normals", "depths"}
-    parts : int
-        Parts of the cloud that went through the device one after the other.
+    image: ndarray, shape (h, w, 4), uint8
+    depth: ndarray, shape (h, w), float32. Mm along the ray; NaN where no point is.
+    shading: {"none", "normals", "depths"}
+    parts: Parts of the cloud that went through the device one after the other.
     """
 
     image: NDArray[np.uint8]
@@ -91,41 +87,17 @@ def draw_splats(
 ) -> SplatPicture:
     """Draw each point as a disc that faces the camera; the nearest disc is seen.
 
-    Parameters
-    ----------
-    device : Device
-    points : ndarray, shape (n, 3), float32
-        Mm from `base`, finite; at most 2^32 - 2.
-    colors : ndarray, shape (n, 4), uint8
-        Red, green, blue, 255.
-    normals : ndarray, shape (n, 3), float32, optional
-        Unit vectors, LPS.  Without them points are shaded by what lies around them, see cl/rays/splats.cl.
-    camera : Camera
-    size : (width, height)
-    radius_mm : float
-        Of the discs; on the picture it is at least 0.7 and at most 128 pixels.
-    base : ndarray, shape (3,), float64, optional
-        LPS mm; default: the origin.
-    lighting : Lighting, optional
-        One that does not shade leaves the colours as they are.
-    background : str or (float, float, float), optional
-        None: transparent.
-    memory : int, optional
-        Bytes that may be taken on the device; a cloud over it goes through in parts, and gives the same picture.
-    progress : callable, optional
-        Called as ``progress("points", done, total)``, a point counted for each of the three passes.
-    stopwatch : Stopwatch, optional
-
-    Returns
-    -------
-    SplatPicture
-
-    Raises
-    ------
-    UsageError
-        The discs would cover more than 2^36 pixels in all.
-    DeviceError
-        The device has no room for the picture and 65,536 points, or it fails.
+    points: ndarray, shape (n, 3), float32. Mm from `base`, finite; at most 2^32 - 2.
+    colors: ndarray, shape (n, 4), uint8. Red, green, blue, 255.
+    normals: ndarray, shape (n, 3), float32. Unit vectors, LPS.  Without them points are shaded by what lies around
+        them, see cl/rays/splats.cl.
+    size: (width, height)
+    radius_mm: Of the discs; on the picture it is at least 0.7 and at most 128 pixels.
+    base: ndarray, shape (3,), float64. LPS mm; default: the origin.
+    lighting: One that does not shade leaves the colours as they are.
+    background: str or (float, float, float). None: transparent.
+    memory: Bytes that may be taken on the device; a cloud over it goes through in parts, and gives the same picture.
+    progress: Called as ``progress("points", done, total)``, a point counted for each of the three passes.
     """
     job = _Splats(device, camera, size, radius_mm, base, lighting or Lighting(), background, normals is not None)
     count = job.plan(len(points), memory)

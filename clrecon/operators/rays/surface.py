@@ -47,39 +47,17 @@ def cast_surface(
     inside and the one before, the surface is found to 1e-3 of a step.  A ray that begins inside has its hit at once: on
     a clip plane with the plane's normal, so that cut bone is flat; at a camera inside, with the ray's direction.
 
-    Parameters
-    ----------
-    resident : DeviceVolume
-    style : SurfaceLook
-        With `shadows`, a hit has only ambient light if the way from it to the fixed light meets something inside, one
-        ray step away or farther; translucent labels let their share through.  A hit in a label with opacity below 1 is
-        blended, and the ray continues: out of the inside to the next entry, or into the next label.
-        The label of a hit is that of the nearest inside voxel of its cell; as in meshes of labels, a voxel without one
-        has that of the nearest of the voxels around it.
-    camera : Camera
-    size : (width, height)
-    ray_step : float
-        Distance of samples, mm.  If the volume is processed in slabs, at most one slice.
-    background : str or (float, float, float), optional
-        None: transparent.
-    progress : callable, optional
-        Called as ``progress("slabs", slices done, all slices)``.
+    style: With `shadows`, a hit has only ambient light if the way from it to the fixed light meets something inside,
+        one ray step away or farther; translucent labels let their share through.  A hit in a label with opacity below 1
+        is blended, and the ray continues: out of the inside to the next entry, or into the next label. The label of a
+        hit is that of the nearest inside voxel of its cell; as in meshes of labels, a voxel without one has that of the
+        nearest of the voxels around it.
+    size: (width, height)
+    ray_step: Distance of samples, mm.  If the volume is processed in slabs, at most one slice.
+    background: str or (float, float, float). None: transparent.
+    progress: Called as ``progress("slabs", slices done, all slices)``.
 
-    Returns
-    -------
-    Rendering
-        ``depth`` is that of the first hit.
-
-    Raises
-    ------
-    UsageError
-        As `choose_iso_rule`.
-    NoSurfaceError
-        The volume holds values that have no surface.
-    RefusedInputError
-        The labels do not lie on the volume.
-    DeviceError
-        Not enough memory: for shadows the volume has to fit the device as a whole.
+    Returns: ``depth`` is that of the first hit.
     """
     rule = choose_iso_rule(resident.volume, style.iso_value, values=resident.values)
 

@@ -38,25 +38,13 @@ MOST_PIECES = 1 << 28
 class MeshPart:
     """Triangles with one look, in the form for a device.
 
-    Attributes
-    ----------
-    vertices : ndarray, shape (n, 3), float32
-        Mm from `base`, finite.
-    triangles : ndarray, shape (m, 3), uint32
-        Indices of vertices that exist.
-    normals : ndarray, shape (n, 3), float32, or None
-        LPS, of any length; None: every triangle has its own.
-    color : (float, float, float)
-        0 to 1.
-    colors : ndarray, shape (n, 4), uint8, or None
-        Red, green, blue and 255 of each vertex, in place of `color`.
-    opacity : float
-        Above 0 and up to 1.
-    lighting : Lighting
-    planes : ndarray, shape (p, 4), float64
-        Half-spaces in LPS mm that are kept: ``normal . p >= offset``.
-    base : ndarray, shape (3,), float64
-        LPS mm.
+    vertices: ndarray, shape (n, 3), float32. Mm from `base`, finite.
+    triangles: ndarray, shape (m, 3), uint32. Indices of vertices that exist.
+    normals: ndarray, shape (n, 3), float32, or None. LPS, of any length; None: every triangle has its own.
+    colors: ndarray, shape (n, 4), uint8, or None. Red, green, blue and 255 of each vertex, in place of `color`.
+    opacity: Above 0 and up to 1.
+    planes: ndarray, shape (p, 4), float64. Half-spaces in LPS mm that are kept: ``normal . p >= offset``.
+    base: ndarray, shape (3,), float64. LPS mm.
     """
 
     vertices: NDArray[np.float32]
@@ -109,22 +97,8 @@ class LayerKeys:
 class Triangles:
     """A `MeshPart` on a device, before a camera.
 
-    Parameters
-    ----------
-    device : Device
-    part : MeshPart
-    first : int
-        Number of its first triangle among those of the picture.
-    camera : Camera
-    size : (width, height)
-    stopwatch : Stopwatch
-
-    Raises
-    ------
-    UsageError
-        The triangles would cover too many pixels.
-    DeviceError
-        Not enough memory, or the device fails.
+    first: Number of its first triangle among those of the picture.
+    size: (width, height)
     """
 
     def __init__(

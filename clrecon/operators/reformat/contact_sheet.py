@@ -53,33 +53,15 @@ def take_contact_sheet(
 
     Axial slices come from the head downwards, coronal ones from the front, sagittal ones from the right.
 
-    Parameters
-    ----------
-    resident : DeviceVolume
-    style : PlaneCut
-        With a `sheet`; thickness, window and labels are those of each slice.
-    plane : Camera
-        The plane in the middle, with zoom and centre, see `clrecon.rendering.views.plane.find_plane`.
-    shown : Grid
-        The volume, or the box of what is left of it: slices beside it are left out, and tiles fit it.
-    size : (int, int)
-        Width and height of the picture.
-    background, progress
-        As in `clrecon.operators.reformat.cut.cut_slice`.
+    style: With a `sheet`; thickness, window and labels are those of each slice.
+    plane: The plane in the middle, with zoom and centre, see `clrecon.rendering.views.plane.find_plane`.
+    shown: The volume, or the box of what is left of it: slices beside it are left out, and tiles fit it.
+    size: Width and height of the picture.
+    background, progress: As in `clrecon.operators.reformat.cut.cut_slice`.
 
-    Returns
-    -------
-    Rendering
-        Without a camera and depths; ``report["pixel_mm"]`` and ``report["edges"]`` are those of all slices,
+    Returns: Without a camera and depths; ``report["pixel_mm"]`` and ``report["edges"]`` are those of all slices,
         ``report["tiles"]`` has ``middle_lps_mm``, ``slice`` (number of its plane of voxels, or None), ``left`` and
         ``top`` (pixels) of each.
-
-    Raises
-    ------
-    UsageError
-        A slice is not there, or they are too many for the size.
-    DeviceError
-        As `cut_slice`.
     """
     tell = progress or ignore_progress
     job = CutJob(resident, style, None)

@@ -25,13 +25,7 @@ __all__ = ["CutJob"]
 
 
 class CutJob:
-    """One picture of sheets through a volume: the device, how samples are combined, labels, and the report.
-
-    Raises
-    ------
-    RefusedInputError
-        The labels of the style cannot belong to the volume.
-    """
+    """One picture of sheets through a volume: the device, how samples are combined, labels, and the report."""
 
     def __init__(self, resident: DeviceVolume, style: PlaneCut | CurveCut, progress: Progress | None):
         self.resident, self.style, self.progress = resident, style, progress

@@ -48,16 +48,10 @@ FARTHEST = 2.0**30
 class Reformation:
     """Values of the pixels of a sheet, and figures of their computation.
 
-    Attributes
-    ----------
-    values : ndarray, shape (h, w), float32
-        HU; NaN where no sample lies within the volume.
-    slices : int
-        Number of slices of the volume that the sheet meets.
-    slabs : int
-        Number of parts in which the volume was processed.
-    device_bytes : int
-        Most bytes taken on the device at one time.
+    values: ndarray, shape (h, w), float32. HU; NaN where no sample lies within the volume.
+    slices: Number of slices of the volume that the sheet meets.
+    slabs: Number of parts in which the volume was processed.
+    device_bytes: Most bytes taken on the device at one time.
     """
 
     values: NDArray[np.float32]
@@ -67,13 +61,7 @@ class Reformation:
 
 
 def prepare_reformat(device: Device, dtype: DTypeLike = np.int16, uneven: bool = False) -> Program:
-    """Build the kernel for volumes of `dtype`, with `uneven` for those whose slices no affine places.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernel for volumes of `dtype`, with `uneven` for those whose slices no affine places."""
     return load_program(device, "reformat/sample.cl", {**voxel_variants(dtype), "UNEVEN": str(int(uneven))})
 
 
@@ -143,13 +131,7 @@ class _Run:
         }
 
     def plan(self) -> int:
-        """Return the number of slices on the device at a time; all of the volume if that is worth it.
-
-        Raises
-        ------
-        DeviceError
-            Not even two slices fit.
-        """
+        """Return the number of slices on the device at a time; all of the volume if that is worth it."""
         resident, nk = self.resident, self.volume.shape_ijk[2]
         self.takes_whole = resident.pays_whole(self.slices) and resident.plan(SHEETS, nk, self.needs) == nk
         if self.takes_whole:
@@ -229,25 +211,9 @@ def sample_sheet(
     at a time if they do not fit.  Single samples, `max` and `min` are then equal bit for bit, means up to the rounding
     of their sums.
 
-    Parameters
-    ----------
-    resident : DeviceVolume
-    sheet : Sheet
-    samples : SlabSamples
-    combine : {"mean", "max", "min"}
-        How the samples of a pixel within the volume are combined.
-    stopwatch : Stopwatch, optional
-    progress : callable, optional
-        Called as ``progress("slabs", slices done, all slices)``.
-    warnings : list of str, optional
-        Gets a line each time that the device had no room for the planned slabs.
-
-    Raises
-    ------
-    UsageError
-        `combine` is unknown, or the sheet is implausibly far away.
-    DeviceError
-        Two slices and the picture do not fit the device, or it fails.
+    combine: {"mean", "max", "min"}. How the samples of a pixel within the volume are combined.
+    progress: Called as ``progress("slabs", slices done, all slices)``.
+    warnings: Gets a line each time that the device had no room for the planned slabs.
     """
     if not isinstance(combine, str) or combine not in COMBINATIONS:
         raise UsageError(f"the samples of a slab are combined by one of {', '.join(COMBINATIONS)}, not {combine!r}")

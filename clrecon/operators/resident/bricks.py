@@ -21,11 +21,8 @@ BRICK = kernel_constant("include/bricks.h", "BRICK")
 class BrickRanges:
     """The lowest and highest value of every brick, on the device.
 
-    Attributes
-    ----------
-    ranges_d : buffer, (bk, bj, bi, 2) of the voxels' type
-    shape : (bi, bj, bk)
-    dtype : dtype of the voxels
+    ranges_d: buffer, (bk, bj, bi, 2) of the voxels' type
+    shape: (bi, bj, bk)
     """
 
     ranges_d: Any
@@ -37,10 +34,8 @@ class BrickRanges:
 class BrickStates:
     """The result of comparing words of 32 samples with an iso value, one row of words for each row of bricks.
 
-    Attributes
-    ----------
-    states_d : buffer, (bk, bj, words) uint8
-    extents_d : buffer, (bk, bj, 2) uint16
+    states_d: buffer, (bk, bj, words) uint8
+    extents_d: buffer, (bk, bj, 2) uint16
     """
 
     states_d: Any
@@ -67,23 +62,10 @@ def measure_bricks(
 ) -> BrickRanges:
     """Find the lowest and highest value of each brick of 8 x 8 x 8 voxels.
 
-    Parameters
-    ----------
-    device : Device
-    voxels_d : buffer, (nk, nj, ni) of `dtype`, without NaN
-    shape_ijk : (ni, nj, nk)
-    dtype : dtype
-    stopwatch : Stopwatch, optional
+    voxels_d: buffer, (nk, nj, ni) of `dtype`, without NaN
+    shape_ijk: (ni, nj, nk)
 
-    Returns
-    -------
-    BrickRanges
-        Bricks at the upper ends of the volume may be smaller.
-
-    Raises
-    ------
-    DeviceError
-        The device fails.
+    Returns: Bricks at the upper ends of the volume may be smaller.
     """
     ni, nj, nk = shape_ijk
     bi, bj, bk = (-(-n // BRICK) for n in shape_ijk)
@@ -106,23 +88,12 @@ def compare_bricks(
 ) -> BrickStates:
     """Classify each word of 32 samples by its bricks: all outside (0), all inside (1) or mixed (2).
 
-    Parameters
-    ----------
-    device : Device
-    ranges : BrickRanges
-    level : scalar of the voxels' type
-        Lowest inside value.
-    ni : int
-        Number of voxels in a row.
-    border : int
-        Word w begins at voxel ``32 * w - border``, and there are samples up to ``ni - 1 + border``. Samples beyond the
-        volume are ignored.
-    stopwatch : Stopwatch, optional
+    level: Lowest inside value.
+    ni: Number of voxels in a row.
+    border: Word w begins at voxel ``32 * w - border``, and there are samples up to ``ni - 1 + border``. Samples beyond
+        the volume are ignored.
 
-    Returns
-    -------
-    BrickStates
-        With the extent of each row of bricks: the first word that is not all outside, and the one after the last.
+    Returns: With the extent of each row of bricks: the first word that is not all outside, and the one after the last.
     """
     _, bj, bk = ranges.shape
     words = -(-(ni + 2 * border) // 32)

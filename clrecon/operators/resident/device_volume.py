@@ -400,16 +400,7 @@ def open_volume(
 ) -> Iterator[DeviceVolume]:
     """Yield a volume on its device: a given open one, or a new one that is closed at the end.
 
-    Parameters
-    ----------
-    what : str
-        The purpose, for messages, for example "a slice".
-
-    Raises
-    ------
-    UsageError
-        The volume is neither a Volume nor a DeviceVolume, or a device or memory is given for a DeviceVolume, which has
-        its own.
+    what: The purpose, for messages, for example "a slice".
     """
     made, is_new = take_volume(volume, device, memory, what)
     try:

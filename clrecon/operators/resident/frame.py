@@ -21,11 +21,8 @@ class FieldFrame:
     """The map from LPS mm to field coordinates: indices; for uneven slices indices in the plane of slice 0, and height
     in mm.
 
-    Attributes
-    ----------
-    matrix : ndarray, shape (3, 3), float64
-    offset : ndarray, shape (3,), float64
-        Field coordinates of p are ``matrix @ p + offset``.
+    matrix: ndarray, shape (3, 3), float64
+    offset: ndarray, shape (3,), float64. Field coordinates of p are ``matrix @ p + offset``.
     """
 
     matrix: Float64Array

@@ -24,12 +24,8 @@ MOST_LAYERS = 1 << 16
 class StackTable:
     """The place of each slice.
 
-    Attributes
-    ----------
-    arguments : dict of str to buffer or number
-        The arguments of kernels with STACK_PARAMETERS; none for even volumes.
-    slope : ndarray, shape (4,), float32
-        Largest number of index steps along i, j and k per mm of height.
+    arguments: The arguments of kernels with STACK_PARAMETERS; none for even volumes.
+    slope: ndarray, shape (4,), float32. Largest number of index steps along i, j and k per mm of height.
     """
 
     arguments: dict[str, Any]

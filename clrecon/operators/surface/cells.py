@@ -17,13 +17,7 @@ __all__ = ["Classified", "Counted", "count", "load_cells"]
 
 
 def load_cells(device: Device, grown: bool = False) -> Program:
-    """Build the kernels, which are the same for every type of voxels; with `grown`, those for parts of a surface.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels, which are the same for every type of voxels; with `grown`, those for parts of a surface."""
     variants = {**device.kernel_variants, "GROWN": "1"} if grown else device.kernel_variants
     return load_program(device, "surface/cells.cl", variants)
 
@@ -32,16 +26,11 @@ def load_cells(device: Device, grown: bool = False) -> Program:
 class Classified:
     """The results of `marching_cubes.classify` for one slab, on the device.
 
-    Attributes
-    ----------
-    mask_d : buffer, (gk, gj, words) uint32
-        Its crossed edges have the vertices.
-    row_extents_d : buffer, (gk, gj) ushort2
-    grown_d, grown_extents_d : buffer, optional
-        For a part of a surface: the samples of the whole grid whose edges have vertices, see cl/surface/growing.cl, and
-        their extents.
-    first_grown : int
-        Slice of them that the slab begins with.
+    mask_d: buffer, (gk, gj, words) uint32. Its crossed edges have the vertices.
+    row_extents_d: buffer, (gk, gj) ushort2
+    grown_d, grown_extents_d: For a part of a surface: the samples of the whole grid whose edges have vertices, see
+        cl/surface/growing.cl, and their extents.
+    first_grown: Slice of them that the slab begins with.
     """
 
     mask_d: Any
@@ -91,17 +80,7 @@ def count(
 ) -> Counted:
     """Passes 2 to 4: count vertices and triangles, find where those of each word begin, and which words have any.
 
-    Parameters
-    ----------
-    voxels_d : buffer, optional
-        Slices ``slab.voxel_slices`` of the volume; needed for the topology of the trilinear field.
-
-    Raises
-    ------
-    DeviceMemoryError
-        The slab has more vertices or triangles than 32 bits can number.
-    DeviceError
-        The device fails.
+    voxels_d: Slices ``slab.voxel_slices`` of the volume; needed for the topology of the trilinear field.
     """
     grid, rows = slab.grid, slab.counted_rows
     program = load_cells(device, classified.is_part)

@@ -24,13 +24,7 @@ SUMS = {
 
 
 def prepare_choosing(device: Device) -> Program:
-    """Build the kernels.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels."""
     return load_program(device, "surface/choosing.cl")
 
 
@@ -95,15 +89,7 @@ def choose_components(
     device: Device, grid: SampleGrid, classified: Classified, runs: Runs, components: Components, seeds: Seeds,
     stopwatch: Stopwatch,
 ) -> None:  # fmt: skip
-    """Choose the components that hold a seed, and sum up all.
-
-    Raises
-    ------
-    UsageError
-        A seed is not near the surface, or no component holds one.
-    DeviceError
-        The device fails.
-    """
+    """Choose the components that hold a seed, and sum up all."""
     program, (gi, gj, gk) = prepare_choosing(device), grid.shape
     sizes = {"gi": gi, "gj": gj, "gk": gk, "words": grid.words}
 

@@ -53,19 +53,13 @@ Float32Array = NDArray[np.float32]
 class CrossingPlan:
     """Triangles in the rows of levels, as the kernel reads them.
 
-    Attributes
-    ----------
-    vertices : ndarray, shape (v, 3), float32
-        Scaled by a power of two, which changes no digit.
-    order : ndarray, shape (n,), int64
-        Triangle of each entry.
-    corners : ndarray, shape (n, 3), uint32
-    low, high : ndarray, shape (n, 3), float32
-        Boxes of the entries.
-    starts : ndarray, uint32
-        First entry of each row, and the number of entries.
-    levels : ndarray, shape (levels, 4), uint32
-    edges : ndarray, shape (levels,), float32
+    vertices: ndarray, shape (v, 3), float32. Scaled by a power of two, which changes no digit.
+    order: ndarray, shape (n,), int64. Triangle of each entry.
+    corners: ndarray, shape (n, 3), uint32
+    low, high: ndarray, shape (n, 3), float32. Boxes of the entries.
+    starts: ndarray, uint32. First entry of each row, and the number of entries.
+    levels: ndarray, shape (levels, 4), uint32
+    edges: ndarray, shape (levels,), float32
     """
 
     vertices: Float32Array
@@ -92,11 +86,8 @@ def prepare_crossings(device: Device) -> Program:
 def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> CrossingPlan:
     """Enter the triangles into rows.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (v, 3), float32
-    triangles : ndarray, shape (n, 3), uint32
-        At least one.
+    vertices: ndarray, shape (v, 3), float32
+    triangles: ndarray, shape (n, 3), uint32. At least one.
     """
     scaled = np.ldexp(vertices, 11 - int(np.frexp(np.abs(vertices).max())[1]))
     low, high = _find_boxes(scaled, triangles)
@@ -140,13 +131,7 @@ def _find_boxes(vertices: Float32Array, triangles: NDArray[np.uint32]) -> tuple[
 def mark_crossings(
     device: Device, plan: CrossingPlan, *, steps: Steps | None = None, stopwatch: Stopwatch | None = None
 ) -> NDArray[np.bool_]:
-    """Mark the triangles that may cut another one, shape (n,), in the order of the mesh.
-
-    Raises
-    ------
-    DeviceError
-        The device fails.
-    """
+    """Mark the triangles that may cut another one, shape (n,), in the order of the mesh."""
     count = len(plan.order)
     kernel = prepare_crossings(device)["mark_crossings"]
     marks_d = zero_words(device, (count + 31) // 32, stopwatch=stopwatch)
@@ -184,27 +169,13 @@ def find_crossings(
     Small meshes, vertices in float64 and meshes for which the device has no room are looked at by the host alone, which
     finds the same pairs.
 
-    Parameters
-    ----------
-    device : Device
-    vertices : ndarray, shape (v, 3), mm
-    triangles : ndarray, shape (n, 3), uint32
-    changed : ndarray, shape (n,), bool, optional
-        Only pairs with one of these are found.
-    memory : int, optional
-        Bytes that may be taken on the device; None is all that it has.
-    steps : Steps, optional
-        Counts the triangles.
+    vertices: ndarray, shape (v, 3), mm
+    triangles: ndarray, shape (n, 3), uint32
+    changed: ndarray, shape (n,), bool. Only pairs with one of these are found.
+    memory: Bytes that may be taken on the device; None is all that it has.
+    steps: Counts the triangles.
 
-    Returns
-    -------
-    ndarray, shape (k, 2), int64
-        Numbers of triangles.
-
-    Raises
-    ------
-    DeviceError
-        The device fails.
+    Returns: ndarray, shape (k, 2), int64. Numbers of triangles.
     """
     if len(triangles) < FEWEST or vertices.dtype != np.float32:
         return find_self_intersections(vertices, triangles, changed, steps=steps)

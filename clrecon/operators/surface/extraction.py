@@ -287,11 +287,6 @@ def prepare_isosurface(
 
     With `uneven`, for volumes with uneven slices; `inside` and `vertex_rule` as in `IsoRule`; with `grown`, for parts
     of a surface.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
     """
     if topology == "trilinear":
         prepare_trilinear(device, dtype)

@@ -45,13 +45,7 @@ MOST_RUNS = 2**31
 
 
 def prepare_growing(device: Device) -> Program:
-    """Build the kernels.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels."""
     prepare_scan(device)
     load_cells(device, grown=True)
     prepare_choosing(device)
@@ -62,20 +56,12 @@ def prepare_growing(device: Device) -> Program:
 class Grown:
     """The grown cells of a grid on the device, and what is told of them.
 
-    Attributes
-    ----------
-    grown_d : buffer, (gk, gj, words) uint32
-        Samples whose edges are grown, see cl/surface/growing.cl.
-    extents_d : buffer, (gk, gj) ushort2
-        First word of each row with a grown sample, and the one after the last.
-    classified : Classified
-        The inside mask of the whole grid.
-    sums_d : buffer, uint32
-        Sums over all components.
-    visited_d : buffer, (1,) uint64
-        Cells that are grown or share a face with one that is.
-    names : tuple of str
-        What was grown from.
+    grown_d: buffer, (gk, gj, words) uint32. Samples whose edges are grown, see cl/surface/growing.cl.
+    extents_d: buffer, (gk, gj) ushort2. First word of each row with a grown sample, and the one after the last.
+    classified: The inside mask of the whole grid.
+    sums_d: buffer, uint32. Sums over all components.
+    visited_d: buffer, (1,) uint64. Cells that are grown or share a face with one that is.
+    names: What was grown from.
     """
 
     grown_d: Any
@@ -201,21 +187,8 @@ def join_slabs(
 def grow(resident: DeviceVolume, grid: SampleGrid, classified: Classified, seeds: Seeds, stopwatch: Stopwatch) -> Grown:
     """Find the components of active cells that hold a seed.
 
-    Parameters
-    ----------
-    classified : Classified
-        Inside mask of the whole grid.
-    stopwatch : Stopwatch
-        Runs already: the last kernels are not waited for.
-
-    Raises
-    ------
-    UsageError
-        A seed is not near the surface, or no component holds one.
-    NoSurfaceError
-        No cell is active.
-    DeviceError
-        The device fails.
+    classified: Inside mask of the whole grid.
+    stopwatch: Runs already: the last kernels are not waited for.
     """
     search = _Search(resident, grid, classified, stopwatch)
     runs = search.find_runs()
@@ -232,20 +205,10 @@ def find_components(
 ) -> tuple[int, int]:
     """Find all components of active cells.
 
-    Parameters
-    ----------
-    classified : Classified
-        Inside mask of the whole grid.
+    classified: Inside mask of the whole grid.
 
-    Returns
-    -------
-    count, cells : int
-        Components, and active cells.
-
-    Raises
-    ------
-    DeviceError
-        The device fails.
+    Returns:
+    count, cells: Components, and active cells.
     """
     search = _Search(resident, grid, classified, stopwatch)
     with stopwatch.running(resident.device):

@@ -57,13 +57,7 @@ class HeldSlices:
 def prepare_labels(
     device: Device, dtype: DTypeLike = np.int16, label_dtype: DTypeLike = np.uint8, uneven: bool = False
 ) -> tuple[Program, Program]:
-    """Build the kernels for volumes and labels of these types: those that find what is inside, those of the surface.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels for volumes and labels of these types: those that find what is inside, those of the surface."""
     variants = {**voxel_variants(dtype), **label_variants(label_dtype)}
     own = load_program(device, "surface/labels.cl", variants)
     return own, marching_cubes.prepare_marching_cubes(device, dtype, label_dtype, uneven)

@@ -47,16 +47,10 @@ def each_label(
     If the device has no room for a group, its remaining labels are processed one by one; a single label is tried once
     more, with nothing else on the device.
 
-    Parameters
-    ----------
-    groups : list of dict of int to Box
-        Labels that are processed together.
-    hold : callable
-        Uploads the data that a group shares.
-    extract : callable
-        Makes the result of one label.
-    warnings : list of str
-        Gets a line each time that the device had no room.
+    groups: Labels that are processed together.
+    hold: Uploads the data that a group shares.
+    extract: Makes the result of one label.
+    warnings: Gets a line each time that the device had no room.
     """
     waiting, retried = list(groups), set[int]()
     while waiting:

@@ -33,13 +33,7 @@ __all__ = ["prepare_survey", "survey_labels"]
 
 
 def prepare_survey(device: Device, label_dtype: DTypeLike = np.uint8) -> Program:
-    """Build the kernels for labels of this type.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels for labels of this type."""
     return load_program(device, "surface/label_survey.cl", label_variants(label_dtype))
 
 
@@ -48,12 +42,8 @@ def survey_labels(
 ) -> tuple[dict[int, Box], NDArray[np.integer[Any]]]:
     """Return the box (k, j, i) of each label and the samples around it, and the table of `count_faces`.
 
-    Parameters
-    ----------
-    labels : LabelMap
-        Label map with at least one label.
-    memory : int, optional
-        Bytes that may be taken on the device; None is all that it has.
+    labels: Label map with at least one label.
+    memory: Bytes that may be taken on the device; None is all that it has.
     """
     try:
         surveyed = _survey(labels, device, memory, stopwatch)

@@ -48,12 +48,7 @@ LONGEST_ROW = 13_000
 
 
 def check_row(ni: int) -> None:
-    """Refuse rows that are too long.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse rows that are too long."""
     if ni + 2 > LONGEST_ROW:
         raise UsageError(f"the volume has {ni:,} columns, {LONGEST_ROW - 2:,} are supported")
 
@@ -73,11 +68,6 @@ def prepare_marching_cubes(
 
     With `uneven`, for volumes with uneven slices; `inside` and `vertex_rule` as in `IsoRule`; with `masks`, for
     surfaces of label masks, whose volumes are occupancies; with `grown`, for parts of a surface.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
     """
     prepare_scan(device)
     load_cells(device, grown)
@@ -115,13 +105,10 @@ def split_steps(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
 class Placement:
     """The places of the samples of a grid in mm, in the form for emit_vertices.
 
-    Attributes
-    ----------
-    slice_frames : ndarray, shape (gk, 9, 4), float32
-    steps : ndarray, shape (4, 4), float32
-    margin : ndarray, shape (4,), float32
-    origin : ndarray, shape (3,), float64, or None
-        Origin of the device's positions, see `find_vertex_origin`.
+    slice_frames: ndarray, shape (gk, 9, 4), float32
+    steps: ndarray, shape (4, 4), float32
+    margin: ndarray, shape (4,), float32
+    origin: ndarray, shape (3,), float64, or None. Origin of the device's positions, see `find_vertex_origin`.
     """
 
     slice_frames: NDArray[np.float32]
@@ -131,13 +118,7 @@ class Placement:
 
     @classmethod
     def of(cls, volume: Volume, border: int) -> Placement:
-        """Make the tables for a volume with `border` layers of outside.
-
-        Raises
-        ------
-        UsageError
-            The volume is too large for float32.
-        """
+        """Make the tables for a volume with `border` layers of outside."""
         origins = volume.slice_origins(border + 1)[1:]
         origin = find_vertex_origin(volume)
         if origin is not None:
@@ -165,14 +146,9 @@ def classify(
 ) -> Classified:
     """Pass 1: mark the samples of the slab that are inside; for a rule that encloses values below, those that are not.
 
-    Parameters
-    ----------
-    voxels_d : buffer
-        Slices ``slab.voxel_slices`` of the volume.
-    levels : sequence of scalars of the voxels' type
-        Lowest inside value and, of a range, the highest.
-    bricks : BrickStates, optional
-        The comparison of the volume's bricks with the only level, if the slab is the whole volume.
+    voxels_d: Slices ``slab.voxel_slices`` of the volume.
+    levels: Lowest inside value and, of a range, the highest.
+    bricks: The comparison of the volume's bricks with the only level, if the slab is the whole volume.
     """
     program = prepare_classify(device, slab.grid.volume.voxels.dtype, slab.grid.rule.inside)
     mask_d = allocate(device, 4 * slab.mask_rows * slab.grid.words)
@@ -204,10 +180,7 @@ def too_many(vertices: int, triangles: int) -> DeviceError:
 class Emission:
     """Passes 3 and 4: the mesh of a slab, on the device until it is downloaded.
 
-    Parameters
-    ----------
-    voxels_d : buffer
-        Slices ``slab.voxel_slices`` of the volume.
+    voxels_d: Slices ``slab.voxel_slices`` of the volume.
     """
 
     def __init__(

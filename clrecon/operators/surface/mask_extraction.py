@@ -54,13 +54,7 @@ SAMPLES_PER_FLAGS = 32 * kernel_constant("surface/label_masks.cl", "STRIP")
 
 
 def prepare_label_masks(device: Device, label_dtype: DTypeLike = np.uint8) -> tuple[Program, Program]:
-    """Build the kernels for labels of this type: those of the occupancy and those of the surface.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels for labels of this type: those of the occupancy and those of the surface."""
     own = load_program(
         device, "surface/label_masks.cl", {"VOXEL": "short", "VALUE": "int", **label_variants(label_dtype)}
     )

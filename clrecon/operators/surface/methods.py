@@ -36,15 +36,9 @@ DECIMATED_SHARE = 0.9
 class Method:
     """A method of marching cubes.
 
-    Attributes
-    ----------
-    name : str
-    what : str
-        In words.
-    on_device : bool
-        Extracted by the kernels; else in numpy, as a row for comparisons.
-    grows : bool
-    decimates : {"", "quadric", "bounded"}
+    what: In words.
+    on_device: Extracted by the kernels; else in numpy, as a row for comparisons.
+    decimates: {"", "quadric", "bounded"}
     """
 
     name: str
@@ -77,17 +71,8 @@ def check_method(
 ) -> Method:
     """Return a method of the table.
 
-    Parameters
-    ----------
-    grows : bool
-        Seeds are given.
-    plain : bool
-        The surface is that of one iso value and what lies above it.
-
-    Raises
-    ------
-    UsageError
-        There is no such method, or it does not go with the other choices.
+    grows: Seeds are given.
+    plain: The surface is that of one iso value and what lies above it.
     """
     if method not in METHODS:
         raise UsageError(f"there is no {name_parameter('method', method)}: it is one of {', '.join(METHODS)}")

@@ -38,13 +38,7 @@ IntArray = NDArray[np.integer]
 
 
 def prepare_near_faces(device: Device) -> Program:
-    """Build the kernels of `DeviceBounds`.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels of `DeviceBounds`."""
     return load_program(device, "surface/near_faces.cl")
 
 
@@ -54,18 +48,9 @@ class DeviceBounds(SurfaceBounds):
     The nearest point of each triangle is found, where the twin may take one near it: bounds are as short or shorter,
     or within the limit.
 
-    Parameters
-    ----------
-    device : Device
-    vertices : ndarray, shape (n, 3), mm, near zero
-    triangles : ndarray, shape (m, 3), uint32
-    fans : Fans, optional
-        As for `NearDistance`.
-
-    Raises
-    ------
-    DeviceError
-        Its methods: not enough memory, or the device fails.
+    vertices: ndarray, shape (n, 3), mm, near zero
+    triangles: ndarray, shape (m, 3), uint32
+    fans: As for `NearDistance`.
     """
 
     def __init__(

@@ -25,18 +25,8 @@ def find_cell_near(
 ) -> tuple[int, int, int]:
     """Return the active cell (k, j, i) whose centre is nearest to a point.
 
-    Parameters
-    ----------
-    classified : Classified
-        Inside mask of the whole grid.
-    point : ndarray, shape (3,), LPS mm
-
-    Raises
-    ------
-    UsageError
-        None is within `SEED_REACH_MM`.
-    DeviceError
-        The device fails.
+    classified: Inside mask of the whole grid.
+    point: ndarray, shape (3,), LPS mm
     """
     for reach in (_NEAR_MM, SEED_REACH_MM):
         found = _look(device, grid, classified, point, reach)

@@ -29,15 +29,10 @@ SEED_REACH_MM = 10.0
 class Seeds:
     """Seeds of one surface; the components of all of them together are grown.
 
-    Attributes
-    ----------
-    auto : bool
-        Take the largest components too.
-    points : ndarray, shape (n, 3), float64, LPS mm
-    voxels : ndarray, shape (nk, nj, ceil(ni / 32)), uint32, or None
-        Bits of the voxels that are seeds.
-    names : tuple of str
-        What was asked for, for the report.
+    auto: Take the largest components too.
+    points: ndarray, shape (n, 3), float64, LPS mm
+    voxels: ndarray, shape (nk, nj, ceil(ni / 32)), uint32, or None. Bits of the voxels that are seeds.
+    names: What was asked for, for the report.
     """
 
     auto: bool
@@ -52,18 +47,10 @@ class Seeds:
         Only those parts of the surface are made whose cells hang together with a seed, through faces of which one to
         three corners are inside; triangles of other parts are never made.
 
-        Parameters
-        ----------
-        grow_from : "auto", (3,) float, LabelMap, (LabelMap, label), Mask, or a list of these
-            A point in LPS mm grows from the nearest cell of the surface, which is not more than `SEED_REACH_MM` away.
-            A label or mask grows all parts that have one of its voxels at their inner side.  "auto" takes the parts
-            with at least `AUTO_SHARE` of the cells of the largest.
-        resident : DeviceVolume
-
-        Raises
-        ------
-        UsageError
-            It is none of the things that are listed there, or a point lies outside of the volume.
+        grow_from: "auto", (3,) float, LabelMap, (LabelMap, label), Mask, or a list of these. A point in LPS mm grows
+            from the nearest cell of the surface, which is not more than `SEED_REACH_MM` away. A label or mask grows all
+            parts that have one of its voxels at their inner side.  "auto" takes the parts with at least `AUTO_SHARE` of
+            the cells of the largest.
         """
         items = _split(grow_from)
         points: list[NDArray[np.float64]] = []
@@ -139,13 +126,7 @@ def _describe_point(point: ArrayLike) -> str:
 
 
 def check_points(volume: Volume, points: NDArray[np.float64]) -> None:
-    """Refuse points outside of the volume.
-
-    Raises
-    ------
-    UsageError
-        The message has the point and the box of the volume in mm.
-    """
+    """Refuse points outside of the volume."""
     if not len(points):
         return
     size = np.array(volume.shape_ijk)

@@ -21,12 +21,7 @@ BRICKS = "brick ranges"
 class SampleGrid:
     """The samples of a volume with its border, and their packing in the inside mask.
 
-    Attributes
-    ----------
-    volume : Volume
-    rule : IsoRule
-    grows : bool
-        Only a part of the surface is made, for which bits of the whole grid stay on the device.
+    grows: Only a part of the surface is made, for which bits of the whole grid stay on the device.
     """
 
     volume: Volume
@@ -167,18 +162,7 @@ MOST_WORDS = 2**32
 
 
 def plan_slabs(grid: SampleGrid, resident: DeviceVolume) -> int:
-    """Return the number of slices in a slab: all if the whole grid fits the device, else as many as fit.
-
-    Parameters
-    ----------
-    grid : SampleGrid
-    resident : DeviceVolume
-
-    Raises
-    ------
-    DeviceError
-        Not even one slice with its neighbours fits; the message states the needed and the available memory.
-    """
+    """Return the number of slices in a slab: all if the whole grid fits the device, else as many as fit."""
     gk = grid.shape[2]
     limits = resident.limits
     mesh_bytes = min(limits.total_bytes // OUTPUT_SHARE, limits.buffer_bytes)

@@ -39,23 +39,12 @@ class CellVertices:
 
 
 def prepare_trilinear(device: Device, dtype: DTypeLike) -> Program:
-    """Build the kernels for volumes of `dtype`.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
+    """Build the kernels for volumes of `dtype`."""
     return load_program(device, "surface/trilinear.cl", voxel_variants(dtype))
 
 
 def check_row(volume: Volume) -> None:
-    """Refuse a volume whose rows are too long.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse a volume whose rows are too long."""
     ni = volume.shape_ijk[0]
     if ni + 2 > LONGEST_ROW:
         raise UsageError(
@@ -81,10 +70,8 @@ def count_cells(
 ) -> CellVertices:
     """Count the slab's triangles again, in place, and the vertices inside cells, which follow those of each slice.
 
-    Parameters
-    ----------
-    flags_d, row_counts_d, word_triangles_d : buffers
-        Results of count_rows: words with work, counts of each row, triangles of the row before each word.
+    flags_d, row_counts_d, word_triangles_d: Results of count_rows: words with work, counts of each row, triangles of
+        the row before each word.
     """
     grid, rows = slab.grid, slab.counted_rows
     row_vertices_d = allocate(device, 4 * rows)
@@ -118,16 +105,9 @@ def emit_cells(
 ) -> None:
     """Write the triangles of the slab and the vertices inside its cells.
 
-    Parameters
-    ----------
-    counted : cells.Counted
-        With `cells`.
-    tables : dict
-        ``slice_frames``, ``steps`` and ``margin``, as emit_vertices takes them.
-    output : dict
-        The buffers ``positions``, ``normals`` and ``triangles``.
-    first_vertex : int
-        Number of vertices of all earlier slabs.
+    tables: ``slice_frames``, ``steps`` and ``margin``, as emit_vertices takes them.
+    output: The buffers ``positions``, ``normals`` and ``triangles``.
+    first_vertex: Number of vertices of all earlier slabs.
     """
     program = prepare_trilinear(device, slab.grid.volume.voxels.dtype)
     cells: CellVertices = counted.cells

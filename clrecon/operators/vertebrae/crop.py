@@ -27,20 +27,11 @@ AXIAL_COSINE = 0.7
 class LabelCrop:
     """A label with its surroundings.
 
-    Attributes
-    ----------
-    volume : Volume
-        The voxels around the label, at their places in the patient.  Axes are in the order that makes the slices as
+    volume: The voxels around the label, at their places in the patient.  Axes are in the order that makes the slices as
         axial as they can be; only those of uneven stacks stay.
-    labels : LabelMap
-        The same part of the label map, on its own grid.
-    number : int
-    name : str
-    inside_share : float
-        Share of the label's voxels that lie in the whole volume, above 0.
-    axial : bool
-        The slices are axial within 45 degrees.
-    warnings : tuple of str
+    labels: The same part of the label map, on its own grid.
+    inside_share: Share of the label's voxels that lie in the whole volume, above 0.
+    axial: The slices are axial within 45 degrees.
     """
 
     volume: Volume
@@ -53,15 +44,7 @@ class LabelCrop:
 
 
 def crop_label(volume: Volume, labels: LabelMap, label: int | str, margin_mm: float) -> LabelCrop:
-    """Cut out one label with `margin_mm`, and some voxels more, around it.
-
-    Raises
-    ------
-    UsageError
-        The map has no such label.
-    RefusedInputError
-        The map names another frame of reference, lies outside of the volume, or this label does.
-    """
+    """Cut out one label with `margin_mm`, and some voxels more, around it."""
     shares = check_together(labels, volume)
     number = labels.find(label)
     share, called = shares[number], f"label {number} {labels.name(number)}"

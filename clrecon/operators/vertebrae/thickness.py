@@ -19,14 +19,9 @@ MOST_RADIUS_MM = 8.0
 class ShellThickness(Record):
     """How thick a shell of bone is.
 
-    Attributes
-    ----------
-    limit_mm : float
-        Two voxels, by their largest step: what is not thicker is not resolved.
-    resolved_share : float
-        Share of the shell's voxels at places that are thicker.
-    median_mm, p95_mm : float or None
-        Of the voxels at these places, to a voxel; None where there are none.
+    limit_mm: Two voxels, by their largest step: what is not thicker is not resolved.
+    resolved_share: Share of the shell's voxels at places that are thicker.
+    median_mm, p95_mm: Of the voxels at these places, to a voxel; None where there are none.
     """
 
     limit_mm: float
@@ -41,19 +36,6 @@ def measure_thickness(mask: Mask) -> ShellThickness:
     The radii begin with the largest step of the voxels, so that three voxels fit across in each direction, and grow by
     half the smallest step.  A ball of lattice points fits into a plate of an odd number of voxels as long as its
     diameter is not above the plate's thickness; of an even number it tells one voxel less.
-
-    Parameters
-    ----------
-    mask : Mask
-
-    Returns
-    -------
-    ShellThickness
-
-    Raises
-    ------
-    DeviceError
-        The device has no room for two masks, or it fails.
 
     References
     ----------

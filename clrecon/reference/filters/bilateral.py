@@ -15,17 +15,10 @@ __all__ = ["filter_bilateral", "spatial_weights"]
 def spatial_weights(volume: Volume, offsets: NDArray[np.integer[Any]], sigma_mm: float) -> NDArray[np.float64]:
     """Return the weights of neighbours by their true distance, exp(-|t|^2 / (2 sigma^2)).
 
-    Parameters
-    ----------
-    volume : Volume
-    offsets : ndarray, shape (n, 3)
-        Steps along i, j, k.
-    sigma_mm : float
+    offsets: ndarray, shape (n, 3). Steps along i, j, k.
 
-    Returns
-    -------
-    ndarray, shape (nk, n), float64
-        For the voxels of each slice; beyond the ends the slices go on in the steps of the ends.
+    Returns: ndarray, shape (nk, n), float64. For the voxels of each slice; beyond the ends the slices go on in the
+        steps of the ends.
     """
     weights = np.empty((volume.shape_ijk[2], len(offsets)))
     for k, of_slice in enumerate(weights):
@@ -40,19 +33,12 @@ def filter_bilateral(
 ) -> NDArray[np.float64]:
     """Filter voxels: the weighted mean of the window, before it is rounded.
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni)
-        Beyond the border lies the value of the nearest voxel.  NaN and infinite ones stay, and count nowhere.
-    offsets : ndarray, shape (n, 3)
-        Steps along i, j, k to the voxels of the window, the voxel itself among them.
-    weights : ndarray, shape (nk, n), float64
-        See `spatial_weights`.
-    sigma_hu : float
+    voxels: ndarray, shape (nk, nj, ni). Beyond the border lies the value of the nearest voxel.  NaN and infinite ones
+        stay, and count nowhere.
+    offsets: ndarray, shape (n, 3). Steps along i, j, k to the voxels of the window, the voxel itself among them.
+    weights: ndarray, shape (nk, n), float64. See `spatial_weights`.
 
-    Returns
-    -------
-    ndarray, shape (nk, nj, ni), float64
+    Returns: ndarray, shape (nk, nj, ni), float64
     """
     values = voxels.astype(np.float64)
     centre = np.where(np.isfinite(values), values, 0.0)

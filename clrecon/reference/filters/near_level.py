@@ -16,18 +16,12 @@ GROUP = 16
 def mark_mixed_groups(voxels: NDArray[Any], level: float, reach: tuple[int, int, int]) -> NDArray[np.bool_]:
     """Mark the groups of which some voxel has both sides of a level in the box around it.
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni)
-    level : float
-        Inside are values from here on; NaN is not.
-    reach : (int, int, int)
-        Half the size of the box along i, j, k, without the voxel in its middle.
+    voxels: ndarray, shape (nk, nj, ni)
+    level: Inside are values from here on; NaN is not.
+    reach: Half the size of the box along i, j, k, without the voxel in its middle.
 
-    Returns
-    -------
-    ndarray, shape (nk, nj, groups), bool
-        Group g is the voxels 16 g to 16 g + 15 of a row; the last one may be shorter.
+    Returns: ndarray, shape (nk, nj, groups), bool. Group g is the voxels 16 g to 16 g + 15 of a row; the last one may
+        be shorter.
     """
     from scipy import ndimage
 

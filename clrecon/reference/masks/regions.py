@@ -22,10 +22,8 @@ def find_places(volume: Volume, border: tuple[int, int, int] = (0, 0, 0)) -> NDA
 def find_in_box(volume: Volume, sides: ArrayLike) -> NDArray[np.bool_]:
     """Return the voxels in a box, its sides included, shape (nk, nj, ni).
 
-    Parameters
-    ----------
-    sides : array_like, shape (3, 2)
-        Lower and upper side in x, y and z, LPS mm; infinity leaves a side open.  Voxels up to 1e-6 mm beyond are in.
+    sides: array_like, shape (3, 2). Lower and upper side in x, y and z, LPS mm; infinity leaves a side open.  Voxels up
+        to 1e-6 mm beyond are in.
     """
     low, high = np.asarray(sides, dtype=np.float64).T
     places = find_places(volume)

@@ -16,12 +16,10 @@ def filter_scales(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return sigma_c and sigma_s of each point.
 
-    Returns
-    -------
-    sigma_c : ndarray, shape (n,), mm
-        Distance to the kth neighbour.
-    sigma_s : ndarray, shape (n,), mm
-        `range_factor` times the standard deviation (population) of the neighbours' projections on the normal.
+    Returns:
+    sigma_c: ndarray, shape (n,), mm. Distance to the kth neighbour.
+    sigma_s: ndarray, shape (n,), mm. `range_factor` times the standard deviation (population) of the neighbours'
+        projections on the normal.
     """
     away = points[:, None].astype(np.float64) - points.astype(np.float64)[indices]
     heights = np.einsum("nki,ni->nk", away, normals)

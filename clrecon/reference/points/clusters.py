@@ -14,22 +14,14 @@ def cluster_points(points: ArrayLike, eps: float, min_samples: int) -> tuple[int
     Neighbours of a point are all points within ``eps * (1 + 1e-6)``, itself included.  A point with at least
     `min_samples` neighbours is a core point.  Core points that are neighbours are in one cluster.
 
-    Parameters
-    ----------
-    points : array_like, shape (n, 3)
-        mm.
-    eps : float
-        mm.
-    min_samples : int
+    points: array_like, shape (n, 3). mm.
+    eps: mm.
 
-    Returns
-    -------
-    count : int
-        Number of clusters.
-    labels : ndarray, shape (n,), int32
-        Clusters are numbered by their first core point.  Other neighbours of core points take the lowest number among
-        these; all further points are noise, -1.
-    cores : ndarray, shape (n,), bool
+    Returns:
+    count: Number of clusters.
+    labels: ndarray, shape (n,), int32. Clusters are numbered by their first core point.  Other neighbours of core
+        points take the lowest number among these; all further points are noise, -1.
+    cores: ndarray, shape (n,), bool
 
     References
     ----------

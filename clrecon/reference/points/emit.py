@@ -34,22 +34,14 @@ def extract_voxels(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.int64]]:
     """Return the centres of voxels from `low` to `high` HU, both included.
 
-    Parameters
-    ----------
-    volume : Volume
-    low, high : float
-    shell : bool
-        True: only voxels with one of six neighbours outside; beyond the volume all is outside.
-    labels : ndarray, shape (nk, nj, ni), optional
-        Only voxels with `label`, or with any number but 0 where it is 0.
-    paper : bool
-        True: every slice lies where the first one does.
+    shell: Only voxels with one of six neighbours outside; beyond the volume all is outside.
+    labels: ndarray, shape (nk, nj, ni). Only voxels with `label`, or with any number but 0 where it is 0.
+    paper: Every slice lies where the first one does.
 
-    Returns
-    -------
-    points : ndarray, shape (n, 3), float64, LPS mm, in the order k, j, i
-    hu : ndarray, shape (n,), float32
-    ijk : ndarray, shape (n, 3)
+    Returns:
+    points: ndarray, shape (n, 3), float64, LPS mm, in the order k, j, i
+    hu: ndarray, shape (n,), float32
+    ijk: ndarray, shape (n, 3)
     """
     marked = (volume.voxels >= low) & (volume.voxels <= high)
     if labels is not None:

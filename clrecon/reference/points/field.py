@@ -19,12 +19,8 @@ _SIDES = tuple((axis, way) for axis in range(3) for way in (1, -1))
 class FieldTwin:
     """The field on nodes, arrays of shape (nz, ny, nx).
 
-    Attributes
-    ----------
-    value : float64, mm
-        Mean of <x - p, n>; NaN where no point has weight.
-    squared : float32, mm^2
-        Squared distance to the nearest point, in the arithmetic of float32; `FAR` beyond the reach.
+    value: float64, mm. Mean of <x - p, n>; NaN where no point has weight.
+    squared: float32, mm^2. Squared distance to the nearest point, in the arithmetic of float32; `FAR` beyond the reach.
     """
 
     value: NDArray[np.float64]
@@ -53,22 +49,11 @@ def measure_field(
 ) -> FieldTwin:
     """Average the distances from the planes of the points around each node.
 
-    Parameters
-    ----------
-    points, normals : ndarray, shape (n, 3), float32
-        mm, and unit vectors.
-    corner : ndarray, shape (3,), float32
-        Place of node (0, 0, 0) in mm.
-    spacing : float
-        mm between nodes.
-    shape : (nx, ny, nz)
-        Number of nodes.
-    reach, smoothing : float
-        R and s in mm: a point at distance d < R has the weight ``(1 - d^2 / R^2)^2 / (d^2 + s^2)``.
-
-    Returns
-    -------
-    FieldTwin
+    points, normals: ndarray, shape (n, 3), float32. mm, and unit vectors.
+    corner: ndarray, shape (3,), float32. Place of node (0, 0, 0) in mm.
+    spacing: mm between nodes.
+    shape: (nx, ny, nz). Number of nodes.
+    reach, smoothing: R and s in mm: a point at distance d < R has the weight ``(1 - d^2 / R^2)^2 / (d^2 + s^2)``.
     """
     h, reach32 = np.float32(spacing), np.float32(reach)
     nx, ny, nz = shape
@@ -119,10 +104,8 @@ def decide_signs(
     `core`, one neighbour farther in each of `rounds` rounds.  Nodes that both signs reach in one round, or none ever,
     keep their own.
 
-    Parameters
-    ----------
-    near, core, negative : ndarray, shape (nz, ny, nx), bool
-        Nodes within B of a point, those within one spacing, and those whose field is not positive.
+    near, core, negative: ndarray, shape (nz, ny, nx), bool. Nodes within B of a point, those within one spacing, and
+        those whose field is not positive.
     """
     from scipy import ndimage
 
@@ -166,17 +149,10 @@ def find_walls(
     A face is supported where both nodes are near and the field has two signs there.  Where it has one, the signs of far
     nodes have come through a hole in the cloud and stopped at the points of the other side: a wall.
 
-    Parameters
-    ----------
-    near, negative, inside : ndarray, shape (nz, ny, nx), bool
-        As in `decide_signs`, and its result.
-    cube : int
-        Nodes along an edge of the cubes in which faces are counted, that of their lower node.
+    near, negative, inside: ndarray, shape (nz, ny, nx), bool. As in `decide_signs`, and its result.
+    cube: Nodes along an edge of the cubes in which faces are counted, that of their lower node.
 
-    Returns
-    -------
-    dict
-        By cube (z, y, x): faces, walls, and the volume that these walls enclose in cubes of the spacing, by the
+    Returns: By cube (z, y, x): faces, walls, and the volume that these walls enclose in cubes of the spacing, by the
         divergence of x - c, their mean place c.
     """
     faces: dict[tuple[int, int, int], int] = {}

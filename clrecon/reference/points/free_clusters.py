@@ -20,20 +20,11 @@ SEVERAL_ROOTS = np.uint32(0xFFFFFFFE)
 def join_chunks(grid: GridTwin, cores: NDArray[np.bool_], reach: float, per_chunk: int) -> NDArray[np.uint32]:
     """Label the core cells: the least cell of the same chunk that each is linked with, by cells of that chunk.
 
-    Parameters
-    ----------
-    grid : GridTwin
-    cores : ndarray, shape (n,), bool
-        Core points in the sorted order.
-    reach : float
-        Largest distance of neighbours in mm.
-    per_chunk : int
-        Cells of a chunk.
+    cores: ndarray, shape (n,), bool. Core points in the sorted order.
+    reach: Largest distance of neighbours in mm.
+    per_chunk: Cells of a chunk.
 
-    Returns
-    -------
-    ndarray, shape (cells,), uint32
-        `NO_CELL` for cells without core points.
+    Returns: ndarray, shape (cells,), uint32. `NO_CELL` for cells without core points.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

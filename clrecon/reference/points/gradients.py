@@ -22,12 +22,8 @@ def _values(voxels: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray
 def find_gradients(volume: Volume, points: NDArray[np.floating], outside: float) -> NDArray[np.float64]:
     """Return the gradient of a volume at points, (n, 3), HU per mm, LPS.
 
-    Parameters
-    ----------
-    volume : Volume
-    points : ndarray, shape (n, 3), LPS mm
-    outside : float
-        Value beyond the border.
+    points: ndarray, shape (n, 3), LPS mm
+    outside: Value beyond the border.
     """
     voxels = np.pad(np.asarray(volume.voxels, dtype=np.float64), 1, constant_values=outside)
     places = volume.lps_to_ijk(points)

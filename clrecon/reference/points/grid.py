@@ -31,17 +31,10 @@ def find_cells(points: NDArray[np.float32], corner: NDArray[np.float32], edge: n
 def make_grid(points: NDArray[np.float32], edge: float) -> GridTwin:
     """Sort points by cubic cells.
 
-    Parameters
-    ----------
-    points : ndarray, shape (n, 3), float32
-        mm; a cloud that is far from the origin is relative to its base.
-    edge : float
-        mm, rounded to float32.
+    points: ndarray, shape (n, 3), float32. mm; a cloud that is far from the origin is relative to its base.
+    edge: mm, rounded to float32.
 
-    Returns
-    -------
-    GridTwin
-        `points` has shape (n, 3), in the sorted order.
+    Returns: `points` has shape (n, 3), in the sorted order.
     """
     cell = np.float32(edge)
     corner = (points.min(axis=0).astype(np.float64) - 1e-3 * float(cell)).astype(np.float32)

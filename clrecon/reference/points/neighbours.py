@@ -44,19 +44,13 @@ def _order(
 def find_neighbours(points: NDArray[np.float32], k: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """Return the `k` nearest points of each point, itself among them.
 
-    Parameters
-    ----------
-    points : ndarray, shape (n, 3), float32
-        mm, relative to a place that is near enough for float32.
-    k : int
-        At most n.
+    points: ndarray, shape (n, 3), float32. mm, relative to a place that is near enough for float32.
+    k: At most n.
 
-    Returns
-    -------
-    indices : ndarray, shape (n, k), int32
-        Ascending by (distance, index).  Of points at the same place the lowest index comes first.
-    distances : ndarray, shape (n, k), float32
-        mm, see `float32_distances`.
+    Returns:
+    indices: ndarray, shape (n, k), int32. Ascending by (distance, index).  Of points at the same place the lowest index
+        comes first.
+    distances: ndarray, shape (n, k), float32. mm, see `float32_distances`.
     """
     n = len(points)
     points = np.asarray(points, dtype=np.float32)

@@ -21,18 +21,13 @@ def principal_axes(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the smallest principal axis of the neighbours of each point, and the eigenvalues.
 
-    Parameters
-    ----------
-    points : ndarray, shape (n, 3), mm
-    indices : ndarray, shape (m, k)
-        Neighbours, the point itself among them.
+    points: ndarray, shape (n, 3), mm
+    indices: ndarray, shape (m, k). Neighbours, the point itself among them.
 
-    Returns
-    -------
-    axes : ndarray, shape (m, 3), float64
-        Unit vectors, which of both directions is not defined; zero for points in a line or at one place.
-    eigenvalues : ndarray, shape (m, 3), float64
-        Of the covariance (population), ascending, mm2.
+    Returns:
+    axes: ndarray, shape (m, 3), float64. Unit vectors, which of both directions is not defined; zero for points in a
+        line or at one place.
+    eigenvalues: ndarray, shape (m, 3), float64. Of the covariance (population), ascending, mm2.
     """
     near = np.asarray(points, dtype=np.float64)[indices]
     away = near - near.mean(axis=1, keepdims=True)
@@ -49,19 +44,13 @@ def orient_by_gradients(
 ) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
     """Turn normals towards lower HU.
 
-    Parameters
-    ----------
-    axes : ndarray, shape (n, 3)
-        Unit vectors of any direction.
-    gradients : ndarray, shape (n, 3)
-        HU per mm, LPS; zero or NaN where there is none.
+    axes: ndarray, shape (n, 3). Unit vectors of any direction.
+    gradients: ndarray, shape (n, 3). HU per mm, LPS; zero or NaN where there is none.
 
-    Returns
-    -------
-    normals : ndarray, shape (n, 3)
-        Where the axis and the gradient are nearly at a right angle, the direction of falling HU itself.
-    doubtful : ndarray, shape (n,), bool
-        True for these.
+    Returns:
+    normals: ndarray, shape (n, 3). Where the axis and the gradient are nearly at a right angle, the direction of
+        falling HU itself.
+    doubtful: ndarray, shape (n,), bool. True for these.
     """
     length = np.linalg.norm(gradients, axis=1)
     known = length > 0.0

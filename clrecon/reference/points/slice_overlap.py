@@ -11,14 +11,9 @@ __all__ = ["count_overlaps"]
 def count_overlaps(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Count the voxels of each slice, and those that it has in common with the next slice and with the one after.
 
-    Parameters
-    ----------
-    inside : ndarray, shape (nk, nj, ni), bool
+    inside: ndarray, shape (nk, nj, ni), bool
 
-    Returns
-    -------
-    ndarray, shape (3, nk), int64
-        0 where there is no such slice.
+    Returns: ndarray, shape (3, nk), int64. 0 where there is no such slice.
     """
     counts = np.zeros((3, len(inside)), np.int64)
     for apart in range(3):

@@ -15,21 +15,13 @@ def grow_cells(
 ) -> NDArray[np.uint8]:
     """Say for each point what becomes of it.
 
-    Parameters
-    ----------
-    points : ndarray, shape (n, 3), float32
-        mm.
-    edge : float
-        mm.
-    fewest, threshold : int
-        Fewest points of a cell that stays, and of one where growth begins.
-    largest : bool
-        Keep the component with the most cells alone; of several the one with the most points, then the first.
+    points: ndarray, shape (n, 3), float32. mm.
+    edge: mm.
+    fewest, threshold: Fewest points of a cell that stays, and of one where growth begins.
+    largest: Keep the component with the most cells alone; of several the one with the most points, then the first.
 
-    Returns
-    -------
-    ndarray, shape (n,), uint8
-        0: kept, 1: in a cell with few points, 2: not reached by growth, 3: in a smaller component.
+    Returns: ndarray, shape (n,), uint8. 0: kept, 1: in a cell with few points, 2: not reached by growth, 3: in a
+        smaller component.
     """
     from scipy import ndimage
 

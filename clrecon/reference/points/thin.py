@@ -13,12 +13,8 @@ __all__ = ["choose_points"]
 def choose_points(points: NDArray[np.float32], spacing: float) -> NDArray[np.uint32]:
     """Return the number of the point nearest to the mean of each cell, in the order of the cells.
 
-    Parameters
-    ----------
-    points : ndarray, shape (n, 3), float32
-        mm.
-    spacing : float
-        Edge of the cells in mm.
+    points: ndarray, shape (n, 3), float32. mm.
+    spacing: Edge of the cells in mm.
     """
     grid = make_grid(points, spacing)
     chosen = []

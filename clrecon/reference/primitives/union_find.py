@@ -14,17 +14,12 @@ def label_components(triangles: NDArray[np.uint32], vertex_count: int) -> tuple[
     Every vertex takes the smallest label in any of its triangles, until no label changes: the label of a component
     is then its smallest vertex.
 
-    Parameters
-    ----------
-    triangles : ndarray, shape (m, 3), uint32
-    vertex_count : int
+    triangles: ndarray, shape (m, 3), uint32
 
-    Returns
-    -------
-    count : int
-        Number of components, not counting vertices that no triangle uses.
-    labels : ndarray, shape (vertex_count,), int64
-        Component of each vertex, numbered in order of the first vertex; -1 for unused vertices.
+    Returns:
+    count: Number of components, not counting vertices that no triangle uses.
+    labels: ndarray, shape (vertex_count,), int64. Component of each vertex, numbered in order of the first vertex; -1
+        for unused vertices.
     """
     roots = np.arange(vertex_count)
     while True:

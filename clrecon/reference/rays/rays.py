@@ -39,11 +39,8 @@ class Box:
     exactly its voxels.  The functions are then i and j counted in the plane of slice 0, with bounds around all slices,
     and the height over slice 0. Samples in that box but beside their slice are ignored.
 
-    Attributes
-    ----------
-    normals : ndarray, shape (3, 3), float64
-    offsets, low, high : ndarray, shape (3,), float64
-        Bounds on ``normals @ p + offsets``.
+    normals: ndarray, shape (3, 3), float64
+    offsets, low, high: ndarray, shape (3,), float64. Bounds on ``normals @ p + offsets``.
     """
 
     def __init__(self, normals: Float64Array, offsets: Float64Array, low: Float64Array, high: Float64Array):
@@ -80,20 +77,13 @@ def find_interval(
 ) -> tuple[Float64Array, Float64Array, NDArray[np.int64]]:
     """Find the part of rays that lies in a box and within clip planes.
 
-    Parameters
-    ----------
-    origins, directions : ndarray, shape (n, 3), float64
-    box : Box
-    clip : Clip, optional
-    nearest : float
-        Start of the rays, mm: 0 for rays that begin at a camera.
+    origins, directions: ndarray, shape (n, 3), float64
+    nearest: Start of the rays, mm: 0 for rays that begin at a camera.
 
-    Returns
-    -------
-    t_in, t_out : ndarray, shape (n,), float64
-        Mm along the ray; a ray that misses has ``t_out <= t_in``.
-    entered_by : ndarray, shape (n,), int64
-        Number of the clip plane through which the ray enters, -1 for a side of the box or the camera.
+    Returns:
+    t_in, t_out: ndarray, shape (n,), float64. Mm along the ray; a ray that misses has ``t_out <= t_in``.
+    entered_by: ndarray, shape (n,), int64. Number of the clip plane through which the ray enters, -1 for a side of the
+        box or the camera.
     """
     planes = np.vstack(
         [
@@ -124,14 +114,10 @@ def sample_field(voxels: NDArray, ijk: Float64Array) -> Float64Array:
     Along i, then j, then k, each ``low + part * (high - low)``, so that a constant field stays constant to the last
     bit.
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni) or (nk, nj, ni, c)
-    ijk : ndarray, shape (n, 3), float64
+    voxels: ndarray, shape (nk, nj, ni) or (nk, nj, ni, c)
+    ijk: ndarray, shape (n, 3), float64
 
-    Returns
-    -------
-    ndarray, shape (n,) or (n, c), float64
+    Returns: ndarray, shape (n,) or (n, c), float64
     """
     last = np.array(voxels.shape[2::-1]) - 1
     inside = np.clip(ijk, 0, last)
@@ -152,16 +138,11 @@ def voxel_gradients(voxels: NDArray, matrices: Float64Array) -> Float64Array:
 
     Central differences; at the border half a one-sided difference (the index beyond is clamped).
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni)
-    matrices : ndarray, shape (nk, 3, 3), float64
-        Matrix of each slice, from `clrecon.geometry.iso_rule.slice_normal_matrices`.
+    voxels: ndarray, shape (nk, nj, ni)
+    matrices: ndarray, shape (nk, 3, 3), float64. Matrix of each slice, from
+        `clrecon.geometry.iso_rule.slice_normal_matrices`.
 
-    Returns
-    -------
-    ndarray, shape (nk, nj, ni, 3), float64
-        Along x, y, z.
+    Returns: ndarray, shape (nk, nj, ni, 3), float64. Along x, y, z.
     """
     wide = np.pad(voxels.astype(np.float64), 1, mode="edge")
     inner = slice(1, -1)

@@ -52,17 +52,13 @@ PLANE_SLACK = 1.0 / 4096.0
 class RayPicture:
     """The results of rays.
 
-    Attributes
-    ----------
-    rgba : ndarray, shape (h, w, 4), float64
-        Colours times opacity, and opacity; zero for modes that show values.
-    depth : ndarray, shape (h, w), float64
-        First hit, mm along the ray; NaN where nothing is hit.  In mip and minip the first place of the value; NaN in
-        mean and drr.
-    expected_depth : ndarray, shape (h, w), float64
-        Mean depth, weighted by the opacity that each sample adds; in mip and minip the depth of the value.
-    values : ndarray, shape (h, w), float64
-        HU in mip, minip and mean, NaN outside of the volume; in drr mm of water, 0 there; NaN everywhere in dvr.
+    rgba: ndarray, shape (h, w, 4), float64. Colours times opacity, and opacity; zero for modes that show values.
+    depth: ndarray, shape (h, w), float64. First hit, mm along the ray; NaN where nothing is hit.  In mip and minip the
+        first place of the value; NaN in mean and drr.
+    expected_depth: ndarray, shape (h, w), float64. Mean depth, weighted by the opacity that each sample adds; in mip
+        and minip the depth of the value.
+    values: ndarray, shape (h, w), float64. HU in mip, minip and mean, NaN outside of the volume; in drr mm of water, 0
+        there; NaN everywhere in dvr.
     """
 
     rgba: Float64Array
@@ -118,33 +114,13 @@ def cast_rays(
     the pixel alone.  A mean is the integral along the ray divided by its length.  A radiograph is the integral of
     attenuation relative to water; its field interpolates max(HU, -1000) / 1000 + 1 between voxels.
 
-    Parameters
-    ----------
-    volume : Volume
-    transfer_function : TransferFunction or None
-        For dvr.
-    camera : Camera
-    size : (int, int)
-        Width and height of the picture.
-    ray_step : float, optional
-        Mm; default half the smallest spacing.
-    lighting : Lighting, optional
-        None: no shading.
-    clip : Clip, optional
-    mode : {"dvr", "mip", "minip", "mean", "drr"}
-        Compositing; highest, lowest or mean value along the ray; thickness of water with the same attenuation as the
-        ray.
-    jitter : bool
-        Only in dvr: extremes have their samples on slice planes, and integrals in the middles of segments.
-
-    Returns
-    -------
-    RayPicture
-
-    Raises
-    ------
-    UsageError
-        The mode is unknown, or dvr has no transfer function.
+    transfer_function: For dvr.
+    size: Width and height of the picture.
+    ray_step: Mm; default half the smallest spacing.
+    lighting: None: no shading.
+    mode: {"dvr", "mip", "minip", "mean", "drr"}. Compositing; highest, lowest or mean value along the ray; thickness of
+        water with the same attenuation as the ray.
+    jitter: Only in dvr: extremes have their samples on slice planes, and integrals in the middles of segments.
     """
     if mode not in MODES:
         raise UsageError(f"there is no mode {mode!r}: it is one of {', '.join(MODES)}")

@@ -26,26 +26,14 @@ def overlay_slices(
 ) -> tuple[Float64Array, Float64Array]:
     """Find where each ray crosses the planes of slices, from front to back, and blend them.
 
-    Parameters
-    ----------
-    volume : Volume
-    camera : Camera
-    size : (width, height)
-    slices : sequence of int
-    opacity : float
-        Opacity of a slice where its value is `lowest_hu` or more; elsewhere it is transparent.
-    lowest_hu : float
-    colors : callable
-        Function from HU (n,) to red, green and blue (n, 3).
-    clip : ndarray, shape (n, 4), optional
-        Half-spaces that are kept: ``normal . p >= offset``.
+    size: (width, height)
+    opacity: Opacity of a slice where its value is `lowest_hu` or more; elsewhere it is transparent.
+    colors: Function from HU (n,) to red, green and blue (n, 3).
+    clip: ndarray, shape (n, 4). Half-spaces that are kept: ``normal . p >= offset``.
 
-    Returns
-    -------
-    rgba : ndarray, shape (h, w, 4), float64
-        Premultiplied.
-    depth : ndarray, shape (h, w), float64
-        Mm to the first visible slice; NaN without one.
+    Returns:
+    rgba: ndarray, shape (h, w, 4), float64. Premultiplied.
+    depth: ndarray, shape (h, w), float64. Mm to the first visible slice; NaN without one.
     """
     width, height = size
     origins, directions = (rays.reshape(-1, 3) for rays in camera.rays(size))

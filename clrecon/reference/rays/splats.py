@@ -26,21 +26,13 @@ def find_splats(
 
     All is float32, product by product and sum by sum as the kernel does it, so that both find the same.
 
-    Parameters
-    ----------
-    points : ndarray, shape (n, 3), floating
-        LPS mm.
-    camera : Camera
-    size : (width, height)
-    radius_mm : float
-        Of the discs; at least 0.7072 and at most 128 pixels count.
+    points: ndarray, shape (n, 3), floating. LPS mm.
+    size: (width, height)
+    radius_mm: Of the discs; at least 0.7072 and at most 128 pixels count.
 
-    Returns
-    -------
-    depth : ndarray, shape (h, w), float32
-        Mm across the view; NaN where no point is.
-    numbers : ndarray, shape (h, w), int64
-        Points; -1 where none is.
+    Returns:
+    depth: ndarray, shape (h, w), float32. Mm across the view; NaN where no point is.
+    numbers: ndarray, shape (h, w), int64. Points; -1 where none is.
     """
     width, height = size
     x, y, z = (_coordinate(points, axis, camera.position) for axis in camera.basis())
@@ -96,24 +88,15 @@ def shade_splats(
     ``exp(-0.5 s)``, s being the mean slope down to it from the eight pixels at a distance of `apart` pixels, those that
     are not nearer counted as 0 and none above 8.
 
-    Parameters
-    ----------
-    depth, numbers
-        Result of `find_splats`.
-    colors : ndarray, shape (n, 3), float64
-        0 to 1.
-    normals : ndarray, shape (n, 3), floating, optional
-    camera : Camera
-    lighting : Lighting
-        One that does not shade leaves the colours as they are.
-    apart : int
-        Pixels.
+    depth, numbers: Result of `find_splats`.
+    colors: ndarray, shape (n, 3), float64. 0 to 1.
+    normals: ndarray, shape (n, 3), floating
+    lighting: One that does not shade leaves the colours as they are.
+    apart: Pixels.
 
-    Returns
-    -------
-    rgba : ndarray, shape (h, w, 4), float64
-    depth : ndarray, shape (h, w), float64
-        Mm along the ray.
+    Returns:
+    rgba: ndarray, shape (h, w, 4), float64
+    depth: ndarray, shape (h, w), float64. Mm along the ray.
     """
     height, width = depth.shape
     _, directions = camera.rays((width, height))

@@ -66,34 +66,15 @@ def cast_surface(
     or at a camera inside, has its hit at once: on the clip plane the cap's normal is the plane's, at a camera it is the
     ray's own direction.
 
-    Parameters
-    ----------
-    volume : Volume
-    iso_value : float
-        HU.
-    camera : Camera
-    size : (int, int)
-        Width and height of the picture.
-    ray_step : float, optional
-        Mm; default half the smallest spacing.
-    lighting : Lighting, optional
-        None: no shading.
-    clip : Clip, optional
-    colour : (float, float, float)
-        Red, green, blue of the surface, 0 to 1.
-    shadows : bool
-        True: a hit has only ambient light if a ray from it towards a fixed light meets something inside, from one step
+    iso_value: HU.
+    size: Width and height of the picture.
+    ray_step: Mm; default half the smallest spacing.
+    lighting: None: no shading.
+    colour: Red, green, blue of the surface, 0 to 1.
+    shadows: A hit has only ambient light if a ray from it towards a fixed light meets something inside, from one step
         on and within the clip planes.
 
-    Returns
-    -------
-    RayPicture
-        Both depths are that of the hit; there are no values.
-
-    Raises
-    ------
-    UsageError, NoSurfaceError
-        As `clrecon.geometry.iso_rule.choose_iso_rule`.
+    Returns: Both depths are that of the hit; there are no values.
     """
     step = 0.5 * min(volume.spacing) if ray_step is None else float(ray_step)
     field, box = _ClosedField(volume, iso_value), box_of(volume, border=1.0)

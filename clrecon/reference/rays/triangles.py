@@ -24,13 +24,9 @@ FAR_ENOUGH_MM = 0.1
 class Meetings(NamedTuple):
     """Where rays meet triangles, sorted by pixel, and in a pixel by depth and then by the number of the triangle.
 
-    Attributes
-    ----------
-    pixels, triangles : ndarray, shape (n,), int64
-    depths : ndarray, shape (n,), float32
-        Mm across the view.
-    shares : ndarray, shape (n, 3), float64
-        Of the corners, in sum 1.
+    pixels, triangles: ndarray, shape (n,), int64
+    depths: ndarray, shape (n,), float32. Mm across the view.
+    shares: ndarray, shape (n, 3), float64. Of the corners, in sum 1.
     """
 
     pixels: NDArray[np.int64]
@@ -47,13 +43,9 @@ def find_meetings(
     All but the signs of areas is float32, product by product and sum by sum as the kernel does it; products of two
     float32 are exact in float64.
 
-    Parameters
-    ----------
-    vertices : ndarray, shape (n, 3), floating
-        LPS mm.
-    triangles : ndarray, shape (m, 3), integer
-    camera : Camera
-    size : (width, height)
+    vertices: ndarray, shape (n, 3), floating. LPS mm.
+    triangles: ndarray, shape (m, 3), integer
+    size: (width, height)
     """
     width, height = size
     pixel, half_x, half_y = (np.float32(v) for v in (2.0 * camera.half_height() / height, 0.5 * width, 0.5 * height))
@@ -109,22 +101,13 @@ def shade_layer(
 ) -> tuple[Float64Array, Float64Array]:
     """Colour and light a layer.
 
-    Parameters
-    ----------
-    meetings, places
-        Results of `find_meetings` and `nth_layer`.
-    normals : ndarray, shape (n, 3), floating, optional
-        Of the vertices; default: those of the triangles.
-    colors : ndarray, shape (n, 3), float64
-        Of the vertices, 0 to 1.
-    camera : Camera
-    lighting : Lighting
+    meetings, places: Results of `find_meetings` and `nth_layer`.
+    normals: ndarray, shape (n, 3), floating. Of the vertices; default: those of the triangles.
+    colors: ndarray, shape (n, 3), float64. Of the vertices, 0 to 1.
 
-    Returns
-    -------
-    rgb : ndarray, shape (h, w, 3), float64
-    depth : ndarray, shape (h, w), float64
-        Mm along the ray; NaN where the layer has nothing.
+    Returns:
+    rgb: ndarray, shape (h, w, 3), float64
+    depth: ndarray, shape (h, w), float64. Mm along the ray; NaN where the layer has nothing.
     """
     height, width = places.shape
     there = places >= 0

@@ -26,16 +26,10 @@ def is_inside(volume: Volume, points: Float64Array) -> NDArray[np.bool_]:
 def sample_field(volume: Volume, points: Float64Array) -> Float64Array:
     """Interpolate trilinearly between voxel centres.
 
-    Parameters
-    ----------
-    volume : Volume
-    points : ndarray, shape (n, 3), float64
-        LPS mm, all of them within the box of the volume.
+    points: ndarray, shape (n, 3), float64. LPS mm, all of them within the box of the volume.
 
-    Returns
-    -------
-    ndarray, shape (n,), float64
-        HU; between the outer voxel centres and the faces of the box the nearest value.
+    Returns: ndarray, shape (n,), float64. HU; between the outer voxel centres and the faces of the box the nearest
+        value.
     """
     last = np.array(volume.shape_ijk) - 1
     at = np.clip(volume.lps_to_ijk(points), 0.0, last)
@@ -54,18 +48,9 @@ def sample_field(volume: Volume, points: Float64Array) -> Float64Array:
 def reformat_sheet(volume: Volume, sheet: Sheet, samples: SlabSamples, combine: str = "mean") -> Float64Array:
     """Compute the values of all pixels of a sheet.
 
-    Parameters
-    ----------
-    volume : Volume
-    sheet : Sheet
-    samples : SlabSamples
-    combine : {"mean", "max", "min"}
-        How the samples of a pixel that lie within the volume are combined.
+    combine: {"mean", "max", "min"}. How the samples of a pixel that lie within the volume are combined.
 
-    Returns
-    -------
-    ndarray, shape (h, w), float64
-        HU; NaN where no sample lies within the volume.
+    Returns: ndarray, shape (h, w), float64. HU; NaN where no sample lies within the volume.
     """
     shape = sheet.height, sheet.width
     values = np.full(shape, 0.0 if combine == "mean" else np.nan)

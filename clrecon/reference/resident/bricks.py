@@ -13,15 +13,10 @@ __all__ = ["compare_bricks", "measure_bricks"]
 def measure_bricks(voxels: NDArray[Any], brick: int = 8) -> NDArray[Any]:
     """Return the lowest and highest value of each brick.
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni)
-    brick : int
-        Voxels along each side.
+    voxels: ndarray, shape (nk, nj, ni)
+    brick: Voxels along each side.
 
-    Returns
-    -------
-    ndarray, shape (bk, bj, bi, 2), of the voxels' type
+    Returns: ndarray, shape (bk, bj, bi, 2), of the voxels' type
     """
     shape = [-(-n // brick) for n in voxels.shape]
     ranges = np.empty((*shape, 2), voxels.dtype)

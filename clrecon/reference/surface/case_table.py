@@ -103,11 +103,7 @@ def _face_segments(case: int, joined: int) -> dict[int, int]:
 def case_loops(case: int, joined: int = 0) -> list[list[int]]:
     """Return the closed loops of edges of a case, each counter-clockwise as seen from outside (< iso value).
 
-    Parameters
-    ----------
-    case : int
-    joined : int
-        Bit f: the two diagonal inside corners of face f are joined on it; by default no face joins them.
+    joined: Bit f: the two diagonal inside corners of face f are joined on it; by default no face joins them.
     """
     segments = _face_segments(case, joined)
     loops = []
@@ -207,10 +203,8 @@ def case_table() -> tuple[tuple[Triangle, ...], ...]:
 def pack_case_table() -> NDArray[np.uint64]:
     """Pack the table for the device: one 64-bit word for each case.
 
-    Returns
-    -------
-    ndarray, shape (256,), uint64
-        The lowest 4 bits are the number of triangles; above them 4 bits for each edge, triangle by triangle.
+    Returns: ndarray, shape (256,), uint64. The lowest 4 bits are the number of triangles; above them 4 bits for each
+        edge, triangle by triangle.
     """
     packed = np.zeros(256, dtype=np.uint64)
     for case, triangles in enumerate(case_table()):

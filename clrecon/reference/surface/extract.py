@@ -154,26 +154,18 @@ def extract_isosurface(
 ) -> Surface:
     """Extract the iso surface of a small volume.
 
-    Parameters
-    ----------
-    volume : Volume
-    iso_value : float or (float, float)
-        HU, or the two ends of a range.
-    closed : bool
-        Surround the volume with outside.
-    topology : {"separated", "trilinear"}
-        Keep inside corners apart that only meet across a face or cell, or join them where the trilinear field does.
-    below : bool
-        True: inside is below the iso value.
-    vertex_rule : {"linear", "golden", "golden-search"}
-    grown : callable, optional
-        Function from the samples that are inside, (gk, gj, gi), to the cells whose triangles are wanted; None: all.
+    iso_value: float or (float, float). HU, or the two ends of a range.
+    closed: Surround the volume with outside.
+    topology: {"separated", "trilinear"}. Keep inside corners apart that only meet across a face or cell, or join them
+        where the trilinear field does.
+    below: Inside is below the iso value.
+    vertex_rule: {"linear", "golden", "golden-search"}
+    grown: Function from the samples that are inside, (gk, gj, gi), to the cells whose triangles are wanted; None: all.
 
-    Returns
-    -------
-    vertices : ndarray, shape (n, 3), float64, LPS mm
-    normals : ndarray, shape (n, 3), float64, unit, towards what is outside
-    triangles : ndarray, shape (m, 3), uint32, counter-clockwise as seen from outside
+    Returns:
+    vertices: ndarray, shape (n, 3), float64, LPS mm
+    normals: ndarray, shape (n, 3), float64, unit, towards what is outside
+    triangles: ndarray, shape (m, 3), uint32, counter-clockwise as seen from outside
     """
     rule = choose_iso_rule(volume, iso_value, closed, topology, below=below, vertex_rule=vertex_rule)
     inside = rule.mark_inside(sample_grid(volume, rule, rule.border))
@@ -196,22 +188,12 @@ def extract_inside(
 ) -> Surface:
     """Extract the surface between the samples that are inside and the others.
 
-    Parameters
-    ----------
-    volume : Volume
-    rule : IsoRule
-    inside : ndarray, shape (gk, gj, gi), bool
-        Samples that are inside, on the sample grid: the volume and its border.
-    hu_places : ndarray, shape (gk, gj, gi), bool, optional
-        Where both samples of an edge are marked, HU place the vertex at the iso level.  Elsewhere it lies half way, and
-        its normal follows `inside`. None: HU place every vertex.
-    cells : ndarray, shape (gk - 1, gj - 1, gi - 1), bool, optional
-        Cells whose triangles are wanted.
+    inside: ndarray, shape (gk, gj, gi), bool. Samples that are inside, on the sample grid: the volume and its border.
+    hu_places: ndarray, shape (gk, gj, gi), bool. Where both samples of an edge are marked, HU place the vertex at the
+        iso level.  Elsewhere it lies half way, and its normal follows `inside`. None: HU place every vertex.
+    cells: ndarray, shape (gk - 1, gj - 1, gi - 1), bool. Cells whose triangles are wanted.
 
-    Returns
-    -------
-    vertices, normals, triangles
-        As `extract_isosurface`; normals point down, and up where the surface ends a range at its upper end.
+    Returns: As `extract_isosurface`; normals point down, and up where the surface ends a range at its upper end.
     """
     field = sample_grid(volume, rule, rule.border)
     slopes = gradients(sample_grid(volume, rule, rule.border + 1), rule.closed)
@@ -246,13 +228,10 @@ def extract_inside(
 class CrossedEdges:
     """Edges of the sample grid between a sample inside and one outside, in the order of their vertices.
 
-    Attributes
-    ----------
-    numbers : ndarray, shape (gk, gj, gi, 3), int64
-        The vertex on the edge that a sample owns along each axis, where it is crossed.
-    near, far : tuple of three ndarray, shape (n,), int64
-        (k, j, i) of the owner and of the other end.
-    axis : ndarray, shape (n,), int64
+    numbers: ndarray, shape (gk, gj, gi, 3), int64. The vertex on the edge that a sample owns along each axis, where it
+        is crossed.
+    near, far: tuple of three ndarray, shape (n,), int64. (k, j, i) of the owner and of the other end.
+    axis: ndarray, shape (n,), int64
     """
 
     numbers: NDArray[np.int64]
@@ -290,15 +269,11 @@ def build_surface(
 ) -> Surface:
     """Place the vertices at the parts `t` of their edges, and write the triangles.
 
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-        Position of each vertex on its edge, from the near end.
-    slope, next_slope : ndarray, shape (n, 3)
-        Parts of the two ends in the gradient at the vertex, per step along i, j, k; where their sum vanishes, the
-        direction of the edge is used.
-    cells_wanted : ndarray, shape (gk - 1, gj - 1, gi - 1), bool, optional
-        Cells whose triangles are wanted, of the topology "separated"; vertices of no triangle are left out then.
+    t: ndarray, shape (n,). Position of each vertex on its edge, from the near end.
+    slope, next_slope: ndarray, shape (n, 3). Parts of the two ends in the gradient at the vertex, per step along i, j,
+        k; where their sum vanishes, the direction of the edge is used.
+    cells_wanted: ndarray, shape (gk - 1, gj - 1, gi - 1), bool. Cells whose triangles are wanted, of the topology
+        "separated"; vertices of no triangle are left out then.
     """
     (k, j, i), (k1, j1, i1), axis, numbers = edges.near, edges.far, edges.axis, edges.numbers
     slope, next_slope = slope.copy(), next_slope.copy()

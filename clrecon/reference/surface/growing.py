@@ -61,12 +61,8 @@ def find_mixed(inside: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
 class Frontier:
     """The result of `grow_cells`.
 
-    Attributes
-    ----------
-    cells : ndarray, shape (gk - 1, gj - 1, gi - 1), bool
-        Cells that were entered: the grown cells.
-    visited : int
-        Cells that were looked at: the grown ones, and neighbours of theirs that were not entered.
+    cells: ndarray, shape (gk - 1, gj - 1, gi - 1), bool. Cells that were entered: the grown cells.
+    visited: Cells that were looked at: the grown ones, and neighbours of theirs that were not entered.
     """
 
     cells: NDArray[np.bool_]
@@ -76,12 +72,8 @@ class Frontier:
 def grow_cells(inside: NDArray[np.bool_], seeds: Iterable[tuple[int, int, int]]) -> Frontier:
     """Grow from seed cells through mixed faces, one cell after the other, as the paper does.
 
-    Parameters
-    ----------
-    inside : ndarray, shape (gk, gj, gi), bool
-        Samples that are inside.
-    seeds : iterable of (k, j, i)
-        Cells; those that are not active grow nothing.
+    inside: ndarray, shape (gk, gj, gi), bool. Samples that are inside.
+    seeds: iterable of (k, j, i). Cells; those that are not active grow nothing.
     """
     active = find_active(inside)
     mixed = [find_mixed(inside, axis) for axis in range(3)]
@@ -109,11 +101,9 @@ def grow_cells(inside: NDArray[np.bool_], seeds: Iterable[tuple[int, int, int]])
 def label_cells(inside: NDArray[np.bool_]) -> tuple[int, NDArray[np.int64]]:
     """Number the components of active cells that mixed faces join.
 
-    Returns
-    -------
-    count : int
-    numbers : ndarray, shape (gk - 1, gj - 1, gi - 1), int64
-        Components in the order of their first cell; -1 for cells that are not active.
+    Returns:
+    numbers: ndarray, shape (gk - 1, gj - 1, gi - 1), int64. Components in the order of their first cell; -1 for cells
+        that are not active.
     """
     import scipy.sparse
     from scipy.sparse.csgraph import connected_components

@@ -60,22 +60,13 @@ def extract_label_mask(
 
     No vertex comes nearer to a sample than `KEEP` of its edge.
 
-    Parameters
-    ----------
-    labels : ndarray, shape (nk, nj, ni)
-    affine : ndarray, shape (4, 4)
-    number : int
-    level : int
-        1 to `FULL` - 1.
-    closed : bool
-        True: the surface is closed at the border of the map.
-    enclosed : dict of int to int, optional
-        The levels of labels that others enclose, see `choose_enclosed`.
+    labels: ndarray, shape (nk, nj, ni)
+    affine: ndarray, shape (4, 4)
+    level: 1 to `FULL` - 1.
+    closed: The surface is closed at the border of the map.
+    enclosed: The levels of labels that others enclose, see `choose_enclosed`.
 
-    Returns
-    -------
-    vertices, normals, triangles
-        As `clrecon.reference.surface.extract.extract_isosurface`.
+    Returns: As `clrecon.reference.surface.extract.extract_isosurface`.
     """
     volume, border = Volume(labels, affine), int(closed)
     rule = IsoRule(0.5, FULL // 2, FULL / 2, 0.0, closed)

@@ -19,19 +19,11 @@ __all__ = ["extract_label", "find_solid", "own_labels"]
 def own_labels(labels: NDArray[Any], volume: Volume, grow_mm: float | None) -> NDArray[np.uint16]:
     """Grow labels into samples without one.
 
-    Parameters
-    ----------
-    labels : ndarray, shape (nk, nj, ni)
-        Labels on the grid of the volume; 0 is no label.
-    volume : Volume
-    grow_mm : float or None
-        A sample without a label gets the nearest label within this distance in mm, the lowest of equally near ones.
-        None: the nearest, in mm, among its 26 neighbours.
+    labels: ndarray, shape (nk, nj, ni). Labels on the grid of the volume; 0 is no label.
+    grow_mm: A sample without a label gets the nearest label within this distance in mm, the lowest of equally near
+        ones. None: the nearest, in mm, among its 26 neighbours.
 
-    Returns
-    -------
-    ndarray, shape (nk, nj, ni), uint16
-        A sample that has a label keeps it.
+    Returns: ndarray, shape (nk, nj, ni), uint16. A sample that has a label keeps it.
     """
     growth = Growth.of(volume, grow_mm)
     offsets, shells, reach = growth.offsets, growth.shells, growth.reach
@@ -76,20 +68,10 @@ def extract_label(
     surface without labels.  Everywhere else (beside another label, or beside dense samples without a label) it lies
     half way, and its normal follows the label, not HU.
 
-    Parameters
-    ----------
-    volume : Volume
-    inside : ndarray, shape (nk, nj, ni), uint16
-        Result of `find_solid`.
-    number : int
-    iso_value : float
-        HU.
-    closed : bool
+    inside: ndarray, shape (nk, nj, ni), uint16. Result of `find_solid`.
+    iso_value: HU.
 
-    Returns
-    -------
-    vertices, normals, triangles
-        As `clrecon.reference.surface.extract.extract_isosurface`.
+    Returns: As `clrecon.reference.surface.extract.extract_isosurface`.
     """
     rule = choose_iso_rule(volume, iso_value, closed)
     grown = np.pad(inside, rule.border)

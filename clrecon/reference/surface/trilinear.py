@@ -53,11 +53,7 @@ def scale_heights(heights: Sequence[float], bits: int) -> list[int]:
 def decide_faces(case: int, heights: Sequence[float]) -> int:
     """Return the mask of the ambiguous faces that join their two diagonal inside corners.
 
-    Parameters
-    ----------
-    case : int
-    heights : sequence of 8 float
-        Values of the corners less the iso level, float32.
+    heights: Values of the corners less the iso level, float32.
     """
     joined = 0
     for face in find_ambiguous_faces(case):
@@ -100,10 +96,7 @@ def _sign_values(case: int, heights: Sequence[float]) -> list[int]:
 def decide_interior(values: Sequence[int]) -> int | None:
     """Return the code of the tunnel that the cell has if its faces allow one, else None.
 
-    Parameters
-    ----------
-    values : sequence of 8 int
-        Heights of the corners as whole numbers.
+    values: Heights of the corners as whole numbers.
     """
     z = _find_parabola(values, 2)
     if z.a == 0 or z.discriminant <= 0:
@@ -131,11 +124,7 @@ def _find_diagonal(values: Sequence[int]) -> int:
 def find_row(case: int, heights: Sequence[float]) -> Row:
     """Return the triangles of a cell.
 
-    Parameters
-    ----------
-    case : int
-    heights : sequence of 8 float
-        Values of the corners less the iso level, float32.
+    heights: Values of the corners less the iso level, float32.
     """
     state = cell_state(case, decide_faces(case, heights))
     return state.row(decide_interior(_sign_values(case, heights)) if state.tunnels else None)
@@ -194,22 +183,14 @@ def place_cell_vertices(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the vertices inside a cell.
 
-    Parameters
-    ----------
-    row : Row
-        Result of `find_row`.
-    case : int
-    heights : sequence of 8 float
-        Values of the corners less the iso level, float32.
-    margin : ndarray, shape (3,)
-        Smallest distance of a vertex from the faces, steps.
+    row: Result of `find_row`.
+    heights: Values of the corners less the iso level, float32.
+    margin: ndarray, shape (3,). Smallest distance of a vertex from the faces, steps.
 
-    Returns
-    -------
-    points : ndarray, shape (n, 3), float64
-        In steps (x, y, z) from corner 0; n is `Row.cell_vertices`.
-    gradients : ndarray, shape (n, 3), float64
-        Gradients of the trilinear field at the points, per step and up to a common factor; (1, 1, 1) where they vanish.
+    Returns:
+    points: ndarray, shape (n, 3), float64. In steps (x, y, z) from corner 0; n is `Row.cell_vertices`.
+    gradients: ndarray, shape (n, 3), float64. Gradients of the trilinear field at the points, per step and up to a
+        common factor; (1, 1, 1) where they vanish.
     """
     values = _sign_values(case, heights)
     if row.cell_vertices == 1:

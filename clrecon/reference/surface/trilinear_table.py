@@ -63,14 +63,9 @@ Loop = tuple[int, ...]
 class Tunnel:
     """A tube through the cell.
 
-    Attributes
-    ----------
-    inside : bool
-        True: it joins inside corners; False: outside corners.
-    diagonal : int
-        Direction of the tunnel, from corner `diagonal` (0 to 3) to corner ``7 - diagonal``.
-    loops : tuple of two loops
-        Loops at its two ends.
+    inside: True: it joins inside corners; False: outside corners.
+    diagonal: Direction of the tunnel, from corner `diagonal` (0 to 3) to corner ``7 - diagonal``.
+    loops: Loops at its two ends.
     """
 
     inside: bool
@@ -304,18 +299,13 @@ def find_states(case: int) -> list[CellState]:
 class PackedTables:
     """The tables in the form for the device.
 
-    Attributes
-    ----------
-    cases : ndarray, shape (256,), uint32
-        Bits 0-15 the first of the case's states, as `find_states` orders them; bits 16-21 its ambiguous faces.
-    states : ndarray, uint32
-        Bits 0-15 the row without a tunnel; bits 16 + 2 n and 17 + 2 n how many rows further the one of the tunnel
-        with code n is, 0 where the state cannot have it.
-    rows : ndarray, uint32
-        Bits 0-15 the first triangle, 16-20 the number of triangles, 21-23 of vertices inside the cell, 24-25 the
-        diagonal of the tunnel.
-    triangles : ndarray, uint16
-        Three vertices of 5 bits, the first the lowest.
+    cases: ndarray, shape (256,), uint32. Bits 0-15 the first of the case's states, as `find_states` orders them; bits
+        16-21 its ambiguous faces.
+    states: ndarray, uint32. Bits 0-15 the row without a tunnel; bits 16 + 2 n and 17 + 2 n how many rows further the
+        one of the tunnel with code n is, 0 where the state cannot have it.
+    rows: ndarray, uint32. Bits 0-15 the first triangle, 16-20 the number of triangles, 21-23 of vertices inside the
+        cell, 24-25 the diagonal of the tunnel.
+    triangles: ndarray, uint16. Three vertices of 5 bits, the first the lowest.
     """
 
     cases: NDArray[np.uint32]

@@ -35,17 +35,8 @@ def round_up(value: float) -> float:
 class ColorScale:
     """A scale of colours for numbers from ``-limit`` to `limit`, or from 0 to `limit`.
 
-    Parameters
-    ----------
-    limit : float
-        Above 0.  Numbers beyond have the colours of the ends.
-    signed : bool
-        True: about zero, else from zero on.
-
-    Raises
-    ------
-    UsageError
-        The limit is not a number above 0.
+    limit: Above 0.  Numbers beyond have the colours of the ends.
+    signed: About zero, else from zero on.
     """
 
     limit: float

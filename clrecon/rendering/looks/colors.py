@@ -41,19 +41,10 @@ def is_transparent(background: Any) -> bool:
 def find_color(color: str | Sequence[float]) -> Float64Array:
     """Red, green and blue from 0 to 1.
 
-    Parameters
-    ----------
-    color : str or (float, float, float)
-        A name of `COLORS` (grey for gray is fine), ``#rgb``, ``#rrggbb``, or three numbers from 0 to 1.
+    color: str or (float, float, float). A name of `COLORS` (grey for gray is fine), ``#rgb``, ``#rrggbb``, or three
+        numbers from 0 to 1.
 
-    Returns
-    -------
-    ndarray, shape (3,), float64
-
-    Raises
-    ------
-    UsageError
-        `color` is none of these; the message lists the names.
+    Returns: ndarray, shape (3,), float64
     """
     if isinstance(color, str):
         text = color.strip().lower()

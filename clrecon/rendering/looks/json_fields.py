@@ -26,13 +26,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def parse_json(text: str) -> Any:
-    """Parse JSON strictly: no NaN, no Infinity, no field twice.
-
-    Raises
-    ------
-    RefusedInputError
-        The text is not strict JSON; the message has line and column of a syntax error.
-    """
+    """Parse JSON strictly: no NaN, no Infinity, no field twice."""
     try:
         return json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_unique)
     except json.JSONDecodeError as error:

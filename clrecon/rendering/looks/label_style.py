@@ -30,11 +30,8 @@ GOLDEN_SHARE = 0.618034
 class LabelStyle(Message):
     """The look of the labels of a map; what is not named keeps its look, voxels without a label (0) too.
 
-    Attributes
-    ----------
-    labels : LabelMap
-    table : ndarray, shape (largest number + 1, 4), float32
-        Red, green, blue and opacity by number, 0 to 1; red below 0 keeps the colour of the picture without labels.
+    table: ndarray, shape (largest number + 1, 4), float32. Red, green, blue and opacity by number, 0 to 1; red below 0
+        keeps the colour of the picture without labels.
     """
 
     labels: LabelMap
@@ -51,21 +48,11 @@ class LabelStyle(Message):
 
         >>> LabelStyle.of(labels, colors={"L1": "orange"}, opacity={"L2": 0.2})
 
-        Parameters
-        ----------
-        labels : LabelMap
-        colors : mapping of label to colour, optional
-            Labels by number or name as `LabelMap.find` takes them, colours as `find_color` does.  Labels that are not
-            named keep the colour of the picture; without a mapping every label gets its own colour, see
+        colors: Labels by number or name as `LabelMap.find` takes them, colours as `find_color` does.  Labels that are
+            not named keep the colour of the picture; without a mapping every label gets its own colour, see
             `distinct_colors`.
-        opacity : mapping of label to float, optional
-            0 to 1: a factor on the opacity; labels that are not named keep theirs.  0 stands for all that has no label.
-
-        Raises
-        ------
-        UsageError
-            `labels` is not a label map, a label or colour is unknown, an opacity is outside 0 to 1, or a label is named
-            twice.
+        opacity: 0 to 1: a factor on the opacity; labels that are not named keep theirs.  0 stands for all that has no
+            label.
         """
         if not isinstance(labels, LabelMap):
             raise UsageError(f"labels are a LabelMap, see clrecon.read_labels, not {type(labels).__name__}")
@@ -90,13 +77,7 @@ _COLORS = "colours"
 
 
 def find_shown(labels: LabelMap, label: int | str) -> int:
-    """Return the number of a label, or 0 for what has no label.
-
-    Raises
-    ------
-    UsageError
-        `LabelMap.find` does not know it.
-    """
+    """Return the number of a label, or 0 for what has no label."""
     return NO_LABEL if str(label).strip() == "0" else labels.find(label)
 
 

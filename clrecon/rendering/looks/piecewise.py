@@ -18,13 +18,7 @@ STRAIGHT_PARTS = 32
 
 
 def check_ascending(what: str, unit: str, positions: Float64Array) -> None:
-    """Refuse positions (n,) that descend, and more than two at one place.
-
-    Raises
-    ------
-    UsageError
-        The message has the two numbers and their place; points are counted from 1.
-    """
+    """Refuse positions (n,) that descend, and more than two at one place."""
     back = np.flatnonzero(np.diff(positions) < 0)
     if back.size:
         at = int(back[0])
@@ -41,12 +35,7 @@ def check_ascending(what: str, unit: str, positions: Float64Array) -> None:
 
 
 def check_share(what: str, value: float, at: int, advice: str = "") -> None:
-    """Refuse a value of point `at` (from 0) that is not in 0..1.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse a value of point `at` (from 0) that is not in 0..1."""
     if not 0.0 <= value <= 1.0:
         raise UsageError(f"{what} of point {at + 1} is {value:g}, and must lie between 0 and 1{advice}")
 

@@ -22,18 +22,11 @@ DEFAULT_PRESET = "bone"
 class Preset:
     """A way to make a picture that shows one tissue well.
 
-    Attributes
-    ----------
-    name : str
-    mode : str
-        The mode that it is made for: "dvr", "mip", "minip" or "drr". It is used unless the caller names another one, so
-        that ``x-ray`` alone gives a radiograph.
-    transfer_function : TransferFunction
-        Transfer function with its `lighting`; used in "dvr".
-    window : (float, float) or None
-        HU of black and of white in projections ("drr" has none); None: chosen from the picture's own values.
-    source : str
-        Origin of the ranges.
+    mode: The mode that it is made for: "dvr", "mip", "minip" or "drr". It is used unless the caller names another one,
+        so that ``x-ray`` alone gives a radiograph.
+    transfer_function: Transfer function with its `lighting`; used in "dvr".
+    window: HU of black and of white in projections ("drr" has none); None: chosen from the picture's own values.
+    source: Origin of the ranges.
     """
 
     name: str
@@ -232,13 +225,7 @@ PRESETS: dict[str, Preset] = {
 
 
 def find_preset(name: str) -> Preset:
-    """Return the rendering preset called `name`, in upper or lower case.
-
-    Raises
-    ------
-    UsageError
-        There is no preset of this name; the message lists all names.
-    """
+    """Return the rendering preset called `name`, in upper or lower case."""
     try:
         return PRESETS[name.lower()]
     except (KeyError, TypeError, AttributeError):

@@ -28,16 +28,11 @@ time."""
 class Steepness:
     """The steepness of a table of opacities over one ray step.
 
-    Attributes
-    ----------
-    changes : ndarray, shape (nodes,), float64
-        Sum of the changes of opacity, up and down, from the first node to each node.
-    narrow : float
-        Number of nodes within which the opacity changes by at most `STEEP`.
-    has_dense : bool
-        True: the opacity is above `DENSE` somewhere.
-    is_steep : bool
-        True: the opacity changes by more than `STEEP` within `STEEP_HU` somewhere.
+    changes: ndarray, shape (nodes,), float64. Sum of the changes of opacity, up and down, from the first node to each
+        node.
+    narrow: Number of nodes within which the opacity changes by at most `STEEP`.
+    has_dense: The opacity is above `DENSE` somewhere.
+    is_steep: The opacity changes by more than `STEEP` within `STEEP_HU` somewhere.
     """
 
     changes: NDArray[np.float64]

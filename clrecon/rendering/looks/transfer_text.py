@@ -17,12 +17,9 @@ def transfer_text(
 ) -> str:
     """Return a transfer function as text; reading it gives the same function, bit for bit.
 
-    Parameters
-    ----------
-    head : mapping
-        Name, description, unit distance and lighting, by the names of the format.
-    points : sequence of (hu, red, green, blue, opacity)
-    gradient_opacity : sequence of (HU per mm, factor), or None
+    head: Name, description, unit distance and lighting, by the names of the format.
+    points: sequence of (hu, red, green, blue, opacity)
+    gradient_opacity: sequence of (HU per mm, factor), or None
     """
     first = {"format": FORMAT, "version": VERSION, **head}
     fields = [f'  "{key}": {json.dumps(value)}' for key, value in first.items()]

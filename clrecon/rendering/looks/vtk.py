@@ -30,11 +30,6 @@ def curve_from_nodes(
 
     Nodes within `STEP_HU` form one step, of which the first and the last node are used.  Without `clamped` the function
     is 0 beyond its ends; `steps` as in `straighten_curve`.
-
-    Raises
-    ------
-    UsageError
-        There are no nodes, or their positions descend.
     """
     rows = np.array(list(nodes), dtype=np.float64)
     if rows.size == 0:

@@ -21,12 +21,7 @@ _FRAME = re.compile(r"frame_[0-9]{4,}\.png")
 
 
 def check_frame_folder(path: str | os.PathLike[str]) -> Path:
-    """Return the folder that will be made or replaced, see `clrecon.system.folders.check_folder`.
-
-    Raises
-    ------
-    UsageError, OutputError
-    """
+    """Return the folder that will be made or replaced, see `clrecon.system.folders.check_folder`."""
     return check_folder(path, _FRAME, "frames")
 
 

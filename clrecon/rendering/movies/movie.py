@@ -88,25 +88,11 @@ def animation_kind(path: str | os.PathLike[str]) -> str:
 def check_animation(path: str | os.PathLike[str], fps: float = 25.0) -> str:
     """Refuse a moving picture that cannot be written, before a frame is computed.
 
-    Parameters
-    ----------
-    path : str or path
-        ``.mp4``, ``.gif``, ``.apng``, or a folder: a name without extension, a name that ends with a slash, or an
+    path: ``.mp4``, ``.gif``, ``.apng``, or a folder: a name without extension, a name that ends with a slash, or an
         existing folder.
-    fps : float
-        Frames per second.
+    fps: Frames per second.
 
-    Returns
-    -------
-    str
-        The extension, empty for a folder.
-
-    Raises
-    ------
-    UsageError
-        The extension is unknown, there is no encoder, the folder contains other files, or `fps` is out of range.
-    OutputError
-        The place cannot be written to.
+    Returns: The extension, empty for a folder.
     """
     try:
         text = os.fspath(path)

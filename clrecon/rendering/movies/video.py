@@ -30,13 +30,7 @@ QUALITY = 18
 
 @lru_cache(maxsize=1)
 def find_encoder() -> str:
-    """Return the ffmpeg to call: that of imageio-ffmpeg, else the one on the PATH.
-
-    Raises
-    ------
-    UsageError
-        There is no ffmpeg, or it cannot make H.264; the message says what to install.
-    """
+    """Return the ffmpeg to call: that of imageio-ffmpeg, else the one on the PATH."""
     program = _find_ffmpeg()
     if program is None:
         raise UsageError(f"no encoder for MP4: {_advice()}; GIF, APNG and a folder of PNG files need none")
@@ -63,13 +57,7 @@ def _find_ffmpeg() -> str | None:
 
 
 def write_video(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float) -> None:
-    """Encode frames (h, w, 3) and copy the finished file to a stream.
-
-    Raises
-    ------
-    OutputError
-        The encoder fails; the message has its last line.
-    """
+    """Encode frames (h, w, 3) and copy the finished file to a stream."""
     first = next(frames)
     height, width = first.shape[:2]
     with tempfile.TemporaryDirectory(prefix="clrecon-") as folder:

@@ -51,16 +51,10 @@ class _Ink(NamedTuple):
 def orientation_letters(direction: ArrayLike) -> str:
     """Name a direction in the patient as DICOM's Patient Orientation does: ``L``, ``LP``, ``PLS``.
 
-    Parameters
-    ----------
-    direction : array_like, shape (3,)
-        A vector in LPS of any length.
+    direction: array_like, shape (3,). A vector in LPS of any length.
 
-    Returns
-    -------
-    str
-        Letters L, R, P, A, S (superior, DICOM's H) and I (inferior, DICOM's F), one for each component, the largest
-        component first.  Components of less than 5 % get no letter; equal ones come in the order x, y, z.
+    Returns: Letters L, R, P, A, S (superior, DICOM's H) and I (inferior, DICOM's F), one for each component, the
+        largest component first.  Components of less than 5 % get no letter; equal ones come in the order x, y, z.
 
     Notes
     -----
@@ -83,17 +77,10 @@ def edge_letters(camera: Camera) -> dict[str, str]:
 def sheet_letters(sheet: Sheet, rows: NDArray[np.bool_]) -> dict[str, str]:
     """Letters of the edges of a picture whose rows turn along a curve; empty where no letter is true for all of it.
 
-    Parameters
-    ----------
-    sheet : Sheet
-    rows : ndarray, shape (h,), bool
-        Rows that show something.
+    rows: ndarray, shape (h,), bool. Rows that show something.
 
-    Returns
-    -------
-    dict of str to str
-        As `edge_letters`: the letters with which the directions of all rows begin, so that the first is everywhere the
-        side to which the edge looks most.
+    Returns: As `edge_letters`: the letters with which the directions of all rows begin, so that the first is everywhere
+        the side to which the edge looks most.
     """
     right = sheet.steps[rows]
     up = np.cross(right, sheet.normals[rows])
@@ -117,29 +104,15 @@ def annotate(
 ) -> NDArray[np.uint8]:
     """Draw annotations into a copy of a picture.
 
-    Parameters
-    ----------
-    rendering : PictureData
-        Not changed.
-    letters : bool
-        Mark each edge with the side of the patient in its direction, see `orientation_letters`; along a curve only
+    rendering: Not changed.
+    letters: Mark each edge with the side of the patient in its direction, see `orientation_letters`; along a curve only
         those that are true for all of the picture, see `sheet_letters`.
-    scale_bar : bool
-        Draw a bar of a round length at the bottom left.  In a perspective picture the bar is valid in the focal plane
-        only, and its text says so.
-    caption : str, optional
-        One line of text at the top left, cut at the edge of the picture.
+    scale_bar: Draw a bar of a round length at the bottom left.  In a perspective picture the bar is valid in the focal
+        plane only, and its text says so.
+    caption: One line of text at the top left, cut at the edge of the picture.
 
-    Returns
-    -------
-    ndarray, shape (h, w, 4), uint8
-        The image, opaque under annotations.  Without any annotation it is the image of the picture itself.
-
-    Raises
-    ------
-    UsageError
-        The picture is smaller than 64 x 64 pixels or too narrow for the text; its directions or its pixel size
-        are not known; or the font lacks a character of the caption.
+    Returns: ndarray, shape (h, w, 4), uint8. The image, opaque under annotations.  Without any annotation it is the
+        image of the picture itself.
     """
     check_caption(caption)
     if not (letters or scale_bar or caption):
@@ -168,13 +141,7 @@ def annotate(
 
 
 def check_caption(caption: str | None) -> None:
-    """Refuse a caption with characters that the font lacks: they would be drawn as boxes.
-
-    Raises
-    ------
-    UsageError
-        The message names these characters.
-    """
+    """Refuse a caption with characters that the font lacks: they would be drawn as boxes."""
     if not caption:
         return
     font = load_font(4.0 * SMALLEST_TEXT)

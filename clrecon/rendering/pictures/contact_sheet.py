@@ -31,13 +31,8 @@ TEXT_SHARE, LEAST_TEXT, MOST_TEXT = 1 / 14, 9.0, 18.0
 class SheetLayout:
     """Tiles of one size in rows.
 
-    Attributes
-    ----------
-    tile : (int, int)
-        Width and height of a tile, pixels.
-    pixel_mm : float
-    corners : sequence of (int, int)
-        Left and top pixel of each tile.
+    tile: Width and height of a tile, pixels.
+    corners: sequence of (int, int). Left and top pixel of each tile.
     """
 
     tile: tuple[int, int]
@@ -48,20 +43,9 @@ class SheetLayout:
 def lay_out(count: int, mm: tuple[float, float], size: tuple[int, int], zoom: float = 1.0) -> SheetLayout:
     """Place tiles so that each is as large as possible.
 
-    Parameters
-    ----------
-    count : int
-    mm : (float, float)
-        Width and height that a tile shows at zoom 1.
-    size : (int, int)
-        Width and height of the picture; it is not exceeded.
-    zoom : float
-        2 shows everything twice as large, and half as much of it.
-
-    Raises
-    ------
-    UsageError
-        The tiles would be smaller than 64 pixels.
+    mm: Width and height that a tile shows at zoom 1.
+    size: Width and height of the picture; it is not exceeded.
+    zoom: 2 shows everything twice as large, and half as much of it.
     """
     best: tuple[float, int, tuple[int, int]] | None = None
     for columns in range(1, count + 1):
@@ -91,14 +75,10 @@ def lay_out(count: int, mm: tuple[float, float], size: tuple[int, int], zoom: fl
 def write_on_tile(image: NDArray[np.uint8], texts: tuple[str, ...], edges: Mapping[str, str]) -> NDArray[np.uint8]:
     """Write on a copy of a tile.
 
-    Parameters
-    ----------
-    image : ndarray, shape (h, w, 4), uint8
-    texts : tuple of str
-        The first that fits stands at the top left, else the last.
-    edges : mapping of str to str
-        Letters of the sides of the patient at the ``left`` and ``right`` edge; tiles under `LEAST_LETTERED` pixels have
-        none.
+    image: ndarray, shape (h, w, 4), uint8
+    texts: The first that fits stands at the top left, else the last.
+    edges: Letters of the sides of the patient at the ``left`` and ``right`` edge; tiles under `LEAST_LETTERED` pixels
+        have none.
     """
     load_pillow()
     from PIL import Image, ImageDraw

@@ -38,13 +38,7 @@ _MOST_PER_METRE = 2**31 - 1
 
 
 def check_image_path(path: str | os.PathLike[str]) -> str:
-    """Return the extension of a picture file in lower case.
-
-    Raises
-    ------
-    UsageError
-        The extension is not in `IMAGE_FORMATS`.
-    """
+    """Return the extension of a picture file in lower case."""
     return _extension(path, tuple(IMAGE_FORMATS), "picture")
 
 
@@ -57,18 +51,8 @@ def write_image(rendering: PictureData, path: str | os.PathLike[str], quality: i
 def encode_image(rendering: PictureData, extension: str, quality: int = 95) -> bytes:
     """Return the bytes of the file that `write_image` writes.
 
-    Parameters
-    ----------
-    rendering : PictureData
-    extension : str
-        One of `IMAGE_FORMATS`.
-    quality : int
-        Quality of JPEG, 1 to 100.
-
-    Raises
-    ------
-    UsageError
-        The format cannot store the opacity of the picture.
+    extension: One of `IMAGE_FORMATS`.
+    quality: Quality of JPEG, 1 to 100.
     """
     load_pillow()
     from PIL import Image
@@ -98,29 +82,16 @@ def encode_image(rendering: PictureData, extension: str, quality: int = 95) -> b
 def write_floats(array: NDArray[np.float32], path: str | os.PathLike[str], pixel_mm: float | None = None) -> int:
     """Write one float32 per pixel, NaN included, to a file with an extension of `FLOAT_FORMATS`.
 
-    Parameters
-    ----------
-    array : ndarray, shape (h, w)
-    path : str or path
-    pixel_mm : float, optional
-        Side of a pixel, for the resolution of a TIFF file.
+    array: ndarray, shape (h, w)
+    pixel_mm: Side of a pixel, for the resolution of a TIFF file.
 
-    Returns
-    -------
-    int
-        Size of the file in bytes.
+    Returns: Size of the file in bytes.
     """
     return _replace(path, encode_floats(array, check_float_path(path), pixel_mm))
 
 
 def check_float_path(path: str | os.PathLike[str]) -> str:
-    """Return the extension of a file of depths or values in lower case.
-
-    Raises
-    ------
-    UsageError
-        The extension is not in `FLOAT_FORMATS`.
-    """
+    """Return the extension of a file of depths or values in lower case."""
     return _extension(path, FLOAT_FORMATS, "depth or value")
 
 

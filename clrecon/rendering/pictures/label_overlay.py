@@ -31,10 +31,7 @@ def labels_on_sheet(labels: LabelMap, sheet: Sheet) -> NDArray[Any]:
     The place of a pixel in mm is looked up in the map itself, whatever slices the scan has: neither tilted nor uneven
     ones move a label.
 
-    Returns
-    -------
-    ndarray, shape (h, w), of the type of the map
-        0 where no label is, and beyond the map.
+    Returns: ndarray, shape (h, w), of the type of the map. 0 where no label is, and beyond the map.
     """
     size = np.array(labels.shape_ijk)
     found = np.zeros((sheet.height, sheet.width), labels.voxels.dtype)
@@ -57,22 +54,13 @@ def draw_labels(
 ) -> NDArray[np.uint8]:
     """Draw labels over a copy of a picture.
 
-    Parameters
-    ----------
-    image : ndarray, shape (h, w, 4), uint8
-        Pixels with opacity 0 show nothing of the scan and stay as they are.
-    numbers : ndarray, shape (h, w)
-        Label of each pixel, 0 for none.
-    look : LabelStyle
-        Labels without a colour, and those with opacity 0, are not drawn.  What has no label keeps its look.
-    tints : mapping of label to float, optional
-        Share of its colour that the inside of a label gets; others get `FILL`.
-    width : int, optional
-        Of outlines, in pixels inwards; default: a 400th of the shorter side, a pixel at least.
+    image: ndarray, shape (h, w, 4), uint8. Pixels with opacity 0 show nothing of the scan and stay as they are.
+    numbers: ndarray, shape (h, w). Label of each pixel, 0 for none.
+    look: Labels without a colour, and those with opacity 0, are not drawn.  What has no label keeps its look.
+    tints: Share of its colour that the inside of a label gets; others get `FILL`.
+    width: Of outlines, in pixels inwards; default: a 400th of the shorter side, a pixel at least.
 
-    Returns
-    -------
-    ndarray, shape (h, w, 4), uint8
+    Returns: ndarray, shape (h, w, 4), uint8
     """
     table = look.table
     drawn = (table[:, 0] >= 0.0) & (table[:, 3] > 0.0)

@@ -19,24 +19,13 @@ def merge_layers(rendering: Rendering, colors: NDArray[np.uint8], depth: NDArray
     Each pixel of the picture is one layer at its expected depth.  A mesh within translucent tissue is therefore drawn
     wholly before or wholly behind the tissue.
 
-    Parameters
-    ----------
-    rendering : Rendering
-        The picture, with a transparent background.
-    colors : ndarray, shape (h, w, 4), uint8
-        The scene: red, green, blue and opacity, not premultiplied; row 0 is the top.
-    depth : ndarray, shape (h, w), floating
-        Depths of the scene in mm, as in `Rendering.depth`; NaN where the scene is empty.
+    rendering: The picture, with a transparent background.
+    colors: ndarray, shape (h, w, 4), uint8. The scene: red, green, blue and opacity, not premultiplied; row 0 is the
+        top.
+    depth: ndarray, shape (h, w), floating. Depths of the scene in mm, as in `Rendering.depth`; NaN where the scene is
+        empty.
 
-    Returns
-    -------
-    Rendering
-        The merged picture.  Both of its depths include the scene; `values` is None.
-
-    Raises
-    ------
-    UsageError
-        The sizes differ, or the background of the picture is a colour.
+    Returns: The merged picture.  Both of its depths include the scene; `values` is None.
     """
     width, height = rendering.size
     if colors.shape != (height, width, 4) or depth.shape != (height, width):

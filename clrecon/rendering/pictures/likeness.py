@@ -36,14 +36,9 @@ _SEED = 20190601
 class PictureLikeness(Record):
     """How alike two pictures are.
 
-    Attributes
-    ----------
-    mse : float
-        Mean squared difference of the values, 0 to 65025.
-    ssim : float
-        Structural similarity, 1 for equal pictures.
-    box : (int, int, int, int)
-        First row, first column, and the row and column after the last: what was compared.
+    mse: Mean squared difference of the values, 0 to 65025.
+    ssim: Structural similarity, 1 for equal pictures.
+    box: First row, first column, and the row and column after the last: what was compared.
     """
 
     mse: float

@@ -85,17 +85,7 @@ def keywords_of(mode: str) -> dict[str, str]:
 def check_known(mode: str, keyword: str, called: str | None = None) -> None:
     """Refuse a keyword that has no meaning in a mode.
 
-    Parameters
-    ----------
-    mode : str
-    keyword : str
-    called : str, optional
-        Name of the keyword in the message, if the caller has another one.
-
-    Raises
-    ------
-    UsageError
-        The message names the modes that know the keyword.
+    called: Name of the keyword in the message, if the caller has another one.
     """
     modes = [name for name in MODES if keyword in keywords_of(name) or name in _BESIDE.get(keyword, ())]
     modes = [name for name in modes if name in _ALONE.get(keyword, modes)]
@@ -110,11 +100,6 @@ def choose_mode(mode: str | None = None, preset: str | None = None, **look: obje
     Without `mode` an iso value means a surface, a curve means a curved reformation, a sheet means slices, a radius of
     points or what they are coloured by means points, and a preset means its own mode.
     The default is volume rendering.
-
-    Raises
-    ------
-    UsageError
-        The mode or the preset does not exist.
     """
     if mode is not None:
         if not isinstance(mode, str) or mode not in MODES:
@@ -137,20 +122,10 @@ def make_style(mode: str | None = None, preset: str | None = None, **look: objec
     >>> make_style("surface", iso_value=300)
     SurfaceLook(iso_value=300.0, ...)
 
-    Parameters
-    ----------
-    mode : str, optional
-        A name of `MODES`; default: see `choose_mode`.
-    preset : str, optional
-        Name of a preset, see `clrecon.rendering.looks.presets`.  Volume rendering and slices in space use its transfer
-        function, the other modes that show HU use its window.
-    **look
-        Fields of the mode's style, see `keywords_of`.  None and False mean the default.
-
-    Raises
-    ------
-    UsageError
-        The mode, preset or keyword is unknown, the keyword has no meaning in the mode, or the style refuses a value.
+    mode: A name of `MODES`; default: see `choose_mode`.
+    preset: Name of a preset, see `clrecon.rendering.looks.presets`.  Volume rendering and slices in space use its
+        transfer function, the other modes that show HU use its window.
+    **look: Fields of the mode's style, see `keywords_of`.  None and False mean the default.
     """
     given = {keyword: value for keyword, value in look.items() if value is not None and value is not False}
     mode = choose_mode(mode, preset, **given)
@@ -177,13 +152,7 @@ def make_style(mode: str | None = None, preset: str | None = None, **look: objec
 
 
 def find_style(style: Style | str | None, look: Mapping[str, object]) -> Style:
-    """Return a given style unchanged, or make the one that a mode and keywords ask for.
-
-    Raises
-    ------
-    UsageError
-        A style was given together with keywords, or `make_style` refuses the keywords.
-    """
+    """Return a given style unchanged, or make the one that a mode and keywords ask for."""
     if isinstance(style, Style):
         if look:
             raise UsageError(f"a style says by itself what a picture shows: leave out {_join(look)}, or the style")

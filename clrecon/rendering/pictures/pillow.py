@@ -18,11 +18,6 @@ def load_pillow() -> None:
 
     The command line hides Pillow by an entry of None in `sys.modules`, because pydicom would load it without need.
     This function removes the entry; pydicom is loaded by then.
-
-    Raises
-    ------
-    UsageError
-        Pillow is not installed.
     """
     if sys.modules.get("PIL", load_pillow) is None:
         del sys.modules["PIL"]
@@ -33,13 +28,7 @@ def load_pillow() -> None:
 
 
 def load_font(pixels: float) -> ImageFont.FreeTypeFont:
-    """Return Pillow's own scalable font, `pixels` high.
-
-    Raises
-    ------
-    UsageError
-        This build of Pillow lacks FreeType.
-    """
+    """Return Pillow's own scalable font, `pixels` high."""
     load_pillow()
     from PIL import ImageFont
 

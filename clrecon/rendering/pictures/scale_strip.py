@@ -18,17 +18,8 @@ _TEXT_SHARE, _SMALLEST_TEXT = 1 / 36, 9.0
 def add_scale(picture: Rendering, scale: ColorScale, title: str) -> Rendering:
     """Return a picture with a strip at its right that has the colours, their numbers and a title.
 
-    Parameters
-    ----------
-    picture : Rendering
-        With an opaque background.  Only its image grows: depth and camera stay those of the left part.
-    scale : ColorScale
-    title : str
-        Lines over the scale, such as ``mm``.
-
-    Returns
-    -------
-    Rendering
+    picture: With an opaque background.  Only its image grows: depth and camera stay those of the left part.
+    title: Lines over the scale, such as ``mm``.
     """
     load_pillow()
     from PIL import Image, ImageDraw

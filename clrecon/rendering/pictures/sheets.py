@@ -25,14 +25,9 @@ BACKGROUND = 24
 class Stroke:
     """A line or circle on a panel, in mm from the panel's centre: x to the right, y down.
 
-    Attributes
-    ----------
-    points : ndarray, shape (n, 2)
-        Corners of a line; of a circle its centre alone.
-    color : (int, int, int)
-        Red, green, blue.
-    radius_mm : float
-        Of a circle; 0 for a line.
+    points: ndarray, shape (n, 2). Corners of a line; of a circle its centre alone.
+    color: Red, green, blue.
+    radius_mm: Of a circle; 0 for a line.
     """
 
     points: NDArray[np.float64]
@@ -44,16 +39,9 @@ class Stroke:
 class Panel:
     """A slice with what is drawn over it.
 
-    Attributes
-    ----------
-    values : ndarray, shape (h, w)
-        HU.
-    pixel_mm : float
-    captions : sequence of str
-        Lines of text at the top left.
-    strokes : sequence of Stroke
-    edges : (str, str, str, str)
-        Letters at the left, right, top and bottom edge.
+    values: ndarray, shape (h, w). HU.
+    captions: Lines of text at the top left.
+    edges: Letters at the left, right, top and bottom edge.
     """
 
     values: NDArray[Any]
@@ -68,23 +56,10 @@ def draw_sheet(
 ) -> PictureData:
     """Draw panels in rows, with lines of text below.
 
-    Parameters
-    ----------
-    rows : sequence of sequence of Panel
-        Panels of one size.
-    footer : sequence of str
-    window : (float, float)
-        HU of black and white.
+    rows: Panels of one size.
+    window: HU of black and white.
 
-    Returns
-    -------
-    PictureData
-        Opaque; its pixels have the size of the panels' own.
-
-    Raises
-    ------
-    UsageError
-        There is no panel, or they differ in size.
+    Returns: Opaque; its pixels have the size of the panels' own.
     """
     load_pillow()
     from PIL import Image, ImageDraw

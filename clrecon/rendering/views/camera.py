@@ -53,15 +53,8 @@ FARTHEST_MM = 1e9
 def box_corners(volume: Grid) -> Float64Array:
     """Corners of the space that voxels fill, half a voxel beyond the outer centres.
 
-    Parameters
-    ----------
-    volume : Volume or Grid
-
-    Returns
-    -------
-    ndarray, shape (n, 3), float64
-        LPS mm.  The first and the last four are those of the whole box; for uneven slices, those of every slice are
-        between them.  The volume lies in the convex hull of these points.
+    Returns: ndarray, shape (n, 3), float64. LPS mm.  The first and the last four are those of the whole box; for uneven
+        slices, those of every slice are between them.  The volume lies in the convex hull of these points.
     """
     ni, nj, nk = volume.shape_ijk
     inner = np.arange(nk) if getattr(volume, "uneven", False) else np.empty(0)

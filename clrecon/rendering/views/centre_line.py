@@ -37,15 +37,7 @@ class Curve(Message):
     between the points as its parameter.  Its length is integrated (Gauss and Legendre, 5 nodes in each of 64 parts of
     a span), and places are found by their arc length.
 
-    Parameters
-    ----------
-    points : array_like, shape (n, 3)
-        LPS mm, in order along the curve; repeated points count once.
-
-    Raises
-    ------
-    UsageError
-        Points are not (n, 3) finite numbers, or fewer than two are different.
+    points: array_like, shape (n, 3). LPS mm, in order along the curve; repeated points count once.
     """
 
     _UNSENT = ("_spline", "_lengths")
@@ -128,13 +120,7 @@ class Curve(Message):
         return Curve(self.points[::-1])
 
     def check_within(self, volume: Volume) -> None:
-        """Check that all points lie within the box of a volume.
-
-        Raises
-        ------
-        UsageError
-            A point lies outside; the message has its number, its place and the box.
-        """
+        """Check that all points lie within the box of a volume."""
         ijk = volume.lps_to_ijk(self.points)
         outside = np.flatnonzero(((ijk < -0.5 - 1e-6) | (ijk > np.array(volume.shape_ijk) - 0.5 + 1e-6)).any(axis=1))
         if len(outside) == 0:
@@ -159,24 +145,11 @@ def rotation_minimising_normals(places: Float64Array, tangents: Float64Array, fi
     Method: double reflection (Wang, Juettler, Zheng and Liu 2008, "Computation of rotation minimizing frames"), of
     fourth order in the distance of the places.
 
-    Parameters
-    ----------
-    places : ndarray, shape (n, 3)
-        Places along the curve.
-    tangents : ndarray, shape (n, 3)
-        Unit.
-    first : array_like, shape (3,)
-        Direction of the first normal; its component along the tangent is ignored.
+    places: ndarray, shape (n, 3). Places along the curve.
+    tangents: ndarray, shape (n, 3). Unit.
+    first: array_like, shape (3,). Direction of the first normal; its component along the tangent is ignored.
 
-    Returns
-    -------
-    ndarray, shape (n, 3), float64
-        Unit, across the tangents.
-
-    Raises
-    ------
-    UsageError
-        `first` is parallel to the first tangent.
+    Returns: ndarray, shape (n, 3), float64. Unit, across the tangents.
     """
     normals = np.empty_like(places)
     start = np.asarray(first, dtype=np.float64)

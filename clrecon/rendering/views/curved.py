@@ -30,13 +30,8 @@ FRAME_STEP_MM = 0.25
 class CurvedSheet:
     """The sheet of a picture along a curve.
 
-    Attributes
-    ----------
-    sheet : Sheet
-    arc : ndarray, shape (h,), float64
-        Arc length of the curve in mm at each row; NaN for rows beyond its ends.
-    columns : ndarray, shape (h,), float64
-        Column in which each row shows the curve, pixel centres at whole numbers.
+    arc: ndarray, shape (h,), float64. Arc length of the curve in mm at each row; NaN for rows beyond its ends.
+    columns: ndarray, shape (h,), float64. Column in which each row shows the curve, pixel centres at whole numbers.
     """
 
     sheet: Sheet
@@ -67,23 +62,12 @@ def straightened_sheet(
 ) -> CurvedSheet:
     """Make a sheet whose rows cross a curve, which becomes a straight line down the middle of the picture.
 
-    Parameters
-    ----------
-    curve : Curve
-        The curve from the top of the picture to its bottom.
-    across : ndarray, shape (3,)
-        Direction in LPS that the rows follow as well as a frame without twist allows: the mean of their rotation from
-        it, along the curve, is zero.
-    size : (w, h)
-    pixel : float
-        mm.
-    angle : float
-        Degrees by which all rows are turned about the curve: into the picture at the right.
-
-    Raises
-    ------
-    UsageError
-        The curve is parallel to `across` everywhere.
+    curve: The curve from the top of the picture to its bottom.
+    across: ndarray, shape (3,). Direction in LPS that the rows follow as well as a frame without twist allows: the mean
+        of their rotation from it, along the curve, is zero.
+    size: (w, h)
+    pixel: mm.
+    angle: Degrees by which all rows are turned about the curve: into the picture at the right.
     """
     width, height = size
     arcs = _fine_arcs(curve.length, pixel)
@@ -115,20 +99,10 @@ def straightened_sheet(
 def stretched_sheet(curve: Curve, across: Float64Array, size: tuple[int, int], pixel: float) -> CurvedSheet:
     """Make a sheet of parallel rows through a curve, at equal distances on the surface that the rows form.
 
-    Parameters
-    ----------
-    curve : Curve
-        The curve from the top of the picture to its bottom.
-    across : ndarray, shape (3,)
-        Direction of all rows, LPS.
-    size : (w, h)
-    pixel : float
-        mm.
-
-    Raises
-    ------
-    UsageError
-        The curve turns back or is parallel to `across` somewhere: its surface would fold.
+    curve: The curve from the top of the picture to its bottom.
+    across: ndarray, shape (3,). Direction of all rows, LPS.
+    size: (w, h)
+    pixel: mm.
     """
     width, height = size
     direction = _unit(np.asarray(across, dtype=np.float64))

@@ -52,13 +52,7 @@ def number_or_nan(value: Any) -> float:
 
 
 def checked_vector(what: str, value: ArrayLike) -> tuple[float, float, float]:
-    """Return three finite numbers as floats.
-
-    Raises
-    ------
-    UsageError
-        They are not three finite numbers; the message begins with `what`.
-    """
+    """Return three finite numbers as floats."""
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -69,13 +63,7 @@ def checked_vector(what: str, value: ArrayLike) -> tuple[float, float, float]:
 
 
 def checked_size(size: Sequence[int]) -> tuple[int, int]:
-    """Return the size of a picture as (width, height).
-
-    Raises
-    ------
-    UsageError
-        The size is not two whole numbers from 1 to `LARGEST_SIDE`.
-    """
+    """Return the size of a picture as (width, height)."""
     try:
         width, height = size
         if int(width) == width and int(height) == height:
@@ -89,22 +77,14 @@ def checked_size(size: Sequence[int]) -> tuple[int, int]:
 def find_view(view: str | Sequence[float]) -> tuple[Float64Array, Float64Array]:
     """Return the direction from which a view is taken, and the direction at its top.
 
-    Parameters
-    ----------
-    view : str or (float, float)
-        A name of `DIRECTIONS`, or azimuth and elevation in degrees, as a pair or as text ``"AZ,EL"``: azimuth turns
-        the camera from anterior towards the patient's left, elevation (-90 to 90) lifts it to the head.
+    view: str or (float, float). A name of `DIRECTIONS`, or azimuth and elevation in degrees, as a pair or as text
+        ``"AZ,EL"``: azimuth turns the camera from anterior towards the patient's left, elevation (-90 to 90) lifts it
+        to the head.
 
-    Returns
-    -------
-    towards, up : ndarray, shape (3,), float64
-        Unit vectors in LPS: from the patient to the camera, and to the top of the picture (the head; for a view along
-        the body, the side of the azimuth, which is anterior for the views by name).
-
-    Raises
-    ------
-    UsageError
-        The view is unknown; the message lists all names.
+    Returns:
+    towards, up: ndarray, shape (3,), float64. Unit vectors in LPS: from the patient to the camera, and to the top of
+        the picture (the head; for a view along the body, the side of the azimuth, which is anterior for the views by
+        name).
     """
     named = DIRECTIONS.get(view.strip().lower()) if isinstance(view, str) else None
     if named is not None:
@@ -119,13 +99,7 @@ def find_view(view: str | Sequence[float]) -> tuple[Float64Array, Float64Array]:
 
 
 def find_up(up: str | ArrayLike) -> Float64Array:
-    """Return the direction in LPS for the top of a picture, from a name of `DIRECTIONS` or three numbers.
-
-    Raises
-    ------
-    UsageError
-        `up` is neither of these.
-    """
+    """Return the direction in LPS for the top of a picture, from a name of `DIRECTIONS` or three numbers."""
     if isinstance(up, str):
         named = DIRECTIONS.get(up.strip().lower())
         if named is None:

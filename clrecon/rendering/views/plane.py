@@ -45,16 +45,10 @@ THIN_LAYER = 0.25
 class Sheet:
     """Pixel (x, y) of a picture lies at ``origins[y] + x * steps[y]``, LPS mm.
 
-    Attributes
-    ----------
-    origins : ndarray, shape (h, 3), float64
-        Centre of the first pixel of each row.
-    steps : ndarray, shape (h, 3), float64
-        Step from one pixel of a row to the next, mm.
-    normals : ndarray, shape (h, 3), float64
-        Unit vectors into the picture, along which a thick slice is sampled.
-    width : int
-        Number of pixels in a row.
+    origins: ndarray, shape (h, 3), float64. Centre of the first pixel of each row.
+    steps: ndarray, shape (h, 3), float64. Step from one pixel of a row to the next, mm.
+    normals: ndarray, shape (h, 3), float64. Unit vectors into the picture, along which a thick slice is sampled.
+    width: Number of pixels in a row.
     """
 
     origins: Float64Array
@@ -114,13 +108,7 @@ def finest_step(volume: Volume) -> float:
 
 
 def slab_samples(volume: Volume, thickness: float) -> SlabSamples:
-    """Place samples through a thick slice of `thickness` mm, at most half the smallest voxel distance apart.
-
-    Raises
-    ------
-    UsageError
-        The thickness is negative, not finite or implausibly large.
-    """
+    """Place samples through a thick slice of `thickness` mm, at most half the smallest voxel distance apart."""
     size = checked_thickness(thickness)
     if size == 0.0:
         return SlabSamples(0, 0.0)
@@ -149,27 +137,14 @@ def find_plane(
 ) -> Camera:
     """Return a parallel camera for a slice through the middle of a volume.
 
-    Parameters
-    ----------
-    volume : Volume or Grid
-    view : str or (float, float)
-        axial, coronal, sagittal, or a view as in `Camera.fit`.
-    size : (int, int)
-        Width and height of the picture.
-    zoom : float
-        At 1 the volume's box, seen in this direction, just fits into the picture: a slice is shown larger than a
+    view: str or (float, float). axial, coronal, sagittal, or a view as in `Camera.fit`.
+    size: Width and height of the picture.
+    zoom: At 1 the volume's box, seen in this direction, just fits into the picture: a slice is shown larger than a
         picture of the whole volume, for which `Camera.fit` leaves room in every direction.
-    up : str or array_like, shape (3,), optional
-        As in `Camera.fit`.
-    pixel_mm : float, optional
-        Side of a pixel; default: so that the box fits.
-    center : array_like, shape (3,), optional
-        A point of the plane, LPS mm, in the middle of the picture; default: the middle of the volume.
-
-    Raises
-    ------
-    UsageError
-        Unknown view or direction, or impossible numbers.
+    up: str or array_like, shape (3,). As in `Camera.fit`.
+    pixel_mm: Side of a pixel; default: so that the box fits.
+    center: array_like, shape (3,). A point of the plane, LPS mm, in the middle of the picture; default: the middle of
+        the volume.
     """
     if isinstance(view, str):
         name = view.strip().lower()
@@ -193,13 +168,7 @@ def _triple(vector: Float64Array) -> tuple[float, float, float]:
 
 
 def checked_thickness(thickness: float) -> float:
-    """Check the thickness of a slice in mm and return it as a float.
-
-    Raises
-    ------
-    UsageError
-        It is negative or not finite.
-    """
+    """Check the thickness of a slice in mm and return it as a float."""
     size = number_or_nan(thickness)
     if not 0.0 <= size < np.inf:
         raise UsageError(f"the thickness of a slice is a length in mm, 0 for a plane without one, not {thickness!r}")
@@ -207,13 +176,7 @@ def checked_thickness(thickness: float) -> float:
 
 
 def checked_offset(offset_mm: float) -> float:
-    """Check the offset of a slice along the view, mm, and return it as a float.
-
-    Raises
-    ------
-    UsageError
-        It is not finite.
-    """
+    """Check the offset of a slice along the view, mm, and return it as a float."""
     offset = number_or_nan(offset_mm)
     if not np.isfinite(offset):
         raise UsageError(f"the offset of a slice is a length in mm, not {offset_mm!r}")
@@ -221,13 +184,7 @@ def checked_offset(offset_mm: float) -> float:
 
 
 def positive_mm(what: str, value: float) -> float:
-    """Check a length in mm and return it as a float.
-
-    Raises
-    ------
-    UsageError
-        It is not a length above 0; the message begins with `what`.
-    """
+    """Check a length in mm and return it as a float."""
     number = number_or_nan(value)
     if not 0.0 < number < np.inf:
         raise UsageError(f"{what} is a length in mm, not {value!r}")
@@ -237,25 +194,12 @@ def positive_mm(what: str, value: float) -> float:
 def plane_sheet(camera: Camera, size: Sequence[int], offset_mm: float = 0.0) -> tuple[Sheet, Camera]:
     """Make the plane through a camera's focal point across its view.
 
-    Parameters
-    ----------
-    camera : Camera
-        For a perspective camera its scale at the focal point is used.
-    size : (w, h)
-        Pixels.
-    offset_mm : float
-        Moves the plane along the view, away from the camera.
+    camera: For a perspective camera its scale at the focal point is used.
+    size: (w, h). Pixels.
+    offset_mm: Moves the plane along the view, away from the camera.
 
-    Returns
-    -------
-    sheet : Sheet
-    camera : Camera
-        A parallel camera with its focal point in the plane: each of its rays meets the sheet in its own pixel.
-
-    Raises
-    ------
-    UsageError
-        The size is not possible, or the offset is not finite.
+    Returns:
+    camera: A parallel camera with its focal point in the plane: each of its rays meets the sheet in its own pixel.
     """
     width, height = checked_size(size)
     right, up, forward = camera.basis()

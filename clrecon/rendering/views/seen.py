@@ -44,21 +44,11 @@ def find_seen_box(
     around its place.  So the box holds what lies within a voxel of both kinds: it can be larger than what is seen, and
     is never smaller.
 
-    Parameters
-    ----------
-    volume : Volume
-    band : (low, high)
-        HU that are shown, infinite where it has no end.
-    clip : Clip, optional
-    labels : ShownLabels, optional
-        Voxels of labels that are not shown do not count.
-    slices : iterable of int, optional
-        Only these slices are shown.
+    band: (low, high). HU that are shown, infinite where it has no end.
+    labels: Voxels of labels that are not shown do not count.
+    slices: Only these slices are shown.
 
-    Returns
-    -------
-    Grid or None
-        One voxel that fills the box; None where nothing can be seen.
+    Returns: One voxel that fills the box; None where nothing can be seen.
     """
     chosen = range(volume.shape_ijk[2]) if slices is None else sorted(slices)
     reach = 1.0 if slices is None else 0.0
@@ -96,13 +86,7 @@ def find_seen_box(
 
 
 def check_center(center: object, shown: Grid) -> tuple[float, float, float]:
-    """Return the centre of a picture, three numbers in LPS mm.
-
-    Raises
-    ------
-    UsageError
-        It is not three finite numbers, or lies outside of the box of what is shown.
-    """
+    """Return the centre of a picture, three numbers in LPS mm."""
     point = checked_vector("the centre of a picture", center)  # type: ignore[arg-type]
     corners = box_corners(shown)
     low, high = corners.min(axis=0), corners.max(axis=0)

@@ -25,18 +25,9 @@ at 1000 mm, in the middle of a patient."""
 def parameters_from_vtk(source: Any, size: Sequence[int] | None = None) -> dict[str, Any]:
     """Return the parameters of the `Camera` with the same view as a VTK or PyVista camera, or the camera of a plotter.
 
-    Parameters
-    ----------
-    source : vtkCamera, pyvista.Camera or pyvista.Plotter
-        Camera or plotter of a scene in LPS mm.
-    size : (int, int), optional
-        Width and height of the picture, needed where the view angle is the horizontal one; default: those of the
+    source: Camera or plotter of a scene in LPS mm.
+    size: Width and height of the picture, needed where the view angle is the horizontal one; default: those of the
         plotter's window.
-
-    Raises
-    ------
-    UsageError
-        The source is not a camera, or has a transform, shear, window centre or off-axis projection.
     """
     camera = getattr(source, "camera", source)
     if not hasattr(camera, "GetFocalPoint"):

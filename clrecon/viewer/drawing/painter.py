@@ -72,18 +72,8 @@ class Painter(Stage):
 
     Use it as a context manager, or `close` it.
 
-    Parameters
-    ----------
-    objects : sequence of ShownObject
-    device : Device, str or int, optional
-        See `clrecon.device`; None is the best of the machine.
-    memory : int, optional
-        Bytes that may be taken on the device.  A scan that does not fit goes through in slabs, which is slow.
-
-    Raises
-    ------
-    DeviceError
-        The device does not exist.
+    device: See `clrecon.device`; None is the best of the machine.
+    memory: Bytes that may be taken on the device.  A scan that does not fit goes through in slabs, which is slow.
     """
 
     def __init__(
@@ -115,22 +105,13 @@ class Painter(Stage):
     ) -> Rendering:
         """Take the picture of a state.
 
-        Parameters
-        ----------
-        state : ViewState
-        size : (width, height)
-        sharp : bool
-            False: coarse meshes, translucent ones opaque, longer steps in volume rendering.
-        share : float
-            Of a coarse picture, its width as a share of `size`.
-        cancelled : callable
-            True ends the work with `Cancelled`.
+        size: (width, height)
+        sharp: False: coarse meshes, translucent ones opaque, longer steps in volume rendering.
+        share: Of a coarse picture, its width as a share of `size`.
+        cancelled: True ends the work with `Cancelled`.
 
-        Returns
-        -------
-        Rendering
-            With a transparent background; ``depth`` in mm, NaN where there is nothing.  A coarse one is smaller than
-            `size`.  ``report["ms"]`` is the time it took, that of waiting for other views not counted.
+        Returns: With a transparent background; ``depth`` in mm, NaN where there is nothing.  A coarse one is smaller
+            than `size`.  ``report["ms"]`` is the time it took, that of waiting for other views not counted.
         """
         width, height = checked_size(size)
         if not sharp:
@@ -147,14 +128,9 @@ class Painter(Stage):
     def slice(self, state: ViewState, plane: str, size: Sequence[int]) -> Rendering:
         """Cut a slice through the cross.
 
-        Parameters
-        ----------
-        plane : {"axial", "coronal", "sagittal"}
+        plane: {"axial", "coronal", "sagittal"}
 
-        Returns
-        -------
-        Rendering
-            Its camera maps pixels to LPS and back; empty where there is no scan.
+        Returns: Its camera maps pixels to LPS and back; empty where there is no scan.
         """
         width, height = checked_size(size)
         with self.lock:
@@ -192,11 +168,8 @@ class Painter(Stage):
 
         One ray is sent through the place; the nearest object is taken.
 
-        Parameters
-        ----------
-        size : (width, height)
-        x, y : float
-            Pixels from the top left corner of a picture of this size; the first pixel's centre is (0.5, 0.5).
+        size: (width, height)
+        x, y: Pixels from the top left corner of a picture of this size; the first pixel's centre is (0.5, 0.5).
         """
         camera = pixel_camera(state.camera, checked_size(size), x, y)
         nearest: tuple[float, _Drawn] | None = None
@@ -249,13 +222,7 @@ class Painter(Stage):
         return make_meshes(self, state, progress)
 
     def curve_picture(self, state: ViewState, size: Sequence[int]) -> Rendering:
-        """Straighten the first scan along the curve of the tool, or the last one that was made.
-
-        Raises
-        ------
-        UsageError
-            There is no scan, or no curve of two points and more.
-        """
+        """Straighten the first scan along the curve of the tool, or the last one that was made."""
         scan = next((each for each in self.objects if isinstance(each, ShownScan)), None)
         if scan is None:
             raise UsageError("there is no scan: a picture along a curve needs one")

@@ -37,13 +37,7 @@ KINDS: dict[str, tuple[str, ...]] = {
 
 
 def check_target(path: str | os.PathLike[str], painter: Painter, state: ViewState) -> str:
-    """Return as what a file is written, a key of `KINDS`.
-
-    Raises
-    ------
-    UsageError
-        The extension is unknown, or there is nothing of this kind.
-    """
+    """Return as what a file is written, a key of `KINDS`."""
     name = Path(path).name.lower()
     found = [kind for kind, endings in KINDS.items() if any(name.endswith(ending) for ending in endings)]
     if not found:
@@ -71,13 +65,7 @@ def save_shown(
     no_clobber: bool = False,
     progress: Progress | None = None,
 ) -> list[str]:
-    """Write what is shown; returns lines that say what was written.
-
-    Raises
-    ------
-    UsageError, NoSurfaceError, OutputError, DeviceError
-        After any of them no file is written, and an older one is intact.
-    """
+    """Write what is shown; returns lines that say what was written."""
     kind = check_target(path, painter, state)
     name = escape_text(Path(path).name)
     if kind == "picture":
@@ -143,13 +131,7 @@ def shown_volume(painter: Painter, state: ViewState, progress: Progress | None =
 
 
 def shown_cloud(painter: Painter, state: ViewState, progress: Progress | None = None) -> PointCloud:
-    """Return the points of the clouds that are shown; without one the vertices of what has a surface.
-
-    Raises
-    ------
-    NoSurfaceError
-        Nothing is shown.
-    """
+    """Return the points of the clouds that are shown; without one the vertices of what has a surface."""
     clouds = []
     for each in painter.objects:
         whole = state.whole(each.number)

@@ -33,15 +33,7 @@ def make_meshes(stage: Stage, state: ViewState, progress: Progress | None = None
     Parts with colours of their own are meshes of their own, else a scan is one.  What clip planes cut off a scan is
     closed, meshes stay open there, as in the picture.
 
-    Returns
-    -------
-    list of Mesh
-        With ``report["part_name"]`` and, where it was set, ``report["color"]``.
-
-    Raises
-    ------
-    NoSurfaceError
-        Nothing is shown.
+    Returns: With ``report["part_name"]`` and, where it was set, ``report["color"]``.
     """
     tell = progress or ignore_progress
     only_labels = find_modes()[state.mode].kind == "labels"
@@ -151,12 +143,8 @@ def number_vertices(mesh: Mesh, volume: Volume, iso_value: float, voxels: NDArra
 
     A vertex lies on an edge between two neighbouring voxels, one inside and one outside.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        Extracted from `volume` at `iso_value`.
-    voxels : ndarray, shape (nk, nj, ni)
-        Numbers.
+    mesh: Extracted from `volume` at `iso_value`.
+    voxels: ndarray, shape (nk, nj, ni). Numbers.
     """
     level = choose_iso_rule(volume, iso_value).iso_level
     ijk = volume.lps_to_ijk(mesh.vertices)

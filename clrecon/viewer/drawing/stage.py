@@ -34,15 +34,9 @@ size."""
 class Stage(Closing):
     """What is on the device; safe for several threads.
 
-    Parameters
-    ----------
-    objects, device, memory
-        See `clrecon.viewer.drawing.painter.Painter`.
+    objects, device, memory: See `clrecon.viewer.drawing.painter.Painter`.
 
-    Attributes
-    ----------
-    lock : RLock
-        Held while the device works for a view.
+    lock: Held while the device works for a view.
     """
 
     def __init__(
@@ -112,13 +106,7 @@ class Stage(Closing):
         return all(self._found_for(scan, state) is not None for scan in self._clustered())
 
     def remove_table(self, progress: Progress | None = None) -> dict[int, dict[str, Any]]:
-        """Make the scans without table and blankets, once; returns what was taken from each, by number.
-
-        Raises
-        ------
-        RefusedInputError
-            There is no body to be told from its table.
-        """
+        """Make the scans without table and blankets, once; returns what was taken from each, by number."""
         from clrecon.anatomy.body import remove_table
 
         said = {}

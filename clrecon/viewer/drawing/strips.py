@@ -25,10 +25,7 @@ def take_strips(
 ) -> Rendering:
     """Take the picture of a parallel camera strip by strip, where it is large; others in one.
 
-    Parameters
-    ----------
-    take : callable
-        Takes a picture of a camera and a size; what it raises ends the work.
+    take: Takes a picture of a camera and a size; what it raises ends the work.
     """
     width, height = size
     rows = max(STRIP_ROWS, STRIP_PIXELS // width // STRIP_ROWS * STRIP_ROWS)

@@ -39,13 +39,8 @@ _GESTURES = frozenset(
 class ChangingView:
     """What `clrecon.viewer.model.model.ViewModel` is made of.
 
-    Parameters
-    ----------
-    objects : tuple of ShownObject
-    state : ViewState
-        At the start.
-    clock : callable
-        Seconds, see `SAME_GESTURE_S`.
+    state: At the start.
+    clock: Seconds, see `SAME_GESTURE_S`.
     """
 
     def __init__(self, objects: tuple[ShownObject, ...], state: ViewState, clock: Callable[[], float] = monotonic):
@@ -85,10 +80,7 @@ class ChangingView:
     def zoom(self, factor: float, at: tuple[float, float] = (0.0, 0.0)) -> None:
         """Show everything larger by a factor; what is seen at `at` stays there.
 
-        Parameters
-        ----------
-        at : (x, y)
-            From the middle of the picture to the right and down, in shares of its height.
+        at: (x, y). From the middle of the picture to the right and down, in shares of its height.
         """
         (factor,) = checked_numbers("the factor of a zoom", factor)
         x, y = checked_numbers("the place of a zoom", *at)
@@ -246,13 +238,7 @@ class ChangingView:
 
 
 def checked_numbers(what: str, *values: Any) -> list[float]:
-    """Return finite numbers as floats.
-
-    Raises
-    ------
-    UsageError
-        One is not; the message begins with `what`.
-    """
+    """Return finite numbers as floats."""
     found = []
     for value in values:
         is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)

@@ -24,12 +24,8 @@ def fit_camera(
 ) -> Camera:
     """Return a camera that looks from a side of the patient, so that the box around points fits.
 
-    Parameters
-    ----------
-    points : ndarray, shape (n, 3)
-        LPS mm.
-    aspect : float
-        Width of the picture by its height.
+    points: ndarray, shape (n, 3). LPS mm.
+    aspect: Width of the picture by its height.
     """
     size = (max(1, round(aspect * FIT_PIXELS)), FIT_PIXELS)
     return Camera.fit(box_around([points]), view, view_angle=view_angle, size=size)

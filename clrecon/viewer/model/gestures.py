@@ -50,15 +50,7 @@ def pan_camera(camera: Camera, dx: float, dy: float) -> Camera:
 def zoom_camera(camera: Camera, factor: float, at: tuple[float, float] = (0.0, 0.0)) -> Camera:
     """Show everything `factor` times as large; what is seen at a place of the picture stays there.
 
-    Parameters
-    ----------
-    at : (float, float)
-        From the middle of the picture, in shares of its height.
-
-    Raises
-    ------
-    UsageError
-        The factor is not above 0.
+    at: From the middle of the picture, in shares of its height.
     """
     if not (math.isfinite(factor) and factor > 0.0):
         raise UsageError(f"the factor of a zoom is a number above 0, not {factor!r}")
@@ -76,11 +68,8 @@ def zoom_camera(camera: Camera, factor: float, at: tuple[float, float] = (0.0, 0
 def pixel_camera(camera: Camera, size: tuple[int, int], x: float, y: float) -> Camera:
     """Return a camera whose picture of one pixel is seen along the ray of a place in this camera's picture.
 
-    Parameters
-    ----------
-    size : (width, height)
-    x, y : float
-        Pixels from the top left corner; the first pixel's centre is (0.5, 0.5).
+    size: (width, height)
+    x, y: Pixels from the top left corner; the first pixel's centre is (0.5, 0.5).
     """
     right, up, forward = camera.basis()
     width, height = size

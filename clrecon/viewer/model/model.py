@@ -34,30 +34,13 @@ class ViewModel(ChangingView):
 
     Every change is a method, and can be undone.  It is not safe for several threads at once: `ViewSession` locks it.
 
-    Parameters
-    ----------
-    objects : sequence of ShownObject
-    space : {"lps", "ras"}
-        Frame in which places are said; everything in here is LPS mm.
-    iso_value : float, optional
-        HU; default: 200, or the nearest value that the slider has.
-    clock : callable
-        Seconds, see `SAME_GESTURE_S`.
+    space: {"lps", "ras"}. Frame in which places are said; everything in here is LPS mm.
+    iso_value: HU; default: 200, or the nearest value that the slider has.
+    clock: Seconds, see `SAME_GESTURE_S`.
 
-    Attributes
-    ----------
-    state : ViewState
-    version : int
-        Grows with each change.
-    aspect : float
-        Width of the picture by its height, for views that fit.
-    iso_range : (float, float)
-        HU at the ends of the slider.
-
-    Raises
-    ------
-    UsageError
-        There is no object, or the space is unknown.
+    version: Grows with each change.
+    aspect: Width of the picture by its height, for views that fit.
+    iso_range: HU at the ends of the slider.
     """
 
     def __init__(
@@ -155,13 +138,7 @@ class ViewModel(ChangingView):
     # What is shown of scans
 
     def set_iso(self, hu: float) -> None:
-        """Set the iso value of all scans, HU.
-
-        Raises
-        ------
-        UsageError
-            It is not a number within `iso_range`.
-        """
+        """Set the iso value of all scans, HU."""
         (value,) = checked_numbers("the iso value", hu)
         low, high = self.iso_range
         if not self.scans:
@@ -179,10 +156,7 @@ class ViewModel(ChangingView):
     def set_window(self, low: float, high: float, of: str = "slices") -> None:
         """Set the HU that are black and white.
 
-        Parameters
-        ----------
-        of : {"slices", "picture"}
-            The three slices, or the projection.
+        of: {"slices", "picture"}. The three slices, or the projection.
         """
         low, high = checked_numbers("a window", low, high)
         if not low < high:
@@ -264,10 +238,7 @@ class ViewModel(ChangingView):
     def add_clip(self, direction: str | Sequence[float]) -> None:
         """Cut with a plane half way along a direction; the side that the direction points to is taken away.
 
-        Parameters
-        ----------
-        direction : str or (x, y, z)
-            A side of the patient, "view" for the side of the camera, or a vector in LPS.
+        direction: str or (x, y, z). A side of the patient, "view" for the side of the camera, or a vector in LPS.
         """
         if direction == "view":
             direction = (-self.camera.basis().forward).tolist()

@@ -17,18 +17,11 @@ SLICE_WINDOW = (-450.0, 1050.0)
 class ViewMode:
     """A mode.
 
-    Attributes
-    ----------
-    name, words : str
-        The words say what is seen.
-    kind : str
-        "surface", "volume" (volume rendering), "projection", "slices" or "labels".
-    style : str
-        Name of the preset or of the projection.
-    joins : bool
-        True: other objects are shown with it in one picture.
-    window : (float, float) or None
-        HU of black and white of a projection; None: chosen from the picture.
+    name, words: The words say what is seen.
+    kind: "surface", "volume" (volume rendering), "projection", "slices" or "labels".
+    style: Name of the preset or of the projection.
+    joins: Other objects are shown with it in one picture.
+    window: HU of black and white of a projection; None: chosen from the picture.
     """
 
     name: str

@@ -26,14 +26,9 @@ __all__ = ["ShownCloud", "ShownLabels", "ShownMesh", "ShownObject", "ShownScan",
 class ShownObject:
     """One input of a view, in LPS mm.  It does not change.
 
-    Attributes
-    ----------
-    number : int
-        From 1, in the order of the inputs.
-    name : str
-        Shown in lists.  No file name: it can hold the name of a patient.
-    said : tuple of str
-        What has to be said of it, such as that it was turned from RAS.
+    number: From 1, in the order of the inputs.
+    name: Shown in lists.  No file name: it can hold the name of a patient.
+    said: What has to be said of it, such as that it was turned from RAS.
     """
 
     number: int
@@ -100,11 +95,7 @@ class ShownCloud(ShownObject):
 class ShownLabels(ShownObject):
     """A label map: it colours and divides the scan that it lies in, or is shown alone.
 
-    Attributes
-    ----------
-    labels : LabelMap
-    within : int or None
-        Number of the scan that it lies in.
+    within: Number of the scan that it lies in.
     """
 
     labels: LabelMap
@@ -131,19 +122,9 @@ def show_objects(
 ) -> list[ShownObject]:
     """Number and name what was read or made.
 
-    Parameters
-    ----------
-    subjects : sequence of Volume, Mesh, PointCloud or LabelMap
-        A label map belongs to the first scan, if there is one.
-    names : sequence of str
-        Names in their order; those that are missing or empty are "scan 1", "mesh 2" and so on.
-    said : sequence of sequence of str
-        What has to be said of each.
-
-    Raises
-    ------
-    UsageError
-        There is nothing, or one of another kind, or a mesh without triangles.
+    subjects: A label map belongs to the first scan, if there is one.
+    names: Names in their order; those that are missing or empty are "scan 1", "mesh 2" and so on.
+    said: What has to be said of each.
     """
     if not subjects:
         raise UsageError("there is nothing to show")

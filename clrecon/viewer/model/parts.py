@@ -45,10 +45,7 @@ STEPS = 5
 class ClusterMap(LabelMap):
     """Numbers of clusters on the grid of a scan, whose slices may be uneven: other label maps have even ones.
 
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni), uint8
-    volume : Volume
+    voxels: ndarray, shape (nk, nj, ni), uint8
     """
 
     def __init__(self, voxels: NDArray[np.uint8], volume: Volume):
@@ -66,21 +63,12 @@ class ClusterMap(LabelMap):
 class FoundParts:
     """The parts of a scan.
 
-    Attributes
-    ----------
-    scan : int
-        Number of the object.
-    iso_value : float
-        HU.
-    table : bool
-        True: of the scan with its table.
-    volume : Volume
-    labels : LabelMap
-        Clusters by number, grown by one voxel; 0 is all else.
-    placed : ResampledLabels
-        The same, on the grid of the scan.
-    parts : tuple of ShownPart
-        The clusters, the smaller ones together, and what lies below the iso value.
+    scan: Number of the object.
+    iso_value: HU.
+    table: Of the scan with its table.
+    labels: Clusters by number, grown by one voxel; 0 is all else.
+    placed: The same, on the grid of the scan.
+    parts: The clusters, the smaller ones together, and what lies below the iso value.
     """
 
     scan: int
@@ -121,24 +109,11 @@ def find_clusters(
 ) -> FoundParts:
     """Find the parts of a scan.
 
-    Parameters
-    ----------
-    resident : DeviceVolume
-    scan : int
-        Number of the object.
-    iso_value : float
-        HU; voxels that are not lower are inside.
-    table : bool
-        See `FoundParts`.
-    progress : callable, optional
-        ``progress("parts", done, 5)``; what it raises ends the search.
-    lock : context manager, optional
-        Held while the device works, which is not most of the time.
-
-    Raises
-    ------
-    DeviceError
-        The device has no room for the runs of voxels, or it fails.
+    scan: Number of the object.
+    iso_value: HU; voxels that are not lower are inside.
+    table: See `FoundParts`.
+    progress: ``progress("parts", done, 5)``; what it raises ends the search.
+    lock: Held while the device works, which is not most of the time.
     """
     tell, volume = progress or ignore_progress, resident.volume
     tell("parts", 0, STEPS)

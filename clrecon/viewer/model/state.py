@@ -28,28 +28,16 @@ def as_point(vector: Any) -> Point:
 class ShownPart:
     """A part that can be switched: an object as a whole, a cluster of a scan's voxels, or a label.
 
-    Attributes
-    ----------
-    key : str
-        "2" for the object of number 2, "2/5" for its part of number 5.
-    name, kind : str
-        Kinds are "scan", "mesh", "cloud", "cluster", "rest" (what of a scan lies below the iso value) and "label".
-    object : int
-    number : int
-        Number of the cluster or label in the label map by which it is drawn; 0 for "rest" and for whole objects.
-    ml : float or None
-        Volume of its voxels.
-    count : int or None
-        Voxels, triangles or points.
-    color : (red, green, blue) or None
-        0 to 1; None: as it looks by itself.
-    opacity : float
-        0 to 1; seen only while it is visible.
-    visible : bool
-    box : ((x, y, z), (x, y, z)) or None
-        LPS mm.
-    inside : (x, y, z) or None
-        LPS mm of a place within the cluster, by which it is known again at another iso value.
+    key: "2" for the object of number 2, "2/5" for its part of number 5.
+    name, kind: Kinds are "scan", "mesh", "cloud", "cluster", "rest" (what of a scan lies below the iso value) and
+        "label".
+    number: Number of the cluster or label in the label map by which it is drawn; 0 for "rest" and for whole objects.
+    ml: Volume of its voxels.
+    count: Voxels, triangles or points.
+    color: (red, green, blue) or None. 0 to 1; None: as it looks by itself.
+    opacity: 0 to 1; seen only while it is visible.
+    box: ((x, y, z), (x, y, z)) or None. LPS mm.
+    inside: (x, y, z) or None. LPS mm of a place within the cluster, by which it is known again at another iso value.
     """
 
     key: str
@@ -94,34 +82,17 @@ class ShownPart:
 class ViewState:
     """What a view shows.
 
-    Attributes
-    ----------
-    camera : Camera
-        LPS mm.
-    mode : str
-        One of `clrecon.viewer.model.model.view_modes`.
-    iso_value : float
-        HU, of all scans.
-    window : (float, float)
-        HU shown as black and white in slices.
-    picture_window : (float, float) or None
-        The same in projections; None: that of the mode.
-    table : bool
-        True: table and blankets are shown.
-    cross : (x, y, z)
-        LPS mm, where the three slices go through.
-    parts : tuple of ShownPart
-    parts_at : float or None
-        Iso value of the clusters; None: they are not known.
-    parts_table : bool
-        Of which volume, see `table`.
-    tool : str or None
-    points : tuple of Pick
-        Points of the tool that is used.
-    measures : tuple of Measure
-    clips : tuple of ClipPlane
-    clip_box : ((x, y, z), (x, y, z)) or None
-        LPS mm.
+    camera: LPS mm.
+    mode: One of `clrecon.viewer.model.model.view_modes`.
+    iso_value: HU, of all scans.
+    window: HU shown as black and white in slices.
+    picture_window: The same in projections; None: that of the mode.
+    table: Table and blankets are shown.
+    cross: (x, y, z). LPS mm, where the three slices go through.
+    parts_at: Iso value of the clusters; None: they are not known.
+    parts_table: Of which volume, see `table`.
+    points: Points of the tool that is used.
+    clip_box: ((x, y, z), (x, y, z)) or None. LPS mm.
     """
 
     camera: Camera

@@ -27,16 +27,10 @@ Point = tuple[float, float, float]
 class Pick:
     """A place that was pointed at.
 
-    Attributes
-    ----------
-    point : (x, y, z)
-        LPS mm.
-    object : int or None
-        Number of the object that is seen there; None in a slice.
-    part : str or None
-        Key of its part.
-    hu : float or None
-        HU of the scan there, trilinear.
+    point: (x, y, z). LPS mm.
+    object: Number of the object that is seen there; None in a slice.
+    part: Key of its part.
+    hu: HU of the scan there, trilinear.
     """
 
     point: Point
@@ -58,18 +52,11 @@ class Pick:
 class Measure:
     """What was measured.
 
-    Attributes
-    ----------
-    kind : str
-        "distance", "angle", "curve" (its length) or "seed".
-    points : tuple of (x, y, z)
-        LPS mm.
-    value : float or None
-        None for a seed.
-    unit : str
-        "mm", "degrees" or "".
-    text : str
-        As it is written beside the picture.
+    kind: "distance", "angle", "curve" (its length) or "seed".
+    points: tuple of (x, y, z). LPS mm.
+    value: None for a seed.
+    unit: "mm", "degrees" or "".
+    text: As it is written beside the picture.
     """
 
     kind: str
@@ -87,17 +74,8 @@ class Measure:
 def measure_points(kind: str, points: Sequence[Point]) -> Measure:
     """Measure points.
 
-    Parameters
-    ----------
-    kind : str
-        One of `TOOLS`.
-    points : sequence of (x, y, z)
-        LPS mm; the angle is that at the second of three.
-
-    Raises
-    ------
-    UsageError
-        There are too few, or two that make an angle lie in one place.
+    kind: One of `TOOLS`.
+    points: sequence of (x, y, z). LPS mm; the angle is that at the second of three.
     """
     places = np.array(points, dtype=np.float64).reshape(-1, 3)
     if kind == "seed":
@@ -125,18 +103,11 @@ def measure_points(kind: str, points: Sequence[Point]) -> Measure:
 class ClipPlane:
     """A plane that cuts everything, along a direction in the patient.
 
-    Attributes
-    ----------
-    direction : (x, y, z)
-        Unit vector in LPS towards the side that is taken away.
-    name : str
-        Of the direction.
-    low, high : float
-        Of what is shown along the direction, mm.
-    share : float
-        0 takes all away, 1 nothing.
-    flipped : bool
-        True: the other side is taken away, with 0 nothing and with 1 all.
+    direction: (x, y, z). Unit vector in LPS towards the side that is taken away.
+    name: Of the direction.
+    low, high: Of what is shown along the direction, mm.
+    share: 0 takes all away, 1 nothing.
+    flipped: The other side is taken away, with 0 nothing and with 1 all.
     """
 
     direction: Point
@@ -167,13 +138,7 @@ class ClipPlane:
 
 
 def clip_direction(direction: str | Sequence[float]) -> tuple[Point, str]:
-    """Return the unit vector of a side of the patient or of a vector in LPS, and its name.
-
-    Raises
-    ------
-    UsageError
-        The side is unknown, or the vector has no length.
-    """
+    """Return the unit vector of a side of the patient or of a vector in LPS, and its name."""
     if isinstance(direction, str):
         if direction not in DIRECTIONS:
             raise UsageError(say_unknown("side of the patient", direction, DIRECTIONS))

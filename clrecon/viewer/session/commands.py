@@ -71,14 +71,9 @@ def _or_none(check: Callable[[Any], Any]) -> Callable[[Any], Any]:
 class Command:
     """A command.
 
-    Attributes
-    ----------
-    words : str
-        What it does.
-    needs, takes : mapping of str to callable
-        Arguments that must be there, and those that may be, with the check of each.
-    call : callable
-        Called with the session and the checked arguments; a mapping that it returns is added to the facts.
+    words: What it does.
+    needs, takes: Arguments that must be there, and those that may be, with the check of each.
+    call: Called with the session and the checked arguments; a mapping that it returns is added to the facts.
     """
 
     words: str
@@ -151,13 +146,7 @@ _session("dismiss", "drop the words of the last error", "dismiss")
 
 
 def check_command(command: Any) -> tuple[Command, dict[str, Any]]:
-    """Return the command that a mapping names, and its checked arguments.
-
-    Raises
-    ------
-    UsageError
-        It is no mapping with a known ``"do"``, an argument is missing, unknown or of the wrong kind.
-    """
+    """Return the command that a mapping names, and its checked arguments."""
     if not isinstance(command, Mapping):
         raise UsageError(f'a command is a mapping such as {{"do": "undo"}}, not {type(command).__name__}')
     name = command.get("do")

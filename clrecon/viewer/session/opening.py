@@ -25,12 +25,7 @@ class OpenedView(Closing):
 
     Use it as a context manager, or `close` it after its sessions.
 
-    Attributes
-    ----------
-    objects : list of ShownObject
-    painter : Painter
-    said : list of str
-        What has to be said of the inputs.
+    said: What has to be said of the inputs.
     """
 
     def __init__(
@@ -78,20 +73,8 @@ def open_view(
 ) -> OpenedView:
     """Read inputs for a view.
 
-    Parameters
-    ----------
-    inputs : sequence of path
-        See `clrecon.jobs.view.inputs.open_inputs`.
-    settings : ViewSettings, optional
-        How scans are read, masked and cropped, the iso value to begin with, the label map.
-    progress : callable, optional
-
-    Raises
-    ------
-    UsageError
-        A setting says how meshes are made, and a view makes none.
-    ClreconError
-        An input cannot be read, or there is no such device.
+    inputs: See `clrecon.jobs.view.inputs.open_inputs`.
+    settings: How scans are read, masked and cropped, the iso value to begin with, the label map.
     """
     settings = settings or ViewSettings()
     check_view_settings(settings)

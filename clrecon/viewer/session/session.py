@@ -52,34 +52,14 @@ class ViewSession(Closing):
 
     Methods may be called from any thread.  Pictures come in a thread of the session, work that takes longer in another.
 
-    Parameters
-    ----------
-    objects : sequence of ShownObject
-    painter : Painter, optional
-        Shared with other views of the same objects; it stays open.  None: one of its own.
-    device, memory
-        Of its own painter.
-    space : {"lps", "ras"}
-        Frame in which places are said and saved.
-    iso_value : float, optional
-        HU at the start.
-    keep_ids : bool
-        Write hashes of UIDs into files.
-    no_clobber : bool
-        Files that exist stay, and to save over one is an error.
-    on_change : callable, optional
-        Called, in any thread, when something happened that was not asked for by the caller just now: work began or
-        ended, parts were found, an error came.
-
-    Attributes
-    ----------
-    model : ViewModel
-    painter : Painter
-
-    Raises
-    ------
-    UsageError, DeviceError
-        There is nothing to show; the device does not exist.
+    painter: Shared with other views of the same objects; it stays open.  None: one of its own.
+    device, memory: Of its own painter.
+    space: {"lps", "ras"}. Frame in which places are said and saved.
+    iso_value: HU at the start.
+    keep_ids: Write hashes of UIDs into files.
+    no_clobber: Files that exist stay, and to save over one is an error.
+    on_change: Called, in any thread, when something happened that was not asked for by the caller just now: work began
+        or ended, parts were found, an error came.
     """
 
     def __init__(
@@ -126,14 +106,10 @@ class ViewSession(Closing):
     def picture(self, size: Sequence[int], moving: bool, then: Callable[[Rendering], None]) -> None:
         """Ask for the picture; the latest request wins.
 
-        Parameters
-        ----------
-        size : (width, height)
-        moving : bool
-            True: coarse, its width steered so that it takes 40 ms.  A coarse one that is drawn is always delivered, a
+        size: (width, height)
+        moving: Coarse, its width steered so that it takes 40 ms.  A coarse one that is drawn is always delivered, a
             sharp one is dropped when the next is asked for.
-        then : callable
-            Called with the `Rendering` in a thread of the session.
+        then: Called with the `Rendering` in a thread of the session.
         """
         width, height = checked_size(size)
         with self._lock:
@@ -192,15 +168,7 @@ class ViewSession(Closing):
     def do(self, command: Mapping[str, Any]) -> dict[str, Any]:
         """Do a command, such as ``{"do": "set_iso", "hu": 250}``; see `clrecon.viewer.session.commands.COMMANDS`.
 
-        Returns
-        -------
-        dict
-            `facts`, and what the command itself has to say: ``"pick"``, ``"undone"``, ``"measure"``.
-
-        Raises
-        ------
-        UsageError
-            The command or an argument is wrong; nothing is changed.
+        Returns: `facts`, and what the command itself has to say: ``"pick"``, ``"undone"``, ``"measure"``.
         """
         found, arguments = check_command(command)
         with self._lock:
@@ -321,19 +289,9 @@ class ViewSession(Closing):
     ) -> None:
         """Write what is shown to a file, in the background; the extension says as what.
 
-        Parameters
-        ----------
-        path : path
-            See `clrecon.viewer.drawing.saving.KINDS`.
-        then : callable, optional
-            Called with lines that say what was written.
-        size : (width, height)
-            Of a picture.
-
-        Raises
-        ------
-        UsageError
-            The extension is unknown, or there is nothing of this kind.
+        path: See `clrecon.viewer.drawing.saving.KINDS`.
+        then: Called with lines that say what was written.
+        size: (width, height). Of a picture.
         """
         checked = checked_size(size)
         with self._lock:

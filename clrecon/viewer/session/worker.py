@@ -45,14 +45,9 @@ class Job:
 class Worker:
     """A thread with one place for each kind of work.
 
-    Parameters
-    ----------
-    name : str
-        Of the thread.
-    on_error : callable
-        Called with the kind and the words of an error, in the thread.
-    on_change : callable
-        Called when work begins and when it ends.
+    name: Of the thread.
+    on_error: Called with the kind and the words of an error, in the thread.
+    on_change: Called when work begins and when it ends.
     """
 
     def __init__(
@@ -72,20 +67,12 @@ class Worker:
     def ask(self, kind: str, work: Callable[[Job], Any], rank: int = 0, *, gives_way: bool = True) -> Job | None:
         """Ask for work; one of the same kind that waits is dropped, and one that runs is cancelled if it gives way.
 
-        Parameters
-        ----------
-        kind : str
-        work : callable
-            Called with the `Job` in the thread.
-        rank : int
-            Lower ones come first.
-        gives_way : bool
-            False: once it runs it is finished, so that pictures are seen while requests come faster than pictures.
+        work: Called with the `Job` in the thread.
+        rank: Lower ones come first.
+        gives_way: False: once it runs it is finished, so that pictures are seen while requests come faster than
+            pictures.
 
-        Returns
-        -------
-        Job or None
-            None after `close`.
+        Returns: None after `close`.
         """
         job = Job(kind, work, rank, gives_way)
         with self._wake:

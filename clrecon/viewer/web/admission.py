@@ -33,21 +33,12 @@ def refuse_request(
 ) -> str | None:
     """Return why a request is refused, or None for one that is let in.
 
-    Parameters
-    ----------
-    host, origin : str or None
-        The header fields of these names.
-    given : str or None
-        The secret of its address.
-    secret : str
-        The right one.
-    by_page : bool
-        True for what only scripts of pages ask for: a request without an Origin is refused too.
+    host, origin: The header fields of these names.
+    given: The secret of its address.
+    secret: The right one.
+    by_page: True for what only scripts of pages ask for: a request without an Origin is refused too.
 
-    Returns
-    -------
-    str or None
-        One line that holds nothing of the request.
+    Returns: One line that holds nothing of the request.
     """
     if host is None or not _OWN_HOST.fullmatch(host):
         return "refused: this server answers to 127.0.0.1 and localhost alone"

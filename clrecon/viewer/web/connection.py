@@ -68,13 +68,9 @@ class Session(Protocol):
 class Connection:
     """One browser.
 
-    Parameters
-    ----------
-    open_session : callable
-        Makes its session; called with a function that the session calls, in any thread, when something happened.
-    socket : aiohttp.web.WebSocketResponse
-    folder : Path
-        For files that it asks for.
+    open_session: Makes its session; called with a function that the session calls, in any thread, when something
+        happened.
+    folder: For files that it asks for.
     """
 
     def __init__(

@@ -14,12 +14,8 @@ __all__ = ["Download", "Downloads"]
 class Download:
     """A finished file.
 
-    Attributes
-    ----------
-    ticket : str
-        Random, part of its address; it counts as the secret does, once.
-    path : Path
-        In a folder of its own.
+    ticket: Random, part of its address; it counts as the secret does, once.
+    path: In a folder of its own.
     """
 
     ticket: str
@@ -34,10 +30,7 @@ class Download:
 class Downloads:
     """The finished files of one browser.
 
-    Parameters
-    ----------
-    folder : Path
-        Where each gets a folder of its own; only the owner of the process can read it.
+    folder: Where each gets a folder of its own; only the owner of the process can read it.
     """
 
     def __init__(self, folder: Path) -> None:

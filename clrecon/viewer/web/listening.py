@@ -26,15 +26,7 @@ _WAITING = 64
 def bind_port(port: int | None = None) -> socket.socket:
     """Return a socket that listens on a port of 127.0.0.1; it is closed by the caller.
 
-    Parameters
-    ----------
-    port : int, optional
-        Default: a free one.
-
-    Raises
-    ------
-    UsageError
-        The number is no port, or the port is taken or reserved.
+    port: Default: a free one.
     """
     if port is not None and (isinstance(port, bool) or not 1 <= port <= LARGEST_PORT):
         raise UsageError(f"a port is a whole number from 1 to {LARGEST_PORT}, not {port!r}")

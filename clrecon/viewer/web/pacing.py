@@ -26,10 +26,7 @@ class Asked(NamedTuple):
 class Pace:
     """What is stale in one browser.
 
-    Attributes
-    ----------
-    moving : bool
-        Something was changed a moment ago; set by `change` and cleared by `rest`.
+    moving: Something was changed a moment ago; set by `change` and cleared by `rest`.
     """
 
     def __init__(self) -> None:

@@ -26,19 +26,9 @@ MOVING_QUALITY, SHARP_QUALITY = 70, 92
 def encode_picture(picture: Rendering, ground: tuple[int, int, int], sharp: bool, facts: dict[str, Any]) -> bytes:
     """Return the message of a picture.
 
-    Parameters
-    ----------
-    picture : Rendering
-    ground : (int, int, int)
-        Red, green and blue of the page's ground, 0 to 255.
-    sharp : bool
-        At rest: in high quality.
-    facts : dict
-        What else the page is to know of it; size and camera are added.
-
-    Returns
-    -------
-    bytes
+    ground: Red, green and blue of the page's ground, 0 to 255.
+    sharp: At rest: in high quality.
+    facts: What else the page is to know of it; size and camera are added.
     """
     load_pillow()
     from PIL import Image

@@ -28,26 +28,11 @@ def serve_view(
 
     The server listens on 127.0.0.1 alone and lets in what knows its secret, see `clrecon.viewer.web.admission`.
 
-    Parameters
-    ----------
-    inputs : sequence of path
-        See `clrecon.jobs.view.inputs.open_inputs`.
-    settings : ViewSettings, optional
-    port : int, optional
-        Default: a free one.
-    opens : bool
-        True: open the user's browser.
-    progress : callable, optional
-        Of the reading.
-    ready : callable
-        Called with the server, what was read and warnings, once the address can be opened.
-
-    Raises
-    ------
-    UsageError
-        aiohttp is missing, the port is taken, or a setting has no meaning for a view; said before anything is read.
-    ClreconError
-        An input cannot be read, or there is no such device.
+    inputs: See `clrecon.jobs.view.inputs.open_inputs`.
+    port: Default: a free one.
+    opens: Open the user's browser.
+    progress: Of the reading.
+    ready: Called with the server, what was read and warnings, once the address can be opened.
     """
     settings = settings or ViewSettings()
     check_view_settings(settings)

@@ -49,21 +49,9 @@ class WebServer:
 
     The port is taken at once, so that one that is not free is said before a scan is read.  Use it in a ``with`` block.
 
-    Parameters
-    ----------
-    port : int, optional
-        Default: a free one.
+    port: Default: a free one.
 
-    Attributes
-    ----------
-    port : int
-    address : str
-        To be opened in a browser; it holds the secret.
-
-    Raises
-    ------
-    UsageError
-        aiohttp is not installed, or the port is taken or no port.
+    address: To be opened in a browser; it holds the secret.
     """
 
     def __init__(self, port: int | None = None) -> None:
@@ -85,12 +73,8 @@ class WebServer:
     def serve(self, open_session: OpenSession, ready: Callable[[Path], object] = lambda folder: None) -> None:
         """Serve until `stop`, or SIGINT (Ctrl-C), SIGTERM or SIGHUP, which end it within a second.
 
-        Parameters
-        ----------
-        open_session : callable
-            Makes the session of a browser, see `Connection`; called in the thread of the server.
-        ready : callable
-            Called once when the page can be opened, with a folder for private files that is removed at the end.
+        open_session: Makes the session of a browser, see `Connection`; called in the thread of the server.
+        ready: Called once when the page can be opened, with a folder for private files that is removed at the end.
         """
         with tempfile.TemporaryDirectory(prefix="clrecon-") as folder, contextlib.suppress(KeyboardInterrupt):
             self._downloads = Path(folder)

@@ -29,12 +29,7 @@ PICTURE_BACK = (0.055, 0.06, 0.07)
 class Glass:
     """A window in which boxes show pictures.
 
-    Parameters
-    ----------
-    title : str
-    layout : Layout
-    display : Display
-        What was found by the probe.
+    display: What was found by the probe.
     """
 
     def __init__(self, title: str, layout: Layout, display: Display):

@@ -54,12 +54,8 @@ class Box:
 class Layout:
     """The boxes of a window.
 
-    Attributes
-    ----------
-    size : (int, int)
-        Width and height of the window.
-    boxes : dict of str to Box
-        ``picture``, ``slider``, ``status``, the planes where scans are shown, and ``side`` where there is room.
+    size: Width and height of the window.
+    boxes: ``picture``, ``slider``, ``status``, the planes where scans are shown, and ``side`` where there is room.
     """
 
     size: tuple[int, int]
@@ -73,11 +69,8 @@ class Layout:
 def lay_out(size: tuple[int, int], *, slices: bool = True) -> Layout:
     """Divide a window.
 
-    Parameters
-    ----------
-    size : (width, height)
-    slices : bool
-        False where no scan is shown: the picture gets their room.
+    size: (width, height)
+    slices: False where no scan is shown: the picture gets their room.
     """
     width, height = max(size[0], 64), max(size[1], 64)
     below = SLIDER + STATUS if height > 4 * (SLIDER + STATUS) else STATUS

@@ -21,17 +21,10 @@ Load = Callable[[Progress], "ViewSession"]
 class Loading:
     """A thread that reads, begun at once.
 
-    Parameters
-    ----------
-    load : callable
-        See `Load`.
-    describe : callable
-        Returns the words for a stage of the progress.
+    load: See `Load`.
+    describe: Returns the words for a stage of the progress.
 
-    Attributes
-    ----------
-    words : str
-        What is done just now.
+    words: What is done just now.
     """
 
     def __init__(self, load: Load, describe: Callable[[str], str] = str):
@@ -44,12 +37,7 @@ class Loading:
         self._thread.start()
 
     def take(self) -> ViewSession | None:
-        """Return the session once it is there, and None before and afterwards.
-
-        Raises
-        ------
-        Whatever the reading raised.
-        """
+        """Return the session once it is there, and None before and afterwards."""
         if self._thread.is_alive():
             return None
         if self._failure is not None:

@@ -35,35 +35,15 @@ def open_window(
 ) -> list[str]:
     """Show inputs in a window until it is closed.
 
-    Parameters
-    ----------
-    inputs : sequence of path
-        See `clrecon.jobs.view.inputs.open_inputs`.
-    settings : ViewSettings, optional
-    save_as : sequence of str
-        Files that a save writes; the extension says as what.
-    progress : callable, optional
-        Of the reading; called in a thread.
-    ready : callable
-        Called with what was read, when it is shown.
-    say : callable
-        Gets a line for each file that was written.
-    describe : callable
-        Returns the words for a stage of the progress.
-    probe : DisplayProbe, optional
-        One that was started before.
+    inputs: See `clrecon.jobs.view.inputs.open_inputs`.
+    save_as: Files that a save writes; the extension says as what.
+    progress: Of the reading; called in a thread.
+    ready: Called with what was read, when it is shown.
+    say: Gets a line for each file that was written.
+    describe: Returns the words for a stage of the progress.
+    probe: One that was started before.
 
-    Returns
-    -------
-    list of str
-        The lines that were said.
-
-    Raises
-    ------
-    UsageError
-        There is no display, OpenGL does not work, or a setting has no meaning for a view; said before the inputs are.
-    ClreconError
-        An input cannot be read, or there is no such device.
+    Returns: The lines that were said.
     """
     probe = probe or DisplayProbe()  # it takes half a second, in which VTK is imported
     settings, tell = settings or ViewSettings(), progress or ignore_progress

@@ -36,14 +36,9 @@ PLAIN = (0.90, 0.86, 0.78)
 class Hit:
     """A place of a panel that answers to a click.
 
-    Attributes
-    ----------
-    box : Box
-        Within the panel.
-    action : dict
-        A command of `ViewSession.do`, or ``{"key": letter}`` for what a key of the window does.
-    share : str
-        Name of the command's argument that gets the share of the box's width left of the click; empty: none.
+    box: Within the panel.
+    action: A command of `ViewSession.do`, or ``{"key": letter}`` for what a key of the window does.
+    share: Name of the command's argument that gets the share of the box's width left of the click; empty: none.
     """
 
     box: Box
@@ -215,17 +210,11 @@ def draw_side(
 ) -> Panel:  # fmt: skip
     """Draw the list of modes, parts and tools.
 
-    Parameters
-    ----------
-    size : (width, height)
-    facts : mapping
-        `ViewModel.facts`.
-    tools : iterable of (key, words, whether it is on)
-        Buttons below, each for a key of the window.
-    first : int
-        Number of the part that the list of parts begins with: the wheel moves it.
-    chosen : str, optional
-        Key of the part that was picked last.
+    size: (width, height)
+    facts: `ViewModel.facts`.
+    tools: iterable of (key, words, whether it is on). Buttons below, each for a key of the window.
+    first: Number of the part that the list of parts begins with: the wheel moves it.
+    chosen: Key of the part that was picked last.
     """
     pen, tools = _Pen(size), list(tools)
     y = _draw_modes(pen, facts, MARGIN)

@@ -76,15 +76,9 @@ class PictureActor:
     Its renderer takes the picture's camera in `show`; where the camera is another one later, the picture is wrong.
     The actor is drawn after what is opaque.  With translucent actors beside it, switch depth peeling on.
 
-    Parameters
-    ----------
-    renderer : vtkRenderer
-        Gets the actor; its clipping range is set before each drawing.
+    renderer: Gets the actor; its clipping range is set before each drawing.
 
-    Attributes
-    ----------
-    actor : vtkActor
-        Not pickable, and no part of the bounds of a scene.
+    actor: Not pickable, and no part of the bounds of a scene.
     """
 
     def __init__(self, renderer: Any) -> None:
@@ -133,14 +127,9 @@ class PictureActor:
     def show(self, rendering: Rendering, *, expected: bool = False, smooth: bool = True) -> None:
         """Show a picture, and give the renderer its camera.
 
-        Parameters
-        ----------
-        rendering : Rendering
-            With a camera; its aspect is that of the renderer.  Its arrays must not change while it is shown.
-        expected : bool
-            True: depths are the expected ones, as volume rendering has them.
-        smooth : bool
-            True: between pixels colours are interpolated, where the picture is smaller than the renderer.
+        rendering: With a camera; its aspect is that of the renderer.  Its arrays must not change while it is shown.
+        expected: Depths are the expected ones, as volume rendering has them.
+        smooth: Between pixels colours are interpolated, where the picture is smaller than the renderer.
         """
         camera = rendering.camera
         assert camera is not None

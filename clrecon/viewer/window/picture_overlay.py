@@ -51,12 +51,7 @@ def _place(point: Any) -> Any:
 
 
 class PictureOverlay:
-    """Actors over the picture of a renderer.
-
-    Parameters
-    ----------
-    renderer : vtkRenderer
-    """
+    """Actors over the picture of a renderer."""
 
     def __init__(self, renderer: Any):
         self._renderer = renderer
@@ -77,16 +72,10 @@ class PictureOverlay:
     def show(self, rendering: Rendering, size: tuple[int, int], facts: Mapping[str, Any], *, cross: bool) -> None:
         """Lay everything out for a picture.
 
-        Parameters
-        ----------
-        rendering : Rendering
-            With a camera.
-        size : (width, height)
-            Of the box in which it is shown, in pixels.
-        facts : mapping
-            `ViewModel.facts`.
-        cross : bool
-            True: mark where the slices meet.
+        rendering: With a camera.
+        size: (width, height). Of the box in which it is shown, in pixels.
+        facts: `ViewModel.facts`.
+        cross: Mark where the slices meet.
         """
         camera = rendering.camera
         assert camera is not None

@@ -33,19 +33,11 @@ GAP = 7
 def dress_slice(rendering: Rendering, plane: str, facts: Mapping[str, Any]) -> NDArray[np.uint8]:
     """Return the image of a slice with all that is drawn over it.
 
-    Parameters
-    ----------
-    rendering : Rendering
-        A slice with a camera.
-    plane : str
-        "axial", "coronal" or "sagittal".
-    facts : mapping
-        `ViewModel.facts`.
+    rendering: A slice with a camera.
+    plane: "axial", "coronal" or "sagittal".
+    facts: `ViewModel.facts`.
 
-    Returns
-    -------
-    ndarray, shape (h, w, 4), uint8
-        Opaque.
+    Returns: ndarray, shape (h, w, 4), uint8. Opaque.
     """
     from PIL import Image, ImageDraw
 
@@ -108,16 +100,10 @@ def slice_place(
 ) -> tuple[float, float, float]:
     """Return the place in LPS mm that a pixel of a slice through the cross shows.
 
-    Parameters
-    ----------
-    camera : Camera
-        Of the slice's picture.
-    size : (width, height)
-        Of that picture.
-    at : (x, y)
-        Pixels from its top left corner.
-    cross : (x, y, z)
-        LPS mm.
+    camera: Of the slice's picture.
+    size: (width, height). Of that picture.
+    at: (x, y). Pixels from its top left corner.
+    cross: (x, y, z). LPS mm.
     """
     right, up, forward = camera.basis()
     width, height = size

@@ -49,30 +49,13 @@ def show_window(
 ) -> None:
     """Show a view in a window until it is closed.
 
-    Parameters
-    ----------
-    load : callable
-        See `Load`.  The session is closed with the window.
-    title : str
-    size : (width, height)
-        Pixels, at most; on a smaller screen the window is smaller.
-    save_as : sequence of str
-        Files that a save writes; numbers are added where they exist.
-    say : callable
-        Gets lines for the console: what was saved.
-    describe : callable
-        Returns words for a stage of the progress.
-    loaded : callable
-        Called when what was loaded is shown.
-    probe : DisplayProbe, optional
-        One that has been started.
-
-    Raises
-    ------
-    NoDisplayError
-        There is no display, or OpenGL does not work on it: the message says which.
-    ClreconError
-        Whatever `load` raises.
+    load: See `Load`.  The session is closed with the window.
+    size: (width, height). Pixels, at most; on a smaller screen the window is smaller.
+    save_as: Files that a save writes; numbers are added where they exist.
+    say: Gets lines for the console: what was saved.
+    describe: Returns words for a stage of the progress.
+    loaded: Called when what was loaded is shown.
+    probe: One that has been started.
     """
     probe = probe or DisplayProbe()
     # While the display is still tried, reading begins.
@@ -94,11 +77,7 @@ def show_window(
 class ViewWindow:
     """The window; see `show_window`, which makes one.
 
-    Parameters
-    ----------
-    glass : Glass
-    save_as, say, loaded
-        See `show_window`.
+    save_as, say, loaded: See `show_window`.
     """
 
     def __init__(

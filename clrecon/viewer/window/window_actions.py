@@ -36,15 +36,9 @@ BOX_SHARE = 0.5
 class WindowActions:
     """What the user does.
 
-    Parameters
-    ----------
-    content : WindowContent
-    end : callable
-        Closes the window.
-    save_as : sequence of str
-        Files that a save writes; empty: a mesh.
-    say : callable
-        Gets lines for the console.
+    end: Closes the window.
+    save_as: Files that a save writes; empty: a mesh.
+    say: Gets lines for the console.
     """
 
     def __init__(

@@ -57,12 +57,7 @@ HINTS = {
 
 
 class WindowContent:
-    """What is shown, and what has been asked for.
-
-    Parameters
-    ----------
-    glass : Glass
-    """
+    """What is shown, and what has been asked for."""
 
     def __init__(self, glass: Glass):
         self.glass = glass

@@ -13,16 +13,10 @@ __all__ = ["KEYS", "Key", "find_key", "help_sections", "side_buttons"]
 class Key:
     """A key.
 
-    Attributes
-    ----------
-    words : str
-        What it does, in the help.
-    command : mapping or None
-        A command of `ViewSession.do`.
-    own : str
-        Else what the window does itself.
-    button : str
-        Words of its button in the list beside the picture; empty: it has none.
+    words: What it does, in the help.
+    command: A command of `ViewSession.do`.
+    own: Else what the window does itself.
+    button: Words of its button in the list beside the picture; empty: it has none.
     """
 
     words: str
