@@ -6,21 +6,6 @@ that reaches a user is a fault of clrecon.
 
 from __future__ import annotations
 
-__all__ = [
-    "ClreconError",
-    "NoDicomError",
-    "NoSurfaceError",
-    "UsageError",
-    "RefusedInputError",
-    "DeviceError",
-    "DeviceFailedError",
-    "DeviceMemoryError",
-    "DeviceLostError",
-    "DeviceTimeoutError",
-    "OutputError",
-    "Cancelled",
-]
-
 
 class ClreconError(Exception):
     """Base of all errors that clrecon raises on purpose.

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from clrecon.sources.listing import SeriesListing
     from clrecon.system.progress import Progress
 
-__all__ = ["Selection", "list_series", "read_selected", "read_volume", "tell_format"]
-
 _OTHER_FORMATS = ("NIfTI", "NRRD", "MetaImage")
 _NAMES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
 """File extensions of these formats, only for messages."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["package_version"]
-
 
 def package_version() -> str:
     """Version as it was installed; ``0+uninstalled`` for a source folder that nobody has installed."""

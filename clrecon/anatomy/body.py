@@ -28,15 +28,14 @@ from clrecon.anatomy.dense_pieces import (
     judge_circle,
 )
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry.base import AIR_HU
 from clrecon.geometry.certificate import amend
-from clrecon.geometry.volume import AIR_HU, Volume
+from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.pieces import in_threads
 from clrecon.system.progress import Progress, Steps
 from clrecon.system.text import say_ml
 from clrecon.system.wording import name_parameter
-
-__all__ = ["BODY_STEPS", "describe_pieces", "find_body", "find_unmeasured", "mask_field_of_view", "remove_table"]
 
 TISSUE_HU = -300.0
 """Cells above this are tissue: the value lies between that of blankets or foam and that of fat."""

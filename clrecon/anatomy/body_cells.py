@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from clrecon.geometry.volume import Volume
 from clrecon.system.pieces import in_threads
 
-__all__ = ["DENSE_HU", "HARD_HU", "METAL_HU", "PIECE", "Cells", "Mask", "count_cells", "grow", "measure_cells"]
-
 Mask = NDArray[np.bool_]
 
 CELL_MM = 2.0

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Background", "BoneEdges", "leave_contrast_medium", "measure_edges"]
-
 FloatArray = NDArray[Any]
 
 METAL_HU = 2000

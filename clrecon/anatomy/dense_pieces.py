@@ -25,16 +25,6 @@ from clrecon.anatomy.body_cells import DENSE_HU, Cells, Mask
 from clrecon.anatomy.equipment import find_equipment
 from clrecon.system.gates import Gate, at_least, unmeasured
 
-__all__ = [
-    "BONE_KEPT",
-    "DensePieces",
-    "find_boneless",
-    "find_dense_pieces",
-    "find_removed",
-    "judge_bone",
-    "judge_circle",
-]
-
 Float64Array = NDArray[np.float64]
 Piece = tuple[int, tuple[float, ...]]
 """Number of voxels of a piece, and its middle, ijk."""

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from clrecon.anatomy.body_cells import Cells, Mask
 
-__all__ = ["find_equipment"]
-
 Float64Array = NDArray[np.float64]
 
 METAL_SHARE = 0.25

@@ -19,8 +19,6 @@ from clrecon.geometry.affine import column_spacing
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
 
-__all__ = ["SKIN_HU", "SKIN_SEEN_HU", "find_head", "measure_skin", "shows_face", "warn_of_face", "warn_of_skin"]
-
 SKIN_HU = (-950.0, 150.0)
 """Levels between air and bone: the outermost surface is the skin."""
 

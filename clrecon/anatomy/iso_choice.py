@@ -31,13 +31,12 @@ from numpy.typing import NDArray
 
 from clrecon.anatomy.bone_edges import Background, BoneEdges, leave_contrast_medium, measure_edges
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.geometry.volume import AIR_HU, Volume
+from clrecon.geometry.base import AIR_HU
+from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import count_of, say_share
 from clrecon.system.wording import name_parameter
-
-__all__ = ["CONTRAST_SAID", "IsoChoice", "choose_iso_value", "half_iso_value"]
 
 Float64Array = NDArray[np.float64]
 

@@ -7,8 +7,6 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["BLOCK_MM", "find_open_places", "holds_ball", "measure_width"]
-
 BLOCK_MM, FINE_MM = 2.0, 1.0
 """Side of the blocks by which the width of a space is measured, and near the limit."""
 BLOCKS_OFF, FINE_BLOCKS_OFF = 2.0, 0.75

@@ -12,8 +12,6 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.system.arguments import explains_arguments
 
-__all__ = ["Noise", "measure_noise"]
-
 SOFT_TISSUE_HU = (-150.0, 250.0)
 """All voxels of a block lie here: fat, muscle and organs with noise of up to some 60 HU, no air and no dense bone."""
 

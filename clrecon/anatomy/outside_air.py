@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from clrecon.anatomy.body import BODY_STEPS, MARGIN_MM, TISSUE_HU, find_body, find_unmeasured
 from clrecon.anatomy.body_cells import count_cells
 from clrecon.errors import NoSurfaceError, RefusedInputError
+from clrecon.geometry.base import AIR_HU
 from clrecon.geometry.certificate import amend
-from clrecon.geometry.volume import AIR_HU, Volume
+from clrecon.geometry.volume import Volume
 from clrecon.system.progress import Progress, Steps
 from clrecon.system.text import say_ml
 from clrecon.system.wording import name_parameter
-
-__all__ = ["leave_outside_air"]
 
 Mask = NDArray[np.bool_]
 

@@ -13,21 +13,6 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.volume import Volume
 from clrecon.system.pieces import in_threads
 
-__all__ = [
-    "CELL_MM",
-    "Field",
-    "Lattice",
-    "SpineCells",
-    "average_cells",
-    "disc_mean",
-    "grow_cortex",
-    "heights",
-    "mean_along_z",
-    "plan_cells",
-    "shifted",
-    "with_border",
-]
-
 Field = NDArray[np.float32]
 
 CELL_MM = (2.5, 2.5, 4.0)

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from clrecon.anatomy.spine_cells import CELL_MM, SpineCells
 from clrecon.anatomy.spine_traits import CANAL_RADIUS, SOFT_HU, STILL, SURE, Likeness, traits_of
 
-__all__ = ["GAP_MM", "SpineEnd", "follow", "look_beyond", "missing_traits"]
-
 GAP_MM = 12.0
 """Largest gap between slices of the canal: an artefact, or a vertebra that looks different."""
 REACH = 2

@@ -27,8 +27,6 @@ from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, Steps
 
-__all__ = ["SpineLine", "find_spine_line"]
-
 WORST = 0.6
 """Most that a slice counts against the path, so that one slice with an artefact does not end it."""
 BEND_COST = 0.05

@@ -21,8 +21,6 @@ from clrecon.anatomy.spine_cells import (
 )
 from clrecon.system.pieces import in_threads
 
-__all__ = ["CANAL_RADIUS", "SOFT_HU", "STILL", "SURE", "WORTH", "Likeness", "measure_likeness", "traits_of"]
-
 CANAL_RADIUS, BODY_RADIUS = 5.0, 10.0
 RING_MM = (8.0, 10.0, 12.0, 14.0, 16.0)
 """Distances from the middle of the canal at which its wall is looked for."""

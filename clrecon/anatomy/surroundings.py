@@ -18,8 +18,6 @@ from clrecon.geometry.certificate import amend
 from clrecon.geometry.volume import Volume
 from clrecon.system.progress import Progress, Steps
 
-__all__ = ["LEFT_OUT", "count_left_out", "leave_out_surroundings"]
-
 LEFT_OUT = "left_out"
 """Entry of the report of a volume with voxels that are left out."""
 

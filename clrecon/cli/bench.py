@@ -9,8 +9,6 @@ from clrecon.cli.common import add_device, add_no_clobber, table
 from clrecon.cli.console import Console, printable
 from clrecon.system.text import say_digits
 
-__all__ = ["add_arguments", "run"]
-
 PARTLY_DONE = 8
 _RUNS = 7
 

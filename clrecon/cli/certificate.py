@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-__all__ = ["describe_certificate"]
-
 _DIRECTIONS = {"L": "left", "R": "right", "P": "back", "A": "front", "S": "head", "I": "feet"}
 _FIRST = {"HF": "head first", "FF": "feet first"}
 _LYING = {"S": "supine", "P": "prone", "DR": "on the right side", "DL": "on the left side"}

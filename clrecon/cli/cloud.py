@@ -19,8 +19,6 @@ from clrecon.jobs.cloud.settings import DENOISERS, GHOSTS, KINDS, STEPS, CloudSe
 from clrecon.jobs.shared.clouds import CLOUD_INPUTS
 from clrecon.system.text import count_of, say_band
 
-__all__ = ["add_arguments", "describe_cloud_job", "run"]
-
 _PARTS = ("device", "read", "mask", "steps", "surface", "write", "other")
 _EXAMPLES = """\
 examples:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-__all__ = ["parse_clusters", "parse_denoisers", "parse_level"]
-
 
 def parse_level(text: str) -> float | tuple[float, ...]:
     """Read ``N`` as an iso value, and ``LO,HI`` or ``LO:HI`` as a band of HU."""

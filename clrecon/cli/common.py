@@ -17,23 +17,6 @@ from clrecon.errors import ClreconError, OutputError, UsageError
 from clrecon.system.text import guess_word
 from clrecon.system.time_limit import DEFAULT_SECONDS, check_time_limit
 
-__all__ = [
-    "EXIT_CODES",
-    "INTERRUPTED",
-    "Parser",
-    "add_common",
-    "add_device",
-    "add_keep_ids",
-    "add_memory",
-    "add_no_clobber",
-    "describe_space",
-    "guard",
-    "has_hung_device",
-    "megabytes",
-    "pick",
-    "table",
-]
-
 INTERRUPTED = 130
 
 _LONG_WORD = re.compile(r"[^\s/\\]{300,}")

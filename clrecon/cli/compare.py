@@ -16,8 +16,6 @@ from clrecon.cli.reading import add_reading
 from clrecon.jobs.compare.methods import COMPARED
 from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS
 
-__all__ = ["add_arguments", "run"]
-
 PARTLY_DONE = 8
 
 

@@ -13,8 +13,6 @@ from clrecon.errors import UsageError
 from clrecon.jobs.words import list_words
 from clrecon.system.text import guess_word
 
-__all__ = ["SHELLS", "add_arguments", "run", "write_script"]
-
 SHELLS = ("bash", "zsh", "fish")
 _WORDS = re.compile(r"[a-z][a-z0-9-]*(?:\|[a-z][a-z0-9-]*)*")
 """A metavar that lists all words of an option, such as ``lps|ras``."""

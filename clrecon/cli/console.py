@@ -10,8 +10,6 @@ from typing import Any
 from clrecon.cli.wrapping import fit, is_terminal
 from clrecon.errors import OutputError
 
-__all__ = ["Console", "describe_stage", "is_terminal", "printable"]
-
 _STAGES = {
     "device": "choosing a device",
     "scan": "looking through the files",

@@ -12,8 +12,6 @@ from clrecon.cli.mesh import describe_volume
 from clrecon.cli.reading import add_reading
 from clrecon.errors import UsageError
 
-__all__ = ["add_arguments", "describe_report", "run"]
-
 PARTLY_DONE = 8
 
 _EPILOG = """\

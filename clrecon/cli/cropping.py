@@ -5,9 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 
-__all__ = ["add_cropping", "parse_clip_box"]
-
-
 _RULES = """\
 Whole voxels outside of the box are left out, after --remove-table and --fov and before --region.
 Surfaces end there as at the ends of a scan. Of several boxes, what is in all of them stays."""

@@ -9,8 +9,6 @@ from clrecon.cli.common import add_device, add_no_clobber
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_mesh
 
-__all__ = ["add_arguments", "run"]
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""

@@ -8,8 +8,6 @@ from typing import Any
 from clrecon.cli.common import add_device, megabytes, table
 from clrecon.cli.console import Console, printable
 
-__all__ = ["add_arguments", "run"]
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""

@@ -10,8 +10,6 @@ from clrecon.cli.console import Console, printable
 from clrecon.jobs.shared.clouds import MESH_INPUTS
 from clrecon.system.text import say_volume
 
-__all__ = ["add_arguments", "run"]
-
 _EPILOG = """\
 From points that cover each mesh evenly by area to the nearest triangle of the other, in mm. Where the other
 mesh is closed, distances have a sign: + is outside of it. See docs/distance.md. To compare methods on a scan,

@@ -13,8 +13,6 @@ from clrecon.cli.masking import add_masking
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.reading import add_reading
 
-__all__ = ["add_arguments", "run"]
-
 _PARTS = ("read", "mask", "resample", "write")
 _EPILOG = """\
 Values are HU, as they were measured: int16 where they fit,

@@ -8,8 +8,6 @@ from typing import Any
 from clrecon.cli.points import parse_point
 from clrecon.system.text import count_of
 
-__all__ = ["add_methods", "describe_cells"]
-
 METHOD_NAMES = ("t-mc", "i-mc", "g-mc", "s-mc", "t-mc-soup", "skimage")
 
 

@@ -8,8 +8,6 @@ from clrecon.cli.common import pick
 from clrecon.cli.console import Console
 from clrecon.cli.reading import add_reading
 
-__all__ = ["add_arguments", "run"]
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""

@@ -13,8 +13,6 @@ from clrecon.cli.reading import add_reading
 from clrecon.jobs.inside.pictures import DEFAULT_VIEW
 from clrecon.system.text import say_volume
 
-__all__ = ["add_arguments", "run"]
-
 _EPILOG = """\
 parts, each a mesh of its own:
   solid       all bone: the label, or what is at --hu and above in it, closed and filled, without the canal

@@ -11,8 +11,6 @@ from clrecon.system.text import say_volume
 if TYPE_CHECKING:
     from clrecon.jobs.mesh.label_choice import LabelChoice
 
-__all__ = ["add_label_arguments", "describe_labels", "label_choice"]
-
 
 def _parse_color(text: str) -> tuple[str, str]:
     """Read ``LABEL=COLOUR``."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-__all__ = ["LEVELS_HELP", "parse_hu", "parse_levels"]
-
 LEVELS_HELP = (
     "iso value in HU, inside is N and above; A:B is a range, inside is from A to B; several with commas make one mesh"
     " each;"
@@ -17,7 +15,7 @@ _HALF = "half:"
 
 
 def parse_hu(text: str) -> dict[str, Any]:
-    """Read the value of ``--hu``: numbers, ranges, ``auto`` or ``half:BONE,TISSUE``; returns entries of `MeshSettings`."""
+    """Read the value of ``--hu``: numbers, ranges, ``auto`` or ``half:BONE,TISSUE`` as entries of `MeshSettings`."""
     if text == "auto":
         return {"half_way": "auto"}
     if not text.startswith(_HALF):

@@ -22,8 +22,6 @@ from clrecon.system.foreign_words import own_streams
 from clrecon.system.time_limit import DEFAULT_SECONDS, time_limit
 from clrecon.system.wording import spoken_by
 
-__all__ = ["main", "run"]
-
 
 class _Command(NamedTuple):
     module: str

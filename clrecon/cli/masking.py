@@ -7,8 +7,6 @@ import argparse
 from clrecon.jobs.shared.preprocess_steps import PREPROCESS_FORMS
 from clrecon.jobs.shared.region_rules import REGION_FORMS
 
-__all__ = ["add_masking"]
-
 
 def add_masking(parser: argparse.ArgumentParser) -> None:
     """Declare ``--remove-table``, ``--allow-bone-loss``, ``--fov``, ``--region`` and ``--preprocess``."""

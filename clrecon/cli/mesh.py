@@ -26,11 +26,6 @@ from clrecon.cli.refinement import (
 from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS
 from clrecon.system.text import count_of, say_digits, say_ml, say_volume
 
-__all__ = [
-    "WHAT_BONE_COSTS", "add_arguments", "add_levels", "add_selection", "add_solid", "describe_mesh",
-    "describe_volume", "run",
-]  # fmt: skip
-
 _PARTS = (
     *("device", "read", "mask", "choose", "solid", "upload", "build", "kernels", "download"),
     *("select", "refine", "measure", "write", "other"),

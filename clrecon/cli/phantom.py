@@ -9,8 +9,6 @@ from clrecon.cli.common import add_no_clobber
 from clrecon.cli.console import Console, printable
 from clrecon.system.text import say_ml
 
-__all__ = ["add_arguments", "run"]
-
 _SETTINGS = (
     "kind", "size", "slices", "spacing", "tilt", "oblique", "noise", "point_spread_mm", "seed", "radius_mm",
     "table", "table_gap_mm", "prone", "ghosts", "levels", "facet_gap_mm", "kyphosis_deg", "scoliosis_deg", "uneven_mm",

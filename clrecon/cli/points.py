@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 
-__all__ = ["parse_point"]
-
 
 def parse_point(text: str) -> tuple[float, ...]:
     """Read ``X,Y,Z``, three numbers in mm."""

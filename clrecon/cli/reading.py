@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 
-__all__ = ["add_reading"]
-
 
 def add_reading(parser: argparse.ArgumentParser) -> None:
     """Add --series, --phase, --allow-gaps, --force, --follow-links and --rescale."""

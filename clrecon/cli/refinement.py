@@ -10,17 +10,6 @@ from clrecon.cli.console import Console
 from clrecon.jobs.mesh.purposes import PURPOSES, Purpose
 from clrecon.system.text import count_of, say_digits, say_ml
 
-__all__ = [
-    "GATE_FAILED",
-    "SCAN_GATE_FAILED",
-    "add_purpose",
-    "add_refinement",
-    "add_strict",
-    "describe_purposes",
-    "describe_refinement",
-    "finish_with_gates",
-]
-
 SCAN_GATE_FAILED, GATE_FAILED = 7, 8
 """Exit code for a failed gate with ``--strict``; everything is written."""
 

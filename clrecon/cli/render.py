@@ -26,8 +26,6 @@ from clrecon.jobs.render.settings import MeshFile, color_apart, describe_modes, 
 from clrecon.jobs.shared.clouds import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file, is_mesh_file
 from clrecon.system.text import count_of
 
-__all__ = ["add_arguments", "run"]
-
 _LABELS_LISTED = 24
 _PARTS = ("read", "mask", "render", "turntable", "write")
 _EXAMPLES = """\

@@ -34,19 +34,6 @@ from clrecon.jobs.render.settings import (
 )
 from clrecon.jobs.shared.clouds import MESH_INPUTS
 
-__all__ = [
-    "add_camera",
-    "add_clipping",
-    "add_curve",
-    "add_labels",
-    "add_looks",
-    "add_meshes",
-    "add_motion",
-    "label_look",
-    "render_settings",
-    "turntable",
-]
-
 _FRAMES, _FPS, _DEGREES, _ANGLE = 100, 25.0, 360.0, 30.0
 
 

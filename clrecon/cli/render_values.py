@@ -8,20 +8,6 @@ import os
 
 from clrecon.jobs.render.settings import VIEWS
 
-__all__ = [
-    "parse_center",
-    "parse_clip_plane",
-    "parse_direction",
-    "parse_label_color",
-    "parse_label_opacity",
-    "parse_light",
-    "parse_mesh",
-    "parse_picture_size",
-    "parse_slices",
-    "parse_views",
-    "parse_window",
-]
-
 
 def _numbers(text: str, count: int, form: str) -> tuple[float, ...]:
     """Read a fixed number of numbers with commas between them."""

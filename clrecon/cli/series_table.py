@@ -20,8 +20,6 @@ from clrecon.cli.console import is_terminal, printable
 if TYPE_CHECKING:
     from rich.table import Table
 
-__all__ = ["render_listing"]
-
 _UNLIMITED = 100_000
 _FOLDED_WIDTH = 20
 """The description is folded to this width before a column is left out."""

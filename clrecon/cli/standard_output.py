@@ -13,8 +13,6 @@ from pathlib import Path
 from clrecon.cli.console import Console
 from clrecon.errors import OutputError, UsageError
 
-__all__ = ["DASH", "STREAMED", "run_with_streams"]
-
 DASH = "-"
 
 STREAMED = {

@@ -13,8 +13,6 @@ from clrecon.cli.console import Console, is_terminal, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.reading import add_reading
 
-__all__ = ["add_arguments", "run"]
-
 _EPILOG = """\
 Each voxel counts with its own volume: slices that lie unevenly are right. A label map on another grid is brought to
 the scan's, voxel by voxel the nearest label in mm. No OpenCL device is needed. See docs/statistics.md.

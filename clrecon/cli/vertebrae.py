@@ -12,8 +12,6 @@ from clrecon.cli.points import parse_point
 from clrecon.cli.reading import add_reading
 from clrecon.system.text import count_of
 
-__all__ = ["add_arguments", "run"]
-
 PARTLY = 8
 _NAMING = "numbers, counted from the head: name the levels with --first T1 or --name-at X,Y,Z=L3"
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from clrecon.jobs.view.settings import ViewSettings
     from clrecon.system.display import DisplayProbe
 
-__all__ = ["add_arguments", "run"]
-
 _EPILOG = """\
 Without --web and --html a window opens: turn with the mouse, move the slider, h shows all keys; q closes it. It needs a
 display with OpenGL. What is saved gets a name that no file has.

@@ -6,8 +6,6 @@ import argparse
 
 from clrecon.system.wording import Speaker, in_python
 
-__all__ = ["speaker_of"]
-
 _DESTINATIONS = {
     "color_by": "color",
     "direction": "light",

@@ -8,8 +8,6 @@ import shutil
 import textwrap
 from typing import Any
 
-__all__ = ["fit", "fit_help", "is_terminal"]
-
 _LABEL = re.compile(r"\s*\S+(?: \S+){0,2}\s{2,}|exit codes: |\s*")
 _COMMAND = re.compile(r"\s*clrecon \S")
 

@@ -19,8 +19,6 @@ from clrecon.labels import LabelMap
 from clrecon.labels.resample import resample_labels
 from clrecon.system.arguments import explains_arguments
 
-__all__ = ["Corridor", "VertebraCorridors", "find_corridors", "measure_corridors", "screw_diameter"]
-
 Float64Array = NDArray[np.float64]
 
 LEAST_RADIUS_MM, LARGEST_RADIUS_MM = 1.0, 9.0

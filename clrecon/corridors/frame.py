@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from clrecon.corridors.solid_bone import SolidBone
 from clrecon.errors import RefusedInputError
 
-__all__ = ["VertebraFrame", "find_frame"]
-
 Float64Array = NDArray[np.float64]
 
 STRIDE = 2

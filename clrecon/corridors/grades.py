@@ -12,8 +12,6 @@ from clrecon.corridors.measures import DIRECTIONS, RAYS, margins, sector_names
 from clrecon.corridors.solid_bone import SolidBone
 from clrecon.errors import UsageError
 
-__all__ = ["GRADES", "SCALE", "Screw", "ScrewGrade", "grade_breach", "grade_screw"]
-
 Float64Array = NDArray[np.float64]
 
 GRADES = (("A", 0.0), ("B", 2.0), ("C", 4.0), ("D", 6.0))

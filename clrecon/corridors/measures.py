@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from clrecon.corridors.frame import VertebraFrame
 from clrecon.corridors.solid_bone import SolidBone
 
-__all__ = ["DIRECTIONS", "Bias", "angles", "canal_wall", "find_exit", "margins", "measure_bias", "sector_names"]
-
 Float64Array = NDArray[np.float64]
 
 DIRECTIONS = ("medial", "lateral", "cranial", "caudal")

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from clrecon.corridors.frame import VertebraFrame
 
-__all__ = ["BODY_SHARE", "SAME_MM", "SIDES", "Line", "Span", "find_line", "line_points", "segment_distances"]
-
 Float64Array = NDArray[np.float64]
 Depth = Callable[[Float64Array], Float64Array]
 """Distance from the surface at points (n, 3) in the vertebra's frame, mm, positive inside."""

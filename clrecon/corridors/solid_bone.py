@@ -18,8 +18,6 @@ from clrecon.geometry import AIR_HU, Volume
 from clrecon.labels.growth import Growth
 from clrecon.labels.solid import fill_solid
 
-__all__ = ["LATTICE_STEP_MM", "Lattice", "SolidBone", "fill_vertebra", "label_box", "sample_volume"]
-
 Float64Array = NDArray[np.float64]
 Box = tuple[slice, slice, slice]
 

@@ -32,8 +32,6 @@ from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text, join_names
 from clrecon.system.wording import name_parameter
 
-__all__ = ["list_series", "list_slices", "read_volume"]
-
 log = get_logger(__name__)
 
 _START_BYTES = 512

@@ -13,8 +13,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
 from typing import Any
 
-__all__ = ["LINES_READ", "LINE_LENGTH", "certificate_lines", "plain_lines"]
-
 LINE_LENGTH = 256
 """Longest line.  Readers of PLY keep comments in buffers of fixed size; a widely used one has 1024 bytes."""
 LINES_READ = 64

@@ -13,11 +13,6 @@ from clrecon.errors import OutputError
 from clrecon.exchange.certificate import certificate_lines, plain_lines
 from clrecon.geometry import frame_from_lps
 
-__all__ = [
-    "BONE_COLOR", "Assembly", "Content", "Pieces", "PointContent", "Writable", "describe_facts", "parts_of",
-    "refuse_file",
-]  # fmt: skip
-
 BONE_COLOR = (0.89, 0.86, 0.78)
 """Colour of a surface without one of its own, in formats that must have one."""
 

@@ -9,9 +9,6 @@ from numpy.typing import NDArray
 
 from clrecon.geometry.precision import float32_step, is_far
 
-__all__ = ["as_stored", "find_coincident", "find_places", "rounded_apart", "rounding_step"]
-
-
 _MOST_STEPS_APART = 64
 
 

@@ -14,8 +14,6 @@ from clrecon.exchange.content import Assembly, PointContent
 from clrecon.system.files import StagedFile, stage_file
 from clrecon.system.text import guess_word
 
-__all__ = ["FOUR_GIB", "NO_LIMIT", "FileFormat", "find_extension", "stage_content"]
-
 FOUR_GIB = 2**32 - 1
 NO_LIMIT = 2**62
 

@@ -23,11 +23,6 @@ from clrecon.exchange.file_format import FOUR_GIB, NO_LIMIT, FileFormat, find_ex
 from clrecon.geometry.precision import float32_step
 from clrecon.system.files import StagedFile
 
-__all__ = [
-    "ASSEMBLIES", "FORMATS", "MOST_PARTS", "check_assembly", "check_format", "describe_rounding", "stage_assembly",
-    "stage_mesh", "write_mesh",
-]  # fmt: skip
-
 # STL: the format could hold more, but many programs keep offsets in 32 bits.  GLB: its length field has 32 bits.
 FORMATS: dict[str, FileFormat[Content]] = {
     ".stl": FileFormat(stl.estimate, stl.write, stl.verify, FOUR_GIB),

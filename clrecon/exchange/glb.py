@@ -23,8 +23,6 @@ import numpy as np
 from clrecon.exchange.content import BONE_COLOR, Assembly, Content, parts_of, refuse_file
 from clrecon.system.pieces import local_origin
 
-__all__ = ["NAMELESS", "estimate", "verify", "write"]
-
 NAMELESS = "surface"
 """Name of a node and mesh that have no other."""
 

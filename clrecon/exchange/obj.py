@@ -15,8 +15,6 @@ import numpy as np
 from clrecon.exchange.content import Assembly, Content, parts_of, refuse_file
 from clrecon.system.pieces import chunks
 
-__all__ = ["estimate", "verify", "write"]
-
 _CHUNK = 1 << 14
 _PIECE = 1 << 22
 

@@ -28,18 +28,6 @@ from clrecon.exchange.content import BONE_COLOR, Assembly, Content, parts_of, re
 from clrecon.exchange.page_coding import CodedSurface, decode_surface, encode_surface
 from clrecon.version import package_version
 
-__all__ = [
-    "MOST_TRIANGLES",
-    "compose_page",
-    "estimate",
-    "hash_code",
-    "parse_page",
-    "read_facts",
-    "read_page_code",
-    "verify",
-    "write",
-]
-
 MOST_TRIANGLES = 10_000_000
 """About 70 MB of page and 200 MB on the graphics card; more is slow to turn on most computers."""
 

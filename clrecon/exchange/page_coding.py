@@ -16,8 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["STEPS", "CodedSurface", "decode_surface", "encode_surface"]
-
 STEPS = 65_535
 """Steps of a coordinate along a side of the bounding box."""
 

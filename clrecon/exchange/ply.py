@@ -20,8 +20,6 @@ from clrecon.errors import OutputError
 from clrecon.exchange.content import Content, PointContent, refuse_file
 from clrecon.system.pieces import chunks
 
-__all__ = ["estimate", "verify", "write"]
-
 _FACE = np.dtype([("count", "u1"), ("corners", "<i4", (3,))])
 _CHUNK = 1 << 14
 

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from clrecon.exchange.content import Content, refuse_file
 from clrecon.exchange.coordinates import rounded_apart
 
-__all__ = ["estimate", "verify", "write"]
-
 _HEAD = 84
 _FACET_BYTES = 50
 """Bytes of a facet: normal, three corners and two unused bytes."""

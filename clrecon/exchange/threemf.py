@@ -16,8 +16,6 @@ from clrecon.errors import OutputError
 from clrecon.exchange.content import Assembly, Content, parts_of, refuse_file
 from clrecon.system.pieces import chunks
 
-__all__ = ["estimate", "verify", "write"]
-
 BONE_COLOR = (0.89, 0.86, 0.78)
 _CHUNK = 1 << 14
 _PIECE = 1 << 22

@@ -20,8 +20,6 @@ from clrecon.errors import OutputError
 from clrecon.exchange.content import BONE_COLOR, Assembly, Content, PointContent, refuse_file
 from clrecon.exchange.vtk import make_polydata
 
-__all__ = ["estimate", "verify", "write"]
-
 _END = b"</VTKFile>"
 
 

@@ -15,8 +15,6 @@ from clrecon.sources.gates import PADDING_SHARE, judge_figures, judge_steps, lis
 from clrecon.sources.plausibility import VoxelFindings, leave_unexamined
 from clrecon.system.gates import Gate, at_most, none_of, unmeasured
 
-__all__ = ["MODALITY", "certify_grid", "collect_header_warnings", "collect_value_warnings"]
-
 MODALITY = "unknown"
 NOT_DICOM = "not DICOM: position, spacing and the meaning of the values are as the file says, nothing vouches for them"
 

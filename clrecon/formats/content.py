@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from clrecon.geometry.affine import Float64Array
 from clrecon.system.progress import Progress
 
-__all__ = ["PACKING", "VolumeContent"]
-
 PACKING = 1
 """Level of gzip, as nibabel has it.  Level 6 takes four times as long for a tenth of the bytes."""
 

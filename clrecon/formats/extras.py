@@ -7,8 +7,6 @@ from typing import Any
 from clrecon.formats.grid_file import Purpose
 from clrecon.system.packages import import_package
 
-__all__ = ["import_extra"]
-
 _PACKAGES = {"nrrd": "pynrrd"}
 
 

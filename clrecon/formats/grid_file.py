@@ -14,8 +14,6 @@ from clrecon.formats.stream import VoxelBytes, check_end, check_size, read_bytes
 from clrecon.geometry.affine import Float64Array
 from clrecon.sources.rescale import Rescale
 
-__all__ = ["LABEL_MAP", "VOLUME", "GridFile", "Purpose"]
-
 
 @dataclass(frozen=True)
 class Purpose:

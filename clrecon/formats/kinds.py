@@ -12,8 +12,6 @@ from clrecon.formats.nifti import is_nifti, open_nifti
 from clrecon.formats.nrrd import is_nrrd, open_nrrd
 from clrecon.system.regular_files import open_regular
 
-__all__ = ["name_of_grid", "open_grid", "tell_kind"]
-
 _START_BYTES = 512
 
 

@@ -30,8 +30,6 @@ from clrecon.system.foreign_words import hush
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["is_metaimage", "open_metaimage"]
-
 LARGEST_HEADER = 2**20
 LONGEST_KEY, LONGEST_VALUE = 100, 4000
 """Longest accepted key and value in bytes; MetaIO has 255 bytes for keys and 32 KiB for values."""

@@ -27,8 +27,6 @@ from clrecon.geometry.nifti import MM_PER_UNIT
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["is_nifti", "nifti_affine", "open_nifti"]
-
 LARGEST_HEADER = 2**24
 """Most bytes before the voxels; extensions of label maps have some 10,000."""
 

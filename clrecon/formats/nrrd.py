@@ -24,8 +24,6 @@ from clrecon.geometry.affine import Float64Array, checked_affine, compose_affine
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["is_nrrd", "nrrd_affine", "open_nrrd"]
-
 LARGEST_HEADER = 2**20
 
 LPS_FROM_SPACE = {

@@ -19,8 +19,6 @@ from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text
 
-__all__ = ["list_grid", "read_grid"]
-
 log = get_logger(__name__)
 
 

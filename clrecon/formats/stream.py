@@ -21,8 +21,6 @@ from clrecon.errors import RefusedInputError
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["LARGEST_GRID", "VoxelBytes", "check_end", "check_size", "file_beside", "read_bytes"]
-
 DEFLATE_RATIO = 1032
 """Highest compression ratio of Deflate (zlib's technical note)."""
 

@@ -25,8 +25,6 @@ from clrecon.system.progress import Progress
 from clrecon.system.text import say_share
 from clrecon.system.wording import name_parameter
 
-__all__ = ["GridValues", "read_values"]
-
 LADDER = (np.dtype(np.int16), np.dtype(np.int32), np.dtype(np.float32))
 """Types of a volume, from the narrowest to the widest."""
 

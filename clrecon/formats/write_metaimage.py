@@ -14,8 +14,6 @@ from clrecon.formats.grid_file import VOLUME
 from clrecon.geometry.itk import make_sitk
 from clrecon.system.foreign_words import hush
 
-__all__ = ["write_metaimage"]
-
 _NAME = "volume.mha"
 
 

@@ -13,8 +13,6 @@ from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import VOLUME
 from clrecon.geometry.nifti import place_in_header
 
-__all__ = ["write_nifti"]
-
 COMMENT_CODE = 6
 """Code of the extension that holds plain text."""
 

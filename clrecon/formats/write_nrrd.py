@@ -9,8 +9,6 @@ from clrecon.formats.content import PACKING, VolumeContent
 from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import VOLUME
 
-__all__ = ["write_nrrd"]
-
 CHUNK_BYTES = 2**20
 """Bytes of voxels that pynrrd packs at a time, for the progress."""
 

@@ -34,16 +34,6 @@ from clrecon.system.files import StagedFile, stage_file
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.wording import name_parameter
 
-__all__ = [
-    "FORMATS",
-    "VolumeFormat",
-    "check_holds",
-    "check_volume_format",
-    "describe_shear",
-    "stage_volume",
-    "write_volume",
-]
-
 SAME_PLACE_MM = 1e-3
 """Largest distance of a voxel from its place when the header is read back; NIfTI keeps its affine in float32."""
 

@@ -10,9 +10,10 @@ from clrecon.geometry.affine import (
     slice_normal,
     tilt_degrees,
 )
+from clrecon.geometry.base import AIR_HU
 from clrecon.geometry.frames import SPACES, frame_from_lps, lps_affine_from_ras
 from clrecon.geometry.grid import Grid
-from clrecon.geometry.volume import AIR_HU, Volume
+from clrecon.geometry.volume import Volume
 
 __all__ = [
     "AIR_HU",

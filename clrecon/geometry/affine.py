@@ -15,20 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 
-__all__ = [
-    "TILT_REPORT_DEG",
-    "apply_affine",
-    "checked_affine",
-    "checked_points",
-    "column_spacing",
-    "compose_affine",
-    "is_left_handed",
-    "normal_matrix",
-    "slice_normal",
-    "signed_tilt",
-    "tilt_degrees",
-]
-
 Float64Array = NDArray[np.float64]
 """The type of the arrays that the functions here take and return."""
 

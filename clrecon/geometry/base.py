@@ -15,8 +15,6 @@ from clrecon.geometry.certificate import Certificate, amend
 from clrecon.geometry.grid import Grid
 from clrecon.geometry.uneven import UnevenStack
 
-__all__ = ["AIR_HU", "DEVICE_DTYPES", "BaseVolume"]
-
 Own = TypeVar("Own", bound="BaseVolume")
 
 AIR_HU = -1024

@@ -13,8 +13,6 @@ from clrecon.geometry.grid import Grid
 from clrecon.geometry.orientation import describe_orientation
 from clrecon.geometry.uneven import fit_even
 
-__all__ = ["Block", "describe_place", "find_block", "place_block"]
-
 ON_EDGE_MM = 1e-6
 """A voxel centre this near to the side of a box lies in the box."""
 

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from clrecon.errors import UsageError
 from clrecon.system.wording import name_parameter
 
-__all__ = ["CROPS", "Box", "crop_box"]
-
 Box = tuple[tuple[float, ...], tuple[float, ...]]
 """Lowest and highest corner (x, y, z) in mm; infinite where a side is open."""
 

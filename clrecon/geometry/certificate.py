@@ -9,8 +9,6 @@ from typing import Any
 from clrecon.system.gates import Gate
 from clrecon.system.records import Record
 
-__all__ = ["Certificate", "amend", "without_ids"]
-
 _ELSEWHERE = {"slices_missing": ("dropped",), "rescale": ("padding_share", "padding_hu")}
 """In reports of files that are not DICOM these entries stand behind that one: as they always have, byte for byte."""
 

@@ -15,8 +15,6 @@ from clrecon.geometry.blocks import Block, describe_place, find_block, place_blo
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.frames import frame_from_lps
 
-__all__ = ["crop_volume", "cut_block", "describe_extent", "find_extent"]
-
 Own = TypeVar("Own", bound=BaseVolume)
 
 

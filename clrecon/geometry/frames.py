@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 
-__all__ = ["SPACES", "choose_space", "frame_from_lps", "lps_affine_from_ras"]
-
 SPACES = ("lps", "ras")
 
 

@@ -11,8 +11,6 @@ from clrecon.geometry.affine import Float64Array, apply_affine, column_spacing
 from clrecon.system.mapping import find_mapping
 from clrecon.system.messages import MappedArray, Message
 
-__all__ = ["Grid"]
-
 
 class Grid(Message):
     """Voxels and their affine: the base class of `Volume` and of `clrecon.labels.LabelMap`.

@@ -18,8 +18,6 @@ from clrecon.geometry.regular import (
 )
 from clrecon.geometry.resample import air_of, check_count
 
-__all__ = ["Taken", "image_of"]
-
 Taken = tuple[NDArray[Any], Float64Array]
 """Voxels, shape (nk, nj, ni), and the affine, index (i, j, k) to LPS mm: what is taken of an image."""
 

@@ -16,9 +16,10 @@ from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry.affine import normal_matrix
+from clrecon.geometry.base import AIR_HU
 from clrecon.geometry.precision import find_vertex_origin, float32_step, largest_coordinate, power_of_two_over
 from clrecon.geometry.vertex_rules import check_vertex_rule
-from clrecon.geometry.volume import AIR_HU, Volume
+from clrecon.geometry.volume import Volume
 from clrecon.system.text import say_digits
 
 LARGEST_INTEGER = 2**23
@@ -35,11 +36,6 @@ TOPOLOGIES = ("separated", "trilinear")
 
 Level = float | Sequence[float]
 """An iso value, or the two ends of a range, HU."""
-
-__all__ = [
-    "TOPOLOGIES", "IsoRule", "Level", "ValueRange", "check_topology", "checked_iso_value", "choose_iso_rule",
-    "data_range", "layer_margins", "layer_normal_matrices", "slice_normal_matrices", "takes_parts", "vertex_margin",
-]  # fmt: skip
 
 
 @dataclass(frozen=True)

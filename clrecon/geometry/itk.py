@@ -12,8 +12,6 @@ from clrecon.geometry.affine import Float64Array, column_spacing
 from clrecon.geometry.images import Taken
 from clrecon.system.packages import import_package
 
-__all__ = ["make_sitk", "take_sitk"]
-
 
 def make_sitk(voxels: NDArray[Any], affine: Float64Array) -> Any:
     """Make a ``SimpleITK.Image``, a copy, of voxels (nk, nj, ni) and their affine."""

@@ -13,8 +13,6 @@ from clrecon.geometry.frames import lps_affine_from_ras
 from clrecon.geometry.images import Taken
 from clrecon.system.packages import import_package
 
-__all__ = ["MM_PER_UNIT", "make_nibabel", "place_in_header", "take_nibabel"]
-
 MM_PER_UNIT = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
 """Millimetres of each code of the spatial unit: unknown (read as mm, as other programs do), metre, mm, micron."""
 

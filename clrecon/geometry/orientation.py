@@ -9,8 +9,6 @@ import numpy as np
 
 from clrecon.geometry.affine import Float64Array, is_left_handed, slice_normal
 
-__all__ = ["describe_orientation"]
-
 
 def describe_orientation(affine: Float64Array) -> dict[str, Any]:
     """Describe the directions of index space in the patient.

@@ -18,16 +18,6 @@ from clrecon.geometry.affine import Float64Array
 if TYPE_CHECKING:
     from clrecon.geometry.volume import Volume
 
-__all__ = [
-    "FAR_MM",
-    "describe_far",
-    "find_vertex_origin",
-    "float32_step",
-    "is_far",
-    "largest_coordinate",
-    "power_of_two_over",
-]
-
 FAR_MM = 4096.0
 """Coordinates from here on count as far.  Below, the step of float32 is at most 2.4e-4 mm; from here on it is 4.9e-4 mm
 or more."""

@@ -12,15 +12,6 @@ from clrecon.geometry.affine import Float64Array, apply_affine
 from clrecon.geometry.grid import Grid
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = [
-    "LARGEST_SHEAR_DEGREES",
-    "RegularGrid",
-    "describe_unevenness",
-    "regular_grid",
-    "resample_grid",
-    "shear_degrees",
-]
-
 LARGEST_SHEAR_DEGREES = 0.01
 """Axes this near to right angles count as rectangular, because directions in headers are rounded.  A file or an image
 gets the affine's own axes, so its points are those of the volume."""

@@ -14,8 +14,6 @@ from clrecon.geometry.certificate import amend
 from clrecon.geometry.regular import RegularGrid, regular_grid, resample_grid
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["MOST_VOXELS", "SMALLEST_STEP_MM", "air_of", "check_count", "check_step", "resample_volume"]
-
 Own = TypeVar("Own", bound=BaseVolume)
 
 SMALLEST_STEP_MM = 0.01

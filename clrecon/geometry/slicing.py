@@ -13,8 +13,6 @@ from clrecon.geometry.base import BaseVolume
 from clrecon.geometry.blocks import Block, describe_place, place_block
 from clrecon.geometry.certificate import amend
 
-__all__ = ["slice_volume"]
-
 Own = TypeVar("Own", bound=BaseVolume)
 
 _AXES = "kji"

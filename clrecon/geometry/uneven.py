@@ -16,15 +16,6 @@ from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, checked_points, slice_normal
 from clrecon.system.messages import Message
 
-__all__ = [
-    "POSITION_TOLERANCE_GAPS",
-    "POSITION_TOLERANCE_MM",
-    "UnevenStack",
-    "fit_even",
-    "fit_line",
-    "position_tolerance",
-]
-
 POSITION_TOLERANCE_MM = 0.01
 POSITION_TOLERANCE_GAPS = 0.01
 """A residual up to 1 % of the gap (or 0.01 mm if larger) is due to rounding and does not make a stack uneven."""

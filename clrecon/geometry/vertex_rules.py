@@ -15,12 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.system.wording import name_parameter
 
-__all__ = [
-    "GOLDEN", "SEARCH_STEPS", "VERTEX_RULES", "check_vertex_rule", "cubic_value", "describe_rule", "golden_fraction",
-    "linear_fraction",
-    "normal_on_edge", "point_on_edge", "search_fraction",
-]  # fmt: skip
-
 VERTEX_RULES = ("linear", "golden", "golden-search")
 
 GOLDEN = 0.6180340

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry.base import AIR_HU, DEVICE_DTYPES, BaseVolume
+from clrecon.geometry.base import BaseVolume
 from clrecon.geometry.boxes import CROPS, crop_box
 from clrecon.geometry.crop import crop_volume, find_extent
 from clrecon.geometry.images import image_of
@@ -22,8 +22,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 from clrecon.system.public import public_function
 from clrecon.system.targets import keep_existing
-
-__all__ = ["AIR_HU", "DEVICE_DTYPES", "Volume"]
 
 Own = TypeVar("Own", bound="Volume")
 

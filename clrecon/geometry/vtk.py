@@ -22,8 +22,6 @@ from clrecon.geometry.affine import Float64Array, is_left_handed
 from clrecon.geometry.frames import choose_space, frame_from_lps
 from clrecon.geometry.images import Image, Taken
 
-__all__ = ["make_image_data", "take_image_data"]
-
 _TURNED = "in reverse order: the volume's axes are left-handed"
 """Field array ``SLICES`` of an image whose slices run from the last one of the volume to its first."""
 

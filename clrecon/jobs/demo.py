@@ -29,8 +29,6 @@ from clrecon.system.targets import (
 if TYPE_CHECKING:
     from clrecon.opencl import Device
 
-__all__ = ["DEMO_FILES", "DEMO_FOLDER", "make_demo"]
-
 DEMO_FOLDER = "clrecon-demo"
 DEMO_FILES = ("ct", "bone.stl", "bone.png", "report.json")
 

@@ -10,8 +10,6 @@ from clrecon.errors import DeviceError
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.time_limit import device_seconds
 
-__all__ = ["run_device_selftest", "survey_devices"]
-
 
 def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError | None]:
     """List every OpenCL platform and device, and say which device would be used.

@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 from clrecon.errors import ClreconError, NoDicomError, RefusedInputError
 from clrecon.system.progress import Progress
 
-__all__ = ["InputListing", "describe_input"]
-
 
 class InputListing(NamedTuple):
     """The listing of an input.

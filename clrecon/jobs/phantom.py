@@ -8,8 +8,6 @@ from typing import Any
 from clrecon.system.progress import Progress
 from clrecon.system.targets import keep_existing
 
-__all__ = ["describe_kinds", "make_phantom"]
-
 
 def describe_kinds() -> dict[str, str]:
     """Return the name of each kind of phantom, and its description."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-__all__ = ["list_words"]
-
 
 def list_words(command: str, setting: str) -> list[str]:
     """Return the words that a setting can be; an empty list where it takes numbers, files or free text.

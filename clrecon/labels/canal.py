@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
 
-__all__ = ["LEAST_HOLE_MM2", "Canal", "find_canal"]
-
 Bits = NDArray[np.bool_]
 
 LEAST_HOLE_MM2 = 60.0

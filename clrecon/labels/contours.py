@@ -14,8 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["United", "fill_contours", "unite_contours"]
-
 MOST_OVER_EACH_OTHER = 20_000
 """Most pairs of contours of one ROI that lie over each other on one slice."""
 

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from clrecon.labels.occupancy import FULL, LEVELS, START, STEEPNESS, VOLUME_SHARE
 
-__all__ = ["FACES_PER_AREA", "Borders", "choose_levels", "count_faces", "find_enclosed", "level_biases"]
-
 FACES_PER_AREA = 1.5
 """Mean number of voxel faces at a border for one face's area of the border, over all directions."""
 

@@ -15,8 +15,6 @@ from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, slice_normal
 from clrecon.geometry.volume import Volume
 
-__all__ = ["LabelSlices", "label_slices"]
-
 PARTS_OF_GAP = (4.0, 2.0)
 """Slices to the smallest gap; the second where the first makes too many."""
 

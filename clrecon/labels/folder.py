@@ -18,8 +18,6 @@ from clrecon.labels.stream import empty_labels, iterate_labels
 from clrecon.system.progress import Progress
 from clrecon.system.text import count_of, escape_text
 
-__all__ = ["open_masks", "read_masks"]
-
 SAME_GRID_MM = 1e-3
 """Largest distance of a voxel from its place in the first mask; a sform is float32."""
 

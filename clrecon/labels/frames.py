@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.affine import Float64Array, checked_affine, compose_affine
 
-__all__ = ["FrameStack", "place_frames"]
-
 DIRECTIONS_DIFFER = 1e-4
 """Largest difference between direction cosines; the gate of a CT series allows as much between slices."""
 

@@ -21,8 +21,6 @@ from clrecon.labels.overlap import Painter, Wanted
 from clrecon.labels.stream import empty_labels, iterate_labels
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["read_grid_labels"]
-
 _LABEL = re.compile(
     rb"""<Label\b[^>]{0,500}?\bKey=["']([0-9]{1,9})["'][^>]{0,500}>\s*(?:<!\[CDATA\[(.*?)\]\]>|([^<]*))""", re.DOTALL
 )

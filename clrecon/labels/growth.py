@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 
-__all__ = ["Growth"]
-
 MOST_OFFSETS = 5000
 SAME_DISTANCE = 1e-6
 """Relative difference; offsets whose lengths differ by less, by rounding alone, are equally near."""

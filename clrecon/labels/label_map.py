@@ -16,8 +16,6 @@ from clrecon.labels.names import check_name, check_wanted, find_number
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.public import public_function
 
-__all__ = ["LARGEST_NUMBER", "LabelMap"]
-
 LARGEST_NUMBER = 65_535
 """Largest label number; numbers go to a device as 16 bits."""
 

@@ -12,8 +12,6 @@ from collections.abc import Collection, Iterable, Mapping
 from clrecon.errors import UsageError
 from clrecon.system.text import escape_text
 
-__all__ = ["check_name", "check_wanted", "file_suffixes", "find_number", "label_suffix", "list_labels"]
-
 SUFFIX_LENGTH = 40
 LABELS_LISTED = 60
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-__all__ = ["FULL", "KEEP", "LEVELS", "REACH", "START", "STEEPNESS", "VOLUME_SHARE", "next_level"]
-
 REACH = 2
 """Samples each way that count; the kernels have the same number, in cl/surface/label_masks.h."""
 

@@ -14,8 +14,6 @@ from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap
 from clrecon.labels.names import check_name, find_number
 from clrecon.system.wording import name_parameter
 
-__all__ = ["Painter", "Wanted"]
-
 
 class Wanted(NamedTuple):
     """The labels that are wanted, None for all, and whether the others are read too.

@@ -26,8 +26,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
 
-__all__ = ["is_dicom_map", "is_large_map", "read_all_labels", "read_labels"]
-
 OTHER_OBJECTS = {
     "1.2.840.10008.5.1.4.1.1.481.2": "an RT dose",
     "1.2.840.10008.5.1.4.1.1.481.5": "an RT plan",

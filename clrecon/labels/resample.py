@@ -17,8 +17,6 @@ from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import say_ml
 
-__all__ = ["LEAST_SHARE_INSIDE", "ResampledLabels", "check_together", "resample_labels", "warn_of_place"]
-
 log = get_logger(__name__)
 
 LEAST_SHARE_INSIDE = 0.01

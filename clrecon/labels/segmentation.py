@@ -28,8 +28,6 @@ from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text, hash_uid
 
-__all__ = ["Check", "read_segmentation", "tell_pixel_bytes"]
-
 SEGMENTATION_CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
 IMPLICIT_LITTLE, EXPLICIT_LITTLE = "1.2.840.10008.1.2", "1.2.840.10008.1.2.1"
 RLE_LOSSLESS = "1.2.840.10008.1.2.5"

@@ -20,8 +20,6 @@ from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
 from clrecon.system.text import say_digits
 
-__all__ = ["PERCENTILES", "LabelFigures", "check_percentiles", "measure_labels", "measure_resampled", "name_percentile"]
-
 PERCENTILES = (5.0, 25.0, 50.0, 75.0, 95.0)
 
 _MOST_LEVELS = 1 << 20

@@ -14,8 +14,6 @@ from clrecon.formats.grid_file import GridFile
 from clrecon.labels.label_map import LARGEST_NUMBER
 from clrecon.system.memory import physical_memory_bytes
 
-__all__ = ["empty_labels", "iterate_labels"]
-
 
 def empty_labels(name: str, shape: tuple[int, int, int]) -> NDArray[np.uint16]:
     """Return zeros of `shape` that take memory only where they are written; refuse a shape too large for the memory."""

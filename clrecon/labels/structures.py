@@ -28,8 +28,6 @@ from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import count_of, escape_text, hash_uid
 
-__all__ = ["STRUCTURE_SET", "read_structures"]
-
 STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"
 IMPLICIT_LITTLE, EXPLICIT_LITTLE = "1.2.840.10008.1.2", "1.2.840.10008.1.2.1"
 LARGEST_BYTES = 2**30

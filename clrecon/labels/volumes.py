@@ -12,8 +12,6 @@ from clrecon.geometry.affine import slice_normal
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.solid import Box
 
-__all__ = ["count_ml", "label_ml", "slice_voxel_ml"]
-
 MM3_PER_ML = 1000.0
 
 

@@ -17,8 +17,6 @@ from clrecon.formats.grid_file import LABEL_MAP
 from clrecon.geometry.nifti import place_in_header
 from clrecon.labels.label_map import LabelMap
 
-__all__ = ["encode_nifti", "load_nibabel"]
-
 CARET_CODE = 30
 """Code of the extension that holds Caret's XML."""
 

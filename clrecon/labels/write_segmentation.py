@@ -20,8 +20,6 @@ from clrecon.errors import RefusedInputError
 from clrecon.labels.label_map import LabelMap
 from clrecon.version import package_version
 
-__all__ = ["SourceSlice", "encode_segmentation"]
-
 SourceSlice = tuple[Path, int, int]
 """File of a slice of the scan, its frame there from 0, and how many frames the file has."""
 

@@ -24,8 +24,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.messages import Message
 from clrecon.system.targets import keep_existing
 
-__all__ = ["BaseMesh"]
-
 _MOST_VERTICES = 2**32
 
 Own = TypeVar("Own", bound="BaseMesh")

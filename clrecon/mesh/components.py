@@ -19,8 +19,6 @@ from clrecon.mesh.pieces import measure_components
 from clrecon.system.text import count_of, say_digits
 from clrecon.system.wording import name_parameter
 
-__all__ = ["Labelled", "select_components", "split_components"]
-
 Own = TypeVar("Own", bound=BaseMesh)
 
 Labelled = tuple[int, NDArray[np.int64]]

@@ -11,19 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "Edges",
-    "Fans",
-    "count_duplicate_faces",
-    "find_duplicate_faces",
-    "find_edges",
-    "find_faces_back_to_back",
-    "find_split_vertices",
-    "label_components",
-    "opposite_half_edges",
-    "order_by_number",
-]
-
 _MOST_STEPS = 64
 """Most faces around a vertex that are counted one after the other; vertices with more take the general way."""
 

@@ -13,10 +13,6 @@ from clrecon.mesh.triangles import corner_edges, cross_product
 from clrecon.system.pieces import in_threads, local_origin
 from clrecon.system.progress import Steps
 
-__all__ = [
-    "FindCrossings", "count_self_intersections", "find_beside", "find_changed_intersections", "find_self_intersections",
-]  # fmt: skip
-
 _CELLS_A_TRIANGLE = 8
 """Largest mean number of cells for a triangle; cells are enlarged until it holds."""
 

@@ -18,8 +18,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.packages import import_package
 from clrecon.system.public import public_function
 
-__all__ = ["Mesh"]
-
 
 class Mesh(BaseMesh):
     """An indexed triangle surface in the patient frame LPS, millimetres.

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from clrecon.exchange.coordinates import rounding_step
 from clrecon.system.pieces import chunks
 
-__all__ = ["find_nearest_triangle"]
-
 Points = NDArray[np.float64]
 
 

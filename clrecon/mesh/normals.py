@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from clrecon.mesh.triangles import corner_edges, cross_product
 
-__all__ = ["vertex_normals"]
-
 
 def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> NDArray[np.float32]:
     """Return the mean of the face normals, weighted by the angle of each face at the vertex.

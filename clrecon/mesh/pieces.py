@@ -10,8 +10,6 @@ from clrecon.mesh.connectivity import label_components
 from clrecon.mesh.triangles import cross_products
 from clrecon.system.pieces import CHUNK, local_origin
 
-__all__ = ["find_pieces", "measure_components"]
-
 
 def find_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32], most: int) -> Pieces:
     """Divide a surface into its components of largest area, and one part of all others.

@@ -21,8 +21,6 @@ from clrecon.mesh.triangles import corner_edges, cross_product
 from clrecon.system.pieces import local_origin
 from clrecon.system.records import Record
 
-__all__ = ["MeshQuality", "measure_quality", "measure_triangles"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeshQuality(Record):

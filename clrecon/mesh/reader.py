@@ -17,8 +17,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.text import escape_text
 
-__all__ = ["MESH_INPUTS", "read_mesh"]
-
 log = get_logger(__name__)
 
 _READERS = {

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from clrecon.system.pieces import CHUNK, chunks, local_origin
 
-__all__ = ["corner_edges", "cross_product", "cross_products", "enclosed_ml"]
-
 
 def corner_edges(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], origin: NDArray[np.float64], size: int = CHUNK

@@ -11,8 +11,6 @@ from clrecon.errors import UsageError
 from clrecon.exchange.vtk import make_polydata
 from clrecon.system.foreign_words import hush
 
-__all__ = ["CellLocator", "smooth_windowed_sinc", "unwrap_polydata", "wrap_polydata"]
-
 Points = NDArray[np.float64]
 
 LINE_TOLERANCE = 1e-9

@@ -13,9 +13,6 @@ from clrecon.opencl.pages import result_pages
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.opencl.waiting import wait
 
-__all__ = ["allocate", "copy_buffer", "download", "empty_output", "upload"]
-
-
 SHARED_BYTES = 1 << 20
 """Arrays smaller than this are copied to the device even if it could use them in place."""
 
@@ -54,7 +51,7 @@ def upload(device: Device, array: NDArray[Any]) -> Any:
 def copy_buffer(
     device: Device, source_d: Any, target_d: Any, size: int, offset: int = 0, source_offset: int = 0
 ) -> None:
-    """Copy `size` bytes of a buffer, from byte `source_offset` on, to byte `offset` of another one on the same device."""
+    """Copy `size` bytes of a buffer, from byte `source_offset` on, to byte `offset` of another on the same device."""
     cl = import_pyopencl()
     try:
         with device.lock:

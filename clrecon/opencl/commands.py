@@ -11,8 +11,6 @@ from typing import Any, NamedTuple
 
 from clrecon.opencl.quirks import import_pyopencl
 
-__all__ = ["Command", "CommandFailedError", "Commands", "has_hung_commands", "keep_for_hung_commands"]
-
 
 class CommandFailedError(Exception):
     """A command failed while the device worked on it.

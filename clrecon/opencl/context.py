@@ -20,8 +20,6 @@ from clrecon.opencl.unknown_cpu import NameOfCpu, has_unknown_cpu
 from clrecon.system.installing import install_command
 from clrecon.system.log import get_logger
 
-__all__ = ["GROUP_SIZE", "Device", "describe_error", "kind_of_error"]
-
 log = get_logger(__name__)
 
 GROUP_SIZE = 64

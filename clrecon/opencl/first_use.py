@@ -23,8 +23,6 @@ from clrecon.system.log import get_logger
 from clrecon.system.time_limit import device_seconds
 from clrecon.version import package_version
 
-__all__ = ["VARIABLE", "find_fault", "register", "remembered_fault"]
-
 log = get_logger(__name__)
 
 VARIABLE = "CLRECON_DEVICE_CHECK"

@@ -12,8 +12,6 @@ from clrecon.opencl.program import Kernel
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.opencl.waiting import settle, wait
 
-__all__ = ["Stopwatch", "launch"]
-
 
 class Stopwatch:
     """Wall seconds by part (upload, build, kernels, download) and device seconds by kernel.

@@ -9,8 +9,6 @@ from clrecon.errors import DeviceError, DeviceFailedError, DeviceMemoryError, Us
 from clrecon.opencl.context import Device
 from clrecon.system.wording import name_parameter
 
-__all__ = ["MemoryLimits", "check_budget", "check_memory", "describe_shortage", "memory_limits"]
-
 
 def _mib(size: int, up: bool = False) -> str:
     if size < 2**20:

@@ -16,8 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-__all__ = ["PagePool", "result_pages"]
-
 BLOCK_BYTES = 1 << 21
 """Block sizes are multiples of this, the size of a huge page on most systems."""
 

@@ -19,8 +19,6 @@ from clrecon.opencl.signatures import KernelArgument, definitions_of, find_signa
 from clrecon.opencl.sources import read_kernel_source
 from clrecon.system.log import get_logger
 
-__all__ = ["Kernel", "Program", "load_program"]
-
 log = get_logger(__name__)
 
 _TYPES: dict[str, Any] = {

@@ -13,20 +13,6 @@ from typing import Any
 from clrecon.errors import DeviceError
 from clrecon.opencl.cache.folders import prepare_caches
 
-__all__ = [
-    "SIMULATOR_PLATFORMS",
-    "first_header",
-    "has_event_times",
-    "import_pyopencl",
-    "is_pocl",
-    "is_simulator",
-    "is_software_gpu",
-    "keeps_programs",
-    "kernel_variants",
-    "most_steps",
-    "shares_host_memory",
-]
-
 SIMULATOR_PLATFORMS = ("oclgrind",)
 """Platforms of simulators, which claim to be fast devices (Oclgrind: CPU, GPU and accelerator at once) and are 1000
 times slower."""

@@ -17,16 +17,6 @@ from clrecon.system.installing import install_command
 from clrecon.system.log import get_logger
 from clrecon.system.wording import name_parameter
 
-__all__ = [
-    "choose_device",
-    "choose_remembered",
-    "choose_unchecked",
-    "driver_advice",
-    "find_candidates",
-    "list_devices",
-    "list_platforms",
-]
-
 log = get_logger(__name__)
 
 

@@ -15,8 +15,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 
-__all__ = ["KernelArgument", "definitions_of", "find_signatures"]
-
 _COMMENT = re.compile(r"/\*.*?(?:\*/|\Z)|//[^\n]*", re.DOTALL)
 _DIRECTIVE = re.compile(r"^[ \t]*#[ \t]*(\w+)[ \t]*(.*)", re.MULTILINE)
 _DEFINE = re.compile(r"(\w+)(\(?)[ \t]*(.*)", re.DOTALL)

@@ -17,8 +17,6 @@ from clrecon.errors import DeviceError
 if TYPE_CHECKING:
     from importlib.abc import Traversable  # importlib.resources.abc from Python 3.11 on
 
-__all__ = ["kernel_constant", "kernel_files", "kernel_number", "kernel_root", "read_kernel_source"]
-
 _REINSTALL = "its installation is damaged, remove it and install it again (pip uninstall clrecon; pip install clrecon)"
 _KNOWN_HEADER = "include/volume.h"
 _NUMBER = re.compile(r"(?m)^#define (\w+) +\(?(-?[0-9.]+)f?\)?(?= |$)")

@@ -17,8 +17,6 @@ from clrecon.opencl.waiting import settle
 from clrecon.system.log import get_logger
 from clrecon.system.wording import name_parameter
 
-__all__ = ["take_device", "work_on"]
-
 Made = TypeVar("Made")
 
 

@@ -16,8 +16,6 @@ import struct
 import sys
 from pathlib import Path
 
-__all__ = ["CPU_NAMES", "UNKNOWN", "NameOfCpu", "choose_name", "has_unknown_cpu"]
-
 UNKNOWN = b"generic"
 
 CPU_NAMES: tuple[tuple[str, frozenset[str]], ...] = (

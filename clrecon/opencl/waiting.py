@@ -23,8 +23,6 @@ from clrecon.opencl.quirks import import_pyopencl
 from clrecon.system.time_limit import device_seconds
 from clrecon.system.wording import name_parameter
 
-__all__ = ["settle", "wait"]
-
 SHORT_SECONDS = 1e-3
 """Waits up to this long need no helper thread: the thread looks again and again, and leaves its core to others."""
 

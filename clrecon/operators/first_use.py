@@ -18,8 +18,6 @@ from clrecon.mesh import Mesh
 from clrecon.opencl import Device, list_devices
 from clrecon.operators.surface.extract import extract_isosurface
 
-__all__ = ["check_ball"]
-
 SIZE = 72
 """Voxels along each side: more than 500 work-items in every pass, and several words in a row."""
 

@@ -10,8 +10,6 @@ from clrecon.geometry import apply_affine
 from clrecon.phantom.settings import PhantomSettings
 from clrecon.phantom.shapes import Body, Box, Cylinder, Sphere, Torus
 
-__all__ = ["choose_body"]
-
 AXIS_LPS = (0.36, -0.48, 0.8)
 """Axis of torus, cylinder and slab: unit length, parallel to no axis of the patient or of usual slices."""
 

@@ -19,8 +19,6 @@ from clrecon.phantom.nearest import Function, gradient_of
 from clrecon.phantom.parts import Vertebra
 from clrecon.phantom.vertebra import local_bounds, vertebra_distance, vertebra_shape
 
-__all__ = ["BoneSurface"]
-
 Float64Array = NDArray[np.float64]
 
 _STEP_MM = 1.0

@@ -34,16 +34,6 @@ from clrecon.system.regular_files import read_regular
 from clrecon.system.targets import existing_stay, place_folder, refuse_existing, resolve_target
 from clrecon.version import package_version
 
-__all__ = [
-    "LARGEST_TRUTH",
-    "SPINE_ISO_HU",
-    "TRUTH_NAME",
-    "is_phantom_truth",
-    "label_materials",
-    "make_phantom",
-    "write_phantom",
-]
-
 TRUTH_NAME = "truth.json"
 LARGEST_TRUTH = 1 << 28
 """Largest truth.json that is read, in bytes; that of a series of thousands of slices has some MiB."""

@@ -14,8 +14,6 @@ import numpy as np
 from clrecon.phantom.fields import Field, capsule, ellipse, smooth_union
 from clrecon.phantom.parts import Vertebra
 
-__all__ = ["cervical_bounds", "cervical_shape", "facet_seats"]
-
 Point = tuple[float, float, float]
 
 

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from clrecon.phantom.levels import LEVELS, THORACOLUMBAR
 
-__all__ = ["Chain", "SpineChoice", "lean_and_roll", "lay_chain"]
-
 Float64Array = NDArray[np.float64]
 
 _KEYS = [THORACOLUMBAR.index(name) for name in ("T1", "T6", "T12", "L1", "L3", "L5")]

@@ -14,8 +14,6 @@ from clrecon.phantom.parts import Anatomy
 from clrecon.phantom.placement import Placement
 from clrecon.phantom.settings import CENTRE_LPS_MM, PhantomSettings
 
-__all__ = ["describe_series", "describe_spine"]
-
 Float64Array = NDArray[np.float64]
 
 

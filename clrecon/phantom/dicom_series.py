@@ -22,8 +22,6 @@ from clrecon.system.progress import Progress
 if TYPE_CHECKING:
     from pydicom.dataset import FileDataset
 
-__all__ = ["RESCALE_INTERCEPT", "slice_file_name", "write_series"]
-
 RESCALE_INTERCEPT = -1024
 CT_IMAGE_STORAGE = "1.2.840.10008.5.1.4.1.1.2"
 _TRANSFER_SYNTAXES = {"explicit": "1.2.840.10008.1.2.1", "implicit": "1.2.840.10008.1.2"}

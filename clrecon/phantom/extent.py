@@ -11,8 +11,6 @@ from clrecon.phantom.chain import SpineChoice
 from clrecon.phantom.parts import Vertebra
 from clrecon.phantom.vertebra import local_bounds, vertebra_distance
 
-__all__ = ["body_extent", "bone_extent", "bone_points", "centring_shift"]
-
 Float64Array = NDArray[np.float64]
 
 _STEP_MM = 3.0

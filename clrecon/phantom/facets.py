@@ -13,8 +13,6 @@ from clrecon.phantom.nearest import nearest_on_surface
 from clrecon.phantom.parts import Vertebra
 from clrecon.phantom.vertebra import upper_facet_seats, vertebra_distance
 
-__all__ = ["LARGEST_GAP_MM", "close_facets"]
-
 Float64Array = NDArray[np.float64]
 
 LARGEST_GAP_MM = 1.5

@@ -12,8 +12,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["capsule", "coverage", "ellipse", "ellipsoid", "smooth_union", "waves_at"]
-
 Field = NDArray[np.float32]
 Point = tuple[float, float, float]
 

@@ -16,8 +16,6 @@ from clrecon.phantom.levels import format_levels
 from clrecon.phantom.parts import Vertebra
 from clrecon.phantom.plan import plan_anatomy
 
-__all__ = ["fit_slices", "spine_choice"]
-
 Float64Array = NDArray[np.float64]
 
 MOST_SLICES = 9999

@@ -7,8 +7,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["slice_directions"]
-
 Float64Array = NDArray[np.float64]
 
 

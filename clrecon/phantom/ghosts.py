@@ -15,8 +15,6 @@ from clrecon.geometry.affine import Float64Array
 if TYPE_CHECKING:
     from pydicom.dataset import FileDataset
 
-__all__ = ["FEWEST_SLICES", "draw_ghosts", "ghost_places", "make_localizer"]
-
 FEWEST_SLICES = 12
 """Fewest slices of a phantom with ghosts: two foreign ones with real ones between, before and behind them."""
 

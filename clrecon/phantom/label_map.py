@@ -12,8 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["write_label_map"]
-
 
 def write_label_map(
     path: Path, labels: NDArray[np.uint8], affine: NDArray[np.float64], names: Mapping[int, str] | None = None

@@ -10,8 +10,6 @@ import re
 
 from clrecon.errors import UsageError
 
-__all__ = ["LEVELS", "THORACOLUMBAR", "format_levels", "level_number", "parse_levels"]
-
 THORACOLUMBAR = tuple([f"T{n}" for n in range(1, 13)] + [f"L{n}" for n in range(1, 6)])
 """Vertebrae of chest and loin from top to bottom: those of a spine phantom without a choice of levels."""
 

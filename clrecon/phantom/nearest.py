@@ -7,8 +7,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Function", "gradient_of", "nearest_on_surface"]
-
 Float64Array = NDArray[np.float64]
 Function = Callable[[Float64Array], Float64Array]
 

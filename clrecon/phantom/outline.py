@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from clrecon.phantom.chain import Chain
 
-__all__ = ["Outline", "plan_outline"]
-
 Float64Array = NDArray[np.float64]
 
 NECK_HALF_WIDTH, NECK_HALF_DEPTH = 62.0, 66.0

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from clrecon.phantom.outline import Outline
 
-__all__ = ["Anatomy", "Disc", "Rib", "Vertebra"]
-
 Float64Array = NDArray[np.float64]
 
 

@@ -17,8 +17,6 @@ from clrecon.geometry import compose_affine
 from clrecon.phantom.frames import slice_directions
 from clrecon.phantom.settings import CENTRE_LPS_MM, PhantomSettings
 
-__all__ = ["Placement", "format_decimal", "place_slices"]
-
 Float64Array = NDArray[np.float64]
 
 

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from clrecon.phantom.fields import Field
 
-__all__ = ["Piece", "PlacedPiece", "Window", "paint"]
-
 Float64Array = NDArray[np.float64]
 
 

@@ -17,8 +17,6 @@ from clrecon.phantom.facets import close_facets
 from clrecon.phantom.outline import plan_outline
 from clrecon.phantom.parts import Anatomy, Disc, Rib, Vertebra
 
-__all__ = ["plan_anatomy"]
-
 Float64Array = NDArray[np.float64]
 
 _ROOM_MM = {f"T{n}": 3.0 for n in range(1, 7)}

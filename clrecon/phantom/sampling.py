@@ -18,8 +18,6 @@ from clrecon.geometry.affine import checked_affine
 from clrecon.phantom.shapes import Body
 from clrecon.system.progress import Progress
 
-__all__ = ["add_noise", "apply_point_spread", "map_slices", "sample_distance", "sample_occupancy"]
-
 Float32Array = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
 

@@ -10,8 +10,6 @@ from clrecon.phantom.skull import plan_dry_skull, plan_head
 from clrecon.phantom.tables import lay_under
 from clrecon.phantom.trunk import plan_bones, plan_contrast, plan_limb, plan_nothing, plan_pair, plan_pelvis, plan_water
 
-__all__ = ["PLANS", "plan_scene"]
-
 PLANS: dict[str, Callable[[], Plan]] = {
     "skull": plan_dry_skull,
     "head": plan_head,

@@ -19,8 +19,6 @@ from clrecon.phantom.placing import Piece, PlacedPiece, Window, paint
 from clrecon.phantom.settings import CENTRE_LPS_MM, PhantomSettings
 from clrecon.system.progress import Progress
 
-__all__ = ["AIR_HU", "CEILING_HU", "DENSE_HU", "MATERIALS", "Part", "Plan", "describe_parts", "draw_scene"]
-
 Float32Array = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
 LabelArray = NDArray[np.uint8]

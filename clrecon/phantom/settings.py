@@ -17,15 +17,6 @@ from clrecon.phantom.ghosts import ghost_places
 from clrecon.phantom.levels import THORACOLUMBAR, format_levels, parse_levels
 from clrecon.system.text import say_unknown
 
-__all__ = [
-    "KINDS",
-    "TABLE_NAMES",
-    "Kind",
-    "PhantomSettings",
-    "parse_missing",
-    "parse_size",
-]
-
 
 @dataclass(frozen=True)
 class Kind:

@@ -15,8 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 
-__all__ = ["Body", "Box", "Cylinder", "HalfSpace", "Sphere", "Torus"]
-
 Float64Array = NDArray[np.float64]
 
 

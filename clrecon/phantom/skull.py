@@ -10,8 +10,6 @@ from clrecon.phantom.fields import Field, ellipsoid
 from clrecon.phantom.scenes import AIR_HU, Part, Plan
 from clrecon.phantom.solids import ball, column, cut, rod
 
-__all__ = ["plan_dry_skull", "plan_head"]
-
 COMPACT_HU = 1350.0
 DIPLOE_HU = 620.0
 PETROUS_HU = 1900.0

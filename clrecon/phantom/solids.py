@@ -10,8 +10,6 @@ import numpy as np
 from clrecon.phantom.fields import Field, capsule, ellipse, ellipsoid
 from clrecon.phantom.scenes import Part, Point
 
-__all__ = ["ball", "box", "column", "cut", "rod"]
-
 Distance = Callable[[Field, Field, Field], Field]
 
 

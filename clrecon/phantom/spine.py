@@ -25,8 +25,6 @@ from clrecon.phantom.tissue import BLOOD_HU, draw_tissue
 from clrecon.phantom.vertebra import local_bounds, vertebra_distance
 from clrecon.system.progress import Progress
 
-__all__ = ["draw_spine", "label_levels", "plan_spine"]
-
 Float64Array = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 

@@ -15,8 +15,6 @@ import numpy as np
 from clrecon.phantom.fields import Field
 from clrecon.phantom.scenes import Part, Plan
 
-__all__ = ["TABLES", "lay_under"]
-
 ENDLESS = 1e4
 FOAM_HU = -930.0
 Distance = Callable[[Field, Field, Field], Field]

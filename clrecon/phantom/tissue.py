@@ -10,8 +10,6 @@ from clrecon.phantom.fields import Field, capsule, coverage, ellipse, ellipsoid
 from clrecon.phantom.parts import Anatomy
 from clrecon.phantom.scenes import Part
 
-__all__ = ["BLOOD_HU", "draw_tissue"]
-
 AIR_HU = -1000.0
 SKIN_HU = 25.0
 FAT_HU = -105.0

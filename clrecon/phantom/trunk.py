@@ -14,8 +14,6 @@ from clrecon.phantom.scenes import AIR_HU, Part, Plan
 from clrecon.phantom.solids import ball, column, cut, rod
 from clrecon.phantom.vertebra import local_bounds, vertebra_distance
 
-__all__ = ["plan_bones", "plan_contrast", "plan_limb", "plan_nothing", "plan_pair", "plan_pelvis", "plan_water"]
-
 COMPACT_HU = 1400.0
 SPONGY_HU = 260.0
 MARROW_HU = -60.0

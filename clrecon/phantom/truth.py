@@ -21,8 +21,6 @@ from clrecon.phantom.spine import label_levels, plan_spine
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.regular_files import read_regular
 
-__all__ = ["PhantomTruth", "phantom_truth"]
-
 Float64Array = NDArray[np.float64]
 
 _SAME_MM = 1e-6

@@ -8,8 +8,6 @@ from clrecon.phantom.cervical import cervical_bounds, cervical_shape, facet_seat
 from clrecon.phantom.fields import Field, capsule, ellipse, smooth_union
 from clrecon.phantom.parts import Vertebra
 
-__all__ = ["canal_distance", "local_bounds", "upper_facet_seats", "vertebra_distance", "vertebra_shape"]
-
 
 def local_bounds(vertebra: Vertebra) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Return the lowest and highest corner, local mm, of a box that holds the whole vertebra."""

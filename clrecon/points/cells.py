@@ -9,8 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MARGIN", "count_cells", "find_cell_numbers"]
-
 MARGIN = 1e-3
 """Margin around the points, in edges of a cell."""
 

@@ -20,8 +20,6 @@ from clrecon.system.messages import Message
 from clrecon.system.public import public_function
 from clrecon.system.targets import keep_existing
 
-__all__ = ["MOST_POINTS", "PointCloud"]
-
 MOST_POINTS = 2**31 - 1
 """Most points of a cloud, so that their numbers fit a signed 32-bit integer."""
 

@@ -12,8 +12,6 @@ from clrecon.errors import UsageError
 from clrecon.points.cloud import PointCloud
 from clrecon.system.pieces import chunks
 
-__all__ = ["SHEET_POINTS", "SHEET_RATIO", "ClusterFigures", "measure_clusters"]
-
 SHEET_POINTS = 500
 """Fewest points of a cluster that may be a sheet: fewer say little about its form."""
 

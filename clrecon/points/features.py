@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["D0_OF_MEDIAN", "VARIATION_OF_FEATURES", "distance_ratios", "find_features", "ratio_threshold"]
-
 D0_OF_MEDIAN = 1.2
 """D0 over the median of all D_i: the paper gives no value."""
 

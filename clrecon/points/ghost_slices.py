@@ -14,8 +14,6 @@ from clrecon.points.cloud import PointCloud
 from clrecon.points.step import PointStep
 from clrecon.system.arguments import explains_arguments
 
-__all__ = ["GHOST_SHARE", "WITHIN_SHARE", "GhostSlices", "drop_ghost_slices", "fill_ghost_slices", "judge_slices"]
-
 GHOST_SHARE = 0.75
 """A slice is a ghost where its likeness to both neighbours is below this share of their likeness to each other."""
 

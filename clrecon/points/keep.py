@@ -16,8 +16,6 @@ from clrecon.points.step import PointStep
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.wording import name_parameter
 
-__all__ = ["KEEP_FORMS", "KeepRule", "keep_clusters", "parse_keep_rules"]
-
 KEEP_FORMS = "largest, largest:N, min:POINTS, seed:X,Y,Z and no-sheets"
 """The forms of a keep rule, for messages and help."""
 

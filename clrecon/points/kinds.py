@@ -2,7 +2,5 @@
 
 from __future__ import annotations
 
-__all__ = ["KINDS"]
-
 KINDS = ("surface", "shell", "voxels")
 """See `clrecon.extract_points`."""

@@ -16,8 +16,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.text import escape_text
 
-__all__ = ["read_points"]
-
 log = get_logger(__name__)
 
 FEWEST_OF_A_BODY = 100

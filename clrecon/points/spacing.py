@@ -7,8 +7,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["mean_spacing"]
-
 POINTS_A_CELL = 4.0
 """Points that a cell should hold: with fewer most cells are empty by chance, with more they hide the shape."""
 

@@ -13,8 +13,6 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume, column_spacing, slice_normal
 from clrecon.geometry.affine import Float64Array
 
-__all__ = ["SLACK", "Lattice", "Stencil", "checked_eps", "make_stencil"]
-
 SLACK = 1e-6
 """Distances up to ``eps * (1 + SLACK)`` are within eps, so that an eps of one slice gap reaches the next slice."""
 

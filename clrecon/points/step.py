@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from clrecon.points.cloud import PointCloud
 
-__all__ = ["PointStep", "count_numbers"]
-
 
 def count_numbers(numbers: NDArray[np.uint8], reasons: Sequence[str]) -> dict[str, int]:
     """Return how many points have the number of each reason, from 1: a pass for each is faster than one for all."""

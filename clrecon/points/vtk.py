@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from clrecon.exchange.vtk import make_polydata
 
-__all__ = ["wrap_cloud"]
-
 
 def wrap_cloud(
     points: NDArray[np.floating],

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from clrecon.sources.facts import PixelFacts
 from clrecon.system.gates import Gate, none_of
 
-__all__ = ["PADDING_SHARE", "judge_figures", "judge_steps", "list_odd_values"]
-
 PADDING_SHARE = 0.75
 """Largest share of padding.  A circle in its square leaves 0.21, a 500 mm circle in a field of 800 mm 0.69; above that
 a wrong PixelPaddingValue probably masks measured voxels."""

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from clrecon.geometry.affine import TILT_REPORT_DEG
 from clrecon.system.threads import count_readers
 
-__all__ = ["Likeness", "judge_slices", "measure_likeness"]
-
 LEAST_LIKENESS = 1.25
 """Ratio of the differences from neighbours to those from the slice one period on; from this ratio on slices belong to
 several volumes.  Four real scans, whole and with every 2nd, 3rd and 4th slice: at most 0.58, for periods of 3 and 4 at

@@ -9,8 +9,6 @@ from clrecon.errors import ClreconError
 from clrecon.geometry.certificate import Certificate
 from clrecon.system.public import public_function
 
-__all__ = ["SeriesEntry", "SeriesListing"]
-
 
 @dataclass(frozen=True)
 class SeriesEntry:

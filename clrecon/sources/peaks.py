@@ -7,8 +7,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Peak", "find_peaks"]
-
 SMOOTHING, FINEST_BIN, MOST_BINS = 20.0, 5.0, 8000
 """Standard deviation of the smoothing and width of a bin, HU; of wider ranges the bins get wider."""
 TAILS = 0.0005

@@ -20,8 +20,6 @@ from clrecon.sources.sign import SIGN_SAID, judge_sign
 from clrecon.sources.stored_values import StoredValues
 from clrecon.system.gates import Gate, unmeasured
 
-__all__ = ["VoxelFindings", "examine_voxels", "leave_unexamined"]
-
 CEILING_BITS = 12
 """Bits of most scanners, even where more bits are stored: 3071 HU with intercept -1024."""
 CEILING_HU = 3071

@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 from clrecon.errors import UsageError
 from clrecon.system.wording import name_parameter
 
-__all__ = ["Rescale", "check_rescale"]
-
 LARGEST = 1e6
 
 

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from clrecon.sources.facts import PixelFacts
 
-__all__ = ["ValueSample", "sample_slices"]
-
 SAMPLED_SLICES, SAMPLED_VOXELS = 16, 1 << 16
 LEAST_SAMPLE = 1000
 """Least number of sampled voxels for stating a share."""

@@ -18,8 +18,6 @@ from clrecon.sources.peaks import Peak, find_peaks
 from clrecon.sources.sample import ValueSample
 from clrecon.system.gates import Gate, none_of, unmeasured
 
-__all__ = ["LOWEST_AIR_HU", "SCALE_SAID", "judge_scale"]
-
 SCALE_SAID = "peaks of air (near -1000 HU) and soft tissue (0 to 80 HU) that lie elsewhere"
 
 FEWEST_VALUES = 4000

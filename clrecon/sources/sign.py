@@ -18,8 +18,6 @@ from clrecon.sources.sample import sample_slices
 from clrecon.sources.stored_values import StoredValues
 from clrecon.system.gates import Gate, none_of, unmeasured
 
-__all__ = ["SIGN_SAID", "judge_sign"]
-
 SIGN_SAID = "neighbouring values that lie nearly the whole range of the stored bits apart: the sign is lost"
 
 FEWEST_BITS = 9

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-__all__ = ["StoredRange", "StoredValues"]
-
 
 class StoredValues(Protocol):
     """What a header says of the values of its slice.

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, TypeVar
 if TYPE_CHECKING:
     from types import TracebackType
 
-__all__ = ["Closing"]
-
 Opened = TypeVar("Opened", bound="Closing")
 
 

@@ -6,8 +6,6 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["free_bytes_of_container"]
-
 _FILES = {  # Of a version of control groups: the files of limit and use, and the reclaimable field of memory.stat.
     2: ("memory.max", "memory.current", "inactive_file"),
     1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),

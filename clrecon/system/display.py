@@ -14,8 +14,6 @@ from dataclasses import dataclass
 
 from clrecon.errors import UsageError
 
-__all__ = ["Display", "DisplayProbe", "NoDisplayError"]
-
 SECONDS = 30.0
 """Until the child is given up; it takes half a second where nothing else runs."""
 

@@ -30,17 +30,6 @@ from clrecon.system.targets import checked_target, existing_stay, final_mode, pl
 if sys.platform != "win32":
     import fcntl
 
-__all__ = [
-    "Staged",
-    "StagedFile",
-    "allow_open_files",
-    "check_writable",
-    "hold_interrupts",
-    "replace_file",
-    "stage_file",
-    "temporary_folder",
-]
-
 log = get_logger(__name__)
 
 _FILES_OF_OTHERS = 200

@@ -11,8 +11,6 @@ from clrecon.system.files import hold_interrupts, temporary_folder
 from clrecon.system.log import get_logger
 from clrecon.system.targets import existing_stay, is_dicom, place_folder, refuse_existing, resolve_target, system_errors
 
-__all__ = ["StagedFolder", "check_folder"]
-
 log = get_logger(__name__)
 
 

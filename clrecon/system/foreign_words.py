@@ -19,9 +19,6 @@ from typing import TYPE_CHECKING, Any, TextIO
 if TYPE_CHECKING:
     import logging
 
-
-__all__ = ["hush", "own_streams"]
-
 _owned = False
 _lock = threading.RLock()
 

@@ -11,8 +11,6 @@ from typing import Any
 
 from clrecon.system.records import Record
 
-__all__ = ["Gate", "at_least", "at_most", "failed_gates", "is_true", "none_of", "unmeasured"]
-
 
 @dataclass(frozen=True, eq=False)
 class Gate(Record):

@@ -9,8 +9,6 @@ import shutil
 import subprocess
 import sys
 
-__all__ = ["install_command"]
-
 
 def install_command(*packages: str) -> str:
     """Return a line for the shell that installs packages for this Python, wherever clrecon was installed from.

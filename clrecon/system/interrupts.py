@@ -10,8 +10,6 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["held_interrupts", "take_interrupt"]
-
 
 @contextmanager
 def held_interrupts() -> Iterator[None]:

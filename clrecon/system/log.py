@@ -13,8 +13,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 
-__all__ = ["get_logger", "log_warnings"]
-
 logging.getLogger("clrecon").addHandler(logging.NullHandler())  # otherwise Python writes warnings to stderr
 
 

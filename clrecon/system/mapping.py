@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
 
-__all__ = ["FilePlace", "Mapping", "find_mapping"]
-
 
 @dataclass(frozen=True)
 class FilePlace:

@@ -15,8 +15,6 @@ from clrecon.errors import RefusedInputError
 from clrecon.system.aligned import aligned_empty
 from clrecon.system.control_groups import free_bytes_of_container
 
-__all__ = ["allocate_voxels", "available_memory_bytes", "physical_memory_bytes"]
-
 MEMORY_SHARE = 0.9
 """Share of the free memory that voxels may take; the rest is for what is computed beside the volume."""
 

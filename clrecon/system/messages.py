@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from clrecon.system.mapping import FilePlace, Mapping
 
-__all__ = ["MappedArray", "Message"]
-
 
 class Message:
     """Base of classes with a ``__dict__`` whose objects pickle and copy as this module says."""

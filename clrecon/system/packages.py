@@ -8,8 +8,6 @@ from typing import Any
 from clrecon.errors import UsageError
 from clrecon.system.installing import install_command
 
-__all__ = ["import_package"]
-
 
 def import_package(module: str, what: str, package: str | None = None) -> Any:
     """Import `module`.

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from clrecon.system.threads import count_readers
 
-__all__ = ["CHUNK", "chunks", "in_threads", "local_origin", "side_by_side"]
-
 CHUNK = 1 << 14
 """Triangles in a piece.  These take about 2 MB in float64; pieces 32 times as long took 1.5 times the time."""
 

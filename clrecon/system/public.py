@@ -10,8 +10,6 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-__all__ = ["public_function"]
-
 
 def public_function(name: str) -> Any:
     """Return a public function, ``clrecon.NAME``; its module is imported when it is first asked for."""

@@ -10,8 +10,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from typing import Any, ClassVar, NoReturn, TypeVar
 
-__all__ = ["Record"]
-
 Own = TypeVar("Own", bound="Record")
 
 

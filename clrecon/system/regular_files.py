@@ -7,8 +7,6 @@ import os
 import stat
 from typing import BinaryIO
 
-__all__ = ["open_regular", "read_regular"]
-
 # A pipe or device put in the place of a file must not make the reader wait for a writer.
 _READ = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 

@@ -20,20 +20,6 @@ from clrecon.errors import OutputError
 from clrecon.system.regular_files import open_regular
 from clrecon.system.wording import name_parameter
 
-__all__ = [
-    "checked_target",
-    "existing_stay",
-    "final_mode",
-    "is_dicom",
-    "keep_existing",
-    "place_file",
-    "place_folder",
-    "refuse_existing",
-    "resolve_target",
-    "shown_path",
-    "system_errors",
-]
-
 _existing_stay: ContextVar[bool] = ContextVar("existing_stay", default=False)
 
 _OPEN_FILES = re.compile(r"/dev/fd|/proc/[^/]+(/task/[^/]+)?/fd")

@@ -7,19 +7,6 @@ import math
 from collections.abc import Iterable
 from functools import lru_cache
 
-__all__ = [
-    "count_of",
-    "escape_text",
-    "guess_word",
-    "hash_uid",
-    "join_names",
-    "say_digits",
-    "say_hu",
-    "say_ml",
-    "say_volume",
-    "say_unknown",
-]
-
 TEXT_LIMIT = 64
 NAMES_SHOWN = 5
 MOST_PLACES = 12

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 
-__all__ = ["count_readers"]
-
 
 def count_readers(slices: int, most: int) -> int:
     """Return the number of reading threads: the number of cores that this process may use."""

@@ -8,8 +8,6 @@ from contextlib import contextmanager
 
 from clrecon.errors import UsageError
 
-__all__ = ["DEFAULT_SECONDS", "check_time_limit", "device_seconds", "time_limit"]
-
 DEFAULT_SECONDS = 600.0
 """Far above any launch: a kernel of clrecon takes seconds at most, on a slow CPU with a large scan a minute."""
 

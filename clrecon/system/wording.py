@@ -11,8 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-__all__ = ["Speaker", "in_python", "name_parameter", "spoken_by"]
-
 Speaker = Callable[[str, object], str]
 """Function that takes a parameter and its value (None for the parameter alone) and returns the words."""
 

@@ -11,8 +11,6 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import Grid
 from clrecon.system.pieces import in_threads
 
-__all__ = ["AHEAD_MM", "ASIDE_MM", "BEYOND_MM", "Course", "follow_canal", "sample_course"]
-
 Field = NDArray[np.float32]
 
 STEP_MM = 1.0

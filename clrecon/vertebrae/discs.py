@@ -16,10 +16,6 @@ from numpy.typing import NDArray
 
 from clrecon.vertebrae.course import AHEAD_MM, ASIDE_MM, Field
 
-__all__ = [
-    "GAPS_MM", "TILTS_DEG", "Bound", "Looks", "choose_discs", "discs_between", "end_of_bone", "look_at_bodies"
-]  # fmt: skip
-
 GAPS_MM = (11, 46)
 """Least and largest distance of two discs."""
 END_SHARES = (0.6, 1.5)

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from clrecon.vertebrae.course import AHEAD_MM, ASIDE_MM, Course, Field
 from clrecon.vertebrae.discs import BODY_BACK_MM, Bound, Looks
 
-__all__ = ["CONFIDENT", "Piece", "Traits", "beside_share", "judge", "weigh"]
-
 CONFIDENT = 0.6
 """Least confidence of a vertebra that is written without being asked for."""
 WEIGHTS = {

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from clrecon.errors import UsageError
 from clrecon.system.wording import name_parameter
 
-__all__ = ["LEVELS", "check_landmark", "name_levels"]
-
 LEVELS = (
     *(f"C{n}" for n in range(1, 8)), *(f"T{n}" for n in range(1, 13)), *(f"L{n}" for n in range(1, 7))
 )  # fmt: skip

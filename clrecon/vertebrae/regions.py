@@ -12,8 +12,6 @@ from clrecon.geometry.volume import Volume
 from clrecon.vertebrae.course import Course
 from clrecon.vertebrae.discs import TILTS_DEG, Bound, Looks
 
-__all__ = ["Part", "cut_part", "divide", "fill_bone", "planes_of"]
-
 Mask = NDArray[np.bool_]
 Planes = tuple[Float64Array, Float64Array]
 """Centres and normals (m, 3) of planes in LPS mm, from the head downwards; normals point downwards."""

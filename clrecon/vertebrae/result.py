@@ -11,8 +11,6 @@ from clrecon.labels import LabelMap
 from clrecon.system.messages import Message
 from clrecon.system.records import Record
 
-__all__ = ["MiddlePlane", "Vertebra", "VertebraSplit"]
-
 
 @dataclass(frozen=True, eq=False)
 class Vertebra(Record):

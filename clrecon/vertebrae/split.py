@@ -36,8 +36,6 @@ from clrecon.vertebrae.naming import check_landmark, name_levels
 from clrecon.vertebrae.regions import cut_part, divide, fill_bone, planes_of
 from clrecon.vertebrae.result import MiddlePlane, Vertebra, VertebraSplit
 
-__all__ = ["split_vertebrae"]
-
 LEVELS_HU = (120.0, 226.0)
 """The level of bone is taken from between these."""
 LEVEL_SHARE = 0.5

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from clrecon.rendering import Rendering
     from clrecon.sources.listing import SeriesListing
 
-__all__ = ["MOST_PAGE_BYTES", "to_html"]
-
 log = get_logger(__name__)
 
 MOST_PAGE_BYTES = 2_000_000

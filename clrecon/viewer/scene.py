@@ -20,8 +20,6 @@ from clrecon.rendering.pictures.vtk import rendering_to_pyvista
 if TYPE_CHECKING:
     from clrecon.rendering.views.camera import Camera
 
-__all__ = ["add_rendering", "merge_scene"]
-
 
 def add_rendering(
     plotter: Any, rendering: Rendering, form: str = "points", *, move_camera: bool = True, **options: Any

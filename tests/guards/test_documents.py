@@ -81,7 +81,8 @@ def test_the_contents_of_the_readme_are_its_sections() -> None:
 def test_exit_codes_are_documented() -> None:
     from clrecon import errors
 
-    codes = {getattr(errors, name).exit_code for name in errors.__all__}
+    codes = {kind.exit_code for kind in vars(errors).values() if isinstance(kind, type) and hasattr(kind, "exit_code")}
+    assert len(codes) > 3
     rows = re.findall(r"^\| (\d+) \|", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert codes <= {int(row) for row in rows}
 

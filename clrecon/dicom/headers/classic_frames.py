@@ -22,8 +22,6 @@ from clrecon.dicom.headers.slice_header import SliceHeader
 from clrecon.dicom.parse.values import ValueProblem, Values
 from clrecon.system.text import join_names
 
-__all__ = ["FramePlaces", "count_frames", "find_places", "spread_frames"]
-
 PLACE_POINTERS = frozenset({0x3004000C, 0x00180050, 0x00180088, 0x00200013, 0x00200032, 0x00201041, 0x00540080})
 """Elements to which FrameIncrementPointer points where frames are slices: GridFrameOffsetVector, SliceThickness,
 SpacingBetweenSlices, InstanceNumber, ImagePositionPatient, SliceLocation, SliceVector.  Others are times or phases."""

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from clrecon.dicom.parse.sequences import Item, decode_number, name_tag
 from clrecon.dicom.parse.values import ValueProblem, decode_text
 
-__all__ = ["CONCATENATION_TAGS", "Concatenation", "read_concatenation"]
-
 UID, PART, PARTS, FIRST_FRAME = 0x00209161, 0x00209162, 0x00209163, 0x00209228
 CONCATENATION_TAGS = (UID, PART, PARTS, FIRST_FRAME)
 """The tags of ConcatenationUID, InConcatenationNumber, InConcatenationTotalNumber, ConcatenationFrameOffsetNumber."""

@@ -22,8 +22,6 @@ from clrecon.dicom.parse.transfer_syntaxes import describe_undecodable, is_encap
 from clrecon.dicom.parse.values import WANTED_TAGS, ValueProblem, Values
 from clrecon.system.text import escape_text, hash_uid
 
-__all__ = ["read_headers"]
-
 CT_IMAGE_STORAGE = "1.2.840.10008.5.1.4.1.1.2"
 SECONDARY_CAPTURE = "1.2.840.10008.5.1.4.1.1.7"
 DICOMDIR_CLASS = "1.2.840.10008.1.3.10"

@@ -28,8 +28,6 @@ from clrecon.dicom.parse.values import ValueProblem, Values, decode_text
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["ENHANCED_CT", "Frame", "Groups", "find_data_set", "read_groups", "split_frames"]
-
 ENHANCED_CT = ("1.2.840.10008.5.1.4.1.1.2.1", "1.2.840.10008.5.1.4.1.1.2.2")
 """SOP classes: Enhanced CT Image Storage, Legacy Converted Enhanced CT Image Storage."""
 

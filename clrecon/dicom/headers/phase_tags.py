@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["FRAME_PHASES", "PHASE_KEYWORDS", "SLICE_PHASES"]
-
 FRAME_PHASES = (
     ("TemporalPositionIndex", 0x00209128, "L"),
     ("TemporalPositionTimeOffset", 0x0020930D, "d"),

@@ -7,8 +7,6 @@ from pathlib import Path
 
 from clrecon.dicom.headers.concatenation import Concatenation
 
-__all__ = ["OtherImage", "SeriesIdentity", "SliceHeader"]
-
 
 @dataclass(frozen=True, slots=True)
 class SeriesIdentity:

@@ -26,8 +26,6 @@ from clrecon.errors import RefusedInputError
 from clrecon.system.regular_files import open_regular
 from clrecon.system.wording import name_parameter
 
-__all__ = ["check_surplus"]
-
 PADDING_TAG = 0xFFFCFFFC
 INFLATED_LIMIT = 1 << 30
 """Most bytes of one data set that are inflated."""

@@ -25,8 +25,6 @@ from clrecon.dicom.parse.raw import (
     read_pixel_head,
 )
 
-__all__ = ["parse_carefully"]
-
 INFLATE_STEP = 1 << 18
 ITEM = b"\xfe\xff\x00\xe0"
 """Stands for a wanted sequence of undefined length: only whether it is there is asked."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-__all__ = ["advise_on", "describe_container", "is_text"]
-
 # First bytes of each type, the longest and surest first.
 _STARTS = (
     (b"PK\x03\x04", "zip archive"),

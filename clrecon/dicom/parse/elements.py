@@ -19,17 +19,6 @@ from clrecon.dicom.parse.plain import parse_plainly
 from clrecon.dicom.parse.raw import META_START, CorruptFileError, DicomElements, NotDicomError
 from clrecon.system.regular_files import open_regular
 
-__all__ = [
-    "META_START",
-    "CorruptFileError",
-    "DicomElements",
-    "FileStart",
-    "NotDicomError",
-    "has_dicom_mark",
-    "read_elements",
-    "read_start",
-]
-
 PREFIX_BYTES = 16 * 1024
 LONG_PREFIX_BYTES = 256 * 1024
 """Bytes read at once where the first prefix does not hold the whole header: large private elements, many frames."""

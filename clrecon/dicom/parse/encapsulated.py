@@ -13,8 +13,6 @@ from typing import BinaryIO
 from clrecon.dicom.parse.transfer_syntaxes import RLE
 from clrecon.errors import RefusedInputError
 
-__all__ = ["Pieces", "find_end", "find_frames", "read_pieces"]
-
 Pieces = list[tuple[int, int]]
 """For each fragment of a frame: offset of its first byte in the file, and number of bytes."""
 

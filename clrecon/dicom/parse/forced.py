@@ -13,8 +13,6 @@ from typing import NamedTuple
 
 from clrecon.system.wording import name_parameter
 
-__all__ = ["Start", "describe_way_out", "find_program", "restore_start"]
-
 MARK_END = 132  # 128 bytes of preamble, then "DICM"
 PREAMBLE = bytes(128) + b"DICM"
 FIRST_GROUP = 0x0008

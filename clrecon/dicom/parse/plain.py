@@ -28,8 +28,6 @@ from clrecon.dicom.parse.raw import (
     read_pixel_head,
 )
 
-__all__ = ["parse_plainly"]
-
 SHORT_VRS = {name.encode(): name for name in "AE AS AT CS DA DS DT FD FL IS LO LT PN SH SL SS ST TM UI UL US".split()}
 """Value representations with a length of 16 bits in explicit VR."""
 LONG_VRS = {name.encode(): name for name in "OB OD OF OL OV OW SQ SV UC UN UR UT UV".split()}

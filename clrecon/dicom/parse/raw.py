@@ -8,8 +8,6 @@ from typing import NamedTuple
 
 from clrecon.errors import RefusedInputError
 
-__all__ = ["CorruptFileError", "DicomElements", "NotDicomError", "read_pixel_head"]
-
 IMPLICIT_LITTLE = "1.2.840.10008.1.2"
 EXPLICIT_LITTLE = "1.2.840.10008.1.2.1"
 DEFLATED = "1.2.840.10008.1.2.1.99"

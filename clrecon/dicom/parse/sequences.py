@@ -16,8 +16,6 @@ from typing import Any
 
 from clrecon.dicom.parse.values import ValueProblem
 
-__all__ = ["LONG_VRS", "Item", "Schema", "decode_number", "name_tag", "read_sequences", "skip_sequence"]
-
 Schema = Mapping[int, Any]
 """Maps a wanted tag to None for a value, or to the schema of its items for a sequence."""
 

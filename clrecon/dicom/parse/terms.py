@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["MODALITIES", "OTHER_TERM", "RESCALE_TYPES", "name_term"]
-
 RESCALE_TYPES = frozenset("HU HU_MOD OD US MGML Z_EFF ED EDW PCT".split())
 """Defined terms of RescaleType (PS3.3 C.11.1.1.2)."""
 

@@ -14,8 +14,6 @@ from clrecon.errors import RefusedInputError
 from clrecon.system.installing import install_command
 from clrecon.system.text import escape_text
 
-__all__ = ["NATIVE_SYNTAXES", "SYNTAX_NAMES", "choose_decoder", "describe_undecodable", "is_encapsulated"]
-
 NATIVE_SYNTAXES = ("1.2.840.10008.1.2", "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.1.99", "1.2.840.10008.1.2.2")
 
 _JPEG = "1.2.840.10008.1.2.4."

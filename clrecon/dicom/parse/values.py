@@ -16,8 +16,6 @@ from clrecon.dicom.parse.elements import DicomElements
 from clrecon.errors import RefusedInputError
 from clrecon.system.text import escape_text
 
-__all__ = ["WANTED_TAGS", "ValueProblem", "Values", "decode_text"]
-
 _TAGS = {
     "SpecificCharacterSet": 0x00080005,
     "ImageType": 0x00080008,

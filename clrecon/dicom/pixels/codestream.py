@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from clrecon.dicom.parse.transfer_syntaxes import JPEG_2000, JPEG_LOSSLESS, JPEG_LS, RLE
 from clrecon.errors import RefusedInputError
 
-__all__ = ["Codestream", "read_codestream"]
-
 RLE_HEAD_BYTES = 64
 RLE_BEST_RATIO = 64
 """Highest compression ratio of RLE: a run of PackBits is two bytes for at most 128."""

@@ -29,8 +29,6 @@ from clrecon.system.closing import Closing
 from clrecon.system.log import get_logger
 from clrecon.system.text import escape_text
 
-__all__ = ["DecoderError", "DecoderPool"]
-
 log = get_logger(__name__)
 
 SCRIPT = Path(__file__).with_name("decoder_process.py")

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.pixels.padding import AIR_RANGE_HU, PaddingMasks, pack_mask
 
-__all__ = ["fill_disc_padding"]
-
 SMALLEST = 32
 SAMPLED_SLICES = 16
 ROUND = 0.03

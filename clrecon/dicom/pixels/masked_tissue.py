@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from clrecon.dicom.headers.slice_header import SliceHeader
 from clrecon.dicom.pixels.padding import AIR_RANGE_HU
 
-__all__ = ["count_masked_tissue", "describe_masked_tissue"]
-
 
 def count_masked_tissue(header: SliceHeader, stored: NDArray[Any], padding: NDArray[np.bool_]) -> int:
     """Count voxels of the padding of a slice that are tissue by value and place.

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import AIR_HU
 
-__all__ = ["PaddingMasks", "pack_mask"]
-
 AIR_RANGE_HU = (-1100, -900)
 """Range of air beside the padding.  The table and a blanket are denser; noise exceeds both ends alike."""
 SAMPLED_SLICES = 16

@@ -27,8 +27,6 @@ from clrecon.errors import RefusedInputError
 from clrecon.system.closing import Closing
 from clrecon.system.regular_files import open_regular
 
-__all__ = ["StoredPixels"]
-
 INFLATE_STEP = 1 << 20
 
 COMPRESSED_RATIO, COMPRESSED_EXTRA_BYTES = 4, 1 << 20

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from clrecon.dicom.headers.slice_header import SliceHeader
 from clrecon.dicom.parse.elements import CorruptFileError, NotDicomError, read_elements
 
-__all__ = ["StrayBits", "describe_stray_bits", "find_stray_bits"]
-
 OVERLAY_BITS = tuple(0x60000102 + (group << 16) for group in range(0, 32, 2))
 """The tags OverlayBitPosition of the 16 overlays that an image may have."""
 

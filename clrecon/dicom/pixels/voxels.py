@@ -29,8 +29,6 @@ from clrecon.system.memory import allocate_voxels
 from clrecon.system.progress import Progress
 from clrecon.system.threads import count_readers
 
-__all__ = ["read_voxels"]
-
 MAX_READERS = 8
 MAX_DECODERS = 32
 DECODER_WORTH_BYTES = 4 << 20

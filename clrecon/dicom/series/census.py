@@ -22,8 +22,6 @@ from clrecon.dicom.stack.layout import median_thickness
 from clrecon.dicom.stack.numbers import median
 from clrecon.system.gates import Gate, none_of, unmeasured
 
-__all__ = ["Census", "describe_numbers", "judge_numbers", "take_census"]
-
 LOCALIZERS = 3
 """So many numbers before the first slice may be those of localizers in a series of their own."""
 WIDER = 1.05

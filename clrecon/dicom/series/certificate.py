@@ -38,8 +38,6 @@ from clrecon.sources.plausibility import VoxelFindings
 from clrecon.system.text import count_of, hash_uid
 from clrecon.system.wording import name_parameter
 
-__all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]
-
 SAID_BY_GATES = (
     "complete_series",
     "padding_share",

@@ -15,8 +15,6 @@ from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.system.text import count_of, hash_uid, join_names
 from clrecon.system.wording import name_parameter
 
-__all__ = ["Choice", "choose_series", "describe_left"]
-
 SHORTEST_START = 4
 """Fewest characters of a hash or UID that name a series by its start."""
 SIMILAR = 0.5

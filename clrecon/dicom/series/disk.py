@@ -22,8 +22,6 @@ from clrecon.errors import RefusedInputError
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text
 
-__all__ = ["DiskReader", "Progress"]
-
 T = TypeVar("T")
 
 NOTICE_S = 10.0

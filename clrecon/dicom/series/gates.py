@@ -32,8 +32,6 @@ from clrecon.sources.likeness import Likeness
 from clrecon.sources.plausibility import leave_unexamined
 from clrecon.system.gates import Gate, at_most, none_of, unmeasured
 
-__all__ = ["count_unknown", "judge_series"]
-
 GAP_THICKNESSES = 2.0
 """Largest gap in units of the slice thickness.  Beyond it more is left out than measured: a high-resolution lung scan
 has 10, and no usable surface."""

@@ -13,8 +13,6 @@ from clrecon.geometry import column_spacing
 from clrecon.sources.listing import SeriesEntry
 from clrecon.system.text import hash_uid
 
-__all__ = ["describe_series"]
-
 
 def describe_series(series: Series, warnings: Iterable[str] = ()) -> SeriesEntry:
     """Make the listing entry of a series."""

@@ -9,8 +9,6 @@ from clrecon.dicom.headers.concatenation import Concatenation
 from clrecon.dicom.headers.slice_header import SliceHeader
 from clrecon.system.text import join_names
 
-__all__ = ["describe_missing_parts"]
-
 
 def describe_missing_parts(slices: Iterable[SliceHeader]) -> list[str]:
     """Describe missing files of concatenations: at an end of the stack they would leave no hole.

@@ -27,17 +27,6 @@ from clrecon.errors import UsageError
 from clrecon.system.text import join_names
 from clrecon.system.wording import name_parameter
 
-__all__ = [
-    "Phase",
-    "Places",
-    "choose_phase",
-    "describe_phases",
-    "describe_spacing",
-    "have_same_pixels",
-    "part_alternating",
-    "sort_places",
-]
-
 PLACES_SHOWN = 4
 PHASES_SHOWN = 12
 SMALLEST_PHASE = 3

@@ -7,8 +7,6 @@ from typing import NamedTuple
 from clrecon.dicom.series.series import Series
 from clrecon.dicom.stack.layout import median_thickness
 
-__all__ = ["Rank", "rank_series"]
-
 _DIRECTIONS = ("sagittal", "coronal", "axial")
 """Names of slices whose normal lies nearest to x, y, z of the patient."""
 _NOT_ORIGINAL = ("DERIVED", "SECONDARY")

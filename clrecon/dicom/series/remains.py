@@ -20,8 +20,6 @@ from typing import NamedTuple
 from clrecon.dicom.parse.containers import describe_container
 from clrecon.dicom.parse.elements import META_START
 
-__all__ = ["DAMAGED_START", "Stranger", "describe_start", "find_remains"]
-
 DAMAGED_MARK = "DICOM by its header, but without the mark at byte 128"
 DAMAGED_START = "holds a DICOM header, but not where it should be"
 EMPTY, TEXT, UNKNOWN = "empty", "text", "no DICOM"

@@ -28,8 +28,6 @@ from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text
 from clrecon.system.wording import name_parameter
 
-__all__ = ["LINK_OUT", "CorruptFile", "Scan", "advise_on_links", "scan_path"]
-
 DICOM_SUFFIXES = (".dcm", ".dic", ".dicom", ".ima")
 PROGRESS_STEPS = 1000
 BLANK_START = bytes(128) + b"DICM"

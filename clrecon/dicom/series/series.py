@@ -30,8 +30,6 @@ from clrecon.errors import RefusedInputError
 from clrecon.sources.likeness import judge_slices
 from clrecon.system.text import join_names
 
-__all__ = ["Series", "group_series"]
-
 PROBLEMS_SHOWN = 3
 SLICE_MODALITIES = ("MR", "NM", "PT")
 """Other modalities whose files are slices: a corrupt file among them probably is one too."""

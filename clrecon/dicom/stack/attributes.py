@@ -21,8 +21,6 @@ from clrecon.dicom.parse.elements import CorruptFileError, NotDicomError, read_e
 from clrecon.dicom.stack.element_kinds import find_verdict
 from clrecon.dicom.stack.numbers import median
 
-__all__ = ["Alternation", "alternate_places", "find_alternation"]
-
 FEWEST_SLICES = 6
 SMALLEST_VOLUME = 3
 LONGEST_PERIOD = 8

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.headers.slice_header import SliceHeader
 
-__all__ = ["ORIENTATION_EXACT", "ORIENTATION_LIMIT", "ORIENTATION_SPREAD_RAD", "Directions", "measure_directions"]
-
 Float64Array = NDArray[np.float64]
 
 ORIENTATION_EXACT = 1e-4

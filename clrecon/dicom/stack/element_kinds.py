@@ -10,8 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-__all__ = ["ELEMENT_KINDS", "ElementKind", "find_verdict"]
-
 Verdict = Literal["phases", "pixels", "nothing"]
 
 

@@ -29,8 +29,6 @@ from clrecon.geometry.uneven import fit_line, position_tolerance
 from clrecon.system.text import join_names
 from clrecon.system.wording import name_parameter
 
-__all__ = ["Line", "Stack", "group_places", "measure_gap", "measure_stack", "measure_stated_gap"]
-
 Float64Array = NDArray[np.float64]
 
 DUPLICATE_MM = 1e-3

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Holes", "find_holes"]
-
 Float64Array = NDArray[np.float64]
 
 MISSING_RATIO = 1.5

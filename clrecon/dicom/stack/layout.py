@@ -13,13 +13,6 @@ from clrecon.dicom.stack.fit import Stack
 from clrecon.dicom.stack.numbers import median
 from clrecon.geometry.uneven import position_tolerance
 
-__all__ = [
-    "describe_thickness",
-    "measure_extent",
-    "median_thickness",
-    "summarise_gaps",
-]
-
 Float64Array = NDArray[np.float64]
 
 

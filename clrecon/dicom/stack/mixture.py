@@ -13,8 +13,6 @@ import numpy as np
 
 from clrecon.dicom.headers.slice_header import SliceHeader
 
-__all__ = ["describe_differences", "find_mixture", "values_of"]
-
 CERTAIN = (
     "TemporalPositionIndex",
     "TemporalPositionIdentifier",

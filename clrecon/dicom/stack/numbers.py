@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["median"]
-
 
 def median(values: Sequence[float] | NDArray[Any]) -> float:
     """Return the same as `numpy.median` of one or more values.

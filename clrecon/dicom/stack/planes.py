@@ -6,8 +6,6 @@ import itertools
 import math
 from collections import defaultdict
 
-__all__ = ["SPLIT_ANGLE_RAD", "Planes"]
-
 SPLIT_ANGLE_RAD = math.radians(1.0)
 """Slices of one SeriesInstanceUID whose directions differ by more are separate stacks (a localizer, another plane).
 With smaller differences they are one stack, and the gate reports the difference."""

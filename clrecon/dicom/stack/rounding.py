@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from clrecon.dicom.headers.slice_header import SliceHeader
 from clrecon.dicom.stack.numbers import median
 
-__all__ = ["Rounding", "find_rounding", "measure_unit"]
-
 Float64Array = NDArray[np.float64]
 
 SLACK = 1e-6

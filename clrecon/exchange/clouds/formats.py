@@ -17,8 +17,6 @@ from clrecon.exchange.content import PointContent
 from clrecon.exchange.file_format import NO_LIMIT, FileFormat, find_extension, stage_content
 from clrecon.system.files import StagedFile
 
-__all__ = ["CLOUD_FORMATS", "check_cloud_format", "describe_cloud_losses", "stage_cloud", "write_cloud"]
-
 CLOUD_FORMATS: dict[str, FileFormat[PointContent]] = {
     ".ply": FileFormat(ply.estimate, ply.write, ply.verify, NO_LIMIT),
     ".vtp": FileFormat(vtp.estimate, vtp.write, vtp.verify, NO_LIMIT),

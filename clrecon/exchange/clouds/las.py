@@ -19,8 +19,6 @@ from clrecon.exchange.content import PointContent, refuse_file
 from clrecon.system.installing import install_command
 from clrecon.system.text import escape_text
 
-__all__ = ["estimate", "import_laspy", "read", "verify", "write"]
-
 SCALE_MM = 1e-4
 """Step of the coordinates: they are rounded by 5e-5 mm at most."""
 _USER = "clrecon"

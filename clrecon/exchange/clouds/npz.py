@@ -30,8 +30,6 @@ from clrecon.exchange.clouds.raw_cloud import RawCloud, columns_of, say_cut
 from clrecon.exchange.content import PointContent, refuse_file
 from clrecon.system.text import escape_text
 
-__all__ = ["estimate", "read", "verify", "write"]
-
 _ENTRY_BYTES = 224
 """Least bytes of an entry beside its numbers: two headers of the ZIP, the header of the array."""
 _DEFLATE_RATIO = 1032

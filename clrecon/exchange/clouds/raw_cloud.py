@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError
 from clrecon.system.text import escape_text, join_names
 
-__all__ = ["RawCloud", "columns_of", "read_remarks", "say_cut"]
-
 HU_NAMES = ("hu", "scalar_hu", "ct", "scalar", "intensity", "scalar_intensity")
 LABEL_NAMES = ("label", "labels", "scalar_label", "cluster", "scalar_cluster", "classification")
 NORMAL_NAMES = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("normalx", "normaly", "normalz"))

@@ -21,8 +21,6 @@ from clrecon.exchange.clouds.raw_cloud import RawCloud, read_remarks, say_cut
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["Element", "Header", "read", "read_binary", "read_header", "read_text", "skip_to_vertices"]
-
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",

@@ -23,8 +23,6 @@ from clrecon.exchange.clouds.raw_cloud import RawCloud, columns_of, say_cut
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["Document", "has_polygons", "parse_document", "read", "read_count", "read_fields", "read_numbers"]
-
 _TYPES = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4", "Int64": "i8",
     "UInt64": "u8", "Float32": "f4", "Float64": "f8",

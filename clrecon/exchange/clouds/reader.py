@@ -11,8 +11,6 @@ from clrecon.exchange.clouds.raw_cloud import RawCloud
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["read_raw_cloud"]
-
 _START_BYTES = 512
 
 

@@ -20,8 +20,6 @@ from clrecon.system.pieces import chunks
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["estimate", "read", "verify", "write"]
-
 _CHUNK = 1 << 14
 _PIECE = 1 << 22
 _LONGEST_HEAD = 1 << 10

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from clrecon.exchange.meshes.raw_mesh import Part
 
-__all__ = ["MOST_LEVELS", "MOST_SHAPES", "PlacedShapes", "Shape"]
-
 MOST_LEVELS = 32
 """Most levels of objects within objects; more are refused, as is an object within itself."""
 

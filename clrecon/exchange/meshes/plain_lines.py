@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["MARK", "plain_lines"]
-
 MARK = b"\xef\xbb\xbf"
 """Byte order mark of UTF-8."""
 

@@ -24,8 +24,6 @@ from clrecon.exchange.meshes.raw_mesh import Part, RawMesh
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["read"]
-
 _LONGEST_JSON = 1 << 26
 _TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3}

@@ -19,8 +19,6 @@ from clrecon.exchange.meshes.raw_mesh import Part, RawMesh
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import count_of, escape_text
 
-__all__ = ["read"]
-
 _ELSE = (b"l", b"p", b"curv", b"curv2", b"surf")
 """Elements that are no faces."""
 _NAMES = (b"o", b"g")

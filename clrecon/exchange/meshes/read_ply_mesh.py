@@ -18,8 +18,6 @@ from clrecon.exchange.meshes.raw_mesh import Part, RawMesh
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["read"]
-
 _CORNERS = ("vertex_indices", "vertex_index")
 
 

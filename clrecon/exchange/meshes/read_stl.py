@@ -19,8 +19,6 @@ from clrecon.exchange.meshes.raw_mesh import RawMesh
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["join_corners", "read"]
-
 _HEAD = 84
 _FACET = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("unused", "<u2")])
 _PIECE = 1 << 16

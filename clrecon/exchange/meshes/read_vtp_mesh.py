@@ -18,8 +18,6 @@ from clrecon.exchange.meshes.raw_mesh import Part, RawMesh
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["read"]
-
 
 def read(path: Path) -> RawMesh:
     """Read the triangles of a VTP file; those of one number in the cell array ``PART`` are a part."""

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
 
-__all__ = ["ALL_DEVICES", "DEFAULT_RUNS", "run_bench"]
-
 ALL_DEVICES = "all"
 DEFAULT_RUNS = 7
 MOST_RUNS = 1000

@@ -9,8 +9,6 @@ import time
 import zlib
 from pathlib import Path
 
-__all__ = ["free_cores", "processor_name", "usable_cores"]
-
 _CPUINFO = Path("/proc/cpuinfo")
 
 

@@ -7,8 +7,6 @@ from collections.abc import Callable, Sequence
 from time import perf_counter
 from typing import Any
 
-__all__ = ["FEWEST_PAIRS", "alternate", "spread", "summarise"]
-
 FEWEST_PAIRS = 3
 """Pairs that are run in spite of the time limit: fewer give no spread."""
 

@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
 
-__all__ = ["FlyingEdges", "PeerRun"]
-
 
 class PeerRun(NamedTuple):
     """One run: wall seconds of ``Update()``, and its output."""

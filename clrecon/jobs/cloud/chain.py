@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.operators.resident.device_volume import DeviceVolume
 
-__all__ = ["run_steps"]
-
 
 def run_steps(
     trail: Trail, settings: CloudSettings, device: Device, resident: DeviceVolume | None, progress: Progress

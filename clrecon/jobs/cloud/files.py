@@ -7,8 +7,6 @@ from pathlib import Path
 
 from clrecon.jobs.shared.outputs import check_distinct
 
-__all__ = ["CloudFiles"]
-
 
 @dataclass(frozen=True)
 class CloudFiles:

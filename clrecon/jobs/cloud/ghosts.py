@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from clrecon.operators.resident.device_volume import DeviceVolume
     from clrecon.points.ghost_slices import GhostSlices
 
-__all__ = ["drop_ghosts", "find_ghosts", "warn_of_ghosts"]
-
 MOST_NAMED = 10
 """Most slices that a warning names."""
 

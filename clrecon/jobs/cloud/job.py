@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from clrecon.points.ghost_slices import GhostSlices
     from clrecon.system.files import Staged
 
-__all__ = ["make_cloud"]
-
 log = get_logger(__name__)
 
 

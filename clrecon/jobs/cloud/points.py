@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from clrecon.points import PointCloud
     from clrecon.points.ghost_slices import GhostSlices
 
-__all__ = ["iso_value_of", "prepare_chain", "take_points"]
-
 
 def take_points(
     subject: Volume | PointCloud,

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.points import PointCloud
 
-__all__ = ["CloudReport", "describe_clouds", "describe_file"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CloudReport(RunReport):

@@ -12,8 +12,6 @@ from clrecon.jobs.shared.settings import InputSettings
 from clrecon.points.kinds import KINDS
 from clrecon.system.wording import name_parameter
 
-__all__ = ["DENOISERS", "GHOSTS", "KINDS", "STEPS", "CloudSettings", "Clustering", "OF_SCANS"]
-
 DENOISERS = ("grid", "bilateral")
 
 GHOSTS = ("keep", "drop")

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from clrecon.points import PointCloud, PointStep
 
-__all__ = ["Trail"]
-
 LEAST_KEPT = 0.5
 """Least share of its points that a step must keep which is there to take noise away."""
 

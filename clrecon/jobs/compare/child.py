@@ -16,8 +16,6 @@ from clrecon.jobs.compare.request import Request, load_volume, save_arrays, save
 from clrecon.jobs.shared.report import peak_memory_bytes, to_json
 from clrecon.system.time_limit import time_limit
 
-__all__ = ["main", "run_method"]
-
 LONG_SECONDS = 2.0
 """No further warm run begins after so many seconds of them."""
 

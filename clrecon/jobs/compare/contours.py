@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 
-__all__ = ["Plane", "cut_mesh", "draw_plane", "find_planes"]
-
 WINDOW_HU = (-200.0, 800.0)
 BETWEEN = 0.487
 """Place of a plane between two slices: on a slice, vertices lie in the plane."""

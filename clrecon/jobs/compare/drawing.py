@@ -12,8 +12,6 @@ from clrecon.opencl import Device
 from clrecon.points import PointCloud
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["draw_mesh", "draw_points", "flatten"]
-
 Image = NDArray[np.uint8]
 
 BACKGROUND = "black"

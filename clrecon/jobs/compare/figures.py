@@ -19,8 +19,6 @@ from clrecon.jobs.compare.pictures import compare_pictures, difference_of, save_
 from clrecon.jobs.compare.report import MethodRecord
 from clrecon.jobs.compare.request import load_array, load_mesh
 
-__all__ = ["COLORS", "Figures", "collect_figures", "draw_figures"]
-
 COLORS = dict(
     zip(
         COMPARED,

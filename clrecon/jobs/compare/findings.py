@@ -7,8 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from clrecon.jobs.compare.report import MethodRecord
 from clrecon.jobs.compare.words import count, join, megabytes, milliseconds, ratio, seconds, share
 
-__all__ = ["find_findings", "find_worse"]
-
 SAME_MM = 1e-3
 """Surfaces whose 95th percentile of distances is below this are the same."""
 

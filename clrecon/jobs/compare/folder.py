@@ -16,8 +16,6 @@ from clrecon.system.files import temporary_folder
 from clrecon.system.folders import StagedFolder, check_folder
 from clrecon.system.targets import final_mode, system_errors
 
-__all__ = ["PAGE", "REPORT", "MadeFolder", "check_report_folder", "stage_report_folder"]
-
 PAGE, REPORT = "index.html", "report.json"
 
 _NAMES = "|".join(map(re.escape, COMPARED))

@@ -42,8 +42,6 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.opencl import Device
 
-__all__ = ["make_comparison"]
-
 log = get_logger(__name__)
 
 

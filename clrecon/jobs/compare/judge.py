@@ -21,8 +21,6 @@ from clrecon.mesh.compare.distances import SAMPLES, SurfaceDistance, compare_mes
 from clrecon.mesh.compare.slices import measure_slices
 from clrecon.mesh.compare.truth import REACH_MM, measure_truth
 
-__all__ = ["MEASURES", "Judge", "main"]
-
 MEASURES = ("quality", "cells", "slices", "surfaces", "truth", "points")
 
 

@@ -15,8 +15,6 @@ from clrecon.points import PointCloud
 from clrecon.rendering import Rendering
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["PARTS", "TWIN_SIZE", "Made", "Scene", "draw", "make"]
-
 PARTS = ("build", "upload", "kernels", "host", "download", "draw")
 """Parts of the time of a method: kernels are built; the volume goes to the device; kernels run; the CPU works (all of
 it, where a method has no kernels); results come back; a picture is drawn."""

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from clrecon.errors import UsageError
 from clrecon.system.wording import name_parameter
 
-__all__ = ["COMPARED", "MESH", "Compared", "choose_methods"]
-
 MESH, CLOUD, PICTURE = "mesh", "cloud", "picture"
 
 

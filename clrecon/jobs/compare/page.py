@@ -16,8 +16,6 @@ from clrecon.jobs.compare.table import main_table, paper_table, shown_columns, s
 from clrecon.jobs.compare.template import PAGE_TEMPLATE, read_style
 from clrecon.jobs.compare.words import join, share
 
-__all__ = ["make_page"]
-
 
 def make_page(report: CompareReport, figures: Figures) -> str:
     """Return the page.

@@ -16,8 +16,6 @@ from clrecon.geometry import Volume
 from clrecon.jobs.compare.contours import to_grey
 from clrecon.rendering.pictures.likeness import make_control_pictures, measure_pictures
 
-__all__ = ["CONTROLS", "PAPER", "along_slices", "measure_against_slice"]
-
 MOST_PIXELS = 512
 
 PAPER = {

@@ -15,8 +15,6 @@ from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
 
-__all__ = ["extract_by_vtk"]
-
 FILTERS = {"vtk-mc": "vtkMarchingCubes", "vtk-fe": "vtkFlyingEdges3D"}
 
 

@@ -17,8 +17,6 @@ from clrecon.operators.rays.mesh_pictures import box_around
 from clrecon.rendering.pictures.likeness import measure_pictures
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["SIZE", "VIEW", "choose_camera", "compare_pictures", "difference_of", "embed", "save_png"]
-
 VIEW = "anterior"
 SIZE = (480, 480)
 QUALITY = 80

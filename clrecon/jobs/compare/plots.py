@@ -11,8 +11,6 @@ from clrecon.jobs.compare.records import ALL_PARTS
 from clrecon.jobs.compare.report import CompareReport, MethodRecord
 from clrecon.jobs.compare.words import seconds
 
-__all__ = ["PART_COLORS", "plot_accuracy", "plot_times"]
-
 PART_COLORS = {
     "read": "#9aa5b1",
     "build": "#f2b134",

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from clrecon.jobs.compare.figures import Figures
     from clrecon.opencl import Device
 
-__all__ = ["ALL_PARTS", "compose_report", "make_record"]
-
 ALL_PARTS = ("read", *PARTS)
 
 LIBRARIES = {

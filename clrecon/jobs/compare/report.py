@@ -9,8 +9,6 @@ from typing import Any
 from clrecon.jobs.shared.run_report import RunReport
 from clrecon.system.records import Record
 
-__all__ = ["CompareReport", "MethodRecord"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MethodRecord(Record):

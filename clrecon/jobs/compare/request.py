@@ -13,8 +13,6 @@ from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["Request", "load_array", "load_mesh", "load_volume", "save_arrays", "save_mesh", "save_volume"]
-
 _VOXELS, _PLACE = "voxels.npy", "place.npz"
 
 

@@ -18,8 +18,6 @@ from clrecon.errors import DeviceError
 from clrecon.jobs.bench.machine import usable_cores
 from clrecon.jobs.compare.request import Request
 
-__all__ = ["measure_in_processes", "run_in_process"]
-
 METHOD = ("-m", "clrecon.jobs.compare.child")
 JUDGE = ("-m", "clrecon.jobs.compare.judge")
 

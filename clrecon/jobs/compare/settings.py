@@ -11,8 +11,6 @@ from clrecon.jobs.compare.methods import Compared, choose_methods
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.shared.settings import InputSettings
 
-__all__ = ["CompareSettings"]
-
 MOST_REPEATS = 100
 
 

@@ -12,8 +12,6 @@ from clrecon.jobs.compare.paper import CONTROLS, PAPER
 from clrecon.jobs.compare.report import CompareReport, MethodRecord
 from clrecon.jobs.compare.words import count, megabytes, milliseconds, seconds, share, signed
 
-__all__ = ["COLUMNS", "main_table", "paper_table", "small_table"]
-
 NOTHING = "&ndash;"
 
 AGAINST = ("cells", "HD95", "ASSD", "picture")

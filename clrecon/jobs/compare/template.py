@@ -5,8 +5,6 @@ from __future__ import annotations
 from importlib.resources import files
 from string import Template
 
-__all__ = ["PAGE_TEMPLATE", "read_style"]
-
 PAGE_TEMPLATE = Template("""<!DOCTYPE html>
 <html lang="en">
 <head>

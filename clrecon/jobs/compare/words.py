@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["count", "join", "megabytes", "milliseconds", "ratio", "seconds", "share", "signed"]
-
 
 def seconds(value: float) -> str:
     """Write seconds with two digits that count: ``0.021``, ``0.39``, ``7.2``, ``42``."""

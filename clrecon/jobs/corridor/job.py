@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.system.files import StagedFile
 
-__all__ = ["make_corridors"]
-
 _PLACED_BY_LABEL = 0.5
 """Below this share of points that HU place a corridor says more of the label than of the bone."""
 

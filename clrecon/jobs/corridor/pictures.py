@@ -17,8 +17,6 @@ from clrecon.rendering.pictures.annotations import orientation_letters
 from clrecon.rendering.pictures.picture_data import PictureData
 from clrecon.rendering.pictures.sheets import Panel, Stroke, draw_sheet
 
-__all__ = ["draw_corridors"]
-
 Float64Array = NDArray[np.float64]
 
 WIDTH_MM = 96.0

@@ -15,15 +15,6 @@ from clrecon.corridors.measures import Bias
 from clrecon.geometry import frame_from_lps
 from clrecon.system.records import Record
 
-__all__ = [
-    "KNOWN_BIAS",
-    "NOT_FOR_PLANNING",
-    "CorridorReport",
-    "describe_corridor",
-    "describe_grade",
-    "describe_vertebra",
-]
-
 NOT_FOR_PLANNING = "not for planning an operation: a measurement on one surface at one level, checked on phantoms alone"
 
 KNOWN_BIAS = (

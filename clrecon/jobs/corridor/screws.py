@@ -16,8 +16,6 @@ from clrecon.geometry import frame_from_lps
 from clrecon.system.regular_files import read_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["CSV_COLUMNS", "parse_screw", "read_screws"]
-
 CSV_COLUMNS = ("entry_x", "entry_y", "entry_z", "tip_x", "tip_y", "tip_z", "diameter")
 """Columns of a CSV file, beside ``name`` and ``label``, which may be left out."""
 

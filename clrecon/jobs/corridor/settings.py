@@ -12,8 +12,6 @@ from clrecon.geometry import frame_from_lps
 from clrecon.reading import Selection
 from clrecon.system.wording import name_parameter
 
-__all__ = ["CorridorFiles", "CorridorSettings"]
-
 LARGEST_MARGIN_MM = 5.0
 
 

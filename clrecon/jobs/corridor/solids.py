@@ -13,8 +13,6 @@ from clrecon.mesh import Mesh
 if TYPE_CHECKING:
     from clrecon.corridors.grades import Screw
 
-__all__ = ["cylinder_mesh", "cylinder_meshes"]
-
 FACES = 48
 """Sides of a cylinder: its walls lie at most 0.2 % of the radius inside of the true one."""
 

@@ -12,8 +12,6 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.reader import read_mesh
 from clrecon.system.text import escape_text, say_digits
 
-__all__ = ["describe_mesh", "doubt_frames", "read_side"]
-
 _OTHER_UNIT = 100.0
 """Ratio of the sizes of two meshes from which on their units are doubted; metres and millimetres differ by 1000."""
 

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from clrecon.rendering import Rendering
     from clrecon.rendering.looks.color_scale import ColorScale
 
-__all__ = ["DistanceFiles", "measure_meshes"]
-
 log = get_logger(__name__)
 
 _LEAST_RANGE_MM = 1e-3

@@ -8,8 +8,6 @@ from typing import Any
 
 from clrecon.system.records import Record
 
-__all__ = ["DistanceReport"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DistanceReport(Record):

@@ -10,8 +10,6 @@ from clrecon.geometry import frame_from_lps
 from clrecon.mesh.compare.distances import SAMPLES
 from clrecon.rendering.views.directions import find_view
 
-__all__ = ["MOST_SAMPLES", "DistanceSettings"]
-
 MOST_SAMPLES = 10_000_000
 
 

@@ -34,8 +34,6 @@ from clrecon.system.targets import keep_existing, refuse_existing, resolve_targe
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
 
-__all__ = ["export_volume"]
-
 log = get_logger(__name__)
 
 

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.jobs.export.settings import ExportSettings
 
-__all__ = ["ExportReport", "describe_export"]
-
 
 @dataclass(frozen=True, eq=False)
 class ExportReport(Record):

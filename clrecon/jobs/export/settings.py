@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from clrecon.jobs.shared.settings import InputSettings
 
-__all__ = ["ExportSettings"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class ExportSettings(InputSettings):

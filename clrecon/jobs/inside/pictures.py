@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.rendering import Rendering
 
-__all__ = ["DEFAULT_VIEW", "check_pictures", "describe_picture", "draw_parts"]
-
 DEFAULT_VIEW = "130,20"
 """From the left, behind and above: body, arch and canal are seen."""
 

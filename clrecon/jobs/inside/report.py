@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
 
-__all__ = ["InsideReport", "describe_job", "describe_mesh_file"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class InsideReport(RunReport):

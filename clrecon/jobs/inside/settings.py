@@ -11,8 +11,6 @@ from clrecon.jobs.inside.pictures import DEFAULT_VIEW
 from clrecon.reading import Selection
 from clrecon.system.wording import name_parameter
 
-__all__ = ["InsideSettings"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class InsideSettings(Selection):

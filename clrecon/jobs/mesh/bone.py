@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.mesh.components import Labelled
 
-__all__ = ["find_bone", "judge_surfaces", "warn_of_walls"]
-
 CONTRAST_SHARE = 0.04
 """Share of a bone surface that looks like contrast medium and is reported from here on; spongy bone gives 0.03."""
 NAMES_SHOWN = 5

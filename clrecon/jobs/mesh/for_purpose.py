@@ -12,8 +12,6 @@ from clrecon.jobs.mesh.purposes import find_purpose
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.system.wording import name_parameter
 
-__all__ = ["settings_for"]
-
 
 def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
     """Return the fields of `MeshSettings` that a purpose sets, with the given fields, which win.

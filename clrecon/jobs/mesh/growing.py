@@ -12,8 +12,6 @@ from clrecon.system.wording import name_parameter
 if TYPE_CHECKING:
     from clrecon.jobs.mesh.label_choice import LabelChoice
 
-__all__ = ["LABEL_SEED", "check_growing", "is_label_seed"]
-
 LABEL_SEED = "label:"
 """What a seed that is a label begins with."""
 

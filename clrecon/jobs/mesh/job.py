@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from clrecon.labels import LabelMap
     from clrecon.opencl import Device
 
-__all__ = ["make_mesh", "makes_objects"]
-
 log = get_logger(__name__)
 
 _DEVICE_PARTS = ("upload", "build", "kernels", "download")

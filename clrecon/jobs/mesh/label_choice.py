@@ -13,8 +13,6 @@ from clrecon.system.wording import name_parameter
 if TYPE_CHECKING:
     from clrecon.labels import LabelMap
 
-__all__ = ["LabelChoice"]
-
 
 @dataclass(frozen=True)
 class LabelChoice:

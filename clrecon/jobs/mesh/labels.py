@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
 
-__all__ = [
-    "describe_label", "extract_label_surfaces", "judge_label_volumes", "name_label_files", "open_labels",
-]  # fmt: skip
-
 NAMES_SHOWN = 5
 
 _FACTS = (

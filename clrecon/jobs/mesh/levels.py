@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from clrecon.anatomy.iso_choice import IsoChoice
     from clrecon.geometry import Volume
 
-__all__ = ["check_known_values", "choose_level", "describe_level", "list_failed_values", "warn_of_contrast"]
-
 THICK_SLICES_MM = 2.5
 """From this spacing on, thin walls across the slices are blurred so much that the half-way level can be too high: with
 slices of 2 mm it is as good as the best, with 3 mm it loses walls (docs/iso_value.md)."""

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
 
-__all__ = ["MadeParts", "make_parts"]
-
 
 @dataclass(frozen=True, eq=False)
 class MadeParts:

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
 
-__all__ = ["extract_one", "find_seeds"]
-
 
 def find_seeds(settings: MeshSettings, labels: LabelMap | None) -> list[Any] | None:
     """Return what the surfaces grow from, as `extract_isosurface` takes it; None where they are whole."""

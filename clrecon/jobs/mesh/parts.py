@@ -26,15 +26,6 @@ if TYPE_CHECKING:
     from clrecon.mesh.components import Labelled
     from clrecon.opencl import Device
 
-__all__ = [
-    "SELECT_STEPS",
-    "check_levels",
-    "extract_surfaces",
-    "first_names",
-    "select_parts",
-    "warn_of_crumbs",
-]
-
 CRUMB_ML, MANY_COMPONENTS = 0.1, 100
 """A mesh of more components than this below this volume gets a warning."""
 

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.opencl import Device
 
-__all__ = ["fill_solid", "leave_outside", "mask_parts", "narrow_volume", "prepare_surfaces"]
-
 
 def prepare_surfaces(
     device: Device,

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from clrecon.errors import UsageError
 from clrecon.system.text import say_unknown
 
-__all__ = ["DEFAULT_PRESET", "HIGHEST_BONE_HU", "LOWEST_BONE_HU", "PRESETS", "Preset", "find_preset"]
-
 
 @dataclass(frozen=True)
 class Preset:

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 
     from clrecon.mesh import Mesh
 
-__all__ = ["describe_print", "measure_pieces", "warn_of_print"]
-
 THIN_MM = 1.0
 """Thinner walls break or are not printed at all by common printers (layers of 0.1 to 0.3 mm, nozzles of 0.4 mm)."""
 

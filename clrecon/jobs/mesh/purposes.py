@@ -8,8 +8,6 @@ from typing import Any
 from clrecon.errors import UsageError
 from clrecon.system.text import guess_word
 
-__all__ = ["PURPOSES", "Purpose", "find_purpose"]
-
 
 @dataclass(frozen=True)
 class Purpose:

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from clrecon.mesh.quality import MeshQuality
     from clrecon.opencl import Device
 
-__all__ = ["describe_purposes", "judge_parts", "measure_parts", "refine_surface", "warn_of_gates"]
-
 
 def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress: Progress = ignore_progress) -> Mesh:
     """Smooth and decimate as the settings say; return the mesh itself if they ask for neither.

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.system.files import StagedFile
 
-__all__ = ["MeshReport", "describe_job", "describe_part"]
-
 _OF_ONE = ("quality", "walls", "iso_distance", "refinement", "print", "cells", "growing")
 """Entries of a mesh that are also at the top of the report if there is only one mesh."""
 

@@ -14,8 +14,6 @@ from clrecon.jobs.mesh.purposes import find_purpose
 from clrecon.jobs.shared.settings import InputSettings
 from clrecon.system.wording import name_parameter
 
-__all__ = ["MeshSettings", "name_level"]
-
 
 def name_level(level: float | Sequence[float]) -> str:
     """Write an iso value or a range as text: ``200``, ``100:300``."""

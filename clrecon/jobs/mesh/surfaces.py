@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.mesh.quality import MeshQuality
 
-__all__ = ["Bones", "Part", "Surface", "plan_surfaces"]
-
 
 @dataclass(frozen=True)
 class Surface:

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from clrecon.rendering import Rendering
     from clrecon.system.files import StagedFile
 
-__all__ = ["PictureFiles", "check_pictures", "format_of", "name_view", "path_of", "stage_picture"]
-
 OPAQUE_ONLY = (".jpg", ".jpeg", ".mp4", ".gif")
 
 

@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from clrecon.rendering import Rendering
     from clrecon.system.files import Staged
 
-__all__ = ["make_pictures"]
-
 log = get_logger(__name__)
 
 

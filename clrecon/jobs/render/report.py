@@ -30,15 +30,6 @@ if TYPE_CHECKING:
     from clrecon.rendering import Rendering, TransferFunction
     from clrecon.rendering.views.camera import Camera
 
-__all__ = [
-    "PictureReport",
-    "describe_camera",
-    "describe_picture",
-    "describe_pictures",
-    "find_emptiness",
-    "warn_of_picture",
-]
-
 
 def describe_camera(camera: Camera | None) -> dict[str, Any] | None:
     """Describe a camera by the arguments of `Camera`, LPS mm; None for a picture without a camera."""

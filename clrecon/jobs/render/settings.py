@@ -20,14 +20,15 @@ from clrecon.rendering.looks.label_style import NO_LABEL, distinct_colors
 from clrecon.rendering.looks.lighting import UNSHADED, Lighting
 from clrecon.rendering.looks.presets import DEFAULT_PRESET, PRESETS, find_preset
 from clrecon.rendering.looks.transfer_function import TransferFunction
-from clrecon.rendering.looks.window import WINDOWS
+from clrecon.rendering.looks.window import WINDOWS as WINDOWS
 from clrecon.rendering.movies.movie import turntable_cameras
 from clrecon.rendering.pictures.annotations import SMALLEST_SIDE
 from clrecon.rendering.pictures.contact_sheet import SHEET_SIZE
 from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.modes import MODES, check_known, choose_mode, keywords_of, make_style
-from clrecon.rendering.pictures.point_look import POINT_COLORS, PointLook
-from clrecon.rendering.pictures.style_checks import SHEET_SLICES
+from clrecon.rendering.pictures.point_look import POINT_COLORS as POINT_COLORS
+from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.style_checks import SHEET_SLICES as SHEET_SLICES
 from clrecon.rendering.pictures.styles import (
     SPINE,
     CurveCut,
@@ -44,20 +45,6 @@ from clrecon.rendering.views.directions import DEFAULT_SIZE, DIRECTIONS, checked
 from clrecon.rendering.views.plane import find_plane
 from clrecon.system.text import say_unknown
 from clrecon.system.wording import name_parameter
-
-__all__ = [
-    "LabelLook",
-    "MeshFile",
-    "POINT_COLORS",
-    "RenderSettings",
-    "SHEET_SLICES",
-    "Turntable",
-    "VIEWS",
-    "WINDOWS",
-    "color_apart",
-    "describe_modes",
-    "describe_presets",
-]
 
 DEFAULT_VIEWS = {"slice": "axial", "cpr": "left", "slices": SLICES_VIEWS[0]}
 """Default view of the modes whose default is not the view from the front; that of slices suits the scan."""
@@ -333,7 +320,7 @@ class RenderSettings(InputSettings):
         return looks
 
     def camera(self, volume: Grid, view: str, turning: bool = False) -> Camera:
-        """Place the camera of one view; with `turning` the whole volume stays in the picture while the camera orbits."""
+        """Place the camera of one view; with `turning` the whole volume stays in it while the camera orbits."""
         if isinstance(self.style, PlaneCut):
             return find_plane(volume, view, self.size_used, zoom=self.zoom, up=self.up, center=self.center)
         return Camera.fit(

@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from clrecon.rendering import Lighting, Rendering, TransferFunction
     from clrecon.rendering.views.camera import Camera
 
-__all__ = ["Studio", "read_curve", "read_function", "read_look"]
-
 
 def read_function(named: str | None) -> TransferFunction | None:
     """Read the transfer function ``FILE`` or ``FILE:NAME``; None if no file is given."""

@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike
 from clrecon.errors import DeviceError
 from clrecon.opencl import Device
 
-__all__ = ["LEAST_ITEMS", "Check", "require_close", "require_equal", "require_share", "require_whole"]
-
 LEAST_ITEMS = 501
 """Fewest work-items of a kernel in its check, where its data allow more: several work-groups on every device."""
 

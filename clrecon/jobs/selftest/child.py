@@ -17,8 +17,6 @@ from clrecon.jobs.selftest.check import Check
 from clrecon.jobs.selftest.table import CHECKS
 from clrecon.opencl import Device, list_devices
 
-__all__ = ["main", "run_check"]
-
 
 def run_check(device: Device, check: Check) -> dict[str, Any]:
     """Run one check.

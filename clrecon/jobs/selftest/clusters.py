@@ -18,8 +18,6 @@ from clrecon.points.voxel_numbers import VoxelNumbers
 from clrecon.reference.points import clusters as twin
 from clrecon.reference.points import slice_overlap as overlap_twin
 
-__all__ = ["CHECKS"]
-
 SHAPE = (26, 41, 70)
 """Voxels (k, j, i): more than 1,000 rows, and three words in each."""
 

@@ -13,8 +13,6 @@ from clrecon.operators.points.field import LEAST_SHARE, FieldSettings, NodeField
 from clrecon.operators.points.field_signs import Masks, decide_signs
 from clrecon.reference.points import field as twin
 
-__all__ = ["CHECKS"]
-
 FIELD_MM = 5e-5
 """float32 sums of heights of up to 2 mm, at places up to 150 mm; measured 1e-5."""
 

@@ -17,8 +17,6 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.reference.filters import bilateral as twin
 from clrecon.reference.filters import near_level as near_twin
 
-__all__ = ["CHECKS"]
-
 SHAPE = (9, 31, 53)
 """Rows of four groups: 1,116 of them, and 558 strips for the ends of the rows."""
 

@@ -17,8 +17,6 @@ from clrecon.reference.points import grid as grid_twin
 from clrecon.reference.points import sparse_cells as sparse_twin
 from clrecon.reference.points import thin as thin_twin
 
-__all__ = ["CHECKS"]
-
 EPS = 0.97
 """mm: clusters of all sizes in the scattered points, border points and noise."""
 

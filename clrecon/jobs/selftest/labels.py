@@ -23,8 +23,6 @@ from clrecon.operators.surface.mask_extraction import prepare_label_masks
 from clrecon.reference.surface import label_masks as mask_twin
 from clrecon.reference.surface import labels as label_twin
 
-__all__ = ["CHECKS"]
-
 SUMS = 700
 """Sums of volumes that are compared, with 16 triangles each."""
 

@@ -27,8 +27,6 @@ from clrecon.rendering.pictures.styles import SlicesInSpace, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 
-__all__ = ["CHECKS"]
-
 SIZE = (160, 104)
 """Pixels, of which 32 are a work-item of the kernel that counts them."""
 

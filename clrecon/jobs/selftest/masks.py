@@ -14,8 +14,6 @@ from clrecon.reference.masks import balls as balls_twin
 from clrecon.reference.masks import components as components_twin
 from clrecon.reference.masks import regions as twin
 
-__all__ = ["CHECKS"]
-
 SHAPE = (26, 41, 70)
 """Voxels (k, j, i): more than 1,000 rows, and three words in each."""
 

@@ -10,8 +10,6 @@ from clrecon.opencl import Device
 from clrecon.operators.surface.crossings import mark_crossings, plan_crossings
 from clrecon.reference.surface import crossings as twin
 
-__all__ = ["CHECKS"]
-
 
 def _scatter(count: int, seed: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     """Return triangles of three sizes at random, in pairs at one place, of which every other one shares a vertex."""

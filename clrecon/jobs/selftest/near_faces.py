@@ -11,8 +11,6 @@ from clrecon.mesh.refine.bounds import MIDDLES, SurfaceBounds
 from clrecon.opencl import Device
 from clrecon.operators.surface.near_faces import DeviceBounds
 
-__all__ = ["CHECKS"]
-
 SIZE = 40
 """Vertices along each side of the sheet: 3042 triangles."""
 

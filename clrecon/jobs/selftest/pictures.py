@@ -27,8 +27,6 @@ from clrecon.rendering.pictures.styles import Projection, SlicesInSpace, Surface
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 
-__all__ = ["CHECKS"]
-
 SIZE = (96, 60)
 """Pixels: 720 work-items that take eight rays each."""
 

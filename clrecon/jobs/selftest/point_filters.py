@@ -24,8 +24,6 @@ from clrecon.reference.points import neighbours as neighbours_twin
 from clrecon.reference.points import normals as normals_twin
 from clrecon.reference.points import outliers as outliers_twin
 
-__all__ = ["CHECKS"]
-
 K = 12
 
 NORMAL = 1e-3

@@ -12,8 +12,6 @@ from clrecon.operators.points.neighbours import find_neighbours
 from clrecon.reference.points import grid as grid_twin
 from clrecon.reference.points import neighbours as neighbours_twin
 
-__all__ = ["CHECKS", "scattered_points"]
-
 
 def scattered_points(n: int) -> NDArray[np.float32]:
     """Return points in a box of 60 x 40 x 30 mm, one in twenty of them twice."""

@@ -18,8 +18,6 @@ from clrecon.reference.primitives import radix_sort as sort_twin
 from clrecon.reference.primitives import scan as scan_twin
 from clrecon.reference.primitives import union_find as components_twin
 
-__all__ = ["CHECKS"]
-
 
 def _check_scan(device: Device) -> str:
     for n in (1, 63, 64, 65, 1023, 1024, 1025, 70_001):

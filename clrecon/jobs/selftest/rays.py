@@ -20,8 +20,6 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.frame import volume_box
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["CHECKS"]
-
 SHAPE = (185, 193, 17)
 """Voxels (k, j, i) of 46 x 48 x 4 bricks: four rows of bricks a work-item are more than 500."""
 

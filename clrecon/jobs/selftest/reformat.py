@@ -12,8 +12,6 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.reference.reformat.cut import reformat_sheet
 from clrecon.rendering.views.plane import find_plane, plane_sheet, slab_samples
 
-__all__ = ["CHECKS"]
-
 SIZE = (41, 37)
 """Pixels, a work-item each."""
 

@@ -10,8 +10,6 @@ from clrecon.opencl import Device, download, upload
 from clrecon.operators.resident.bricks import compare_bricks, measure_bricks
 from clrecon.reference.resident import bricks as twin
 
-__all__ = ["CHECKS"]
-
 SHAPE = (221, 196, 21)
 """Voxels (k, j, i) of 28 x 25 x 3 bricks: 700 rows."""
 

@@ -19,8 +19,6 @@ from clrecon.errors import DeviceError
 from clrecon.jobs.selftest.check import Check
 from clrecon.opencl import Device
 
-__all__ = ["run_selftest"]
-
 COMMAND = ("-m", "clrecon.jobs.selftest.child")
 
 MOST_PROCESSES = 4

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["MIRRORED", "OBLIQUE", "WIDE", "blobs", "centre_of", "look_at", "noise", "random_integers", "stack", "waves"]
-
 OBLIQUE = np.array([[0.7, 0.1, 0.05, -50.0], [-0.1, 0.5, 0.02, -30.0], [0.0, 0.05, 0.9, -146.0], [0.0, 0.0, 0.0, 1.0]])
 """An affine that is anisotropic, oblique and sheared."""
 

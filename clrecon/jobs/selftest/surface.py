@@ -22,8 +22,6 @@ from clrecon.reference.surface import growing as growing_twin
 from clrecon.reference.surface.extract import Surface
 from clrecon.reference.surface.extract import extract_isosurface as extract_twin
 
-__all__ = ["CHECKS", "MARCHING", "VERTEX_TOLERANCE_VOXEL", "compare_mesh"]
-
 VERTEX_TOLERANCE_VOXEL = 1e-4
 """Largest difference of device (float32) and twin (float64), in units of the smallest voxel edge."""
 

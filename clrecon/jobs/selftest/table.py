@@ -24,8 +24,6 @@ from clrecon.jobs.selftest import (
 )
 from clrecon.jobs.selftest.check import Check
 
-__all__ = ["CHECKS", "checks_of"]
-
 CHECKS: tuple[Check, ...] = (
     *primitives.CHECKS,
     *resident.CHECKS,

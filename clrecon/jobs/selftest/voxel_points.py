@@ -9,8 +9,6 @@ from clrecon.opencl import Device
 from clrecon.operators.points.extract import extract_points
 from clrecon.reference.points import emit as twin
 
-__all__ = ["CHECKS"]
-
 PLACE_TOLERANCE_MM = 1.6e-5
 """Half a step of float32 below 512 mm."""
 

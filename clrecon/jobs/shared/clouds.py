@@ -15,16 +15,6 @@ from clrecon.system.wording import name_parameter
 if TYPE_CHECKING:
     from clrecon.points import PointCloud
 
-__all__ = [
-    "CLOUD_INPUTS",
-    "MESH_INPUTS",
-    "describe_cloud",
-    "is_cloud_file",
-    "is_mesh_file",
-    "refuse_other_clouds",
-    "refuse_scan_settings",
-]
-
 CLOUD_INPUTS = (".ply", ".vtp", ".npz", ".xyz", ".las", ".csv", ".txt")
 """Extensions of files that are read as clouds, see `clrecon.read_points`."""
 

@@ -11,8 +11,6 @@ if TYPE_CHECKING:
     from clrecon.geometry.boxes import Box
     from clrecon.labels import LabelMap
 
-__all__ = ["crop_labels", "crop_scan"]
-
 
 def crop_scan(volume: Volume, box: Box | None, space: str, *, margin: int = 0) -> Volume:
     """Return the part of a scan in a box, in mm of the frame `space`; all of it without a box."""

@@ -10,8 +10,6 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
 
-__all__ = ["read_with_labels"]
-
 
 def read_with_labels(
     read_scan: Callable[[], Volume], path: str | Path | None, read_map: Callable[[Volume | None], LabelMap | None]

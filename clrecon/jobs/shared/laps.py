@@ -6,8 +6,6 @@ from time import perf_counter
 
 from clrecon.system.log import get_logger
 
-__all__ = ["Laps"]
-
 log = get_logger(__name__)
 
 

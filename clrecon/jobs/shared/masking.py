@@ -11,8 +11,6 @@ from clrecon.system.text import say_digits
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
 
-__all__ = ["mask_volume"]
-
 
 def mask_volume(volume: Volume, settings: InputSettings, progress: Progress) -> Volume:
     """Return the volume with air outside the field of view and the body, as the settings ask for it."""

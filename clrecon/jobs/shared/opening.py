@@ -12,8 +12,6 @@ from clrecon.errors import Cancelled
 if TYPE_CHECKING:
     from clrecon.opencl import Device
 
-__all__ = ["DeviceOpening"]
-
 
 def _choose(name: str | int | Device | None) -> Device:
     from clrecon.operators import take_device

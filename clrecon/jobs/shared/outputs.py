@@ -19,18 +19,6 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.system.files import Staged, StagedFile
 
-__all__ = [
-    "MOST_FILES",
-    "check_distinct",
-    "check_kept",
-    "check_outputs",
-    "commit_all",
-    "count_leftovers",
-    "name_outputs",
-    "stage_meshes",
-    "stage_together",
-]
-
 MOST_FILES = 1000
 """Most meshes of a job.  More are useless crumbs, and each keeps a file open until all are written."""
 

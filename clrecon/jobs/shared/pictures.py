@@ -11,8 +11,6 @@ if TYPE_CHECKING:
     from clrecon.rendering import Rendering
     from clrecon.system.files import StagedFile
 
-__all__ = ["stage_picture"]
-
 
 def stage_picture(stack: ExitStack, picture: Rendering, path: str | Path) -> StagedFile:
     """Write a picture under a temporary name that `stack` removes unless it is committed."""

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from clrecon.operators.masks.mask import Mask
     from clrecon.operators.resident.device_volume import DeviceVolume
 
-__all__ = ["MOST_TAKEN", "preprocess_volume"]
-
 MOST_TAKEN = 0.5
 """Largest share of the voxels at the level and above that the steps may take unless that is allowed."""
 

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 from clrecon.errors import UsageError
 
-__all__ = ["FILTERS", "MORPHOLOGY", "PREPROCESS_FORMS", "PreprocessStep", "parse_preprocess"]
-
 FILTERS = {
     "bilateral": ("sigma_mm", "sigma_hu"),
     "bilateral-2d": ("sigma_mm", "sigma_hu"),

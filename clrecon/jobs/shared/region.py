@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry.base import AIR_HU
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.crop import describe_extent
-from clrecon.geometry.volume import AIR_HU
 from clrecon.jobs.shared.cropping import crop_scan
 from clrecon.jobs.shared.region_rules import RegionRule, parse_region_rules
 from clrecon.jobs.shared.settings import InputSettings
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.operators.masks.mask import Mask
     from clrecon.operators.resident.device_volume import DeviceVolume
-
-__all__ = ["Band", "apply_region", "carry_report", "restrict_volume", "value_outside"]
 
 Band = tuple[float, float]
 """Lowest and highest HU that are inside of what the job makes; infinite where it has no end."""
@@ -88,7 +86,7 @@ def carry_report(before: Volume, after: Volume) -> dict[str, Any]:
 
 
 def value_outside(bands: Sequence[Band], dtype: np.dtype[Any]) -> float:
-    """Return the HU of what lies outside of a region: air, or where air is inside of a band, a value beyond the bands."""
+    """Return the HU outside of a region: air, or where air is inside of a band, a value beyond the bands."""
     air = float(AIR_HU) if dtype.kind == "f" else float(max(AIR_HU, np.iinfo(dtype).min))
     if not any(low <= air <= high for low, high in bands):
         return air

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 from clrecon.errors import UsageError
 
-__all__ = ["REGION_FORMS", "RegionRule", "parse_region_rules"]
-
 REGION_FORMS = "box:X0,X1,Y0,Y1,Z0,Z1, hu:LO,HI, label:FILE:NAME, mask:FILE, seed:X,Y,Z, tube:MM and tube:MM:FILE"
 """The forms of a region rule, for messages and help."""
 

@@ -18,8 +18,6 @@ from clrecon.errors import ClreconError
 if TYPE_CHECKING:
     from clrecon.system.files import StagedFile
 
-__all__ = ["error_as_dict", "peak_memory_bytes", "platform_name", "to_json", "stage_report"]
-
 
 def to_json(value: Any, indent: int | None = 2) -> str:
     """Return strict JSON (ASCII): numpy values become plain ones, NaN and infinities become null."""

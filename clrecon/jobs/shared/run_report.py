@@ -7,8 +7,6 @@ from typing import Any
 
 from clrecon.system.records import Record
 
-__all__ = ["RunReport"]
-
 
 class RunReport(Record):
     """The entries that all reports share; each report is a dataclass with these fields and its own, in JSON order.

@@ -13,8 +13,6 @@ from clrecon.reading import Selection
 if TYPE_CHECKING:
     from clrecon.geometry.boxes import Box
 
-__all__ = ["InputSettings"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class InputSettings(Selection):

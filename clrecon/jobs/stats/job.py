@@ -21,8 +21,6 @@ from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.targets import keep_existing
 
-__all__ = ["measure_stats"]
-
 log = get_logger(__name__)
 
 

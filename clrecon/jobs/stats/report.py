@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from clrecon.jobs.stats.settings import StatsSettings
     from clrecon.labels.statistics import LabelFigures
 
-__all__ = ["StatsReport", "as_csv", "describe_stats"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StatsReport(Record):

@@ -9,8 +9,6 @@ from pathlib import Path
 from clrecon.labels.statistics import PERCENTILES, check_percentiles
 from clrecon.reading import Selection
 
-__all__ = ["StatsSettings"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class StatsSettings(Selection):

@@ -8,8 +8,6 @@ from pathlib import Path
 from clrecon.errors import UsageError
 from clrecon.jobs.shared.outputs import check_distinct, check_kept
 
-__all__ = ["NIFTI", "SEGMENTATION", "check_files", "map_format", "picture_beside"]
-
 NIFTI, SEGMENTATION = ("nii", "nii.gz"), ("dcm",)
 
 

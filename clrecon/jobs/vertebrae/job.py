@@ -23,8 +23,6 @@ from clrecon.system.targets import keep_existing
 if TYPE_CHECKING:
     from clrecon.labels import LabelMap
 
-__all__ = ["make_vertebrae"]
-
 log = get_logger(__name__)
 
 

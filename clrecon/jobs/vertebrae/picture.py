@@ -14,8 +14,6 @@ from clrecon.rendering.pictures.pillow import load_font, load_pillow
 if TYPE_CHECKING:
     from clrecon.vertebrae import VertebraSplit
 
-__all__ = ["draw_vertebrae"]
-
 PIXELS_PER_MM = 3
 WINDOW_HU = (-150.0, 650.0)
 TINT = 0.35

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from clrecon.jobs.vertebrae.settings import VertebraeSettings
     from clrecon.vertebrae import VertebraSplit
 
-__all__ = ["VertebraeReport", "describe_split"]
-
 
 @dataclass(frozen=True, eq=False)
 class VertebraeReport(Record):

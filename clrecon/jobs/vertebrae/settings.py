@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from clrecon.errors import UsageError
 from clrecon.reading import Selection
 
-__all__ = ["VertebraeSettings"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class VertebraeSettings(Selection):

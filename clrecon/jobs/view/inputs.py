@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from clrecon.labels import LabelMap
     from clrecon.points import PointCloud
 
-__all__ = ["OpenedInput", "open_inputs"]
-
 _MOST_LABELS = 1000
 """Values up to which whole numbers from 0 are taken for labels; air of a CT is negative."""
 

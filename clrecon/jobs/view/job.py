@@ -35,8 +35,6 @@ from clrecon.version import package_version
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
 
-__all__ = ["is_mesh_file", "write_view"]
-
 log = get_logger(__name__)
 
 _OF_THE_MACHINE = ("device", "memory", "space", "keep_ids")

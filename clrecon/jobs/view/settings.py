@@ -8,8 +8,6 @@ from dataclasses import dataclass, field, replace
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.settings import MeshSettings
 
-__all__ = ["ViewSettings"]
-
 MOST_NAME = 80
 
 

@@ -10,8 +10,6 @@ from clrecon.jobs.shared.settings import InputSettings
 from clrecon.jobs.view.settings import ViewSettings
 from clrecon.system.wording import name_parameter
 
-__all__ = ["check_view_settings"]
-
 _OF_A_VIEW = {"iso_value", "preset", "half_way", "space", "labels", "one_file"}
 """Settings of meshes that a view has a meaning for; a label map sets the last one by itself."""
 

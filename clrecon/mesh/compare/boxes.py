@@ -8,8 +8,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["meets_box"]
-
 
 def meets_box(corners: NDArray[np.float64], half: float) -> NDArray[np.bool_]:
     """Mark triangles that meet a cube around the origin, its faces included.

@@ -23,8 +23,6 @@ from clrecon.system.pieces import chunks
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
 
-__all__ = ["CellOverlap", "GridCells", "find_mesh_cells", "measure_cells"]
-
 _ROUNDINGS = 2.0
 """Steps of the coordinates by which a triangle may reach into a cell without passing through it: vertices are rounded,
 and those of marching cubes stay four steps away from the samples."""

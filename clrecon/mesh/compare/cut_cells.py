@@ -13,8 +13,6 @@ from clrecon.mesh.compare.cells import GridCells
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["SignedSurface", "find_cut_cells"]
-
 _BLOCK = 16
 """Cells along the edges of the first blocks, a power of two; those that the surface may meet are halved."""
 

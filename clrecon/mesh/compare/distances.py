@@ -16,17 +16,6 @@ from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
 
-__all__ = [
-    "SAMPLES",
-    "DistanceSummary",
-    "MeshDistance",
-    "SurfaceDistance",
-    "compare_meshes",
-    "sample_surface",
-    "sample_surface_points",
-    "summarise_distances",
-]
-
 SAMPLES = 50_000
 """Points on each surface, so that the 95th percentile is based on the 2500 largest distances."""
 

@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from clrecon.mesh.triangles import cross_product
 
-__all__ = ["FaceFrames", "rounding_of_bounds"]
-
 _ROUNDINGS = 16.0
 """Units of the last place of the largest coordinate by which a bound may be too small; each of 16 steps rounds by half
 a unit of a number that is no larger."""

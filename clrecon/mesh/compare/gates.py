@@ -6,12 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from clrecon.mesh.compare.iso_distance import METAL_HU
-from clrecon.system.gates import Gate, at_most, failed_gates, is_true, none_of, unmeasured
-
-__all__ = [
-    "DEVIATION_MEAN_VOXEL", "DEVIATION_P95_VOXEL", "LABEL_VOLUME_PERCENT", "MASK_VOLUME_PERCENT",
-    "VOLUME_CHANGE_PERCENT", "failed_gates", "judge_label_volume", "judge_mesh",
-]  # fmt: skip
+from clrecon.system.gates import Gate, at_most, is_true, none_of, unmeasured
 
 DEVIATION_P95_VOXEL = 0.25
 """Bound for 95 % of the surface, in shortest voxel steps."""

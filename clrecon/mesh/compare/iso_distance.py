@@ -17,18 +17,6 @@ from clrecon.mesh.mesh import Mesh
 from clrecon.system.pieces import chunks
 from clrecon.system.records import Record
 
-__all__ = [
-    "METAL_HU",
-    "SAMPLES",
-    "IsoDistance",
-    "distances_to_iso_surface",
-    "measure_iso_distance",
-    "rule_of_report",
-    "smallest_voxel_mm",
-    "trilinear_field",
-    "trilinear_values",
-]
-
 SAMPLES = 100_000
 """Most points; larger meshes are measured at every n-th vertex and triangle."""
 

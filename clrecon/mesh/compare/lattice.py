@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule
 
-__all__ = ["Lattice", "count_points", "exclusive_or", "find_level_runs"]
-
 _SLAB_VOXELS = 1 << 23
 """Voxels at a time: some 200 MB with what is computed from them."""
 

@@ -13,8 +13,6 @@ from clrecon.mesh.connectivity import Fans
 from clrecon.mesh.triangles import cross_product
 from clrecon.system.pieces import in_threads
 
-__all__ = ["NearDistance", "triangle_distances"]
-
 _PIECE = 1 << 13
 """Points in a piece: with six triangles each they take about 8 MB."""
 

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from clrecon.mesh.compare.lattice import Lattice
 from clrecon.system.pieces import chunks
 
-__all__ = ["find_piercings"]
-
 _PIECE = 1 << 16
 """Triangles at a time."""
 

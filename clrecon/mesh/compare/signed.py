@@ -32,11 +32,6 @@ from clrecon.system.pieces import chunks, local_origin
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
 
-__all__ = [
-    "MeshDeviation", "SideDistance", "SignedDistance", "measure_distance", "measure_vertex_distances",
-    "why_unsigned",
-]  # fmt: skip
-
 _AT_CORNER = 1e-6
 """Share of a triangle within which the nearest point counts as on its edge or at its corner."""
 

@@ -19,8 +19,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
 
-__all__ = ["FINER", "OFFSETS", "SliceOverlap", "measure_slices"]
-
 FINER = 3
 """Points of the lattice for each voxel, along each axis."""
 

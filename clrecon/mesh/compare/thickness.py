@@ -12,8 +12,6 @@ from clrecon.mesh.vtk import CellLocator
 from clrecon.system.pieces import local_origin
 from clrecon.system.records import Record
 
-__all__ = ["SAMPLES", "WallFigures", "measure_walls", "wall_thickness"]
-
 SAMPLES = 20_000
 """Points on the surface, so that the 5th percentile is based on the 1000 thinnest places."""
 

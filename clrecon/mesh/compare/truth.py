@@ -16,8 +16,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
 
-__all__ = ["REACH_MM", "TRUTH_SAMPLES", "TruthDistance", "measure_truth"]
-
 TRUTH_SAMPLES = 20_000
 """Points on the mesh; each asks the true surface seven times."""
 

@@ -22,20 +22,6 @@ from clrecon.mesh.compare.iso_distance import METAL_HU, trilinear_values
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.records import Record
 
-__all__ = [
-    "MOST_SAMPLES",
-    "WallLook",
-    "Walls",
-    "find_rails",
-    "is_straight",
-    "judge_components",
-    "judge_walls",
-    "lie_near_line",
-    "looks_like_bone",
-    "normals_of",
-    "sample_walls",
-]
-
 COMPACT_HU = 600.0
 """Compact bone reaches this below its surface; contrast medium in heart and vessels does not."""
 WALL_MM = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)

@@ -9,8 +9,6 @@ from clrecon.mesh.compare.near_distances import NearDistance
 from clrecon.mesh.refine.faults import any_corner
 from clrecon.system.pieces import in_threads
 
-__all__ = ["MIDDLES", "WITNESSES", "SurfaceBounds"]
-
 WITNESSES = 7
 """Most faces that are needed to show that a triangle is within the bound: for its corners, its middle and its edges."""
 

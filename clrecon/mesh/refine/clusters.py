@@ -16,8 +16,6 @@ from clrecon.mesh.refine.topology import TopologyChange, compare_topology, measu
 from clrecon.mesh.triangles import cross_products
 from clrecon.system.pieces import side_by_side
 
-__all__ = ["Clusters"]
-
 _FEW = 0.05
 """Share of the vertices or triangles up to which it is faster to look at the triangles around each than at all."""
 

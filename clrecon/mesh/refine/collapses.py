@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from clrecon.mesh.connectivity import order_by_number
 from clrecon.mesh.triangles import cross_product
 
-__all__ = ["Collapses", "Quadrics", "last_of_collapses"]
-
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]
 

@@ -26,11 +26,6 @@ from clrecon.mesh.refine.shifts import measure_volumes, move_vertices, restore_v
 from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress
 
-__all__ = [
-    "BOUND_VOXEL", "carry_on", "check_refinement", "check_share", "check_triangles", "decimate_mesh",
-    "default_deviation",
-]  # fmt: skip
-
 BOUND_VOXEL = 0.25
 """Default bound in shortest voxel steps; a mean of 0.1 voxel is then kept too."""
 

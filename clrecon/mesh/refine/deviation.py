@@ -14,8 +14,6 @@ from clrecon.mesh.refine.bounds import MIDDLES, SurfaceBounds
 from clrecon.mesh.refine.faults import any_corner
 from clrecon.mesh.triangles import corner_edges
 
-__all__ = ["Deviation", "MakeBounds"]
-
 _MOST_STEPS = 12
 """Most parts into which an edge of the present surface is divided for points."""
 

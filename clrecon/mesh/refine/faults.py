@@ -14,8 +14,6 @@ from clrecon.mesh.connectivity import (
     opposite_half_edges,
 )
 
-__all__ = ["any_corner", "find_faults_beside", "find_sheets", "find_torn"]
-
 IntArray = NDArray[np.integer]
 
 

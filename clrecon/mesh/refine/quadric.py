@@ -26,8 +26,6 @@ from clrecon.system.gates import Gate, none_of
 from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["collapse_quadric", "measure_farthest"]
-
 _EXACT = 64
 """Points at a time that are measured exactly."""
 

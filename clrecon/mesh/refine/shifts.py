@@ -12,8 +12,6 @@ from clrecon.mesh.connectivity import find_edges, label_components
 from clrecon.mesh.intersections import FindCrossings, find_changed_intersections, find_self_intersections
 from clrecon.mesh.triangles import cross_products
 
-__all__ = ["Volumes", "measure_volumes", "move_vertices", "restore_volumes", "shorten_steps"]
-
 _VOLUME_STEPS = 4
 """Newton steps along the normals; the first leaves about a hundredth of the missing volume."""
 

@@ -21,8 +21,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["smooth_mesh"]
-
 _PASS_BAND = 0.1
 """Pass band of the windowed sinc filter.  On CT at 0.7 mm and 20 iterations the surface moves by a mean of 0.05 voxel
 and by 0.15 at the 95th percentile; half the pass band loses more than 0.5 % of the volume."""

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from clrecon.mesh.connectivity import Edges, find_edges
 from clrecon.system.records import Record
 
-__all__ = ["LISTED", "Topology", "TopologyChange", "compare_topology", "measure_topology"]
-
 LISTED = 20
 """Most components that are listed one by one."""
 

@@ -17,8 +17,6 @@ from pathlib import Path
 from clrecon.opencl.cache.folders import prepare_caches
 from clrecon.system.log import get_logger
 
-__all__ = ["binary_key", "read_binary", "store_binary"]
-
 log = get_logger(__name__)
 
 _MAGIC = b"clrecon kernels 2\n"

@@ -25,16 +25,6 @@ try:
 except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
-__all__ = [
-    "ROOM_BYTES",
-    "Caches",
-    "cache_warnings",
-    "find_fault",
-    "make_private",
-    "prepare_caches",
-    "refuse_short_files",
-]
-
 ROOM_BYTES = 64 << 20
 """Room that a folder of built kernels must have.  All kernels for one device take 12 MB; PoCL ends the process when the
 disk is full."""

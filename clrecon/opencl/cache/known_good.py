@@ -36,8 +36,6 @@ from clrecon.system.log import get_logger
 if sys.platform != "win32":
     import fcntl
 
-__all__ = ["DAMAGED", "UNFINISHED", "KnownGood", "known_good"]
-
 log = get_logger(__name__)
 
 DAMAGED = "kept kernels are damaged: they are not used, and built anew"

@@ -39,8 +39,6 @@ from clrecon.operators.resident.voxel_types import voxel_variants
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["Filtered", "filter_bilateral", "prepare_bilateral", "run_bilateral"]
-
 VolumeKind = TypeVar("VolumeKind", Volume, DeviceVolume)
 
 GROUP = kernel_constant("filters/bilateral.cl", "GROUP")

@@ -22,8 +22,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.installing import install_command
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["DENOISERS", "filter_volume"]
-
 VolumeKind = TypeVar("VolumeKind", Volume, DeviceVolume)
 
 SHEARED_DEGREES = 0.1

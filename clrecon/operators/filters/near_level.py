@@ -12,8 +12,6 @@ from clrecon.opencl import Device, Program, Stopwatch, allocate, kernel_constant
 from clrecon.operators.primitives.compact import Compacted, compact, prepare_compact
 from clrecon.operators.resident.voxel_types import voxel_variants
 
-__all__ = ["GROUP", "SlicesThere", "list_mixed_groups", "mixed_group_bytes", "prepare_near_level", "row_words"]
-
 GROUP = kernel_constant("filters/near_level.cl", "GROUP")
 """Voxels of a group."""
 

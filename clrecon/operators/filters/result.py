@@ -11,8 +11,6 @@ from clrecon.geometry import Volume
 from clrecon.geometry.certificate import amend
 from clrecon.operators.resident.device_volume import DeviceVolume
 
-__all__ = ["finish_result", "report_filter"]
-
 
 def report_filter(volume: Volume, voxels: NDArray[Any], facts: dict[str, Any], warnings: Sequence[str]) -> Volume:
     """Return a volume with filtered voxels, and one step more in ``report["filtered"]``.

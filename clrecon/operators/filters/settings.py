@@ -14,8 +14,6 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import LARGEST_INTEGER, checked_iso_value
 from clrecon.operators.filters.window import Window, choose_window
 
-__all__ = ["BilateralSettings", "checked_length"]
-
 NOISE_FACTOR = 3.0
 """Sigma of the differences over the noise, where it is not given."""
 

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 
-__all__ = ["LARGEST_REACH", "Window", "choose_window"]
-
 LARGEST_REACH = 14
 """Most voxels from the middle of a window to its end, along each axis: with two rings, a group of 16."""
 

@@ -14,8 +14,6 @@ from clrecon.opencl import Device, Program, Stopwatch, allocate, kernel_constant
 from clrecon.operators.masks.band_mask import VoxelMask
 from clrecon.points.stencil import SLACK, Lattice, Stencil, make_stencil
 
-__all__ = ["ball_of", "prepare_balls", "reaches_beyond", "spread_bits", "table_bytes", "whole_ball_of"]
-
 PIECE_WORDS = {
     "8": kernel_constant("masks/row_pieces.h", "CPU_PIECE_WORDS"),
     "1": kernel_constant("masks/row_pieces.h", "GPU_PIECE_WORDS"),

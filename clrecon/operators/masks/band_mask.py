@@ -20,17 +20,6 @@ from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import say_band
 from clrecon.system.wording import name_parameter
 
-__all__ = [
-    "VoxelMask",
-    "band_bounds",
-    "check_shape",
-    "checked_band",
-    "mark_band",
-    "mark_voxels",
-    "mask_bytes",
-    "zero_words",
-]
-
 LONGEST_ROW = 65_535
 """Most voxels in a row: columns of runs have 16 bits."""
 

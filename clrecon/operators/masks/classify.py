@@ -8,8 +8,6 @@ from numpy.typing import DTypeLike
 from clrecon.opencl import Device, Program, load_program
 from clrecon.operators.resident.voxel_types import voxel_variants
 
-__all__ = ["prepare_classify"]
-
 
 def prepare_classify(device: Device, dtype: DTypeLike = np.int16, inside: str = "above") -> Program:
     """Build the kernels for volumes of `dtype`; `inside` as in `IsoRule.inside`."""

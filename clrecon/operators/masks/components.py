@@ -16,8 +16,6 @@ from clrecon.operators.masks.morphology import MaskShapes
 from clrecon.operators.masks.runs import Components, find_components, mark_at_border, mark_with_voxels, write_runs
 from clrecon.system.arguments import explains_arguments
 
-__all__ = ["MaskComponents"]
-
 Bits = TypeVar("Bits", bound="MaskComponents")
 
 

@@ -26,8 +26,6 @@ from clrecon.system.wording import name_parameter
 LEAST_SAID_ML = 0.1
 """Smaller spaces that stay open are in the report alone."""
 
-__all__ = ["AIR_LIMIT_HU", "LARGEST_MARROW_MM", "SEAL_MM", "fill_enclosed"]
-
 SEAL_MM, LARGEST_SEAL_MM = 2.5, 3.0
 """Radius of the balls that close pores and vessels of the cortex, and the largest, for coarse voxels: at levels of bone
 the thin cortex of vertebrae has openings of up to 5 mm.  Between centres of voxels the ball closes every pore up to

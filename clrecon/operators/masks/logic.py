@@ -21,8 +21,6 @@ from clrecon.opencl import (
 from clrecon.operators.masks.band_mask import VoxelMask
 from clrecon.operators.resident.voxel_types import voxel_variants
 
-__all__ = ["OPERATIONS", "combine", "count_bits", "find_extents", "invert", "prepare_logic", "replace_outside"]
-
 OPERATIONS = {
     "and": kernel_constant("masks/logic.cl", "OPERATION_AND"),
     "or": kernel_constant("masks/logic.cl", "OPERATION_OR"),

@@ -25,8 +25,6 @@ from clrecon.system.text import say_band
 if TYPE_CHECKING:  # label maps load pydicom, which others need not wait for
     from clrecon.labels import LabelMap
 
-__all__ = ["Mask"]
-
 
 class Mask(MaskComponents):
     """Voxels of a volume that are chosen: one bit each, on a device, in the frame of the volume.

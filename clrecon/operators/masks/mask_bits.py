@@ -14,8 +14,6 @@ from clrecon.operators.masks import logic
 from clrecon.operators.masks.band_mask import VoxelMask, mask_bytes
 from clrecon.system.text import say_digits
 
-__all__ = ["MaskBits"]
-
 PLACE_TOLERANCE_MM = 0.01
 """Voxels of two volumes that lie as close are the same."""
 

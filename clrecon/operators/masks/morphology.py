@@ -16,8 +16,6 @@ from clrecon.operators.masks.regions import checked_mm
 from clrecon.points.stencil import SLACK, Stencil
 from clrecon.system.arguments import explains_arguments
 
-__all__ = ["MaskShapes"]
-
 Shapes = TypeVar("Shapes", bound="MaskShapes")
 
 

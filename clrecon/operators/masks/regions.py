@@ -13,8 +13,6 @@ from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array, checked_points
 from clrecon.points.stencil import SLACK
 
-__all__ = ["BOX_SLACK_MM", "RowSpans", "box_spans", "checked_box", "checked_mm", "tube_spans"]
-
 Ends = tuple[Float64Array, Float64Array]
 
 BOX_SLACK_MM = 1e-6

@@ -16,21 +16,6 @@ from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
 from clrecon.operators.primitives.union_find import join_parts, prepare_components
 from clrecon.points.stencil import Stencil
 
-__all__ = [
-    "PARTS_PER_CORE",
-    "Components",
-    "RowRuns",
-    "StencilTable",
-    "count_runs",
-    "find_components",
-    "join_runs",
-    "list_runs",
-    "mark_at_border",
-    "mark_with_voxels",
-    "prepare_runs",
-    "write_runs",
-]
-
 PARTS_PER_CORE = 4
 """Parts of the rows for each core of a CPU device, so that all cores are busy to the end."""
 

@@ -15,8 +15,6 @@ from clrecon.operators.masks.band_mask import mask_bytes, zero_words
 from clrecon.operators.masks.mask import Mask
 from clrecon.operators.masks.runs import Components, find_components, mark_with_voxels, write_runs
 
-__all__ = ["Spaces", "find_joints", "find_spaces"]
-
 WIDE_ML = 20.0
 """Smaller spaces are not wide: even a slice of 5 mm through a ball of 35 mm has 19 ml."""
 

@@ -33,8 +33,6 @@ from clrecon.points.features import VARIATION_OF_FEATURES, distance_ratios, find
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 
-__all__ = ["FEATURES", "denoise_points", "prepare_bilateral"]
-
 FEATURES = ("paper", "variation")
 """Ways to tell features: paper B's ratio of distances, and the surface variation."""
 

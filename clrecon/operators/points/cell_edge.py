@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from clrecon.operators.points.grid import MOST_CELLS_ALONG, find_box
 
-__all__ = ["choose_cell_edge"]
-
 CANDIDATES = 5.6
 """Points in 27 cells for each neighbour that is searched: fewer send points to farther cells, more are compared in
 vain."""

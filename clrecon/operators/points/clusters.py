@@ -27,8 +27,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 from clrecon.system.wording import name_parameter
 
-__all__ = ["Clustering", "cluster_points"]
-
 DEFAULT_MIN_SAMPLES = 6
 
 PLANE_PLUS_ONE = "plane+1"

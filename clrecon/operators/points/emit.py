@@ -32,8 +32,6 @@ from clrecon.operators.surface.slabs import OUTPUT_SHARE
 from clrecon.points.cloud import MOST_POINTS
 from clrecon.system.progress import Progress
 
-__all__ = ["Selection", "VoxelEmission", "prepare_voxels"]
-
 POINT_BYTES = 20
 """Bytes of a point: place, HU, number of the voxel."""
 

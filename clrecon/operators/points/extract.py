@@ -29,8 +29,6 @@ from clrecon.system.wording import name_parameter
 if TYPE_CHECKING:  # label maps load pydicom, which other clouds need not wait for
     from clrecon.labels import LabelMap
 
-__all__ = ["extract_points"]
-
 Band = tuple[float, float]
 
 

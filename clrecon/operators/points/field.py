@@ -31,8 +31,6 @@ from clrecon.operators.points.field_signs import Masks, Signs
 from clrecon.operators.points.grid import CELL_ROUNDING, GridPlan, fill_grid, plan_grid
 from clrecon.operators.primitives.compact import compact, prepare_compact
 
-__all__ = ["MOST_NODES", "FieldSettings", "Nodes", "NodeField", "plan_nodes", "prepare_field"]
-
 BRICK = tuple(kernel_constant("points/field.cl", name) for name in ("BRICK_LONG", "BRICK_WIDE", "BRICK_WIDE"))
 BRICK_ROWS = kernel_constant("points/field.cl", "BRICK_ROWS")
 BRICK_BYTES = 4 * kernel_constant("points/field.cl", "BRICK_NODES")

@@ -24,8 +24,6 @@ from clrecon.opencl import (
 from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
 from clrecon.operators.primitives.union_find import label_components, prepare_components
 
-__all__ = ["Masks", "Signs", "decide_signs", "prepare_signs"]
-
 
 def prepare_signs(device: Device) -> Program:
     """Build the kernels of `decide_signs`."""

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CUBE", "Walls", "count_bits", "find_walls"]
-
 CUBE = 32
 """Nodes along an edge of the cubes in which walls are counted: those of a word."""
 

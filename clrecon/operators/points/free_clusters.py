@@ -41,8 +41,6 @@ from clrecon.operators.primitives.union_find import hook_in_rounds, prepare_comp
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.wording import name_parameter
 
-__all__ = ["FreeClusters", "cluster_free_points", "find_clusters", "plan_cells", "prepare_clusters"]
-
 EPS_TOLERANCE = 1e-6
 """Distances up to eps times one more than this are within eps."""
 

@@ -21,8 +21,6 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.voxel_types import voxel_variants
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["find_gradients", "prepare_gradients"]
-
 GRADIENTS = "gradients"
 """Purpose by which slabs are planned."""
 

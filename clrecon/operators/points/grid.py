@@ -29,21 +29,6 @@ from clrecon.operators.primitives.radix_sort import prepare_sort, radix_sort, so
 from clrecon.operators.primitives.scan import exclusive_scan
 from clrecon.points.cells import MARGIN
 
-__all__ = [
-    "CELL_ROUNDING",
-    "MOST_CELLS",
-    "MOST_CELLS_ALONG",
-    "MOST_PAIRS",
-    "PADDING",
-    "GridPlan",
-    "PointGrid",
-    "fill_grid",
-    "find_box",
-    "make_grid",
-    "plan_grid",
-    "prepare_grid",
-]
-
 STEPS_A_POINT = 16
 """Steps with each point of a cloud that a work-item may make where all others are candidates: four passes at least."""
 

@@ -31,17 +31,6 @@ from clrecon.points import PointCloud
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = [
-    "MOST_NEIGHBOURS",
-    "NeighbourSearch",
-    "Neighbours",
-    "Part",
-    "check_neighbours",
-    "find_neighbours",
-    "prepare_neighbours",
-    "take_points",
-]
-
 BATCH_CELLS = kernel_constant("points/neighbours.cl", "BATCH_CELLS")
 """Cells a work-item on a CPU."""
 

@@ -33,8 +33,6 @@ from clrecon.system.progress import Progress
 from clrecon.system.text import say_share
 from clrecon.system.wording import name_parameter
 
-__all__ = ["PlaneFits", "estimate_normals", "prepare_normals"]
-
 FEWEST_NEIGHBOURS = 3
 """Three points lie in a plane."""
 

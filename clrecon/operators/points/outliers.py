@@ -27,8 +27,6 @@ from clrecon.points import PointCloud, PointStep
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 
-__all__ = ["DistanceMeasure", "prepare_outliers", "remove_outliers"]
-
 
 def prepare_outliers(device: Device) -> Program:
     """Build the kernel of `remove_outliers`, but for those that search neighbours."""

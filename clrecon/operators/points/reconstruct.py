@@ -23,8 +23,6 @@ from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import say_share
 from clrecon.system.wording import name_parameter
 
-__all__ = ["reconstruct_surface"]
-
 FEWEST_POINTS = 4
 """Fewest points that can enclose anything."""
 

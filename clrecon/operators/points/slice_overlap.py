@@ -13,8 +13,6 @@ from clrecon.points.ghost_slices import GhostSlices, judge_slices
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 
-__all__ = ["count_overlaps", "find_ghost_slices", "prepare_slice_overlap"]
-
 
 def prepare_slice_overlap(device: Device) -> Program:
     """Build the kernel of `count_overlaps`."""

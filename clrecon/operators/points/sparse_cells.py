@@ -35,8 +35,6 @@ from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import say_share
 from clrecon.system.wording import name_parameter
 
-__all__ = ["REASONS", "choose_edge", "grow_cells", "prepare_sparse_cells", "remove_sparse_cells"]
-
 REASONS = ("sparse cell", "not reached by growth", "smaller component")
 
 NEIGHBOURS = 16

@@ -28,8 +28,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.wording import name_parameter
 
-__all__ = ["choose_points", "prepare_thin", "thin_points"]
-
 REASON = "thinned"
 
 

@@ -32,15 +32,6 @@ from clrecon.operators.masks.runs import (
 )
 from clrecon.points.stencil import Stencil
 
-__all__ = [
-    "MOST_SAMPLES",
-    "ClusterSearch",
-    "checked_min_samples",
-    "pad_for",
-    "prepare_voxel_clusters",
-    "search_bytes",
-]
-
 MOST_SAMPLES = 255
 """Largest min_samples: counters have 8 bits."""
 

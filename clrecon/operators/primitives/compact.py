@@ -9,8 +9,6 @@ from clrecon.errors import UsageError
 from clrecon.opencl import Device, Program, Stopwatch, allocate, kernel_constant, launch, load_program
 from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
 
-__all__ = ["Compacted", "compact", "prepare_compact"]
-
 LARGEST_MASK = 2**27
 
 COMPACT_WORDS = kernel_constant("primitives/compact.cl", "COMPACT_WORDS")

@@ -9,8 +9,6 @@ from clrecon.errors import UsageError
 from clrecon.opencl import Device, Program, Stopwatch, allocate, kernel_constant, launch, load_program
 from clrecon.operators.primitives.scan import LARGEST_SCAN, exclusive_scan, prepare_scan
 
-__all__ = ["Sorted", "prepare_sort", "radix_sort", "sort_bytes"]
-
 RADIX_BITS = kernel_constant("primitives/radix_sort.cl", "RADIX_BITS")
 """Bits of a digit, at most."""
 

@@ -10,8 +10,6 @@ import numpy as np
 from clrecon.errors import UsageError
 from clrecon.opencl import Device, Program, Stopwatch, allocate, download, kernel_constant, launch, load_program
 
-__all__ = ["LARGEST_SCAN", "Scanned", "enqueue_scan", "exclusive_scan", "prepare_scan"]
-
 SCAN_PER_ITEM = kernel_constant("primitives/scan.cl", "SCAN_PER_ITEM")
 """Elements a work-item."""
 

@@ -24,8 +24,6 @@ from clrecon.opencl import (
 from clrecon.operators.primitives.compact import Compacted, compact, prepare_compact
 from clrecon.operators.primitives.scan import LARGEST_SCAN, exclusive_scan
 
-__all__ = ["hook_in_rounds", "join_parts", "label_components", "prepare_components"]
-
 LARGEST_MESH = 2**32 - 1
 """Most triangles, so that 32 bits can count them."""
 

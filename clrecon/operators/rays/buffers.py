@@ -14,8 +14,6 @@ from clrecon.operators.rays.ray_view import TILE
 from clrecon.rendering import Lighting
 from clrecon.rendering.looks.colors import find_color
 
-__all__ = ["HIGHLIGHTS", "Between", "DrawnVolume", "PictureBuffers", "count_queues", "highlight_table"]
-
 HIGHLIGHTS = kernel_constant("rays/shade.h", "HIGHLIGHTS")
 """Entries of the table of highlights."""
 

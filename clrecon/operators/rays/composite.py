@@ -23,8 +23,6 @@ from clrecon.rendering.looks.label_style import LabelStyle
 from clrecon.rendering.looks.steepness import PARTS, Steepness
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["NODES", "MainWay", "TransferTables", "composite_slab", "enter_tiles", "look_ahead"]
-
 NODES = kernel_constant("rays/steep_segments.h", "NODES")
 """Entries of a transfer function's table."""
 

@@ -7,8 +7,9 @@ import math
 import numpy as np
 
 from clrecon.anatomy.surroundings import LEFT_OUT
+from clrecon.geometry.base import AIR_HU
 from clrecon.geometry.grid import Grid
-from clrecon.geometry.volume import AIR_HU, Volume
+from clrecon.geometry.volume import Volume
 from clrecon.labels import resample_labels
 from clrecon.operators.rays.slices import choose_slices
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -16,8 +17,6 @@ from clrecon.rendering.looks.label_style import LabelStyle
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.pictures.styles import Projection, SlicesInSpace, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.seen import ShownLabels, find_seen_box
-
-__all__ = ["framing_key", "shown_box"]
 
 MASKED_BY = ("field_of_view", "remove_table", "region", LEFT_OUT)
 """Entries of the report of a volume of which a part was turned into air, or left out."""

@@ -29,8 +29,6 @@ from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["LAYERS", "PIXEL_BYTES", "LayeredPicture", "Still", "draw_layers"]
-
 LAYERS = 16
 """Most layers of a picture."""
 

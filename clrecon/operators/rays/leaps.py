@@ -15,8 +15,6 @@ from clrecon.operators.rays.slabs import LeapMap, RaySlab
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.frame import BOX_BORDER, enclose
 
-__all__ = ["find_leaps", "measure_cells"]
-
 ROWS_AT_ONCE = kernel_constant("rays/leaps.cl", "ROWS_AT_ONCE")
 """Rows of bricks for each work-item."""
 

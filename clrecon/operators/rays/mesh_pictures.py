@@ -16,8 +16,6 @@ from clrecon.operators.rays.triangles import MOST_TRIANGLES, MeshPart
 from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.system.text import say_digits
 
-__all__ = ["box_around", "make_part", "mesh_corners"]
-
 FARTHEST_MM = 1e9
 """Largest coordinate of a vertex: a thousand kilometres, as of cameras; products of two fit float32."""
 

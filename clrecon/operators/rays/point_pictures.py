@@ -25,8 +25,6 @@ from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
 from clrecon.system.wording import name_parameter
 
-__all__ = ["PointPictures", "cloud_box"]
-
 LONE_POINT_MM = 1.0
 """Radius of the discs of clouds that have no spacing; of others it is their mean spacing, which leaves few gaps."""
 

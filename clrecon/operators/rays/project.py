@@ -11,8 +11,6 @@ from clrecon.operators.rays.ray_view import RayView
 from clrecon.operators.rays.slabs import RaySlab
 from clrecon.operators.resident.device_volume import DeviceVolume
 
-__all__ = ["AIR_HU", "PROJECTIONS", "project_slab"]
-
 AIR_HU = kernel_number("rays/project.cl", "AIR_HU")
 """Attenuates nothing: lower values are padding, or what a mask left."""
 

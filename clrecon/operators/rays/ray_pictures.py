@@ -32,8 +32,6 @@ from clrecon.rendering.pictures.styles import Projection, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["take_picture", "take_with_layers"]
-
 _NO_BODY = "no body was found in the scan: the lowest values are those of all of it, the air around included"
 
 

@@ -16,8 +16,6 @@ from clrecon.rendering import Lighting
 from clrecon.rendering.looks.lighting import LEAST_SOFT_GRADIENT
 from clrecon.rendering.views.camera import Camera, box_corners
 
-__all__ = ["NEAR_ROW", "TILE", "RayView"]
-
 TILE = kernel_constant("rays/view.h", "TILE")
 """Pixels along each side of a tile."""
 

@@ -26,8 +26,6 @@ from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 
-__all__ = ["VolumeRenderer", "render"]
-
 
 @explains_arguments
 def render(

@@ -32,8 +32,6 @@ from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["ScenePictures", "Subject", "check_objects"]
-
 Subject = Volume | DeviceVolume | PointCloud | Mesh
 """What a picture can show."""
 

@@ -17,20 +17,6 @@ from clrecon.opencl import Stopwatch, check_budget, kernel_constant, upload
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.rendering.views.camera import Camera
 
-__all__ = [
-    "BRICK_CELLS",
-    "FARTHEST",
-    "RAYS",
-    "LeapMap",
-    "RaySlab",
-    "choose_brick_cells",
-    "entry_slice",
-    "pad_slices",
-    "plan_ray_slabs",
-    "ray_slabs",
-    "slab_labels",
-]
-
 BRICK_CELLS = kernel_constant("rays/leap.h", "BRICK_CELLS")
 """Cells of a brick along i and j."""
 

@@ -24,8 +24,6 @@ from clrecon.rendering.pictures.styles import SlicesInSpace
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["choose_slices", "overlay_slices", "overlay_with_layers"]
-
 DEFAULT_COUNT = 12
 """Number of slices shown by default: enough to see the body, few enough to see each slice."""
 

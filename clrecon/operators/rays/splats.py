@@ -32,8 +32,6 @@ from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.progress import Progress
 
-__all__ = ["LARGEST_DISC", "SplatPicture", "draw_splats", "eye_table"]
-
 LARGEST_DISC = kernel_number("rays/splats.cl", "MOST_PIXELS")
 """Largest radius of a disc in pixels."""
 

@@ -25,8 +25,6 @@ from clrecon.rendering.pictures.styles import SurfaceLook
 from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["cast_surface"]
-
 CLOSED_BORDER = 1.0
 """Index steps beyond the outermost voxel centres within which the closed field falls to its outside value."""
 

@@ -18,8 +18,6 @@ from clrecon.operators.rays.splats import eye_table
 from clrecon.rendering import Lighting
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["MOST_TRIANGLES", "LayerKeys", "MeshPart", "Triangles"]
-
 MOST_TRIANGLES = 2**32 - 2
 """Most triangles of a picture: one number is that of no triangle."""
 

@@ -45,8 +45,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
 
-__all__ = ["Place", "VolumeRenderer"]
-
 SMALLEST_STEP = 0.01
 """Smallest ray step as a share of the smallest spacing; shorter steps only add time."""
 

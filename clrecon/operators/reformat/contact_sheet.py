@@ -22,8 +22,6 @@ from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.rendering.views.plane import plane_sheet
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["take_contact_sheet"]
-
 PARALLEL = 1.0 - 1e-6
 """Cosine above which planes of voxels lie in those of the sheet."""
 

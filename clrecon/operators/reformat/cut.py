@@ -27,9 +27,6 @@ from clrecon.rendering.views.plane import find_plane, finest_step, plane_sheet
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 
-__all__ = ["cut_slice", "reformat_curve", "take_curve", "take_cut"]
-
-
 DEFAULT_WIDTH_MM = 120.0
 """Default width of a curved reformation without a size: a vertebra with its surroundings."""
 

@@ -21,8 +21,6 @@ from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.plane import Sheet, slab_samples
 from clrecon.system.progress import Progress
 
-__all__ = ["CutJob"]
-
 
 class CutJob:
     """One picture of sheets through a volume: the device, how samples are combined, labels, and the report."""

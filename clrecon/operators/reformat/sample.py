@@ -29,8 +29,6 @@ from clrecon.rendering.pictures import styles
 from clrecon.rendering.views.plane import Sheet, SlabSamples
 from clrecon.system.progress import Progress
 
-__all__ = ["COMBINATIONS", "Reformation", "prepare_reformat", "sample_sheet"]
-
 COMBINATIONS = {name: kernel_constant("reformat/sample.cl", f"COMBINE_{name.upper()}") for name in styles.COMBINATIONS}
 """How the samples of a slab are combined: the kernel's numbers."""
 

@@ -11,8 +11,6 @@ import numpy as np
 from clrecon.opencl import Device, Program, Stopwatch, allocate, kernel_constant, launch, load_program
 from clrecon.operators.resident.voxel_types import voxel_variants
 
-__all__ = ["BRICK", "BrickRanges", "BrickStates", "brick_bytes", "compare_bricks", "measure_bricks", "prepare_bricks"]
-
 BRICK = kernel_constant("include/bricks.h", "BRICK")
 """Voxels along each side of a brick."""
 

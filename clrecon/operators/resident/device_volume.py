@@ -38,8 +38,6 @@ from clrecon.system.text import count_of
 if TYPE_CHECKING:  # label maps load pydicom, which surfaces need not wait for
     from clrecon.labels import LabelMap, ResampledLabels
 
-__all__ = ["DeviceVolume", "open_volume", "take_volume"]
-
 Made = TypeVar("Made")
 
 log = get_logger(__name__)

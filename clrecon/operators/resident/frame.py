@@ -10,8 +10,6 @@ import numpy as np
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
 
-__all__ = ["BOX_BORDER", "FieldFrame", "enclose", "volume_box"]
-
 BOX_BORDER = 0.5
 """Index steps beyond the outermost voxel centres that still belong to a volume."""
 

@@ -14,8 +14,6 @@ from clrecon.geometry.iso_rule import slice_normal_matrices
 from clrecon.opencl import Device, upload
 from clrecon.operators.resident.frame import FieldFrame
 
-__all__ = ["StackTable"]
-
 MOST_LAYERS = 1 << 16
 """Most entries of the lookup by height; with smaller gaps kernels continue from slice to slice."""
 

@@ -9,8 +9,6 @@ from numpy.typing import DTypeLike
 
 from clrecon.opencl import Device
 
-__all__ = ["label_variants", "ray_variants", "voxel_variants"]
-
 _NAMES = {
     "int8": "char", "uint8": "uchar", "int16": "short", "uint16": "ushort", "int32": "int", "float32": "float",
 }  # fmt: skip

@@ -13,8 +13,6 @@ from clrecon.operators.primitives.scan import exclusive_scan
 from clrecon.operators.surface.slabs import Slab
 from clrecon.operators.surface.trilinear import CellVertices, count_cells
 
-__all__ = ["Classified", "Counted", "count", "load_cells"]
-
 
 def load_cells(device: Device, grown: bool = False) -> Program:
     """Build the kernels, which are the same for every type of voxels; with `grown`, those for parts of a surface."""

@@ -14,8 +14,6 @@ from clrecon.operators.surface.nearest_cell import find_cell_near
 from clrecon.operators.surface.seeds import AUTO_SHARE, Seeds
 from clrecon.operators.surface.slabs import SampleGrid
 
-__all__ = ["SUMS", "Components", "Runs", "Sums", "choose_components", "prepare_choosing", "sum_components"]
-
 SUMS = {
     name: kernel_constant("surface/component_sums.h", name)
     for name in ("COMPONENTS", "CHOSEN", "ACTIVE_CELLS", "CHOSEN_CELLS", "LARGEST_LEFT_OUT", "SUMS")

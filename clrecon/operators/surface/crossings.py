@@ -28,8 +28,6 @@ from clrecon.operators.masks.band_mask import zero_words
 from clrecon.system.pieces import in_threads
 from clrecon.system.progress import Steps
 
-__all__ = ["FEWEST", "CrossingPlan", "find_crossings", "mark_crossings", "plan_crossings", "prepare_crossings"]
-
 FEWEST = 20_000
 """Meshes with fewer triangles are looked at by the host alone, in less time than the device needs to begin."""
 

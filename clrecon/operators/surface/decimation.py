@@ -12,8 +12,6 @@ from clrecon.operators.surface.near_faces import DeviceBounds
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 
-__all__ = ["decimate_mesh"]
-
 
 @explains_arguments
 def decimate_mesh(

@@ -29,8 +29,6 @@ from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
 from clrecon.system.wording import name_parameter
 
-__all__ = ["SurfaceExtractor", "extract_isosurface", "extract_isosurfaces", "prepare_isosurface"]
-
 
 class SurfaceExtractor(Closing):
     """A volume on a device, from which surfaces are extracted at one iso value after the other.

@@ -28,8 +28,6 @@ from clrecon.operators.surface.trilinear import prepare_trilinear
 from clrecon.system.progress import Progress
 from clrecon.system.text import say_hu
 
-__all__ = ["Extraction", "Part", "prepare_isosurface", "voxel_level"]
-
 Part = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]
 """Positions, normals and triangles of one slab."""
 

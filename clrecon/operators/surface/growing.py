@@ -39,8 +39,6 @@ from clrecon.operators.surface.choosing import (
 from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import SampleGrid, Slab
 
-__all__ = ["Grown", "find_components", "grow", "growing_needs", "join_slabs", "prepare_growing"]
-
 MOST_RUNS = 2**31
 
 

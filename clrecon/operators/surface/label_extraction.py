@@ -38,8 +38,6 @@ from clrecon.operators.surface.label_groups import Window, group_boxes
 from clrecon.operators.surface.marching_cubes import Placement
 from clrecon.operators.surface.slabs import SampleGrid
 
-__all__ = ["HeldSlices", "LabelExtraction", "prepare_labels"]
-
 SPARE_SLICES = 3
 """Slices needed beyond a label's box: the far end of a crossed edge, its gradient, and the last slices of the mask."""
 

@@ -11,8 +11,6 @@ from clrecon.labels.solid import Box
 from clrecon.opencl import MemoryLimits, describe_shortage
 from clrecon.operators.surface.slabs import Slab
 
-__all__ = ["Window", "each_label", "group_boxes"]
-
 Held = TypeVar("Held")
 Made = TypeVar("Made")
 

@@ -24,11 +24,9 @@ from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Part
 from clrecon.operators.surface.label_groups import each_label
 from clrecon.operators.surface.label_survey import survey_labels
-from clrecon.operators.surface.mask_extraction import HeldMap, MaskExtraction, prepare_label_masks
+from clrecon.operators.surface.mask_extraction import HeldMap, MaskExtraction
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
-
-__all__ = ["extract_label_masks", "prepare_label_masks", "warn_of_volume"]
 
 
 @explains_arguments

@@ -29,8 +29,6 @@ from clrecon.opencl import (
 )
 from clrecon.operators.resident.voxel_types import label_variants
 
-__all__ = ["prepare_survey", "survey_labels"]
-
 
 def prepare_survey(device: Device, label_dtype: DTypeLike = np.uint8) -> Program:
     """Build the kernels for labels of this type."""

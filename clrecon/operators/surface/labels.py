@@ -22,12 +22,10 @@ from clrecon.opencl import (
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Part
-from clrecon.operators.surface.label_extraction import HeldSlices, LabelExtraction, prepare_labels
+from clrecon.operators.surface.label_extraction import HeldSlices, LabelExtraction
 from clrecon.operators.surface.label_groups import each_label
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
-
-__all__ = ["extract_labels", "prepare_labels"]
 
 _FILLS = "the whole CT is inside of it, and a surface that ends open has nowhere to lie; close it"
 

@@ -32,17 +32,6 @@ from clrecon.operators.surface.cells import Classified, Counted, load_cells
 from clrecon.operators.surface.slabs import Slab
 from clrecon.operators.surface.trilinear import emit_cells
 
-__all__ = [
-    "Emission",
-    "Placement",
-    "check_row",
-    "classify",
-    "emit",
-    "pad4",
-    "prepare_marching_cubes",
-    "split_steps",
-]
-
 LONGEST_ROW = 13_000
 """Most samples in a row: indices in a row have 16 bits, and a cell has up to 5 triangles."""
 

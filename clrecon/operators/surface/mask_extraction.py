@@ -43,8 +43,6 @@ from clrecon.operators.surface.label_groups import Window, group_boxes
 from clrecon.operators.surface.marching_cubes import Placement
 from clrecon.operators.surface.slabs import SampleGrid
 
-__all__ = ["HeldMap", "MaskExtraction", "prepare_label_masks"]
-
 SPARE_SLICES = 3 + REACH
 """Slices needed beyond a label's box: slices of the mask, gradients, and their occupancy."""
 

@@ -26,8 +26,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 from clrecon.system.wording import name_parameter
 
-__all__ = ["DECIMATED_SHARE", "METHODS", "Method", "check_method", "extract_by_method"]
-
 DECIMATED_SHARE = 0.9
 """Share of the triangles that G-MC and S-MC take away, if none is given."""
 

@@ -24,8 +24,6 @@ from clrecon.opencl import (
 )
 from clrecon.system.pieces import chunks
 
-__all__ = ["DeviceBounds", "prepare_near_faces"]
-
 PART = 1 << 20
 """Points or triangles of a launch: each stays short, and its arrays fit beside the surface."""
 

@@ -11,8 +11,6 @@ from clrecon.operators.surface.cells import Classified
 from clrecon.operators.surface.seeds import SEED_REACH_MM
 from clrecon.operators.surface.slabs import SampleGrid
 
-__all__ = ["find_cell_near"]
-
 FARTHEST_TOLD_MM = 50.0
 """Of a seed in air the nearest cell is looked for up to here, for the message."""
 

@@ -14,8 +14,6 @@ from clrecon.geometry import Volume
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.system.wording import name_parameter
 
-__all__ = ["AUTO", "AUTO_SHARE", "SEED_REACH_MM", "Seeds", "check_points", "pack_seeds"]
-
 AUTO = "auto"
 """Word for: the components with at least `AUTO_SHARE` of the cells of the largest."""
 

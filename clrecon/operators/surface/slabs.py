@@ -11,8 +11,6 @@ from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.iso_rule import IsoRule
 from clrecon.operators.resident.device_volume import DeviceVolume
 
-__all__ = ["BRICKS", "SampleGrid", "Slab", "plan_slabs"]
-
 BRICKS = "brick ranges"
 """Name of the object that surfaces keep for a whole volume."""
 

@@ -19,8 +19,6 @@ from clrecon.geometry.iso_rule import IsoRule
 from clrecon.geometry.vertex_rules import linear_fraction
 from clrecon.opencl.sources import read_kernel_source
 
-__all__ = ["extract_soup", "weld"]
-
 CORNERS = np.array([(c & 1, c >> 1 & 1, c >> 2) for c in range(8)])
 """(x, y, z) of each corner of a cell."""
 

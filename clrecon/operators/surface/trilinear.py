@@ -23,8 +23,6 @@ from clrecon.operators.primitives.scan import exclusive_scan
 from clrecon.operators.resident.voxel_types import voxel_variants
 from clrecon.operators.surface.slabs import Slab
 
-__all__ = ["LONGEST_ROW", "CellVertices", "check_row", "count_cells", "emit_cells", "prepare_trilinear"]
-
 LONGEST_ROW = 2_970
 """Most samples in a row: indices in a row have 16 bits, and a cell has up to 22 triangles."""
 

@@ -14,8 +14,6 @@ from clrecon.labels import LabelMap
 from clrecon.labels.resample import check_together, warn_of_place
 from clrecon.labels.solid import find_boxes
 
-__all__ = ["LabelCrop", "crop_label"]
-
 SPARE_VOXELS = 3
 """Voxels beyond the distances that are asked for, so that nothing round the label touches the end of the crop."""
 

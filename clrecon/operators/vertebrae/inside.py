@@ -28,8 +28,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.text import say_volume
 from clrecon.system.wording import name_parameter
 
-__all__ = ["DENSE_HU", "PARTS", "VertebraInside", "name_band", "vertebra_inside"]
-
 DENSE_HU = (450.0, None)
 """Band of dense bone: from half way between thin cortex (850 HU) and soft tissue on."""
 

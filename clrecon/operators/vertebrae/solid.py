@@ -22,8 +22,6 @@ from clrecon.operators.vertebrae.crop import LabelCrop, crop_label
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.text import say_hu
 
-__all__ = ["CLOSE_MM", "label_margin", "make_solid", "vertebra_solid"]
-
 CLOSE_MM = 1.5
 """Radius of the balls that close pores and vessels of the cortex."""
 

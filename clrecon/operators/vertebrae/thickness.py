@@ -9,8 +9,6 @@ import numpy as np
 from clrecon.operators.masks.mask import Mask
 from clrecon.system.records import Record
 
-__all__ = ["MOST_RADIUS_MM", "ShellThickness", "measure_thickness"]
-
 MOST_RADIUS_MM = 8.0
 """Bone in which larger balls fit is no shell any more."""
 

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 
-__all__ = ["filter_bilateral", "spatial_weights"]
-
 
 def spatial_weights(volume: Volume, offsets: NDArray[np.integer[Any]], sigma_mm: float) -> NDArray[np.float64]:
     """Return the weights of neighbours by their true distance, exp(-|t|^2 / (2 sigma^2)).

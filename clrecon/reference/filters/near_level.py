@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["GROUP", "mark_mixed_groups"]
-
 GROUP = 16
 """Voxels of a group, along i."""
 

@@ -8,8 +8,6 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.geometry import Volume
 from clrecon.reference.masks.regions import find_places
 
-__all__ = ["close", "dilate", "erode", "open_up"]
-
 Bits = NDArray[np.bool_]
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["fill_holes", "grow"]
-
 
 def fill_holes(chosen: ArrayLike, by_slice: bool = False) -> NDArray[np.bool_]:
     """Return the chosen voxels and those that they enclose, (nk, nj, ni): what a flood from beyond never meets."""

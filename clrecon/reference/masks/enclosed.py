@@ -9,8 +9,6 @@ from clrecon.geometry import Volume
 from clrecon.reference.masks import balls
 from clrecon.reference.masks.components import fill_holes
 
-__all__ = ["dilate_within", "find_filled"]
-
 Bits = NDArray[np.bool_]
 
 

@@ -9,8 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.geometry import Volume
 
-__all__ = ["find_in_box", "find_in_tube", "find_places"]
-
 
 def find_places(volume: Volume, border: tuple[int, int, int] = (0, 0, 0)) -> NDArray[np.float64]:
     """Return LPS mm of all voxels, and of as many beyond them along i, j and k as `border` says, (nk, nj, ni, 3)."""

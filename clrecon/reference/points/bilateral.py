@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LEAST_RANGE_MM", "bilateral_factors", "cell_factors", "denoise_points", "filter_scales"]
-
 LEAST_RANGE_MM = 1e-6
 """Where sigma_s is smaller, the neighbours lie in the plane already, and the point stays."""
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["cluster_points"]
-
 
 def cluster_points(points: ArrayLike, eps: float, min_samples: int) -> tuple[int, NDArray[np.int32], NDArray[np.bool_]]:
     """Cluster points by DBSCAN in float64.

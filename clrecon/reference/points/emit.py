@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 
-__all__ = ["extract_voxels", "mark_shell"]
-
 
 def mark_shell(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mark those of the marked voxels that have one of their six neighbours outside; beyond the ends all is outside."""

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FAR", "FieldTwin", "SignsTwin", "decide_signs", "fill_nodes", "find_walls", "measure_field"]
-
 FAR = np.float32(np.inf)
 """Squared distance of nodes that no point reaches."""
 

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from clrecon.reference.points.grid import GridTwin, find_cells
 
-__all__ = ["NO_CELL", "SEVERAL_ROOTS", "count_pairs", "join_chunks", "note_words"]
-
 NO_CELL = np.uint32(0xFFFFFFFF)
 """Label of a cell without core points, and root of a word without core cells."""
 

@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 
-__all__ = ["find_gradients"]
-
 
 def _values(voxels: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the trilinear field of padded voxels at index coordinates of the volume."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["find_neighbours", "float32_distances"]
-
 ROWS_AT_ONCE = 256
 
 SPARE = 16

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["orient_by_gradients", "orient_from", "principal_axes"]
-
 NO_WIDTH = 4e-6
 """Sum of the products of two eigenvalues, as a share of the squared trace, up to which points lie in a line."""
 

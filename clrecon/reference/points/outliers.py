@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["find_outliers", "mean_distances"]
-
 
 def mean_distances(distances: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the mean distance of each point to its others: distances (n, k) without the first, its own."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["count_overlaps"]
-
 
 def count_overlaps(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Count the voxels of each slice, and those that it has in common with the next slice and with the one after.

@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from clrecon.reference.points.grid import find_cells, make_grid
 
-__all__ = ["grow_cells"]
-
 
 def grow_cells(
     points: NDArray[np.float32], edge: float, fewest: int, threshold: int, largest: bool

@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from clrecon.reference.points.grid import make_grid
 
-__all__ = ["choose_points"]
-
 
 def choose_points(points: NDArray[np.float32], spacing: float) -> NDArray[np.uint32]:
     """Return the number of the point nearest to the mean of each cell, in the order of the cells.

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["compact"]
-
 
 def compact(mask: NDArray[np.uint32]) -> NDArray[np.uint32]:
     """Return the positions of the set bits of a bit mask in ascending order; bit b of word w is position 32 w + b."""

@@ -13,17 +13,6 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array, slice_normal
 
-__all__ = [
-    "Box",
-    "Planes",
-    "box_of",
-    "find_interval",
-    "hash_pixels",
-    "jitter_pixels",
-    "sample_field",
-    "voxel_gradients",
-]
-
 
 class Planes(Protocol):
     """Form of `clrecon.rendering.views.clip.Clip`: unit normals and offsets (n, 4); kept is normal . p >= offset."""

@@ -22,8 +22,6 @@ from clrecon.rendering.looks.lighting import LEAST_SOFT_GRADIENT
 from clrecon.rendering.looks.steepness import DENSE, PARTS, STEEP, Steepness
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["FLAT_GRADIENT", "MODES", "OPAQUE", "TABLE_NODES", "RayPicture", "cast_rays", "look_up", "shade"]
-
 MODES = ("dvr", "mip", "minip", "mean", "drr")
 
 AIR_HU = -1000.0

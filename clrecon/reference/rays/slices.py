@@ -11,8 +11,6 @@ from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["overlay_slices"]
-
 
 def overlay_slices(
     volume: Volume,

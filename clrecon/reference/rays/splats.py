@@ -12,8 +12,6 @@ from clrecon.reference.rays.render import shade
 from clrecon.rendering import Lighting
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["find_splats", "shade_splats"]
-
 LEAST_PIXELS, MOST_PIXELS = np.float32(0.7072), np.float32(128.0)
 NEAREST_MM = np.float32(1e-3)
 STEEPEST, DARKENING = 8.0, 0.5

@@ -19,8 +19,6 @@ from clrecon.reference.rays.render import RayPicture, shade
 from clrecon.rendering import Lighting
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["cast_surface"]
-
 HALVINGS = 10
 """Number of halvings of a step: the hit is then known to 1e-3 of it."""
 

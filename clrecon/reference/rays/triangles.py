@@ -13,8 +13,6 @@ from clrecon.reference.rays.render import shade
 from clrecon.rendering import Lighting
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["Meetings", "find_meetings", "nth_layer", "shade_layer"]
-
 NOTHING_MM = np.float32(1e-12)
 NEAREST_MM = np.float32(1e-3)
 FAR_ENOUGH_MM = 0.1

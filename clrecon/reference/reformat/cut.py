@@ -9,8 +9,6 @@ from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.rendering.views.plane import Sheet, SlabSamples
 
-__all__ = ["EDGE", "is_inside", "reformat_sheet", "sample_field"]
-
 EDGE = 2.0**-20
 """Index steps beyond the box of a volume that still count as inside: the rounding error of a pixel on a face."""
 

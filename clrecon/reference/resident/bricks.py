@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["compare_bricks", "measure_bricks"]
-
 
 def measure_bricks(voxels: NDArray[Any], brick: int = 8) -> NDArray[Any]:
     """Return the lowest and highest value of each brick.

@@ -27,11 +27,6 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "CORNERS", "EDGES", "FACES", "FACES_OF_EDGE", "MAX_TRIANGLES", "Triangle",
-    "case_loops", "case_table", "find_ambiguous_faces", "pack_case_table",
-]  # fmt: skip
-
 CORNERS = tuple(((b & 1), (b >> 1) & 1, (b >> 2) & 1) for b in range(8))
 """(x, y, z) of corner b."""
 

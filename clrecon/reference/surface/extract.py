@@ -23,11 +23,6 @@ from clrecon.reference.surface.case_table import CORNERS, EDGES, case_table
 from clrecon.reference.surface.trilinear import find_row, place_cell_vertices
 from clrecon.reference.surface.trilinear_table import CELL_VERTEX
 
-__all__ = [
-    "CrossedEdges", "Surface", "build_surface", "edge_margins", "extract_inside", "extract_isosurface",
-    "find_crossed_edges", "gradients", "sample_grid",
-]  # fmt: skip
-
 Surface = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint32]]
 """Vertices (n, 3) and normals (n, 3), LPS mm, and triangles (m, 3)."""
 

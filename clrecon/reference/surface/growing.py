@@ -18,11 +18,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "Frontier", "choose_largest", "count_visited", "find_active", "find_mixed", "find_seeded", "grow_cells",
-    "label_cells",
-]  # fmt: skip
-
 
 def _corners(inside: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
     gk, gj, gi = inside.shape

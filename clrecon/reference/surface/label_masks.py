@@ -21,8 +21,6 @@ from clrecon.reference.surface.extract import (
     gradients,
 )
 
-__all__ = ["choose_enclosed", "choose_level", "extract_label_mask", "find_occupancy"]
-
 WEIGHTS = (1, 4, 6, 4, 1)
 """Two rounds of [1 2 1]."""
 

@@ -13,8 +13,6 @@ from clrecon.labels.growth import Growth
 from clrecon.labels.solid import fill_solid, find_boxes
 from clrecon.reference.surface.extract import Surface, extract_inside, sample_grid
 
-__all__ = ["extract_label", "find_solid", "own_labels"]
-
 
 def own_labels(labels: NDArray[Any], volume: Volume, grow_mm: float | None) -> NDArray[np.uint16]:
     """Grow labels into samples without one.

@@ -29,8 +29,6 @@ from numpy.typing import NDArray
 from clrecon.reference.surface.case_table import CORNERS, EDGES, FACES, find_ambiguous_faces
 from clrecon.reference.surface.trilinear_table import CELL_VERTEX, Row, cell_state, ring_corners
 
-__all__ = ["decide_faces", "decide_interior", "find_row", "place_cell_vertices", "scale_heights"]
-
 FACE_BITS = 30
 CELL_BITS = 18
 NEWTON_STEPS = 3

@@ -45,11 +45,6 @@ from clrecon.reference.surface.case_table import (
     find_ambiguous_faces,
 )
 
-__all__ = [
-    "CELL_VERTEX", "MAX_TRILINEAR_TRIANGLES", "CellState", "Row", "Tunnel",
-    "cell_state", "find_regions", "find_states", "pack_trilinear_tables", "ring_corners",
-]  # fmt: skip
-
 CELL_VERTEX = 12
 """Numbers in a triangle from here on are vertices inside the cell; lower numbers are edges."""
 

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 
-__all__ = ["ColorScale", "round_up"]
-
 _ABOUT_ZERO = np.array(
     [(33, 102, 172), (67, 147, 195), (146, 197, 222), (222, 222, 222), (244, 165, 130), (214, 96, 77), (178, 24, 43)],
     dtype=np.float64,

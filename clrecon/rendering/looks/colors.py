@@ -12,8 +12,6 @@ from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.system.text import say_unknown
 
-__all__ = ["COLORS", "find_color", "is_transparent"]
-
 COLORS = {
     "black": "000000",
     "white": "ffffff",

@@ -9,8 +9,6 @@ from typing import Any, NoReturn
 
 from clrecon.errors import RefusedInputError
 
-__all__ = ["parse_json", "take_color", "take_list", "take_number", "take_object", "take_text"]
-
 
 def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is no number of JSON")

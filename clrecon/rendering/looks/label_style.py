@@ -14,8 +14,6 @@ from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import find_color
 from clrecon.system.messages import Message
 
-__all__ = ["NO_LABEL", "LabelStyle", "distinct_colors", "find_shown"]
-
 NO_COLOR = (-1.0, -1.0, -1.0)
 """Colour in the table that means: keep the colour of the picture without labels."""
 

@@ -10,8 +10,6 @@ import numpy as np
 
 from clrecon.errors import UsageError
 
-__all__ = ["LEAST_SOFT_GRADIENT", "UNSHADED", "Lighting"]
-
 LEAST_SOFT_GRADIENT = 0.01
 """Least gradient in HU per mm that is shaded; rounding errors of float32 in a flat field are a hundredth of it."""
 

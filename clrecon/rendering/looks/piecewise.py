@@ -11,8 +11,6 @@ import numpy as np
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 
-__all__ = ["check_ascending", "check_share", "evaluate_curve", "merge_curves", "straighten_curve"]
-
 STRAIGHT_PARTS = 32
 """Number of straight parts that replace a bent one; the error is at most 0.003 of its rise."""
 

@@ -13,8 +13,6 @@ from clrecon.rendering.looks.lighting import UNSHADED, Lighting
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.system.text import say_unknown
 
-__all__ = ["DEFAULT_PRESET", "PRESETS", "Preset", "find_preset"]
-
 DEFAULT_PRESET = "bone"
 
 

@@ -21,8 +21,6 @@ from clrecon.rendering.looks.lighting import UNSHADED, Lighting
 from clrecon.rendering.looks.piecewise import merge_curves
 from clrecon.rendering.looks.vtk import curve_from_nodes, gradient_points
 
-__all__ = ["Entry", "read_paraview_json", "read_slicer_json", "read_slicer_text", "read_slicer_xml"]
-
 Entry = tuple[str, Callable[[], dict[str, Any]]]
 """A name, empty where the file has none, and the function that makes the parameters."""
 

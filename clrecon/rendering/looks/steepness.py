@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["DENSE", "PARTS", "STEEP", "STEEP_HU", "Steepness"]
-
 # The kernels have these three numbers too, in cl/rays/steep_segments.h; a test compares them.
 PARTS = 4
 """Number of parts of a segment where the transfer function is steep."""

@@ -27,8 +27,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.regular_files import read_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["load_transfer_function"]
-
 SIZE_LIMIT = 1_000_000
 """Bytes: presets.xml of 3D Slicer has 12 kB."""
 NAMES_LISTED = 60

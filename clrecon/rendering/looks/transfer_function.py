@@ -17,8 +17,6 @@ from clrecon.rendering.looks.piecewise import check_ascending, check_share, eval
 from clrecon.system.arguments import as_numbers, explains_arguments
 from clrecon.system.messages import Message
 
-__all__ = ["TransferFunction"]
-
 UNIT_LIMIT_MM = 1e9
 """Largest unit distance in mm; its inverse is the smallest.  float32 can hold all values that a ray step computes from
 them."""

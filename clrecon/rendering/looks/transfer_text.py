@@ -6,8 +6,6 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-__all__ = ["FORMAT", "VERSION", "transfer_text"]
-
 FORMAT = "clrecon transfer function"
 VERSION = 1
 

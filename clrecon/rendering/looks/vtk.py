@@ -14,8 +14,6 @@ from clrecon.rendering.looks.lighting import UNSHADED, Lighting
 from clrecon.rendering.looks.piecewise import merge_curves, straighten_curve
 from clrecon.system.arguments import as_numbers
 
-__all__ = ["curve_from_nodes", "parameters_from_vtk", "points_from_pyvista", "property_to_vtk"]
-
 STEP_HU = 1e-4
 """Nodes nearer than this form a step: programs that cannot keep two nodes at one place move one by a rounding unit."""
 

@@ -10,17 +10,6 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 
-__all__ = [
-    "BODY_SHARE",
-    "BONE_WINDOW",
-    "WINDOWS",
-    "checked_window",
-    "choose_mip_window",
-    "choose_water_window",
-    "choose_window",
-    "grey_image",
-]
-
 BONE_WINDOW = (-450.0, 1050.0)
 """Level 300, width 1500 HU: distinguishes marrow, cortex and soft tissue."""
 

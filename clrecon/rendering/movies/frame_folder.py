@@ -15,8 +15,6 @@ from clrecon.system.files import temporary_folder
 from clrecon.system.folders import StagedFolder, check_folder
 from clrecon.system.targets import final_mode, system_errors
 
-__all__ = ["check_frame_folder", "stage_frame_folder"]
-
 _FRAME = re.compile(r"frame_[0-9]{4,}\.png")
 
 

@@ -25,16 +25,6 @@ from clrecon.system.text import guess_word
 if TYPE_CHECKING:
     from clrecon.rendering.pictures.picture import Rendering
 
-__all__ = [
-    "ANIMATIONS",
-    "MOST_FRAMES",
-    "animation_kind",
-    "check_animation",
-    "stage_animation",
-    "turntable_cameras",
-    "write_animation",
-]
-
 ANIMATIONS = (".mp4", ".gif", ".apng")
 """Extensions of moving pictures; a name without extension is a folder of PNG files."""
 

@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 from clrecon.errors import OutputError, UsageError
 from clrecon.system.installing import install_command
 
-__all__ = ["find_encoder", "write_video"]
-
 QUALITY = 18
 """x264's constant rate factor; at 18 the loss is not visible."""
 

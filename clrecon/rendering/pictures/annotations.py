@@ -18,16 +18,6 @@ from clrecon.rendering.views.plane import Sheet
 if TYPE_CHECKING:
     from PIL import Image
 
-__all__ = [
-    "SMALLEST_SIDE",
-    "annotate",
-    "bar_length",
-    "check_caption",
-    "edge_letters",
-    "orientation_letters",
-    "sheet_letters",
-]
-
 SMALLEST_SIDE = 64
 """Smallest width and height in pixels; letters in smaller pictures cannot be read."""
 

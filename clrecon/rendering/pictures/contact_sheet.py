@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.rendering.pictures.pillow import load_font, load_pillow
 
-__all__ = ["SHEET_SIZE", "SheetLayout", "lay_out", "write_on_tile"]
-
 SHEET_SIZE = (1600, 1200)
 """Default width and height of a contact sheet: twenty slices of about 300 pixels."""
 

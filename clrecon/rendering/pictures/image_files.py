@@ -17,17 +17,6 @@ from clrecon.system.text import guess_word
 from clrecon.system.wording import name_parameter
 from clrecon.version import package_version
 
-__all__ = [
-    "FLOAT_FORMATS",
-    "IMAGE_FORMATS",
-    "check_float_path",
-    "check_image_path",
-    "encode_floats",
-    "encode_image",
-    "write_floats",
-    "write_image",
-]
-
 IMAGE_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".tif": "TIFF", ".tiff": "TIFF"}
 """Pillow's name of the format, by extension."""
 

@@ -12,8 +12,6 @@ from clrecon.labels import LabelMap, file_suffixes
 from clrecon.rendering.looks.label_style import LabelStyle, find_shown
 from clrecon.rendering.views.plane import Sheet
 
-__all__ = ["describe_overlay", "draw_labels", "labels_on_sheet"]
-
 ROWS_AT_ONCE = 128
 TIES = 1e-6
 """Tolerance in index steps: half-way between two labels the lower index wins, independent of rounding."""

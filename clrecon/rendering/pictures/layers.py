@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.rendering.pictures.picture import Rendering
 
-__all__ = ["merge_layers"]
-
 
 def merge_layers(rendering: Rendering, colors: NDArray[np.uint8], depth: NDArray[np.floating]) -> Rendering:
     """Merge a picture and a scene from the same camera: the nearer one covers the farther one.

@@ -17,8 +17,6 @@ from clrecon.errors import UsageError
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.records import Record
 
-__all__ = ["RANGE", "SHIFT", "WINDOW", "PictureLikeness", "make_control_pictures", "measure_pictures"]
-
 WINDOW = 7
 """Edge of the window of SSIM, pixels."""
 

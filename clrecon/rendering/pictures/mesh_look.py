@@ -18,8 +18,6 @@ from clrecon.rendering.pictures import style_checks as checks
 from clrecon.rendering.pictures.styles import DEFAULT_COLOR, Style, style_field
 from clrecon.rendering.views.clip import Clip
 
-__all__ = ["MeshLook"]
-
 
 def _vertex_colors(value: Any) -> NDArray[np.uint8]:
     """Return colours of vertices, (n, 3) uint8."""

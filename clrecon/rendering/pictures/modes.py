@@ -23,8 +23,6 @@ from clrecon.rendering.views.directions import hint_at_sheet
 from clrecon.system.text import say_unknown
 from clrecon.system.wording import name_parameter
 
-__all__ = ["MODES", "Mode", "check_known", "choose_mode", "find_style", "keywords_of", "make_style"]
-
 
 class Mode(NamedTuple):
     """A kind of picture: the class of its styles, and a description for people."""

@@ -14,8 +14,6 @@ from clrecon.rendering.pictures.picture_data import PictureData
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.targets import keep_existing
 
-__all__ = ["Rendering"]
-
 
 @dataclass
 class Rendering(PictureData):

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.messages import Message
 
-__all__ = ["PictureData"]
-
 
 @dataclass
 class PictureData(Message):

@@ -10,8 +10,6 @@ from clrecon.errors import UsageError
 if TYPE_CHECKING:
     from PIL import ImageFont
 
-__all__ = ["load_font", "load_pillow"]
-
 
 def load_pillow() -> None:
     """Make ``from PIL import ...`` work from here on.

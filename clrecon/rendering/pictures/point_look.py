@@ -16,8 +16,6 @@ from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.plane import positive_mm
 from clrecon.system.wording import name_parameter
 
-__all__ = ["POINT_COLORS", "PointLook"]
-
 POINT_COLORS = ("hu", "label", "removed")
 
 

@@ -10,8 +10,6 @@ from clrecon.rendering.looks.color_scale import ColorScale
 from clrecon.rendering.pictures.picture import Rendering
 from clrecon.rendering.pictures.pillow import load_font, load_pillow
 
-__all__ = ["add_scale"]
-
 _TEXT_SHARE, _SMALLEST_TEXT = 1 / 36, 9.0
 
 

@@ -14,8 +14,6 @@ from clrecon.rendering.looks.window import BONE_WINDOW, grey_image
 from clrecon.rendering.pictures.picture_data import PictureData
 from clrecon.rendering.pictures.pillow import load_font, load_pillow
 
-__all__ = ["Panel", "Stroke", "draw_sheet"]
-
 GAP_PIXELS = 6
 TEXT_PIXELS = 15
 BACKGROUND = 24

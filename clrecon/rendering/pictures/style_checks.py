@@ -14,22 +14,6 @@ from clrecon.rendering.looks.presets import find_preset
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.views.centre_line import Curve
 
-__all__ = [
-    "SHEET_SLICES",
-    "SPINE",
-    "color",
-    "curve",
-    "flag",
-    "instance_of",
-    "mapping",
-    "number",
-    "one_of",
-    "preset_or_function",
-    "ray_step",
-    "sheet",
-    "slices",
-]
-
 SPINE = "spine"
 """Value of a curve that stands for the spinal canal, which is found in the volume."""
 

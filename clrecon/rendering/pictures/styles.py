@@ -32,21 +32,6 @@ from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.plane import checked_offset, checked_thickness, positive_mm
 from clrecon.system.wording import name_parameter
 
-__all__ = [
-    "COMBINATIONS",
-    "CURVED_KINDS",
-    "PROJECTIONS",
-    "SPINE",
-    "CurveCut",
-    "PlaneCut",
-    "Projection",
-    "SlicesInSpace",
-    "Style",
-    "SurfaceLook",
-    "VolumeLook",
-    "style_field",
-]
-
 _T = TypeVar("_T")
 _ByLabel = Mapping[int, _T] | Mapping[str, _T] | Mapping[int | str, _T]
 _Color = str | Sequence[float]

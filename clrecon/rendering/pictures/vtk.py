@@ -15,8 +15,6 @@ from clrecon.errors import UsageError
 from clrecon.rendering.pictures.picture_data import PictureData
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["FORMS", "rendering_to_pyvista"]
-
 FORMS = ("points", "plane")
 
 

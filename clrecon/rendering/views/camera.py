@@ -22,8 +22,6 @@ from clrecon.rendering.views.directions import (
 )
 from clrecon.system.arguments import explains_arguments
 
-__all__ = ["Camera", "CameraBasis", "box_corners"]
-
 DEFAULT_VIEW_ANGLE = 30.0
 """Degrees from the bottom to the top of a perspective picture, as in VTK."""
 

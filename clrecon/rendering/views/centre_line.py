@@ -13,8 +13,6 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.volume import Volume
 from clrecon.system.messages import Message
 
-__all__ = ["Curve", "rotation_minimising_normals"]
-
 SAME_PLACE_MM = 1e-6
 """Distance up to which a point counts as the same as the one before."""
 

@@ -14,8 +14,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.regular_files import read_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["read_curve_points"]
-
 LARGEST_BYTES = 1 << 24
 """Largest file in bytes; a larger one is not a centre line."""
 

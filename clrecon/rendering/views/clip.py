@@ -10,8 +10,6 @@ from clrecon.geometry.affine import Float64Array, checked_points
 from clrecon.rendering.views.directions import checked_vector
 from clrecon.system.messages import Message
 
-__all__ = ["Clip"]
-
 
 class Clip(Message):
     """The part of space on the inner side of every plane; without planes, all of space.

@@ -20,8 +20,6 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.rendering.views.centre_line import Curve, rotation_minimising_normals
 from clrecon.rendering.views.plane import Sheet
 
-__all__ = ["CurvedSheet", "FRAME_STEP_MM", "straightened_sheet", "stretched_sheet"]
-
 FRAME_STEP_MM = 0.25
 """Largest distance between places at which frames and projected lengths are computed; less for small pixels."""
 

@@ -7,8 +7,6 @@ import numpy as np
 from clrecon.geometry.grid import Grid
 from clrecon.rendering.views.directions import find_view
 
-__all__ = ["ANTERIOR", "SLICES_VIEWS", "default_view"]
-
 ANTERIOR = "anterior"
 
 SLICES_VIEWS = ("30,30", "-60,30", "75,-30")

@@ -14,18 +14,6 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.system.text import say_unknown
 from clrecon.system.wording import name_parameter
 
-__all__ = [
-    "DEFAULT_SIZE",
-    "DIRECTIONS",
-    "LARGEST_SIDE",
-    "checked_size",
-    "checked_vector",
-    "find_up",
-    "find_view",
-    "hint_at_sheet",
-    "number_or_nan",
-]
-
 DIRECTIONS: dict[str, tuple[float, float, float]] = {
     "anterior": (0.0, -1.0, 0.0),
     "posterior": (0.0, 1.0, 0.0),

@@ -21,19 +21,6 @@ from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.rendering.views.directions import DIRECTIONS, checked_size, number_or_nan
 from clrecon.system.text import say_unknown
 
-__all__ = [
-    "PLANES",
-    "Sheet",
-    "SlabSamples",
-    "checked_offset",
-    "checked_thickness",
-    "find_plane",
-    "finest_step",
-    "plane_sheet",
-    "positive_mm",
-    "slab_samples",
-]
-
 MOST_SAMPLES = 65536
 """Most samples through a thick slice; more mean that its thickness is a mistake."""
 

@@ -17,8 +17,6 @@ from clrecon.rendering.views.camera import box_corners
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import checked_vector
 
-__all__ = ["ShownLabels", "check_center", "find_seen_box"]
-
 SMALLEST_SIDE_MM = 1e-3
 """Least side of a box, so that its affine can be inverted."""
 

@@ -13,8 +13,6 @@ import numpy as np
 from clrecon.errors import UsageError
 from clrecon.rendering.views.directions import checked_size
 
-__all__ = ["make_pyvista_camera", "parameters_from_vtk"]
-
 Point = Sequence[float]
 
 NEAR_AND_FAR = (0.01, 100.0)

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from clrecon.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
 
-__all__ = ["coarsen_mesh", "select_triangles"]
-
 TRIANGLES_A_CELL = 2.0
 """Triangles that a surface leaves in each cell that it passes through."""
 

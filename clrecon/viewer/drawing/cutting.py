@@ -9,8 +9,6 @@ from clrecon.mesh import Mesh
 from clrecon.rendering.views.clip import Clip
 from clrecon.viewer.drawing.coarse import select_triangles
 
-__all__ = ["cut_mesh"]
-
 
 def cut_mesh(mesh: Mesh, clip: Clip) -> Mesh:
     """Return the part of a mesh within a clip; triangles across a plane are cut at it."""

@@ -17,8 +17,6 @@ from clrecon.rendering.pictures.styles import PlaneCut, Projection, SlicesInSpac
 from clrecon.viewer.model.modes import ViewMode
 from clrecon.viewer.model.state import ShownPart, ViewState
 
-__all__ = ["LEAST_OPACITY", "LabelledLook", "Looks", "label_level", "to_voxels"]
-
 LEAST_OPACITY = 0.01
 """Meshes that are more translucent are not drawn."""
 

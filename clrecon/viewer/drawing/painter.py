@@ -37,8 +37,6 @@ from clrecon.viewer.model.objects import ShownCloud, ShownLabels, ShownMesh, Sho
 from clrecon.viewer.model.state import ShownPart, ViewState, as_point
 from clrecon.viewer.model.tools import Pick
 
-__all__ = ["Painter", "never"]
-
 SMALLEST_SIDE = 64
 """Pixels of the shorter side of a coarse picture."""
 

@@ -25,8 +25,6 @@ from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.model.objects import ShownCloud, ShownScan
 from clrecon.viewer.model.state import ViewState
 
-__all__ = ["KINDS", "check_target", "save_shown", "shown_volume"]
-
 KINDS: dict[str, tuple[str, ...]] = {
     "picture": tuple(IMAGE_FORMATS),
     "mesh": tuple(FORMATS),

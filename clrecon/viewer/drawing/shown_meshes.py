@@ -21,8 +21,6 @@ from clrecon.viewer.model.modes import find_modes
 from clrecon.viewer.model.objects import ShownLabels, ShownMesh, ShownScan
 from clrecon.viewer.model.state import Color, ShownPart, ViewState
 
-__all__ = ["clip_volume", "make_meshes", "number_vertices"]
-
 CUT_HU_PER_MM = 100.0
 """Slope of the values across a cut: steep enough that whole HU place it to 0.005 mm."""
 

@@ -24,8 +24,6 @@ from clrecon.viewer.model.objects import ShownLabels, ShownObject, ShownScan
 from clrecon.viewer.model.parts import FoundParts, find_clusters
 from clrecon.viewer.model.state import Point, ViewState
 
-__all__ = ["Stage"]
-
 MOST_FOUND, MOST_FOUND_BYTES = 6, 1 << 29
 """Sets of parts that are kept, of all views together, and the bytes of their label maps; two are kept whatever their
 size."""

@@ -11,8 +11,6 @@ import numpy as np
 from clrecon.rendering import Rendering
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["take_strips"]
-
 STRIP_PIXELS = 1 << 18
 """Pixels of a strip: some 50 ms of volume rendering on two cores."""
 

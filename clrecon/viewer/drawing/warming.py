@@ -22,8 +22,6 @@ from clrecon.system.progress import Progress, ignore_progress
 from clrecon.viewer.model.objects import ShownMesh, ShownObject, ShownScan
 from clrecon.viewer.model.parts import find_clusters
 
-__all__ = ["warm_kernels"]
-
 SIDE = 20
 """Voxels along each side of the volume by which kernels are built."""
 

@@ -22,8 +22,6 @@ from clrecon.viewer.model.objects import ShownObject
 from clrecon.viewer.model.parts import FoundParts, carry_looks
 from clrecon.viewer.model.state import Color, ShownPart, ViewState, as_point
 
-__all__ = ["ChangingView", "checked_numbers"]
-
 MOST_UNDO = 200
 """Changes that can be taken back."""
 

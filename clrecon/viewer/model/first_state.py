@@ -11,8 +11,6 @@ from clrecon.rendering.looks.label_style import distinct_colors
 from clrecon.viewer.model.objects import ShownCloud, ShownLabels, ShownMesh, ShownObject, ShownScan
 from clrecon.viewer.model.state import ShownPart, as_point
 
-__all__ = ["find_iso_range", "first_parts"]
-
 ISO_ENDS = (-1000.0, 2000.0)
 """Ends of the slider, as far as the values of the scan go: air, and dense cortex."""
 

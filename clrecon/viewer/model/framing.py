@@ -13,8 +13,6 @@ from clrecon.rendering.views.directions import DIRECTIONS
 from clrecon.rendering.views.plane import PLANES
 from clrecon.viewer.model.objects import ShownScan
 
-__all__ = ["fit_camera", "plane_step"]
-
 FIT_PIXELS = 1000
 """Height of the picture that a camera is fitted for; only its ratio to the width counts."""
 

@@ -12,8 +12,6 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.rendering.views.camera import Camera
 from clrecon.viewer.model.state import as_point
 
-__all__ = ["pan_camera", "pixel_camera", "roll_camera", "turn_camera", "zoom_camera"]
-
 TURN_DEGREES = 180.0
 """By which a gesture over the height of the picture turns."""
 

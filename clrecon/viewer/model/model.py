@@ -26,8 +26,6 @@ from clrecon.viewer.model.objects import ShownLabels, ShownObject, ShownScan
 from clrecon.viewer.model.state import Box, Point, ShownPart, ViewState, as_point
 from clrecon.viewer.model.tools import POINTS_OF, TOOLS, ClipPlane, Measure, Pick, clip_direction, measure_points
 
-__all__ = ["ViewModel"]
-
 
 class ViewModel(ChangingView):
     """The state of one view.

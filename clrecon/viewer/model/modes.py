@@ -7,8 +7,6 @@ from functools import cache
 
 from clrecon.rendering.looks.presets import PRESETS
 
-__all__ = ["SLICE_WINDOW", "ViewMode", "find_modes"]
-
 SLICE_WINDOW = (-450.0, 1050.0)
 """HU shown as black and white in slices at the start: a window for bone."""
 

@@ -19,8 +19,6 @@ from clrecon.rendering.views.camera import box_corners
 if TYPE_CHECKING:
     from clrecon.jobs.view.inputs import OpenedInput
 
-__all__ = ["ShownCloud", "ShownLabels", "ShownMesh", "ShownObject", "ShownScan", "show_objects", "wrap_inputs"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShownObject:

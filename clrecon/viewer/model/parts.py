@@ -30,8 +30,6 @@ from clrecon.viewer.model.state import Box, Point, ShownPart
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
 
-__all__ = ["MOST_CLUSTERS", "FoundParts", "carry_looks", "find_clusters", "grow_labels"]
-
 MOST_CLUSTERS = 20
 """Clusters that are parts of their own."""
 

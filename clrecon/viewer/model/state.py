@@ -11,8 +11,6 @@ from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 from clrecon.viewer.model.tools import ClipPlane, Measure, Pick
 
-__all__ = ["Box", "Color", "Point", "ShownPart", "ViewState", "as_point"]
-
 Color = tuple[float, float, float]
 Point = tuple[float, float, float]
 Box = tuple[Point, Point]

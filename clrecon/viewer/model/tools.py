@@ -13,8 +13,6 @@ from clrecon.errors import UsageError
 from clrecon.rendering.views.directions import DIRECTIONS, checked_vector
 from clrecon.system.text import say_unknown
 
-__all__ = ["POINTS_OF", "TOOLS", "ClipPlane", "Measure", "Pick", "clip_direction", "measure_points"]
-
 POINTS_OF = {"distance": 2, "angle": 3, "curve": None, "seed": 1}
 """Tools, and the points that make a measure of each; a curve has as many as it gets."""
 

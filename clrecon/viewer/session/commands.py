@@ -9,8 +9,6 @@ from typing import Any
 from clrecon.errors import UsageError
 from clrecon.system.text import say_unknown
 
-__all__ = ["COMMANDS", "Command", "check_command"]
-
 MOST_TEXT = 200
 """Characters of a name in a command."""
 

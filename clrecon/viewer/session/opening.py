@@ -17,8 +17,6 @@ from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.model.objects import ShownScan, wrap_inputs
 from clrecon.viewer.session.session import ViewSession
 
-__all__ = ["OpenedView", "open_view"]
-
 
 class OpenedView(Closing):
     """What the views of some inputs share.

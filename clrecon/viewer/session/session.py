@@ -23,8 +23,6 @@ from clrecon.viewer.model.tools import Pick
 from clrecon.viewer.session.commands import check_command
 from clrecon.viewer.session.worker import CLOSE_S, Job, Worker
 
-__all__ = ["ViewSession"]
-
 log = get_logger(__name__)
 
 MOVING_MS = 40.0

@@ -10,8 +10,6 @@ from typing import Any
 from clrecon.errors import Cancelled, ClreconError
 from clrecon.system.log import get_logger
 
-__all__ = ["Job", "Worker"]
-
 log = get_logger(__name__)
 
 CLOSE_S = 1.0

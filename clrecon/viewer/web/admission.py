@@ -16,8 +16,6 @@ import hmac
 import re
 import secrets
 
-__all__ = ["LOOPBACK", "make_secret", "refuse_request"]
-
 LOOPBACK = "127.0.0.1"
 
 _OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from clrecon.rendering import Rendering
     from clrecon.viewer.model.model import ViewModel
 
-__all__ = ["Connection", "Session"]
-
 log = get_logger(__name__)
 
 REST_SECONDS = 0.2

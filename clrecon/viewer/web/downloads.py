@@ -7,8 +7,6 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Download", "Downloads"]
-
 
 @dataclass(frozen=True)
 class Download:

@@ -17,8 +17,6 @@ from clrecon.errors import UsageError
 from clrecon.system.wording import name_parameter
 from clrecon.viewer.web.admission import LOOPBACK
 
-__all__ = ["bind_port", "has_screen", "open_browser"]
-
 LARGEST_PORT = 65535
 _WAITING = 64
 

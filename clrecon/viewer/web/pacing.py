@@ -8,8 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import NamedTuple
 
-__all__ = ["SCENE", "SLICES", "VIEWS", "Asked", "Pace"]
-
 SCENE, SLICES = "scene", ("axial", "coronal", "sagittal")
 VIEWS = (SCENE, *SLICES, "curve")
 """The picture in three dimensions, the three slices, and the reformation along the points of the curve tool."""

@@ -9,8 +9,6 @@ from typing import NamedTuple
 
 from clrecon.exchange.page import hash_code, read_page_code
 
-__all__ = ["Page", "compose_page"]
-
 
 class Page(NamedTuple):
     """The document and its Content-Security-Policy, which goes into the header of the answer."""

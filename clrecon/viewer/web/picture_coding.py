@@ -17,8 +17,6 @@ from clrecon.rendering import Rendering
 from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["MOVING_QUALITY", "SHARP_QUALITY", "describe_camera", "encode_picture"]
-
 MOVING_QUALITY, SHARP_QUALITY = 70, 92
 """Of JPEG.  Above 90 the colours are not halved: edges of labels stay where they are."""
 

@@ -12,8 +12,6 @@ from clrecon.viewer.session.opening import OpenedView, open_view
 from clrecon.viewer.web.listening import has_screen, open_browser
 from clrecon.viewer.web.server import WebServer
 
-__all__ = ["serve_view"]
-
 
 def serve_view(
     inputs: Sequence[str | Path],

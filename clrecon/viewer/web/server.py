@@ -24,8 +24,6 @@ from clrecon.viewer.web.page import compose_page
 if TYPE_CHECKING:
     from aiohttp import web
 
-__all__ = ["MOST_BROWSERS", "WebServer"]
-
 log = get_logger(__name__)
 
 MOST_BROWSERS = 16

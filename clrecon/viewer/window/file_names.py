@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["DEFAULT_MESH", "DEFAULT_PICTURE", "free_name"]
-
 DEFAULT_MESH = "clrecon-view.stl"
 DEFAULT_PICTURE = "clrecon-view.png"
 

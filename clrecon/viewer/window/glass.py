@@ -14,8 +14,6 @@ from clrecon.viewer.window.picture_actor import image_data
 if TYPE_CHECKING:
     from clrecon.system.display import Display
 
-__all__ = ["Glass"]
-
 COVER = "cover"
 """Name of what lies over the picture."""
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["PLANES", "Box", "Layout", "lay_out"]
-
 PLANES = ("axial", "coronal", "sagittal")
 """The slices, from the top to the bottom of the window."""
 

@@ -12,8 +12,6 @@ from clrecon.system.progress import Progress
 if TYPE_CHECKING:
     from clrecon.viewer.session.session import ViewSession
 
-__all__ = ["Load", "Loading"]
-
 Load = Callable[[Progress], "ViewSession"]
 """Reads the inputs; called in a thread, with a progress function that raises `Cancelled` when nobody waits any more."""
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from clrecon.viewer.session.opening import OpenedView
     from clrecon.viewer.session.session import ViewSession
 
-__all__ = ["open_window"]
-
 
 def open_window(
     inputs: Sequence[str | Path],

@@ -19,8 +19,6 @@ from clrecon.viewer.window.layout import Box
 if TYPE_CHECKING:
     from PIL import ImageFont
 
-__all__ = ["Hit", "Panel", "draw_help", "draw_side", "draw_slider", "draw_status", "draw_words", "slider_value"]
-
 BACK, RAISED, LINE = (30, 32, 36), (48, 51, 57), (74, 78, 86)
 TEXT, FAINT, ACCENT, WARNING = (226, 228, 232), (152, 157, 166), (82, 158, 255), (255, 190, 92)
 TEXT_PIXELS, ROW = 13, 21

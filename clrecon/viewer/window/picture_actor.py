@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from clrecon.rendering import Rendering
     from clrecon.rendering.views.camera import Camera
 
-__all__ = ["PictureActor", "image_data", "place_camera"]
-
 _COLOR = """
   // VTK would multiply both textures: this is all that is drawn.  Row 0 of a picture is its top.
   vec2 pictureSize = vec2(textureSize(pictureColor, 0));

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from clrecon.rendering import Rendering
     from clrecon.rendering.views.camera import Camera
 
-__all__ = ["PLANE_COLORS", "PictureOverlay", "marked_lines"]
-
 PLANE_COLORS = {"axial": (0.95, 0.42, 0.42), "coronal": (0.42, 0.85, 0.47), "sagittal": (0.45, 0.62, 1.0)}
 """Of the cross and of the frames of slices: each plane has its own."""
 

@@ -11,8 +11,6 @@ from typing import Any
 from clrecon.viewer.window.layout import PLANES, Box, Layout
 from clrecon.viewer.window.panels import Hit, Panel
 
-__all__ = ["Pointer"]
-
 Action = dict[str, Any]
 
 STILL_PIXELS = 4

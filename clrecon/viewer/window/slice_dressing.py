@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from clrecon.rendering import Rendering
     from clrecon.rendering.views.camera import Camera
 
-__all__ = ["dress_curve", "dress_slice", "slice_place"]
-
 NORMALS = {"axial": 2, "coronal": 1, "sagittal": 0}
 """Axis of the patient across each slice."""
 

@@ -21,8 +21,6 @@ from clrecon.viewer.window.pointer import Pointer
 from clrecon.viewer.window.window_actions import WindowActions
 from clrecon.viewer.window.window_content import WindowContent
 
-__all__ = ["Load", "ViewWindow", "show_window"]
-
 SIZE = (1280, 860)
 SMALLEST = (320, 240)
 SCREEN_SHARE = 0.92

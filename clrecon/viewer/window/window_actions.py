@@ -20,8 +20,6 @@ from clrecon.viewer.window.slice_dressing import slice_place
 from clrecon.viewer.window.window_content import WindowContent
 from clrecon.viewer.window.window_keys import find_key
 
-__all__ = ["WindowActions"]
-
 ISO_STEP = 5.0
 LEAST_BOX = 0.02
 """Share between the ends of a clip box."""

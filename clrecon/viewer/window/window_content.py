@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from clrecon.viewer.session.session import ViewSession
     from clrecon.viewer.window.glass import Glass
 
-__all__ = ["WindowContent"]
-
 log = get_logger(__name__)
 
 REST_S = 0.2

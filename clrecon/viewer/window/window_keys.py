@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["KEYS", "Key", "find_key", "help_sections", "side_buttons"]
-
 
 @dataclass(frozen=True)
 class Key:

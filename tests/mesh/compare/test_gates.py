@@ -8,9 +8,9 @@ import sample_meshes as samples
 
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import compare_meshes
-from clrecon.mesh.compare.gates import failed_gates, judge_label_volume, judge_mesh
+from clrecon.mesh.compare.gates import judge_label_volume, judge_mesh
 from clrecon.mesh.triangles import enclosed_ml
-from clrecon.system.gates import Gate
+from clrecon.system.gates import Gate, failed_gates
 
 pytestmark = pytest.mark.unit
 
