@@ -16,7 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.dicom.headers.multiframe import find_data_set
+from clrecon.dicom.parse.raw import EXPLICIT_LITTLE, IMPLICIT_LITTLE
 from clrecon.dicom.parse.sequences import Schema, read_sequences
+from clrecon.dicom.parse.transfer_syntaxes import RLE
 from clrecon.dicom.parse.values import ValueProblem
 from clrecon.errors import ClreconError, RefusedInputError
 from clrecon.formats.stream import check_size
@@ -29,8 +31,6 @@ from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text, hash_uid
 
 SEGMENTATION_CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
-IMPLICIT_LITTLE, EXPLICIT_LITTLE = "1.2.840.10008.1.2", "1.2.840.10008.1.2.1"
-RLE_LOSSLESS = "1.2.840.10008.1.2.5"
 MOST_FRAMES = 1_000_000
 Check = Callable[[tuple[int, int, int], int], None]
 """Called with the shape (i, j, k) of a map and its unpacked bytes, before anything is unpacked; may refuse it."""
@@ -172,7 +172,7 @@ def _parse(path: Path, name: str) -> Any:
     try:
         meta = read_file_meta_info(path)
         syntax = str(meta.get("TransferSyntaxUID", ""))
-        if syntax not in (IMPLICIT_LITTLE, EXPLICIT_LITTLE, RLE_LOSSLESS):
+        if syntax not in (IMPLICIT_LITTLE, EXPLICIT_LITTLE, RLE):
             raise RefusedInputError(
                 f"{name} is stored with transfer syntax {escape_text(syntax)}: of DICOM SEG uncompressed little endian"
                 " and RLE are read, convert it"
@@ -215,7 +215,7 @@ def _read_layout(dataset: Any, name: str, file_bytes: int) -> _Layout:
     layout = _layout_of(dataset, kind)
     if layout.bits not in ((1, 8) if kind == "BINARY" else (8, 16)) or not 0 < layout.frames <= MOST_FRAMES:
         raise RefusedInputError(f"{name} is corrupt: {layout.frames} frames of {layout.bits} bits a pixel")
-    compressed = dataset.file_meta.TransferSyntaxUID == RLE_LOSSLESS
+    compressed = dataset.file_meta.TransferSyntaxUID == RLE
     # RLE writes two bytes for up to 128, and a header of 64 bytes or more for each frame: it never shrinks more than 64
     # to 1.
     held = file_bytes * (8 if layout.bits == 1 else 1) * (64 if compressed else 1)
@@ -245,7 +245,7 @@ class _FramePixels:
         self._items = layout.rows * layout.columns
         self._data = bytes(dataset.PixelData)
         self._fragments: list[bytes] | None = None
-        if dataset.file_meta.TransferSyntaxUID == RLE_LOSSLESS:
+        if dataset.file_meta.TransferSyntaxUID == RLE:
             from pydicom.encaps import generate_frames
 
             self._fragments = list(generate_frames(self._data, number_of_frames=layout.frames))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.dicom.headers.multiframe import find_data_set
+from clrecon.dicom.parse.raw import EXPLICIT_LITTLE, IMPLICIT_LITTLE
 from clrecon.dicom.parse.sequences import Item, Schema, read_sequences
 from clrecon.dicom.parse.values import ValueProblem
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
@@ -29,7 +30,6 @@ from clrecon.system.regular_files import open_regular
 from clrecon.system.text import count_of, escape_text, hash_uid
 
 STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"
-IMPLICIT_LITTLE, EXPLICIT_LITTLE = "1.2.840.10008.1.2", "1.2.840.10008.1.2.1"
 LARGEST_BYTES = 2**30
 MOST_CONTOURS = 1_000_000
 

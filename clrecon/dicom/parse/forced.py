@@ -11,6 +11,7 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple
 
+from clrecon.dicom.parse.raw import EXPLICIT_BIG, EXPLICIT_LITTLE, IMPLICIT_LITTLE
 from clrecon.system.wording import name_parameter
 
 MARK_END = 132  # 128 bytes of preamble, then "DICM"
@@ -19,11 +20,10 @@ FIRST_GROUP = 0x0008
 FIRST_LENGTH_LIMIT = 1024
 """Longest first element: data sets begin with short ones, such as group length, character set, type or date."""
 ENCODINGS = {
-    "1.2.840.10008.1.2": "implicit VR little endian",
-    "1.2.840.10008.1.2.1": "explicit VR little endian",
-    "1.2.840.10008.1.2.2": "explicit VR big endian",
+    IMPLICIT_LITTLE: "implicit VR little endian",
+    EXPLICIT_LITTLE: "explicit VR little endian",
+    EXPLICIT_BIG: "explicit VR big endian",
 }
-IMPLICIT_LITTLE, EXPLICIT_LITTLE, EXPLICIT_BIG = ENCODINGS
 PROGRAMS = {
     b"MZ": "Windows",
     b"\x7fELF": "Linux",

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import importlib.util
 
+from clrecon.dicom.parse.raw import DEFLATED, EXPLICIT_BIG, EXPLICIT_LITTLE, IMPLICIT_LITTLE
 from clrecon.errors import RefusedInputError
 from clrecon.system.installing import install_command
 from clrecon.system.text import escape_text
 
-NATIVE_SYNTAXES = ("1.2.840.10008.1.2", "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.1.99", "1.2.840.10008.1.2.2")
+NATIVE_SYNTAXES = (IMPLICIT_LITTLE, EXPLICIT_LITTLE, DEFLATED, EXPLICIT_BIG)
 
 _JPEG = "1.2.840.10008.1.2.4."
 JPEG_LOSSLESS = (_JPEG + "57", _JPEG + "70")
@@ -34,10 +35,10 @@ _DECODERS = {
 }
 
 SYNTAX_NAMES = {
-    "1.2.840.10008.1.2": "Implicit VR Little Endian",
-    "1.2.840.10008.1.2.1": "Explicit VR Little Endian",
-    "1.2.840.10008.1.2.1.99": "Deflated Explicit VR Little Endian",
-    "1.2.840.10008.1.2.2": "Explicit VR Big Endian",
+    IMPLICIT_LITTLE: "Implicit VR Little Endian",
+    EXPLICIT_LITTLE: "Explicit VR Little Endian",
+    DEFLATED: "Deflated Explicit VR Little Endian",
+    EXPLICIT_BIG: "Explicit VR Big Endian",
     _JPEG + "57": "JPEG Lossless, Non-Hierarchical (Process 14)",
     _JPEG + "70": "JPEG Lossless, Non-Hierarchical, First-Order Prediction (Process 14 [Selection Value 1])",
     _JPEG + "80": "JPEG-LS Lossless Image Compression",
