@@ -15,7 +15,7 @@ from clrecon.operators.points.voxel_clusters import ClusterSearch, pad_for
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points.stencil import Lattice, make_stencil
 from clrecon.points.voxel_numbers import VoxelNumbers
-from clrecon.reference.points import clusters as twin
+from clrecon.reference.points import clusters as cluster_twin
 from clrecon.reference.points import slice_overlap as overlap_twin
 
 SHAPE = (26, 41, 70)
@@ -69,7 +69,7 @@ def _check_clusters(device: Device) -> str:
             search = ClusterSearch(device, mask, stencil, samples, parts_per_core=MANY_PARTS)
             labels, cores = search.label(), search.flag_cores()
         ijk = np.argwhere((volume.voxels >= 75) & (volume.voxels <= 110))[:, ::-1]
-        count, expected, expected_cores = twin.cluster_points(volume.ijk_to_lps(ijk), eps, samples)
+        count, expected, expected_cores = cluster_twin.cluster_points(volume.ijk_to_lps(ijk), eps, samples)
         what = f"at eps {eps} mm and min_samples {samples}"
         require_equal(search.count, count, f"the number of clusters {what}")
         require_equal(cores, expected_cores, f"core points {what}")

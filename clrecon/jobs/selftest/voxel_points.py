@@ -7,7 +7,7 @@ from clrecon.jobs.selftest.scenes import OBLIQUE, WIDE, noise, random_integers, 
 from clrecon.labels import LabelMap
 from clrecon.opencl import Device
 from clrecon.operators.points.extract import extract_points
-from clrecon.reference.points import emit as twin
+from clrecon.reference.points import emit as voxel_twin
 
 PLACE_TOLERANCE_MM = 1.6e-5
 """Half a step of float32 below 512 mm."""
@@ -23,7 +23,7 @@ def _compare(device: Device, dtype: str, uneven: bool, kind: str, labels: str | 
     cloud = extract_points(
         volume, kind=kind, hu=BAND, labels=label_map, label=number or None, device=device
     )  # fmt: skip
-    points, hu, ijk = twin.extract_voxels(volume, *BAND, shell=kind == "shell", labels=chosen, label=number)
+    points, hu, ijk = voxel_twin.extract_voxels(volume, *BAND, shell=kind == "shell", labels=chosen, label=number)
     what = f"{kind} of {dtype} voxels{'' if labels is None else f' with labels of {labels}'}"
     require_whole(cloud.report)
     require_equal(cloud.ijk if cloud.ijk is not None else (), ijk, f"indices of {what}")

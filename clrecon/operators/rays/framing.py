@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from clrecon.anatomy.surroundings import LEFT_OUT
+from clrecon.geometry import Volume
 from clrecon.geometry.base import AIR_HU
 from clrecon.geometry.grid import Grid
-from clrecon.geometry.volume import Volume
 from clrecon.labels import resample_labels
 from clrecon.operators.rays.slices import choose_slices
 from clrecon.operators.resident.device_volume import DeviceVolume
