@@ -34,7 +34,7 @@ from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.pieces import in_threads
 from clrecon.system.progress import Progress, Steps
-from clrecon.system.text import say_ml
+from clrecon.system.text import format_ml
 from clrecon.system.wording import name_parameter
 
 TISSUE_HU = -300.0
@@ -138,7 +138,7 @@ def _place_pieces(volume: Volume, cells: Cells, pieces: list[Piece]) -> list[dic
 def describe_pieces(pieces: list[dict[str, Any]]) -> str:
     """Say how large pieces are and where: ``8.2 ml around (140, 10, -4) mm LPS``."""
     places = (", ".join(f"{x:.0f}" for x in piece["at_mm"]) for piece in pieces)
-    return ", ".join(f"{say_ml(piece['ml'])} around ({at}) mm LPS" for piece, at in zip(pieces, places, strict=True))
+    return ", ".join(f"{format_ml(piece['ml'])} around ({at}) mm LPS" for piece, at in zip(pieces, places, strict=True))
 
 
 @explains_arguments

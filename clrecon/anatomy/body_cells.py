@@ -23,7 +23,7 @@ DENSE_HU = 300.0
 """Bone has voxels above this; plastic and carbon fibre may have them too."""
 HARD_HU = 600.0
 """Compact bone, teeth and metal have voxels above this; plastic and carbon fibre have none (560 HU at most)."""
-METAL_HU = 2200.0
+SURE_METAL_HU = 2200.0
 """Metal has voxels above this; of bone only the enamel of teeth and a few voxels of the densest cortex."""
 
 PIECE = 4
@@ -36,7 +36,7 @@ class Cells:
 
     mean: ndarray, shape (ck, cj, ci), float32. Mean HU; cells at the far ends may hold fewer voxels.
     dense, hard, metal: ndarray, shape (ck, cj, ci), uint16 or wider. Number of voxels above `DENSE_HU`, `HARD_HU` and
-        `METAL_HU`; the type holds the number of voxels of a full cell.
+        `SURE_METAL_HU`; the type holds the number of voxels of a full cell.
     step: Number of voxels of a cell along i, j, k.
     size_mm: Lengths of a cell along i, j, k.
     """
@@ -91,7 +91,7 @@ def measure_cells(volume: Volume, done: Callable[[slice], None] | None = None) -
             first, end = place * sk, min((place + 1) * sk, nk)
             slab = volume.voxels[first:end]
             mean[place] = _sum_blocks(slab, sj, si) / (end - first)
-            _count_dense(slab, {DENSE_HU: dense[place], HARD_HU: hard[place], METAL_HU: metal[place]}, sj, si)
+            _count_dense(slab, {DENSE_HU: dense[place], HARD_HU: hard[place], SURE_METAL_HU: metal[place]}, sj, si)
             volume.release_slices(first, end)
 
     in_threads(measure, shape[0], PIECE, done)

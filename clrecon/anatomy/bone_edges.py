@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.geometry import METAL_HU
+
 FloatArray = NDArray[Any]
 
-METAL_HU = 2000
-"""Highest value of cortical bone; enamel and metal are above."""
 CONTRAST_MEDIUM_HU = 600
 """Vessels and organs with contrast medium stay below this value."""
 

@@ -16,8 +16,8 @@ from clrecon.anatomy.body_cells import Cells, Mask
 Float64Array = NDArray[np.float64]
 
 METAL_SHARE = 0.25
-"""Least share of voxels above `METAL_HU` among the dense voxels of a piece of metal; their blurred edges are the rest.
-Jaws with teeth have a share below 0.1."""
+"""Least share of voxels above `SURE_METAL_HU` among the dense voxels of a piece of metal; their blurred edges are the
+rest.  Jaws with teeth have a share below 0.1."""
 BAR_MM, BAR_RATIO = 50.0, 3.0
 """Least length of a bar, in mm and in its larger thickness."""
 SECTION_MM = 12.0

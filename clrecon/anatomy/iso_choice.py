@@ -35,7 +35,7 @@ from clrecon.geometry.base import AIR_HU
 from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.text import count_of, say_share
+from clrecon.system.text import count_of, format_share
 from clrecon.system.wording import name_parameter
 
 Float64Array = NDArray[np.float64]
@@ -241,7 +241,7 @@ def _describe(background: Background, edges: BoneEdges, flat: tuple[float, float
     )
     if flat_share >= CONTRAST_SAID:
         done = "left out" if left_out else "taken for bone, as nearly all is of this kind"
-        reason += f"; {say_share(flat_share)} of the contrast ends in flat plateaus, as of contrast medium: {done}"
+        reason += f"; {format_share(flat_share)} of the contrast ends in flat plateaus, as of contrast medium: {done}"
     return IsoChoice(
         iso_value,
         round(bone, 1),
@@ -266,7 +266,7 @@ def _no_bone(background: Background, edges: BoneEdges, histogram: Float64Array, 
     above = histogram[background.seed - LOWEST_HU :].sum() / max(histogram.sum(), 1.0)
     return (
         f"no bone found to choose the iso value by: {background.name} has its mode at {background.mode:.0f} HU with a "
-        f"noise of {background.noise:.0f} HU, {say_share(above, 2)} of the voxels of {slices} slices lie above "
+        f"noise of {background.noise:.0f} HU, {format_share(above, 2)} of the voxels of {slices} slices lie above "
         f"{background.seed} HU and {len(edges.bone)} edges of bone rise from it; {_describe_way_out()}"
     )
 

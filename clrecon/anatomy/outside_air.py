@@ -20,7 +20,7 @@ from clrecon.geometry.base import AIR_HU
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.volume import Volume
 from clrecon.system.progress import Progress, Steps
-from clrecon.system.text import say_ml
+from clrecon.system.text import format_ml
 from clrecon.system.wording import name_parameter
 
 Mask = NDArray[np.bool_]
@@ -83,7 +83,7 @@ def leave_outside_air(volume: Volume, levels: Sequence[float], *, progress: Prog
     left_out_ml, kept_ml = _millilitres(outside, volume), _millilitres(voxels < max(levels), volume)
     if kept_ml == 0.0:
         raise NoSurfaceError(
-            f"nothing below {max(levels):g} HU lies within the body: {say_ml(left_out_ml)} are outside of it"
+            f"nothing below {max(levels):g} HU lies within the body: {format_ml(left_out_ml)} are outside of it"
             f" ({name_parameter('keep_outside', True)} takes them)"
         )
     changed = volume.with_voxels(voxels)

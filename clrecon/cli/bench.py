@@ -7,7 +7,7 @@ from typing import Any
 
 from clrecon.cli.common import add_device, add_no_clobber, table
 from clrecon.cli.console import Console, printable
-from clrecon.system.text import say_digits
+from clrecon.system.text import format_digits
 
 PARTLY_DONE = 8
 _RUNS = 7
@@ -67,7 +67,7 @@ def _describe(result: dict[str, Any]) -> list[str]:
         f"surface  {result['iso_value_hu']:g} HU, open at the border of the volume",
         f"system   {printable(result['processor'])}, {result['cores']} cores ({result['free_cores']:.1f} free),"
         f" {result['platform']}",
-        f"{read:<8} {_seconds(result['seconds'][read])} ({say_digits(rate, 2)} Mvoxel/s)",
+        f"{read:<8} {_seconds(result['seconds'][read])} ({format_digits(rate, 2)} Mvoxel/s)",
     ]
     for entry in result["devices"]:
         lines += ["", *_describe_device(entry)]
@@ -97,7 +97,8 @@ def _describe_device(entry: dict[str, Any]) -> list[str]:
         threads = f"{peer['threads']} thread{'s' * (peer['threads'] != 1)}"
         rows.append(("flying edges", _seconds(peer["seconds"]["median"]), f"{_range(peer['seconds'])}, {threads}"))
         rows.append(("ratio", f"{entry['ratio']['median']:.2f}", _ratio_range(entry["ratio"])))
-    rates = f"{say_digits(entry['mvoxels_per_s'], 2)} Mvoxel/s, {say_digits(entry['mtriangles_per_s'], 2)} Mtriangle/s"
+    voxels, triangles = (format_digits(entry[name], 2) for name in ("mvoxels_per_s", "mtriangles_per_s"))
+    rates = f"{voxels} Mvoxel/s, {triangles} Mtriangle/s"
     counts = f"{entry['vertices']:,} vertices, {entry['triangles']:,} triangles"
     return [head, *(f"  {line}" for line in table(rows, right=(1,))), f"  {counts}, {rates}"]
 

@@ -17,7 +17,7 @@ from clrecon.cli.points import parse_point
 from clrecon.cli.reading import add_reading
 from clrecon.jobs.cloud.settings import DENOISERS, GHOSTS, KINDS, STEPS, CloudSettings
 from clrecon.jobs.shared.clouds import CLOUD_INPUTS
-from clrecon.system.text import count_of, say_band
+from clrecon.system.text import count_of, format_band
 
 _PARTS = ("device", "read", "mask", "steps", "surface", "write", "other")
 _EXAMPLES = """\
@@ -250,7 +250,7 @@ def _describe_step(step: dict[str, Any]) -> str:
     if step["step"] == "points":
         band = step.get("band_hu")
         level = f" of {step['iso_value_hu']:g} HU" if step.get("iso_value_hu") is not None else ""
-        level = f" of {say_band(band[0], math.inf if band[1] is None else band[1])}" if band else level
+        level = f" of {format_band(band[0], math.inf if band[1] is None else band[1])}" if band else level
         share = f", {100.0 * step['share']:.3g} % of {step['voxels']:,} voxels" if "share" in step else ""
         return f"{count_of(after, 'point')} ({step['kind']}{level}){share}"
     if "clusters" in step and "eps_mm" in step:

@@ -8,7 +8,7 @@ from typing import Any
 from clrecon.cli.common import add_device, add_memory, add_no_clobber, megabytes, table
 from clrecon.cli.console import Console, printable
 from clrecon.jobs.shared.clouds import MESH_INPUTS
-from clrecon.system.text import say_volume
+from clrecon.system.text import format_volume
 
 _EPILOG = """\
 From points that cover each mesh evenly by area to the nearest triangle of the other, in mm. Where the other
@@ -126,7 +126,7 @@ def _describe(report: dict[str, Any]) -> list[str]:
 
 def _describe_mesh(letter: str, entry: dict[str, Any]) -> list[str]:
     size = f"{entry['triangles']:,} triangles, "
-    size += "not closed" if entry["volume_ml"] is None else f"closed, {say_volume(entry['volume_ml'])}"
+    size += "not closed" if entry["volume_ml"] is None else f"closed, {format_volume(entry['volume_ml'])}"
     turned = ", turned to LPS" if entry["space"] != "LPS" else ""
     source = {"file": "named by the file", "argument": "as you say", "assumed": "assumed"}[entry["space_from"]]
     return [

@@ -11,7 +11,7 @@ from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.reading import add_reading
 from clrecon.jobs.inside.pictures import DEFAULT_VIEW
-from clrecon.system.text import say_volume
+from clrecon.system.text import format_volume
 
 _EPILOG = """\
 parts, each a mesh of its own:
@@ -178,12 +178,12 @@ def _describe_vertebra(vertebra: dict[str, Any]) -> list[str]:
         f"{low:g} HU and above" if high is None else f"up to {high:g} HU" if low is None else f"{low:g} to {high:g} HU"
     )
     canal, height = volumes["canal"], vertebra["canal_height_mm"]
-    told = "no canal: arch not closed" if canal is None else f"canal {say_volume(canal)}, {height:.3g} mm high"
+    told = "no canal: arch not closed" if canal is None else f"canal {format_volume(canal)}, {height:.3g} mm high"
     return [
         f"{printable(vertebra['name'])}",
-        f"         solid {say_volume(volumes['solid'])} ({of}), {told}",
-        f"         dense {say_volume(volumes['dense'])} ({band}), trabecular"
-        f" {say_volume(volumes['trabecular'] or 0.0)}",
+        f"         solid {format_volume(volumes['solid'])} ({of}), {told}",
+        f"         dense {format_volume(volumes['dense'])} ({band}), trabecular"
+        f" {format_volume(volumes['trabecular'] or 0.0)}",
         f"         {_describe_thickness(vertebra['dense_thickness'])}",
     ]
 

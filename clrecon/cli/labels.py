@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.system.text import say_volume
+from clrecon.system.text import format_volume
 
 if TYPE_CHECKING:
     from clrecon.jobs.mesh.label_choice import LabelChoice
@@ -109,4 +109,4 @@ def _describe_volumes(labels: list[dict[str, Any]]) -> list[str]:
     label_ml = sum(mesh["label_compared_ml"] for mesh in surfaces)
     mesh_ml = sum(mesh["label_mesh_ml"] for mesh in surfaces)
     change = 100.0 * (mesh_ml / label_ml - 1.0)
-    return [f"         {say_volume(mesh_ml)} of mesh for {say_volume(label_ml)} of labels ({change:+.1f} %)"]
+    return [f"         {format_volume(mesh_ml)} of mesh for {format_volume(label_ml)} of labels ({change:+.1f} %)"]

@@ -24,7 +24,7 @@ from clrecon.cli.refinement import (
     finish_with_gates,
 )
 from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS
-from clrecon.system.text import count_of, say_digits, say_ml, say_volume
+from clrecon.system.text import count_of, format_digits, format_ml, format_volume
 
 _PARTS = (
     *("device", "read", "mask", "choose", "solid", "upload", "build", "kernels", "download"),
@@ -259,9 +259,9 @@ def _describe_solid(solid: dict[str, Any] | None) -> list[str]:
     if solid is None:
         return []
     left = sum(kind["ml"] for kind in solid["open"].values())
-    stays = f", {say_digits(left)} ml enclosed stay open" if left >= 0.05 else ""
+    stays = f", {format_digits(left)} ml enclosed stay open" if left >= 0.05 else ""
     share = 100.0 * solid["filled_share"]
-    filled = f"{solid['filled_ml']:,.1f} ml" if solid["filled_ml"] >= 0.1 else say_ml(solid["filled_ml"])
+    filled = f"{solid['filled_ml']:,.1f} ml" if solid["filled_ml"] >= 0.1 else format_ml(solid["filled_ml"])
     return [f"solid    {filled} filled, {share:.0f} % of the solid{stays}"]
 
 
@@ -314,7 +314,7 @@ def _describe_parts(meshes: list[dict[str, Any]]) -> list[str]:
         return []
     lines = []
     for mesh in meshes[:_SHOWN_PARTS]:
-        volume = "" if mesh["volume_ml"] is None else f", {say_volume(mesh['volume_ml'])}"
+        volume = "" if mesh["volume_ml"] is None else f", {format_volume(mesh['volume_ml'])}"
         lines.append(f"         {mesh['name']}: {mesh['triangles']:,} triangles{volume}")
     if len(meshes) > _SHOWN_PARTS:
         lines.append(f"         and {len(meshes) - _SHOWN_PARTS:,} more")
@@ -335,7 +335,7 @@ def _describe_quality(report: dict[str, Any]) -> list[str]:
         return []
     closed = "closed" if report["closed"] else "not closed"
     manifold = "manifold" if report["manifold"] else "not manifold"
-    volume = "" if report["volume_ml"] is None else f", {say_volume(report['volume_ml'])}"
+    volume = "" if report["volume_ml"] is None else f", {format_volume(report['volume_ml'])}"
     parts = f"{report['components']:,} component{'s' * (report['components'] != 1)}"
     return [f"         {parts}, {closed}, {manifold}, {report['area_mm2']:,.0f} mm2{volume}"]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from clrecon.cli.common import add_no_clobber
 from clrecon.cli.console import Console, printable
-from clrecon.system.text import say_ml
+from clrecon.system.text import format_ml
 
 _SETTINGS = (
     "kind", "size", "slices", "spacing", "tilt", "oblique", "noise", "point_spread_mm", "seed", "radius_mm",
@@ -119,7 +119,7 @@ def _summary(truth: dict[str, Any], output: str) -> list[str]:
         lines[0] += f", tilt {truth['tilt_deg']:+.2f} degrees"
     for material, part in (truth["parts"] or {}).items():
         dense = f", {part['voxels_above_300_hu']:,} voxels above 300 HU" if part["voxels_above_300_hu"] else ""
-        lines.append(f"{material:<8} {say_ml(part['volume_ml'], 4)}{dense}")
+        lines.append(f"{material:<8} {format_ml(part['volume_ml'], 4)}{dense}")
     lines.append(f"surface  at {truth['iso_value_hu']:g} HU")
     if truth["surface"]:
         lines[-1] += f": {truth['surface']['area_mm2']:,.1f} mm2, {truth['surface']['volume_ml']:,.3f} ml"

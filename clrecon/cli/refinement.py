@@ -8,7 +8,7 @@ from typing import Any
 
 from clrecon.cli.console import Console
 from clrecon.jobs.mesh.purposes import PURPOSES, Purpose
-from clrecon.system.text import count_of, say_digits, say_ml
+from clrecon.system.text import count_of, format_digits, format_ml
 
 SCAN_GATE_FAILED, GATE_FAILED = 7, 8
 """Exit code for a failed gate with ``--strict``; everything is written."""
@@ -102,7 +102,7 @@ def _describe_decimation(found: dict[str, Any]) -> str:
     topology = _describe_topology(found["topology"])
     if found["ended_by"] == "share":
         return f"{reached:.1f} % of the triangles taken away, as asked, {topology}"
-    bound = f"the bound of {say_digits(found['max_deviation_mm'])} mm"
+    bound = f"the bound of {format_digits(found['max_deviation_mm'])} mm"
     return f"{reached:.1f} % of the triangles taken away of {asked:g} % asked for: {bound} ended it, {topology}"
 
 
@@ -137,12 +137,12 @@ def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
     lines = [f"{which}size {' x '.join(f'{length:.1f}' for length in facts['size_mm'])} mm"]
     if wall["median_mm"] is not None:
         lines[0] += (
-            f", walls {wall['median_mm']:.1f} mm (median), 5 % below {say_digits(wall['p5_mm'], 2)} mm,"
+            f", walls {wall['median_mm']:.1f} mm (median), 5 % below {format_digits(wall['p5_mm'], 2)} mm,"
             f" {100 * wall['thin_share']:.1f} % below {wall['thin_mm']:g} mm"
         )
-    pieces = f"{count_of(left_out['pieces'], 'piece')} of {say_ml(left_out['pieces_ml'])} together"
+    pieces = f"{count_of(left_out['pieces'], 'piece')} of {format_ml(left_out['pieces_ml'])} together"
     cavities = (
-        f"{count_of(left_out['cavities'], 'closed cavity', 'closed cavities')} of {say_ml(left_out['cavities_ml'])}"
+        f"{count_of(left_out['cavities'], 'closed cavity', 'closed cavities')} of {format_ml(left_out['cavities_ml'])}"
     )
     if left_out["pieces"] or left_out["cavities"]:
         lines.append(f"         left out {pieces}, filled {cavities}")
@@ -150,7 +150,7 @@ def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
         bone = left_out["pieces"] + facts["pieces"] - left_out["not_bone"]
         lines.append(
             f"         kept {facts['pieces']:,} of {bone:,} pieces with walls like bone; {left_out['not_bone']:,} of"
-            f" {say_ml(left_out['not_bone_ml'])} are not, or are crumbs"
+            f" {format_ml(left_out['not_bone_ml'])} are not, or are crumbs"
         )
     return lines
 

@@ -14,7 +14,7 @@ from clrecon.cli.masking import add_masking
 from clrecon.cli.mesh import add_levels, add_selection, add_solid, describe_volume
 from clrecon.cli.reading import add_reading
 from clrecon.errors import UsageError
-from clrecon.system.text import say_volume
+from clrecon.system.text import format_volume
 
 if TYPE_CHECKING:
     from clrecon.jobs.view.settings import ViewSettings
@@ -207,7 +207,7 @@ def _describe(report: dict[str, Any], output: str) -> list[str]:
     lines = [f"input    {_describe_input(entry)}" for entry in report["inputs"]]
     lines.append(f"mesh     {report['vertices']:,} vertices, {report['triangles']:,} triangles")
     rows = [
-        [part["name"], f"{part['triangles']:,} triangles", "" if part["ml"] is None else say_volume(part["ml"])]
+        [part["name"], f"{part['triangles']:,} triangles", "" if part["ml"] is None else format_volume(part["ml"])]
         for part in report["parts"][:_SHOWN_PARTS]
     ]
     if len(report["parts"]) > 1:

@@ -22,7 +22,7 @@ from clrecon.sources.facts import PixelFacts
 from clrecon.sources.likeness import Likeness, judge_slices
 from clrecon.system.memory import allocate_voxels
 from clrecon.system.progress import Progress
-from clrecon.system.text import say_share
+from clrecon.system.text import format_share
 from clrecon.system.wording import name_parameter
 
 LADDER = (np.dtype(np.int16), np.dtype(np.int32), np.dtype(np.float32))
@@ -128,7 +128,9 @@ class _Filling:
         doubts, warnings = _doubts(voxels, low, high), []
         share = self._holes / voxels.size
         if self._holes:
-            warnings = [f"{self._holes:,} voxels ({say_share(share, 2)}) are NaN: {AIR_HU} HU, air, is taken for them"]
+            warnings = [
+                f"{self._holes:,} voxels ({format_share(share, 2)}) are NaN: {AIR_HU} HU, air, is taken for them"
+            ]
             low, high = min(low, AIR_HU), max(high, AIR_HU)
         filled = float(AIR_HU) if self._holes else None
         facts = PixelFacts(share, float(low), float(high), filled)

@@ -10,7 +10,7 @@ from clrecon.geometry.affine import (
     slice_normal,
     tilt_degrees,
 )
-from clrecon.geometry.base import AIR_HU
+from clrecon.geometry.base import AIR_HU, METAL_HU
 from clrecon.geometry.frames import SPACES, frame_from_lps, lps_affine_from_ras
 from clrecon.geometry.grid import Grid
 from clrecon.geometry.volume import Volume
@@ -18,6 +18,7 @@ from clrecon.geometry.volume import Volume
 __all__ = [
     "AIR_HU",
     "Grid",
+    "METAL_HU",
     "SPACES",
     "Volume",
     "apply_affine",

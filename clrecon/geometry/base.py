@@ -21,6 +21,9 @@ AIR_HU = -1024
 """HU given to voxels that hold no measurement (padding): the floor of the 12-bit CT number scale.  Air is -1000 HU, so
 a lower value stays outside every surface of something denser than air."""
 
+METAL_HU = 2000.0
+"""Highest value of cortical bone; enamel and metal are above."""
+
 DEVICE_DTYPES = tuple(np.dtype(name) for name in ("int8", "uint8", "int16", "uint16", "int32", "float32"))
 """Voxel types that go to a device unchanged; others are converted once, when a Volume is made."""
 

@@ -20,7 +20,7 @@ from clrecon.geometry.base import AIR_HU
 from clrecon.geometry.precision import find_vertex_origin, float32_step, largest_coordinate, power_of_two_over
 from clrecon.geometry.vertex_rules import check_vertex_rule
 from clrecon.geometry.volume import Volume
-from clrecon.system.text import say_digits
+from clrecon.system.text import format_digits
 
 LARGEST_INTEGER = 2**23
 """Integer voxels are interpolated in float32, which holds multiples of 0.5 exactly up to here."""
@@ -99,7 +99,7 @@ class IsoRule:
             return f"{self.iso_value:g} to {self.upper_value:g} HU"
         return f"{'below ' if self.inside == 'below' else ''}{self.iso_value:g} HU"
 
-    def describe_place(self) -> str:
+    def phrase(self) -> str:
         """Describe the same for use after the word "surface": ``at 200 HU``, ``of what lies below -400 HU``."""
         return f"of what lies {self.describe()}" if self.inside == "below" else f"at {self.describe()}"
 
@@ -315,8 +315,8 @@ def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
     margin = 4.0 * unit / steps
     if margin.max() > LARGEST_MARGIN:
         raise UsageError(
-            f"the volume reaches {say_digits(largest)} mm from its centre with steps of {say_digits(steps.min())} mm:"
-            f" float32 vertices come in steps of {say_digits(unit, 2)} mm there; take a part of it"
+            f"the volume reaches {format_digits(largest)} mm from its centre with steps of {format_digits(steps.min())}"
+            f" mm: float32 vertices come in steps of {format_digits(unit, 2)} mm there; take a part of it"
         )
     return margin
 

@@ -15,7 +15,7 @@ from clrecon.labels.label_map import LabelMap
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.text import say_ml
+from clrecon.system.text import format_ml
 
 log = get_logger(__name__)
 
@@ -255,7 +255,7 @@ def _check_overlap(labels: LabelMap, volume: Volume, shares: dict[int, float]) -
         )
     ml = total * abs(np.linalg.det(labels.affine[:3, :3])) / 1000.0
     raise RefusedInputError(
-        f"{100 * share:.2g} % of the labels ({say_ml(ml)}) lie inside the CT: they span {_extent(labels)}, the CT"
+        f"{100 * share:.2g} % of the labels ({format_ml(ml)}) lie inside the CT: they span {_extent(labels)}, the CT"
         f" {_extent(volume)}; they belong to another scan, or one of both is misplaced"
     )
 

@@ -18,7 +18,7 @@ from clrecon.labels.volumes import label_ml, slice_voxel_ml
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
-from clrecon.system.text import say_digits
+from clrecon.system.text import format_digits
 
 PERCENTILES = (5.0, 25.0, 50.0, 75.0, 95.0)
 
@@ -61,7 +61,7 @@ class LabelFigures(Record):
         """What is doubtful about this label."""
         if not self.voxels:
             where = "outside of the scan" if self.inside_share == 0.0 else "smaller than the voxels of the scan"
-            return [f"{self.name} has no voxel in the scan: its {say_digits(self.label_ml)} ml are {where}"]
+            return [f"{self.name} has no voxel in the scan: its {format_digits(self.label_ml)} ml are {where}"]
         told = []
         if self.inside_share < 1.0:
             told.append(
@@ -70,8 +70,8 @@ class LabelFigures(Record):
         wanted = self.label_ml * self.inside_share
         if abs(self.ml - wanted) > _ODD_VOLUME * wanted:
             told.append(
-                f"{self.name} has {say_digits(self.ml, 4)} ml on the grid of the scan and"
-                f" {say_digits(wanted, 4)} ml on its own:"
+                f"{self.name} has {format_digits(self.ml, 4)} ml on the grid of the scan and"
+                f" {format_digits(wanted, 4)} ml on its own:"
                 " look at the slices of both"
             )
         if self.unmeasured:

@@ -16,7 +16,7 @@ from clrecon.mesh.base import BaseMesh
 from clrecon.mesh.connectivity import label_components
 from clrecon.mesh.nearest import find_nearest_triangle
 from clrecon.mesh.pieces import measure_components
-from clrecon.system.text import count_of, say_digits
+from clrecon.system.text import count_of, format_digits
 from clrecon.system.wording import name_parameter
 
 Own = TypeVar("Own", bound=BaseMesh)
@@ -190,7 +190,7 @@ def _choose(
         if not keep.any():
             raise NoSurfaceError(
                 f"none of {count_of(int(np.count_nonzero(candidates)), 'component')} encloses {min_volume_ml:g} ml: "
-                f"the largest has {say_digits(volumes[candidates].max(initial=0.0), 4)} ml, ask for less"
+                f"the largest has {format_digits(volumes[candidates].max(initial=0.0), 4)} ml, ask for less"
             )
     facts: dict[str, object] = {}
     if len(seeds):

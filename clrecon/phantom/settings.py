@@ -15,7 +15,7 @@ from clrecon.phantom.facets import LARGEST_GAP_MM
 from clrecon.phantom.fit import fit_slices, spine_choice
 from clrecon.phantom.ghosts import ghost_places
 from clrecon.phantom.levels import THORACOLUMBAR, format_levels, parse_levels
-from clrecon.system.text import say_unknown
+from clrecon.system.text import unknown_name
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ class PhantomSettings:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise UsageError(say_unknown("phantom kind", self.kind, KINDS))
+            raise UsageError(unknown_name("phantom kind", self.kind, KINDS))
         if self.transfer_syntax not in ("explicit", "implicit"):
             raise UsageError(f"unknown transfer syntax {self.transfer_syntax!r}: use explicit or implicit")
         for name in ("spacing", "noise", "point_spread_mm"):
@@ -254,7 +254,7 @@ class PhantomSettings:
 
     def _check_lying(self) -> None:
         if self.table is not None and self.table not in TABLE_NAMES:
-            raise UsageError(say_unknown("table", self.table, TABLE_NAMES))
+            raise UsageError(unknown_name("table", self.table, TABLE_NAMES))
         lies = self.table is not None or self.table_gap_mm != 0.0 or self.prone
         if lies and KINDS[self.kind].table is None:
             raise UsageError(f"a {self.kind} lies on nothing: table, gap and prone are for spine and the other bodies")

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
+from clrecon.geometry import METAL_HU
 from clrecon.sources.facts import PixelFacts
 from clrecon.sources.sample import ValueSample
 from clrecon.sources.scale import LOWEST_AIR_HU, SCALE_SAID, judge_scale
@@ -30,9 +31,6 @@ CEILING_VOXELS = 10
 CEILING_LEVELS, CEILING_SPIKE = 8, 10.0
 """Values beyond a ceiling: it still counts as one if it has this many times the voxels of the values around it.  Values
 that were cut off there and then interpolated, or put beside slices with more bits, exceed it in a few voxels."""
-
-METAL_HU = 2000
-"""Highest value of cortical bone."""
 
 LEAST_PADDING_SHARE = 0.01
 

@@ -38,7 +38,7 @@ def guess_word(word: object, known: Iterable[str]) -> str:
     return f" (did you mean {folded[near[0]]}?)" if near else ""
 
 
-def say_unknown(noun: str, word: object, known: Iterable[str]) -> str:
+def unknown_name(noun: str, word: object, known: Iterable[str]) -> str:
     """Return the start of a message: the word is unknown, which one it may have meant, and all that are known."""
     known = list(known)
     return f"unknown {noun} {word!r:.60}{guess_word(word, known)}: use one of {', '.join(known)}"
@@ -49,7 +49,7 @@ def count_of(number: int, noun: str, several: str | None = None) -> str:
     return f"{number:,} {noun if number == 1 else several or noun + 's'}"
 
 
-def say_digits(value: float, digits: int = 3) -> str:
+def format_digits(value: float, digits: int = 3) -> str:
     """Return a number with so many significant digits, never with an exponent: ``10,000``, ``0.0039``, ``-312``.
 
     Digits before the point are all there, as in ``12,346``.
@@ -63,31 +63,35 @@ def say_digits(value: float, digits: int = 3) -> str:
     return text.rstrip("0").rstrip(".") if "." in text else text
 
 
-def say_hu(value: float) -> str:
+def format_hu(value: float) -> str:
     """Return HU as far as they mean something: whole numbers as they are, others with three significant digits."""
     if math.isfinite(value) and value == round(value) and abs(value) < LARGEST_HU:
         return str(round(value))
-    return say_digits(value)
+    return format_digits(value)
 
 
-def say_ml(ml: float, digits: int = 3) -> str:
+def format_ml(ml: float, digits: int = 3) -> str:
     """Return a volume with its unit: ml, and mm3 below 0.1 ml."""
-    return f"{say_digits(ml, digits)} ml" if abs(ml) >= 0.1 or ml == 0.0 else f"{say_digits(1000.0 * ml, digits)} mm3"
+    return (
+        f"{format_digits(ml, digits)} ml"
+        if abs(ml) >= 0.1 or ml == 0.0
+        else f"{format_digits(1000.0 * ml, digits)} mm3"
+    )
 
 
-def say_volume(ml: float) -> str:
+def format_volume(ml: float) -> str:
     """Return a measured volume with its unit: ml to two decimals, and mm3 below 0.1 ml."""
-    return f"{ml:,.2f} ml" if abs(ml) >= 0.1 else say_ml(ml)
+    return f"{ml:,.2f} ml" if abs(ml) >= 0.1 else format_ml(ml)
 
 
-def say_band(low: float, high: float, unit: str = "HU") -> str:
+def format_band(low: float, high: float, unit: str = "HU") -> str:
     """Return what lies from `low` to `high`, an infinite end open: ``200 HU and more``, ``up to 40 HU``."""
     if math.isinf(low):
         return f"any {unit}" if math.isinf(high) else f"up to {high:g} {unit}"
     return f"{low:g} {unit} and more" if math.isinf(high) else f"{low:g} to {high:g} {unit}"
 
 
-def say_share(share: float, places: int = 0) -> str:
+def format_share(share: float, places: int = 0) -> str:
     """Return a share, 0 to 1, as ``31 %``, with so many digits behind the point."""
     return f"{100.0 * share:.{places}f} %"
 

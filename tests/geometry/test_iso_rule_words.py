@@ -21,7 +21,7 @@ VOLUME = Volume(np.array([[[-1000, 900]]], np.int16), np.eye(4))
 )
 def test_a_rule_says_what_is_asked_for(level, below, words, place):
     rule = choose_iso_rule(VOLUME, level, below=below)
-    assert (rule.describe(), rule.describe_place()) == (words, place)
+    assert (rule.describe(), rule.phrase()) == (words, place)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.render.files import PictureFiles
 from clrecon.jobs.render.job import make_pictures
 from clrecon.jobs.render.settings import RenderSettings
-from clrecon.system.text import say_ml
+from clrecon.system.text import format_ml
 
 BONY = [name for name in BODIES if name not in ("water", "empty")]
 SPINELESS = [name for name in BODIES if name != "contrast"]
@@ -223,7 +223,7 @@ def test_air_within_a_body_is_told_from_the_air_around_it(
     report, vertices = mesh_of(odd, device, tmp_path, name, below=-400.0)
     facts = report["volume"]["outside_air"]
     assert kept_ml[0] < facts["kept_ml"] < kept_ml[1] < facts["left_out_ml"]
-    assert any(f"{say_ml(facts['kept_ml'])} within it" in warning for warning in report["warnings"])
+    assert any(f"{format_ml(facts['kept_ml'])} within it" in warning for warning in report["warnings"])
     assert share_near(body, vertices, "table") < 0.1
     assert share_near(body, vertices, "tissue", "bone") > 0.85
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from clrecon.system.text import say_digits, say_hu
+from clrecon.system.text import format_digits, format_hu
 
 
 @pytest.mark.parametrize(
@@ -16,7 +16,7 @@ from clrecon.system.text import say_digits, say_hu
     ],
 )  # fmt: skip
 def test_digits_are_sensible_and_never_an_exponent(value, digits, text):
-    assert say_digits(value, digits) == text
+    assert format_digits(value, digits) == text
 
 
 @pytest.mark.parametrize(
@@ -24,4 +24,4 @@ def test_digits_are_sensible_and_never_an_exponent(value, digits, text):
     [(-1024.0, "-1024"), (3071, "3071"), (-311.789, "-312"), (0.25, "0.25"), (-0.0, "0"), (4e6, "4,000,000")],
 )
 def test_hu_are_whole_where_fractions_mean_nothing(value, text):
-    assert say_hu(value) == text
+    assert format_hu(value) == text

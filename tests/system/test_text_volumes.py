@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from clrecon.system.text import say_ml, say_volume
+from clrecon.system.text import format_ml, format_volume
 
 pytestmark = pytest.mark.unit
 
@@ -21,4 +21,4 @@ pytestmark = pytest.mark.unit
     ],
 )
 def test_volumes_below_a_tenth_of_a_millilitre_are_said_in_mm3(ml, short, long):
-    assert (say_ml(ml), say_volume(ml)) == (short, long)
+    assert (format_ml(ml), format_volume(ml)) == (short, long)

@@ -35,7 +35,7 @@ from clrecon.system.files import temporary_folder
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.targets import keep_existing, system_errors
-from clrecon.system.text import say_hu
+from clrecon.system.text import format_hu
 from clrecon.system.time_limit import device_seconds
 
 if TYPE_CHECKING:
@@ -150,7 +150,9 @@ def _prepare(
     assert isinstance(level, float | int)
     low, high = volume.hu_range or (math.nan, math.nan)
     if not level <= high:
-        raise NoSurfaceError(f"no surface at {level:g} HU: the volume runs from {say_hu(low)} to {say_hu(high)} HU")
+        raise NoSurfaceError(
+            f"no surface at {level:g} HU: the volume runs from {format_hu(low)} to {format_hu(high)} HU"
+        )
     return volume, float(level), str(facts["iso_value_reason"]), warnings
 
 

@@ -53,7 +53,7 @@ def extract_by_vtk(volume: Volume, iso_value: float, name: str, closed: bool) ->
     contour.Update()
     made = contour.GetOutput()
     if not made.GetNumberOfPolys():
-        raise NoSurfaceError(f"no surface {rule.describe_place()}")
+        raise NoSurfaceError(f"no surface {rule.phrase()}")
     extracted = perf_counter()
     found: NDArray[np.float64] = vtk_to_numpy(made.GetPoints().GetData()).astype(np.float64)
     faces = vtk_to_numpy(made.GetPolys().GetConnectivityArray()).reshape(-1, 3)

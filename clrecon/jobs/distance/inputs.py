@@ -10,7 +10,7 @@ import numpy as np
 
 from clrecon.mesh import Mesh
 from clrecon.mesh.reader import read_mesh
-from clrecon.system.text import escape_text, say_digits
+from clrecon.system.text import escape_text, format_digits
 
 _OTHER_UNIT = 100.0
 """Ratio of the sizes of two meshes from which on their units are doubted; metres and millimetres differ by 1000."""
@@ -59,14 +59,14 @@ def doubt_frames(meshes: Sequence[Mesh], entries: Sequence[dict[str, Any]]) -> l
     sizes = [float(np.linalg.norm(box[1] - box[0])) for box in boxes]
     if min(sizes) > 0.0 and max(sizes) / min(sizes) >= _OTHER_UNIT:
         doubts.append(
-            f"{a} is {say_digits(sizes[0], 4)} mm across and {b} {say_digits(sizes[1], 4)} mm: is"
+            f"{a} is {format_digits(sizes[0], 4)} mm across and {b} {format_digits(sizes[1], 4)} mm: is"
             f" one of them in another unit?"
         )
     gap = float(np.linalg.norm(np.maximum(0.0, np.maximum(boxes[0][0] - boxes[1][1], boxes[1][0] - boxes[0][1]))))
     if gap > 0.0:
         sources = {entry["space_from"] for entry in entries}
         hint = ": is the frame of the file that names none another?" if "assumed" in sources else ""
-        doubts.append(f"the boxes round {a} and {b} lie {say_digits(gap, 4)} mm apart{hint}")
+        doubts.append(f"the boxes round {a} and {b} lie {format_digits(gap, 4)} mm apart{hint}")
     return doubts
 
 

@@ -11,7 +11,7 @@ from clrecon.jobs.mesh.presets import find_preset
 from clrecon.jobs.mesh.purposes import find_purpose
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.text import say_hu
+from clrecon.system.text import format_hu
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def describe_level(
     for material, hu in (("bone", choice.bone_hu), ("tissue", choice.tissue_hu)):
         if choice.method == "half" and not low <= hu <= high:
             warnings.append(
-                f"{material} was given as {hu:g} HU, but the volume runs from {say_hu(low)} to {say_hu(high)} HU:"
+                f"{material} was given as {hu:g} HU, but the volume runs from {format_hu(low)} to {format_hu(high)} HU:"
                 " the level half way may not be that of this scan"
             )
     if choice.method == "auto" and volume.spacing[2] > THICK_SLICES_MM:

@@ -13,7 +13,7 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface
 from clrecon.jobs.shared.outputs import MOST_FILES
 from clrecon.system.progress import Progress, Steps
-from clrecon.system.text import say_hu, say_ml
+from clrecon.system.text import format_hu, format_ml
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
@@ -46,8 +46,8 @@ def check_levels(volume: Volume, surfaces: Sequence[Surface]) -> None:
             all_inside = level > high if surface.below else level <= low
         if all_inside:  # the surface would be the box of the scan
             raise NoSurfaceError(
-                f"no surface {surface.place}: every voxel is inside, the volume runs from"
-                f" {say_hu(low)} to {say_hu(high)} HU"
+                f"no surface {surface.phrase}: every voxel is inside, the volume runs from"
+                f" {format_hu(low)} to {format_hu(high)} HU"
             )
 
 
@@ -139,7 +139,7 @@ def _select_parts(
         pieces = split_components(mesh, *limits, seeds=seeds, labelled=labelled, among=among, most=MOST_FILES)
     except (NoSurfaceError, UsageError) as error:
         label = "" if surface.label is None else f"{surface.label} "  # one of several is too small, or too far
-        raise type(error)(f"{label}{surface.place}: {error}") from error
+        raise type(error)(f"{label}{surface.phrase}: {error}") from error
     return [Part(surface, _name_piece(surface, place), piece) for place, piece in enumerate(pieces, start=1)]
 
 
@@ -174,7 +174,7 @@ def warn_of_crumbs(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
         if len(small) > MANY_COMPONENTS:
             warnings.append(
                 f"{f'{part.name}: ' if part.name else ''}{len(small):,} of {len(ml):,} components enclose less than"
-                f" {CRUMB_ML:g} ml each, {say_ml(float(small.sum()))} together:"
+                f" {CRUMB_ML:g} ml each, {format_ml(float(small.sum()))} together:"
                 f" {name_parameter('min_volume_ml', CRUMB_ML)} drops them"
             )
     return warnings

@@ -14,7 +14,7 @@ from clrecon.jobs.shared.masking import mask_volume
 from clrecon.jobs.shared.preprocess import preprocess_volume
 from clrecon.jobs.shared.region import Band, restrict_volume
 from clrecon.system.progress import Progress
-from clrecon.system.text import say_ml
+from clrecon.system.text import format_ml
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
@@ -133,8 +133,8 @@ def leave_outside(volume: Volume, settings: MeshSettings, progress: Progress) ->
     volume = leave_outside_air(volume, levels, progress=progress)
     facts = volume.report["outside_air"]
     warnings.append(
-        f"air outside of the body was left out: {say_ml(facts['left_out_ml'])}, {say_ml(facts['kept_ml'])} within it"
-        f" are kept ({name_parameter('keep_outside', True)} takes all)"
+        f"air outside of the body was left out: {format_ml(facts['left_out_ml'])}, {format_ml(facts['kept_ml'])} within"
+        f" it are kept ({name_parameter('keep_outside', True)} takes all)"
     )
     if facts["opening_mm2"] > 0.0:
         warnings.append(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from clrecon.errors import UsageError
-from clrecon.system.text import say_unknown
+from clrecon.system.text import unknown_name
 
 
 @dataclass(frozen=True)
@@ -58,4 +58,4 @@ def find_preset(name: str) -> Preset:
     try:
         return PRESETS[name.lower()]
     except (KeyError, AttributeError):
-        raise UsageError(f"{say_unknown('preset', name, PRESETS)}, or give the iso value in HU") from None
+        raise UsageError(f"{unknown_name('preset', name, PRESETS)}, or give the iso value in HU") from None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from clrecon.system.text import count_of, say_digits
+from clrecon.system.text import count_of, format_digits
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def warn_of_print(facts: dict[str, Any]) -> list[str]:
     if facts["cavities"]:
         warnings.append(
             f"{count_of(facts['cavities'], 'closed cavity', 'closed cavities')} of"
-            f" {say_digits(facts['cavities_ml'], 2)} ml together are in it: powder or"
+            f" {format_digits(facts['cavities_ml'], 2)} ml together are in it: powder or"
             f" resin stays in them; {name_parameter('keep_largest', 1)} fills them"
         )
     bone_told = left_out.get("not_bone") is not None
@@ -87,8 +87,8 @@ def warn_of_print(facts: dict[str, Any]) -> list[str]:
         away, seed = name_parameter("remove_table", True), name_parameter("seeds", "X,Y,Z")
         table = "" if bone_told else f" The piece of largest area can be a table ({away});"
         warnings.append(
-            f"{'bone that' if bone_told else 'what'} was left out encloses {say_digits(other_ml)} ml, beside the"
-            f" {say_digits(facts['pieces_ml'])} ml that were kept: is it the right piece?{table}"
+            f"{'bone that' if bone_told else 'what'} was left out encloses {format_digits(other_ml)} ml, beside the"
+            f" {format_digits(facts['pieces_ml'])} ml that were kept: is it the right piece?{table}"
             f" {seed} keeps the one at a point, {name_parameter('all_parts', True)} keeps all"
         )
     return warnings

@@ -36,7 +36,7 @@ class Surface:
         return f"{'below ' if self.below else ''}{name_level(self.iso_value)} HU"
 
     @property
-    def place(self) -> str:
+    def phrase(self) -> str:
         """Describe the same for use after the word "surface": ``at 200 HU``, ``of what lies below -400 HU``."""
         return f"of what lies {self.describe()}" if self.below else f"at {self.describe()}"
 

@@ -43,7 +43,7 @@ from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.default_view import ANTERIOR, SLICES_VIEWS
 from clrecon.rendering.views.directions import DEFAULT_SIZE, DIRECTIONS, checked_size
 from clrecon.rendering.views.plane import find_plane
-from clrecon.system.text import say_unknown
+from clrecon.system.text import unknown_name
 from clrecon.system.wording import name_parameter
 
 DEFAULT_VIEWS = {"slice": "axial", "cpr": "left", "slices": SLICES_VIEWS[0]}
@@ -340,7 +340,7 @@ def _turn_light(light: str | Sequence[float], lighting: Lighting) -> Lighting:
     if isinstance(light, str):
         if light not in (*LIGHTS, *DIRECTIONS):
             known = (*LIGHTS, *DIRECTIONS)
-            raise UsageError(f"{say_unknown('light', light, known)}, or a direction X,Y,Z in LPS")
+            raise UsageError(f"{unknown_name('light', light, known)}, or a direction X,Y,Z in LPS")
         direction = DIRECTIONS.get(light)
     return replace(lighting if lighting.shades else Lighting(), direction=direction)
 

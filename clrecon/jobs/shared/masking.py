@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.shared.settings import InputSettings
 from clrecon.system.progress import Progress
-from clrecon.system.text import say_digits
+from clrecon.system.text import format_digits
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -25,7 +25,7 @@ def mask_volume(volume: Volume, settings: InputSettings, progress: Progress) -> 
         volume = mask_field_of_view(volume, None if isinstance(radius, str) else radius, progress=progress)
         facts = volume.report["field_of_view"]
         warnings.append(
-            f"outside of {say_digits(facts['radius_mm'], 4)} mm around the centre of the slices is air now:"
+            f"outside of {format_digits(facts['radius_mm'], 4)} mm around the centre of the slices is air now:"
             f" {100.0 * facts['removed_share']:.3g} % of the voxels, {facts['dense_voxels_removed']:,} of them dense"
             + _describe_cut(facts)
         )

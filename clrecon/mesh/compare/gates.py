@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from clrecon.mesh.compare.iso_distance import METAL_HU
+from clrecon.geometry import METAL_HU
 from clrecon.system.gates import Gate, at_most, is_true, none_of, unmeasured
 
 DEVIATION_P95_VOXEL = 0.25

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.geometry import Volume
+from clrecon.geometry import METAL_HU, Volume
 from clrecon.geometry.iso_rule import IsoRule, layer_normal_matrices
 from clrecon.mesh.compare.distances import DistanceSummary, summarise_distances
 from clrecon.mesh.mesh import Mesh
@@ -20,8 +20,6 @@ from clrecon.system.records import Record
 SAMPLES = 100_000
 """Most points; larger meshes are measured at every n-th vertex and triangle."""
 
-METAL_HU = 2000.0
-"""Bone is below, metal and enamel above."""
 METAL_REACH = 2
 """Voxels.  At an edge of thousands of HU a level of bone lies in the outermost voxels: the surface is a staircase,
 which smoothing leaves."""

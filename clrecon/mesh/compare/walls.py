@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from clrecon.anatomy.dense_pieces import RAIL_MM, STRAIGHT_MM
 from clrecon.errors import UsageError
-from clrecon.geometry import Volume
+from clrecon.geometry import METAL_HU, Volume
 from clrecon.geometry.iso_rule import IsoRule
-from clrecon.mesh.compare.iso_distance import METAL_HU, trilinear_values
+from clrecon.mesh.compare.iso_distance import trilinear_values
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.records import Record
 

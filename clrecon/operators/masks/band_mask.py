@@ -17,7 +17,7 @@ from clrecon.operators.masks.classify import prepare_classify
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points.voxel_numbers import VoxelNumbers
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.text import say_band
+from clrecon.system.text import format_band
 from clrecon.system.wording import name_parameter
 
 LONGEST_ROW = 65_535
@@ -98,7 +98,7 @@ def band_bounds(volume: Volume, hu: tuple[float, float]) -> tuple[Any, Any]:
     limits = np.iinfo(dtype)
     low, high = max(hu[0], float(limits.min)), min(hu[1], float(limits.max))
     if math.ceil(low) > math.floor(high):
-        raise NoSurfaceError(f"no voxel can have {say_band(*hu)}: voxels are {dtype}")
+        raise NoSurfaceError(f"no voxel can have {format_band(*hu)}: voxels are {dtype}")
     return dtype.type(math.ceil(low)), dtype.type(math.floor(high))
 
 

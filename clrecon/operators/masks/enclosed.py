@@ -20,7 +20,7 @@ from clrecon.points.stencil import Lattice
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.gates import at_most
 from clrecon.system.progress import Progress, Steps
-from clrecon.system.text import count_of, say_hu, say_ml
+from clrecon.system.text import count_of, format_hu, format_ml
 from clrecon.system.wording import name_parameter
 
 LEAST_SAID_ML = 0.1
@@ -128,7 +128,7 @@ def fill_enclosed(
         if not bone.count or bone.count == own.voxels.size:
             what = "no voxel has" if not bone.count else "every voxel has"
             low, high = own.hu_range or (float(own.voxels.min()), float(own.voxels.max()))
-            ends = f"the volume runs from {say_hu(low)} to {say_hu(high)} HU"
+            ends = f"the volume runs from {format_hu(low)} to {format_hu(high)} HU"
             raise NoSurfaceError(f"{what} {iso_value:g} HU or more: {ends}")
         seal = seal or _default_seal(own, bone)
         steps.take()
@@ -239,17 +239,17 @@ def _warn(facts: dict[str, Any]) -> list[str]:
         left = facts["open"][kind]
         if left["ml"] >= LEAST_SAID_ML:
             at = ", ".join(f"{x:.0f}" for x in left["at_mm"])
-            several = f", the largest {say_ml(left['largest_ml'])}" if left["spaces"] > 1 else ""
+            several = f", the largest {format_ml(left['largest_ml'])}" if left["spaces"] > 1 else ""
             warnings.append(
-                f"solid: {say_ml(left['ml'])} stay open in {count_of(left['spaces'], 'enclosed space')}"
+                f"solid: {format_ml(left['ml'])} stay open in {count_of(left['spaces'], 'enclosed space')}"
                 f" ({what}{several}, round {at} mm LPS)"
             )
     if not facts["filled_ml"]:
         warnings.append("solid: nothing is enclosed at this level, and nothing was filled")
     elif facts["filled_ml"] > facts["bone_ml"]:
         warnings.append(
-            f"solid: {say_ml(facts['filled_ml'])} were filled, more than the"
-            f" {say_ml(facts['bone_ml'])} of the bone"
+            f"solid: {format_ml(facts['filled_ml'])} were filled, more than the"
+            f" {format_ml(facts['bone_ml'])} of the bone"
             " itself: see in a picture that it is marrow"
         )
     return warnings

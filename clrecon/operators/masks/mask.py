@@ -20,7 +20,7 @@ from clrecon.operators.masks.runs import write_runs
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
-from clrecon.system.text import say_band
+from clrecon.system.text import format_band
 
 if TYPE_CHECKING:  # label maps load pydicom, which others need not wait for
     from clrecon.labels import LabelMap
@@ -80,7 +80,7 @@ class Mask(MaskComponents):
             No device, not even the mask and one slice fit its memory, or it fails.
         """
         band = checked_band(hu)
-        name = say_band(*band)
+        name = format_band(*band)
         with open_volume(volume, device, memory, "a mask") as resident:
 
             def make(told: list[str]) -> Mask:
@@ -192,7 +192,7 @@ class Mask(MaskComponents):
         sides = checked_box(box)
         with open_volume(volume, device, memory, "a mask") as resident:
             name = "box " + ", ".join(
-                f"{axis} {say_band(low, high, 'mm')}"
+                f"{axis} {format_band(low, high, 'mm')}"
                 for axis, (low, high) in zip("xyz", sides, strict=True)
                 if np.isfinite((low, high)).any()
             )

@@ -12,7 +12,7 @@ from clrecon.geometry import Volume
 from clrecon.opencl import Device, check_budget, download, upload
 from clrecon.operators.masks import logic
 from clrecon.operators.masks.band_mask import VoxelMask, mask_bytes
-from clrecon.system.text import say_digits
+from clrecon.system.text import format_digits
 
 PLACE_TOLERANCE_MM = 0.01
 """Voxels of two volumes that lie as close are the same."""
@@ -127,4 +127,4 @@ class MaskBits:
         turned = np.abs((volume.affine - own.affine)[:3, :2] * (ni, nj)).max()
         away = max(float(turned), float(np.abs(volume.slice_origins() - own.slice_origins()).max()))
         if away > PLACE_TOLERANCE_MM:
-            raise UsageError(f"the voxels of the mask and of the other volume lie up to {say_digits(away)} mm apart")
+            raise UsageError(f"the voxels of the mask and of the other volume lie up to {format_digits(away)} mm apart")

@@ -23,7 +23,7 @@ from clrecon.points.kinds import KINDS
 from clrecon.points.voxel_numbers import VoxelNumbers
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
-from clrecon.system.text import say_hu
+from clrecon.system.text import format_hu
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:  # label maps load pydicom, which other clouds need not wait for
@@ -136,7 +136,7 @@ def _describe(band: Band) -> str:
 def _refuse_band(volume: Volume, band: Band, where: str) -> NoSurfaceError:
     low, high = data_range(volume)
     return NoSurfaceError(
-        f"no voxel {where}of {_describe(band)}: the volume runs from {say_hu(low)} to {say_hu(high)} HU"
+        f"no voxel {where}of {_describe(band)}: the volume runs from {format_hu(low)} to {format_hu(high)} HU"
     )
 
 

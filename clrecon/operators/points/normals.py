@@ -30,7 +30,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points import PointCloud, PointStep
 from clrecon.system.arguments import as_numbers, explains_arguments
 from clrecon.system.progress import Progress
-from clrecon.system.text import say_share
+from clrecon.system.text import format_share
 from clrecon.system.wording import name_parameter
 
 FEWEST_NEIGHBOURS = 3
@@ -221,8 +221,8 @@ class _Run:
             warnings.append("normals have either direction: give a volume or a viewpoint to orient them")
         if doubtful > DOUBTFUL_SHARE * n:
             warnings.append(
-                f"{doubtful:,} of {n:,} normals ({say_share(doubtful / n)}) are doubtful and follow the HU alone: the"
-                f" {self.k} nearest points of theirs lie in one slice, or on both sides of something thin; take the"
+                f"{doubtful:,} of {n:,} normals ({format_share(doubtful / n)}) are doubtful and follow the HU alone:"
+                f" the {self.k} nearest points of theirs lie in one slice, or on both sides of something thin; take the"
                 f" points of a surface ({name_parameter('kind', 'surface')}), which bring their normals, or thin the"
                 " cloud to the largest gap between slices before"
             )

@@ -20,7 +20,7 @@ from clrecon.points import PointCloud
 from clrecon.points.spacing import mean_spacing
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.text import say_share
+from clrecon.system.text import format_share
 from clrecon.system.wording import name_parameter
 
 FEWEST_POINTS = 4
@@ -242,12 +242,12 @@ class _Reconstruction:
                 raise self._refuse(signs, tries)
             if signs.outside_is_inside:
                 raise RefusedInputError(
-                    f"the normals of the cloud point inward: {say_share(1.0 - signs.share_against)} of"
+                    f"the normals of the cloud point inward: {format_share(1.0 - signs.share_against)} of"
                     f" {signs.votes:,} votes put the surroundings of the cloud inside; turn the normals"
                 )
             if signs.share_against > DOUBTFUL_SHARE:
                 self.warnings.append(
-                    f"{say_share(signs.share_against, 1)} of {signs.votes:,} votes are against the winner: parts of"
+                    f"{format_share(signs.share_against, 1)} of {signs.votes:,} votes are against the winner: parts of"
                     " the cloud may be open, and the volume too small; compare with a larger spacing or bridge"
                 )
             masks = field.masks
@@ -289,14 +289,14 @@ class _Reconstruction:
             place = ", ".join(f"{at:.0f}" for at in cubes[0]["centre_mm"]) if cubes else ""
             where = f", most of it within {CUBE * h / 2:.3g} mm of ({place}) mm LPS" if place else ""
             much = (
-                f"at least {say_share(lost, 1)} of the volume are lost"
+                f"at least {format_share(lost, 1)} of the volume are lost"
                 if lost > LOST_SHARE
                 else "parts of it may be lost"
             )
             self.warnings.append(
-                f"{say_share(walls.share, 1)} of the surface are walls that no points support{where}: the cloud is open"
-                f" there, or its points are farther apart than nodes of {h:.4g} mm bridge, and {much}; take a larger"
-                f" {name_parameter('spacing')} and compare the volumes"
+                f"{format_share(walls.share, 1)} of the surface are walls that no points support{where}: the cloud is"
+                f" open there, or its points are farther apart than nodes of {h:.4g} mm bridge, and {much}; take a"
+                f" larger {name_parameter('spacing')} and compare the volumes"
             )
         return {"wall_share": walls.share, "lost_share": lost, "open_cubes": cubes}
 
@@ -305,17 +305,17 @@ class _Reconstruction:
         bridge = WIDER * old.bridge
         self.settings = FieldSettings(old.spacing, max(old.reach, bridge), old.smoothing, bridge)
         self.warnings.append(
-            f"with a bridge of {old.bridge:.4g} mm {say_share(signs.share_against)} of the votes were against the"
+            f"with a bridge of {old.bridge:.4g} mm {format_share(signs.share_against)} of the votes were against the"
             f" winner, so inside and outside were joined: {bridge:.4g} mm were taken"
         )
 
     def _refuse(self, signs: Signs, tries: int) -> RefusedInputError:
         h, b = self.settings.spacing, self.settings.bridge
         return RefusedInputError(
-            f"inside and outside of the cloud are joined: {say_share(signs.share_against)} of {signs.votes:,} votes"
-            f" are against the winner, at most {say_share(LEAK_SHARE)} may be (bridge {b:.4g} mm, spacing {h:.4g} mm,"
-            f" tries {tries}): the cloud has holes wider than twice the bridge, ends open, or its normals do not agree;"
-            f" take a larger {name_parameter('spacing')} or a wider bridge, or close it first"
+            f"inside and outside of the cloud are joined: {format_share(signs.share_against)} of {signs.votes:,} votes"
+            f" are against the winner, at most {format_share(LEAK_SHARE)} may be (bridge {b:.4g} mm, spacing {h:.4g}"
+            f" mm, tries {tries}): the cloud has holes wider than twice the bridge, ends open, or its normals do not"
+            f" agree; take a larger {name_parameter('spacing')} or a wider bridge, or close it first"
         )
 
     def _describe(self, field: NodeField, signs: Signs, tries: int) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from clrecon.operators.primitives.union_find import hook_in_rounds, prepare_comp
 from clrecon.points import PointCloud, PointStep
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.text import say_share
+from clrecon.system.text import format_share
 from clrecon.system.wording import name_parameter
 
 REASONS = ("sparse cell", "not reached by growth", "smaller component")
@@ -252,7 +252,7 @@ def _finish(cloud: PointCloud, grown: _Grown, facts: dict[str, Any], keep_larges
         components, points = grown.facts["components"], int((removed == 0).sum())
         warnings.append(
             f"the largest component keeps {points:,} points; {smaller:,} in {components - 1:,} other components went"
-            f" ({say_share(smaller / len(cloud), 1)} of the cloud), bone that stands apart among them"
+            f" ({format_share(smaller / len(cloud), 1)} of the cloud), bone that stands apart among them"
         )
     facts["points_a_cell"] = len(cloud) / grown.facts["cells"]
     return PointStep(cloud.select(removed == 0), removed, REASONS, facts, tuple(warnings))

@@ -14,7 +14,7 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
 from clrecon.operators.rays.triangles import MOST_TRIANGLES, MeshPart
 from clrecon.rendering.pictures.mesh_look import MeshLook
-from clrecon.system.text import say_digits
+from clrecon.system.text import format_digits
 
 FARTHEST_MM = 1e9
 """Largest coordinate of a vertex: a thousand kilometres, as of cameras; products of two fit float32."""
@@ -34,7 +34,7 @@ def mesh_corners(mesh: Mesh) -> Float64Array:
     corners = np.array([vertices.min(axis=0), vertices.max(axis=0)], dtype=np.float64)
     if np.abs(mesh.vertices).max() > FARTHEST_MM:
         raise UsageError(
-            f"vertices of the mesh lie up to {say_digits(np.abs(mesh.vertices).max())} mm from the origin:"
+            f"vertices of the mesh lie up to {format_digits(np.abs(mesh.vertices).max())} mm from the origin:"
             f" pictures show what is within {FARTHEST_MM / 1e6:,.0f} kilometres"
         )
     return corners

@@ -118,7 +118,7 @@ def choose_components(
     sums = Sums.read(device, components.sums_d)
     if not sums.chosen:
         raise UsageError(
-            f"no part of the surface {grid.rule.describe_place()} touches {', '.join(seeds.names)}:"
+            f"no part of the surface {grid.rule.phrase()} touches {', '.join(seeds.names)}:"
             f" {sums.components:,} components, none of them has a seed"
         )
 

@@ -26,7 +26,7 @@ from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import BRICKS, SampleGrid, Slab
 from clrecon.operators.surface.trilinear import prepare_trilinear
 from clrecon.system.progress import Progress
-from clrecon.system.text import say_hu
+from clrecon.system.text import format_hu
 
 Part = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]
 """Positions, normals and triangles of one slab."""
@@ -34,7 +34,7 @@ Part = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]
 
 def _refuse_level(device: Device, volume: Volume, rule: IsoRule) -> ClreconError:
     low, high = data_range(volume)
-    runs = f"the volume runs from {say_hu(low)} to {say_hu(high)} HU"
+    runs = f"the volume runs from {format_hu(low)} to {format_hu(high)} HU"
     if rule.inside == "between":
         marked = sum(int(np.count_nonzero(rule.mark_inside(voxels))) for voxels in volume.voxels)
         if 0 < marked < volume.voxels.size or (marked and rule.closed):
@@ -44,12 +44,12 @@ def _refuse_level(device: Device, volume: Volume, rule: IsoRule) -> ClreconError
     if low < rule.lowest_inside <= high:
         return _refuse_device(device, rule, runs)
     where = "above" if rule.lowest_inside > high else "at or below the lowest of"
-    return NoSurfaceError(f"no surface {rule.describe_place()}: {runs}, the iso value lies {where} that range")
+    return NoSurfaceError(f"no surface {rule.phrase()}: {runs}, the iso value lies {where} that range")
 
 
 def _refuse_device(device: Device, rule: IsoRule, runs: str) -> DeviceError:
     return DeviceError(
-        f"{device.label} found no surface {rule.describe_place()} although {runs}: it computes wrongly,"
+        f"{device.label} found no surface {rule.phrase()} although {runs}: it computes wrongly,"
         " see `clrecon selftest` and try another device"
     )
 

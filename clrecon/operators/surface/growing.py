@@ -191,7 +191,7 @@ def grow(resident: DeviceVolume, grid: SampleGrid, classified: Classified, seeds
     search = _Search(resident, grid, classified, stopwatch)
     runs = search.find_runs()
     if runs.total == 0:
-        raise NoSurfaceError(f"no surface {grid.rule.describe_place()} to grow")
+        raise NoSurfaceError(f"no surface {grid.rule.phrase()} to grow")
     components = search.join(runs)
     choose_components(resident.device, grid, classified, runs, components, seeds, stopwatch)
     grown_d, extents_d, visited_d = search.mark(runs, components)

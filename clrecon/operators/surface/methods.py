@@ -178,7 +178,7 @@ def _extract_on_host(volume: Volume | DeviceVolume, iso_value: Level, method: st
         extracted = time.perf_counter()
         vertices, triangles = weld(soup)
     if not len(triangles):
-        raise NoSurfaceError(f"no surface {rule.describe_place()}")
+        raise NoSurfaceError(f"no surface {rule.phrase()}")
     welded = time.perf_counter()
     every = int(np.prod([n + 2 * rule.border - 1 for n in scan.shape_ijk]))
     report = {
@@ -209,7 +209,7 @@ def _extract_by_skimage(volume: Volume, rule: IsoRule) -> tuple[np.ndarray[Any, 
     try:
         found, faces, _, _ = marching_cubes(values, rule.iso_level, allow_degenerate=False)
     except (ValueError, RuntimeError) as error:
-        raise NoSurfaceError(f"no surface {rule.describe_place()}: {error}") from error
+        raise NoSurfaceError(f"no surface {rule.phrase()}: {error}") from error
     vertices = volume.ijk_to_lps(found[:, ::-1].astype(np.float64) - rule.border)
     # In (k, j, i) its triangles are counter-clockwise as seen from higher values; reversing the axes mirrors them.
     triangles = faces[:, ::-1] if is_left_handed(volume.affine) else faces

@@ -82,5 +82,5 @@ def _describe_lone(grid: SampleGrid, point: NDArray[np.float64], away: float | N
     far = f"more than {FARTHEST_TOLD_MM:g}" if away is None or away > FARTHEST_TOLD_MM else f"{away:.1f}"
     return (
         f"seed {','.join(f'{n:g}' for n in point)} has {float(volume.voxels[k, j, i]):g} HU and is {far} mm away"
-        f" from the surface {grid.rule.describe_place()}: a seed lies within {SEED_REACH_MM:g} mm of it"
+        f" from the surface {grid.rule.phrase()}: a seed lies within {SEED_REACH_MM:g} mm of it"
     )

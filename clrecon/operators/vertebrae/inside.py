@@ -25,7 +25,7 @@ from clrecon.operators.vertebrae.crop import LabelCrop, crop_label
 from clrecon.operators.vertebrae.solid import CLOSE_MM, label_margin, make_solid
 from clrecon.operators.vertebrae.thickness import ShellThickness, measure_thickness
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.text import say_volume
+from clrecon.system.text import format_volume
 from clrecon.system.wording import name_parameter
 
 DENSE_HU = (450.0, None)
@@ -96,7 +96,7 @@ class VertebraInside:
         raise TypeError("a VertebraInside belongs to its process: send to_label_map(), as_dict() and the meshes")
 
     def __repr__(self) -> str:
-        parts = ", ".join(f"{name} {say_volume(ml)}" for name, ml in self.volumes_ml.items())
+        parts = ", ".join(f"{name} {format_volume(ml)}" for name, ml in self.volumes_ml.items())
         return f"VertebraInside({self.name}: {parts})"
 
     @property

@@ -20,7 +20,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.label_extraction import LabelExtraction
 from clrecon.operators.vertebrae.crop import LabelCrop, crop_label
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.text import say_hu
+from clrecon.system.text import format_hu
 
 CLOSE_MM = 1.5
 """Radius of the balls that close pores and vessels of the cortex."""
@@ -119,7 +119,7 @@ def _refuse_empty(crop: LabelCrop, own: NDArray[np.bool_], iso_value: float | No
         return NoSurfaceError(f"{called} holds the centre of no voxel of the CT: it is smaller than they are")
     low, high = float(hu.min()), float(hu.max())
     return NoSurfaceError(
-        f"no voxel of {called} has {iso_value:g} HU: they run from {say_hu(low)} to {say_hu(high)} HU"
+        f"no voxel of {called} has {iso_value:g} HU: they run from {format_hu(low)} to {format_hu(high)} HU"
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
-from clrecon.system.text import say_unknown
+from clrecon.system.text import unknown_name
 
 COLORS = {
     "black": "000000",
@@ -58,4 +58,4 @@ def find_color(color: str | Sequence[float]) -> Float64Array:
             numbers = np.empty(0)
         if numbers.shape == (3,) and (numbers >= 0.0).all() and (numbers <= 1.0).all():
             return numbers
-    raise UsageError(f"{say_unknown('colour', color, COLORS)}, #rrggbb, or three numbers from 0 to 1")
+    raise UsageError(f"{unknown_name('colour', color, COLORS)}, #rrggbb, or three numbers from 0 to 1")

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from clrecon.errors import UsageError
 from clrecon.rendering.looks.lighting import UNSHADED, Lighting
 from clrecon.rendering.looks.transfer_function import TransferFunction
-from clrecon.system.text import say_unknown
+from clrecon.system.text import unknown_name
 
 DEFAULT_PRESET = "bone"
 
@@ -228,5 +228,5 @@ def find_preset(name: str) -> Preset:
         return PRESETS[name.lower()]
     except (KeyError, TypeError, AttributeError):
         raise UsageError(
-            f"{say_unknown('rendering preset', name, PRESETS)}, or a file with a transfer function"
+            f"{unknown_name('rendering preset', name, PRESETS)}, or a file with a transfer function"
         ) from None

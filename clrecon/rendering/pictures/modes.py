@@ -20,7 +20,7 @@ from clrecon.rendering.pictures.styles import (
     VolumeLook,
 )
 from clrecon.rendering.views.directions import hint_at_sheet
-from clrecon.system.text import say_unknown
+from clrecon.system.text import unknown_name
 from clrecon.system.wording import name_parameter
 
 
@@ -101,7 +101,7 @@ def choose_mode(mode: str | None = None, preset: str | None = None, **look: obje
     """
     if mode is not None:
         if not isinstance(mode, str) or mode not in MODES:
-            raise UsageError(say_unknown("mode", mode, MODES) + hint_at_sheet(mode))
+            raise UsageError(unknown_name("mode", mode, MODES) + hint_at_sheet(mode))
         return mode
     if look.get("iso_value") is not None:
         return "surface"

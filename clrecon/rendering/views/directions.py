@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
-from clrecon.system.text import say_unknown
+from clrecon.system.text import unknown_name
 from clrecon.system.wording import name_parameter
 
 DIRECTIONS: dict[str, tuple[float, float, float]] = {
@@ -120,7 +120,7 @@ def _find_angles(view: str | Sequence[float]) -> tuple[float, float]:
         azimuth = elevation = float("nan")
     if not (np.isfinite(azimuth) and abs(elevation) <= 90.0):
         raise UsageError(
-            f"{say_unknown('view', view, DIRECTIONS)}, or AZIMUTH,ELEVATION in degrees,"
+            f"{unknown_name('view', view, DIRECTIONS)}, or AZIMUTH,ELEVATION in degrees,"
             f" elevation from -90 to 90, such as 30,15{hint_at_sheet(view)}"
         )
     return azimuth, elevation

@@ -19,7 +19,7 @@ from clrecon.geometry.grid import Grid
 from clrecon.geometry.volume import Volume
 from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.rendering.views.directions import DIRECTIONS, checked_size, number_or_nan
-from clrecon.system.text import say_unknown
+from clrecon.system.text import unknown_name
 
 MOST_SAMPLES = 65536
 """Most samples through a thick slice; more mean that its thickness is a mistake."""
@@ -137,7 +137,7 @@ def find_plane(
         name = view.strip().lower()
         view = PLANES.get(name, name)
         if "," not in view and view not in DIRECTIONS:
-            raise UsageError(f"{say_unknown('plane', name, [*PLANES, *DIRECTIONS])}, or AZIMUTH,ELEVATION in degrees")
+            raise UsageError(f"{unknown_name('plane', name, [*PLANES, *DIRECTIONS])}, or AZIMUTH,ELEVATION in degrees")
     width, height = checked_size(size)
     camera = Camera.fit(volume, view, up=up, size=size)
     right, top, _ = camera.basis()

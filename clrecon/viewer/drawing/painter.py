@@ -24,7 +24,7 @@ from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import checked_size
 from clrecon.rendering.views.plane import PLANES, find_plane
 from clrecon.system.progress import Progress
-from clrecon.system.text import say_unknown
+from clrecon.system.text import unknown_name
 from clrecon.viewer.drawing.coarse import coarsen_mesh
 from clrecon.viewer.drawing.looks import LEAST_OPACITY, LabelledLook, Looks, to_voxels
 from clrecon.viewer.drawing.shown_meshes import make_meshes
@@ -147,7 +147,7 @@ class Painter(Stage):
     def slice_camera(self, state: ViewState, plane: str, size: Sequence[int]) -> Camera:
         """Return the camera of a slice: its focal point lies in the slice, so that places can be told from pixels."""
         if plane not in PLANES:
-            raise UsageError(say_unknown("plane", plane, PLANES))
+            raise UsageError(unknown_name("plane", plane, PLANES))
         found = self._sliced(state)
         grid = found[0].volume if found is not None else _box_grid(self.objects)
         camera = find_plane(grid, plane, size)

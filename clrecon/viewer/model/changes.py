@@ -15,7 +15,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.rendering.looks.label_style import distinct_colors
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import checked_vector
-from clrecon.system.text import say_unknown
+from clrecon.system.text import unknown_name
 from clrecon.viewer.model.framing import fit_camera
 from clrecon.viewer.model.gestures import pan_camera, roll_camera, turn_camera, zoom_camera
 from clrecon.viewer.model.objects import ShownObject
@@ -213,7 +213,7 @@ class ChangingView:
     def _part(self, key: str) -> ShownPart:
         part = self.state.part(key)
         if part is None:
-            raise UsageError(say_unknown("part", key, [each.key for each in self.state.parts]))
+            raise UsageError(unknown_name("part", key, [each.key for each in self.state.parts]))
         return part
 
     def _shown_corners(self) -> Float64Array:

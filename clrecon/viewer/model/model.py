@@ -17,7 +17,7 @@ from clrecon.rendering.pictures.styles import DEFAULT_ISO_VALUE
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import checked_vector
 from clrecon.rendering.views.plane import PLANES
-from clrecon.system.text import say_hu, say_unknown
+from clrecon.system.text import format_hu, unknown_name
 from clrecon.viewer.model.changes import ChangingView, checked_numbers
 from clrecon.viewer.model.first_state import find_iso_range, first_parts
 from clrecon.viewer.model.framing import fit_camera, plane_step
@@ -142,13 +142,15 @@ class ViewModel(ChangingView):
         if not self.scans:
             raise UsageError("there is no scan: nothing has an iso value")
         if not low <= value <= high:
-            raise UsageError(f"the iso value runs from {say_hu(low)} to {say_hu(high)} HU here, not to {say_hu(value)}")
-        self._change("iso", f"the iso value {say_hu(self.iso_value)} HU", iso_value=value)
+            raise UsageError(
+                f"the iso value runs from {format_hu(low)} to {format_hu(high)} HU here, not to {format_hu(value)}"
+            )
+        self._change("iso", f"the iso value {format_hu(self.iso_value)} HU", iso_value=value)
 
     def set_mode(self, name: str) -> None:
         """Set the mode, one of `modes`."""
         if name not in self.modes:
-            raise UsageError(say_unknown("mode", name, self.modes))
+            raise UsageError(unknown_name("mode", name, self.modes))
         self._change("mode", f"the mode {self.mode}", mode=name, picture_window=None)
 
     def set_window(self, low: float, high: float, of: str = "slices") -> None:
@@ -167,7 +169,7 @@ class ViewModel(ChangingView):
         elif of == "slices":
             self._change("window", "the window", window=(low, high))
         else:
-            raise UsageError(say_unknown("window", of, ("slices", "picture")))
+            raise UsageError(unknown_name("window", of, ("slices", "picture")))
 
     def set_table(self, shown: bool) -> None:
         """Show the table and the blankets, or the body alone."""
@@ -178,7 +180,7 @@ class ViewModel(ChangingView):
     def scroll(self, plane: str, steps: float) -> None:
         """Move the cross through a plane, by the distance of the voxels there; positive steps go away from the eye."""
         if plane not in PLANES:
-            raise UsageError(say_unknown("plane", plane, PLANES))
+            raise UsageError(unknown_name("plane", plane, PLANES))
         (count,) = checked_numbers("steps", steps)
         step = plane_step(self.scans, plane)
         low, high = self._span()
@@ -196,7 +198,7 @@ class ViewModel(ChangingView):
     def start_tool(self, name: str) -> None:
         """Let the next points be those of a tool; points of an unfinished measure are dropped."""
         if name not in TOOLS:
-            raise UsageError(say_unknown("tool", name, TOOLS))
+            raise UsageError(unknown_name("tool", name, TOOLS))
         self._change("tool", f"the tool {name}", tool=name, points=())
 
     def add_point(self, pick: Pick) -> Measure | None:

@@ -24,7 +24,7 @@ from clrecon.operators.masks.mask import Mask
 from clrecon.operators.masks.runs import find_components
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.text import say_hu
+from clrecon.system.text import format_hu
 from clrecon.viewer.model.state import Box, Point, ShownPart
 
 if TYPE_CHECKING:
@@ -207,7 +207,7 @@ def _describe_parts(
                 inside=_place(volume, middle),
             )  # fmt: skip
         )
-    below = f"below {say_hu(iso_value)} HU"
+    below = f"below {format_hu(iso_value)} HU"
     return (*parts, ShownPart(key=f"{scan}/0", name=below, kind="rest", object=scan, number=0))
 
 

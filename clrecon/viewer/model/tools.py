@@ -11,7 +11,7 @@ import numpy as np
 
 from clrecon.errors import UsageError
 from clrecon.rendering.views.directions import DIRECTIONS, checked_vector
-from clrecon.system.text import say_unknown
+from clrecon.system.text import unknown_name
 
 POINTS_OF = {"distance": 2, "angle": 3, "curve": None, "seed": 1}
 """Tools, and the points that make a measure of each; a curve has as many as it gets."""
@@ -139,7 +139,7 @@ def clip_direction(direction: str | Sequence[float]) -> tuple[Point, str]:
     """Return the unit vector of a side of the patient or of a vector in LPS, and its name."""
     if isinstance(direction, str):
         if direction not in DIRECTIONS:
-            raise UsageError(say_unknown("side of the patient", direction, DIRECTIONS))
+            raise UsageError(unknown_name("side of the patient", direction, DIRECTIONS))
         return DIRECTIONS[direction], direction
     vector = np.array(checked_vector("the direction of a clip plane", direction))
     length = float(np.linalg.norm(vector))

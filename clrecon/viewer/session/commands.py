@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from clrecon.errors import UsageError
-from clrecon.system.text import say_unknown
+from clrecon.system.text import unknown_name
 
 MOST_TEXT = 200
 """Characters of a name in a command."""
@@ -149,7 +149,7 @@ def check_command(command: Any) -> tuple[Command, dict[str, Any]]:
         raise UsageError(f'a command is a mapping such as {{"do": "undo"}}, not {type(command).__name__}')
     name = command.get("do")
     if not isinstance(name, str) or name not in COMMANDS:
-        raise UsageError(say_unknown("command", name, COMMANDS))
+        raise UsageError(unknown_name("command", name, COMMANDS))
     found = COMMANDS[name]
     given = {key: value for key, value in command.items() if key != "do"}
     known = {**found.needs, **found.takes}

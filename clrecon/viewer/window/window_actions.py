@@ -12,7 +12,7 @@ import numpy as np
 from clrecon.errors import ClreconError
 from clrecon.geometry import frame_from_lps
 from clrecon.rendering.looks.label_style import distinct_colors
-from clrecon.system.text import say_volume
+from clrecon.system.text import format_volume
 from clrecon.viewer.window.file_names import DEFAULT_MESH, DEFAULT_PICTURE, free_name
 from clrecon.viewer.window.layout import PLANES
 from clrecon.viewer.window.panels import slider_value
@@ -303,7 +303,7 @@ class WindowActions:
         part = next((each for each in facts["parts"] if each["key"] == pick["part"]), None)
         words = [] if part is None else [part["name"]]
         if part is not None and part["ml"] is not None:
-            words.append(say_volume(part["ml"]))
+            words.append(format_volume(part["ml"]))
         if pick["hu"] is not None:
             words.append(f"{pick['hu']:.0f} HU")
         signs = np.diag(frame_from_lps(facts["space"]))
