@@ -14,6 +14,8 @@ CLRECON_REQUIRE_DEVICE=1
     No device is a failure, not a skip.
 CLRECON_REQUIRE_PLATFORMS
     Comma list of texts; each must be found in platform, version or driver of a device of its own.
+CLRECON_RELEASE_TESTS=1
+    Tests marked ``release`` too.
 CLRECON_COVERAGE=1
     Lines and branches of clrecon that the tests run are counted, see `coverage_figure`.
 CLRECON_REQUIRE_TESTS=1
@@ -140,14 +142,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     of a minute must not be the last.
     """
     devices = Devices.found[0] if Devices.found else []
-    first, chosen = first_of(devices), []
+    first, chosen, left = first_of(devices), [], []
     for item in items:
+        if item.get_closest_marker("release") and not is_set("CLRECON_RELEASE_TESTS"):
+            left.append(item)
+            continue
         device = item.callspec.params.get("device") if hasattr(item, "callspec") else None
         if device in devices[1:]:
             item.add_marker("further_device")
             if item.get_closest_marker("first_device") and device not in first:
                 continue
         chosen.append(item)
+    config.hook.pytest_deselected(items=left)
     items[:] = sorted(chosen, key=lambda item: item.get_closest_marker("long") is None)
 
 

@@ -217,26 +217,25 @@ class Schedule:
 
 
 @dataclass
-class OneCase:
-    """The schedule of a single case."""
+class NamedCases:
+    """The schedule of cases that are named, one after the other."""
 
-    case: Case | None
+    cases: list[Case]
 
     def draw(self) -> Case | None:
-        """Return the case once."""
-        case, self.case = self.case, None
-        return case
+        """Return the next case; None if there is none."""
+        return self.cases.pop(0) if self.cases else None
 
     def spend(self, case: Case, seconds: float) -> None:
-        """Nothing follows."""
+        """Time changes nothing."""
 
 
-def run_campaign(schedule: Schedule | OneCase, *, seconds: float, seed: str = "1", jobs: int = 1) -> Campaign:
+def run_campaign(schedule: Schedule | NamedCases, *, seconds: float, seed: str = "1", jobs: int = 1) -> Campaign:
     """Run cases in `jobs` processes until the time or the cases are over.
 
     Parameters
     ----------
-    schedule : Schedule or OneCase
+    schedule : Schedule or NamedCases
     seconds : float
         Time after which no case is begun.
     seed : str
@@ -306,12 +305,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     unknown = [family for family in families if family not in SHARES]
     if unknown:
         parser.error(f"no family {unknown[0]!r}: there are {', '.join(SHARES)}")
-    schedule: Schedule | OneCase = Schedule(families, options.cases if options.cases is not None else sys.maxsize)
+    schedule: Schedule | NamedCases = Schedule(families, options.cases if options.cases is not None else sys.maxsize)
     if options.case:
         family, _, number = options.case.partition(":")
         if family not in SHARES or not number.isdigit():
             parser.error(f"no case {options.case!r}: write it as values:117")
-        schedule = OneCase(Case(family, int(number)))
+        schedule = NamedCases([Case(family, int(number))])
     seconds = options.seconds or (1e9 if options.case or options.cases is not None else 60.0)
     campaign = run_campaign(schedule, seconds=seconds, seed=options.seed, jobs=max(options.jobs, 1))
     for case, outcome in campaign.faults:

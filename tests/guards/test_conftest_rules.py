@@ -165,14 +165,21 @@ def test_watched(device):
     assert device in found
 def test_first(device):
     assert device is found[0]
+@pytest.mark.release
+def test_release():
+    pass
 """
 
 
 @pytest.mark.parametrize(
     ("variables", "passed"),
     [
-        ({}, "6 passed"),  # one parameter and the test with a simulator on both devices, the rest on the first
-        ({"CLRECON_TEST_EVERY_DEVICE": "1"}, "1 failed, 7 passed"),
+        (
+            {},
+            "6 passed, 1 deselected",
+        ),  # one parameter and what a simulator watches on both, the rest on the first
+        ({"CLRECON_TEST_EVERY_DEVICE": "1"}, "1 failed, 7 passed, 1 deselected"),
+        ({"CLRECON_RELEASE_TESTS": "1"}, "7 passed"),
         ({"CLRECON_TEST_DEVICE": "0"}, "4 passed"),  # the 0 in the name of the other is no index
     ],
 )

@@ -16,6 +16,7 @@ from guide_commands import command_parser, describe_options
 from guide_gallery import read_script
 from guide_sources import rewrite_links, site_pages
 from house import ROOT
+from made_once import make_once
 
 import clrecon
 from clrecon.cli.main import COMMANDS
@@ -62,13 +63,15 @@ def find_outside(name: str, text: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(shared_folder: Path) -> Path:
     """The Guide, built with warnings as errors."""
     for name in NEEDED:
         pytest.importorskip(name, reason="the Guide is built with the extra docs, which is not installed")
-    folder = tmp_path_factory.mktemp("guide")
-    assert build_guide(folder) == 0
-    return folder
+
+    def make(folder: Path) -> None:
+        assert build_guide(folder) == 0
+
+    return make_once(shared_folder, "guide-site", make)
 
 
 @pytest.fixture(scope="module")

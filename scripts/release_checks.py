@@ -1,0 +1,84 @@
+#!/usr/bin/env python3
+"""Run what a release needs, which is more than `.ci/run`, and list it.
+
+    python scripts/release_checks.py [--list] [NAME ...]
+
+NAME is one of the checks that --list names; without one all run, in their order.  What they keep (results of changed
+code, so that an ended run goes on) goes to build/release.  The exit status is 1 if one fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+KEPT = ROOT / "build" / "release"
+
+
+@dataclass(frozen=True)
+class ReleaseCheck:
+    """A check: what it holds, its command in the folder of the project (a script or a program), and its variables."""
+
+    holds: str
+    command: Sequence[str]
+    variables: dict[str, str] = field(default_factory=dict)
+
+
+CHECKS = {
+    "tests": ReleaseCheck(
+        "all that .ci/run checks, with the tests marked release: every check of the self-test on every device, where"
+        " .ci/run leaves out on the second device and later what tests of operators ask there; and the coverage",
+        (".ci/run",),
+        {"CLRECON_RELEASE_TESTS": "1", "CLRECON_COVERAGE": "1"},
+    ),
+    "kernels": ReleaseCheck(
+        "every mutation of every kernel is caught by the self-test, where .ci/run draws a few; on PoCL 3.1",
+        ("scripts/mutate_kernels.py", "--device", "0", "--results", str(KEPT / "kernels.json")),
+    ),
+    "python": ReleaseCheck(
+        "at most 5 % of the changes of a room survive its tests; needs the extra mutation",
+        ("scripts/mutate_python.py", "--json", str(KEPT / "changes.json"), "--resume"),
+        {"CLRECON_TEST_DEVICE": "0"},
+    ),
+    "fuzz": ReleaseCheck(
+        "ten minutes of harmed input without a fault, where .ci/run tries the first cases of each family",
+        ("scripts/fuzz/fuzz.py", "--seconds", "600"),
+    ),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the checks that are named on the command line, or list all."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--list", action="store_true", help="say what each check holds, and run none")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(CHECKS))
+    options = parser.parse_args(argv)
+    if unknown := [name for name in options.names if name not in CHECKS]:
+        parser.error(f"no check {unknown[0]!r}: there are {', '.join(CHECKS)}")
+    if options.list:
+        for name, check in CHECKS.items():
+            said = [f"{variable}={value}" for variable, value in check.variables.items()]
+            print(f"{name}: {check.holds}\n    {' '.join([*said, *check.command])}")
+        return 0
+    KEPT.mkdir(parents=True, exist_ok=True)
+    failed = []
+    for name in options.names or CHECKS:
+        check = CHECKS[name]
+        print(f"== {name}: {check.holds}", flush=True)
+        environment = {**os.environ, **check.variables}
+        python = [sys.executable] if check.command[0].endswith(".py") else []
+        if subprocess.run([*python, *check.command], cwd=ROOT, env=environment).returncode:
+            failed.append(name)
+    if failed:
+        print(f"failed: {', '.join(failed)}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
