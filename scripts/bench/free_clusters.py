@@ -68,7 +68,7 @@ def measure_sort(job: Job) -> dict[str, Any]:
     import numpy as np
 
     from clrecon.opencl import upload, wait
-    from clrecon.operators.primitives.radix_sort import radix_sort
+    from clrecon.operators.primitives.scan import radix_sort
 
     n = int((job.input.volume().voxels >= job.hu).sum())
     keys = np.random.default_rng(1).integers(0, 2**21, n, dtype=np.uint32)

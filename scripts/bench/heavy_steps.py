@@ -52,7 +52,7 @@ def measure_crossings(job: Job) -> dict[str, Any]:
     """Time `find_crossings` beside `find_self_intersections` on one surface."""
     import clrecon
     from clrecon.mesh.intersections import find_self_intersections
-    from clrecon.operators.surface.crossings import find_crossings
+    from clrecon.operators.surface.decimation import find_crossings
 
     mesh = clrecon.extract_isosurface(job.input.volume(), job.hu, device=job.device)
     arrays = mesh.vertices, mesh.triangles

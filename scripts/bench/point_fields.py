@@ -28,8 +28,7 @@ def measure_fields(job: Job) -> dict[str, Any]:
     from vtkmodules.vtkCommonDataModel import vtkPolyData
     from vtkmodules.vtkFiltersPoints import vtkSignedDistance
 
-    from clrecon.operators.points.field import FieldSettings, NodeField
-    from clrecon.operators.points.field_signs import decide_signs
+    from clrecon.operators.points.field import FieldSettings, NodeField, decide_signs
     from clrecon.operators.surface.extract import extract_isosurface
 
     mesh = extract_isosurface(job.input.volume(), job.hu, device=job.device)

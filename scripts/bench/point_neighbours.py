@@ -124,7 +124,7 @@ def measure_filter(job: Job) -> dict[str, Any]:
     import numpy as np
     from scipy.spatial import cKDTree
 
-    from clrecon.operators.points.bilateral import denoise_points
+    from clrecon.operators.points.denoising import denoise_points
     from clrecon.points import PointCloud
     from clrecon.reference.points.bilateral import denoise_points as filter_twin
     from clrecon.reference.points.normals import principal_axes
@@ -155,7 +155,7 @@ def measure_filter(job: Job) -> dict[str, Any]:
 
 def _kernel_seconds(points: Any, job: Job) -> float:
     """Return the device's seconds of the kernel filter_points alone."""
-    from clrecon.operators.points.bilateral import denoise_points
+    from clrecon.operators.points.denoising import denoise_points
     from clrecon.points import PointCloud
 
     seconds: float = denoise_points(PointCloud(points), K, device=job.device).facts["kernel_seconds"]["filter_points"]
@@ -186,7 +186,7 @@ def measure_outliers(job: Job) -> dict[str, Any]:
     import numpy as np
     import open3d
 
-    from clrecon.operators.points.outliers import remove_outliers
+    from clrecon.operators.points.denoising import remove_outliers
     from clrecon.points import PointCloud
 
     def with_open3d(points: Any) -> Any:

@@ -26,7 +26,7 @@ def measure_voxel_clusters(job: Job) -> dict[str, Any]:
     """
     import numpy as np
 
-    from clrecon.operators.masks.band_mask import mark_band
+    from clrecon.operators.masks.voxel_mask import mark_band
     from clrecon.operators.points.voxel_clusters import ClusterSearch, pad_for
     from clrecon.operators.resident.device_volume import DeviceVolume
     from clrecon.points.stencil import Lattice, make_stencil

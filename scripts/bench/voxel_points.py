@@ -22,7 +22,7 @@ def measure_voxel_points(job: Job) -> dict[str, Any]:
     """
     import numpy as np
 
-    from clrecon.operators.points.extract import extract_points
+    from clrecon.operators.points.point_extraction import extract_points
     from clrecon.operators.resident.device_volume import DeviceVolume
 
     volume = job.input.volume()

@@ -14,8 +14,8 @@ import pytest
 from house import PACKAGE, ROOT
 
 from clrecon.opencl import kernel_constant, kernel_number
-from clrecon.operators.rays.project import PROJECTIONS
-from clrecon.operators.reformat.sample import COMBINATIONS
+from clrecon.operators.rays.ray_pictures import PROJECTIONS
+from clrecon.operators.reformat.sheets import COMBINATIONS
 
 PAIRS = [
     ("clrecon.labels.occupancy.REACH", "surface/label_masks.h", "REACH"),

@@ -117,7 +117,7 @@ def test_a_forbidden_line_is_found(line: str) -> None:
 
 def test_files_are_short() -> None:
     longest = {path.name: len(path.read_text().splitlines()) for path in project_files(".py", ".cl")}
-    assert {name: lines for name, lines in longest.items() if lines > 450} == {}
+    assert {name: lines for name, lines in longest.items() if lines > 600} == {}
 
 
 def long_functions(source: str, limit: int = 80) -> list[str]:

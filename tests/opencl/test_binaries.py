@@ -115,7 +115,7 @@ def test_the_next_process_takes_the_binary(keeper, monkeypatch):
 
 def test_binaries_compute_what_sources_do(keeper, monkeypatch):
     from clrecon.opencl import upload
-    from clrecon.operators.primitives.compact import compact
+    from clrecon.operators.primitives.scan import compact
 
     mask = np.random.default_rng(0).integers(0, 2**32, 1000, dtype=np.uint32)
     for _ in range(2):

@@ -20,7 +20,7 @@ import json, os, sys
 import numpy as np
 import clrecon
 from clrecon.opencl import upload
-from clrecon.operators.primitives.compact import compact
+from clrecon.operators.primitives.scan import compact
 device = clrecon.device(int(sys.argv[1]))
 count = compact(device, upload(device, np.full(70, 5, dtype=np.uint32)), 70).count
 device.queue.finish()

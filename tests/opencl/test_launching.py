@@ -14,7 +14,7 @@ from clrecon.opencl import allocate, download, kernel_files, launch, load_progra
 from clrecon.opencl.program import LAUNCHES_BEFORE_TYPES
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.opencl.signatures import KernelArgument, definitions_of, find_signatures
-from clrecon.operators.resident.bricks import BrickRanges, compare_bricks
+from clrecon.operators.resident.tables import BrickRanges, compare_bricks
 
 VARIANTS = [
     (),

@@ -14,17 +14,17 @@ from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule, slice_normal_matrices
 from clrecon.operators.first_use import _count_open_edges
-from clrecon.operators.masks.band_mask import mask_bytes
+from clrecon.operators.masks.voxel_mask import mask_bytes
 from clrecon.operators.points import field
-from clrecon.operators.points.cell_edge import choose_cell_edge
 from clrecon.operators.points.clusters import _order_voxels
-from clrecon.operators.points.emit import VoxelEmission
 from clrecon.operators.points.field import BRICK, NodeField, Nodes
 from clrecon.operators.points.free_clusters import CELLS_A_CHUNK, CHUNKS_A_CORE, ClusterSearch
 from clrecon.operators.points.grid import PADDING, GridPlan
+from clrecon.operators.points.neighbours import choose_cell_edge
+from clrecon.operators.points.point_extraction import VoxelEmission
 from clrecon.operators.points.slice_overlap import find_ghost_slices
 from clrecon.operators.points.voxel_clusters import pad_for, search_bytes
-from clrecon.operators.primitives.radix_sort import (
+from clrecon.operators.primitives.scan import (
     FEWEST_PER_CHUNK,
     MOST_CHUNKS,
     RADIX_BITS,
@@ -32,14 +32,13 @@ from clrecon.operators.primitives.radix_sort import (
     _plan_digits,
     sort_bytes,
 )
-from clrecon.operators.rays import composite
-from clrecon.operators.rays.buffers import TILE, PictureBuffers
-from clrecon.operators.rays.point_pictures import DARKEST_SHARE, _choose_window
-from clrecon.operators.rays.splats import LARGEST_DISC, SMALLEST_DISC, _Splats
-from clrecon.operators.resident import stack_table
-from clrecon.operators.resident.frame import FieldFrame
-from clrecon.operators.surface import mask_extraction
-from clrecon.operators.surface.mask_extraction import FACES_PER_AREA, FULL, STEEPNESS
+from clrecon.operators.rays import ray_pictures
+from clrecon.operators.rays.picture_buffers import TILE, PictureBuffers
+from clrecon.operators.rays.point_pictures import DARKEST_SHARE, LARGEST_DISC, SMALLEST_DISC, _choose_window, _Splats
+from clrecon.operators.resident import tables as stack_table
+from clrecon.operators.resident.tables import FieldFrame
+from clrecon.operators.surface import label_masks
+from clrecon.operators.surface.label_masks import FACES_PER_AREA, FULL, STEEPNESS
 from clrecon.operators.surface.slabs import SampleGrid, Slab
 from clrecon.rendering import Lighting, TransferFunction
 from clrecon.rendering.views.camera import Camera
@@ -199,10 +198,14 @@ def test_items_of_a_picture():
 
 
 def test_the_table_of_colours_has_ten_bits_a_channel(monkeypatch):
-    monkeypatch.setattr(composite, "upload", lambda device, table: table)
+    monkeypatch.setattr(ray_pictures, "upload", lambda device, table: table)
     function = TransferFunction([(0, 1.0, 0.5, 0.0, 0.0), (100, 0.0, 0.5, 1.0, 1.0)])
-    tables = composite.TransferTables.of(device(1), function, 1.0)
-    assert (tables.low, len(tables.colors_d), tables.shown_ends) == (0.0, composite.NODES, (1, composite.NODES - 1))
+    tables = ray_pictures.TransferTables.of(device(1), function, 1.0)
+    assert (tables.low, len(tables.colors_d), tables.shown_ends) == (
+        0.0,
+        ray_pictures.NODES,
+        (1, ray_pictures.NODES - 1),
+    )
     for node, expected in ((0, (1023, 511.5, 0)), (-1, (0, 511.5, 1023))):
         color = int(tables.colors_d[node])
         assert [color >> 20, color >> 10 & 1023, color & 1023] == pytest.approx(expected, abs=1.0)
@@ -246,14 +249,14 @@ def test_what_a_search_for_ghosts_takes_beside_its_band_is_named():
 def test_the_first_step_to_the_volume_of_a_label(monkeypatch):
     """The slope by which levels move the volume, of 300 vertices over voxels of 3 mm3."""
     told = []
-    monkeypatch.setattr(mask_extraction, "next_level", lambda tried, wanted, slope: told.append((wanted, slope)) or 7)
+    monkeypatch.setattr(label_masks, "next_level", lambda tried, wanted, slope: told.append((wanted, slope)) or 7)
     mesh: Any = SimpleNamespace(
         counted=SimpleNamespace(vertices=300),
         run=SimpleNamespace(labels=SimpleNamespace(affine=np.diag([2.0, -3.0, 0.5, 1.0]))),
         place=lambda level: None,
         emission=SimpleNamespace(download=lambda: "mesh"),
     )
-    assert mask_extraction.StartedMesh.keep_volume(mesh, 10.0, closed=False) == ("mesh", 7)
+    assert label_masks.StartedMesh.keep_volume(mesh, 10.0, closed=False) == ("mesh", 7)
     ((wanted, slope),) = told
     assert (wanted, slope) == (10.0, pytest.approx(-(300 / FACES_PER_AREA) * 3.0 / (STEEPNESS * FULL)))
 

@@ -79,7 +79,7 @@ def _remove_sparse(
     """Remove what paper B's grid takes for noise."""
     if "grid" not in settings.denoise:
         return
-    from clrecon.operators.points.sparse_cells import remove_sparse_cells
+    from clrecon.operators.points.thinning import remove_sparse_cells
 
     trail.add("sparse cells", remove_sparse_cells(trail.cloud, **shared), takes_noise=True)
 
@@ -89,7 +89,7 @@ def _remove_outliers(
 ) -> None:
     if settings.outliers is None:
         return
-    from clrecon.operators.points.outliers import remove_outliers
+    from clrecon.operators.points.denoising import remove_outliers
 
     trail.add("outliers", remove_outliers(trail.cloud, deviations=settings.outliers, **shared), takes_noise=True)
 
@@ -97,7 +97,7 @@ def _remove_outliers(
 def _denoise(trail: Trail, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]) -> None:
     if "bilateral" not in settings.denoise:
         return
-    from clrecon.operators.points.bilateral import denoise_points
+    from clrecon.operators.points.denoising import denoise_points
 
     trail.add("bilateral", denoise_points(trail.cloud, paper=settings.paper, **shared))
 
@@ -115,6 +115,6 @@ def _find_normals(trail: Trail, settings: CloudSettings, resident: DeviceVolume 
 def _thin(trail: Trail, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]) -> None:
     if settings.spacing is None:
         return
-    from clrecon.operators.points.thin import thin_points
+    from clrecon.operators.points.thinning import thin_points
 
     trail.add("spacing", thin_points(trail.cloud, settings.spacing, **shared))

@@ -53,7 +53,7 @@ def take_points(
 
 
 def _extract(resident: DeviceVolume, labels: LabelMap | None, settings: CloudSettings, progress: Progress) -> Trail:
-    from clrecon.operators.points.extract import extract_points
+    from clrecon.operators.points.point_extraction import extract_points
 
     began = Trail.clock()
     what: dict[str, Any] = {"hu": settings.hu} if settings.is_band else {"iso_value": iso_value_of(settings)}

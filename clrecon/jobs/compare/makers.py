@@ -96,7 +96,7 @@ def _vtk(scene: Scene) -> Product:
 
 
 def _cloud(scene: Scene) -> Product:
-    from clrecon.operators.points.extract import extract_points
+    from clrecon.operators.points.point_extraction import extract_points
 
     request = scene.request
     cloud = extract_points(scene.volume, request.iso_value, kind="shell", device=scene.device, memory=request.memory)
@@ -105,8 +105,8 @@ def _cloud(scene: Scene) -> Product:
 
 def _cloud_surface(scene: Scene) -> Product:
     """Voxels, their normals, and the surface around them; the volume goes to the device once."""
-    from clrecon.operators.points.extract import extract_points
     from clrecon.operators.points.normals import estimate_normals
+    from clrecon.operators.points.point_extraction import extract_points
     from clrecon.operators.points.reconstruct import reconstruct_surface
     from clrecon.operators.resident.device_volume import DeviceVolume
 

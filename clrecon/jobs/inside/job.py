@@ -146,7 +146,7 @@ def _open(source: str | Path, settings: InsideSettings, progress: Progress) -> t
 
 
 def _prepare(device: Device) -> None:
-    from clrecon.operators.surface.mask_extraction import prepare_label_masks
+    from clrecon.operators.surface.label_masks import prepare_label_masks
 
     prepare_label_masks(device)
 

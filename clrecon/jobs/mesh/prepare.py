@@ -42,12 +42,12 @@ def prepare_surfaces(
 
         prepare_growing(device)
     if decimates:
-        from clrecon.operators.surface.near_faces import prepare_near_faces
+        from clrecon.operators.surface.decimation import prepare_near_faces
 
         prepare_near_faces(device)
     if solid:
-        from clrecon.operators.masks.balls import prepare_balls
         from clrecon.operators.masks.runs import prepare_runs
+        from clrecon.operators.masks.shapes import prepare_balls
 
         prepare_balls(device)
         prepare_runs(device)

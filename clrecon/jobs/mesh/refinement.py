@@ -138,7 +138,7 @@ def _count_crossings(mesh: Mesh, device: Device | None, steps: Steps) -> int:
     """Count the pairs of triangles that cut each other."""
     from clrecon.mesh.intersections import find_self_intersections
     from clrecon.opencl import work_on
-    from clrecon.operators.surface.crossings import find_crossings
+    from clrecon.operators.surface.decimation import find_crossings
 
     if device is None:
         return len(find_self_intersections(mesh.vertices, mesh.triangles, steps=steps))

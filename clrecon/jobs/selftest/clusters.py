@@ -9,7 +9,7 @@ from clrecon.geometry import Volume
 from clrecon.jobs.selftest.check import Check, require_equal
 from clrecon.jobs.selftest.scenes import OBLIQUE, noise, stack
 from clrecon.opencl import Device, download
-from clrecon.operators.masks.band_mask import VoxelMask, mark_band, mark_voxels
+from clrecon.operators.masks.voxel_mask import VoxelMask, mark_band, mark_voxels
 from clrecon.operators.points.slice_overlap import count_overlaps
 from clrecon.operators.points.voxel_clusters import ClusterSearch, pad_for
 from clrecon.operators.resident.device_volume import DeviceVolume

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from clrecon.jobs.selftest.check import Check, require_close, require_equal
 from clrecon.opencl import Device, download
-from clrecon.operators.points.field import LEAST_SHARE, FieldSettings, NodeField
-from clrecon.operators.points.field_signs import Masks, decide_signs
+from clrecon.operators.points.field import LEAST_SHARE, FieldSettings, Masks, NodeField, decide_signs
 from clrecon.reference.points import field as twin
 
 FIELD_MM = 5e-5

@@ -10,8 +10,7 @@ from clrecon.errors import DeviceError
 from clrecon.jobs.selftest.check import Check, require_close, require_equal
 from clrecon.jobs.selftest.scenes import OBLIQUE, random_integers, stack
 from clrecon.opencl import Device, Stopwatch, download
-from clrecon.operators.filters.bilateral import run_bilateral
-from clrecon.operators.filters.near_level import SlicesThere, list_mixed_groups, row_words
+from clrecon.operators.filters.bilateral import SlicesThere, list_mixed_groups, row_words, run_bilateral
 from clrecon.operators.filters.settings import BilateralSettings
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.reference.filters import bilateral as twin

@@ -9,8 +9,7 @@ from clrecon.jobs.selftest.points import scattered_points
 from clrecon.opencl import Device, download
 from clrecon.operators.points.free_clusters import ClusterSearch, cluster_free_points, plan_cells
 from clrecon.operators.points.grid import fill_grid, plan_grid
-from clrecon.operators.points.sparse_cells import grow_cells
-from clrecon.operators.points.thin import choose_points
+from clrecon.operators.points.thinning import choose_points, grow_cells
 from clrecon.reference.points import clusters as clusters_twin
 from clrecon.reference.points import free_clusters as passes_twin
 from clrecon.reference.points import grid as grid_twin

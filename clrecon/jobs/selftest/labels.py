@@ -16,10 +16,8 @@ from clrecon.labels.enclosed import count_faces
 from clrecon.labels.occupancy import FULL
 from clrecon.labels.solid import find_boxes
 from clrecon.opencl import Device, Stopwatch, allocate, download, launch, upload
-from clrecon.operators.surface.label_masks import extract_label_masks
-from clrecon.operators.surface.label_survey import survey_labels
+from clrecon.operators.surface.label_masks import extract_label_masks, prepare_label_masks, survey_labels
 from clrecon.operators.surface.labels import extract_labels
-from clrecon.operators.surface.mask_extraction import prepare_label_masks
 from clrecon.reference.surface import label_masks as mask_twin
 from clrecon.reference.surface import labels as label_twin
 

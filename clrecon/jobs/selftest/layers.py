@@ -14,10 +14,9 @@ from clrecon.jobs.selftest.check import Check, require_close, require_equal, req
 from clrecon.jobs.selftest.scenes import OBLIQUE, blobs, centre_of, look_at
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, download
-from clrecon.operators.rays.buffers import Between
-from clrecon.operators.rays.layers import LayeredPicture, Still, draw_layers
 from clrecon.operators.rays.mesh_pictures import make_part
-from clrecon.operators.rays.scene import ScenePictures
+from clrecon.operators.rays.picture_buffers import Between
+from clrecon.operators.rays.scene import LayeredPicture, ScenePictures, Still, draw_layers
 from clrecon.reference.rays.render import cast_rays
 from clrecon.reference.rays.slices import overlay_slices as overlay_twin
 from clrecon.reference.rays.triangles import Meetings, find_meetings, nth_layer, shade_layer

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from clrecon.jobs.selftest.check import Check, require_equal
 from clrecon.opencl import Device
-from clrecon.operators.surface.crossings import mark_crossings, plan_crossings
+from clrecon.operators.surface.decimation import mark_crossings, plan_crossings
 from clrecon.reference.surface import crossings as twin
 
 

@@ -9,7 +9,7 @@ from clrecon.jobs.selftest.check import Check, require_close, require_equal
 from clrecon.mesh.compare.near_distances import NearDistance, triangle_distances
 from clrecon.mesh.refine.bounds import MIDDLES, SurfaceBounds
 from clrecon.opencl import Device
-from clrecon.operators.surface.near_faces import DeviceBounds
+from clrecon.operators.surface.decimation import DeviceBounds
 
 SIZE = 40
 """Vertices along each side of the sheet: 3042 triangles."""

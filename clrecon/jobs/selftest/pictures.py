@@ -13,10 +13,10 @@ from clrecon.jobs.selftest.check import Check, require_close, require_equal, req
 from clrecon.jobs.selftest.scenes import OBLIQUE, blobs, centre_of, look_at
 from clrecon.labels import LabelMap
 from clrecon.opencl import Device
+from clrecon.operators.rays.point_pictures import draw_splats
 from clrecon.operators.rays.ray_pictures import take_picture
 from clrecon.operators.rays.slices import overlay_slices
-from clrecon.operators.rays.splats import draw_splats
-from clrecon.operators.rays.surface import cast_surface
+from clrecon.operators.rays.surface_pictures import cast_surface
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.reference.rays.render import cast_rays
 from clrecon.reference.rays.slices import overlay_slices as overlay_twin

@@ -11,10 +11,8 @@ from clrecon.geometry import Volume
 from clrecon.jobs.selftest.check import Check, require_close, require_equal, require_share
 from clrecon.jobs.selftest.scenes import OBLIQUE, random_integers, stack
 from clrecon.opencl import Device, Stopwatch
-from clrecon.operators.points.bilateral import denoise_points
-from clrecon.operators.points.gradients import find_gradients
-from clrecon.operators.points.normals import estimate_normals
-from clrecon.operators.points.outliers import remove_outliers
+from clrecon.operators.points.denoising import denoise_points, remove_outliers
+from clrecon.operators.points.normals import estimate_normals, find_gradients
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
 from clrecon.points.features import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold

@@ -9,9 +9,7 @@ from clrecon.errors import DeviceError
 from clrecon.jobs.selftest.check import Check, require_equal
 from clrecon.jobs.selftest.scenes import random_integers
 from clrecon.opencl import Device, download, upload
-from clrecon.operators.primitives.compact import compact
-from clrecon.operators.primitives.radix_sort import radix_sort
-from clrecon.operators.primitives.scan import exclusive_scan
+from clrecon.operators.primitives.scan import compact, exclusive_scan, radix_sort
 from clrecon.operators.primitives.union_find import label_components
 from clrecon.reference.primitives import compact as compact_twin
 from clrecon.reference.primitives import radix_sort as sort_twin

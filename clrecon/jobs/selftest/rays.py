@@ -11,13 +11,19 @@ from clrecon.geometry import Volume
 from clrecon.jobs.selftest.check import Check, require_close, require_equal
 from clrecon.jobs.selftest.scenes import stack
 from clrecon.opencl import Device, Stopwatch, download, upload
-from clrecon.operators.rays.buffers import PictureBuffers
-from clrecon.operators.rays.composite import MainWay, enter_tiles, look_ahead
-from clrecon.operators.rays.leaps import find_leaps, measure_cells
-from clrecon.operators.rays.ray_view import TILE, RayView
-from clrecon.operators.rays.slabs import BRICK_CELLS, FARTHEST, LeapMap, RaySlab, ray_slabs
+from clrecon.operators.rays.picture_buffers import TILE, PictureBuffers, RayView
+from clrecon.operators.rays.ray_pictures import MainWay, enter_tiles, look_ahead
+from clrecon.operators.rays.ray_slabs import (
+    BRICK_CELLS,
+    FARTHEST,
+    LeapMap,
+    RaySlab,
+    find_leaps,
+    measure_cells,
+    ray_slabs,
+)
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.operators.resident.frame import volume_box
+from clrecon.operators.resident.tables import volume_box
 from clrecon.rendering.views.camera import Camera
 
 SHAPE = (185, 193, 17)

@@ -7,7 +7,7 @@ from functools import partial
 from clrecon.jobs.selftest.check import Check, require_close, require_whole
 from clrecon.jobs.selftest.scenes import OBLIQUE, random_integers, stack
 from clrecon.opencl import Device
-from clrecon.operators.reformat.sample import sample_sheet
+from clrecon.operators.reformat.sheets import sample_sheet
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.reference.reformat.cut import reformat_sheet
 from clrecon.rendering.views.plane import find_plane, plane_sheet, slab_samples

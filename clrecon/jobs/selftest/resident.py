@@ -7,7 +7,7 @@ import numpy as np
 from clrecon.jobs.selftest.check import Check, require_equal
 from clrecon.jobs.selftest.scenes import noise
 from clrecon.opencl import Device, download, upload
-from clrecon.operators.resident.bricks import compare_bricks, measure_bricks
+from clrecon.operators.resident.tables import compare_bricks, measure_bricks
 from clrecon.reference.resident import bricks as twin
 
 SHAPE = (221, 196, 21)

@@ -6,7 +6,7 @@ from clrecon.jobs.selftest.check import Check, require_close, require_equal, req
 from clrecon.jobs.selftest.scenes import OBLIQUE, WIDE, noise, random_integers, stack
 from clrecon.labels import LabelMap
 from clrecon.opencl import Device
-from clrecon.operators.points.extract import extract_points
+from clrecon.operators.points.point_extraction import extract_points
 from clrecon.reference.points import emit as voxel_twin
 
 PLACE_TOLERANCE_MM = 1.6e-5

@@ -28,7 +28,7 @@ Corners = list[Float32Array]
 class SurfaceBounds(NearDistance):
     """A surface to which distances are bounded, by numpy.
 
-    `clrecon.operators.surface.near_faces.DeviceBounds` does the same on a device.
+    `clrecon.operators.surface.decimation.DeviceBounds` does the same on a device.
 
     vertices: ndarray, shape (n, 3), mm, near zero
     triangles: ndarray, shape (m, 3), uint32

@@ -12,11 +12,11 @@ from clrecon.errors import UsageError
 from clrecon.geometry import AIR_HU, Volume
 from clrecon.geometry.certificate import amend
 from clrecon.opencl import Device, Stopwatch, check_budget, upload
-from clrecon.operators.masks import logic
-from clrecon.operators.masks.band_mask import check_shape, checked_band, mark_band, mask_bytes, zero_words
-from clrecon.operators.masks.components import MaskComponents
+from clrecon.operators.masks import voxel_mask
 from clrecon.operators.masks.regions import RowSpans, box_spans, checked_box, tube_spans
 from clrecon.operators.masks.runs import write_runs
+from clrecon.operators.masks.shapes import MaskComponents
+from clrecon.operators.masks.voxel_mask import check_shape, checked_band, mark_band, mask_bytes, zero_words
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
@@ -296,7 +296,7 @@ class Mask(MaskComponents):
         if resident.shortage(sizes):
             return np.where(self.to_numpy(), voxels, value), None
         voxels_d = resident.whole(Stopwatch())
-        return logic.replace_outside(self.device, voxels_d, voxels.dtype, self._mask_d, self.shape_ijk, value)
+        return voxel_mask.replace_outside(self.device, voxels_d, voxels.dtype, self._mask_d, self.shape_ijk, value)
 
     @classmethod
     def _packed(cls, resident: DeviceVolume, chosen: NDArray[np.bool_], name: str) -> Mask:

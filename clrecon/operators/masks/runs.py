@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import DeviceMemoryError
 from clrecon.opencl import Device, Program, Stopwatch, allocate, check_budget, download, launch, load_program, upload
-from clrecon.operators.masks.band_mask import VoxelMask, zero_words
+from clrecon.operators.masks.voxel_mask import VoxelMask, zero_words
 from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
 from clrecon.operators.primitives.union_find import join_parts, prepare_components
 from clrecon.points.stencil import Stencil

@@ -13,9 +13,9 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import checked_affine
 from clrecon.opencl import Device, Stopwatch, check_memory, take_device, work_on
-from clrecon.operators.masks.band_mask import checked_band, mark_band, mark_voxels, mask_bytes
-from clrecon.operators.points.extract import extract_points
+from clrecon.operators.masks.voxel_mask import checked_band, mark_band, mark_voxels, mask_bytes
 from clrecon.operators.points.free_clusters import cluster_free_points
+from clrecon.operators.points.point_extraction import extract_points
 from clrecon.operators.points.voxel_clusters import ClusterSearch, checked_min_samples, pad_for, search_bytes
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points import PointCloud, PointStep

@@ -25,8 +25,7 @@ from clrecon.opencl import (
     upload,
     wait,
 )
-from clrecon.operators.primitives.radix_sort import prepare_sort, radix_sort, sort_bytes
-from clrecon.operators.primitives.scan import exclusive_scan
+from clrecon.operators.primitives.scan import exclusive_scan, prepare_sort, radix_sort, sort_bytes
 from clrecon.points.cells import MARGIN
 
 STEPS_A_POINT = 16

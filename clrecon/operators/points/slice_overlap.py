@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.geometry import Volume
 from clrecon.opencl import Device, Program, Stopwatch, allocate, download, launch, load_program
-from clrecon.operators.masks.band_mask import VoxelMask, checked_band, mark_band
+from clrecon.operators.masks.voxel_mask import VoxelMask, checked_band, mark_band
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points.ghost_slices import GhostSlices, judge_slices
 from clrecon.system.arguments import explains_arguments

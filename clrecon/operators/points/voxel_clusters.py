@@ -21,7 +21,6 @@ from clrecon.opencl import (
     memory_limits,
     upload,
 )
-from clrecon.operators.masks.band_mask import VoxelMask
 from clrecon.operators.masks.runs import (
     PARTS_PER_CORE,
     StencilTable,
@@ -30,6 +29,7 @@ from clrecon.operators.masks.runs import (
     list_runs,
     prepare_runs,
 )
+from clrecon.operators.masks.voxel_mask import VoxelMask
 from clrecon.points.stencil import Stencil
 
 MOST_SAMPLES = 255

@@ -21,8 +21,7 @@ from clrecon.opencl import (
     memory_limits,
     upload,
 )
-from clrecon.operators.primitives.compact import Compacted, compact, prepare_compact
-from clrecon.operators.primitives.scan import LARGEST_SCAN, exclusive_scan
+from clrecon.operators.primitives.scan import LARGEST_SCAN, Compacted, compact, exclusive_scan, prepare_compact
 
 LARGEST_MESH = 2**32 - 1
 """Most triangles, so that 32 bits can count them."""

@@ -1,8 +1,10 @@
-"""Meshes with their looks, in the form in which a device draws them."""
+"""Triangles on a device, and meshes with their looks in the form in which it draws them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +14,174 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import Grid
 from clrecon.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
-from clrecon.operators.rays.triangles import MOST_TRIANGLES, MeshPart
+from clrecon.opencl import Device, Stopwatch, allocate, kernel_number, launch, load_program, upload
+from clrecon.operators.primitives.scan import exclusive_scan
+from clrecon.operators.rays.picture_buffers import highlight_table
+from clrecon.operators.rays.point_pictures import eye_table
+from clrecon.rendering import Lighting
 from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.rendering.views.camera import Camera
 from clrecon.system.text import format_digits
+
+MOST_TRIANGLES = 2**32 - 2
+"""Most triangles of a picture: one number is that of no triangle."""
+
+PIECE = int(kernel_number("rays/triangles.cl", "PIECE"))
+"""Pixels along each side of a piece of a large triangle."""
+
+PIECES_A_LAUNCH = 1 << 20
+"""Pieces of large triangles that a launch draws: a fraction of a second, so that graphics drivers do not take it for a
+hang."""
+
+MOST_PIECES = 1 << 28
+"""Pieces of all large triangles of a mesh: half an hour a layer on two cores."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPart:
+    """Triangles with one look, in the form for a device.
+
+    vertices: ndarray, shape (n, 3), float32. Mm from `base`, finite.
+    triangles: ndarray, shape (m, 3), uint32. Indices of vertices that exist.
+    normals: ndarray, shape (n, 3), float32, or None. LPS, of any length; None: every triangle has its own.
+    colors: ndarray, shape (n, 4), uint8, or None. Red, green, blue and 255 of each vertex, in place of `color`.
+    opacity: Above 0 and up to 1.
+    planes: ndarray, shape (p, 4), float64. Half-spaces in LPS mm that are kept: ``normal . p >= offset``.
+    base: ndarray, shape (3,), float64. LPS mm.
+    """
+
+    vertices: NDArray[np.float32]
+    triangles: NDArray[np.uint32]
+    normals: NDArray[np.float32] | None
+    color: Sequence[float]
+    colors: NDArray[np.uint8] | None
+    opacity: float
+    lighting: Lighting
+    planes: Float64Array
+    base: Float64Array
+
+    @property
+    def device_bytes(self) -> int:
+        """Bytes that its buffers take on a device."""
+        beside = (0 if self.normals is None else 12) + (0 if self.colors is None else 4)
+        return (24 + beside) * len(self.vertices) + 16 * len(self.triangles)
+
+
+@dataclass
+class LayerKeys:
+    """Buffers (height, width) uint32 of a layer, and of the layer before, which is its floor; see the kernels."""
+
+    keys_d: Any
+    numbers_d: Any
+    floor_keys_d: Any
+    floor_numbers_d: Any
+
+    @classmethod
+    def of(cls, device: Device, pixels: int) -> LayerKeys:
+        """Allocate them."""
+        return cls(*(allocate(device, 4 * pixels) for _ in range(4)))
+
+    def go_behind(self) -> None:
+        """Make the layer the floor of the next one."""
+        self.keys_d, self.floor_keys_d = self.floor_keys_d, self.keys_d
+        self.numbers_d, self.floor_numbers_d = self.floor_numbers_d, self.numbers_d
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments for the kernels that draw."""
+        return {
+            "keys": self.keys_d,
+            "numbers": self.numbers_d,
+            "floor_keys": self.floor_keys_d,
+            "floor_numbers": self.floor_numbers_d,
+        }
+
+
+class Triangles:
+    """A `MeshPart` on a device, before a camera.
+
+    first: Number of its first triangle among those of the picture.
+    size: (width, height)
+    """
+
+    def __init__(
+        self, device: Device, part: MeshPart, first: int, camera: Camera, size: tuple[int, int], stopwatch: Stopwatch
+    ):
+        self.device, self.part, self.first, self.stopwatch = device, part, first, stopwatch
+        self._program = load_program(device, "rays/triangles.cl")
+        width, height = size
+        with stopwatch.timed("upload"):
+            self._view_d = upload(device, eye_table(camera, size, part.lighting, part.base))
+            self._triangles_d = upload(device, part.triangles)
+            self._planes_d = upload(device, _camera_planes(camera, part.planes))
+            self._normals_d = upload(device, _or_nothing(part.normals, np.float32))
+            self._colors_d = upload(device, _or_nothing(part.colors, np.uint8))
+            self._highlights_d = upload(device, highlight_table(part.lighting))
+            vertices_d = upload(device, part.vertices)
+        self._placed_d = allocate(device, 12 * len(part.vertices))
+        self._picture: dict[str, Any] = {
+            "placed": self._placed_d, "triangles": self._triangles_d, "view": self._view_d, "width": width,
+            "height": height, "count": len(part.triangles),
+        }  # fmt: skip
+        sums_d = allocate(device, 4 * len(part.triangles))
+        with stopwatch.running(device):  # wait: CPU devices read the host's arrays
+            launch(
+                device, self._program["place_vertices"], len(part.vertices), stopwatch=stopwatch,
+                vertices=vertices_d, view=self._view_d, placed=self._placed_d, count=len(part.vertices),
+            )  # fmt: skip
+            launch(
+                device, self._program["count_pieces"], len(part.triangles), stopwatch=stopwatch,
+                pieces=sums_d, **self._picture,
+            )  # fmt: skip
+            scanned = exclusive_scan(device, sums_d, len(part.triangles), in_place=True, stopwatch=stopwatch)
+        self._sums_d, self._pieces = scanned.offsets_d, scanned.total
+        if self._pieces > MOST_PIECES:
+            raise UsageError(
+                f"{len(part.triangles):,} triangles cover {self._pieces * PIECE**2:.1e} pixels, at most"
+                f" {MOST_PIECES * PIECE**2:.1e} are drawn: take a smaller picture, or zoom less"
+            )
+
+    def draw(self, layer: LayerKeys, finds_numbers: bool) -> None:
+        """Bring depths, or numbers where all depths are known, to the pixels of a layer, without a wait."""
+        device, stopwatch = self.device, self.stopwatch
+        common: dict[str, Any] = {
+            **self._picture, **layer.arguments, "planes": self._planes_d, "plane_count": len(self.part.planes),
+            "first": self.first, "finds_numbers": finds_numbers,
+        }  # fmt: skip
+        launch(device, self._program["draw_triangles"], len(self.part.triangles), stopwatch=stopwatch, **common)
+        for first in range(0, self._pieces, PIECES_A_LAUNCH):
+            end = min(first + PIECES_A_LAUNCH, self._pieces)
+            launch(
+                device, self._program["draw_pieces"], end - first, stopwatch=stopwatch,
+                sums=self._sums_d, first_piece=first, end_piece=end, **common,
+            )  # fmt: skip
+
+    def shade(self, layer: LayerKeys, layer_d: Any, depths_d: Any) -> None:
+        """Write colours and depths of a layer where these triangles are seen; the queue is not waited for."""
+        part = self.part
+        color = np.array([*part.color, part.opacity], np.float32)
+        launch(
+            self.device, self._program["shade_triangles"], self._picture["width"] * self._picture["height"],
+            stopwatch=self.stopwatch, normals=self._normals_d, colors=self._colors_d, highlights=self._highlights_d,
+            numbers=layer.numbers_d, keys=layer.keys_d, layer=layer_d, layer_depths=depths_d, color=color,
+            has_normals=part.normals is not None, has_colors=part.colors is not None, shaded=part.lighting.shades,
+            first=self.first, **self._picture,
+        )  # fmt: skip
+
+
+def _or_nothing(array: NDArray[Any] | None, dtype: Any) -> NDArray[Any]:
+    return np.zeros(4, dtype) if array is None else array  # OpenCL has no empty buffers
+
+
+def _camera_planes(camera: Camera, planes: Float64Array) -> NDArray[np.float32]:
+    """Return clip planes in mm of the camera, (p, 4), at least one row."""
+    basis = np.array(camera.basis())
+    table = np.zeros((max(len(planes), 1), 4), np.float32)
+    for row, plane in zip(table, planes, strict=False):
+        row[:3] = basis @ plane[:3]
+        row[3] = plane[3] - plane[:3] @ np.array(camera.position)
+    return table
+
 
 FARTHEST_MM = 1e9
 """Largest coordinate of a vertex: a thousand kilometres, as of cameras; products of two fit float32."""

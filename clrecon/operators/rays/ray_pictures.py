@@ -1,8 +1,10 @@
-"""Pictures by sampling rays: volume rendering and projections, from slab to slab."""
+"""Pictures by sampling rays, from slab to slab: volume rendering through a transfer function, and projections."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -11,16 +13,35 @@ from numpy.typing import NDArray
 
 from clrecon.anatomy.surroundings import LEFT_OUT, count_left_out
 from clrecon.geometry.affine import Float64Array
-from clrecon.opencl import Stopwatch
-from clrecon.operators.rays.buffers import Between, DrawnVolume, PictureBuffers
-from clrecon.operators.rays.composite import TransferTables, composite_slab
-from clrecon.operators.rays.leaps import find_leaps
-from clrecon.operators.rays.project import project_slab
-from clrecon.operators.rays.ray_view import NEAR_ROW, RayView
-from clrecon.operators.rays.slabs import RAYS, RaySlab, entry_slice, plan_ray_slabs, ray_slabs
+from clrecon.geometry.iso_rule import takes_parts
+from clrecon.labels.resample import ResampledLabels
+from clrecon.opencl import Device, Stopwatch, allocate, kernel_constant, kernel_number, launch, upload
+from clrecon.operators.rays.picture_buffers import (
+    NEAR_ROW,
+    Between,
+    DrawnVolume,
+    PictureBuffers,
+    RayView,
+    count_queues,
+    highlight_table,
+)
+from clrecon.operators.rays.ray_slabs import (
+    FARTHEST,
+    RAYS,
+    LeapMap,
+    RaySlab,
+    entry_slice,
+    find_leaps,
+    measure_cells,
+    plan_ray_slabs,
+    ray_slabs,
+    slab_labels,
+)
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.operators.resident.frame import volume_box
-from clrecon.rendering import Lighting, Rendering
+from clrecon.operators.resident.tables import FieldFrame, label_variants, volume_box
+from clrecon.rendering import Lighting, Rendering, TransferFunction
+from clrecon.rendering.looks.label_style import LabelStyle
+from clrecon.rendering.looks.steepness import PARTS, Steepness
 from clrecon.rendering.looks.window import (
     checked_window,
     choose_mip_window,
@@ -31,6 +52,271 @@ from clrecon.rendering.looks.window import (
 from clrecon.rendering.pictures.styles import Projection, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.progress import Progress, ignore_progress
+
+NODES = kernel_constant("rays/steep_segments.h", "NODES")
+"""Entries of a transfer function's table."""
+
+GRADIENT_NODES = kernel_constant("rays/composite.cl", "GRADIENT_NODES")
+"""Entries of the table of opacity factors by magnitude of the gradient."""
+
+LEAST_DRIFT = 0.02
+"""Rays that drift less than this many bricks to the side per brick ahead count as running straight along the row."""
+
+LOWEST_LOG = -1000.0
+"""log2 of the transparency of an opaque sample: 0 in float32; infinity times a length of 0 would give NaN."""
+
+
+@dataclass(frozen=True)
+class TransferTables:
+    """A transfer function in tables for one ray step.
+
+    colors_d: buffer, (NODES,) int32. Red, green and blue, 10 bits each.
+    opacities_d: buffer, (NODES,) float32. Opacities over one ray step.
+    clears_d: buffer, (NODES,) float32. Transparency of one of the `PARTS` parts of a ray step.
+    changes_d: buffer, (NODES,) float32. Sum of the changes of the opacity, up and down, from the first node to each
+        node.
+    shown: ndarray, shape (NODES,), bool
+    steepness: Steepness of `opacities_d`.
+    low, scale: Nearest node to v: ``floor((v - low) * scale + 0.5)``.
+    factors_d: buffer, (GRADIENT_NODES,) float32. Factors on the opacity, by magnitude of the gradient times
+        `factor_scale`; used if it is `weighed`.
+    steps_per_unit: Number of ray steps in the unit distance.
+    """
+
+    colors_d: Any
+    opacities_d: Any
+    clears_d: Any
+    changes_d: Any
+    factors_d: Any
+    shown: NDArray[np.bool_]
+    low: float
+    scale: float
+    steepness: Steepness
+    factor_scale: float
+    steps_per_unit: float
+    weighed: bool
+
+    @property
+    def shown_ends(self) -> tuple[int, int]:
+        """First and last node with opacity; (NODES, -1) if all are transparent."""
+        shown = np.flatnonzero(self.shown)
+        return (int(shown[0]), int(shown[-1])) if len(shown) else (NODES, -1)
+
+    @property
+    def is_one_sided(self) -> bool:
+        """True where the visible nodes are the first ones of the table, or the last ones."""
+        return int(np.count_nonzero(np.diff(self.shown.astype(np.int8)))) <= 1
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments for the kernel."""
+        first_shown, last_shown = self.shown_ends
+        return {
+            "colors": self.colors_d,
+            "opacities": self.opacities_d,
+            "clears": self.clears_d,
+            "changes": self.changes_d,
+            "factors": self.factors_d,
+            "low": self.low,
+            "scale": self.scale,
+            "first_shown": first_shown,
+            "last_shown": last_shown,
+            "narrow": self.steepness.narrow,
+            "has_dense": self.steepness.has_dense,
+            "one_sided": self.is_one_sided,
+            "factor_scale": self.factor_scale,
+            "steps_per_unit": self.steps_per_unit,
+        }
+
+    @classmethod
+    def of(cls, device: Device, function: TransferFunction, ray_step: float) -> TransferTables:
+        """Make the tables of `function` for samples every `ray_step` mm."""
+        low, high = function.range_hu
+        table = function.table(low, high, NODES)
+        with np.errstate(divide="ignore"):
+            let_through = np.log2(1.0 - table[:, 3].astype(np.float64)) * (ray_step / function.unit_distance)
+        let_through = np.maximum(let_through, LOWEST_LOG)
+        red, green, blue = np.rint(1023.0 * table[:, :3].T).astype(np.int32)
+        colors = red << 20 | green << 10 | blue
+        opacities = (-np.expm1(let_through * np.log(2.0))).astype(np.float32)
+        clears = np.exp2(let_through / PARTS).astype(np.float32)
+        scale = (NODES - 1) / (high - low)
+        steepness = Steepness.of(opacities, scale)
+        shown = opacities > 0.0
+        factors = np.ones(GRADIENT_NODES, np.float32)
+        top = 1.0
+        if function.gradient_opacity is not None:
+            top = max(float(function.gradient_opacity[-1, 0]), 1.0)
+            factors = function.gradient_table(top, GRADIENT_NODES)
+        return cls(
+            upload(device, colors), upload(device, opacities), upload(device, clears),
+            upload(device, steepness.changes.astype(np.float32)), upload(device, factors), shown, low,
+            scale, steepness, (GRADIENT_NODES - 1) / top, function.unit_distance / ray_step,
+            function.gradient_opacity is not None,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class MainWay:
+    """The main direction of a picture's rays through the bricks of a slab.
+
+    axis: 0, 1 or 2 for i, j or k.
+    ahead: 1 or -1: the direction along the axis.
+    eye: ndarray, shape (4,), float32. The camera in bricks, and 1; or the direction of all rays in bricks, 1 along
+        `axis`, and 0.
+    aside: Distance in bricks from the camera, or drift to the side per brick ahead, from which on rays count as
+        drifting.
+    """
+
+    axis: int
+    ahead: int
+    eye: NDArray[np.float32]
+    aside: float
+
+    @classmethod
+    def of(cls, resident: DeviceVolume, slab: RaySlab, camera: Camera) -> MainWay:
+        """Find the main way from the ray in the middle."""
+        frame, cells = FieldFrame.of(resident.volume), np.array(slab.brick_cells, np.float64)
+        forward = frame.matrix @ camera.basis().forward / cells
+        axis = int(np.argmax(np.abs(forward)))
+        ahead = 1 if forward[axis] > 0.0 else -1
+        if camera.is_parallel:
+            eye, aside = np.append(forward / np.abs(forward).max(), 0.0), LEAST_DRIFT
+        else:
+            place = (frame.places(np.array([camera.position]))[0] - (0.0, 0.0, slab.first_k)) / cells
+            nearest = -place[axis] if ahead > 0 else place[axis] - slab.bricks[axis]  # brick on the way
+            eye, aside = np.append(place, 1.0), max(LEAST_DRIFT * nearest, 0.5)
+        return cls(axis, ahead, eye.astype(np.float32), aside)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments for kernels."""
+        return {"main_axis": self.axis, "ahead": self.ahead, "eye": self.eye, "aside": self.aside}
+
+
+def composite_slab(
+    resident: DeviceVolume,
+    slab: RaySlab,
+    view: RayView,
+    tables: TransferTables,
+    leaps: LeapMap,
+    lighting: Lighting,
+    jitter: bool,
+    labels: ResampledLabels | None,
+    style: LabelStyle | None,
+    output: PictureBuffers,
+    stopwatch: Stopwatch,
+    between: Between | None = None,
+) -> None:
+    """Blend one slab into a picture, and wait.
+
+    view: With the slab's focus.
+    leaps: Of this slab, for the transfer function of `tables`.
+    labels: Labels on the grid of the volume.
+    output: Picture with the results of earlier slabs.
+    between: The part of the rays that counts; only the states of `output` are written.
+    """
+    device = resident.device
+    variants = {"GRADIENT_OPACITY": "1"} if tables.weighed else {}
+    if tables.steepness.is_steep and takes_parts(resident.volume, view.ray_step):
+        variants |= {"TAKES_PARTS": "1"}
+    label_tables: dict[str, Any] = {}
+    if labels is not None and style is not None:
+        variants |= {"LABELS": "1", **label_variants(labels.voxels.dtype)}
+        label_tables = {
+            "labels": slab_labels(resident, slab, labels, stopwatch),
+            "label_colors": upload(device, style.table),
+        }
+    shortened: dict[str, Any] = {}
+    if between is not None:
+        variants |= {"BETWEEN": "1"}
+        shortened = {"nearest": between.nearest_d, "farthest": between.farthest_d, "stage": 0}
+    program = resident.program("rays/composite.cl", **variants)
+    lanes = int(device.kernel_variants["LANES"])
+    queues = count_queues(device)
+    last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
+    with stopwatch.running(device):  # wait: CPU devices read host arrays that are freed here
+        entries_d = enter_tiles(resident, slab, view, leaps, output, stopwatch)
+        way = MainWay.of(resident, slab, view.camera)
+        ways_d = look_ahead(resident, slab, way, leaps, stopwatch)
+        launch(
+            device, program["composite_rays"], output.items(queues, lanes), stopwatch=stopwatch,
+            ways=ways_d, entries=entries_d, highlights=upload(device, highlight_table(lighting)),
+            view=upload(device, view.table), last_place=last, slope=resident.stack.slope, shaded=lighting.shades,
+            jitter=jitter, queues=queues, **{**slab.arguments, **shortened}, **tables.arguments, **output.arguments,
+            **view.arguments, **way.arguments, **label_tables, **resident.stack.arguments,
+        )  # fmt: skip
+
+
+def enter_tiles(
+    resident: DeviceVolume,
+    slab: RaySlab,
+    view: RayView,
+    leaps: LeapMap,
+    output: PictureBuffers,
+    stopwatch: Stopwatch,
+) -> Any:
+    """Return for each tile the distance in mm before which its rays meet nothing visible, on the device."""
+    device = resident.device
+    lanes = int(device.kernel_variants["LANES"])
+    width, height = view.size
+    camera = view.camera
+    margin = math.ceil(min((resident.stack.index_steps(view.spread) / slab.brick_cells).max(), FARTHEST))
+    entries_d = allocate(device, 4 * output.tiles)
+    launch(
+        device, resident.program("rays/tiles.cl")["enter_tiles"], -(-output.tiles // lanes), stopwatch=stopwatch,
+        leaps=leaps.distances_d, view=upload(device, view.widened()), entries=entries_d, slope=resident.stack.slope,
+        first_k=slab.first_k, margin=margin, width=width, height=height, perspective=not camera.is_parallel,
+        **slab.brick_arguments, **resident.stack.arguments,
+    )  # fmt: skip
+    return entries_d
+
+
+def look_ahead(resident: DeviceVolume, slab: RaySlab, way: MainWay, leaps: LeapMap, stopwatch: Stopwatch) -> Any:
+    """Return for each brick the empty distance around it, and ahead of it along the main way, on the device."""
+    bi, bj, bk = bricks = slab.bricks
+    count = math.prod(bricks)
+    ways_d = allocate(resident.device, count)
+    launch(
+        resident.device, resident.program("rays/leaps.cl")["look_ahead"], count // bricks[way.axis],
+        stopwatch=stopwatch, distances=leaps.distances_d, ways=ways_d, bi=bi, bj=bj, bk=bk, **way.arguments,
+    )  # fmt: skip
+    return ways_d
+
+
+AIR_HU = kernel_number("rays/project.cl", "AIR_HU")
+"""Attenuates nothing: lower values are padding, or what a mask left."""
+
+PROJECTIONS = {
+    mode: kernel_constant("rays/project.cl", macro)
+    for mode, macro in {"mip": "HIGHEST", "minip": "LOWEST", "mean": "MEAN", "drr": "RADIOGRAPH"}.items()
+}
+"""Numbers of the modes in the kernel."""
+
+
+def project_slab(
+    resident: DeviceVolume,
+    slab: RaySlab,
+    view: RayView,
+    mode: str,
+    output: PictureBuffers,
+    stopwatch: Stopwatch,
+) -> None:
+    """Add one slab to a projection; `output.means_d` receives the values.
+
+    mode: {"mip", "minip", "mean", "drr"}
+    """
+    variants = {"LEAST_VALUE": f"({AIR_HU:g})"} if mode == "drr" else {}
+    device = resident.device
+    queues, lanes = count_queues(device), int(device.kernel_variants["LANES"])
+    last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
+    launch(
+        device, resident.program("rays/project.cl", **variants)["project_rays"], output.items(queues, lanes),
+        stopwatch=stopwatch, ranges=measure_cells(resident, slab, stopwatch), view=upload(device, view.table),
+        states=output.states_d, depths=output.depths_d, values=output.means_d, last_place=last,
+        which=PROJECTIONS[mode], queues=queues, **slab.arguments, **view.arguments, **resident.stack.arguments,
+    )  # fmt: skip
+
 
 _NO_BODY = "no body was found in the scan: the lowest values are those of all of it, the air around included"
 

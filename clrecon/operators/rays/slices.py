@@ -13,11 +13,9 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.opencl import Stopwatch, check_budget, kernel_constant, launch, load_program, upload
-from clrecon.operators.rays.buffers import Between, DrawnVolume, PictureBuffers, count_queues
-from clrecon.operators.rays.ray_view import NEAR_ROW, RayView
+from clrecon.operators.rays.picture_buffers import NEAR_ROW, Between, DrawnVolume, PictureBuffers, RayView, count_queues
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.operators.resident.frame import FieldFrame, volume_box
-from clrecon.operators.resident.voxel_types import voxel_variants
+from clrecon.operators.resident.tables import FieldFrame, volume_box, voxel_variants
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.window import checked_window
 from clrecon.rendering.pictures.styles import SlicesInSpace

@@ -29,8 +29,7 @@ from clrecon.opencl import (
     upload,
     work_on,
 )
-from clrecon.operators.resident.stack_table import StackTable
-from clrecon.operators.resident.voxel_types import ray_variants
+from clrecon.operators.resident.tables import StackTable, ray_variants
 from clrecon.system.closing import Closing
 from clrecon.system.log import get_logger
 from clrecon.system.text import count_of

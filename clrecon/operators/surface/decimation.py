@@ -1,16 +1,321 @@
-"""Decimation within a bound, with distances and crossings on a device if one is named."""
+"""Decimation within a bound, and what a device finds for it: triangles that cut each other, and upper bounds of
+distances.
+
+The device marks the triangles that may cut another one, in float32; `clrecon.mesh.intersections` then looks at these
+alone, in float64.  The pairs are those that it finds among all triangles.
+"""
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from clrecon.mesh import Mesh
+from clrecon.mesh.compare.frames import rounding_of_bounds
+from clrecon.mesh.connectivity import Fans
+from clrecon.mesh.intersections import find_self_intersections
 from clrecon.mesh.refine import decimation
-from clrecon.opencl import Device, take_device, work_on
-from clrecon.operators.surface.crossings import find_crossings
-from clrecon.operators.surface.near_faces import DeviceBounds
+from clrecon.mesh.refine.bounds import WITNESSES, SurfaceBounds
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    check_budget,
+    describe_shortage,
+    download,
+    empty_output,
+    kernel_constant,
+    launch,
+    load_program,
+    memory_limits,
+    take_device,
+    upload,
+    wait,
+    work_on,
+)
+from clrecon.operators.masks.voxel_mask import zero_words
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.progress import Progress
+from clrecon.system.pieces import chunks, in_threads
+from clrecon.system.progress import Progress, Steps
+
+FEWEST = 20_000
+"""Meshes with fewer triangles are looked at by the host alone, in less time than the device needs to begin."""
+
+MOST_ROWS = 1 << 22
+"""Rows of the finest level; its edge is made longer until there are no more."""
+
+FINEST = 0.97
+"""Share of the triangles that belong to the finest level.  With a half, extracted and decimated surfaces took 1.2 to
+1.5 times the time: each level is looked through by itself."""
+
+LONGEST = 1.0 / 0.998
+"""Edge of a level for the longest box in it: what the kernel needs for the rounding of rows."""
+
+PIECE = 1 << 17
+"""Triangles of a launch; progress is reported between launches."""
+
+Float32Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class CrossingPlan:
+    """Triangles in the rows of levels, as the kernel reads them.
+
+    vertices: ndarray, shape (v, 3), float32. Scaled by a power of two, which changes no digit.
+    order: ndarray, shape (n,), int64. Triangle of each entry.
+    corners: ndarray, shape (n, 3), uint32
+    low, high: ndarray, shape (n, 3), float32. Boxes of the entries.
+    starts: ndarray, uint32. First entry of each row, and the number of entries.
+    levels: ndarray, shape (levels, 4), uint32
+    edges: ndarray, shape (levels,), float32
+    """
+
+    vertices: Float32Array
+    order: NDArray[np.int64]
+    corners: NDArray[np.uint32]
+    low: Float32Array
+    high: Float32Array
+    starts: NDArray[np.uint32]
+    levels: NDArray[np.uint32]
+    edges: Float32Array
+
+    def needs(self) -> dict[str, int]:
+        """Return the bytes on the device by what they are for."""
+        tables = ("vertices", "corners", "low", "high", "starts", "levels", "edges")
+        return {"triangles in rows": sum(getattr(self, name).nbytes for name in tables), "marks": len(self.order) // 8}
+
+
+def prepare_crossings(device: Device) -> Program:
+    """Build the kernels of `find_crossings`."""
+    load_program(device, "masks/band_mask.cl")
+    return load_program(device, "surface/crossings.cl")
+
+
+def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> CrossingPlan:
+    """Enter the triangles into rows.
+
+    vertices: ndarray, shape (v, 3), float32
+    triangles: ndarray, shape (n, 3), uint32. At least one.
+    """
+    scaled = np.ldexp(vertices, 11 - int(np.frexp(np.abs(vertices).max())[1]))
+    low, high = _find_boxes(scaled, triangles)
+    box = (high - low).T
+    longest = LONGEST * np.maximum(np.maximum(box[0], box[1]), box[2]).astype(np.float64)
+    origin, beyond = low.min(axis=0).astype(np.float64), low.max(axis=0).astype(np.float64)
+    edge = max(1.0, float(np.quantile(longest[:: max(1, len(longest) // 10_000)], FINEST)))
+    while np.prod(np.floor((beyond - origin)[1:] / edge) + 1.0) > MOST_ROWS:
+        edge *= 1.25
+    level = np.ceil(np.log2(np.maximum(longest / edge, 1.0))).astype(np.int64)
+    edges = (edge * 2.0 ** np.arange(int(level.max()) + 1)).astype(np.float32)
+    # An edge rounded to float32 is far nearer to the edge than the longest box.
+    size = (np.floor((beyond - origin)[1:] / edges[:, None].astype(np.float64)) + 1.0).astype(np.int64)  # y, z
+    first_row = np.concatenate([[0], np.cumsum(size.prod(axis=1))])
+    row = first_row.take(level)
+    width = edges.astype(np.float64).take(level)
+    row += ((low[:, 1] - origin[1]) / width).astype(np.int64)
+    row += size[:, 0].take(level) * ((low[:, 2] - origin[2]) / width).astype(np.int64)
+    bits = np.ascontiguousarray(low[:, 0]).view(np.int32)
+    along = np.where(bits < 0, bits ^ 0x7FFFFFFF, bits).astype(np.int64) + (1 << 31)  # in the order of the numbers
+    order = np.argsort(row << 32 | along)
+    starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=first_row[-1]))]).astype(np.uint32)
+    levels = np.column_stack([first_row[:-1], size, starts[first_row[1:]]]).astype(np.uint32)
+    low, high = low.take(order, axis=0), high.take(order, axis=0)
+    return CrossingPlan(scaled, order, triangles.take(order, axis=0), low, high, starts, levels, edges)
+
+
+def _find_boxes(vertices: Float32Array, triangles: NDArray[np.uint32]) -> tuple[Float32Array, Float32Array]:
+    """Return the lowest and the highest coordinates of each triangle."""
+    low, high = np.empty((len(triangles), 3), np.float32), np.empty((len(triangles), 3), np.float32)
+
+    def work(where: slice) -> None:
+        one, two, three = (vertices[triangles[where, corner]] for corner in range(3))
+        np.minimum(np.minimum(one, two), three, out=low[where])
+        np.maximum(np.maximum(one, two), three, out=high[where])
+
+    in_threads(work, len(triangles))
+    return low, high
+
+
+def mark_crossings(
+    device: Device, plan: CrossingPlan, *, steps: Steps | None = None, stopwatch: Stopwatch | None = None
+) -> NDArray[np.bool_]:
+    """Mark the triangles that may cut another one, shape (n,), in the order of the mesh."""
+    count = len(plan.order)
+    kernel = prepare_crossings(device)["mark_crossings"]
+    marks_d = zero_words(device, (count + 31) // 32, stopwatch=stopwatch)
+    buffers = {
+        name: upload(device, getattr(plan, name))
+        for name in ("vertices", "corners", "low", "high", "starts", "levels", "edges")
+    }
+    origin = plan.low.min(axis=0)
+    for first in range(0, count, PIECE):
+        items = min(PIECE, count - first)
+        launch(
+            device, kernel, items, stopwatch=stopwatch, **buffers, marks=marks_d, origin_y=origin[1],
+            origin_z=origin[2], first=first, items=items, level_count=len(plan.edges),
+        )  # fmt: skip
+        if steps is not None:
+            wait(device)
+            steps.take(items)
+    words = download(device, np.empty((count + 31) // 32, np.uint32), marks_d)
+    marked = np.zeros(count, bool)
+    marked[plan.order] = np.unpackbits(words.view(np.uint8), bitorder="little")[:count].view(bool)
+    return marked
+
+
+def find_crossings(
+    device: Device,
+    vertices: NDArray[np.floating],
+    triangles: NDArray[np.uint32],
+    changed: NDArray[np.bool_] | None = None,
+    *,
+    memory: int | None = None,
+    steps: Steps | None = None,
+) -> NDArray[np.int64]:
+    """Find the pairs of triangles that cut each other, see `clrecon.mesh.intersections.find_self_intersections`.
+
+    Small meshes, vertices in float64 and meshes for which the device has no room are looked at by the host alone, which
+    finds the same pairs.
+
+    vertices: ndarray, shape (v, 3), mm
+    triangles: ndarray, shape (n, 3), uint32
+    changed: ndarray, shape (n,), bool. Only pairs with one of these are found.
+    memory: Bytes that may be taken on the device; None is all that it has.
+    steps: Counts the triangles.
+
+    Returns: ndarray, shape (k, 2), int64. Numbers of triangles.
+    """
+    if len(triangles) < FEWEST or vertices.dtype != np.float32:
+        return find_self_intersections(vertices, triangles, changed, steps=steps)
+    plan = plan_crossings(vertices, triangles)
+    if describe_shortage(memory_limits(device, memory), plan.needs()):
+        return find_self_intersections(vertices, triangles, changed, steps=steps)
+    marked = np.flatnonzero(mark_crossings(device, plan, steps=steps))
+    return marked[find_self_intersections(vertices, triangles[marked], None if changed is None else changed[marked])]
+
+
+PART = 1 << 20
+"""Points or triangles of a launch: each stays short, and its arrays fit beside the surface."""
+
+if kernel_constant("surface/near_faces.cl", "WITNESSES") != WITNESSES:
+    raise ImportError("cl/surface/near_faces.cl and clrecon.mesh.refine.bounds differ in the number of witnesses")
+
+Float64Array = NDArray[np.float64]
+IntArray = NDArray[np.integer]
+
+
+def prepare_near_faces(device: Device) -> Program:
+    """Build the kernels of `DeviceBounds`."""
+    return load_program(device, "surface/near_faces.cl")
+
+
+class DeviceBounds(SurfaceBounds):
+    """A surface to which distances are bounded on a device; its twin is `SurfaceBounds`.
+
+    The nearest point of each triangle is found, where the twin may take one near it: bounds are as short or shorter,
+    or within the limit.
+
+    vertices: ndarray, shape (n, 3), mm, near zero
+    triangles: ndarray, shape (m, 3), uint32
+    fans: As for `NearDistance`.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        vertices: NDArray[np.floating],
+        triangles: NDArray[np.uint32],
+        fans: Fans | None = None,
+    ):
+        super().__init__(vertices, triangles, fans)
+        self._device = device
+
+    def prepare(self) -> None:
+        """Bring the surface to the device, before threads use it."""
+        assert self._surface
+
+    @property
+    def slack(self) -> float:
+        """As of the twin."""
+        return self._slack
+
+    @cached_property
+    def _slack(self) -> float:
+        return rounding_of_bounds(max(float(self._vertices.max(initial=0)), -float(self._vertices.min(initial=0))))
+
+    @cached_property
+    def _program(self) -> Program:
+        return prepare_near_faces(self._device)
+
+    @cached_property
+    def _surface(self) -> dict[str, Any]:
+        """The arguments of the kernels that are the surface."""
+        arrays = {
+            "places": self._vertices.astype(np.float32),
+            "faces": self._triangles,
+            "begin": self._fans.begin.astype(np.int32),
+            "around": self._fans.rows.astype(np.int32, copy=False),
+        }
+        part = {"points of a launch": 64 * PART, "vertices": 20 * len(self._vertices)}
+        check_budget(self._device, {name: array.nbytes for name, array in arrays.items()} | part)
+        return {
+            name: upload(self._device, array if len(array) else np.zeros(4, array.dtype))
+            for name, array in arrays.items()
+        }
+
+    def find_upper_bounds(self, points: Float64Array, near: IntArray) -> tuple[Float64Array, NDArray[np.int64]]:
+        """As `NearDistance.find_upper_bounds`."""
+        length, rows = self.find_bounds(points, near[:, None], 0.0)
+        return length.astype(np.float64), rows.astype(np.int64)
+
+    def find_bounds(
+        self, points: Float64Array, near: IntArray, limit: float, walks: int = 0
+    ) -> tuple[Float32Array, IntArray]:
+        """As `SurfaceBounds.find_bounds`."""
+        device, surface = self._device, self._surface
+        squares = np.empty(len(points), np.float32)
+        rows = np.empty(len(points), np.int32)
+        for where in chunks(len(points), PART):
+            count = where.stop - where.start
+            here = (upload(device, points[where].astype(np.float32)), upload(device, near[where].astype(np.int32)))
+            found = empty_output(device, (count,), np.float32), empty_output(device, (count,), np.int32)
+            launch(
+                device, self._program["find_near_faces"], count, points=here[0], near=here[1], **surface,
+                squares=found[0][1], rows=found[1][1], hints=near.shape[1], walks=walks, enough=self._most(limit),
+                count=count,
+            )  # fmt: skip
+            squares[where], rows[where] = download(device, *found[0]), download(device, *found[1])
+        nothing = rows < 0
+        length = np.sqrt(squares) + np.float32(self.slack)
+        length[nothing] = np.inf
+        return length, rows
+
+    def find_witnesses(
+        self, places: Float32Array, triangles: IntArray, names: IntArray, beside: IntArray, limit: float
+    ) -> tuple[IntArray, NDArray[np.uint8]]:
+        """As `SurfaceBounds.find_witnesses`."""
+        device = self._device
+        witnesses: NDArray[np.int32] = np.empty((WITNESSES, len(triangles)), np.int32)
+        left = np.empty(len(triangles), np.uint8)
+        of_vertices = {
+            "vertices": upload(device, places),
+            "names": upload(device, names.astype(np.int32)),
+            "beside": upload(device, beside),
+        }
+        for where in chunks(len(triangles), PART):
+            count = where.stop - where.start
+            faces = upload(device, triangles[where])
+            found = empty_output(device, (WITNESSES, count), np.int32), empty_output(device, (count,), np.uint8)
+            launch(
+                device, self._program["find_witnesses"], count, triangles=faces, **of_vertices, **self._surface,
+                witnesses=found[0][1], left=found[1][1], enough=self._most(limit), count=count,
+            )  # fmt: skip
+            witnesses[:, where], left[where] = download(device, *found[0]), download(device, *found[1])
+        return witnesses, left
 
 
 @explains_arguments

@@ -16,12 +16,11 @@ from clrecon.geometry.iso_rule import IsoRule, data_range
 from clrecon.geometry.precision import describe_far
 from clrecon.geometry.vertex_rules import describe_rule
 from clrecon.opencl import Device, Program, Stopwatch, result_pages
-from clrecon.operators.resident.bricks import BrickStates, brick_bytes, compare_bricks, measure_bricks
 from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.resident.tables import BrickStates, brick_bytes, compare_bricks, measure_bricks
 from clrecon.operators.surface import marching_cubes
-from clrecon.operators.surface.cells import Classified, Counted, count
 from clrecon.operators.surface.growing import Grown, grow, growing_needs, join_slabs
-from clrecon.operators.surface.marching_cubes import Placement
+from clrecon.operators.surface.marching_cubes import Classified, Counted, Placement, count
 from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import BRICKS, SampleGrid, Slab
 from clrecon.operators.surface.trilinear import prepare_trilinear

@@ -1,4 +1,4 @@
-"""Growing of surfaces: the components of active cells that hold a seed, the host side of cl/surface/growing.cl.
+"""Growing of surfaces: the components of active cells that hold a seed.
 
 All of the volume's bits are on the device while components are found, 1 / 16 of the bytes of 16-bit voxels for each of
 four masks and half of one, also where the surface is then emitted slab by slab.
@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from clrecon.errors import DeviceMemoryError, NoSurfaceError
+from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.opencl import (
     Device,
     Program,
@@ -21,23 +22,208 @@ from clrecon.opencl import (
     allocate,
     copy_buffer,
     download,
+    kernel_constant,
     launch,
     load_program,
+    upload,
 )
 from clrecon.operators.primitives.scan import enqueue_scan, exclusive_scan, prepare_scan
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.operators.surface.cells import Classified, load_cells
-from clrecon.operators.surface.choosing import (
-    SUMS,
-    Components,
-    Runs,
-    Sums,
-    choose_components,
-    prepare_choosing,
-    sum_components,
-)
-from clrecon.operators.surface.seeds import Seeds
+from clrecon.operators.surface.marching_cubes import Classified, load_cells
+from clrecon.operators.surface.seeds import AUTO_SHARE, SEED_REACH_MM, Seeds
 from clrecon.operators.surface.slabs import SampleGrid, Slab
+
+FARTHEST_TOLD_MM = 50.0
+"""Of a seed in air the nearest cell is looked for up to here, for the message."""
+
+_NEAR_MM = 2.0
+"""Most seeds lie on the surface: it is looked for as near as this first, among few cells."""
+
+
+def find_cell_near(
+    device: Device, grid: SampleGrid, classified: Classified, point: NDArray[np.float64]
+) -> tuple[int, int, int]:
+    """Return the active cell (k, j, i) whose centre is nearest to a point.
+
+    classified: Inside mask of the whole grid.
+    point: ndarray, shape (3,), LPS mm
+    """
+    for reach in (_NEAR_MM, SEED_REACH_MM):
+        found = _look(device, grid, classified, point, reach)
+        if found is not None and found[1] <= reach:
+            return found[0]
+    farther = _look(device, grid, classified, point, FARTHEST_TOLD_MM)
+    raise UsageError(_describe_lone(grid, point, None if farther is None else farther[1]))
+
+
+def _look(
+    device: Device, grid: SampleGrid, classified: Classified, point: NDArray[np.float64], reach: float
+) -> tuple[tuple[int, int, int], float] | None:
+    """Return the cell and how far it is; cells farther than `reach` may be missed."""
+    volume, (gi, gj, gk), border = grid.volume, grid.shape, grid.rule.border
+    normal = np.cross(volume.affine[:3, 0], volume.affine[:3, 1])
+    heights = np.abs((volume.slice_origins(border) - point) @ (normal / np.linalg.norm(normal)))
+    near = np.flatnonzero(heights <= reach)
+    if not len(near):
+        return None
+    first, end = max(int(near[0]) - 1, 0), min(int(near[-1]) + 2, gk)
+    (begin_j, end_j), (begin_word, end_word) = _rows_near(grid, point, reach, first, end)
+    mask = download(
+        device, np.empty((end - first, gj, grid.words), np.uint32), classified.mask_d, 4 * first * gj * grid.words
+    )[:, begin_j:end_j, begin_word:end_word]
+    bits = np.unpackbits(np.ascontiguousarray(mask).view(np.uint8), axis=2, bitorder="little")
+    inside = bits[..., : gi - 32 * begin_word].view(bool)
+    some, every = inside[:-1] | inside[1:], inside[:-1] & inside[1:]
+    some, every = some[:, :-1] | some[:, 1:], every[:, :-1] & every[:, 1:]
+    cells = np.argwhere((some[..., :-1] | some[..., 1:]) & ~(every[..., :-1] & every[..., 1:]))
+    if not len(cells):
+        return None
+    cells += (first, begin_j, 32 * begin_word)
+    away = np.linalg.norm(volume.ijk_to_lps(cells[:, ::-1] + 0.5 - border) - point, axis=1)
+    best = int(np.argmin(away))
+    k, j, i = (int(n) for n in cells[best])
+    return (k, j, i), float(away[best])
+
+
+def _rows_near(
+    grid: SampleGrid, point: NDArray[np.float64], reach: float, first: int, end: int
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return begin and end of the rows, and of the words in them, that cells within `reach` have in some slices."""
+    volume, border = grid.volume, grid.rule.border
+    steps = np.linalg.pinv(volume.affine[:3, :2])  # to i and j of the nearest point of a slice
+    places = (point - volume.slice_origins(border)[first:end]) @ steps.T + border
+    around = reach * np.linalg.norm(steps, axis=1) + 2
+    (low_i, low_j), (high_i, high_j) = places.min(axis=0) - around, places.max(axis=0) + around
+    begin_j, begin_word = max(0, int(low_j)), max(0, int(low_i)) // 32
+    return (begin_j, min(grid.shape[1], int(high_j) + 2)), (begin_word, min(grid.words, int(high_i) // 32 + 1))
+
+
+def _describe_lone(grid: SampleGrid, point: NDArray[np.float64], away: float | None) -> str:
+    volume = grid.volume
+    i, j, k = np.clip(np.rint(volume.lps_to_ijk(point[None])[0]).astype(int), 0, np.array(volume.shape_ijk) - 1)
+    far = f"more than {FARTHEST_TOLD_MM:g}" if away is None or away > FARTHEST_TOLD_MM else f"{away:.1f}"
+    return (
+        f"seed {','.join(f'{n:g}' for n in point)} has {float(volume.voxels[k, j, i]):g} HU and is {far} mm away"
+        f" from the surface {grid.rule.phrase()}: a seed lies within {SEED_REACH_MM:g} mm of it"
+    )
+
+
+SUMS = {
+    name: kernel_constant("surface/component_sums.h", name)
+    for name in ("COMPONENTS", "CHOSEN", "ACTIVE_CELLS", "CHOSEN_CELLS", "LARGEST_LEFT_OUT", "SUMS")
+}
+"""Places of what is summed up over components, and their number."""
+
+
+def prepare_choosing(device: Device) -> Program:
+    """Build the kernels."""
+    return load_program(device, "surface/choosing.cl")
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Sums over all components, see cl/surface/component_sums.h."""
+
+    components: int
+    chosen: int
+    active_cells: int
+    chosen_cells: int
+    largest_left_out: int
+
+    @classmethod
+    def read(cls, device: Device, sums_d: Any) -> Sums:
+        sums = download(device, np.empty(SUMS["SUMS"], np.uint32), sums_d)
+
+        def cells(which: str) -> int:
+            return int(sums[SUMS[which]]) + (int(sums[SUMS[which] + 1]) << 32)
+
+        return cls(
+            int(sums[SUMS["COMPONENTS"]]), int(sums[SUMS["CHOSEN"]]), cells("ACTIVE_CELLS"), cells("CHOSEN_CELLS"),
+            int(sums[SUMS["LARGEST_LEFT_OUT"]]),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Runs of active cells on the device."""
+
+    active_d: Any
+    starts_d: Any
+    words_d: Any
+    extents_d: Any
+    offsets_d: Any
+    total: int
+
+    @property
+    def places(self) -> dict[str, Any]:
+        """Arguments of kernels that walk along the runs of a row."""
+        return {"run_starts": self.starts_d, "run_extents": self.extents_d, "row_offsets": self.offsets_d}
+
+
+@dataclass(frozen=True)
+class Components:
+    """Components of runs on the device: the root of each run; at roots the cells of the component, and 1 where it is
+    chosen; and sums over all of them.
+    """
+
+    roots_d: Any
+    cells_d: Any
+    chosen_d: Any
+    sums_d: Any
+
+    @property
+    def places(self) -> dict[str, Any]:
+        """Arguments of kernels that look up the components of runs."""
+        return {"roots": self.roots_d, "chosen": self.chosen_d}
+
+
+def choose_components(
+    device: Device, grid: SampleGrid, classified: Classified, runs: Runs, components: Components, seeds: Seeds,
+    stopwatch: Stopwatch,
+) -> None:  # fmt: skip
+    """Choose the components that hold a seed, and sum up all."""
+    program, (gi, gj, gk) = prepare_choosing(device), grid.shape
+    sizes = {"gi": gi, "gj": gj, "gk": gk, "words": grid.words}
+
+    def run(kernel: str, items: int, **arguments: Any) -> None:
+        launch(device, program[kernel], items, stopwatch=stopwatch, **arguments)
+
+    n = runs.total
+    if seeds.auto:
+        sized = {"roots": components.roots_d, "run_cells": components.cells_d, "sums": components.sums_d}
+        run("find_largest", n, runs=n, **sized)
+        run("choose_largest", n, chosen=components.chosen_d, parts=round(1 / AUTO_SHARE), runs=n, **sized)
+    if len(seeds.points):
+        near = [find_cell_near(device, grid, classified, point) for point in seeds.points]
+        cells = np.array([(i, j, k, 0) for k, j, i in near], np.uint32)
+        run(
+            "choose_cells", len(cells), run_starts=runs.starts_d, word_runs=runs.words_d, row_offsets=runs.offsets_d,
+            cells=upload(device, cells), n=len(cells), gj=gj, words=grid.words, **components.places,
+        )  # fmt: skip
+    if seeds.voxels is not None:
+        run(
+            "choose_seeded", gj * gk, mask=classified.mask_d, word_runs=runs.words_d, border=grid.rule.border,
+            seeds=upload(device, seeds.voxels), enclosed_set=grid.rule.inside != "below",
+            voxel_words=seeds.voxels.shape[2], **runs.places, **components.places, **sizes,
+        )  # fmt: skip
+    sum_components(device, runs, components, stopwatch)
+    if seeds.auto or len(seeds.points):
+        return
+    sums = Sums.read(device, components.sums_d)
+    if not sums.chosen:
+        raise UsageError(
+            f"no part of the surface {grid.rule.phrase()} touches {', '.join(seeds.names)}:"
+            f" {sums.components:,} components, none of them has a seed"
+        )
+
+
+def sum_components(device: Device, runs: Runs, components: Components, stopwatch: Stopwatch) -> None:
+    """Sum up the components."""
+    launch(
+        device, prepare_choosing(device)["sum_components"], runs.total, stopwatch=stopwatch,
+        run_cells=components.cells_d, sums=components.sums_d, runs=runs.total, **components.places,
+    )  # fmt: skip
+
 
 MOST_RUNS = 2**31
 

@@ -20,7 +20,7 @@ from clrecon.opencl import (
     load_program,
 )
 from clrecon.operators.primitives.scan import exclusive_scan
-from clrecon.operators.resident.voxel_types import voxel_variants
+from clrecon.operators.resident.tables import voxel_variants
 from clrecon.operators.surface.slabs import Slab
 
 LONGEST_ROW = 2_970

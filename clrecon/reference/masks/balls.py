@@ -1,4 +1,4 @@
-"""Twin of `clrecon.operators.masks.balls`: distances of the voxels' places, one nearest voxel at a time."""
+"""Twin of `clrecon.operators.masks.shapes`: distances of the voxels' places, one nearest voxel at a time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Twins of what `clrecon.operators.masks.components` does: components of voxels that share a face."""
+"""Twins of what `clrecon.operators.masks.shapes` does: components of voxels that share a face."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Twin of `clrecon.operators.points.bilateral`: the bilateral filter of paper B, eq. 3 to 5, along the normal."""
+"""Twin of `clrecon.operators.points.denoising`: the bilateral filter of paper B, eq. 3 to 5, along the normal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Twin of `clrecon.operators.points.gradients`: differences of the trilinear field over half a voxel."""
+"""Twin of `clrecon.operators.points.normals`: differences of the trilinear field over half a voxel."""
 
 from __future__ import annotations
 

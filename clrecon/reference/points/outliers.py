@@ -1,4 +1,4 @@
-"""Twin of `clrecon.operators.points.outliers`: points whose mean distance to their neighbours is unusual."""
+"""Twin of `clrecon.operators.points.denoising`: points whose mean distance to their neighbours is unusual."""
 
 from __future__ import annotations
 

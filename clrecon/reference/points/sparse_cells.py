@@ -1,4 +1,4 @@
-"""Twin of `clrecon.operators.points.sparse_cells`."""
+"""Twin of `clrecon.operators.points.thinning`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Twin of `clrecon.operators.points.thin`."""
+"""Twin of `clrecon.operators.points.thinning`."""
 
 from __future__ import annotations
 

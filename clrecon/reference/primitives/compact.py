@@ -1,4 +1,4 @@
-"""Twin of `clrecon.operators.primitives.compact`."""
+"""Twin of `clrecon.operators.primitives.scan`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Twin of `clrecon.operators.primitives.radix_sort`."""
+"""Twin of `clrecon.operators.primitives.scan`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Twin of `clrecon.operators.reformat.sample`: slices and curved reformations in float64."""
+"""Twin of `clrecon.operators.reformat.sheets`: slices and curved reformations in float64."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Twin of `clrecon.operators.resident.bricks`."""
+"""Twin of `clrecon.operators.resident.tables`."""
 
 from __future__ import annotations
 

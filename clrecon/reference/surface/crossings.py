@@ -1,4 +1,4 @@
-"""Twin of `clrecon.operators.surface.crossings`: all pairs of triangles, edge by edge, in float64."""
+"""Twin of `clrecon.operators.surface.decimation`: all pairs of triangles, edge by edge, in float64."""
 
 from __future__ import annotations
 

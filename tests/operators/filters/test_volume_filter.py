@@ -13,8 +13,7 @@ import clrecon
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.opencl import Stopwatch, download, list_devices
-from clrecon.operators.filters.bilateral import run_bilateral
-from clrecon.operators.filters.near_level import SlicesThere, list_mixed_groups, row_words
+from clrecon.operators.filters.bilateral import SlicesThere, list_mixed_groups, row_words, run_bilateral
 from clrecon.operators.filters.settings import BilateralSettings
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.reference.filters import bilateral as twin

@@ -8,7 +8,7 @@ from surface_volumes import OBLIQUE
 from uneven_volume import uneven
 
 from clrecon.geometry import Volume
-from clrecon.operators.filters.window import LARGEST_REACH, choose_window
+from clrecon.operators.filters.settings import LARGEST_REACH, choose_window
 from clrecon.reference.filters.bilateral import spatial_weights
 
 pytestmark = pytest.mark.unit

@@ -13,7 +13,7 @@ from uneven_volume import uneven
 import clrecon
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.operators.masks.balls import ball_of, whole_ball_of
+from clrecon.operators.masks.shapes import ball_of, whole_ball_of
 from clrecon.reference.masks import balls as twin
 
 FINE = np.diag((0.7, 0.6, 1.4, 1.0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from clrecon.errors import UsageError
-from clrecon.operators.masks.band_mask import check_shape
+from clrecon.operators.masks.voxel_mask import check_shape
 
 
 def test_masks_too_large_are_refused():

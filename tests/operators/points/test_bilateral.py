@@ -9,7 +9,7 @@ from tolerances import FILTER_TRUTH_SHARE, FILTERED_PLANE_MM, TWIN_FILTER_MM
 
 from clrecon.errors import UsageError
 from clrecon.operators.points import neighbours
-from clrecon.operators.points.bilateral import denoise_points
+from clrecon.operators.points.denoising import denoise_points
 from clrecon.points import PointCloud
 from clrecon.points.features import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
 from clrecon.reference.points import bilateral as twin

@@ -10,8 +10,7 @@ import tolerances
 
 from clrecon import LabelMap, Volume, extract_isosurface, extract_labels
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
-from clrecon.operators.points.emit import Selection, VoxelEmission, _join
-from clrecon.operators.points.extract import extract_points
+from clrecon.operators.points.point_extraction import Selection, VoxelEmission, _join, extract_points
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.reference.points.emit import extract_voxels, mark_shell
 

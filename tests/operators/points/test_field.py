@@ -9,8 +9,7 @@ from tolerances import TWIN_FIELD_MM
 
 from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.opencl import memory_limits, upload
-from clrecon.operators.points.field import MOST_NODES, FieldSettings, NodeField, plan_nodes
-from clrecon.operators.points.field_signs import Masks, decide_signs
+from clrecon.operators.points.field import MOST_NODES, FieldSettings, Masks, NodeField, decide_signs, plan_nodes
 from clrecon.operators.points.grid import plan_grid
 from clrecon.points import PointCloud
 from clrecon.reference.points import field as twin

@@ -7,7 +7,7 @@ import pytest
 from cloud_shapes import cube_cloud, sphere_cloud
 
 from clrecon import PointCloud, reconstruct_surface
-from clrecon.operators.points.field_walls import find_walls
+from clrecon.operators.points.reconstruct import find_walls
 from clrecon.reference.points import field as twin
 
 

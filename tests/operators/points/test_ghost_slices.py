@@ -13,7 +13,7 @@ from pydicom import dcmread
 import clrecon
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.operators.masks.band_mask import mark_band
+from clrecon.operators.masks.voxel_mask import mark_band
 from clrecon.operators.points.slice_overlap import count_overlaps, find_ghost_slices
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.phantom import PhantomSettings, make_phantom, write_phantom

@@ -10,9 +10,8 @@ from tolerances import TREE_DISTANCE_STEPS
 from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.opencl import download
 from clrecon.operators.points import neighbours
-from clrecon.operators.points.cell_edge import choose_cell_edge
 from clrecon.operators.points.grid import fill_grid, plan_grid
-from clrecon.operators.points.neighbours import find_neighbours
+from clrecon.operators.points.neighbours import choose_cell_edge, find_neighbours
 from clrecon.points import PointCloud
 from clrecon.reference.points import neighbours as twin
 

@@ -13,7 +13,7 @@ import clrecon
 from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
 from clrecon.opencl import Stopwatch
-from clrecon.operators.points import gradients, neighbours
+from clrecon.operators.points import neighbours, normals
 from clrecon.operators.points.normals import estimate_normals
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
@@ -84,7 +84,7 @@ def test_gradients_equal_their_twin(device, dtype, affine):
     volume, middle = ball(dtype, affine, (22, 24, 20), 8.0, 9.0)
     points = middle + np.random.default_rng(3).uniform(-14.0, 14.0, (800, 3))  # some beyond the border
     resident = DeviceVolume(volume, device=device)
-    found = gradients.find_gradients(resident, points, stopwatch=Stopwatch())
+    found = normals.find_gradients(resident, points, stopwatch=Stopwatch())
     expected = gradients_twin(volume, points, resident.values.lowest)
     assert np.abs(found - expected).max() < GRADIENT_SHARE * np.abs(expected).max()
 
@@ -100,7 +100,7 @@ def test_gradients_of_uneven_slices_are_those_of_a_linear_field(device, sign):
     linear = uneven(voxels, sign)
     inside = np.random.default_rng(1).uniform((0.6, 0.6, 0.6), (ni - 1.6, nj - 1.6, nk - 1.6), (200, 3))
     points = linear.ijk_to_lps(inside)
-    found = gradients.find_gradients(DeviceVolume(linear, device=device), points, stopwatch=Stopwatch())
+    found = normals.find_gradients(DeviceVolume(linear, device=device), points, stopwatch=Stopwatch())
     assert np.abs(found - slope).max() < GRADIENT_SHARE * 3.0
     assert np.abs(gradients_twin(linear, points, -1024.0) - slope).max() < GRADIENT_SHARE * 3.0
 
@@ -108,10 +108,10 @@ def test_gradients_of_uneven_slices_are_those_of_a_linear_field(device, sign):
 def test_slabs_have_the_same_gradients(device):
     volume, middle = ball()
     points = middle + np.random.default_rng(4).uniform(-25.0, 25.0, (1000, 3))
-    whole = gradients.find_gradients(DeviceVolume(volume, device=device), points, stopwatch=Stopwatch())
+    whole = normals.find_gradients(DeviceVolume(volume, device=device), points, stopwatch=Stopwatch())
     memory = 24 * len(points) + 9 * 40 * 40 * 2
     told = []
-    parts = gradients.find_gradients(
+    parts = normals.find_gradients(
         DeviceVolume(volume, device=device, memory=memory), points, stopwatch=Stopwatch(),
         progress=lambda *step: told.append(step),
     )  # fmt: skip

@@ -8,7 +8,7 @@ from point_shapes import sphere
 from tolerances import MEAN_DISTANCE_SHARE
 
 from clrecon.errors import UsageError
-from clrecon.operators.points.outliers import remove_outliers
+from clrecon.operators.points.denoising import remove_outliers
 from clrecon.points import PointCloud
 from clrecon.reference.points.neighbours import find_neighbours
 from clrecon.reference.points.outliers import find_outliers, mean_distances

@@ -9,7 +9,7 @@ from point_grids import fetch_grid, scattered_points
 from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.operators.points.grid import make_grid, plan_grid
 from clrecon.operators.points.neighbours import find_neighbours
-from clrecon.operators.points.sparse_cells import REASONS, choose_edge, grow_cells, remove_sparse_cells
+from clrecon.operators.points.thinning import REASONS, choose_edge, grow_cells, remove_sparse_cells
 from clrecon.points import PointCloud
 from clrecon.points.cells import count_cells, find_cell_numbers
 from clrecon.reference.points import sparse_cells as twin

@@ -8,7 +8,7 @@ from point_grids import scattered_points
 
 from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.operators.points.grid import plan_grid
-from clrecon.operators.points.thin import choose_points, thin_points
+from clrecon.operators.points.thinning import choose_points, thin_points
 from clrecon.points import PointCloud
 from clrecon.reference.points import thin as twin
 

@@ -13,7 +13,7 @@ from variants import VOXEL_TYPES
 import clrecon
 from clrecon.errors import DeviceError, DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.operators.masks.band_mask import checked_band, mark_band
+from clrecon.operators.masks.voxel_mask import checked_band, mark_band
 from clrecon.operators.points import voxel_clusters
 from clrecon.operators.points.clusters import cluster_points
 from clrecon.operators.points.voxel_clusters import ClusterSearch, pad_for

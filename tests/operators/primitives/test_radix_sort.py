@@ -7,9 +7,8 @@ import pytest
 
 from clrecon.errors import UsageError
 from clrecon.opencl import download, upload
-from clrecon.operators.primitives import radix_sort as module
-from clrecon.operators.primitives.radix_sort import FEWEST_PER_CHUNK, RADIX_BITS, radix_sort, sort_bytes
-from clrecon.operators.primitives.scan import exclusive_scan
+from clrecon.operators.primitives import scan as module
+from clrecon.operators.primitives.scan import FEWEST_PER_CHUNK, RADIX_BITS, exclusive_scan, radix_sort, sort_bytes
 from clrecon.reference.primitives import radix_sort as twin
 
 CHUNK = FEWEST_PER_CHUNK

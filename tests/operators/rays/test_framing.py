@@ -10,8 +10,8 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.operators.rays import volume_renderer
-from clrecon.operators.rays.framing import shown_box
 from clrecon.operators.rays.scene import _box_of
+from clrecon.operators.rays.volume_renderer import shown_box
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 

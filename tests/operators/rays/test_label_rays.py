@@ -11,7 +11,7 @@ from ray_scenes import STEPS, centre_of, look, make_volume, positions, premultip
 
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
-from clrecon.operators.rays.surface import cast_surface
+from clrecon.operators.rays.surface_pictures import cast_surface
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.reference.surface.labels import find_solid
 from clrecon.rendering import Lighting, Rendering

@@ -10,10 +10,9 @@ from scipy import ndimage
 
 from clrecon.geometry import Volume
 from clrecon.opencl import Stopwatch, download, upload
-from clrecon.operators.rays import composite
-from clrecon.operators.rays.composite import MainWay
-from clrecon.operators.rays.leaps import find_leaps
-from clrecon.operators.rays.slabs import FARTHEST, LeapMap, ray_slabs
+from clrecon.operators.rays import ray_pictures
+from clrecon.operators.rays.ray_pictures import MainWay
+from clrecon.operators.rays.ray_slabs import FARTHEST, LeapMap, find_leaps, ray_slabs
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.rendering.views.camera import Camera
 
@@ -23,7 +22,7 @@ def look(device, shape, distances, way: MainWay):
     resident, stopwatch = DeviceVolume(Volume(np.zeros(shape, np.int16), np.eye(4)), device=device), Stopwatch()
     slab = next(ray_slabs(resident, shape[0], np.inf, stopwatch))
     with stopwatch.running(device):
-        ways_d = composite.look_ahead(resident, slab, way, LeapMap(upload(device, distances), None), stopwatch)
+        ways_d = ray_pictures.look_ahead(resident, slab, way, LeapMap(upload(device, distances), None), stopwatch)
         return download(device, np.empty_like(distances), ways_d)
 
 

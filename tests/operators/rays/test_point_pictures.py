@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clrecon.operators.rays.point_pictures import PointPictures
-from clrecon.operators.rays.splats import LARGEST_DISC
+from clrecon.operators.rays.point_pictures import LARGEST_DISC, PointPictures
 from clrecon.points import PointCloud
 from clrecon.points.spacing import mean_spacing
 from clrecon.rendering.pictures.point_look import PointLook

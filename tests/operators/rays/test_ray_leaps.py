@@ -11,10 +11,11 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.opencl import upload
-from clrecon.operators.rays import composite, ray_pictures, slabs
+from clrecon.operators.rays import ray_pictures, ray_slabs
+from clrecon.operators.rays import ray_pictures as composite
 from clrecon.operators.rays.render import VolumeRenderer, render
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.operators.resident.frame import volume_box
+from clrecon.operators.resident.tables import volume_box
 from clrecon.rendering import UNSHADED, Rendering, TransferFunction
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
@@ -34,7 +35,7 @@ def take_every_sample(monkeypatch, *arguments, **settings) -> Rendering:
 
     def show_all(resident, slab, *_):
         bi, bj, bk = slab.bricks
-        return slabs.LeapMap(upload(resident.device, np.zeros((bk, bj, bi), np.uint8)), volume_box(resident.volume))
+        return ray_slabs.LeapMap(upload(resident.device, np.zeros((bk, bj, bi), np.uint8)), volume_box(resident.volume))
 
     def enter_at_once(resident, slab, view, leaps, output, stopwatch):
         return upload(resident.device, np.full(output.tiles, -np.inf, np.float32))
@@ -201,8 +202,8 @@ def test_volumes_of_more_voxels_than_an_int_counts_go_through_in_slabs(device, m
     """Of samples that are taken at once places are ints from the first of them on."""
     volume = scattered(np.random.default_rng(3), uneven=False)
     ni, nj, nk = volume.shape_ijk
-    monkeypatch.setattr(slabs, "MOST_VOXELS", ni * nj * (nk // 2 + 6))
-    found = slabs.plan_ray_slabs(DeviceVolume(volume, device=device), {}, {})
+    monkeypatch.setattr(ray_slabs, "MOST_VOXELS", ni * nj * (nk // 2 + 6))
+    found = ray_slabs.plan_ray_slabs(DeviceVolume(volume, device=device), {}, {})
     held = nk if int(device.kernel_variants["LANES"]) == 1 else nk // 2 + 1
     assert found == held
 

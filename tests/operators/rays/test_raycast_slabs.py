@@ -19,8 +19,8 @@ from raycast_scenes import (
 from soft_function import SOFT
 
 from clrecon.geometry import Volume
-from clrecon.operators.rays import slabs
-from clrecon.operators.rays.slabs import BRICK_CELLS, plan_ray_slabs
+from clrecon.operators.rays import ray_slabs
+from clrecon.operators.rays.ray_slabs import BRICK_CELLS, plan_ray_slabs
 from clrecon.reference.rays.render import MODES
 from clrecon.rendering import Lighting
 
@@ -46,7 +46,7 @@ def test_slabs_give_the_picture_of_the_whole(device, mode, towards, even):
 def test_a_slab_needs_its_slices_with_two_before_and_three_behind(monkeypatch, lanes, most_slices, most):
     """The forecast and the bound of kernels with several lanes, by hand: 9 x 7 x 20 voxels of two bytes."""
     ni, nj, nk = 9, 7, 20
-    monkeypatch.setattr(slabs, "MOST_VOXELS", ni * nj * most_slices + 1)
+    monkeypatch.setattr(ray_slabs, "MOST_VOXELS", ni * nj * most_slices + 1)
     asked: dict[str, Any] = {}
     resident = SimpleNamespace(
         volume=Volume(np.zeros((nk, nj, ni), np.int16), np.eye(4)),

@@ -13,7 +13,7 @@ import clrecon
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.opencl import launching
-from clrecon.operators.rays.slabs import entry_slice
+from clrecon.operators.rays.ray_slabs import entry_slice
 from clrecon.rendering import TransferFunction
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip

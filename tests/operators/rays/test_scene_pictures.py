@@ -22,9 +22,8 @@ from clrecon import (
     VolumeLook,
 )
 from clrecon.errors import DeviceError, UsageError
-from clrecon.operators.rays.layers import PIXEL_BYTES
-from clrecon.operators.rays.scene import ScenePictures
-from clrecon.operators.rays.slabs import ray_slabs
+from clrecon.operators.rays.ray_slabs import ray_slabs
+from clrecon.operators.rays.scene import PIXEL_BYTES, ScenePictures
 from clrecon.rendering import UNSHADED
 from clrecon.rendering.views.camera import Camera
 

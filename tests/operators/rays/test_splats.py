@@ -10,9 +10,8 @@ import tolerances
 
 import clrecon
 from clrecon.errors import DeviceError, UsageError
-from clrecon.operators.rays import splats
-from clrecon.operators.rays.point_pictures import MOST_NAMED, PointPictures, cloud_box
-from clrecon.operators.rays.splats import draw_splats
+from clrecon.operators.rays import point_pictures
+from clrecon.operators.rays.point_pictures import MOST_NAMED, PointPictures, cloud_box, draw_splats
 from clrecon.points import PointCloud
 from clrecon.reference.rays.splats import find_splats, shade_splats
 from clrecon.rendering import UNSHADED, Lighting
@@ -115,7 +114,7 @@ def test_parts_and_permutations_give_the_same_picture(device: Any, name: str, mo
     colors[:, 0] = np.arange(2000) % 256
     camera, calls = CAMERAS[name], []
     whole = draw_splats(device, points, colors, normals, camera, SIZE, 0.5)
-    monkeypatch.setattr(splats, "FEWEST_POINTS", 300)
+    monkeypatch.setattr(point_pictures, "FEWEST_POINTS", 300)
     memory = 16 * SIZE[0] * SIZE[1] + 28 * 650
     parts = draw_splats(
         device, points, colors, normals, camera, SIZE, 0.5, memory=memory, progress=lambda *call: calls.append(call)
@@ -215,6 +214,6 @@ def test_what_cannot_be_shown_is_refused(device: Any, monkeypatch: pytest.Monkey
         PointPictures(cloud, device=device, memory=0)
     near = clrecon.render(cloud, camera=FRONT, size=(64, 64), radius_mm=80.0, device=device)
     assert "are drawn with 128" in near.report["warnings"][-1]
-    monkeypatch.setattr(splats, "MOST_PIXELS", 1000)
+    monkeypatch.setattr(point_pictures, "MOST_PIXELS", 1000)
     with pytest.raises(UsageError, match="take a smaller radius, or zoom less"):
         clrecon.render(cloud, camera=FRONT, size=(64, 64), radius_mm=8.0, device=device)

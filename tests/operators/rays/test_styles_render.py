@@ -24,8 +24,8 @@ from clrecon import (
     VolumeRenderer,
 )
 from clrecon.geometry import Volume
-from clrecon.operators.rays import project
-from clrecon.operators.reformat import sample
+from clrecon.operators.rays import ray_pictures
+from clrecon.operators.reformat import sheets
 from clrecon.rendering.pictures import styles
 from clrecon.rendering.pictures.modes import MODES
 
@@ -152,5 +152,5 @@ def test_a_picture_in_slabs_tells_each(device: Any) -> None:
 
 
 def test_names_of_kinds_are_those_of_the_kernels() -> None:
-    assert tuple(project.PROJECTIONS) == styles.PROJECTIONS
-    assert tuple(sample.COMBINATIONS) == styles.COMBINATIONS
+    assert tuple(ray_pictures.PROJECTIONS) == styles.PROJECTIONS
+    assert tuple(sheets.COMBINATIONS) == styles.COMBINATIONS

@@ -9,7 +9,7 @@ from ray_scenes import GRIDS, LONGEST_STEP, blobs, centre_of, look, make_volume,
 
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.operators.rays.surface import cast_surface
+from clrecon.operators.rays.surface_pictures import cast_surface
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.reference.rays.surface import cast_surface as cast_twin

@@ -12,8 +12,8 @@ from sample_meshes import ball
 import clrecon
 from clrecon import Mesh, MeshLook
 from clrecon.errors import DeviceError, UsageError
-from clrecon.operators.rays.layers import LAYERS, draw_layers
 from clrecon.operators.rays.mesh_pictures import make_part
+from clrecon.operators.rays.scene import LAYERS, draw_layers
 from clrecon.reference.rays.triangles import find_meetings, nth_layer, shade_layer
 from clrecon.rendering import UNSHADED, Lighting
 from clrecon.rendering.views.camera import Camera
@@ -275,6 +275,6 @@ def test_what_cannot_be_shown_is_refused(device: Any, monkeypatch: pytest.Monkey
         MeshLook(opacity=0.0)
     with pytest.raises(DeviceError, match="triangles"):
         clrecon.render(mesh, size=SIZE, memory=1000, device=device)
-    monkeypatch.setattr("clrecon.operators.rays.triangles.MOST_PIECES", 5)
+    monkeypatch.setattr("clrecon.operators.rays.mesh_pictures.MOST_PIECES", 5)
     with pytest.raises(UsageError, match="take a smaller picture"):
         clrecon.render(mesh, camera=FRONT, size=(200, 200), device=device)

@@ -14,7 +14,7 @@ from clrecon.geometry import Volume
 from clrecon.opencl import Stopwatch, kernel_files
 from clrecon.operators.rays.render import render
 from clrecon.operators.reformat.cut import cut_slice, reformat_curve
-from clrecon.operators.reformat.sample import prepare_reformat, sample_sheet
+from clrecon.operators.reformat.sheets import prepare_reformat, sample_sheet
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.reference.reformat.cut import reformat_sheet
 from clrecon.rendering.views.camera import Camera

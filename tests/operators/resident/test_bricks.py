@@ -9,7 +9,7 @@ from variants import VOXEL_TYPES
 
 from clrecon.geometry import Volume
 from clrecon.opencl import download, upload
-from clrecon.operators.resident.bricks import compare_bricks, measure_bricks
+from clrecon.operators.resident.tables import compare_bricks, measure_bricks
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
 from clrecon.reference.resident import bricks as twin
 

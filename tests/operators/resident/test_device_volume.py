@@ -15,7 +15,7 @@ import clrecon
 from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
 from clrecon.labels import LabelMap, resample
 from clrecon.opencl import Stopwatch
-from clrecon.operators.rays.composite import TransferTables
+from clrecon.operators.rays.ray_pictures import TransferTables
 from clrecon.operators.resident.device_volume import DeviceVolume
 
 

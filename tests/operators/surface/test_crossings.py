@@ -8,8 +8,8 @@ import sample_meshes as samples
 
 from clrecon.errors import Cancelled
 from clrecon.mesh.intersections import find_self_intersections
-from clrecon.operators.surface import crossings
-from clrecon.operators.surface.crossings import find_crossings, mark_crossings, plan_crossings
+from clrecon.operators.surface import decimation
+from clrecon.operators.surface.decimation import find_crossings, mark_crossings, plan_crossings
 from clrecon.reference.surface import crossings as twin
 from clrecon.system.progress import Steps
 
@@ -50,7 +50,7 @@ def test_a_few_triangles(device):
 @pytest.mark.parametrize("extent", [(60.0, 50.0, 40.0), (0.0, 90.0, 5.0), (500.0, 1.0, 1.0)])
 @pytest.mark.parametrize("place", [0.0, 3000.0])
 def test_pairs_are_those_of_the_host(device, sizes, extent, place, monkeypatch):
-    monkeypatch.setattr(crossings, "FEWEST", 1)
+    monkeypatch.setattr(decimation, "FEWEST", 1)
     vertices, triangles = scattered(1200, sizes, extent=extent)
     vertices += np.float32(place)
     expected = find_self_intersections(vertices, triangles)
@@ -59,7 +59,7 @@ def test_pairs_are_those_of_the_host(device, sizes, extent, place, monkeypatch):
 
 @pytest.mark.parametrize("fewest", [1, 10_000])
 def test_pairs_with_a_changed_triangle(device, fewest, monkeypatch):
-    monkeypatch.setattr(crossings, "FEWEST", fewest)
+    monkeypatch.setattr(decimation, "FEWEST", fewest)
     vertices, triangles = scattered(900)
     changed = np.arange(900) % 4 == 1
     every = find_self_intersections(vertices, triangles)
@@ -72,7 +72,7 @@ def test_pairs_with_a_changed_triangle(device, fewest, monkeypatch):
 @pytest.mark.parametrize("scale", [2.0**-60, 2.0**-9, 1.0, 2.0**30])
 def test_bodies_that_cut_each_other(device, scale, monkeypatch):
     """Whatever the unit of length; two spheres whose triangles lie in each other's planes too."""
-    monkeypatch.setattr(crossings, "FEWEST", 1)
+    monkeypatch.setattr(decimation, "FEWEST", 1)
     sphere = samples.sphere(rounds=3)
     for shift in ((11.0, 4.0, -3.0), (0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (25.0, 0.0, 0.0)):
         vertices, triangles = samples.join(sphere, samples.sphere(shift, 10.0, 3))
@@ -90,7 +90,7 @@ def test_a_closed_surface_leaves_nothing_to_look_at(device):
 
 
 def test_triangles_without_area_are_left_to_the_host(device, monkeypatch):
-    monkeypatch.setattr(crossings, "FEWEST", 1)
+    monkeypatch.setattr(decimation, "FEWEST", 1)
     nothing = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32)
     assert len(find_crossings(device, *nothing)) == 0
     vertices, triangles = scattered(400)
@@ -101,8 +101,8 @@ def test_triangles_without_area_are_left_to_the_host(device, monkeypatch):
 @pytest.mark.parametrize("case", ["small", "float64", "no room"])
 def test_what_the_device_does_not_take_the_host_does(device, case, monkeypatch):
     if case != "small":
-        monkeypatch.setattr(crossings, "FEWEST", 1)
-    monkeypatch.setattr(crossings, "mark_crossings", None)
+        monkeypatch.setattr(decimation, "FEWEST", 1)
+    monkeypatch.setattr(decimation, "mark_crossings", None)
     vertices, triangles = scattered(600)
     own = vertices.astype(np.float64) if case == "float64" else vertices
     told: list[tuple[str, int, int]] = []
@@ -113,8 +113,8 @@ def test_what_the_device_does_not_take_the_host_does(device, case, monkeypatch):
 
 
 def test_progress_counts_triangles_and_may_end_the_work(device, monkeypatch):
-    monkeypatch.setattr(crossings, "FEWEST", 1)
-    monkeypatch.setattr(crossings, "PIECE", 256)
+    monkeypatch.setattr(decimation, "FEWEST", 1)
+    monkeypatch.setattr(decimation, "PIECE", 256)
     vertices, triangles = scattered(600)
     told: list[int] = []
     find_crossings(device, vertices, triangles, steps=Steps(lambda *step: told.append(step[1]), "crossings", 600))

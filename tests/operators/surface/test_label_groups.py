@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import pytest
 
 from clrecon.errors import DeviceMemoryError
-from clrecon.operators.surface.label_groups import Box, each_label
+from clrecon.operators.surface.labels import Box, each_label
 
 BOX: Box = (slice(0, 1), slice(0, 1), slice(0, 1))
 GROUPS = [{1: BOX, 2: BOX, 3: BOX}, {4: BOX}, {5: BOX, 6: BOX}]

@@ -15,8 +15,7 @@ from clrecon.labels.occupancy import FULL, KEEP
 from clrecon.labels.solid import find_boxes
 from clrecon.mesh.triangles import enclosed_ml
 from clrecon.opencl import Stopwatch
-from clrecon.operators.surface.label_masks import extract_label_masks
-from clrecon.operators.surface.label_survey import survey_labels
+from clrecon.operators.surface.label_masks import extract_label_masks, survey_labels
 from clrecon.reference.surface import label_masks as twin
 
 OBLIQUE = np.array([[0.7, 0.1, 0.05, -250.0], [-0.1, 0.5, 0.2, -300.0], [0.0, 0.05, 2.5, -846.0], [0, 0, 0, 1.0]])

@@ -15,7 +15,7 @@ from clrecon.labels.growth import Growth
 from clrecon.opencl import Stopwatch
 from clrecon.operators.resident import device_volume
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.operators.surface import label_extraction as operator
+from clrecon.operators.surface import labels as operator
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.labels import extract_labels
 from clrecon.reference.surface import labels as twin

@@ -12,8 +12,8 @@ from near_surfaces import FLAT_BOUND, FLAT_CASES, flat_case, sheet
 from clrecon.errors import DeviceError
 from clrecon.mesh.compare.near_distances import NearDistance, triangle_distances
 from clrecon.mesh.refine.bounds import MIDDLES, SurfaceBounds
-from clrecon.operators.surface import near_faces
-from clrecon.operators.surface.near_faces import DeviceBounds
+from clrecon.operators.surface import decimation
+from clrecon.operators.surface.decimation import DeviceBounds
 
 ROUNDING_MM = 2e-4
 """Slack of bounds at coordinates of some tens of mm, and the rounding of float32."""
@@ -117,7 +117,7 @@ def test_long_requests_are_made_in_parts(device, monkeypatch):
     arguments = vertices.astype(np.float32) + np.float32(0.3), triangles, names, beside, 0.4
     bounds = DeviceBounds(device, vertices, triangles)
     whole = (*bounds.find_bounds(points, near, 0.5, 2), *bounds.find_witnesses(*arguments))
-    monkeypatch.setattr(near_faces, "PART", 64)
+    monkeypatch.setattr(decimation, "PART", 64)
     for one, other in zip(
         whole, (*bounds.find_bounds(points, near, 0.5, 2), *bounds.find_witnesses(*arguments)), strict=True
     ):
@@ -137,6 +137,6 @@ def test_a_small_surface(device):
 
 def test_a_device_without_room_says_what_it_would_need(device, monkeypatch):
     vertices, triangles = sheet(9)
-    monkeypatch.setattr(near_faces, "PART", 1 << 40)
+    monkeypatch.setattr(decimation, "PART", 1 << 40)
     with pytest.raises(DeviceError, match="points of a launch"):
         DeviceBounds(device, vertices, triangles).find_bounds(vertices, np.zeros((81, 1), int), 0.0)

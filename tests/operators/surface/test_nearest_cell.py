@@ -14,8 +14,8 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.opencl import Stopwatch
 from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.surface.growing import find_cell_near
 from clrecon.operators.surface.marching_cubes import classify
-from clrecon.operators.surface.nearest_cell import find_cell_near
 from clrecon.operators.surface.seeds import SEED_REACH_MM
 from clrecon.operators.surface.slabs import SampleGrid, Slab
 from clrecon.reference.surface.growing import find_active

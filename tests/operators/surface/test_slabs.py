@@ -16,8 +16,9 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.operators.resident import device_volume
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.operators.surface import cells, marching_cubes
 from clrecon.operators.surface import extract as isosurface
+from clrecon.operators.surface import marching_cubes
+from clrecon.operators.surface import marching_cubes as cells
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
 from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
 

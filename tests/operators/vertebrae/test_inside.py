@@ -12,8 +12,7 @@ import clrecon
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
-from clrecon.operators.vertebrae.inside import PARTS, name_band
-from clrecon.operators.vertebrae.thickness import measure_thickness
+from clrecon.operators.vertebrae.inside import PARTS, measure_thickness, name_band
 from clrecon.phantom import PhantomSettings, make_phantom
 from clrecon.phantom.fields import coverage
 from clrecon.phantom.settings import CENTRE_LPS_MM

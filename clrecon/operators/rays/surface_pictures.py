@@ -13,13 +13,19 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.labels.growth import Growth
 from clrecon.opencl import Stopwatch, launch, memory_limits, upload
-from clrecon.operators.rays.buffers import PictureBuffers, count_queues, highlight_table
-from clrecon.operators.rays.leaps import find_leaps
-from clrecon.operators.rays.ray_view import RayView
-from clrecon.operators.rays.slabs import RAYS, LeapMap, RaySlab, entry_slice, plan_ray_slabs, ray_slabs, slab_labels
+from clrecon.operators.rays.picture_buffers import PictureBuffers, RayView, count_queues, highlight_table
+from clrecon.operators.rays.ray_slabs import (
+    RAYS,
+    LeapMap,
+    RaySlab,
+    entry_slice,
+    find_leaps,
+    plan_ray_slabs,
+    ray_slabs,
+    slab_labels,
+)
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.operators.resident.frame import FieldFrame, enclose
-from clrecon.operators.resident.voxel_types import label_variants
+from clrecon.operators.resident.tables import FieldFrame, enclose, label_variants
 from clrecon.rendering import Rendering
 from clrecon.rendering.pictures.styles import SurfaceLook
 from clrecon.rendering.views.camera import Camera, box_corners
