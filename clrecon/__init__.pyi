@@ -6,7 +6,6 @@ from clrecon.anatomy.iso_choice import choose_iso_value as choose_iso_value
 from clrecon.anatomy.noise import Noise as Noise
 from clrecon.anatomy.noise import measure_noise as measure_noise
 from clrecon.anatomy.spine_line import find_spine_line as find_spine_line
-from clrecon.corridors.corridor import find_corridors as find_corridors
 from clrecon.errors import Cancelled as Cancelled
 from clrecon.errors import ClreconError as ClreconError
 from clrecon.errors import DeviceError as DeviceError
@@ -97,11 +96,12 @@ from clrecon.rendering.pictures.styles import VolumeLook as VolumeLook
 from clrecon.rendering.views.camera import Camera as Camera
 from clrecon.rendering.views.centre_line_files import read_curve_points as read_curve_points
 from clrecon.rendering.views.clip import Clip as Clip
-from clrecon.system.time_limit import time_limit as time_limit
-from clrecon.vertebrae.result import MiddlePlane as MiddlePlane
-from clrecon.vertebrae.result import Vertebra as Vertebra
-from clrecon.vertebrae.result import VertebraSplit as VertebraSplit
-from clrecon.vertebrae.split import split_vertebrae as split_vertebrae
+from clrecon.spine.corridors import find_corridors as find_corridors
+from clrecon.spine.split import MiddlePlane as MiddlePlane
+from clrecon.spine.split import Vertebra as Vertebra
+from clrecon.spine.split import VertebraSplit as VertebraSplit
+from clrecon.spine.split import split_vertebrae as split_vertebrae
+from clrecon.system.progress import time_limit as time_limit
 from clrecon.viewer.notebook import to_html as to_html
 
 __all__: list[str]

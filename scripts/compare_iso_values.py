@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from clrecon.anatomy import iso_choice as choice  # noqa: E402
-from clrecon.anatomy.bone_edges import measure_edges  # noqa: E402
+from clrecon.anatomy.iso_choice import measure_edges  # noqa: E402
 from clrecon.errors import NoSurfaceError  # noqa: E402
 from clrecon.geometry import Volume, column_spacing  # noqa: E402
 

@@ -19,7 +19,7 @@ SUBJECTS = {
     "measures": ("Measures of meshes", "clrecon.mesh.compare clrecon.phantom"),
     "anatomy": ("Body, table, noise, spine", "clrecon.anatomy"),
     "labels": ("Label maps", "clrecon.labels"),
-    "vertebrae": ("Vertebrae", "clrecon.vertebrae clrecon.operators.vertebrae clrecon.corridors"),
+    "vertebrae": ("Vertebrae", "clrecon.spine clrecon.operators.vertebrae clrecon.spine"),
     "filters": ("Filters and masks", "clrecon.operators.filters clrecon.operators.masks"),
     "clouds": ("Point clouds", "clrecon.points clrecon.operators.points"),
     "pictures": (

@@ -31,11 +31,10 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.base import AIR_HU
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.volume import Volume
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.pieces import in_threads
 from clrecon.system.progress import Progress, Steps
 from clrecon.system.text import format_ml
-from clrecon.system.wording import name_parameter
 
 TISSUE_HU = -300.0
 """Cells above this are tissue: the value lies between that of blankets or foam and that of fat."""

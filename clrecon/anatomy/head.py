@@ -130,7 +130,7 @@ def _outer_air(volume: Volume) -> tuple[NDArray[np.bool_], NDArray[Any]]:
 def shows_face(volume: Volume, hu: float) -> bool:
     """Tell whether the outermost surface of a scan at a level can show a face.
 
-    False also where the air around the patient was left out (`clrecon.anatomy.outside_air`), and with it the skin.
+    False also where the air around the patient was left out (`clrecon.anatomy.surroundings`), and with it the skin.
     """
     if not SKIN_HU[0] <= hu <= SKIN_HU[1] or volume.report.get("outside_air") is not None:
         return False

@@ -1,14 +1,17 @@
-"""The spinal canal: a centre line of the vertebral column for curved reformations.
+"""The spinal canal: a centre line of the vertebral column for curved reformations, and the ends of the canal.
 
 In slices across the patient every place is compared with what the middle of the spinal canal looks like.  It is soft.
 Cortical bone encloses it in all directions (within 24 mm of height, so that arches close the gaps between them).  There
 is a vertebral body in front and nothing but muscle behind, and the left mirrors the right.  Dynamic programming finds
-the path through the slices that agrees best.  The path is the canal where it agrees over enough height; elsewhere
-it is followed as long as all but the mirror image agrees, see `clrecon.anatomy.spine_ends`.  Each slice's point is then
-moved to the middle of the space that the bone encloses, and the line is smoothed.
+the path through the slices that agrees best.  The path is the canal where it agrees over enough height; elsewhere it is
+followed as long as all but the mirror image agrees.  Each slice's point is then moved to the middle of the space that
+the bone encloses, and the line is smoothed.
 
-The search is meant for the spine of an adult, in a scan whose axes are those of the patient.
-"""
+Beyond the sure slices the place of the canal is known, so less is needed of the next slice: left and right may differ,
+as in a scan that is cropped at one side.  All other traits stay: without the vertebral body in front the way would go
+on in the soft tissue before the sacrum.
+
+The search is meant for the spine of an adult, in a scan whose axes are those of the patient."""
 
 from __future__ import annotations
 
@@ -18,14 +21,138 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.anatomy.spine_cells import CELL_MM, Field, SpineCells, average_cells, disc_mean, grow_cortex, plan_cells
-from clrecon.anatomy.spine_ends import GAP_MM, SpineEnd, follow, look_beyond, missing_traits
-from clrecon.anatomy.spine_traits import BODY_RADIUS, WORTH, Likeness, measure_likeness
+from clrecon.anatomy.spine_cells import (
+    BODY_RADIUS,
+    CANAL_RADIUS,
+    CELL_MM,
+    SOFT_HU,
+    STILL,
+    SURE,
+    WORTH,
+    Field,
+    Likeness,
+    SpineCells,
+    average_cells,
+    disc_mean,
+    grow_cortex,
+    measure_likeness,
+    plan_cells,
+    traits_of,
+)
 from clrecon.errors import RefusedInputError
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, Steps
+
+GAP_MM = 12.0
+"""Largest gap between slices of the canal: an artefact, or a vertebra that looks different."""
+REACH = 2
+"""Cells by which the canal may move aside from slice to slice."""
+
+
+MISSING = {
+    "wall": "bone around it on all sides",
+    "body": "a vertebral body in front of it",
+    "soft": "soft tissue in its middle",
+    "mirror": "left and right that are alike",
+}
+LOOKED_AT = 9
+"""Slices of a path on which traits are compared."""
+
+
+@dataclass(frozen=True)
+class SpineEnd:
+    """An end of the line that was found.
+
+    z_mm: Height of the last slice of the line, LPS mm.
+    lost_mm: Height of the first slice in which it was not found again; None where the scan ends there.
+    because: What was found there instead; empty where the scan ends.
+    """
+
+    z_mm: float
+    lost_mm: float | None = None
+    because: str = ""
+
+
+def follow(likeness: Likeness, path: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Follow the canal beyond both ends of a path.
+
+    path: ndarray, shape (n, 3). Cells (k, j, i) of the likeness, one a slice, k ascending.
+
+    Returns: ndarray, shape (m, 3). The longer path; its new slices have the traits of `STILL`, but for gaps up to
+        `GAP_MM` between them.
+    """
+    below = _beyond(likeness, path[0], -1)[::-1]
+    above = _beyond(likeness, path[-1], 1)
+    return np.concatenate([below, path, above])
+
+
+def _beyond(likeness: Likeness, last: NDArray[np.int64], step: int, stop: bool = True) -> NDArray[np.int64]:
+    """Return the cells from the last one on, one a slice; with `stop` only as far as the canal goes on."""
+    k, j, i = (int(n) for n in last)
+    cells: list[tuple[int, int, int]] = []
+    sure = 0
+    while 0 <= k + step < len(likeness.worth):
+        k += step
+        rows, columns = slice(max(j - REACH, 0), j + REACH + 1), slice(max(i - REACH, 0), i + REACH + 1)
+        near = np.where(likeness.goes_on[k, rows, columns], 100.0, 0.0) + likeness.worth[k, rows, columns]
+        at = np.unravel_index(int(near.argmax()), near.shape)
+        j, i = rows.start + int(at[0]), columns.start + int(at[1])
+        cells.append((k, j, i))
+        if likeness.goes_on[k, j, i]:
+            sure = len(cells)
+        elif (len(cells) - sure) * CELL_MM[2] > GAP_MM:
+            break
+    found = np.array(cells, np.int64).reshape(-1, 3)
+    return found[:sure] if stop else found
+
+
+def look_beyond(cells: SpineCells, likeness: Likeness, last: NDArray[np.int64], step: int) -> SpineEnd:
+    """Return the end of a path at its last cell: whether the scan ends there, or what was found instead of the canal.
+
+    last: ndarray, shape (3,). Cell (k, j, i) of the likeness.
+    step: {-1, 1}. Downwards or upwards.
+    """
+    z_mm = float(cells.origin[2] + last[0] * CELL_MM[2])
+    left = len(likeness.worth) - 1 - int(last[0]) if step > 0 else int(last[0])
+    if left * CELL_MM[2] <= GAP_MM:
+        return SpineEnd(z_mm)
+    found = _beyond(likeness, last, step, stop=False)[0]
+    return SpineEnd(z_mm, float(cells.origin[2] + found[0] * CELL_MM[2]), _lacking(likeness.box_of(cells), found))
+
+
+def _lacking(cells: SpineCells, place: NDArray[np.int64]) -> str:
+    """Say in words what the place that is most like a canal lacks of one."""
+    k, j, i = (int(n) for n in place)
+    traits = {name: float(field[j, i]) for name, field in traits_of(cells, k).items()}
+    parts = []
+    if traits["soft"] < STILL["soft"]:
+        reach = round(CANAL_RADIUS / CELL_MM[0])
+        around = cells.values[k, max(j - reach, 0) : j + reach + 1, max(i - reach, 0) : i + reach + 1]
+        hu = float(around.mean())
+        what = "bone" if hu >= SOFT_HU[1] else "air or fat" if hu <= SOFT_HU[0] else "bone beside soft tissue"
+        parts.append(f"{what} in its place ({hu:.0f} HU)")
+    if traits["wall"] < STILL["wall"]:
+        parts.append(
+            f"bone in {100.0 * traits['wall']:.0f} % of the directions around it (at least"
+            f" {100.0 * STILL['wall']:.0f} % are needed)"
+        )
+    if traits["body"] < STILL["body"]:
+        parts.append("no vertebral body in front of it")
+    return " and ".join(filter(None, (", ".join(parts[:-1]), *parts[-1:])))
+
+
+def missing_traits(cells: SpineCells, likeness: Likeness, path: NDArray[np.int64]) -> str:
+    """Say in words which traits most slices lack on a path that is no canal; empty where there is no path."""
+    box = likeness.box_of(cells)
+    chosen = path[np.unique(np.linspace(0, len(path) - 1, LOOKED_AT).astype(int))] if len(path) else path
+    found = [({name: field[j, i] for name, field in traits_of(box, int(k)).items()}) for k, j, i in chosen]
+    lacking = [
+        text for name, text in MISSING.items() if 2 * sum(traits[name] < SURE[name] for traits in found) > len(found)
+    ]
+    return " and ".join(filter(None, (", ".join(lacking[:-1]), *lacking[-1:])))
+
 
 WORST = 0.6
 """Most that a slice counts against the path, so that one slice with an artefact does not end it."""
@@ -47,7 +174,7 @@ class SpineLine:
     """The middle of the spinal canal.
 
     points: ndarray, shape (n, 3), float64. LPS mm, from the head downwards, about 10 mm apart.
-    sure_share: Share of the slices of the line whose traits are all sure, see `clrecon.anatomy.spine_traits.SURE`.
+    sure_share: Share of the slices of the line whose traits are all sure, see `clrecon.anatomy.spine_cells.SURE`.
     searched_mm: Height of the volume; the line may be shorter.
     sure_mm: Heights between which its slices are sure, but for gaps, z of the upper and the lower end.
     upper, lower: Its ends: those of the scan, or where it was lost and why; None where only the sure part was asked

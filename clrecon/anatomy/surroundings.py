@@ -1,27 +1,191 @@
-"""What a projection of the lowest values leaves out: the air around the body, table and blankets, and masked voxels.
+"""What surrounds the patient: outside air below an iso value, and what a projection of the lowest values leaves out.
 
-All of it is at least as low as what such a picture is made for (airways, emphysema, gas), so a ray that counted it
-would show nothing else.  Voxels that are left out get a value above all others: the lowest value along a ray then never
-is theirs, and a ray that meets nothing else is empty.
-"""
+Voxels below an iso value are air around the patient, or lung, airway, sinus or bowel gas.  The body
+(`clrecon.anatomy.body`) tells what is outside: its cavities belong to it.  An airway that is open to the outside, at
+nostrils or mouth, is cut a little under the skin, and the area of the cut is reported.
+
+A projection of the lowest values leaves out the air around the body, table and blankets, and masked voxels.  All of it
+is at least as low as what such a picture is made for (airways, emphysema, gas), so a ray that counted it would show
+nothing else.  Voxels that are left out get a value above all others: the lowest value along a ray then never is theirs,
+and a ray that meets nothing else is empty."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from clrecon.anatomy.body import BODY_STEPS, MARGIN_MM, find_body, find_unmeasured
+from clrecon.anatomy.body import BODY_STEPS, MARGIN_MM, TISSUE_HU, find_body, find_unmeasured
 from clrecon.anatomy.body_cells import count_cells, grow
-from clrecon.errors import RefusedInputError
+from clrecon.errors import NoSurfaceError, RefusedInputError
+from clrecon.geometry.base import AIR_HU
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.volume import Volume
+from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, Steps
+from clrecon.system.text import format_ml
+
+Mask = NDArray[np.bool_]
+
+SKIN_MM = 2.0
+"""Air less deep than this under the outline of the body is outside: folds of the skin, steps of the outline."""
+DEEP_MM = 5.0
+"""Air that is connected to the outside is a cavity of the body if it reaches this far below `SKIN_MM`."""
+OPEN_MM = 12.0
+"""Slices in which an airway is open (parted lips) get the outline of the slices above and below, up to this height."""
+
+OWN_STEPS = 6
+"""Steps after the search for the body, as progress counts them."""
+
+
+def leave_outside_air(volume: Volume, levels: Sequence[float], *, progress: Progress | None = None) -> Volume:
+    """Raise the air around the patient above the iso values, so that no surface of air includes it.
+
+    volume: A scan in HU.
+    levels: Iso values, HU.  What is denser than -300 HU is never left out.
+    progress: Called as ``progress("mask", steps done, steps)``.
+
+    Returns: A volume with the same places.  Air outside gets a value as far above the highest level as air is below it,
+        so that a surface between it and air of the body lies half way.  ``report["outside_air"]`` has ``left_out_ml``,
+        ``kept_ml`` (below the highest level), ``opening_mm2`` (area where the two kinds of air meet, as far as it was
+        measured) and ``filled_hu`` (the new value).
+    """
+    level = min(max(levels), TISSUE_HU)
+    steps = Steps(progress, "mask", count_cells(volume)[0] + BODY_STEPS + OWN_STEPS)
+    try:
+        body, step = find_body(volume, steps=steps)
+    except RefusedInputError as error:
+        way_out = f"{name_parameter('keep_outside', True)} takes all"
+        raise RefusedInputError(f"{error}: what is outside of it is not known ({way_out})") from None
+    body = _close_along_k(body, int(OPEN_MM / (2.0 * step[2] * volume.spacing[2])))
+    across = math.sqrt(step[0] * volume.spacing[0] * step[1] * volume.spacing[1])
+    unmeasured = find_unmeasured(volume.voxels)
+    steps.take()
+    # A lung that is cut by the circle of the reconstruction reaches up to it: unmeasured voxels must not shrink the
+    # body.
+    inner = _shrink(body | unmeasured[:: step[2], :: step[1], :: step[0]], (MARGIN_MM + SKIN_MM) / across)
+    deep = _to_voxels(_shrink(body, (MARGIN_MM + SKIN_MM + DEEP_MM) / across, border=False), step, volume)
+    within = _to_voxels(inner, step, volume)
+    steps.take()
+
+    air = np.empty(volume.voxels.shape, dtype=bool)
+    for k, layer in enumerate(volume.voxels):
+        np.less(layer, level, out=air[k])
+        volume.release_slices(k, k + 1)
+    steps.take()
+    kept = _find_cavities(air, within & ~unmeasured, deep)
+    steps.take()
+    outside = air & ~kept
+    opening = _touching_mm2(kept, outside & ~unmeasured, volume)
+    steps.take()
+
+    filled = _value_above(max(levels), volume.voxels.dtype)
+    voxels = np.array(volume.voxels)
+    voxels[outside] = filled
+    left_out_ml, kept_ml = _millilitres(outside, volume), _millilitres(voxels < max(levels), volume)
+    if kept_ml == 0.0:
+        raise NoSurfaceError(
+            f"nothing below {max(levels):g} HU lies within the body: {format_ml(left_out_ml)} are outside of it"
+            f" ({name_parameter('keep_outside', True)} takes them)"
+        )
+    changed = volume.with_voxels(voxels)
+    steps.take()
+    facts = {
+        "left_out_ml": round(left_out_ml, 3),
+        "kept_ml": round(kept_ml, 3),
+        "opening_mm2": round(opening, 1),
+        "filled_hu": float(filled),
+    }
+    changed.report = amend(changed.report, outside_air=facts)
+    return changed
+
+
+def _find_cavities(air: Mask, within: Mask, deep: Mask) -> Mask:
+    """Find air within the outline that is either not connected to the air outside, or reaches deep."""
+    from scipy import ndimage
+
+    pieces, count = ndimage.label(air & within)
+    keep = np.zeros(count + 1, dtype=bool)
+    keep[pieces[deep]] = True
+    joined = np.zeros(count + 1, dtype=bool)
+    outside = air & ~within
+    for low, high in _neighbours():
+        joined[pieces[low][outside[high]]] = True
+        joined[pieces[high][outside[low]]] = True
+    keep |= ~joined
+    keep[0] = False
+    return np.asarray(keep[pieces])
+
+
+def _touching_mm2(kept: Mask, outside: Mask, volume: Volume) -> float:
+    """Return the area of the faces between the voxels of two masks, mm2."""
+    steps = volume.affine[:3, :3].T
+    areas = [float(np.linalg.norm(np.cross(steps[(axis + 1) % 3], steps[(axis + 2) % 3]))) for axis in (2, 1, 0)]
+    total = 0.0
+    for area, (low, high) in zip(areas, _neighbours(), strict=True):
+        faces = np.count_nonzero(kept[low] & outside[high]) + np.count_nonzero(outside[low] & kept[high])
+        total += area * int(faces)
+    return total
+
+
+def _millilitres(mask: Mask, volume: Volume) -> float:
+    """Return the volume of the voxels of a mask, ml; a slice reaches half way to its neighbours."""
+    steps = np.gradient(volume.slice_origins(border=1), axis=0)[1:-1]
+    across = np.cross(volume.affine[:3, 0], volume.affine[:3, 1])
+    return float(np.count_nonzero(mask, axis=(1, 2)) @ np.abs(steps @ across)) / 1000.0
+
+
+def _neighbours() -> Iterator[tuple[Any, Any]]:
+    """Yield for k, j and i the subscripts of the lower and of the upper voxel of each pair of neighbours."""
+    for axis in range(3):
+        low, high = [slice(None)] * 3, [slice(None)] * 3
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        yield tuple(low), tuple(high)
+
+
+def _shrink(mask: Mask, cells: float, border: bool = True) -> Mask:
+    """Erode slice by slice; the border of the scan erodes too where `border` is False."""
+    from scipy import ndimage
+
+    for turn in range(max(1, round(cells))):
+        shape = ndimage.generate_binary_structure(2, 1 + turn % 2)[None]
+        mask = ndimage.binary_erosion(mask, shape, border_value=border)
+    return mask
+
+
+def _close_along_k(mask: Mask, reach: int) -> Mask:
+    """Close gaps along k: a voxel is inside when voxels above and below, at most `reach` slices away, are inside."""
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    size, around = 2 * reach + 1, ((reach, reach), (0, 0), (0, 0))
+    grown = maximum_filter1d(np.pad(mask, around).view(np.uint8), size, axis=0, mode="constant")
+    closed = minimum_filter1d(grown, size, axis=0, mode="constant", cval=1)
+    return np.asarray(closed[reach : len(closed) - reach].astype(bool))
+
+
+def _to_voxels(cells: Mask, step: tuple[int, int, int], volume: Volume) -> Mask:
+    nk, nj, ni = volume.voxels.shape
+    voxels = cells
+    for axis, count in enumerate(reversed(step)):
+        voxels = np.repeat(voxels, count, axis=axis)
+    return np.asarray(voxels[:nk, :nj, :ni])
+
+
+def _value_above(level: float, dtype: np.dtype[Any]) -> Any:
+    """Return a value as far above a level as air lies below it, within the range of the type."""
+    value = level + max(level - AIR_HU, 1.0)
+    if dtype.kind == "f":
+        return dtype.type(value)
+    return dtype.type(min(math.ceil(value), np.iinfo(dtype).max))
+
 
 LEFT_OUT = "left_out"
 """Entry of the report of a volume with voxels that are left out."""
 
-SKIN_MM = 3.0
+LEFT_OUT_SKIN_MM = 3.0
 """What is left out reaches at least so far under the surface of the body: values mix there with those of the air."""
 
 LEAST_ROOM = 2.0
@@ -55,7 +219,7 @@ def leave_out_surroundings(volume: Volume, *, progress: Progress | None = None) 
         body = None
     if body is not None:
         across = np.sqrt(si * volume.spacing[0] * sj * volume.spacing[1])
-        body = grow(body, -(max(1, round(MARGIN_MM / across)) + np.ceil(SKIN_MM / across)))
+        body = grow(body, -(max(1, round(MARGIN_MM / across)) + np.ceil(LEFT_OUT_SKIN_MM / across)))
         for k, layer in enumerate(taken):
             kept = np.repeat(np.repeat(body[k // sk], sj, 0), si, 1)[: layer.shape[0], : layer.shape[1]]
             unmeasured = find_unmeasured(voxels[k : k + 1])[0]

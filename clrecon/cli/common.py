@@ -14,8 +14,8 @@ from clrecon.cli.console import Console
 from clrecon.cli.standard_output import STREAMED
 from clrecon.cli.wrapping import fit_help
 from clrecon.errors import ClreconError, OutputError, UsageError
+from clrecon.system.progress import DEFAULT_SECONDS, check_time_limit
 from clrecon.system.text import guess_word
-from clrecon.system.time_limit import DEFAULT_SECONDS, check_time_limit
 
 INTERRUPTED = 130
 

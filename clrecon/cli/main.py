@@ -18,9 +18,9 @@ from clrecon.cli.console import Console
 from clrecon.cli.standard_output import run_with_streams
 from clrecon.cli.wording import speaker_of
 from clrecon.errors import UsageError
-from clrecon.system.foreign_words import own_streams
-from clrecon.system.time_limit import DEFAULT_SECONDS, time_limit
-from clrecon.system.wording import spoken_by
+from clrecon.system.arguments import spoken_by
+from clrecon.system.log import own_streams
+from clrecon.system.progress import DEFAULT_SECONDS, time_limit
 
 
 class _Command(NamedTuple):

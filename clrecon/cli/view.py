@@ -103,7 +103,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         return _serve(options, _settings(options), console)
     if options.html is None:
         from clrecon.system.display import DisplayProbe
-        from clrecon.system.interrupts import held_interrupts
+        from clrecon.system.progress import held_interrupts
 
         # Both before numpy is loaded: the probe takes half a second, and numpy's threads hold Ctrl-C back too.
         with held_interrupts(), DisplayProbe() as probe:

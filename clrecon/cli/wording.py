@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from clrecon.system.wording import Speaker, in_python
+from clrecon.system.arguments import Speaker, in_python
 
 _DESTINATIONS = {
     "color_by": "color",

@@ -26,11 +26,11 @@ from clrecon.sources.likeness import Likeness, judge_slices
 from clrecon.sources.listing import SeriesListing
 from clrecon.sources.plausibility import examine_voxels
 from clrecon.sources.rescale import Rescale
+from clrecon.system.arguments import name_parameter
 from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.paths import open_regular
 from clrecon.system.progress import Progress
-from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text, join_names
-from clrecon.system.wording import name_parameter
 
 log = get_logger(__name__)
 

@@ -13,7 +13,7 @@ from clrecon.geometry.certificate import Certificate
 from clrecon.geometry.orientation import describe_orientation
 from clrecon.sources.gates import PADDING_SHARE, judge_figures, judge_steps, list_odd_values
 from clrecon.sources.plausibility import VoxelFindings, leave_unexamined
-from clrecon.system.gates import Gate, at_most, none_of, unmeasured
+from clrecon.system.records import Gate, at_most, none_of, unmeasured
 
 MODALITY = "unknown"
 NOT_DICOM = "not DICOM: position, spacing and the meaning of the values are as the file says, nothing vouches for them"

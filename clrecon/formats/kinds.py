@@ -10,7 +10,7 @@ from clrecon.formats.grid_file import GridFile, Purpose
 from clrecon.formats.metaimage import is_metaimage, open_metaimage
 from clrecon.formats.nifti import is_nifti, open_nifti
 from clrecon.formats.nrrd import is_nrrd, open_nrrd
-from clrecon.system.regular_files import open_regular
+from clrecon.system.paths import open_regular
 
 _START_BYTES = 512
 

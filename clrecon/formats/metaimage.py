@@ -26,8 +26,8 @@ from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import GridFile, Purpose
 from clrecon.formats.stream import VoxelBytes, file_beside
 from clrecon.geometry.affine import Float64Array, checked_affine
-from clrecon.system.foreign_words import hush
-from clrecon.system.regular_files import open_regular
+from clrecon.system.log import hush
+from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 
 LARGEST_HEADER = 2**20

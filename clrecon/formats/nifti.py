@@ -24,7 +24,7 @@ from clrecon.formats.stream import VoxelBytes, file_beside, read_bytes
 from clrecon.geometry.affine import Float64Array, checked_affine
 from clrecon.geometry.frames import lps_affine_from_ras
 from clrecon.geometry.nifti import MM_PER_UNIT
-from clrecon.system.regular_files import open_regular
+from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 
 LARGEST_HEADER = 2**24

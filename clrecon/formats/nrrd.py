@@ -21,7 +21,7 @@ from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import LABEL_MAP, GridFile, Purpose
 from clrecon.formats.stream import VoxelBytes, file_beside
 from clrecon.geometry.affine import Float64Array, checked_affine, compose_affine
-from clrecon.system.regular_files import open_regular
+from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 
 LARGEST_HEADER = 2**20

@@ -20,10 +20,10 @@ from clrecon.geometry import AIR_HU
 from clrecon.geometry.affine import column_spacing, tilt_degrees
 from clrecon.sources.facts import PixelFacts
 from clrecon.sources.likeness import Likeness, judge_slices
+from clrecon.system.arguments import name_parameter
 from clrecon.system.memory import allocate_voxels
 from clrecon.system.progress import Progress
 from clrecon.system.text import format_share
-from clrecon.system.wording import name_parameter
 
 LADDER = (np.dtype(np.int16), np.dtype(np.int32), np.dtype(np.float32))
 """Types of a volume, from the narrowest to the widest."""

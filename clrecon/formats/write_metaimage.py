@@ -12,7 +12,7 @@ from clrecon.formats.content import VolumeContent
 from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import VOLUME
 from clrecon.geometry.itk import make_sitk
-from clrecon.system.foreign_words import hush
+from clrecon.system.log import hush
 
 _NAME = "volume.mha"
 

@@ -29,10 +29,9 @@ from clrecon.formats.write_nrrd import write_nrrd
 from clrecon.geometry.regular import LARGEST_SHEAR_DEGREES, describe_unevenness, shear_degrees
 from clrecon.geometry.resample import resample_volume
 from clrecon.geometry.volume import Volume
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.files import StagedFile, stage_file
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.wording import name_parameter
 
 SAME_PLACE_MM = 1e-3
 """Largest distance of a voxel from its place when the header is read back; NIfTI keeps its affine in float32."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from clrecon.errors import UsageError
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 Box = tuple[tuple[float, ...], tuple[float, ...]]
 """Lowest and highest corner (x, y, z) in mm; infinite where a side is open."""

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from clrecon.system.gates import Gate
-from clrecon.system.records import Record
+from clrecon.system.records import Gate, Record
 
 _ELSEWHERE = {"slices_missing": ("dropped",), "rescale": ("padding_share", "padding_hu")}
 """In reports of files that are not DICOM these entries stand behind that one: as they always have, byte for byte."""

@@ -8,14 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from clrecon.geometry.affine import Float64Array, apply_affine, column_spacing
-from clrecon.system.mapping import find_mapping
-from clrecon.system.messages import MappedArray, Message
+from clrecon.system.base_classes import MappedArray, Message
+from clrecon.system.memory import find_mapping
 
 
 class Grid(Message):
     """Voxels and their affine: the base class of `Volume` and of `clrecon.labels.LabelMap`.
 
-    It pickles and copies as `clrecon.system.messages` says: memory-mapped voxels are sent as their place in the file.
+    It pickles and copies as `clrecon.system.base_classes` says: memory-mapped voxels are sent as their place in the
+    file.
 
     voxels: ndarray, shape (nk, nj, ni). Checked by the subclass.
     affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm, checked too; it becomes read-only.

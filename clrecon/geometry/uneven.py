@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, checked_points, slice_normal
-from clrecon.system.messages import Message
+from clrecon.system.base_classes import Message
 
 POSITION_TOLERANCE_MM = 0.01
 POSITION_TOLERANCE_GAPS = 0.01

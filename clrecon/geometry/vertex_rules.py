@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 VERTEX_RULES = ("linear", "golden", "golden-search")
 

@@ -19,9 +19,9 @@ from clrecon.geometry.nifti import make_nibabel, take_nibabel
 from clrecon.geometry.resample import resample_volume
 from clrecon.geometry.slicing import slice_volume
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.packages import public_function
+from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress
-from clrecon.system.public import public_function
-from clrecon.system.targets import keep_existing
 
 Own = TypeVar("Own", bound="Volume")
 

@@ -14,8 +14,7 @@ from clrecon.jobs.render.job import make_pictures
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.jobs.shared.laps import Laps
 from clrecon.system.files import hold_interrupts, temporary_folder
-from clrecon.system.progress import Progress
-from clrecon.system.targets import (
+from clrecon.system.paths import (
     existing_stay,
     final_mode,
     keep_existing,
@@ -25,6 +24,7 @@ from clrecon.system.targets import (
     resolve_target,
     system_errors,
 )
+from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
     from clrecon.opencl import Device

@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from clrecon.errors import DeviceError
-from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.time_limit import device_seconds
+from clrecon.system.progress import Progress, device_seconds, ignore_progress
 
 
 def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError | None]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress
-from clrecon.system.targets import keep_existing
 
 
 def describe_kinds() -> dict[str, str]:

@@ -14,7 +14,7 @@ from clrecon.geometry import Grid
 from clrecon.geometry.affine import checked_affine
 from clrecon.labels.names import check_name, check_wanted, find_number
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.public import public_function
+from clrecon.system.packages import public_function
 
 LARGEST_NUMBER = 65_535
 """Largest label number; numbers go to a device as 16 bits."""

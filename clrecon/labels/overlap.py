@@ -12,7 +12,7 @@ from clrecon.errors import RefusedInputError
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap
 from clrecon.labels.names import check_name, find_number
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 
 class Wanted(NamedTuple):

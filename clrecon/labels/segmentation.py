@@ -26,8 +26,8 @@ from clrecon.labels.frames import FrameStack, place_frames
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.overlap import Painter, Wanted
 from clrecon.labels.stream import empty_labels
+from clrecon.system.paths import open_regular
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text, hash_uid
 
 SEGMENTATION_CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")

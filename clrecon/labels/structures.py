@@ -25,8 +25,8 @@ from clrecon.labels.label_map import LabelMap
 from clrecon.labels.names import find_number
 from clrecon.labels.overlap import Painter, Wanted
 from clrecon.labels.stream import empty_labels
+from clrecon.system.paths import open_regular
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.regular_files import open_regular
 from clrecon.system.text import count_of, escape_text, hash_uid
 
 STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"

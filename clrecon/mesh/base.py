@@ -21,8 +21,8 @@ from clrecon.geometry.affine import apply_affine, checked_affine, normal_matrix
 from clrecon.mesh.normals import vertex_normals
 from clrecon.mesh.pieces import find_pieces
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.messages import Message
-from clrecon.system.targets import keep_existing
+from clrecon.system.base_classes import Message
+from clrecon.system.paths import keep_existing
 
 _MOST_VERTICES = 2**32
 

@@ -16,8 +16,8 @@ from clrecon.mesh.base import BaseMesh
 from clrecon.mesh.connectivity import label_components
 from clrecon.mesh.nearest import find_nearest_triangle
 from clrecon.mesh.pieces import measure_components
+from clrecon.system.arguments import name_parameter
 from clrecon.system.text import count_of, format_digits
-from clrecon.system.wording import name_parameter
 
 Own = TypeVar("Own", bound=BaseMesh)
 

@@ -15,8 +15,7 @@ from clrecon.mesh.base import BaseMesh
 from clrecon.mesh.components import select_components, split_components
 from clrecon.mesh.quality import MeshQuality, measure_quality, measure_triangles
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.packages import import_package
-from clrecon.system.public import public_function
+from clrecon.system.packages import import_package, public_function
 
 
 class Mesh(BaseMesh):

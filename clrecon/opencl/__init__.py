@@ -3,19 +3,34 @@
 Only this package searches for drivers and knows where the kernel files are.
 """
 
-from clrecon.opencl.arrays import allocate, copy_buffer, download, empty_output, upload
-from clrecon.opencl.cache.folders import cache_warnings
-from clrecon.opencl.commands import has_hung_commands, keep_for_hung_commands
-from clrecon.opencl.context import Device
-from clrecon.opencl.first_use import remembered_fault
-from clrecon.opencl.launching import Stopwatch, launch
-from clrecon.opencl.memory import MemoryLimits, check_budget, check_memory, describe_shortage, memory_limits
-from clrecon.opencl.pages import result_pages
+from clrecon.opencl.arrays import (
+    MemoryLimits,
+    allocate,
+    check_budget,
+    check_memory,
+    copy_buffer,
+    describe_shortage,
+    download,
+    empty_output,
+    memory_limits,
+    result_pages,
+    upload,
+)
+from clrecon.opencl.cache import cache_warnings
+from clrecon.opencl.device import Device, has_hung_commands, keep_for_hung_commands
+from clrecon.opencl.launching import Stopwatch, launch, settle, wait
 from clrecon.opencl.program import Kernel, Program, load_program
-from clrecon.opencl.select import choose_device, choose_remembered, choose_unchecked, list_devices, list_platforms
+from clrecon.opencl.select import (
+    choose_device,
+    choose_remembered,
+    choose_unchecked,
+    list_devices,
+    list_platforms,
+    remembered_fault,
+    take_device,
+    work_on,
+)
 from clrecon.opencl.sources import kernel_constant, kernel_files, kernel_number, read_kernel_source
-from clrecon.opencl.stand_in import take_device, work_on
-from clrecon.opencl.waiting import settle, wait
 
 __all__ = [
     "Device",

@@ -1,17 +1,209 @@
-"""Arrays on a device.  On a CPU device they use numpy's memory without a copy."""
+"""Arrays on a device, its memory budget, and pages for results.
+
+All buffers of an operator are summed and compared with the device before any is allocated.  On a CPU device they use
+numpy's memory without a copy.
+
+The memory of results is used again for later results.  When a kernel first writes to a new page, the system has to find
+and clear it.  For the mesh of a CT series this takes as long as computing the mesh.  Arrays made here return their
+pages when their last view is gone, and a later result of the same process uses them without that delay."""
 
 from __future__ import annotations
 
+import mmap
+import threading
+import weakref
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clrecon.errors import DeviceLostError, DeviceMemoryError
-from clrecon.opencl.context import Device, describe_error, kind_of_error
-from clrecon.opencl.pages import result_pages
+from clrecon.errors import DeviceError, DeviceFailedError, DeviceLostError, DeviceMemoryError, UsageError
+from clrecon.opencl.device import Device, describe_error, kind_of_error
+from clrecon.opencl.launching import wait
 from clrecon.opencl.quirks import import_pyopencl
-from clrecon.opencl.waiting import wait
+from clrecon.system.arguments import name_parameter
+
+
+def _mib(size: int, up: bool = False) -> str:
+    if size < 2**20:
+        return f"{size:,} bytes"
+    return f"{-(-size // 2**20) if up else round(size / 2**20):,} MiB"
+
+
+@dataclass(frozen=True)
+class MemoryLimits:
+    """The memory that may be taken on a device.
+
+    label: Name of the device, for messages.
+    device_bytes, device_buffer_bytes: Memory of the device for all buffers together, and for the largest single one.
+    asked_bytes: Bytes that the user allows, if less.
+    """
+
+    label: str
+    device_bytes: int
+    device_buffer_bytes: int
+    asked_bytes: int | None
+
+    @property
+    def total_bytes(self) -> int:
+        """Bytes that all buffers together may take."""
+        return self.device_bytes if self.asked_bytes is None else self.asked_bytes
+
+    @property
+    def buffer_bytes(self) -> int:
+        """Bytes that a single buffer may take."""
+        return min(self.device_buffer_bytes, self.total_bytes)
+
+    def device_fits(self, buffers: Mapping[str, int]) -> bool:
+        """True where the device has room for `buffers`, regardless of the user's limit."""
+        sizes = buffers.values()
+        return sum(sizes) <= self.device_bytes and max(sizes, default=0) <= self.device_buffer_bytes
+
+    def describe(self) -> str:
+        """Describe the available memory for messages."""
+        if self.asked_bytes is not None:
+            return f"{_mib(self.asked_bytes)} are allowed on {self.label} by {name_parameter('memory')}"
+        return f"{self.label} has {_mib(self.device_bytes)}, at most {_mib(self.device_buffer_bytes)} in one buffer"
+
+
+def check_memory(memory: int | None) -> None:
+    """Refuse a value that is not a byte count of at least 1; None stands for all memory of the device."""
+    if memory is not None and (isinstance(memory, bool) or not isinstance(memory, int) or memory < 1):
+        raise UsageError(f"memory is a whole number of bytes, not {memory!r}")
+
+
+def memory_limits(device: Device, memory: int | None = None) -> MemoryLimits:
+    """Return the device's own limits, or `memory` bytes if that is less."""
+    asked = int(memory) if memory is not None and memory < device.memory_bytes else None
+    largest = min(device.max_allocation_bytes, device.memory_bytes)
+    return MemoryLimits(device.label, device.memory_bytes, largest, asked)
+
+
+def describe_shortage(limits: MemoryLimits, buffers: Mapping[str, int]) -> str:
+    """Return why `buffers` do not fit together, or one of them does not fit alone; empty if they fit."""
+    for what, size in buffers.items():
+        if size > limits.device_buffer_bytes:
+            most = _mib(limits.device_buffer_bytes)
+            return f"the {what} needs a buffer of {_mib(size)}, {limits.label} allows {most}"
+    total = sum(buffers.values())
+    if total <= limits.total_bytes:
+        return ""
+    if not limits.device_fits(buffers):
+        limits = replace(limits, asked_bytes=None)  # a higher limit would not help
+    parts = ", ".join(f"{what} {_mib(size)}" for what, size in buffers.items())
+    return f"this needs {_mib(total, up=True)} on the device ({parts}): {limits.describe()}"
+
+
+def check_budget(
+    device: Device, buffers: Mapping[str, int], memory: int | None = None, *, less_may_fit: bool = False
+) -> int:
+    """Check that all `buffers` fit the device together and each alone.
+
+    buffers: Bytes of all buffers that exist at the same time, by description.
+    memory: Bytes that may be taken on the device; None is all of its memory.
+    less_may_fit: The caller can do the work in smaller parts.
+
+    Returns: The sum in bytes.
+    """
+    limits = memory_limits(device, memory)
+    shortage = describe_shortage(limits, buffers)
+    if shortage:
+        if limits.device_fits(buffers):
+            kind = DeviceMemoryError if less_may_fit else DeviceError
+            raise kind(f"{shortage}: allow that much or ask for less")
+        kind = DeviceMemoryError if less_may_fit else DeviceFailedError
+        raise kind(f"{shortage}: use a device with more memory or a smaller volume")
+    return sum(buffers.values())
+
+
+BLOCK_BYTES = 1 << 21
+"""Block sizes are multiples of this, the size of a huge page on most systems."""
+
+SMALLEST_BYTES = 1 << 20
+"""Smaller results come from numpy: the allocator of the C library keeps those pages itself."""
+
+SPARE_BYTES = 1 << 28
+"""Most bytes of unused pages that are kept for the next result; more go back to the system."""
+
+LARGEST_WASTE = 2
+"""A spare block serves a request only if it is at most this many times as large."""
+
+
+_PRIVATE: dict[str, int] = (
+    {"flags": mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS} if hasattr(mmap, "MAP_ANONYMOUS") else {}  # Windows has neither
+)
+
+
+class _Loan(np.ndarray[Any, np.dtype[Any]]):
+    """The array as which a block is lent: its views keep it alive, and when it is gone the block is free."""
+
+
+class PagePool:
+    """Blocks of memory that are lent as numpy arrays and return automatically.
+
+    spare_bytes: Most bytes of unused memory that are kept.
+    """
+
+    def __init__(self, spare_bytes: int = SPARE_BYTES):
+        self._spare_bytes = spare_bytes
+        self._spare: list[mmap.mmap] = []
+        self._lock = threading.RLock()  # a loan can end, by garbage collection, while its own thread holds the lock
+
+    @property
+    def spare_bytes(self) -> int:
+        """Bytes that are free for the next result."""
+        with self._lock:
+            return sum(map(len, self._spare))
+
+    def empty(self, shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
+        """Return an uninitialised array, C-contiguous, aligned for every vector type."""
+        dtype = np.dtype(dtype)
+        count = int(np.prod(shape, dtype=object))
+        size = count * dtype.itemsize
+        if size < SMALLEST_BYTES:
+            return np.empty(shape, dtype)
+        block = self._take(size)
+        # Made directly on the block: views then refer to the loan.  If the loan were a view itself, numpy would skip
+        # it.
+        loan = _Loan(tuple(shape), dtype, buffer=block)
+        weakref.finalize(loan, self._give_back, block).atexit = False
+        return loan.view(np.ndarray)
+
+    def _take(self, size: int) -> mmap.mmap:
+        with self._lock:
+            fitting = [block for block in self._spare if size <= len(block) <= LARGEST_WASTE * size]
+            if fitting:
+                block = min(fitting, key=len)
+                self._spare.remove(block)
+                return block
+        try:
+            block = mmap.mmap(-1, -(-size // BLOCK_BYTES) * BLOCK_BYTES, **_PRIVATE)
+        except (OSError, OverflowError) as error:
+            raise MemoryError(f"{size:,} bytes cannot be had: {error}") from error
+        if hasattr(mmap, "MADV_HUGEPAGE"):
+            try:
+                block.madvise(mmap.MADV_HUGEPAGE)
+            except OSError:  # a kernel without huge pages
+                pass
+        return block
+
+    def _give_back(self, block: mmap.mmap) -> None:
+        with self._lock:
+            self._spare.append(block)
+            while sum(map(len, self._spare)) > self._spare_bytes:
+                self._spare.pop(0)  # unmapped when nothing refers to it
+
+    def clear(self) -> None:
+        """Give all spare memory back to the system."""
+        with self._lock:
+            self._spare.clear()
+
+
+result_pages = PagePool()
+"""The pool of this process."""
+
 
 SHARED_BYTES = 1 << 20
 """Arrays smaller than this are copied to the device even if it could use them in place."""

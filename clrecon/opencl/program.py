@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import DeviceError
-from clrecon.opencl.cache.binaries import binary_key, read_binary, store_binary
-from clrecon.opencl.cache.folders import refuse_short_files
-from clrecon.opencl.context import Device, describe_error
+from clrecon.opencl.cache import binary_key, read_binary, refuse_short_files, store_binary
+from clrecon.opencl.device import Device, describe_error
 from clrecon.opencl.quirks import import_pyopencl
-from clrecon.opencl.signatures import KernelArgument, definitions_of, find_signatures
-from clrecon.opencl.sources import read_kernel_source
+from clrecon.opencl.sources import KernelArgument, definitions_of, find_signatures, read_kernel_source
 from clrecon.system.log import get_logger
 
 log = get_logger(__name__)

@@ -1,6 +1,6 @@
 """Quirks: every exception that a driver or pyopencl needs, each with its reason.
 
-One has its own file: `clrecon.opencl.unknown_cpu`.
+One has its own file: `clrecon.opencl.pocl`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from functools import cache
 from typing import Any
 
 from clrecon.errors import DeviceError
-from clrecon.opencl.cache.folders import prepare_caches
+from clrecon.opencl.cache import prepare_caches
 
 SIMULATOR_PLATFORMS = ("oclgrind",)
 """Platforms of simulators, which claim to be fast devices (Oclgrind: CPU, GPU and accelerator at once) and are 1000

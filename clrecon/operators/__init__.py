@@ -3,7 +3,7 @@ modified.
 """
 
 from clrecon.opencl import Device, choose_device, take_device
-from clrecon.opencl.first_use import register
+from clrecon.opencl.select import register
 
 __all__ = ["choose_device", "take_device"]  # from here on they check a device at its first use
 

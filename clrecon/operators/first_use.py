@@ -1,6 +1,6 @@
 """The check of a device at its first use: the surface of a ball, which is known exactly.
 
-It builds what most surfaces need, and what it finds is remembered by `clrecon.opencl.first_use`.  `clrecon selftest`
+It builds what most surfaces need, and what it finds is remembered by `clrecon.opencl.select`.  `clrecon selftest`
 checks every kernel.
 """
 

@@ -29,9 +29,8 @@ from clrecon.phantom.settings import KINDS, PhantomSettings
 from clrecon.phantom.spine import draw_spine, label_levels
 from clrecon.phantom.tissue import BLOOD_HU
 from clrecon.system.files import temporary_folder
+from clrecon.system.paths import existing_stay, place_folder, read_regular, refuse_existing, resolve_target
 from clrecon.system.progress import Progress
-from clrecon.system.regular_files import read_regular
-from clrecon.system.targets import existing_stay, place_folder, refuse_existing, resolve_target
 from clrecon.version import package_version
 
 TRUTH_NAME = "truth.json"

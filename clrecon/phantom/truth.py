@@ -19,7 +19,7 @@ from clrecon.phantom.placement import place_slices
 from clrecon.phantom.settings import CENTRE_LPS_MM, KINDS, PhantomSettings
 from clrecon.phantom.spine import label_levels, plan_spine
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.regular_files import read_regular
+from clrecon.system.paths import read_regular
 
 Float64Array = NDArray[np.float64]
 

@@ -15,10 +15,9 @@ from clrecon.exchange.coordinates import as_stored
 from clrecon.geometry import frame_from_lps
 from clrecon.points.voxel_numbers import VoxelNumbers
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.installing import install_command
-from clrecon.system.messages import Message
-from clrecon.system.public import public_function
-from clrecon.system.targets import keep_existing
+from clrecon.system.base_classes import Message
+from clrecon.system.packages import install_command, public_function
+from clrecon.system.paths import keep_existing
 
 MOST_POINTS = 2**31 - 1
 """Most points of a cloud, so that their numbers fit a signed 32-bit integer."""

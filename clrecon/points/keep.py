@@ -13,8 +13,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.points.cloud import PointCloud
 from clrecon.points.cluster_figures import SHEET_POINTS, SHEET_RATIO, ClusterFigures, measure_clusters
 from clrecon.points.step import PointStep
-from clrecon.system.arguments import explains_arguments
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import explains_arguments, name_parameter
 
 KEEP_FORMS = "largest, largest:N, min:POINTS, seed:X,Y,Z and no-sheets"
 """The forms of a keep rule, for messages and help."""

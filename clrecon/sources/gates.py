@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from clrecon.sources.facts import PixelFacts
-from clrecon.system.gates import Gate, none_of
+from clrecon.system.records import Gate, none_of
 
 PADDING_SHARE = 0.75
 """Largest share of padding.  A circle in its square leaves 0.21, a 500 mm circle in a field of 800 mm 0.69; above that

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry.affine import TILT_REPORT_DEG
-from clrecon.system.threads import count_readers
+from clrecon.system.pieces import count_readers
 
 LEAST_LIKENESS = 1.25
 """Ratio of the differences from neighbours to those from the slice one period on; from this ratio on slices belong to

@@ -7,7 +7,7 @@ from typing import Any
 
 from clrecon.errors import ClreconError
 from clrecon.geometry.certificate import Certificate
-from clrecon.system.public import public_function
+from clrecon.system.packages import public_function
 
 
 @dataclass(frozen=True)

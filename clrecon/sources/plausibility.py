@@ -19,7 +19,7 @@ from clrecon.sources.sample import ValueSample
 from clrecon.sources.scale import LOWEST_AIR_HU, SCALE_SAID, judge_scale
 from clrecon.sources.sign import SIGN_SAID, judge_sign
 from clrecon.sources.stored_values import StoredValues
-from clrecon.system.gates import Gate, unmeasured
+from clrecon.system.records import Gate, unmeasured
 
 CEILING_BITS = 12
 """Bits of most scanners, even where more bits are stored: 3071 HU with intercept -1024."""

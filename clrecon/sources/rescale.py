@@ -6,7 +6,7 @@ import math
 from typing import Any, NamedTuple
 
 from clrecon.errors import UsageError
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 LARGEST = 1e6
 

@@ -16,7 +16,7 @@ import numpy as np
 from clrecon.sources.facts import PixelFacts
 from clrecon.sources.peaks import Peak, find_peaks
 from clrecon.sources.sample import ValueSample
-from clrecon.system.gates import Gate, none_of, unmeasured
+from clrecon.system.records import Gate, none_of, unmeasured
 
 SCALE_SAID = "peaks of air (near -1000 HU) and soft tissue (0 to 80 HU) that lie elsewhere"
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from clrecon.sources.facts import PixelFacts
 from clrecon.sources.sample import sample_slices
 from clrecon.sources.stored_values import StoredValues
-from clrecon.system.gates import Gate, none_of, unmeasured
+from clrecon.system.records import Gate, none_of, unmeasured
 
 SIGN_SAID = "neighbouring values that lie nearly the whole range of the stored bits apart: the sign is lost"
 

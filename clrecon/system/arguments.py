@@ -1,15 +1,23 @@
-"""Arguments of public functions: where one fails on an argument of a wrong kind, the error names the parameter.
+"""Arguments of public functions: the words by which a message names them, and which one is of a wrong kind.
 
-What is wanted is read from the annotations, so that it stands once.  Only kinds are told apart (a number, a text, a
-`Volume`); what a function checks by itself it says by itself, with ranges and shapes.
-"""
+A parameter is named by Python's word, or by that of the command line when it runs.
+
+>>> name_parameter("keep_largest", "N")
+'keep_largest=N'
+
+On the command line the same call returns the option of the running command: see `clrecon.cli.wording`.
+
+Where a function fails on an argument of a wrong kind, the error names the parameter.  What is wanted is read from the
+annotations, so that it stands once.  Only kinds are told apart (a number, a text, a `Volume`); what a function checks
+by itself it says by itself, with ranges and shapes."""
 
 from __future__ import annotations
 
 import functools
 import inspect
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 from clrecon.errors import ClreconError, UsageError
@@ -17,6 +25,42 @@ from clrecon.errors import ClreconError, UsageError
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+
+Speaker = Callable[[str, object], str]
+"""Function that takes a parameter and its value (None for the parameter alone) and returns the words."""
+
+
+def in_python(parameter: str, value: object = None) -> str:
+    """Return the words for a caller in Python; capital letters stand for a value: ``N``, ``(BONE, TISSUE)``."""
+    if value is None:
+        return parameter
+    placeholder = isinstance(value, str) and value == value.upper()
+    return f"{parameter}={value if placeholder else repr(value)}"
+
+
+_speaker: Speaker = in_python
+
+
+def name_parameter(parameter: str, value: object = None) -> str:
+    """Name a parameter, with a value if one is given, in Python's words or those of the command line.
+
+    parameter: As Python calls it, such as ``"keep_largest"``.
+    value: True, a number, a text, or capital letters that stand for one: ``"N"``.
+    """
+    return _speaker(parameter, value)
+
+
+@contextmanager
+def spoken_by(speaker: Speaker) -> Iterator[None]:
+    """Let `speaker` name parameters within a block; messages of other threads change with it during that time."""
+    global _speaker
+    before, _speaker = _speaker, speaker
+    try:
+        yield
+    finally:
+        _speaker = before
+
 
 _CLASSES = (
     "Volume", "DeviceVolume", "Mesh", "LabelMap", "PointCloud", "Mask", "Camera", "Grid", "GridCells", "GhostSlices",

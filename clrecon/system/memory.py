@@ -1,10 +1,17 @@
-"""Memory for voxels, checked before it is taken: a small file that claims huge dimensions cannot fill the computer."""
+"""Memory for voxels, checked before it is taken: a small file that claims huge dimensions cannot fill the computer.
+
+What may be taken is also limited by a container or service (Linux control groups).
+
+Voxels in a memory-mapped file can be released from memory, and found in their file."""
 
 from __future__ import annotations
 
 import math
+import mmap
 import os
-from collections.abc import Sequence
+import stat
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +19,6 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import RefusedInputError
-from clrecon.system.aligned import aligned_empty
-from clrecon.system.control_groups import free_bytes_of_container
 
 MEMORY_SHARE = 0.9
 """Share of the free memory that voxels may take; the rest is for what is computed beside the volume."""
@@ -60,3 +65,174 @@ def allocate_voxels(shape: Sequence[int], dtype: DTypeLike, name: str = "") -> N
         return aligned_empty(shape, dtype)
     except MemoryError as error:
         raise RefusedInputError(f"{what}, which cannot be had") from error
+
+
+_FILES = {  # Of a version of control groups: the files of limit and use, and the reclaimable field of memory.stat.
+    2: ("memory.max", "memory.current", "inactive_file"),
+    1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+}
+
+
+def free_bytes_of_container(proc: Path, groups: Path) -> float:
+    """Return the bytes that this process may still take before it is killed; infinity without a limit.
+
+    proc, groups: Folders of processes and of control groups: ``/proc`` and ``/sys/fs/cgroup``.
+    """
+    return min(_group_bytes(proc, groups), default=math.inf)
+
+
+def _group_bytes(proc: Path, groups: Path) -> Iterator[int]:
+    """Free bytes in the control group of this process and in each group around it."""
+    try:
+        lines = (proc / "self" / "cgroup").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return
+    for line in lines:
+        number, _, rest = line.partition(":")
+        controllers, _, path = rest.partition(":")
+        if number == "0":
+            version, root = 2, groups
+        elif "memory" in controllers.split(","):
+            version, root = 1, groups / "memory"
+        else:
+            continue
+        own = root / path.lstrip("/")
+        for folder in (own, *own.parents):  # A container may see its own group as the root.
+            free = _free_in(folder, *_FILES[version])
+            if free is not None:
+                yield free
+            if folder == root:
+                break
+
+
+def _free_in(folder: Path, limit: str, used: str, reclaimable: str) -> int | None:
+    try:
+        free = int((folder / limit).read_text()) - int((folder / used).read_text())
+        fields = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
+        return max(free + int(fields.get(reclaimable, 0)), 0)
+    except (OSError, ValueError):
+        return None  # no limit ("max"), or no group of this name
+
+
+def aligned_empty(shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
+    """Return an uninitialised C-contiguous array that begins at the start of a memory page.
+
+    CPU drivers use the memory of such an array directly (Intel's copies any other array), and kernels may read it as
+    vectors.
+    """
+    dtype = np.dtype(dtype)
+    size = int(np.prod(shape, dtype=object)) * dtype.itemsize
+    raw = np.empty(size + mmap.PAGESIZE, np.uint8)
+    first = -raw.ctypes.data % mmap.PAGESIZE
+    return raw[first : first + size].view(dtype).reshape(shape)
+
+
+@dataclass(frozen=True)
+class FilePlace:
+    """The place of a C-contiguous array in a file, and the state of the file at that time.
+
+    path: Absolute.
+    offset: Bytes before the first value.
+    dtype: With the byte order, as ``numpy.dtype.str`` has it.
+    file_bytes, changed_ns: Size of the file, and when it was changed last (ns since 1970).
+    """
+
+    path: str
+    offset: int
+    dtype: str
+    shape: tuple[int, ...]
+    file_bytes: int
+    changed_ns: int
+
+    def open(self) -> NDArray[Any]:
+        """Map the array into memory, read-only."""
+        what = f"voxels were sent as a place in the file {self.path}"
+        try:
+            found = os.stat(self.path)
+            if not stat.S_ISREG(found.st_mode) or (found.st_size, found.st_mtime_ns) != (
+                self.file_bytes,
+                self.changed_ns,
+            ):
+                raise RefusedInputError(f"{what}, which has changed since then: send the volume again")
+            return np.memmap(self.path, np.dtype(self.dtype), "r", self.offset, self.shape)
+        except OSError as error:
+            raise RefusedInputError(
+                f"{what}, which cannot be read here ({error.strerror or error}): keep it until all have read it, or"
+                " send a volume that is not memory-mapped"
+            ) from error
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """A memory mapping of a file.
+
+    address: Address of its first byte in memory.
+    path: Path of the file, if it is known.
+    start: Offset in the file at which the mapping begins, bytes.
+    identity: Device and number of the file when the mapping was found: another file may take its name later.
+    """
+
+    file: mmap.mmap
+    address: int
+    path: str | None
+    start: int
+    identity: tuple[int, int] | None
+    writeable: bool
+
+    def release(self, part: NDArray[Any]) -> None:
+        """Let the whole pages of `part`, a C-contiguous view of the mapping, leave memory.
+
+        They stay in the system's file cache while it has room, and are read again when they are used.
+        """
+        begin = part.ctypes.data - self.address
+        first = -(-begin // mmap.PAGESIZE) * mmap.PAGESIZE
+        end = (begin + part.nbytes) // mmap.PAGESIZE * mmap.PAGESIZE
+        if end > first and hasattr(mmap, "MADV_DONTNEED"):
+            self.file.madvise(mmap.MADV_DONTNEED, first, end - first)
+
+    def place(self, part: NDArray[Any]) -> FilePlace | None:
+        """Return where `part`, a C-contiguous view of the mapping, is in the file; changes are written to the file
+        first.
+
+        Returns: None where the path no longer names the mapped file.
+        """
+        if self.path is None or self.identity is None:
+            return None
+        if self.writeable:
+            self.file.flush()
+        try:
+            found = os.stat(self.path)
+        except OSError:
+            return None
+        if (found.st_dev, found.st_ino) != self.identity:
+            return None
+        offset = self.start + part.ctypes.data - self.address
+        return FilePlace(self.path, offset, part.dtype.str, part.shape, found.st_size, found.st_mtime_ns)
+
+
+def find_mapping(array: NDArray[Any]) -> Mapping | None:
+    """Return the file mapping that `array` is a view of, None where its values are ordinary memory.
+
+    Only a `numpy.memmap` that is shared with its file is accepted: changes to any other mapping would be lost.
+    """
+    owner: Any = array
+    while isinstance(owner, np.ndarray):
+        base: Any = owner.base
+        if isinstance(owner, np.memmap) and isinstance(base, mmap.mmap):
+            return None if owner.mode == "c" else _describe(owner, base)
+        owner = base
+    return None
+
+
+def _describe(owner: np.memmap[Any, Any], file: mmap.mmap) -> Mapping:
+    path = None if owner.filename is None else os.path.abspath(owner.filename)
+    identity = None
+    if path is not None:
+        try:
+            found = os.stat(path)
+            identity = found.st_dev, found.st_ino
+        except OSError:  # removed since it was mapped
+            path = None
+    start = owner.offset - owner.offset % mmap.ALLOCATIONGRANULARITY  # numpy maps from a multiple of this
+    address = np.frombuffer(file, np.uint8, 1).ctypes.data
+    return Mapping(file, address, path, start, identity, owner.mode != "r")

@@ -1,12 +1,21 @@
-"""Packages that not every use of clrecon needs, imported where one is."""
+"""What is imported by name when it is needed: packages that not every use needs, and public functions further right.
+
+`Volume.save` is `clrecon.write_volume`, and the writers of files know volumes: an import in the class would lead round
+a corner.  The list of the public names, `clrecon/__init__.pyi`, knows where both are.  The guard of the layers lists
+the modules that call this one."""
 
 from __future__ import annotations
 
+import importlib.util
+import os
+import shlex
+import shutil
+import subprocess
+import sys
 from importlib import import_module
 from typing import Any
 
 from clrecon.errors import UsageError
-from clrecon.system.installing import install_command
 
 
 def import_package(module: str, what: str, package: str | None = None) -> Any:
@@ -21,3 +30,24 @@ def import_package(module: str, what: str, package: str | None = None) -> Any:
     except ImportError as error:
         named = package or module
         raise UsageError(f"{what} needs the package {named}: {install_command(named)}") from error
+
+
+def install_command(*packages: str) -> str:
+    """Return a line for the shell that installs packages for this Python, wherever clrecon was installed from.
+
+    A bare ``pip`` may belong to another Python, and an extra of clrecon can be named only where an index has clrecon.
+    Environments without pip, as uv makes them, get uv's own command.
+
+    *packages: Names as package indexes have them.
+    """
+    python = [sys.executable or "python3"]
+    if importlib.util.find_spec("pip") is None and shutil.which("uv") is not None:
+        words = ["uv", "pip", "install", "-p", *python, *packages]
+    else:
+        words = [*python, "-m", "pip", "install", *packages]
+    return subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
+
+
+def public_function(name: str) -> Any:
+    """Return a public function, ``clrecon.NAME``; its module is imported when it is first asked for."""
+    return getattr(sys.modules["clrecon"], name)

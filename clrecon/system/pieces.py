@@ -1,15 +1,14 @@
-"""Work on long arrays in pieces that fit the processor's cache, and coordinates that are small numbers."""
+"""Work on long arrays in pieces that fit the processor's cache, its threads, and coordinates that are small numbers."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-
-from clrecon.system.threads import count_readers
 
 CHUNK = 1 << 14
 """Triangles in a piece.  These take about 2 MB in float64; pieces 32 times as long took 1.5 times the time."""
@@ -79,3 +78,9 @@ def local_origin(vertices: NDArray[np.floating]) -> NDArray[np.float64]:
     if len(vertices) == 0:
         return np.zeros(3)
     return 0.5 * (vertices.min(axis=0).astype(np.float64) + vertices.max(axis=0))
+
+
+def count_readers(slices: int, most: int) -> int:
+    """Return the number of reading threads: the number of cores that this process may use."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(most, cores, slices))

@@ -1,8 +1,17 @@
-"""Progress of long work: the type of the functions that receive it."""
+"""Long work: functions that receive its progress, Ctrl-C while kernels are built, and the time limit of a device.
+
+Ctrl-C is held back while threads build kernels.  LLVM, the compiler within PoCL, answers a SIGINT by taking its
+unfinished files away and complaining on the console, whatever thread is meant.  A signal that all threads hold back
+reaches nobody: the one that waits for it asks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from clrecon.errors import UsageError
 
 Progress = Callable[[str, int, int], None]
 """Called as ``progress(stage, done, total)``; ``total`` is 0 where the end is not known.
@@ -36,3 +45,70 @@ class Steps:
     def take_slice(self, piece: slice) -> None:
         """Report the steps of a slice of a range, for `clrecon.system.pieces.in_threads`."""
         self.take(piece.stop - piece.start)
+
+
+@contextmanager
+def held_interrupts() -> Iterator[None]:
+    """Hold SIGINT back in this thread and in those that it starts within the block; on Windows nothing is held."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def take_interrupt() -> bool:
+    """True, once, where SIGINT has come while it was held back."""
+    if not hasattr(signal, "sigpending") or signal.SIGINT not in signal.sigpending():
+        return False
+    signal.sigwait({signal.SIGINT})
+    return True
+
+
+DEFAULT_SECONDS = 600.0
+"""Far above any launch: a kernel of clrecon takes seconds at most, on a slow CPU with a large scan a minute."""
+
+_seconds = DEFAULT_SECONDS
+
+
+def device_seconds() -> float:
+    """Seconds that a device may be without progress; infinite without a limit."""
+    return _seconds
+
+
+def check_time_limit(seconds: float) -> float:
+    """Return the seconds of a time limit, infinite for 0."""
+    if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not seconds >= 0.0:
+        raise UsageError(f"a time limit is a number of seconds, 0 for none, not {seconds!r}")
+    return float(seconds) or math.inf
+
+
+@contextmanager
+def time_limit(timeout: float) -> Iterator[None]:
+    """Limit the time that a device may take without any progress within a block, in all threads of the process.
+
+    A device makes progress whenever a kernel or a transfer ends.  One that makes none for longer has most likely hung:
+    `DeviceError` names the kernel, and the device gets a fresh context for later work.
+
+    >>> with clrecon.time_limit(30):
+    ...     mesh = clrecon.extract_isosurface(volume, 200)
+
+    Parameters
+    ----------
+    timeout : float
+        Seconds; 0: no limit.  Outside of all blocks it is 600.
+
+    Raises
+    ------
+    UsageError
+        ``timeout`` is not a number from 0 on.
+    """
+    global _seconds
+    before, _seconds = _seconds, check_time_limit(timeout)
+    try:
+        yield
+    finally:
+        _seconds = before

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from body_volumes import AFFINE, SHAPE, add_table, as_volume, ellipse, make_patient
 
-from clrecon.anatomy.outside_air import leave_outside_air
+from clrecon.anatomy.surroundings import leave_outside_air
 from clrecon.errors import NoSurfaceError, RefusedInputError
 from clrecon.geometry import Volume
 

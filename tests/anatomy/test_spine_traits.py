@@ -5,18 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from clrecon.anatomy import spine_traits
+from clrecon.anatomy import spine_cells
 from clrecon.anatomy.spine_cells import (
     CELL_MM,
+    SURE,
+    WORTH,
     SpineCells,
     average_cells,
     disc_mean,
     grow_cortex,
     heights,
     mean_along_z,
+    measure_likeness,
     plan_cells,
 )
-from clrecon.anatomy.spine_traits import SURE, WORTH, measure_likeness
 from clrecon.geometry import Volume
 
 pytestmark = pytest.mark.unit
@@ -121,7 +123,7 @@ def test_the_worth_of_every_cell(border):
 
 def test_some_of_these_cells_are_sure(monkeypatch):
     """The test before compares something: with lower bounds some cells are sure and others are not."""
-    monkeypatch.setattr(spine_traits, "SURE", {"wall": 0.2, "mirror": 0.01, "body": 0.2, "soft": 0.2})
+    monkeypatch.setattr(spine_cells, "SURE", {"wall": 0.2, "mirror": 0.01, "body": 0.2, "soft": 0.2})
     sure = measure_likeness(some_cells(), lambda _: None).sure
     assert 0.001 < sure.mean() < 0.9
 

@@ -91,7 +91,7 @@ CALLS_PUBLIC = {
 
 
 def public_calls(source: str) -> set[str]:
-    """Names that a source asks `clrecon.system.public` for; "?" for one that is not written out."""
+    """Names that a source asks `clrecon.system.packages` for; "?" for one that is not written out."""
     calls = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)]
     asked = [call.args[0] for call in calls if isinstance(call.func, ast.Name) and call.func.id == "public_function"]
     return {str(name.value) if isinstance(name, ast.Constant) else "?" for name in asked}

@@ -21,7 +21,7 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.render.files import PictureFiles
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.jobs.shared.settings import InputSettings
-from clrecon.system.wording import in_python, name_parameter, spoken_by
+from clrecon.system.arguments import in_python, name_parameter, spoken_by
 from clrecon.viewer.web.serve import serve_view
 
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from clrecon.errors import DeviceError
-from clrecon.opencl import program, quirks
-from clrecon.opencl.cache import binaries
-from clrecon.opencl.cache.binaries import binary_key, read_binary, store_binary
-from clrecon.opencl.cache.folders import make_private, prepare_caches
+from clrecon.opencl import cache, program, quirks
+from clrecon.opencl.cache import binary_key, make_private, prepare_caches, read_binary, store_binary
 from clrecon.opencl.program import load_program
 from clrecon.opencl.sources import read_kernel_source
 
@@ -23,7 +21,7 @@ def own_cache(tmp_path, monkeypatch):
     folder = tmp_path / "kernels"
     make_private(folder)
     caches = prepare_caches()._replace(binaries=folder)
-    monkeypatch.setattr(binaries, "prepare_caches", lambda: caches)
+    monkeypatch.setattr(cache, "prepare_caches", lambda: caches)
     return folder
 
 
@@ -66,7 +64,7 @@ def test_row_59_a_binary_in_the_place_of_another_is_not_trusted(own_cache):
 
 def test_without_a_folder_nothing_is_kept(own_cache, monkeypatch):
     caches = prepare_caches()._replace(binaries=None)
-    monkeypatch.setattr(binaries, "prepare_caches", lambda: caches)
+    monkeypatch.setattr(cache, "prepare_caches", lambda: caches)
     store_binary(KEY, b"program")
     assert read_binary(KEY) is None and not list(own_cache.iterdir())
 
@@ -87,7 +85,7 @@ def test_row_72_files_are_private_whatever_the_umask(own_cache):
 
 
 def test_the_oldest_go(own_cache, monkeypatch):
-    monkeypatch.setattr(binaries, "_MOST_FILES", 3)
+    monkeypatch.setattr(cache, "_MOST_FILES", 3)
     for number in range(5):
         store_binary(binary_key(str(number)), b"program")
         os.utime(own_cache / binary_key(str(number)), (number, number))

@@ -16,11 +16,10 @@ import pytest
 from made_once import make_once
 
 from clrecon.errors import DeviceError
-from clrecon.opencl import quirks
-from clrecon.opencl.cache import folders
-from clrecon.opencl.cache.folders import cache_warnings, find_fault, make_private, prepare_caches, refuse_short_files
+from clrecon.opencl import cache, quirks
+from clrecon.opencl.cache import cache_warnings, find_fault, make_private, prepare_caches, refuse_short_files
 
-VARIABLES = ("XDG_CACHE_HOME", "POCL_CACHE_DIR", "PYOPENCL_NO_CACHE", *folders._MESA_OFF)
+VARIABLES = ("XDG_CACHE_HOME", "POCL_CACHE_DIR", "PYOPENCL_NO_CACHE", *cache._MESA_OFF)
 
 CODE = """
 import json, sys
@@ -118,8 +117,8 @@ def fresh(tmp_path, monkeypatch):
         monkeypatch.delenv(name)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
     leaving = []
-    monkeypatch.setattr(folders, "atexit", SimpleNamespace(register=lambda *call: leaving.append(call)))
-    yield folders.prepare_caches.__wrapped__
+    monkeypatch.setattr(cache, "atexit", SimpleNamespace(register=lambda *call: leaving.append(call)))
+    yield cache.prepare_caches.__wrapped__
     for remove, folder in leaving:
         remove(folder)
         assert not os.path.exists(folder)
@@ -234,7 +233,7 @@ def test_row_59_a_folder_without_room_is_not_used(fresh, monkeypatch):
     def disk_usage(folder):
         return SimpleNamespace(free=63 << 20 if "home" in folder.parts else 64 << 20)
 
-    monkeypatch.setattr(folders, "shutil", SimpleNamespace(disk_usage=disk_usage, rmtree=shutil.rmtree))
+    monkeypatch.setattr(cache, "shutil", SimpleNamespace(disk_usage=disk_usage, rmtree=shutil.rmtree))
     caches = fresh()
     [warning] = caches.warnings
     assert warning.endswith("XDG_CACHE_HOME has room for 63 MiB, and 64 MiB are needed") and not caches.refusal
@@ -243,9 +242,9 @@ def test_row_59_a_folder_without_room_is_not_used(fresh, monkeypatch):
 
 def test_row_59_no_room_anywhere_is_an_error(fresh, monkeypatch):
     room = SimpleNamespace(disk_usage=lambda folder: SimpleNamespace(free=0), rmtree=shutil.rmtree)
-    monkeypatch.setattr(folders, "shutil", room)
+    monkeypatch.setattr(cache, "shutil", room)
     caches = fresh()
-    monkeypatch.setattr(folders, "prepare_caches", lambda: caches)
+    monkeypatch.setattr(cache, "prepare_caches", lambda: caches)
     with pytest.raises(DeviceError, match="the temporary folder has room for 0 MiB.*: free some space"):
         refuse_short_files()
 
@@ -271,8 +270,8 @@ def test_a_folder_that_a_driver_still_writes_to_is_removed(tmp_path):
             (folder / "newer").write_bytes(b"kernel")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(folders, "shutil", SimpleNamespace(rmtree=remove_all_but_a_newer_file))
-        folders._remove_tree(str(folder))
+        patch.setattr(cache, "shutil", SimpleNamespace(rmtree=remove_all_but_a_newer_file))
+        cache._remove_tree(str(folder))
     assert len(removed) == 3 and not folder.exists()
 
 

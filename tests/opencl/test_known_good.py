@@ -11,8 +11,8 @@ import sys
 
 import pytest
 
-from clrecon.opencl.cache import known_good
-from clrecon.opencl.cache.known_good import DAMAGED, UNFINISHED, KnownGood
+from clrecon.opencl import pocl
+from clrecon.opencl.pocl import DAMAGED, UNFINISHED, KnownGood
 from clrecon.opencl.quirks import is_pocl
 
 CODE = """
@@ -115,7 +115,7 @@ KEY, PROGRAM = "a" * 64, "AB/CDEFG"
 @pytest.fixture
 def records(tmp_path, monkeypatch):
     """Makes a `KnownGood` as in a new process, with no end of it but `record`."""
-    monkeypatch.setattr(known_good.atexit, "register", lambda call: None)
+    monkeypatch.setattr(pocl.atexit, "register", lambda call: None)
     made: list[KnownGood] = []
 
     def make():
@@ -231,7 +231,7 @@ def test_what_another_process_is_building_stays(records, tmp_path):
     assert not (tmp_path / "tempfile_abc.so").exists()
     second = os.open(tmp_path / "in-use", os.O_RDWR)
     try:
-        known_good.fcntl.flock(second, known_good.fcntl.LOCK_SH)
+        pocl.fcntl.flock(second, pocl.fcntl.LOCK_SH)
         assert not other._is_alone()
     finally:
         os.close(second)
@@ -277,6 +277,6 @@ def test_a_long_process_records_what_has_worked_for_some_seconds(records, tmp_pa
     build(store, tmp_path)
     store.record_when_due()
     assert not (tmp_path / "records" / KEY).exists()
-    monkeypatch.setattr(known_good.time, "perf_counter", lambda: float("inf"))
+    monkeypatch.setattr(pocl.time, "perf_counter", lambda: float("inf"))
     store.record_when_due()
     assert (tmp_path / "records" / KEY).exists()

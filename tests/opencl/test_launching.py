@@ -13,7 +13,7 @@ from variants import VOXEL_TYPES
 from clrecon.opencl import allocate, download, kernel_files, launch, load_program, read_kernel_source, upload
 from clrecon.opencl.program import LAUNCHES_BEFORE_TYPES
 from clrecon.opencl.quirks import import_pyopencl
-from clrecon.opencl.signatures import KernelArgument, definitions_of, find_signatures
+from clrecon.opencl.sources import KernelArgument, definitions_of, find_signatures
 from clrecon.operators.resident.tables import BrickRanges, compare_bricks
 
 VARIANTS = [

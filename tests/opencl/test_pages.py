@@ -8,7 +8,7 @@ import threading
 import numpy as np
 import pytest
 
-from clrecon.opencl.pages import BLOCK_BYTES, SMALLEST_BYTES, PagePool
+from clrecon.opencl.arrays import BLOCK_BYTES, SMALLEST_BYTES, PagePool
 
 ROWS = SMALLEST_BYTES
 

@@ -10,7 +10,7 @@ import pytest
 
 from clrecon.errors import DeviceError
 from clrecon.opencl import check_budget, choose_device, list_devices, list_platforms, select
-from clrecon.opencl.context import _find_shortcoming
+from clrecon.opencl.device import _find_shortcoming
 
 
 class FakeDevice:

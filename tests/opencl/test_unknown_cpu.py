@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import pytest
 
 from clrecon.errors import DeviceError
-from clrecon.opencl import unknown_cpu
-from clrecon.opencl.context import Device
-from clrecon.opencl.unknown_cpu import CPU_NAMES, UNKNOWN, NameOfCpu, choose_name, has_unknown_cpu
+from clrecon.opencl import pocl
+from clrecon.opencl.device import Device
+from clrecon.opencl.pocl import CPU_NAMES, UNKNOWN, NameOfCpu, choose_name, has_unknown_cpu
 
 linux_only = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
@@ -52,13 +52,13 @@ def test_names_fit_where_the_unknown_one_was():
 
 @linux_only
 def test_only_pocl_on_a_cpu_that_it_does_not_know_is_touched(monkeypatch):
-    monkeypatch.setattr(unknown_cpu.platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(pocl.platform, "machine", lambda: "x86_64")
     assert has_unknown_cpu(POCL, ZEN_5) and has_unknown_cpu(POCL, ZEN_5.replace("pthread", "basic") + " ")
     for known in ("znver3", "skylake-avx512"):
         assert not has_unknown_cpu(POCL, ZEN_5.replace("generic", known))
     assert not has_unknown_cpu("rusticl", ZEN_5)
     assert not has_unknown_cpu(POCL, ZEN_5.replace("x86_64", "aarch64"))
-    monkeypatch.setattr(unknown_cpu.platform, "machine", lambda: "aarch64")
+    monkeypatch.setattr(pocl.platform, "machine", lambda: "aarch64")
     assert not has_unknown_cpu(POCL, ZEN_5)
 
 
@@ -122,7 +122,7 @@ def make_device(device: Device, address: int) -> Device:
 
 @linux_only
 def test_a_device_whose_cpu_cannot_be_named_says_what_to_install(device, monkeypatch):
-    monkeypatch.setattr(unknown_cpu.platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(pocl.platform, "machine", lambda: "x86_64")
     made = Structure(b"nothing", b"of the kind")
     found = make_device(device, made.address)
     assert found.shortcoming.startswith(
@@ -133,7 +133,7 @@ def test_a_device_whose_cpu_cannot_be_named_says_what_to_install(device, monkeyp
 
 @linux_only
 def test_a_device_names_its_cpu_when_it_is_opened_and_not_before(device, monkeypatch):
-    monkeypatch.setattr(unknown_cpu.platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(pocl.platform, "machine", lambda: "x86_64")
     made = Structure(b"x86_64-unknown-linux-gnu", UNKNOWN)
     found = make_device(device, made.address)
     assert found.shortcoming == "" and made.texts[1] == UNKNOWN

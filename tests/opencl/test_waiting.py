@@ -12,11 +12,10 @@ import pytest
 
 from clrecon.errors import DeviceFailedError, DeviceLostError, DeviceMemoryError, DeviceTimeoutError
 from clrecon.opencl import Stopwatch, allocate, download, launch, load_program, settle, upload, wait
-from clrecon.opencl import commands as commands_module
-from clrecon.opencl.commands import Commands, has_hung_commands
-from clrecon.opencl.context import _Opened
+from clrecon.opencl import device as commands_module
+from clrecon.opencl.device import Commands, _Opened, has_hung_commands
 from clrecon.opencl.quirks import import_pyopencl
-from clrecon.system.time_limit import time_limit
+from clrecon.system.progress import time_limit
 
 
 class Event:
@@ -136,7 +135,7 @@ def test_row_56_an_interrupt_keeps_the_context_of_a_device_that_ends_in_time(dev
     event, context = Event(), object()
     device.commands.add("kernel one", event, QUEUE)
     monkeypatch.setattr(device._opened, "context", context)
-    monkeypatch.setattr("clrecon.opencl.waiting._watch", _interrupt)
+    monkeypatch.setattr("clrecon.opencl.launching._watch", _interrupt)
     if is_short:
         threading.Timer(0.1, event.end).start()
     with pytest.raises(KeyboardInterrupt):

@@ -16,7 +16,7 @@ import pytest
 
 from clrecon.errors import DeviceError
 from clrecon.geometry import Volume
-from clrecon.opencl import Device, first_use, program
+from clrecon.opencl import Device, program, select
 from clrecon.operators.first_use import check_ball
 from clrecon.operators.surface.extract import extract_isosurface
 
@@ -70,12 +70,12 @@ def checked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
     def check(device: Any) -> str:
         seen.append(device)
-        assert first_use.find_fault(device) == ""  # what the check itself asks of the device
+        assert select.find_fault(device) == ""  # what the check itself asks of the device
         return "wrong sums" if device.name == "wrong" else ""
 
-    monkeypatch.setattr(first_use, "_check", [check])
-    monkeypatch.setattr(first_use, "read_binary", files.get)
-    monkeypatch.setattr(first_use, "store_binary", files.__setitem__)
+    monkeypatch.setattr(select, "_check", [check])
+    monkeypatch.setattr(select, "read_binary", files.get)
+    monkeypatch.setattr(select, "store_binary", files.__setitem__)
     return seen
 
 
@@ -83,62 +83,62 @@ def test_row_57_the_check_runs_once_for_a_driver_a_device_and_a_version(
     checked: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first: Any = FakeDevice()
-    assert first_use.find_fault(first) == first_use.find_fault(first) == ""
+    assert select.find_fault(first) == select.find_fault(first) == ""
     assert checked == [first]
     another_process: Any = FakeDevice()
-    assert first_use.find_fault(another_process) == "" and len(checked) == 1
+    assert select.find_fault(another_process) == "" and len(checked) == 1
     for changed in ({"driver": "2.1"}, {"name": "M"}, {"platform_version": "1.1"}):
         other: Any = FakeDevice(**changed)
-        assert first_use.find_fault(other) == "" and checked[-1] is other
-    monkeypatch.setattr(first_use, "package_version", lambda: "0.0")
-    assert first_use.find_fault(FakeDevice()) == "" and len(checked) == 5  # type: ignore[arg-type]
+        assert select.find_fault(other) == "" and checked[-1] is other
+    monkeypatch.setattr(select, "package_version", lambda: "0.0")
+    assert select.find_fault(FakeDevice()) == "" and len(checked) == 5  # type: ignore[arg-type]
 
 
 def test_row_57_what_fails_is_not_remembered_for_the_next_process(checked: list[Any]) -> None:
     for count in (1, 2):
         wrong: Any = FakeDevice(name="wrong")
-        assert first_use.find_fault(wrong) == first_use.find_fault(wrong) == "wrong sums"
+        assert select.find_fault(wrong) == select.find_fault(wrong) == "wrong sums"
         assert len(checked) == count
 
 
 @pytest.fixture
 def kept(checked: list[Any]) -> dict[str, bytes]:
     """What the files say."""
-    return first_use.read_binary.__self__  # type: ignore[attr-defined, no-any-return]
+    return select.read_binary.__self__  # type: ignore[attr-defined, no-any-return]
 
 
 def test_row_57_what_was_found_is_told_without_a_check(checked: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
     for name, words in (("wrong", "wrong sums"), ("right", "")):
         device: Any = FakeDevice(name=name)
-        assert first_use.remembered_fault(device) == ""
-        first_use.find_fault(device)
-        assert first_use.remembered_fault(FakeDevice(name=name)) == words  # type: ignore[arg-type]
+        assert select.remembered_fault(device) == ""
+        select.find_fault(device)
+        assert select.remembered_fault(FakeDevice(name=name)) == words  # type: ignore[arg-type]
     assert len(checked) == 2
-    assert first_use.remembered_fault(FakeDevice(name="wrong", is_simulator=True)) == ""  # type: ignore[arg-type]
-    monkeypatch.setenv(first_use.VARIABLE, "off")
-    assert first_use.remembered_fault(FakeDevice(name="wrong")) == ""  # type: ignore[arg-type]
+    assert select.remembered_fault(FakeDevice(name="wrong", is_simulator=True)) == ""  # type: ignore[arg-type]
+    monkeypatch.setenv(select.VARIABLE, "off")
+    assert select.remembered_fault(FakeDevice(name="wrong")) == ""  # type: ignore[arg-type]
 
 
 def test_row_57_an_interrupted_check_says_nothing(
     checked: list[Any], kept: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(device: Any) -> str:
-        assert list(kept.values()) == [first_use._BEGUN]
+        assert list(kept.values()) == [select._BEGUN]
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(first_use, "_check", [interrupt])
+    monkeypatch.setattr(select, "_check", [interrupt])
     with pytest.raises(KeyboardInterrupt):
-        first_use.find_fault(FakeDevice())  # type: ignore[arg-type]
-    assert list(kept.values()) == [b""] and first_use.remembered_fault(FakeDevice()) == ""  # type: ignore[arg-type]
+        select.find_fault(FakeDevice())  # type: ignore[arg-type]
+    assert list(kept.values()) == [b""] and select.remembered_fault(FakeDevice()) == ""  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     ("code", "fault", "remembered"),
     [
-        ("import os; os.abort()", "its driver ends the process (SIGABRT)", first_use._CRASHED),
-        ("raise SystemExit(3)", "its driver ends the process (exit code 3)", first_use._CRASHED),
-        ("print('of a driver'); print('\"wrong sums\"')", "wrong sums", first_use._WRONG),
-        ("print('\"\"')", "", first_use._PASSED),
+        ("import os; os.abort()", "its driver ends the process (SIGABRT)", select._CRASHED),
+        ("raise SystemExit(3)", "its driver ends the process (exit code 3)", select._CRASHED),
+        ("print('of a driver'); print('\"wrong sums\"')", "wrong sums", select._WRONG),
+        ("print('\"\"')", "", select._PASSED),
     ],
 )
 def test_row_57_where_a_process_died_in_the_check_a_child_makes_it(
@@ -149,19 +149,19 @@ def test_row_57_where_a_process_died_in_the_check_a_child_makes_it(
     fault: str,
     remembered: bytes,
 ) -> None:
-    monkeypatch.setattr(first_use, "_command", ["-c", code])
-    key = first_use._key(FakeDevice())  # type: ignore[arg-type]
-    for before in (first_use._BEGUN, first_use._CRASHED + b"earlier"):
+    monkeypatch.setattr(select, "_command", ["-c", code])
+    key = select._key(FakeDevice())  # type: ignore[arg-type]
+    for before in (select._BEGUN, select._CRASHED + b"earlier"):
         kept[key] = before
-        expected = {first_use._BEGUN: "a process ended while it checked this device"}.get(before, "earlier")
-        assert first_use.remembered_fault(FakeDevice()) == expected  # type: ignore[arg-type]
+        expected = {select._BEGUN: "a process ended while it checked this device"}.get(before, "earlier")
+        assert select.remembered_fault(FakeDevice()) == expected  # type: ignore[arg-type]
         device: Any = FakeDevice(index=0)
-        assert first_use.find_fault(device) == fault
+        assert select.find_fault(device) == fault
         assert kept[key] == remembered + (fault.encode() if fault else b"")
     assert checked == []
     monkeypatch.setattr(sys, "executable", "")
-    kept[key] = first_use._BEGUN
-    assert first_use.find_fault(FakeDevice(index=0)) == "a process ended while it checked this device"  # type: ignore[arg-type]
+    kept[key] = select._BEGUN
+    assert select.find_fault(FakeDevice(index=0)) == "a process ended while it checked this device"  # type: ignore[arg-type]
 
 
 CRASH = """
@@ -175,7 +175,7 @@ choose_device(int(sys.argv[1]))
 
 def test_row_57_a_crash_in_the_check_becomes_words_in_the_next_process(device: Device, tmp_path: Path) -> None:
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
-    environment.pop(first_use.VARIABLE, None)
+    environment.pop(select.VARIABLE, None)
 
     def devices() -> dict[str, Any]:
         line = [sys.executable, "-m", "clrecon.cli.main", "devices", "--json"]
@@ -195,10 +195,10 @@ def test_row_57_simulators_and_those_who_say_so_are_not_checked(
     checked: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     simulator: Any = FakeDevice(is_simulator=True)
-    assert first_use.find_fault(simulator) == ""
-    monkeypatch.setenv(first_use.VARIABLE, "off")
+    assert select.find_fault(simulator) == ""
+    monkeypatch.setenv(select.VARIABLE, "off")
     wrong: Any = FakeDevice(name="wrong")
-    assert first_use.find_fault(wrong) == "" and checked == []
+    assert select.find_fault(wrong) == "" and checked == []
     assert wrong.remarks == [
         "N (P) was not checked at its first use (CLRECON_DEVICE_CHECK=off): its results may be wrong"
     ]

@@ -30,8 +30,7 @@ _layer("dicom", "errors", "system", "geometry", "sources")
 _layer("formats", "errors", "system", "geometry", "exchange", "sources")
 _layer("reading", "errors", "system", "geometry", "sources", "dicom", "formats")
 _layer("labels", "errors", "version", "system", "geometry", "dicom", "formats")
-_layer("vertebrae", "errors", "system", "geometry", "anatomy", "labels")
-_layer("corridors", "errors", "system", "geometry", "labels")
+_layer("spine", "errors", "system", "geometry", "anatomy", "labels")
 _layer("mesh", "errors", "system", "geometry", "anatomy", "exchange")
 _layer("points", "errors", "system", "geometry", "exchange")
 _layer("rendering", "errors", "version", "system", "geometry", "labels")
@@ -51,14 +50,13 @@ _layer(
     "formats",
     "reading",
     "labels",
+    "spine",
     "mesh",
     "points",
     "rendering",
     "phantom",
     "reference",
     "operators",
-    "vertebrae",
-    "corridors",
 )
 _layer(
     "viewer",
@@ -87,16 +85,15 @@ _layer(
     "opencl",
     "geometry",
     "anatomy",
-    "corridors",
     "formats",
     "reading",
     "labels",
+    "spine",
     "mesh",
-    "phantom",
     "points",
     "rendering",
+    "phantom",
     "operators",
-    "vertebrae",
     "viewer",
 )
 
@@ -109,8 +106,6 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "formats": frozenset({"numpy"}),
     "sources": frozenset({"numpy"}),
     "labels": frozenset({"numpy"}),
-    "vertebrae": frozenset({"numpy"}),
-    "corridors": frozenset({"numpy"}),
     "mesh": frozenset({"numpy"}),
     "points": frozenset({"numpy"}),
     "exchange": frozenset({"numpy"}),
@@ -121,6 +116,7 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "operators": frozenset({"numpy"}),
     "jobs": frozenset({"numpy"}),
     "viewer": frozenset({"numpy"}),
+    "spine": frozenset({"numpy"}),
 }
 INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "geometry": frozenset({"scipy", "pyvista", "nibabel", "SimpleITK"}),
@@ -128,9 +124,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "dicom": frozenset({"imagecodecs", "openjpeg", "rle", "jpeg_ls", "pylibjpeg"}),
     "formats": frozenset({"nibabel", "nrrd", "SimpleITK"}),
     "labels": frozenset({"pydicom", "scipy"}),
-    "vertebrae": frozenset({"scipy", "skimage"}),
     "exchange": frozenset({"vtk", "vtkmodules", "laspy"}),
-    "corridors": frozenset({"scipy"}),
     "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification", "trimesh"}),
     "points": frozenset({"pyvista", "open3d"}),
     "reference": frozenset({"scipy"}),
@@ -142,6 +136,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "jobs": frozenset({"pyvista", "skimage", "vtkmodules", "matplotlib", "PIL"}),
     "viewer": frozenset({"aiohttp", "PIL", "pyvista", "vtk", "vtkmodules"}),
     "cli": frozenset({"rich"}),
+    "spine": frozenset({"scipy", "skimage"}),
 }
 
 

@@ -7,7 +7,7 @@ import mmap
 import numpy as np
 import pytest
 
-from clrecon.system.aligned import aligned_empty
+from clrecon.system.memory import aligned_empty
 
 
 @pytest.mark.parametrize("dtype", ["int16", "uint8", "float32"])

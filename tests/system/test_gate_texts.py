@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from clrecon.system.gates import at_least, at_most
+from clrecon.system.records import at_least, at_most
 
 
 def test_a_figure_beside_its_bound_has_the_digits_that_tell_them_apart() -> None:

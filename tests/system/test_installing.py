@@ -11,7 +11,7 @@ import sys
 import pytest
 from house import PACKAGE, ROOT
 
-from clrecon.system.installing import install_command
+from clrecon.system.packages import install_command
 
 
 def test_the_command_is_of_this_python(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from clrecon.system.interrupts import held_interrupts, take_interrupt
+from clrecon.system.progress import held_interrupts, take_interrupt
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="signals are not held on Windows")
 

@@ -15,8 +15,8 @@ from dicom_series import Plan, set_values, write_series
 import clrecon
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.opencl.cache import binaries
-from clrecon.opencl.cache.folders import prepare_caches
+from clrecon.opencl import cache
+from clrecon.opencl.cache import prepare_caches
 
 NAME = "Mueller^Hans"
 
@@ -54,13 +54,13 @@ def test_a_kept_binary_that_is_damaged_is_said(
 ) -> None:
     caplog.set_level(logging.INFO, "clrecon")
     caches = prepare_caches()._replace(binaries=tmp_path)
-    monkeypatch.setattr(binaries, "prepare_caches", lambda: caches)
-    assert binaries.read_binary("key") is None  # none is there: nothing to say
-    binaries.store_binary("key", b"binary")
-    assert binaries.read_binary("key") == b"binary"
+    monkeypatch.setattr(cache, "prepare_caches", lambda: caches)
+    assert cache.read_binary("key") is None  # none is there: nothing to say
+    cache.store_binary("key", b"binary")
+    assert cache.read_binary("key") == b"binary"
     assert caplog.messages == []
     (tmp_path / "key").write_bytes(content)
-    assert binaries.read_binary("key") is None
+    assert cache.read_binary("key") is None
     assert caplog.messages == ["a kept binary is damaged: it is built anew and replaced"]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from clrecon.geometry import Volume
-from clrecon.system.mapping import find_mapping
+from clrecon.system.memory import find_mapping
 
 VOXELS = np.arange(6 * 64 * 64, dtype=np.int16).reshape(6, 64, 64)
 

@@ -42,8 +42,8 @@ from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.clip import Clip
 from clrecon.sources.listing import SeriesEntry, SeriesListing
-from clrecon.system.gates import at_most
-from clrecon.vertebrae.result import MiddlePlane, Vertebra, VertebraSplit
+from clrecon.spine.split import MiddlePlane, Vertebra, VertebraSplit
+from clrecon.system.records import at_most
 
 VOXELS = np.arange(4 * 5 * 6, dtype=np.int16).reshape(4, 5, 6)
 AFFINE = np.array([[0.7, 0.1, 0.0, -25.0], [-0.1, 0.7, 0.2, -30.0], [0.0, 0.05, 2.5, -84.0], [0, 0, 0, 1.0]])

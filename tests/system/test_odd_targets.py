@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from clrecon.errors import OutputError
-from clrecon.system.targets import resolve_target
+from clrecon.system.paths import resolve_target
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="made with POSIX means")
 

@@ -12,8 +12,7 @@ import pytest
 from house import package_modules
 
 from clrecon.geometry.certificate import Certificate, amend
-from clrecon.system.gates import Gate, at_most
-from clrecon.system.records import Record
+from clrecon.system.records import Gate, Record, at_most
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from clrecon.phantom import PhantomSettings, write_phantom
 from clrecon.reading import list_series, read_volume
 from clrecon.rendering import load_transfer_function
 from clrecon.rendering.views.centre_line_files import LARGEST_BYTES, read_curve_points
-from clrecon.system.regular_files import open_regular, read_regular
+from clrecon.system.paths import open_regular, read_regular
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="FIFOs and devices of POSIX")
 
@@ -86,10 +86,9 @@ def test_a_phantom_does_not_wait_for_its_truth(tmp_path):
 
 OWN = {
     "system/files.py": "locks of folders",
-    "system/foreign_words.py": "streams of a command",
-    "system/targets.py": "a name that is taken",
-    "system/mapping.py": "maps a file that it has looked at",
-    "system/regular_files.py": "the helper itself",
+    "system/log.py": "streams of a command",
+    "system/paths.py": "a name that is taken; the helper itself",
+    "system/memory.py": "maps a file that it has looked at; the system",
     "cli/console.py": "the null device",
     "cli/standard_output.py": "what the command has just written",
     "exchange/clouds/las.py": "looks again at what it has written, and reads a file that was looked at",
@@ -98,10 +97,8 @@ OWN = {
     "dicom/pixels/decoder_pool.py": "pipes to its own processes",
     "dicom/pixels/decoder_process.py": "its own pipes and memory",
     "dicom/parse/elements.py": "looks at kind and size with one call, for speed",
-    "system/control_groups.py": "the system",
-    "system/memory.py": "the system",
-    "opencl/cache/binaries.py": "its own cache",
-    "opencl/cache/known_good.py": "its own cache",
+    "opencl/cache.py": "its own cache",
+    "opencl/pocl.py": "its own cache; the system",
     "opencl/sources.py": "its own sources",
     "exchange/glb.py": "what it has just written",
     "exchange/obj.py": "what it has just written",
@@ -114,7 +111,6 @@ OWN = {
     "exchange/threemf.py": "what it has just written",
     "exchange/vtp.py": "what it has just written",
     "__init__.py": "its own list of names",
-    "opencl/unknown_cpu.py": "the system",
     "formats/write_metaimage.py": "what it has just written",
     "jobs/bench/machine.py": "the system",
     "jobs/compare/folder.py": "what it has just written",

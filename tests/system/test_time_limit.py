@@ -7,7 +7,7 @@ import math
 import pytest
 
 from clrecon.errors import UsageError
-from clrecon.system.time_limit import DEFAULT_SECONDS, device_seconds, time_limit
+from clrecon.system.progress import DEFAULT_SECONDS, device_seconds, time_limit
 
 
 def test_time_limits():

@@ -25,7 +25,7 @@ from clrecon.dicom.headers.phase_tags import FRAME_PHASES
 from clrecon.dicom.parse.raw import IMPLICIT_LITTLE, META_START, DicomElements
 from clrecon.dicom.parse.sequences import Item, Schema, decode_number, name_tag, read_sequences
 from clrecon.dicom.parse.values import ValueProblem, Values, decode_text
-from clrecon.system.regular_files import open_regular
+from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 
 ENHANCED_CT = ("1.2.840.10008.5.1.4.1.1.2.1", "1.2.840.10008.5.1.4.1.1.2.2")

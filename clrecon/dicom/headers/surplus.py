@@ -23,8 +23,8 @@ from clrecon.dicom.parse.sequences import LONG_VRS, skip_sequence
 from clrecon.dicom.parse.transfer_syntaxes import is_encapsulated
 from clrecon.dicom.parse.values import ValueProblem
 from clrecon.errors import RefusedInputError
-from clrecon.system.regular_files import open_regular
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
+from clrecon.system.paths import open_regular
 
 PADDING_TAG = 0xFFFCFFFC
 INFLATED_LIMIT = 1 << 30

@@ -17,7 +17,7 @@ from clrecon.dicom.parse.careful import parse_carefully
 from clrecon.dicom.parse.forced import Start, describe_way_out, find_program, restore_start
 from clrecon.dicom.parse.plain import parse_plainly
 from clrecon.dicom.parse.raw import META_START, CorruptFileError, DicomElements, NotDicomError
-from clrecon.system.regular_files import open_regular
+from clrecon.system.paths import open_regular
 
 PREFIX_BYTES = 16 * 1024
 LONG_PREFIX_BYTES = 256 * 1024

@@ -12,7 +12,7 @@ import struct
 from typing import NamedTuple
 
 from clrecon.dicom.parse.raw import EXPLICIT_BIG, EXPLICIT_LITTLE, IMPLICIT_LITTLE
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 MARK_END = 132  # 128 bytes of preamble, then "DICM"
 PREAMBLE = bytes(128) + b"DICM"

@@ -12,7 +12,7 @@ import importlib.util
 
 from clrecon.dicom.parse.raw import DEFLATED, EXPLICIT_BIG, EXPLICIT_LITTLE, IMPLICIT_LITTLE
 from clrecon.errors import RefusedInputError
-from clrecon.system.installing import install_command
+from clrecon.system.packages import install_command
 from clrecon.system.text import escape_text
 
 NATIVE_SYNTAXES = (IMPLICIT_LITTLE, EXPLICIT_LITTLE, DEFLATED, EXPLICIT_BIG)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.pixels.decoder_process import DONE, FAILED, NO_DECODER, NO_MEMORY, READY, REPLY
 from clrecon.errors import RefusedInputError
-from clrecon.system.closing import Closing
+from clrecon.system.base_classes import Closing
 from clrecon.system.log import get_logger
 from clrecon.system.text import escape_text
 

@@ -24,8 +24,8 @@ from clrecon.dicom.parse.transfer_syntaxes import choose_decoder, is_encapsulate
 from clrecon.dicom.pixels.codestream import Codestream, read_codestream
 from clrecon.dicom.pixels.decoder_pool import DecoderError, DecoderPool
 from clrecon.errors import RefusedInputError
-from clrecon.system.closing import Closing
-from clrecon.system.regular_files import open_regular
+from clrecon.system.base_classes import Closing
+from clrecon.system.paths import open_regular
 
 INFLATE_STEP = 1 << 20
 

@@ -26,8 +26,8 @@ from clrecon.dicom.pixels.stray_bits import StrayBits, describe_stray_bits, find
 from clrecon.errors import RefusedInputError
 from clrecon.sources.facts import PixelFacts
 from clrecon.system.memory import allocate_voxels
+from clrecon.system.pieces import count_readers
 from clrecon.system.progress import Progress
-from clrecon.system.threads import count_readers
 
 MAX_READERS = 8
 MAX_DECODERS = 32

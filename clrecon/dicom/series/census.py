@@ -20,7 +20,7 @@ from clrecon.dicom.headers.slice_header import OtherImage, SliceHeader
 from clrecon.dicom.stack.fit import Stack
 from clrecon.dicom.stack.layout import median_thickness
 from clrecon.dicom.stack.numbers import median
-from clrecon.system.gates import Gate, none_of, unmeasured
+from clrecon.system.records import Gate, none_of, unmeasured
 
 LOCALIZERS = 3
 """So many numbers before the first slice may be those of localizers in a series of their own."""

@@ -35,8 +35,8 @@ from clrecon.geometry.orientation import describe_orientation
 from clrecon.sources.facts import PixelFacts
 from clrecon.sources.likeness import Likeness
 from clrecon.sources.plausibility import VoxelFindings
+from clrecon.system.arguments import name_parameter
 from clrecon.system.text import count_of, hash_uid
-from clrecon.system.wording import name_parameter
 
 SAID_BY_GATES = (
     "complete_series",

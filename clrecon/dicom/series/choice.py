@@ -12,8 +12,8 @@ from clrecon.dicom.parse.terms import OTHER_TERM
 from clrecon.dicom.series.rank import Rank, rank_series
 from clrecon.dicom.series.series import Series
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
+from clrecon.system.arguments import name_parameter
 from clrecon.system.text import count_of, hash_uid, join_names
-from clrecon.system.wording import name_parameter
 
 SHORTEST_START = 4
 """Fewest characters of a hash or UID that name a series by its start."""

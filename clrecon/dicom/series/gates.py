@@ -1,4 +1,5 @@
-"""The gates of a CT series: conditions that it must meet before it is used for measurements, as `clrecon.system.gates`.
+"""The gates of a CT series: conditions that it must meet before it is used for measurements, as
+`clrecon.system.records`.
 
 A gate covers a fact that moves a surface in the patient or changes its level, without the user of the mesh seeing it.
 Everything else that is unusual gives only a warning; docs/certificate.md lists both, with the reasons.
@@ -30,7 +31,7 @@ from clrecon.sources.facts import PixelFacts
 from clrecon.sources.gates import PADDING_SHARE, judge_figures, judge_steps, list_odd_values
 from clrecon.sources.likeness import Likeness
 from clrecon.sources.plausibility import leave_unexamined
-from clrecon.system.gates import Gate, at_most, none_of, unmeasured
+from clrecon.system.records import Gate, at_most, none_of, unmeasured
 
 GAP_THICKNESSES = 2.0
 """Largest gap in units of the slice thickness.  Beyond it more is left out than measured: a high-resolution lung scan
@@ -55,7 +56,7 @@ def judge_series(
     likeness: Likeness of its slices; also None where they are too few or too small.
     value_gates: Gates of the values of the voxels, see `clrecon.sources.plausibility.examine_voxels`.
 
-    Returns: See `clrecon.system.gates.Gate`.  The texts hold no file names.
+    Returns: See `clrecon.system.records.Gate`.  The texts hold no file names.
     """
     refused = len(series.problems)
     gates = [

@@ -24,8 +24,8 @@ from clrecon.dicom.stack.fit import measure_gap
 from clrecon.dicom.stack.mixture import find_mixture, values_of
 from clrecon.dicom.stack.rounding import measure_unit
 from clrecon.errors import UsageError
+from clrecon.system.arguments import name_parameter
 from clrecon.system.text import join_names
-from clrecon.system.wording import name_parameter
 
 PLACES_SHOWN = 4
 PHASES_SHOWN = 12

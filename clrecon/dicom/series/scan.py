@@ -24,9 +24,9 @@ from clrecon.dicom.series.disk import DiskReader
 from clrecon.dicom.series.remains import Stranger, describe_start, find_remains
 from clrecon.errors import NoDicomError
 from clrecon.sources.rescale import Rescale
+from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text
-from clrecon.system.wording import name_parameter
 
 DICOM_SUFFIXES = (".dcm", ".dic", ".dicom", ".ima")
 PROGRESS_STEPS = 1000

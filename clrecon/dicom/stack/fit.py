@@ -26,8 +26,8 @@ from clrecon.dicom.stack.rounding import Rounding, find_rounding
 from clrecon.geometry import compose_affine, signed_tilt
 from clrecon.geometry.affine import TILT_REPORT_DEG
 from clrecon.geometry.uneven import fit_line, position_tolerance
+from clrecon.system.arguments import name_parameter
 from clrecon.system.text import join_names
-from clrecon.system.wording import name_parameter
 
 Float64Array = NDArray[np.float64]
 

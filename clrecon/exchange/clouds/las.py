@@ -16,7 +16,7 @@ import numpy as np
 from clrecon.errors import OutputError, RefusedInputError, UsageError
 from clrecon.exchange.clouds.raw_cloud import RawCloud, read_remarks, say_cut
 from clrecon.exchange.content import PointContent, refuse_file
-from clrecon.system.installing import install_command
+from clrecon.system.packages import install_command
 from clrecon.system.text import escape_text
 
 SCALE_MM = 1e-4

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
 from clrecon.exchange.clouds.raw_cloud import RawCloud, columns_of, say_cut
-from clrecon.system.regular_files import open_regular
+from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 
 _TYPES = {

@@ -8,7 +8,7 @@ from pathlib import Path
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.exchange.clouds import las, npz, read_ply, read_vtp, xyz
 from clrecon.exchange.clouds.raw_cloud import RawCloud
-from clrecon.system.regular_files import open_regular
+from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 
 _START_BYTES = 512

@@ -23,7 +23,7 @@ from clrecon.errors import RefusedInputError
 from clrecon.exchange.clouds.raw_cloud import read_remarks, say_cut
 from clrecon.exchange.meshes.placed_shapes import MOST_LEVELS, PlacedShapes, Shape
 from clrecon.exchange.meshes.raw_mesh import Part, RawMesh
-from clrecon.system.regular_files import open_regular
+from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 
 _CORE = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"

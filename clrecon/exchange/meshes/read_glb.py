@@ -21,7 +21,7 @@ from clrecon.exchange.coordinates import find_places
 from clrecon.exchange.glb import NAMELESS
 from clrecon.exchange.meshes.placed_shapes import MOST_LEVELS, PlacedShapes, Shape
 from clrecon.exchange.meshes.raw_mesh import Part, RawMesh
-from clrecon.system.regular_files import open_regular
+from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 
 _LONGEST_JSON = 1 << 26

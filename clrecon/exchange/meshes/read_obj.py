@@ -16,7 +16,7 @@ from clrecon.errors import RefusedInputError
 from clrecon.exchange.clouds.raw_cloud import RawCloud, columns_of, read_remarks, say_cut
 from clrecon.exchange.meshes.plain_lines import plain_lines
 from clrecon.exchange.meshes.raw_mesh import Part, RawMesh
-from clrecon.system.regular_files import open_regular
+from clrecon.system.paths import open_regular
 from clrecon.system.text import count_of, escape_text
 
 _ELSE = (b"l", b"p", b"curv", b"curv2", b"surf")

@@ -15,7 +15,7 @@ from clrecon.errors import RefusedInputError
 from clrecon.exchange.clouds.raw_cloud import RawCloud, read_remarks, say_cut
 from clrecon.exchange.clouds.read_ply import Element, Header, read_binary, read_header, read_text, skip_to_vertices
 from clrecon.exchange.meshes.raw_mesh import Part, RawMesh
-from clrecon.system.regular_files import open_regular
+from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 
 _CORNERS = ("vertex_indices", "vertex_index")

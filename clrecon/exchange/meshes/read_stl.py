@@ -16,7 +16,7 @@ from clrecon.exchange.clouds.raw_cloud import say_cut
 from clrecon.exchange.coordinates import find_places
 from clrecon.exchange.meshes.plain_lines import MARK, plain_lines
 from clrecon.exchange.meshes.raw_mesh import RawMesh
-from clrecon.system.regular_files import open_regular
+from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 
 _HEAD = 84

@@ -15,7 +15,7 @@ from clrecon.exchange.clouds.raw_cloud import RawCloud, columns_of, say_cut
 from clrecon.exchange.clouds.read_vtp import Document, parse_document, read_count, read_fields, read_numbers
 from clrecon.exchange.meshes.placed_shapes import PlacedShapes, Shape
 from clrecon.exchange.meshes.raw_mesh import Part, RawMesh
-from clrecon.system.regular_files import open_regular
+from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 
 

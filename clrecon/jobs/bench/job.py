@@ -15,8 +15,8 @@ from clrecon.jobs.mesh.presets import DEFAULT_PRESET, find_preset
 from clrecon.jobs.shared.laps import Laps
 from clrecon.jobs.shared.outputs import check_kept
 from clrecon.jobs.shared.report import platform_name, stage_report
+from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.targets import keep_existing
 from clrecon.version import package_version
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from clrecon.jobs.cloud.settings import CloudSettings
 from clrecon.jobs.cloud.trail import Trail
+from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress
-from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

@@ -25,11 +25,11 @@ from clrecon.jobs.shared.preprocess import preprocess_volume
 from clrecon.jobs.shared.region import Band, restrict_volume
 from clrecon.jobs.shared.report import stage_report
 from clrecon.reading import read_selected
+from clrecon.system.arguments import name_parameter
 from clrecon.system.files import allow_open_files
 from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.paths import keep_existing, refuse_existing, resolve_target
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.targets import keep_existing, refuse_existing, resolve_target
-from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

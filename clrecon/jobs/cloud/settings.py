@@ -10,7 +10,7 @@ from pathlib import Path
 from clrecon.errors import UsageError
 from clrecon.jobs.shared.settings import InputSettings
 from clrecon.points.kinds import KINDS
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 DENOISERS = ("grid", "bilateral")
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from clrecon.errors import RefusedInputError
 from clrecon.points.step import count_numbers
-from clrecon.system.gates import Gate
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
+from clrecon.system.records import Gate
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -12,9 +12,8 @@ from typing import Any
 from clrecon.errors import UsageError
 from clrecon.jobs.compare.methods import COMPARED
 from clrecon.jobs.shared.report import to_json
-from clrecon.system.files import temporary_folder
-from clrecon.system.folders import StagedFolder, check_folder
-from clrecon.system.targets import final_mode, system_errors
+from clrecon.system.files import StagedFolder, check_folder, temporary_folder
+from clrecon.system.paths import final_mode, system_errors
 
 PAGE, REPORT = "index.html", "report.json"
 

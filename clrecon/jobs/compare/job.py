@@ -33,10 +33,9 @@ from clrecon.jobs.shared.outputs import check_kept
 from clrecon.reading import read_selected
 from clrecon.system.files import temporary_folder
 from clrecon.system.log import get_logger, log_warnings
-from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.targets import keep_existing, system_errors
+from clrecon.system.paths import keep_existing, system_errors
+from clrecon.system.progress import Progress, device_seconds, ignore_progress
 from clrecon.system.text import format_hu
-from clrecon.system.time_limit import device_seconds
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from clrecon.errors import UsageError
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 MESH, CLOUD, PICTURE = "mesh", "cloud", "picture"
 

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from clrecon.corridors.corridor import VertebraCorridors, measure_corridors
-from clrecon.corridors.grades import SCALE, Screw, ScrewGrade, grade_screw
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.certificate import without_ids
 from clrecon.jobs.corridor.report import KNOWN_BIAS, NOT_FOR_PLANNING, CorridorReport, describe_vertebra
@@ -24,8 +22,10 @@ from clrecon.jobs.shared.report import peak_memory_bytes, platform_name, stage_r
 from clrecon.labels.names import file_suffixes
 from clrecon.labels.resample import resample_labels
 from clrecon.reading import read_selected
+from clrecon.spine.corridors import VertebraCorridors, measure_corridors
+from clrecon.spine.measures import SCALE, Screw, ScrewGrade, grade_screw
+from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.targets import keep_existing
 from clrecon.version import package_version
 
 if TYPE_CHECKING:

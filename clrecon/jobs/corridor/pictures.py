@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.corridors.corridor import Corridor, VertebraCorridors, screw_diameter
-from clrecon.corridors.grades import Screw
-from clrecon.corridors.search import SIDES
-from clrecon.corridors.solid_bone import sample_volume
 from clrecon.geometry import Volume
 from clrecon.rendering.pictures.annotations import orientation_letters
 from clrecon.rendering.pictures.picture_data import PictureData
 from clrecon.rendering.pictures.sheets import Panel, Stroke, draw_sheet
+from clrecon.spine.corridors import SIDES, Corridor, VertebraCorridors, screw_diameter
+from clrecon.spine.measures import Screw
+from clrecon.spine.solid_bone import sample_volume
 
 Float64Array = NDArray[np.float64]
 

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.corridors.corridor import Corridor, VertebraCorridors, screw_diameter
-from clrecon.corridors.grades import SCALE, Screw, ScrewGrade
-from clrecon.corridors.measures import Bias
 from clrecon.geometry import frame_from_lps
+from clrecon.spine.corridors import Corridor, VertebraCorridors, screw_diameter
+from clrecon.spine.measures import SCALE, Bias, Screw, ScrewGrade
 from clrecon.system.records import Record
 
 NOT_FOR_PLANNING = "not for planning an operation: a measurement on one surface at one level, checked on phantoms alone"

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from clrecon.corridors.grades import Screw
 from clrecon.errors import UsageError
 from clrecon.geometry import frame_from_lps
-from clrecon.system.regular_files import read_regular
+from clrecon.spine.measures import Screw
+from clrecon.system.paths import read_regular
 from clrecon.system.text import escape_text
 
 CSV_COLUMNS = ("entry_x", "entry_y", "entry_z", "tip_x", "tip_y", "tip_z", "diameter")

@@ -10,7 +10,7 @@ from typing import Any
 from clrecon.errors import UsageError
 from clrecon.geometry import frame_from_lps
 from clrecon.reading import Selection
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 LARGEST_MARGIN_MM = 5.0
 

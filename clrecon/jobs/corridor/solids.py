@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.corridors.corridor import VertebraCorridors
 from clrecon.mesh import Mesh
+from clrecon.spine.corridors import VertebraCorridors
 
 if TYPE_CHECKING:
-    from clrecon.corridors.grades import Screw
+    from clrecon.spine.measures import Screw
 
 FACES = 48
 """Sides of a cylinder: its walls lie at most 0.2 % of the radius inside of the true one."""

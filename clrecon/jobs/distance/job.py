@@ -23,8 +23,8 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.compare.signed import MeshDeviation, measure_distance, measure_vertex_distances
 from clrecon.system.files import Staged, check_writable
 from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.targets import keep_existing
 from clrecon.version import package_version
 
 if TYPE_CHECKING:

@@ -28,8 +28,8 @@ from clrecon.jobs.shared.report import stage_report
 from clrecon.reading import read_selected
 from clrecon.system.files import Staged, check_writable
 from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.paths import keep_existing, refuse_existing, resolve_target
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.targets import keep_existing, refuse_existing, resolve_target
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

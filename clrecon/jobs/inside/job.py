@@ -27,8 +27,8 @@ from clrecon.jobs.shared.pictures import stage_picture
 from clrecon.jobs.shared.report import stage_report
 from clrecon.reading import read_selected
 from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.targets import keep_existing
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

@@ -9,7 +9,7 @@ from pathlib import Path
 from clrecon.errors import UsageError
 from clrecon.jobs.inside.pictures import DEFAULT_VIEW
 from clrecon.reading import Selection
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 
 @dataclass(frozen=True, kw_only=True)

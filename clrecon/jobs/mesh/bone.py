@@ -11,8 +11,8 @@ from clrecon.jobs.mesh.levels import warn_of_contrast
 from clrecon.jobs.mesh.presets import LOWEST_BONE_HU
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Bones, Part, Surface
+from clrecon.system.arguments import name_parameter
 from clrecon.system.text import count_of
-from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     import numpy as np

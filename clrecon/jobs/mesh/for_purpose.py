@@ -10,7 +10,7 @@ from clrecon.errors import UsageError
 from clrecon.jobs.mesh.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
 from clrecon.jobs.mesh.purposes import find_purpose
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 
 def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:

@@ -31,8 +31,8 @@ from clrecon.jobs.shared.outputs import (
 )
 from clrecon.jobs.shared.report import stage_report
 from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.targets import keep_existing
 from clrecon.system.text import count_of
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.labels import LabelMap

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.jobs.shared.cropping import crop_labels
+from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress
-from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

@@ -10,9 +10,9 @@ from clrecon.errors import RefusedInputError
 from clrecon.jobs.mesh.presets import find_preset
 from clrecon.jobs.mesh.purposes import find_purpose
 from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_hu
-from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.anatomy.iso_choice import IsoChoice

@@ -12,9 +12,9 @@ from clrecon.jobs.mesh.methods import extract_one
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface
 from clrecon.jobs.shared.outputs import MOST_FILES
+from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, Steps
 from clrecon.system.text import format_hu, format_ml
-from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     import numpy as np

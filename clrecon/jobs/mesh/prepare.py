@@ -13,9 +13,9 @@ from clrecon.jobs.shared.laps import Laps
 from clrecon.jobs.shared.masking import mask_volume
 from clrecon.jobs.shared.preprocess import preprocess_volume
 from clrecon.jobs.shared.region import Band, restrict_volume
+from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress
 from clrecon.system.text import format_ml
-from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -125,7 +125,7 @@ def leave_outside(volume: Volume, settings: MeshSettings, progress: Progress) ->
     """Return the volume without the air around the patient, if the settings ask for the values below an iso value."""
     if settings.below is None or settings.keep_outside:
         return volume
-    from clrecon.anatomy.outside_air import leave_outside_air
+    from clrecon.anatomy.surroundings import leave_outside_air
     from clrecon.geometry.certificate import amend
 
     warnings = list(volume.report.get("warnings", ()))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from clrecon.system.arguments import name_parameter
 from clrecon.system.text import count_of, format_digits
-from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     import numpy as np

@@ -160,6 +160,6 @@ def describe_purposes(parts: Sequence[Part]) -> list[str]:
 
 def warn_of_gates(gates: Sequence[dict[str, Any]]) -> list[str]:
     """Return one line for each failed gate, with the name of its mesh if there are several."""
-    from clrecon.system.gates import failed_gates
+    from clrecon.system.records import failed_gates
 
     return [f"{gate['mesh']}: {line}" if gate["mesh"] else line for gate in gates for line in failed_gates([gate])]

@@ -12,7 +12,7 @@ from clrecon.jobs.mesh.label_choice import LabelChoice
 from clrecon.jobs.mesh.presets import DEFAULT_PRESET, find_preset
 from clrecon.jobs.mesh.purposes import find_purpose
 from clrecon.jobs.shared.settings import InputSettings
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 
 def name_level(level: float | Sequence[float]) -> str:

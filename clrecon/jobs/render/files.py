@@ -13,7 +13,7 @@ from clrecon.errors import UsageError
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.jobs.shared.outputs import check_distinct
 from clrecon.rendering.pictures.modes import check_known
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.rendering import Rendering

@@ -35,8 +35,8 @@ from clrecon.reading import read_selected
 from clrecon.rendering.pictures.styles import Projection, SurfaceLook
 from clrecon.system.files import allow_open_files
 from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.targets import keep_existing
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

@@ -17,7 +17,7 @@ from clrecon.rendering.pictures.annotations import edge_letters
 from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.point_look import PointLook
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, Style, SurfaceLook, VolumeLook
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 from clrecon.version import package_version
 
 if TYPE_CHECKING:

@@ -43,8 +43,8 @@ from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.default_view import ANTERIOR, SLICES_VIEWS
 from clrecon.rendering.views.directions import DEFAULT_SIZE, DIRECTIONS, checked_size
 from clrecon.rendering.views.plane import find_plane
+from clrecon.system.arguments import name_parameter
 from clrecon.system.text import unknown_name
-from clrecon.system.wording import name_parameter
 
 DEFAULT_VIEWS = {"slice": "axial", "cpr": "left", "slices": SLICES_VIEWS[0]}
 """Default view of the modes whose default is not the view from the front; that of slices suits the scan."""

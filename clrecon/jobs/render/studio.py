@@ -23,7 +23,7 @@ from clrecon.rendering.pictures.styles import (
 )
 from clrecon.rendering.views.default_view import default_view
 from clrecon.rendering.views.seen import check_center
-from clrecon.system.closing import Closing
+from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:

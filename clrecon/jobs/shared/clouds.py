@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.jobs.shared.settings import InputSettings
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.points import PointCloud

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from clrecon.errors import ClreconError, OutputError, UsageError
+from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress
 from clrecon.system.text import count_of
-from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.mesh import Mesh
@@ -94,7 +94,7 @@ def _find_voxels(path: str | Path) -> Path | None:
 
 def _is_bare_data_set(path: str | Path) -> bool:
     from clrecon.dicom.parse.forced import restore_start
-    from clrecon.system.regular_files import open_regular
+    from clrecon.system.paths import open_regular
 
     try:
         with open_regular(path) as stream:
@@ -117,7 +117,7 @@ def count_leftovers(output: str | Path, paths: Sequence[str | Path]) -> int:
 
 def refuse_files(paths: Sequence[str | Path]) -> None:
     """Raise `OutputError` if one of the files exists."""
-    from clrecon.system.targets import keep_existing, refuse_existing, resolve_target
+    from clrecon.system.paths import keep_existing, refuse_existing, resolve_target
 
     with keep_existing():
         for path in paths:
@@ -126,7 +126,7 @@ def refuse_files(paths: Sequence[str | Path]) -> None:
 
 def refuse_numbered(output: str | Path) -> None:
     """Raise `OutputError` in a block of `keep_existing` if components of an earlier run have names of `output`."""
-    from clrecon.system.targets import existing_stay
+    from clrecon.system.paths import existing_stay
 
     if existing_stay() and (found := count_leftovers(output, [])):
         raise OutputError(
@@ -138,7 +138,7 @@ def refuse_numbered(output: str | Path) -> None:
 
 def _identity(path: str | Path) -> str:
     """Return a key that is equal for two names of one file, also with links and on systems that ignore case."""
-    from clrecon.system.targets import resolve_target
+    from clrecon.system.paths import resolve_target
 
     return str(resolve_target(path)).casefold()
 

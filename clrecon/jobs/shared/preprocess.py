@@ -15,8 +15,8 @@ from clrecon.geometry.certificate import amend
 from clrecon.jobs.shared.preprocess_steps import FILTERS, MORPHOLOGY, PreprocessStep, parse_preprocess
 from clrecon.jobs.shared.region import Band, apply_region, carry_report
 from clrecon.jobs.shared.settings import InputSettings
+from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress
-from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

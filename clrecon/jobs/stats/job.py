@@ -18,8 +18,8 @@ from clrecon.labels.statistics import measure_resampled
 from clrecon.reading import read_selected
 from clrecon.system.files import Staged, check_writable, stage_file
 from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.targets import keep_existing
 
 log = get_logger(__name__)
 

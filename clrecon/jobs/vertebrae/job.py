@@ -17,8 +17,8 @@ from clrecon.jobs.vertebrae.settings import VertebraeSettings
 from clrecon.reading import Selection, read_selected
 from clrecon.system.files import Staged, StagedFile, stage_file
 from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.targets import keep_existing
 
 if TYPE_CHECKING:
     from clrecon.labels import LabelMap
@@ -50,7 +50,7 @@ def make_vertebrae(
     progress: ``progress(stage, done, total)``.
     """
     from clrecon.jobs.vertebrae.picture import draw_vertebrae
-    from clrecon.vertebrae import split_vertebrae
+    from clrecon.spine import split_vertebrae
 
     settings = settings or VertebraeSettings()
     progress = progress or ignore_progress

@@ -12,7 +12,7 @@ from clrecon.rendering.looks.label_style import distinct_colors
 from clrecon.rendering.pictures.pillow import load_font, load_pillow
 
 if TYPE_CHECKING:
-    from clrecon.vertebrae import VertebraSplit
+    from clrecon.spine import VertebraSplit
 
 PIXELS_PER_MM = 3
 WINDOW_HU = (-150.0, 650.0)

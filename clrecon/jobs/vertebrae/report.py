@@ -14,14 +14,14 @@ from clrecon.version import package_version
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.jobs.vertebrae.settings import VertebraeSettings
-    from clrecon.vertebrae import VertebraSplit
+    from clrecon.spine import VertebraSplit
 
 
 @dataclass(frozen=True, eq=False)
 class VertebraeReport(Record):
     """Report of `make_vertebrae`.
 
-    vertebrae: All that were found, from the head downwards, see `clrecon.vertebrae.result.Vertebra`.
+    vertebrae: All that were found, from the head downwards, see `clrecon.spine.split.Vertebra`.
     low_confidence: How many of them have a confidence below 0.5.
     written: How many the label map has.
     discs: ``centre_mm`` and ``normal`` (downwards) of each disc, LPS.

@@ -31,7 +31,7 @@ class VertebraeSettings(Selection):
     keep_ids: bool = False
 
     def __post_init__(self) -> None:
-        from clrecon.vertebrae.naming import check_landmark
+        from clrecon.spine.split import check_landmark
 
         if self.level is not None and not math.isfinite(self.level):
             raise UsageError(f"the level of bone is a number of HU, not {self.level!r}")

@@ -24,12 +24,12 @@ from clrecon.jobs.view.settings import ViewSettings
 from clrecon.mesh import Mesh
 from clrecon.mesh.reader import MESH_INPUTS
 from clrecon.rendering.looks.label_style import distinct_colors
+from clrecon.system.arguments import name_parameter
 from clrecon.system.files import check_writable
 from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.targets import keep_existing
 from clrecon.system.text import escape_text
-from clrecon.system.wording import name_parameter
 from clrecon.version import package_version
 
 if TYPE_CHECKING:

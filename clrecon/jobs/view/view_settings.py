@@ -8,7 +8,7 @@ from dataclasses import MISSING, fields
 from clrecon.errors import UsageError
 from clrecon.jobs.shared.settings import InputSettings
 from clrecon.jobs.view.settings import ViewSettings
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 _OF_A_VIEW = {"iso_value", "preset", "half_way", "space", "labels", "one_file"}
 """Settings of meshes that a view has a meaning for; a label map sets the last one by itself."""

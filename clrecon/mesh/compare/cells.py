@@ -18,7 +18,7 @@ from clrecon.geometry.iso_rule import layer_normal_matrices
 from clrecon.mesh.compare.boxes import meets_box
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.messages import Message
+from clrecon.system.base_classes import Message
 from clrecon.system.pieces import chunks
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from clrecon.geometry import METAL_HU
-from clrecon.system.gates import Gate, at_most, is_true, none_of, unmeasured
+from clrecon.system.records import Gate, at_most, is_true, none_of, unmeasured
 
 DEVIATION_P95_VOXEL = 0.25
 """Bound for 95 % of the surface, in shortest voxel steps."""

@@ -22,9 +22,9 @@ from clrecon.mesh.refine.collapses import last_of_collapses
 from clrecon.mesh.refine.decimation import carry_on, check_share, check_triangles
 from clrecon.mesh.refine.topology import TopologyChange, compare_topology, measure_topology
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.gates import Gate, none_of
 from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.records import Gate, none_of
 
 _EXACT = 64
 """Points at a time that are measured exactly."""

@@ -18,7 +18,7 @@ from clrecon.geometry.regular import shear_degrees
 from clrecon.operators.filters.settings import checked_length, report_filter
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.installing import install_command
+from clrecon.system.packages import install_command
 from clrecon.system.progress import Progress, ignore_progress
 
 VolumeKind = TypeVar("VolumeKind", Volume, DeviceVolume)

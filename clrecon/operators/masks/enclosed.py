@@ -23,11 +23,10 @@ from clrecon.operators.masks.runs import Components, find_components, mark_with_
 from clrecon.operators.masks.voxel_mask import mask_bytes, zero_words
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points.stencil import Lattice
-from clrecon.system.arguments import explains_arguments
-from clrecon.system.gates import at_most
+from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.progress import Progress, Steps
+from clrecon.system.records import at_most
 from clrecon.system.text import count_of, format_hu, format_ml
-from clrecon.system.wording import name_parameter
 
 WIDE_ML = 20.0
 """Smaller spaces are not wide: even a slice of 5 mm through a ball of 35 mm has 19 ml."""

@@ -28,9 +28,9 @@ from clrecon.opencl import (
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import voxel_variants
 from clrecon.points.voxel_numbers import VoxelNumbers
+from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_band
-from clrecon.system.wording import name_parameter
 
 
 def prepare_classify(device: Device, dtype: DTypeLike = np.int16, inside: str = "above") -> Program:

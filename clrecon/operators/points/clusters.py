@@ -23,9 +23,8 @@ from clrecon.points.cluster_figures import ClusterFigures, measure_clusters
 from clrecon.points.keep import REPORTED
 from clrecon.points.stencil import Lattice, Stencil, checked_eps, make_stencil
 from clrecon.points.voxel_numbers import VoxelNumbers
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.progress import Progress
-from clrecon.system.wording import name_parameter
 
 DEFAULT_MIN_SAMPLES = 6
 

@@ -38,8 +38,8 @@ from clrecon.operators.points.grid import (
 )
 from clrecon.operators.primitives.scan import exclusive_scan
 from clrecon.operators.primitives.union_find import hook_in_rounds, prepare_components
+from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.wording import name_parameter
 
 EPS_TOLERANCE = 1e-6
 """Distances up to eps times one more than this are within eps."""

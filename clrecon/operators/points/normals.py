@@ -29,10 +29,9 @@ from clrecon.operators.points.neighbours import NeighbourSearch, Part, check_nei
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.resident.tables import voxel_variants
 from clrecon.points import PointCloud, PointStep
-from clrecon.system.arguments import as_numbers, explains_arguments
+from clrecon.system.arguments import as_numbers, explains_arguments, name_parameter
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_share
-from clrecon.system.wording import name_parameter
 
 GRADIENTS = "gradients"
 """Purpose by which slabs are planned."""

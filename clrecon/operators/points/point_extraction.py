@@ -37,10 +37,9 @@ from clrecon.points import PointCloud
 from clrecon.points.cloud import MOST_POINTS
 from clrecon.points.kinds import KINDS
 from clrecon.points.voxel_numbers import VoxelNumbers
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.progress import Progress
 from clrecon.system.text import format_hu
-from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.labels import LabelMap

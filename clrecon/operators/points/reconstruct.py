@@ -20,10 +20,9 @@ from clrecon.operators.points.field import FieldSettings, NodeField, Signs, deci
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.points import PointCloud
 from clrecon.points.spacing import mean_spacing
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_share
-from clrecon.system.wording import name_parameter
 
 CUBE = 32
 """Nodes along an edge of the cubes in which walls are counted: those of a word."""

@@ -32,10 +32,9 @@ from clrecon.operators.points.grid import GridPlan, PointGrid, fill_grid, plan_g
 from clrecon.operators.points.neighbours import find_neighbours
 from clrecon.operators.primitives.union_find import hook_in_rounds, prepare_components
 from clrecon.points import PointCloud, PointStep
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_share
-from clrecon.system.wording import name_parameter
 
 REASON = "thinned"
 

@@ -39,9 +39,9 @@ from clrecon.rendering.looks.label_style import distinct_colors
 from clrecon.rendering.looks.window import checked_window, choose_window
 from clrecon.rendering.pictures.point_look import PointLook
 from clrecon.rendering.views.camera import Camera
-from clrecon.system.closing import Closing
+from clrecon.system.arguments import name_parameter
+from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress
-from clrecon.system.wording import name_parameter
 
 LARGEST_DISC = kernel_number("rays/splats.cl", "MOST_PIXELS")
 """Largest radius of a disc in pixels."""

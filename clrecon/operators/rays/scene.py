@@ -53,7 +53,7 @@ from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.point_look import PointLook
 from clrecon.rendering.pictures.styles import SlicesInSpace, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import Camera, box_corners
-from clrecon.system.closing import Closing
+from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress, ignore_progress
 
 LAYERS = 16

@@ -47,7 +47,7 @@ from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size
 from clrecon.rendering.views.plane import find_plane
 from clrecon.rendering.views.seen import ShownLabels, check_center, find_seen_box
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.closing import Closing
+from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress
 
 MASKED_BY = ("field_of_view", "remove_table", "region", LEFT_OUT)

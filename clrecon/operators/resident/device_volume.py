@@ -30,7 +30,7 @@ from clrecon.opencl import (
     work_on,
 )
 from clrecon.operators.resident.tables import StackTable, ray_variants
-from clrecon.system.closing import Closing
+from clrecon.system.base_classes import Closing
 from clrecon.system.log import get_logger
 from clrecon.system.text import count_of
 

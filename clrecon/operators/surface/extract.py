@@ -24,10 +24,9 @@ from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
 from clrecon.operators.surface.trilinear import check_row
 from clrecon.points import PointCloud
-from clrecon.system.arguments import explains_arguments
-from clrecon.system.closing import Closing
+from clrecon.system.arguments import explains_arguments, name_parameter
+from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress
-from clrecon.system.wording import name_parameter
 
 
 class SurfaceExtractor(Closing):

@@ -30,9 +30,8 @@ from clrecon.opencl.sources import read_kernel_source
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.extract import SurfaceExtractor
 from clrecon.operators.surface.seeds import AUTO
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.progress import Progress
-from clrecon.system.wording import name_parameter
 
 CORNERS = np.array([(c & 1, c >> 1 & 1, c >> 2) for c in range(8)])
 """(x, y, z) of each corner of a cell."""

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 AUTO = "auto"
 """Word for: the components with at least `AUTO_SHARE` of the cells of the largest."""

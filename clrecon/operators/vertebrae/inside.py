@@ -22,10 +22,9 @@ from clrecon.operators.masks.mask import Mask
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.label_masks import extract_label_masks
 from clrecon.operators.vertebrae.solid import CLOSE_MM, LabelCrop, crop_label, label_margin, make_solid
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.records import Record
 from clrecon.system.text import format_volume
-from clrecon.system.wording import name_parameter
 
 MOST_RADIUS_MM = 8.0
 """Bone in which larger balls fit is no shell any more."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import find_color
-from clrecon.system.messages import Message
+from clrecon.system.base_classes import Message
 
 NO_COLOR = (-1.0, -1.0, -1.0)
 """Colour in the table that means: keep the colour of the picture without labels."""

@@ -24,7 +24,7 @@ from clrecon.rendering.looks.slicer_files import (
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.looks.transfer_text import FORMAT, VERSION
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.regular_files import read_regular
+from clrecon.system.paths import read_regular
 from clrecon.system.text import escape_text
 
 SIZE_LIMIT = 1_000_000

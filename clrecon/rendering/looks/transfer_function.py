@@ -15,7 +15,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.rendering.looks.lighting import Lighting
 from clrecon.rendering.looks.piecewise import check_ascending, check_share, evaluate_curve
 from clrecon.system.arguments import as_numbers, explains_arguments
-from clrecon.system.messages import Message
+from clrecon.system.base_classes import Message
 
 UNIT_LIMIT_MM = 1e9
 """Largest unit distance in mm; its inverse is the smallest.  float32 can hold all values that a ray step computes from
@@ -341,7 +341,7 @@ class TransferFunction(Message):
         """
         from clrecon.rendering.looks.transfer_text import transfer_text
         from clrecon.system.files import replace_file
-        from clrecon.system.targets import keep_existing
+        from clrecon.system.paths import keep_existing
 
         names = {"name": self.name, "description": self.description}
         head: dict[str, Any] = {key: text for key, text in names.items() if text}

@@ -11,15 +11,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.system.files import temporary_folder
-from clrecon.system.folders import StagedFolder, check_folder
-from clrecon.system.targets import final_mode, system_errors
+from clrecon.system.files import StagedFolder, check_folder, temporary_folder
+from clrecon.system.paths import final_mode, system_errors
 
 _FRAME = re.compile(r"frame_[0-9]{4,}\.png")
 
 
 def check_frame_folder(path: str | os.PathLike[str]) -> Path:
-    """Return the folder that will be made or replaced, see `clrecon.system.folders.check_folder`."""
+    """Return the folder that will be made or replaced, see `clrecon.system.files.check_folder`."""
     return check_folder(path, _FRAME, "frames")
 
 

@@ -18,8 +18,8 @@ from clrecon.errors import UsageError
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.files import Staged, check_writable, stage_file
+from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress
-from clrecon.system.targets import keep_existing
 from clrecon.system.text import guess_word
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.system.installing import install_command
+from clrecon.system.packages import install_command
 
 QUALITY = 18
 """x264's constant rate factor; at 18 the loss is not visible."""

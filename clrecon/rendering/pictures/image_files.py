@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.rendering.pictures.picture_data import PictureData
 from clrecon.rendering.pictures.pillow import load_pillow
+from clrecon.system.arguments import name_parameter
 from clrecon.system.files import replace_file
 from clrecon.system.text import guess_word
-from clrecon.system.wording import name_parameter
 from clrecon.version import package_version
 
 IMAGE_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".tif": "TIFF", ".tiff": "TIFF"}

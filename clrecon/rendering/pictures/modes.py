@@ -20,8 +20,8 @@ from clrecon.rendering.pictures.styles import (
     VolumeLook,
 )
 from clrecon.rendering.views.directions import hint_at_sheet
+from clrecon.system.arguments import name_parameter
 from clrecon.system.text import unknown_name
-from clrecon.system.wording import name_parameter
 
 
 class Mode(NamedTuple):

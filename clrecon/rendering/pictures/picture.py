@@ -12,7 +12,7 @@ import numpy as np
 from clrecon.errors import UsageError
 from clrecon.rendering.pictures.picture_data import PictureData
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.targets import keep_existing
+from clrecon.system.paths import keep_existing
 
 
 @dataclass

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.rendering.views.camera import Camera
-from clrecon.system.messages import Message
+from clrecon.system.base_classes import Message
 
 
 @dataclass

@@ -14,7 +14,7 @@ from clrecon.rendering.pictures import style_checks as checks
 from clrecon.rendering.pictures.styles import Style, style_field
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.plane import positive_mm
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 POINT_COLORS = ("hu", "label", "removed")
 

@@ -30,7 +30,7 @@ from clrecon.rendering.pictures.style_checks import SPINE
 from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.plane import checked_offset, checked_thickness, positive_mm
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 
 _T = TypeVar("_T")
 _ByLabel = Mapping[int, _T] | Mapping[str, _T] | Mapping[int | str, _T]

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.volume import Volume
-from clrecon.system.messages import Message
+from clrecon.system.base_classes import Message
 
 SAME_PLACE_MM = 1e-6
 """Distance up to which a point counts as the same as the one before."""

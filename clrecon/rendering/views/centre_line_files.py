@@ -11,7 +11,7 @@ import numpy as np
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.regular_files import read_regular
+from clrecon.system.paths import read_regular
 from clrecon.system.text import escape_text
 
 LARGEST_BYTES = 1 << 24

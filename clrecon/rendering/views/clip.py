@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, checked_points
 from clrecon.rendering.views.directions import checked_vector
-from clrecon.system.messages import Message
+from clrecon.system.base_classes import Message
 
 
 class Clip(Message):

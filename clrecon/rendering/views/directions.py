@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
+from clrecon.system.arguments import name_parameter
 from clrecon.system.text import unknown_name
-from clrecon.system.wording import name_parameter
 
 DIRECTIONS: dict[str, tuple[float, float, float]] = {
     "anterior": (0.0, -1.0, 0.0),

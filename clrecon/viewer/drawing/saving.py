@@ -18,8 +18,8 @@ from clrecon.mesh import Mesh
 from clrecon.operators.masks.mask import Mask
 from clrecon.points import PointCloud
 from clrecon.rendering.pictures.image_files import IMAGE_FORMATS
+from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress
-from clrecon.system.targets import keep_existing
 from clrecon.system.text import count_of, escape_text
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.model.objects import ShownCloud, ShownScan

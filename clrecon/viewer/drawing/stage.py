@@ -17,7 +17,7 @@ from clrecon.opencl import Device, take_device
 from clrecon.operators.rays.point_pictures import PointPictures
 from clrecon.operators.rays.volume_renderer import VolumeRenderer
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.system.closing import Closing
+from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress
 from clrecon.viewer.drawing.looks import LabelledLook
 from clrecon.viewer.model.objects import ShownLabels, ShownObject, ShownScan

@@ -11,7 +11,7 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.view.inputs import open_inputs
 from clrecon.jobs.view.settings import ViewSettings
 from clrecon.jobs.view.view_settings import check_view_settings
-from clrecon.system.closing import Closing
+from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.model.objects import ShownScan, wrap_inputs

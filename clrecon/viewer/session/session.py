@@ -13,7 +13,7 @@ from clrecon.errors import ClreconError, UsageError
 from clrecon.opencl import Device
 from clrecon.rendering import Rendering
 from clrecon.rendering.views.directions import checked_size
-from clrecon.system.closing import Closing
+from clrecon.system.base_classes import Closing
 from clrecon.system.log import get_logger
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.drawing.saving import check_target, save_shown

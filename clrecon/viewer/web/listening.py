@@ -14,7 +14,7 @@ from html import escape
 from pathlib import Path
 
 from clrecon.errors import UsageError
-from clrecon.system.wording import name_parameter
+from clrecon.system.arguments import name_parameter
 from clrecon.viewer.web.admission import LOOPBACK
 
 LARGEST_PORT = 65535

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 from clrecon.errors import UsageError
 from clrecon.system.display import DisplayProbe, NoDisplayError
-from clrecon.system.interrupts import take_interrupt
+from clrecon.system.progress import take_interrupt
 from clrecon.viewer.window.glass import Glass
 from clrecon.viewer.window.layout import lay_out
 from clrecon.viewer.window.loading import Load, Loading

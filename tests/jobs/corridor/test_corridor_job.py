@@ -13,15 +13,15 @@ import tolerances
 from made_once import make_once
 
 from clrecon.cli.main import main
-from clrecon.corridors.corridor import Corridor
-from clrecon.corridors.frame import VertebraFrame
-from clrecon.corridors.grades import Screw
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.jobs.corridor.pictures import GIVEN, draw_corridors
 from clrecon.jobs.corridor.screws import parse_screw, read_screws
 from clrecon.jobs.corridor.solids import cylinder_mesh
 from clrecon.phantom import PhantomSettings, phantom_truth, write_phantom
+from clrecon.spine.corridors import Corridor
+from clrecon.spine.frame import VertebraFrame
+from clrecon.spine.measures import Screw
 
 pytestmark = pytest.mark.untraced
 pytest.importorskip("nrrd")

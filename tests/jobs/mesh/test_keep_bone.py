@@ -13,7 +13,7 @@ from clrecon.geometry import Volume
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.label_choice import LabelChoice
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.system.gates import none_of
+from clrecon.system.records import none_of
 
 AFFINE = np.diag((1.0, 1.0, 1.5, 1.0))
 HEART_ML, BONE_ML = 4 / 3 * np.pi * 12**3 / 1000, 4 / 3 * np.pi * 9**3 / 1000

@@ -20,7 +20,7 @@ from clrecon.jobs.selftest.child import run_check
 from clrecon.jobs.selftest.run import run_selftest
 from clrecon.jobs.selftest.table import CHECKS
 from clrecon.opencl import Device
-from clrecon.opencl.signatures import definitions_of
+from clrecon.opencl.sources import definitions_of
 
 FEW = {"scan_block_sums": 64, "total_counts": 64}
 """Kernels that are launched over one work-group, whatever the data."""

@@ -16,7 +16,7 @@ from clrecon.errors import OutputError
 from clrecon.jobs.shared.outputs import refuse_numbered
 from clrecon.rendering.movies.movie import stage_animation, write_animation
 from clrecon.system.files import replace_file, stage_file
-from clrecon.system.targets import keep_existing
+from clrecon.system.paths import keep_existing
 
 FRAMES = [np.zeros((8, 8, 3), np.uint8)] * 2
 COMMANDS = {

@@ -107,7 +107,7 @@ def test_the_segmentation_is_the_same_map(scan: Path, written: Path, tmp_path: P
 def test_vertebrae_of_low_confidence_are_left_out_with_exit_code_8(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from clrecon.vertebrae import split
+    from clrecon.spine import split
 
     def doubt(piece: Any, *given: Any) -> dict[str, tuple[float, str]]:
         low = piece.upper is not None and piece.upper.is_disc and piece.lower is not None and piece.lower.is_disc

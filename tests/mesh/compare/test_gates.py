@@ -10,7 +10,7 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import compare_meshes
 from clrecon.mesh.compare.gates import judge_label_volume, judge_mesh
 from clrecon.mesh.triangles import enclosed_ml
-from clrecon.system.gates import Gate, failed_gates
+from clrecon.system.records import Gate, failed_gates
 
 pytestmark = pytest.mark.unit
 

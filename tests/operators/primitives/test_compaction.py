@@ -7,7 +7,7 @@ import pytest
 
 from clrecon.errors import UsageError
 from clrecon.opencl import download, upload
-from clrecon.opencl.context import GROUP_SIZE
+from clrecon.opencl.device import GROUP_SIZE
 from clrecon.operators.primitives.scan import SCAN_PER_ITEM, compact, exclusive_scan
 from clrecon.reference.primitives import compact as compact_twin
 from clrecon.reference.primitives import scan as scan_twin

@@ -123,7 +123,7 @@ def test_row_54_a_cpu_device_never_hands_over(device, volume, monkeypatch):
 def test_row_54_only_a_device_that_nobody_named_has_a_stand_in(device, gpu, monkeypatch):
     gpu.stand_in = None
     monkeypatch.setattr("clrecon.opencl.select.list_devices", lambda: [device, gpu])
-    monkeypatch.setattr("clrecon.opencl.stand_in.list_devices", lambda: [device, gpu])
+    monkeypatch.setattr("clrecon.opencl.select.list_devices", lambda: [device, gpu])
     for variable in ("CLRECON_DEVICE", "PYOPENCL_CTX"):
         monkeypatch.delenv(variable, raising=False)
     for name in (None, "auto", "AUTO"):

@@ -1,0 +1,188 @@
+"""Corridors of a vertebra of boxes and cylinders: radius, angles and distances in closed form, in any grid and pose."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import tolerances
+from box_vertebra import BODY_HALF, CANAL_Y, HALF_HU, PLATE_HALF, PLATE_Y, BoxVertebra, grid_around, turned
+
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.labels import LabelMap
+from clrecon.spine.corridors import BODY_SHARE, find_corridors, measure_corridors, screw_diameter, segment_distances
+from clrecon.spine.measures import canal_wall
+
+pytestmark = pytest.mark.untraced
+
+POSES = {
+    "straight": (BoxVertebra(), {}),
+    "turned": (BoxVertebra(rotation=turned(18.0, -12.0, 9.0)), {}),
+    "sheared": (BoxVertebra(), {"shear": 0.3}),
+    "mirrored": (BoxVertebra(), {"mirrored": True}),
+    "thick slices": (BoxVertebra(left_radius=4.5, right_radius=3.5), {"spacing": (1.0, 1.0, 2.0)}),
+}
+
+
+@pytest.mark.parametrize("name", POSES)
+def test_the_cylinder_is_the_corridor(name: str) -> None:
+    vertebra, options = POSES[name]
+    off_mm = tolerances.CORRIDOR_RADIUS_MM * (2.0 if name == "thick slices" else 1.0)
+    affine, shape = grid_around(vertebra, **options)  # type: ignore[arg-type]
+    volume, labels = vertebra.scan(affine, shape)
+    found = measure_corridors(volume, labels, 3, HALF_HU, "L3")
+    assert found.warnings == ()
+    angles = np.degrees(np.arccos(np.clip((found.frame.axes * vertebra.axes).sum(axis=1), -1.0, 1.0)))
+    assert angles.max() < tolerances.CORRIDOR_FRAME_DEG
+    for corridor, sign, radius in zip(
+        found.corridors, (1.0, -1.0), (vertebra.left_radius, vertebra.right_radius), strict=True
+    ):
+        assert corridor.side == ("left" if sign > 0.0 else "right")
+        assert corridor.refused is None
+        assert corridor.radius == pytest.approx(radius, abs=off_mm)
+        assert corridor.canal == pytest.approx(radius, abs=2.0 * off_mm)
+        start, way = vertebra.axis(sign)
+        ends = (np.stack((corridor.back, corridor.tip)) - np.array(vertebra.centre)) @ vertebra.axes.T
+        cosine = (ends[1] - ends[0]) @ way / np.linalg.norm(ends[1] - ends[0])
+        assert np.degrees(np.arccos(min(1.0, cosine))) < tolerances.CORRIDOR_ANGLE_DEG
+        assert abs(corridor.medial_deg - vertebra.medial_deg) < tolerances.CORRIDOR_ANGLE_DEG
+        off = ends[0] - start
+        assert np.linalg.norm(off - (off @ way) * way) < 0.5
+        assert ends[0, 1] == pytest.approx(CANAL_Y, abs=1.0)
+        assert ends[1, 1] == pytest.approx(BODY_HALF[1] - 2.0 * BODY_SHARE * BODY_HALF[1], abs=1.0)
+        entry = (corridor.entry - np.array(vertebra.centre)) @ vertebra.axes.T
+        assert entry[1] == pytest.approx(PLATE_Y + PLATE_HALF[1], abs=1.0)
+        assert corridor.length == pytest.approx(np.linalg.norm(corridor.tip - corridor.entry), abs=1e-6)
+        assert set(corridor.margins) == {"medial", "lateral", "cranial", "caudal"}
+        assert min(value for value in corridor.margins.values() if value is not None) == pytest.approx(
+            corridor.radius, abs=0.02
+        )
+        assert abs(corridor.bias.median_mm) <= 0.2
+        assert corridor.by_hu_share > 0.95
+        low, high = corridor.medial_range_deg
+        assert low <= corridor.medial_deg <= high
+
+
+def test_angles_of_the_patient_follow_the_pose() -> None:
+    vertebra = BoxVertebra(rotation=turned(0.0, 0.0, 15.0))
+    affine, shape = grid_around(vertebra)
+    found = measure_corridors(*vertebra.scan(affine, shape), 3, HALF_HU, "L3")
+    left, right = found.corridors
+    # its left points backwards: a line of the left side runs more to the left, and less towards the midline
+    turn = np.degrees(np.arctan2(vertebra.axes[0, 1], vertebra.axes[0, 0]))
+    assert left.medial_lps_deg - left.medial_deg == pytest.approx(-turn, abs=2.0)
+    assert right.medial_lps_deg - right.medial_deg == pytest.approx(turn, abs=2.0)
+
+
+def test_a_level_farther_out_is_told() -> None:
+    """Partial volume reaches half a voxel to both sides: a tenth of the contrast lies 0.4 voxel outside of the half."""
+    vertebra = BoxVertebra()
+    affine, shape = grid_around(vertebra, spacing=(1.0, 1.0, 1.0))
+    found = measure_corridors(*vertebra.scan(affine, shape), 3, 100.0, "L3")
+    for corridor, radius in zip(found.corridors, (4.0, 3.0), strict=True):
+        assert corridor.radius == pytest.approx(radius + 0.4, abs=2.0 * tolerances.CORRIDOR_RADIUS_MM)
+        assert corridor.bias.median_mm == pytest.approx(0.4, abs=0.25)
+        assert corridor.bias.half_hu == pytest.approx(HALF_HU, abs=30.0)
+
+
+def test_a_pedicle_below_two_voxels_is_refused() -> None:
+    vertebra = BoxVertebra(left_radius=4.5, right_radius=2.0)
+    affine, shape = grid_around(vertebra, spacing=(2.5, 2.5, 2.5))
+    left, right = measure_corridors(*vertebra.scan(affine, shape), 3, HALF_HU, "L3").corridors
+    assert left.refused is None and left.radius == pytest.approx(4.5, abs=0.6)
+    assert right.radius is None and right.refused is not None
+    assert "not resolved" in right.refused
+
+
+def test_what_is_no_vertebra_is_refused() -> None:
+    vertebra = BoxVertebra(arch=False)
+    affine, shape = grid_around(vertebra)
+    volume, labels = vertebra.scan(affine, shape)
+    with pytest.raises(RefusedInputError, match="liver is not the label of a whole vertebra: no vertebral canal"):
+        measure_corridors(volume, labels, 3, HALF_HU, "liver")
+    with pytest.raises(RefusedInputError, match="no voxel of L9 lies in the scan"):
+        measure_corridors(volume, labels, 9, HALF_HU, "L9")
+    with pytest.raises(RefusedInputError, match="no voxel of L3 has 2000 HU or more: they run to 1000 HU"):
+        measure_corridors(volume, labels, 3, 2000.0, "L3")
+    few = np.zeros_like(labels)
+    few[20:30, 40:50, 40:50] = 3
+    volume = volume.with_voxels(np.where(few > 0, 900, 0).astype(np.int16))
+    with pytest.raises(RefusedInputError, match="volume of 0.* ml: no vertebra"):
+        measure_corridors(volume, few, 3, HALF_HU, "L3")
+
+
+def test_a_cut_body_is_refused_and_a_cut_process_is_told() -> None:
+    vertebra = BoxVertebra()
+    affine, (nk, nj, ni) = grid_around(vertebra)
+    volume, labels = vertebra.scan(affine, (nk, nj, ni))
+    marked = np.argwhere(labels == 3)
+    first, last = marked[:, 1].min(), marked[:, 1].max()
+    cut = slice(0, last - 3)  # through the plate behind the canal
+    shorter = type(volume)(volume.voxels[:, cut], affine)
+    found = measure_corridors(shorter, labels[:, cut], 3, HALF_HU, "L3")
+    assert found.warnings == ("L3 touches the end of the scan with its processes; body and pedicles are whole",)
+    assert found.corridors[0].radius == pytest.approx(4.0, abs=tolerances.CORRIDOR_RADIUS_MM)
+    front = affine.copy()
+    front[:3, 3] += affine[:3, 1] * (first + 4)
+    shorter = type(volume)(volume.voxels[:, first + 4 :], front)
+    with pytest.raises(RefusedInputError, match="L3 is cut off: .* voxels of its body and pedicles"):
+        measure_corridors(shorter, labels[:, first + 4 :], 3, HALF_HU, "L3")
+
+
+def test_distances_of_segments_are_those_of_their_nearest_points() -> None:
+    generator = np.random.default_rng(4)
+    points = generator.uniform(-20.0, 20.0, (500, 3))
+    first, last = generator.uniform(-20.0, 20.0, (2, 40, 3))
+    share = np.linspace(0.0, 1.0, 4001)[:, None]
+    expected = [
+        np.sqrt(((a + share[:, None] * (b - a) - points) ** 2).sum(axis=-1).min())
+        for a, b in zip(first, last, strict=True)
+    ]
+    np.testing.assert_allclose(segment_distances(first, last, points), expected, atol=tolerances.SEGMENT_DISTANCE_MM)
+    assert np.isinf(segment_distances(first, last, np.zeros((0, 3)))).all()
+    # beyond the ends, beside the middle, and a segment without length
+    ends = (
+        np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [3.0, 0.0, 0.0]]),
+        np.array([[10.0, 0, 0], [10.0, 0, 0], [3.0, 0, 0]]),
+    )
+    for point, wanted in (
+        ((13.0, 4.0, 0.0), (5.0, 5.0, np.hypot(10, 4))),
+        ((4.0, 0.0, 2.0), (2.0, 2.0, np.hypot(1, 2))),
+    ):
+        np.testing.assert_allclose(segment_distances(*ends, np.array([point])), wanted, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("radius", "margin", "diameter"), [(3.5, 1.0, 5.0), (3.56, 1.0, 5.1), (0.9, 1.0, 0.0), (3.0, 0.0, 6.0)]
+)
+def test_the_largest_screw_keeps_the_margin(radius: float, margin: float, diameter: float) -> None:
+    assert screw_diameter(radius, margin) == pytest.approx(diameter)
+
+
+def test_a_label_map_by_name_gives_the_same() -> None:
+    vertebra = BoxVertebra()
+    volume, labels = vertebra.scan(*grid_around(vertebra))
+    found = find_corridors(volume, LabelMap(labels, volume.affine, {3: "L3"}), "L3", HALF_HU)
+    wanted = measure_corridors(volume, labels, 3, HALF_HU, "L3")
+    assert [each.radius for each in found.corridors] == [each.radius for each in wanted.corridors]
+    assert found.name == "L3"
+    with pytest.raises(UsageError, match="L4"):
+        find_corridors(volume, LabelMap(labels, volume.affine, {3: "L3"}), "L4", HALF_HU)
+
+
+def test_the_canal_wall_ends_three_quarters_of_a_body_from_its_middle() -> None:
+    heights = np.array((-31.0, -30.0, -29.9, 0.0, 29.9, 30.0, 31.0))
+    wall = np.stack((np.full(7, 5.0), np.zeros(7), heights), axis=1)
+    frame = SimpleNamespace(
+        body_height=40.0,
+        to_frame=lambda points: points,
+        to_lps=lambda points: points,
+        canal_at=lambda z: np.stack((np.zeros_like(z), np.zeros_like(z), z), axis=1),
+    )
+    bone = SimpleNamespace(
+        surface=wall, lattice=SimpleNamespace(step=0.5), is_solid=lambda points: np.zeros(len(points), bool)
+    )
+    assert heights[canal_wall(bone, frame)].tolist() == [-30.0, -29.9, 0.0, 29.9, 30.0]
+    bone.is_solid = lambda points: points[:, 2] > 29.95  # what stands before the wall hides it
+    assert heights[canal_wall(bone, frame)].tolist() == [-30.0, -29.9, 0.0, 29.9]
