@@ -123,7 +123,7 @@ def by_plain_edges(volume: Volume) -> float:
 
 def by_preset(volume: Volume) -> float:
     """The preset "bone", the same for every scan."""
-    from clrecon.jobs.mesh.presets import PRESETS
+    from clrecon.jobs.presets import PRESETS
 
     return PRESETS["bone"].iso_value
 

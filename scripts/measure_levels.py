@@ -34,7 +34,7 @@ from marked_tables import markdown_table, put_table  # noqa: E402
 from clrecon.anatomy.iso_choice import IsoChoice, choose_iso_value, half_iso_value  # noqa: E402
 from clrecon.errors import ClreconError, NoSurfaceError  # noqa: E402
 from clrecon.geometry import Volume  # noqa: E402
-from clrecon.jobs.mesh.presets import PRESETS  # noqa: E402
+from clrecon.jobs.presets import PRESETS  # noqa: E402
 
 FIGURES = ROOT / "docs" / "benchmarks" / "levels"
 PAGE = ROOT / "docs" / "iso_value.md"

@@ -16,7 +16,7 @@ from clrecon.cli.mesh import describe_volume
 from clrecon.cli.points import parse_point
 from clrecon.cli.reading import add_reading
 from clrecon.jobs.cloud.settings import DENOISERS, GHOSTS, KINDS, STEPS, CloudSettings
-from clrecon.jobs.shared.clouds import CLOUD_INPUTS
+from clrecon.jobs.inputs import CLOUD_INPUTS
 from clrecon.system.text import count_of, format_band
 
 _PARTS = ("device", "read", "mask", "steps", "surface", "write", "other")
@@ -188,8 +188,7 @@ def _add_steps(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.cloud.files import CloudFiles
-    from clrecon.jobs.cloud.job import make_cloud
+    from clrecon.jobs.cloud.job import CloudFiles, make_cloud
     from clrecon.jobs.cloud.settings import Clustering
 
     given = pick(options, {own.name for own in fields(CloudSettings)})

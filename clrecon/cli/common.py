@@ -270,7 +270,7 @@ def _report_error(error: BaseException, console: Console, debug: bool) -> int:
     known = type(known)(_shorten(str(known)))
     console.error(str(known))
     try:
-        from clrecon.jobs.shared.report import error_as_dict
+        from clrecon.jobs.run import error_as_dict
 
         console.fail(error_as_dict(known))
     except OutputError:

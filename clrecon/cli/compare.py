@@ -14,7 +14,7 @@ from clrecon.cli.masking import add_masking
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.reading import add_reading
 from clrecon.jobs.compare.methods import COMPARED
-from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS
+from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 
 PARTLY_DONE = 8
 

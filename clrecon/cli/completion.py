@@ -10,7 +10,7 @@ from importlib import import_module
 from clrecon.cli.common import Parser, add_common
 from clrecon.cli.console import Console
 from clrecon.errors import UsageError
-from clrecon.jobs.words import list_words
+from clrecon.jobs.presets import list_words
 from clrecon.system.text import guess_word
 
 SHELLS = ("bash", "zsh", "fish")

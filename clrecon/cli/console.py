@@ -119,7 +119,7 @@ class Console:
     def result(self, value: dict[str, Any]) -> None:
         """Print the JSON object; nothing without ``--json`` or ``--report -``."""
         if (self.as_json or self._streams_result) and not self.has_result:
-            from clrecon.jobs.shared.report import to_json
+            from clrecon.jobs.run import to_json
 
             self.has_result = True
             self._to_stdout(to_json(value))

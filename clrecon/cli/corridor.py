@@ -86,8 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _settings(options: argparse.Namespace) -> Any:
-    from clrecon.jobs.corridor.screws import parse_screw, read_screws
-    from clrecon.jobs.corridor.settings import CorridorSettings
+    from clrecon.jobs.corridor import CorridorSettings, parse_screw, read_screws
 
     level = None
     if options.hu != "auto":
@@ -122,8 +121,7 @@ def _settings(options: argparse.Namespace) -> Any:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.corridor.job import make_corridors
-    from clrecon.jobs.corridor.settings import CorridorFiles
+    from clrecon.jobs.corridor import CorridorFiles, make_corridors
 
     files = CorridorFiles(options.output, options.picture, options.report)
     report = make_corridors(
@@ -165,7 +163,7 @@ def describe_report(report: dict[str, Any]) -> list[str]:
 
 def _name_files(report: dict[str, Any], output: str | None, picture: str | None) -> list[tuple[str, int]]:
     """Return the path and the size of each picture and mesh."""
-    from clrecon.jobs.shared.outputs import name_outputs
+    from clrecon.jobs.outputs import name_outputs
 
     files = []
     for kind, path in (("picture", picture), ("mesh", output)):

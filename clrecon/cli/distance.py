@@ -7,7 +7,7 @@ from typing import Any
 
 from clrecon.cli.common import add_device, add_memory, add_no_clobber, megabytes, table
 from clrecon.cli.console import Console, printable
-from clrecon.jobs.shared.clouds import MESH_INPUTS
+from clrecon.jobs.inputs import MESH_INPUTS
 from clrecon.system.text import format_volume
 
 _EPILOG = """\
@@ -62,8 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.distance.job import DistanceFiles, measure_meshes
-    from clrecon.jobs.distance.settings import DistanceSettings
+    from clrecon.jobs.distance import DistanceFiles, DistanceSettings, measure_meshes
 
     given = {} if options.samples is None else {"samples": options.samples}
     settings = DistanceSettings(

@@ -64,8 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.export.job import export_volume
-    from clrecon.jobs.export.settings import ExportSettings
+    from clrecon.jobs.export import ExportSettings, export_volume
 
     settings = ExportSettings(**pick(options, {own.name for own in fields(ExportSettings)}))
     report = export_volume(

@@ -10,7 +10,7 @@ from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clob
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.reading import add_reading
-from clrecon.jobs.inside.pictures import DEFAULT_VIEW
+from clrecon.jobs.inside import DEFAULT_VIEW
 from clrecon.system.text import format_volume
 
 _EPILOG = """\
@@ -114,8 +114,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
     from dataclasses import fields
 
-    from clrecon.jobs.inside.job import make_inside
-    from clrecon.jobs.inside.settings import InsideSettings
+    from clrecon.jobs.inside import InsideSettings, make_inside
 
     settings = InsideSettings(**pick(options, {own.name for own in fields(InsideSettings)}))
     report = make_inside(
@@ -157,8 +156,8 @@ def describe_inside(report: dict[str, Any]) -> list[str]:
 
 def _name_files(path: str, report: dict[str, Any], kind: str) -> str:
     """Name the files of a kind, ``meshes`` or ``pictures``: all of one vertebra, the first and the last of several."""
-    from clrecon.jobs.inside.job import name_part
-    from clrecon.jobs.shared.outputs import name_outputs
+    from clrecon.jobs.inside import name_part
+    from clrecon.jobs.outputs import name_outputs
 
     several = len(report["vertebrae"]) > 1
     names = [

@@ -9,7 +9,7 @@ from clrecon.errors import UsageError
 from clrecon.system.text import format_volume
 
 if TYPE_CHECKING:
-    from clrecon.jobs.mesh.label_choice import LabelChoice
+    from clrecon.jobs.mesh.settings import LabelChoice
 
 
 def _parse_color(text: str) -> tuple[str, str]:
@@ -55,7 +55,7 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
 def label_choice(options: argparse.Namespace) -> LabelChoice | None:
     """Make the settings of labels from the options, None without a label map."""
     if options.labels is not None:
-        from clrecon.jobs.mesh.label_choice import LabelChoice
+        from clrecon.jobs.mesh.settings import LabelChoice
 
         surface = "hu" if options.surface is None else options.surface.lower()
         return LabelChoice(

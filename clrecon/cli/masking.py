@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from clrecon.jobs.shared.preprocess_steps import PREPROCESS_FORMS
-from clrecon.jobs.shared.region_rules import REGION_FORMS
+from clrecon.jobs.options import PREPROCESS_FORMS, REGION_FORMS
 
 
 def add_masking(parser: argparse.ArgumentParser) -> None:

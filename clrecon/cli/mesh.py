@@ -23,7 +23,7 @@ from clrecon.cli.refinement import (
     describe_refinement,
     finish_with_gates,
 )
-from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS
+from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 from clrecon.system.text import count_of, format_digits, format_ml, format_volume
 
 _PARTS = (
@@ -196,10 +196,8 @@ def _add_checks(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.mesh.for_purpose import settings_for
-    from clrecon.jobs.mesh.growing import is_label_seed
     from clrecon.jobs.mesh.job import make_mesh, makes_objects
-    from clrecon.jobs.mesh.settings import MeshSettings
+    from clrecon.jobs.mesh.settings import MeshSettings, is_label_seed, settings_for
 
     names = {own.name for own in fields(MeshSettings)} - {"purpose"}
     given = {**pick(options, names), **options.hu, "labels": label_choice(options)}
@@ -322,7 +320,7 @@ def _describe_parts(meshes: list[dict[str, Any]]) -> list[str]:
 
 
 def _describe_files(output: str, report: dict[str, Any], *, together: bool) -> str:
-    from clrecon.jobs.shared.outputs import name_outputs
+    from clrecon.jobs.outputs import name_outputs
 
     paths = [output] if together else name_outputs(output, [mesh["name"] or "" for mesh in report["meshes"]])
     names = [printable(str(path)) for path in (paths[0], paths[-1])]

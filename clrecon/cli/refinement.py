@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from clrecon.cli.console import Console
-from clrecon.jobs.mesh.purposes import PURPOSES, Purpose
+from clrecon.jobs.presets import PURPOSES, Purpose
 from clrecon.system.text import count_of, format_digits, format_ml
 
 SCAN_GATE_FAILED, GATE_FAILED = 7, 8

@@ -22,8 +22,8 @@ from clrecon.cli.render_options import (
     render_settings,
 )
 from clrecon.errors import UsageError
+from clrecon.jobs.inputs import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file, is_mesh_file
 from clrecon.jobs.render.settings import MeshFile, color_apart, describe_modes, describe_presets
-from clrecon.jobs.shared.clouds import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file, is_mesh_file
 from clrecon.system.text import count_of
 
 _LABELS_LISTED = 24
@@ -97,8 +97,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.render.files import PictureFiles
-    from clrecon.jobs.render.job import make_pictures
+    from clrecon.jobs.render.job import PictureFiles, make_pictures
 
     if options.input is None:
         _show_meshes_alone(options)
@@ -227,7 +226,7 @@ def _describe_picture(picture: dict[str, Any]) -> str:
 
 
 def _describe_files(report: dict[str, Any], files: Any) -> list[str]:
-    from clrecon.jobs.render.files import path_of
+    from clrecon.jobs.render.job import path_of
 
     lines = []
     for what, path in (("output", files.picture), ("depth_output", files.depth), ("values_output", files.values)):

@@ -21,6 +21,7 @@ from clrecon.cli.render_values import (
     parse_window,
 )
 from clrecon.errors import UsageError
+from clrecon.jobs.inputs import MESH_INPUTS
 from clrecon.jobs.render.settings import (
     POINT_COLORS,
     SHEET_SLICES,
@@ -32,7 +33,6 @@ from clrecon.jobs.render.settings import (
     Turntable,
     describe_modes,
 )
-from clrecon.jobs.shared.clouds import MESH_INPUTS
 
 _FRAMES, _FPS, _DEGREES, _ANGLE = 100, 25.0, 360.0, 30.0
 

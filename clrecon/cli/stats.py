@@ -63,8 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.stats.job import measure_stats
-    from clrecon.jobs.stats.settings import StatsSettings
+    from clrecon.jobs.stats import StatsSettings, measure_stats
 
     given = {} if options.percentiles is None else {"percentiles": options.percentiles}
     settings = StatsSettings(

@@ -86,9 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.vertebrae.files import picture_beside
-    from clrecon.jobs.vertebrae.job import make_vertebrae
-    from clrecon.jobs.vertebrae.settings import VertebraeSettings
+    from clrecon.jobs.vertebrae import VertebraeSettings, make_vertebrae, picture_beside
 
     reading = ("series", "phase", "allow_gaps", "force", "follow_links", "rescale")
     names = ("level", "seeds", "name_at", "first", "keep_unsure", "keep_ids")

@@ -17,7 +17,7 @@ from clrecon.errors import UsageError
 from clrecon.system.text import format_volume
 
 if TYPE_CHECKING:
-    from clrecon.jobs.view.settings import ViewSettings
+    from clrecon.jobs.view.inputs import ViewSettings
     from clrecon.system.display import DisplayProbe
 
 _EPILOG = """\
@@ -124,7 +124,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 def _settings(options: argparse.Namespace) -> ViewSettings:
     from clrecon.jobs.mesh.settings import MeshSettings
-    from clrecon.jobs.view.settings import ViewSettings
+    from clrecon.jobs.view.inputs import ViewSettings
 
     given = {**pick(options, {own.name for own in fields(MeshSettings)}), **options.hu, "labels": label_choice(options)}
     if options.labels is not None:

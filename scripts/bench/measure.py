@@ -162,7 +162,7 @@ def _revision() -> str | None:
 
 def write_json(path: Path, result: dict[str, Any]) -> None:
     """Write a result as JSON that is readable and stable under diff."""
-    from clrecon.jobs.shared.report import to_json
+    from clrecon.jobs.run import to_json
 
     plain = json.loads(to_json(result))
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -20,7 +20,7 @@ def main(arguments: list[str]) -> None:
         marks.setdefault(name, time.time() - started)
 
     from clrecon.jobs.mesh.settings import MeshSettings
-    from clrecon.jobs.view.settings import ViewSettings
+    from clrecon.jobs.view.inputs import ViewSettings
     from clrecon.viewer.window import glass, window_content
     from clrecon.viewer.window.open_window import open_window
 

@@ -14,8 +14,7 @@ import pytest
 from clrecon.cli.levels import parse_hu
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
-from clrecon.jobs.mesh.label_choice import LabelChoice
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 
 
 @pytest.fixture(scope="module")

@@ -104,7 +104,7 @@ def test_preparing_a_device_for_a_cloud_loads_no_scipy(device: Any, hu: object) 
     subprocess.run([sys.executable, "-c", f"import clrecon; clrecon.device({device.index})"], check=True)
     code = f"""
 import sys, clrecon
-from clrecon.jobs.cloud.points import prepare_chain
+from clrecon.jobs.cloud.steps import prepare_chain
 from clrecon.jobs.cloud.settings import CloudSettings, Clustering
 prepare_chain(clrecon.device({device.index}), CloudSettings(hu={hu}, clusters=Clustering()), is_cloud=False)
 """

@@ -16,11 +16,10 @@ from clrecon.cli.common import Parser, add_common
 from clrecon.cli.main import COMMANDS
 from clrecon.cli.wording import _DESTINATIONS, speaker_of
 from clrecon.jobs.cloud.settings import CloudSettings
-from clrecon.jobs.mesh.label_choice import LabelChoice
-from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.render.files import PictureFiles
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
+from clrecon.jobs.options import InputSettings
+from clrecon.jobs.render.job import PictureFiles
 from clrecon.jobs.render.settings import RenderSettings
-from clrecon.jobs.shared.settings import InputSettings
 from clrecon.system.arguments import in_python, name_parameter, spoken_by
 from clrecon.viewer.web.serve import serve_view
 

@@ -16,10 +16,9 @@ import clrecon
 from clrecon.geometry import Volume
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.render.files import PictureFiles
-from clrecon.jobs.render.job import make_pictures
+from clrecon.jobs.render.job import PictureFiles, make_pictures
 from clrecon.jobs.render.settings import RenderSettings, Turntable
-from clrecon.jobs.shared.opening import DeviceOpening
+from clrecon.jobs.run import DeviceOpening
 from clrecon.labels import LabelMap
 from clrecon.phantom import PhantomSettings, write_phantom
 from clrecon.system.progress import Progress

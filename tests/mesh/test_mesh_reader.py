@@ -104,6 +104,6 @@ def test_harmed_files_are_refused_in_one_line(tmp_path: Path) -> None:
 
 
 def test_the_job_knows_the_files_that_are_read() -> None:
-    from clrecon.jobs.shared.clouds import MESH_INPUTS as OF_JOBS
+    from clrecon.jobs.inputs import MESH_INPUTS as OF_JOBS
 
     assert OF_JOBS == MESH_INPUTS

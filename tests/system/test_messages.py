@@ -16,8 +16,7 @@ from clrecon.anatomy.noise import Noise
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
 from clrecon.jobs.compare.settings import CompareSettings
-from clrecon.jobs.mesh.label_choice import LabelChoice
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh

@@ -115,7 +115,7 @@ OWN = {
     "jobs/bench/machine.py": "the system",
     "jobs/compare/folder.py": "what it has just written",
     "jobs/compare/template.py": "its own style",
-    "jobs/shared/report.py": "the system",
+    "jobs/run.py": "the system",
     "rendering/movies/frame_folder.py": "new frames",
     "rendering/movies/video.py": "its own temporary files",
 }

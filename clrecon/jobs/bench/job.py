@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.jobs.bench.machine import free_cores, processor_name, usable_cores
 from clrecon.jobs.bench.pairs import alternate, spread, summarise
-from clrecon.jobs.mesh.presets import DEFAULT_PRESET, find_preset
-from clrecon.jobs.shared.laps import Laps
-from clrecon.jobs.shared.outputs import check_kept
-from clrecon.jobs.shared.report import platform_name, stage_report
+from clrecon.jobs.outputs import check_kept
+from clrecon.jobs.presets import DEFAULT_PRESET, find_preset
+from clrecon.jobs.run import Laps, platform_name, stage_report
 from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.version import package_version

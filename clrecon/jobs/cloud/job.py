@@ -4,26 +4,19 @@ from __future__ import annotations
 
 import math
 from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.jobs.cloud.files import CloudFiles
-from clrecon.jobs.cloud.ghosts import find_ghosts
-from clrecon.jobs.cloud.points import iso_value_of, prepare_chain, take_points
 from clrecon.jobs.cloud.report import CloudReport, describe_clouds, describe_file
 from clrecon.jobs.cloud.settings import OF_SCANS, CloudSettings
-from clrecon.jobs.cloud.trail import Trail
-from clrecon.jobs.shared.clouds import is_cloud_file, refuse_other_clouds, refuse_scan_settings
-from clrecon.jobs.shared.labelled import read_with_labels
-from clrecon.jobs.shared.laps import Laps
-from clrecon.jobs.shared.masking import mask_volume
-from clrecon.jobs.shared.opening import DeviceOpening
-from clrecon.jobs.shared.outputs import check_kept, commit_all
-from clrecon.jobs.shared.preprocess import preprocess_volume
-from clrecon.jobs.shared.region import Band, restrict_volume
-from clrecon.jobs.shared.report import stage_report
+from clrecon.jobs.cloud.steps import CloudSteps, find_ghosts, iso_value_of, prepare_chain, take_points
+from clrecon.jobs.inputs import is_cloud_file, read_with_labels, refuse_other_clouds, refuse_scan_settings
+from clrecon.jobs.outputs import check_distinct, check_kept, commit_all
+from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
+from clrecon.jobs.run import DeviceOpening, Laps, stage_report
 from clrecon.reading import read_selected
 from clrecon.system.arguments import name_parameter
 from clrecon.system.files import allow_open_files
@@ -39,6 +32,7 @@ if TYPE_CHECKING:
     from clrecon.points import PointCloud
     from clrecon.points.ghost_slices import GhostSlices
     from clrecon.system.files import Staged
+
 
 log = get_logger(__name__)
 
@@ -88,24 +82,24 @@ def make_cloud(
             " clouds of points"
         )
 
-    subject, labels, device = _open(source, is_cloud, settings, progress, watch)
+    subject, labels, device = _open_input(source, is_cloud, settings, progress, watch)
     ghosts = None
     if not is_cloud and settings.masks:
-        subject, ghosts = _mask(subject, device, settings, progress)  # type: ignore[arg-type]
+        subject, ghosts = _mask_scan(subject, device, settings, progress)  # type: ignore[arg-type]
         watch.lap("mask")
-    trail = take_points(subject, labels, device, settings, progress, ghosts)
+    steps = take_points(subject, labels, device, settings, progress, ghosts)
     watch.lap("steps")
-    trail.check(settings.allow_point_loss)
-    surface = _reconstruct(trail, files, settings, device.current, progress)
+    steps.check(settings.allow_point_loss)
+    surface = _reconstruct_surface(steps, files, settings, device.current, progress)
     watch.lap("surface")
     with keep_existing(no_clobber):
-        report = _write(subject, trail, surface, files, settings, device.current, watch, progress)
+        report = _write_files(subject, steps, surface, files, settings, device.current, watch, progress)
     log_warnings(log, report.warnings, subject.report.get("warnings", ()))
     log.info("%d points of %d on %s in %.3f s", report.points, report.points_first, report.device, watch.total())
     return report
 
 
-def _open(
+def _open_input(
     source: str | Path, is_cloud: bool, settings: CloudSettings, progress: Progress, watch: Laps
 ) -> tuple[Volume | PointCloud, LabelMap | None, Device]:
     """Read the input while the device opens and builds its kernels."""
@@ -130,7 +124,9 @@ def _open(
     return subject, labels, device
 
 
-def _mask(volume: Volume, device: Device, settings: CloudSettings, progress: Progress) -> tuple[Volume, GhostSlices]:
+def _mask_scan(
+    volume: Volume, device: Device, settings: CloudSettings, progress: Progress
+) -> tuple[Volume, GhostSlices]:
     """Turn what the settings name into air; ghost slices are found before, and do not tie the body to its table."""
     from clrecon.operators.resident.device_volume import DeviceVolume
     from clrecon.points.ghost_slices import fill_ghost_slices
@@ -154,19 +150,19 @@ def _read_map(settings: CloudSettings, volume: Volume | None) -> LabelMap | None
     return read_labels(settings.labels, None if settings.label is None else [settings.label], volume=volume)
 
 
-def _reconstruct(
-    trail: Trail, files: CloudFiles, settings: CloudSettings, device: Device, progress: Progress
+def _reconstruct_surface(
+    steps: CloudSteps, files: CloudFiles, settings: CloudSettings, device: Device, progress: Progress
 ) -> Mesh | None:
     """Make the mesh around the points, if its file is named."""
     if files.surface is None:
         return None
-    of_scan = any(step["step"] == "points" for step in trail.steps)
-    if trail.cloud.normals is None:
+    of_scan = any(step["step"] == "points" for step in steps.entries)
+    if steps.cloud.normals is None:
         more = "" if of_scan else f", and name a point inside of the cloud ({name_parameter('viewpoint')})"
         raise UsageError(
             f"a surface needs points with normals out of bone: ask for them ({name_parameter('normals', True)}){more}"
         )
-    if any(step["step"] == "normals" and step["oriented_by"] is None for step in trail.steps):
+    if any(step["step"] == "normals" and step["oriented_by"] is None for step in steps.entries):
         raise UsageError(
             "a surface needs normals that point outward, and those of this cloud have either direction: name a point"
             f" inside of it ({name_parameter('viewpoint')})"
@@ -174,12 +170,12 @@ def _reconstruct(
     from clrecon.operators.points.reconstruct import reconstruct_surface
 
     progress("surface", 0, 0)
-    return reconstruct_surface(trail.cloud, device=device, memory=settings.memory, progress=progress)
+    return reconstruct_surface(steps.cloud, device=device, memory=settings.memory, progress=progress)
 
 
-def _write(
+def _write_files(
     subject: Volume | PointCloud,
-    trail: Trail,
+    steps: CloudSteps,
     surface: Mesh | None,
     files: CloudFiles,
     settings: CloudSettings,
@@ -196,10 +192,10 @@ def _write(
     written: list[Staged] = []
     entries: list[dict[str, Any]] = []
     with ExitStack() as staged:  # all files are on the disk before the first replaces an older one
-        wanted = [("cloud", files.output, trail.cloud), ("removed", files.removed, None)]
+        wanted = [("cloud", files.output, steps.cloud), ("removed", files.removed, None)]
         for what, path, cloud in wanted:
             if path is not None:
-                chosen = trail.removed_cloud() if cloud is None else cloud
+                chosen = steps.removed_cloud() if cloud is None else cloud
                 file = staged.enter_context(stage_cloud(chosen, path, space, keep_ids=ids))
                 written.append(file)
                 entries.append(describe_file(what, path, file.size))
@@ -209,11 +205,11 @@ def _write(
             mesh_file = staged.enter_context(stage_mesh(surface, files.surface, space, keep_ids=ids))
             written.append(mesh_file)
             entries.append(describe_file("surface", files.surface, mesh_file.size))
-        losses = describe_cloud_losses(trail.cloud.describe(space, with_ijk=False), f".{entries[0]['format']}")
+        losses = describe_cloud_losses(steps.cloud.describe(space, with_ijk=False), f".{entries[0]['format']}")
         watch.lap("write")
         report = describe_clouds(
-            subject, trail, settings, device, surface=surface, has_removed=files.removed is not None, outputs=entries,
-            warnings=[*trail.warnings, *(surface.report["warnings"] if surface is not None else ()), *losses],
+            subject, steps, settings, device, surface=surface, has_removed=files.removed is not None, outputs=entries,
+            warnings=[*steps.warnings, *(surface.report["warnings"] if surface is not None else ()), *losses],
             seconds=_seconds(watch),
         )  # fmt: skip
         if files.report is not None:
@@ -228,3 +224,46 @@ def _seconds(watch: Laps) -> dict[str, float]:
     seconds["other"] = max(0.0, watch.total() - sum(seconds.values()))
     seconds["total"] = watch.total()
     return {part: round(value, 4) for part, value in seconds.items()}
+
+
+@dataclass(frozen=True)
+class CloudFiles:
+    """Files that a cloud job writes.
+
+    output: The cloud: ``.ply``, ``.vtp``, ``.npz``, ``.xyz`` or ``.las``.
+    removed: The points as they were extracted, each with the number of the reason why it went as its label; 0 is kept.
+    surface: A closed mesh around the cloud, in a format of meshes.
+    report: The report as JSON.
+    """
+
+    output: str | Path
+    removed: str | Path | None = None
+    surface: str | Path | None = None
+    report: str | Path | None = None
+
+    def check(self) -> list[tuple[str, str | Path]]:
+        """Refuse outputs that cannot be written, before any work is done.
+
+        Returns: list of (str, path). Description and path of each output.
+        """
+        from clrecon.exchange.clouds.formats import check_cloud_format
+        from clrecon.system.files import check_writable
+
+        named = [
+            ("the cloud", self.output),
+            ("the cloud of removed points", self.removed),
+            ("the surface", self.surface),
+            ("the report", self.report),
+        ]
+        outputs = [(what, path) for what, path in named if path is not None]
+        for path in (self.output, self.removed):
+            if path is not None:
+                check_cloud_format(path)
+        if self.surface is not None:
+            from clrecon.exchange.formats import check_format
+
+            check_format(self.surface)
+        check_distinct(outputs)
+        for _, path in outputs:
+            check_writable(path)
+        return outputs

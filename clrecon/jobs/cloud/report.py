@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.geometry.certificate import without_ids
 from clrecon.jobs.cloud.settings import CloudSettings
-from clrecon.jobs.cloud.trail import Trail, name_reasons
-from clrecon.jobs.shared.clouds import describe_cloud
-from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
-from clrecon.jobs.shared.run_report import RunReport
+from clrecon.jobs.cloud.steps import CloudSteps, name_reasons
+from clrecon.jobs.inputs import describe_cloud
+from clrecon.jobs.run import RunReport, peak_memory_bytes, platform_name
 from clrecon.version import package_version
 
 if TYPE_CHECKING:
@@ -30,7 +29,7 @@ class CloudReport(RunReport):
 
     kind: Kind of the points; None for a cloud that was read.
     hu: [low, high] or None
-    cloud_read: The cloud that was read, see `clrecon.jobs.shared.clouds.describe_cloud`.
+    cloud_read: The cloud that was read, see `clrecon.jobs.inputs.describe_cloud`.
     points, points_first: Points of the written cloud, and before any step.
     removed: Points that went, by reason.
     normals, has_hu, labels: What the written cloud knows of its points.
@@ -82,7 +81,7 @@ def describe_file(what: str, path: str | Path, size: int) -> dict[str, Any]:
 
 def describe_clouds(
     subject: Volume | PointCloud,
-    trail: Trail,
+    steps: CloudSteps,
     settings: CloudSettings,
     device: Device,
     *,
@@ -101,7 +100,7 @@ def describe_clouds(
     """
     from clrecon.geometry import Volume
 
-    cloud, first = trail.cloud, trail.first.report
+    cloud, first = steps.cloud, steps.first.report
     certificate: dict[str, Any] = {}
     read = None
     if isinstance(subject, Volume):
@@ -119,17 +118,17 @@ def describe_clouds(
         label=settings.label,
         cloud_read=read,
         points=len(cloud),
-        points_first=len(trail.first),
-        removed=trail.counts,
+        points_first=len(steps.first),
+        removed=steps.counts,
         normals=cloud.normals is not None,
         has_hu=cloud.hu is not None,
         labels=cloud.labels is not None,
         bounds_mm=_bounds(cloud, settings.space),
         space=settings.space,
         paper=settings.paper,
-        steps=trail.steps,
-        gates=[gate.as_dict() for gate in trail.gates],
-        removed_labels=name_reasons(trail.reasons) if has_removed else None,
+        steps=steps.entries,
+        gates=[gate.as_dict() for gate in steps.gates],
+        removed_labels=name_reasons(steps.reasons) if has_removed else None,
         surface=None if surface is None else _describe_surface(surface),
         outputs=outputs,
         device=device.label,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from clrecon.errors import UsageError
-from clrecon.jobs.shared.settings import InputSettings
+from clrecon.jobs.options import InputSettings
 from clrecon.points.kinds import KINDS
 from clrecon.system.arguments import name_parameter
 
@@ -83,7 +83,7 @@ class CloudSettings(InputSettings):
     allow_point_loss: Go on where a step that should take noise only takes more than half of its points.
     space: {"lps", "ras"}. Patient frame of the written files, and of the seeds.
     input_space: {"lps", "ras"}. Patient frame of a cloud file that does not say its own.
-    **shared: See `clrecon.jobs.shared.settings.InputSettings`.
+    **shared: See `clrecon.jobs.options.InputSettings`.
     """
 
     points: str | None = None
@@ -170,7 +170,7 @@ class CloudSettings(InputSettings):
         return isinstance(self.hu, Sequence)
 
     def for_trial(self) -> CloudSettings:
-        """Return the settings for a cube of a few voxels: the same steps, none of them about this scan."""
+        """Settings of the trial run that builds the kernels: the same steps on a cube of 12 voxels a side."""
         hu = (300.0, 3000.0) if self.is_band else 300.0  # below, a cube of 12 mm is searched for a face
         rules = [rule for rule in self.keep if not rule.lower().startswith(("min", "seed"))]
         return replace(

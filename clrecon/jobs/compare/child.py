@@ -13,7 +13,7 @@ from clrecon.errors import ClreconError, DeviceError
 from clrecon.jobs.compare.makers import Scene, draw, make, time_small
 from clrecon.jobs.compare.methods import COMPARED
 from clrecon.jobs.compare.request import Request, load_volume, save_arrays, save_mesh
-from clrecon.jobs.shared.report import peak_memory_bytes, to_json
+from clrecon.jobs.run import peak_memory_bytes, to_json
 from clrecon.system.progress import time_limit
 
 LONG_SECONDS = 2.0

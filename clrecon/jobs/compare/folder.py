@@ -11,7 +11,7 @@ from typing import Any
 
 from clrecon.errors import UsageError
 from clrecon.jobs.compare.methods import COMPARED
-from clrecon.jobs.shared.report import to_json
+from clrecon.jobs.run import to_json
 from clrecon.system.files import StagedFolder, check_folder, temporary_folder
 from clrecon.system.paths import final_mode, system_errors
 

@@ -23,13 +23,11 @@ from clrecon.jobs.compare.report import CompareReport
 from clrecon.jobs.compare.request import Request, save_volume
 from clrecon.jobs.compare.run import measure_in_processes, run_in_process
 from clrecon.jobs.compare.settings import CompareSettings
-from clrecon.jobs.mesh.levels import choose_level, describe_level
-from clrecon.jobs.mesh.parts import check_levels
-from clrecon.jobs.mesh.prepare import mask_parts, narrow_volume
-from clrecon.jobs.mesh.surfaces import plan_surfaces
-from clrecon.jobs.shared.laps import Laps
-from clrecon.jobs.shared.opening import DeviceOpening
-from clrecon.jobs.shared.outputs import check_kept
+from clrecon.jobs.mesh.make import mask_and_preprocess, mask_parts
+from clrecon.jobs.mesh.mesh_parts import check_levels
+from clrecon.jobs.mesh.surfaces import choose_level, describe_level, plan_surfaces
+from clrecon.jobs.outputs import check_kept
+from clrecon.jobs.run import DeviceOpening, Laps
 from clrecon.reading import read_selected
 from clrecon.system.files import temporary_folder
 from clrecon.system.log import get_logger, log_warnings
@@ -143,7 +141,7 @@ def _prepare(
     if choice is not None:
         surfaces = plan_surfaces([choice.iso_value])
     check_levels(volume, surfaces)
-    volume = narrow_volume(volume, surfaces, wanted, device, progress)
+    volume = mask_and_preprocess(volume, surfaces, wanted, device, progress)
     facts, warnings = describe_level(volume, wanted, choice)
     level = surfaces[0].iso_value
     assert isinstance(level, float | int)

@@ -14,7 +14,7 @@ import numpy as np
 
 from clrecon.errors import ClreconError
 from clrecon.jobs.compare.request import load_array, load_mesh, load_volume
-from clrecon.jobs.shared.report import to_json
+from clrecon.jobs.run import to_json
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.cells import GridCells, find_mesh_cells, measure_cells
 from clrecon.mesh.compare.distances import SAMPLES, SurfaceDistance, compare_meshes, summarise_distances

@@ -18,8 +18,7 @@ from clrecon.jobs.compare.methods import Compared
 from clrecon.jobs.compare.pictures import SIZE, VIEW
 from clrecon.jobs.compare.report import CompareReport, MethodRecord
 from clrecon.jobs.compare.settings import CompareSettings
-from clrecon.jobs.shared.laps import Laps
-from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
+from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name
 from clrecon.version import package_version
 
 if TYPE_CHECKING:

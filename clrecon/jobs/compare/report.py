@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from clrecon.jobs.shared.run_report import RunReport
+from clrecon.jobs.run import RunReport
 from clrecon.system.records import Record
 
 

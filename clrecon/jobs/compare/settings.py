@@ -9,7 +9,7 @@ from pathlib import Path
 from clrecon.errors import UsageError
 from clrecon.jobs.compare.methods import Compared, choose_methods
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.shared.settings import InputSettings
+from clrecon.jobs.options import InputSettings
 
 MOST_REPEATS = 100
 
@@ -24,7 +24,7 @@ class CompareSettings(InputSettings):
     paper: Also compare a picture of each method with the middle slice, as a paper does, beside controls.
     repeat: Warm runs of each method, of which the median counts.
     iso_value, preset, half_way, closed: See `MeshSettings`; one level, above which is inside.
-    **shared: See `clrecon.jobs.shared.settings.InputSettings`.
+    **shared: See `clrecon.jobs.options.InputSettings`.
     """
 
     methods: Sequence[str] = ()

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
-from clrecon.jobs.mesh.levels import warn_of_contrast
-from clrecon.jobs.mesh.presets import LOWEST_BONE_HU
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.mesh.surfaces import Bones, Part, Surface
+from clrecon.jobs.mesh.surfaces import Bones, Part, Surface, warn_of_contrast
+from clrecon.jobs.presets import LOWEST_BONE_HU
 from clrecon.system.arguments import name_parameter
 from clrecon.system.text import count_of
 
@@ -94,7 +93,7 @@ def _describe_none(told: Sequence[dict[str, Any]], count: int, rails: int) -> st
 
 def _describe_other_values(volume: Volume) -> str:
     """Say that values on another scale than HU show no bone; empty where they are HU."""
-    from clrecon.jobs.mesh.levels import list_failed_values
+    from clrecon.jobs.mesh.surfaces import list_failed_values
     from clrecon.mesh.compare.walls import COMPACT_HU
 
     failed = list_failed_values(volume)

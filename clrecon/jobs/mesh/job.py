@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Any
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import judge_label_volumes, name_label_files
 from clrecon.jobs.mesh.make import make_parts
-from clrecon.jobs.mesh.parts import first_names, warn_of_crumbs
+from clrecon.jobs.mesh.mesh_parts import first_names, warn_of_crumbs
 from clrecon.jobs.mesh.refinement import describe_purposes, judge_parts, measure_parts, refine_surface, warn_of_gates
 from clrecon.jobs.mesh.report import MeshReport, describe_job, describe_part
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface, plan_surfaces
-from clrecon.jobs.shared.laps import Laps
-from clrecon.jobs.shared.outputs import (
+from clrecon.jobs.outputs import (
     check_kept,
     check_outputs,
     commit_all,
@@ -29,7 +28,7 @@ from clrecon.jobs.shared.outputs import (
     stage_meshes,
     stage_together,
 )
-from clrecon.jobs.shared.report import stage_report
+from clrecon.jobs.run import Laps, stage_report
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
@@ -100,8 +99,8 @@ def make_mesh(
         )
 
     with keep_existing(no_clobber):
-        report = _write(parts, paths, report_path, settings, compose, watch, progress)
-    _log(report, volume)
+        report = _write_meshes(parts, paths, report_path, settings, compose, watch, progress)
+    _log_report(report, volume)
     return report
 
 
@@ -144,7 +143,7 @@ def _name_files(
     return name_outputs(output, [part.name for part in parts], report_path)
 
 
-def _log(report: MeshReport, volume: Volume) -> None:
+def _log_report(report: MeshReport, volume: Volume) -> None:
     log_warnings(log, report.warnings, volume.report.get("warnings", ()))
     log.info(
         "%d meshes made, %d triangles, %d slabs, on %s in %.3f s",
@@ -152,7 +151,7 @@ def _log(report: MeshReport, volume: Volume) -> None:
     )
 
 
-def _write(
+def _write_meshes(
     parts: Sequence[Part],
     paths: Sequence[str | Path],
     report_path: str | Path | None,

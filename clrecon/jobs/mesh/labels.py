@@ -7,14 +7,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.jobs.shared.cropping import crop_labels
+from clrecon.jobs.inputs import crop_labels
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
-    from clrecon.jobs.mesh.label_choice import LabelChoice
-    from clrecon.jobs.mesh.settings import MeshSettings
+    from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
     from clrecon.jobs.mesh.surfaces import Part, Surface
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh

@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.geometry.certificate import without_ids
 from clrecon.jobs.mesh.labels import describe_label
-from clrecon.jobs.mesh.levels import describe_level
-from clrecon.jobs.mesh.presets import find_preset
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.mesh.surfaces import Part
-from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
-from clrecon.jobs.shared.run_report import RunReport
+from clrecon.jobs.mesh.surfaces import Part, describe_level
+from clrecon.jobs.presets import find_preset
+from clrecon.jobs.run import RunReport, peak_memory_bytes, platform_name
 from clrecon.version import package_version
 
 if TYPE_CHECKING:

@@ -1,18 +1,24 @@
-"""Settings of the mesh job, validated on construction."""
+"""Settings of the mesh job, validated on construction.
+
+Beside them the choice of labels that become meshes, what the methods of marching cubes go with, and the settings that
+follow from the purpose of a mesh.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.jobs.mesh.growing import LABEL_SEED, check_growing, is_label_seed
-from clrecon.jobs.mesh.label_choice import LabelChoice
-from clrecon.jobs.mesh.presets import DEFAULT_PRESET, find_preset
-from clrecon.jobs.mesh.purposes import find_purpose
-from clrecon.jobs.shared.settings import InputSettings
+from clrecon.jobs.options import InputSettings
+from clrecon.jobs.presets import DEFAULT_PRESET, HIGHEST_BONE_HU, LOWEST_BONE_HU, find_preset, find_purpose
 from clrecon.system.arguments import name_parameter
+
+if TYPE_CHECKING:
+    from clrecon.labels import LabelMap
 
 
 def name_level(level: float | Sequence[float]) -> str:
@@ -28,7 +34,7 @@ class MeshSettings(InputSettings):
         A pair in the sequence is a range, both ends included: ``((100, 300),)``.
     below: In place of an iso value: inside is ``< below``, HU.  The air around the patient is left out.
     keep_outside: With `below`: keep the air around the patient.
-    preset: Name of an iso value, see `clrecon.jobs.mesh.presets`. If neither is given, the preset is "bone".
+    preset: Name of an iso value, see `clrecon.jobs.presets`. If neither is given, the preset is "bone".
     half_way: "auto" or (bone, tissue). In place of an iso value: half way between the two materials, measured in the
         scan or given in HU.
     space: {"lps", "ras"}. Patient frame of the written mesh.
@@ -57,9 +63,9 @@ class MeshSettings(InputSettings):
     decimate: Share of the triangles to remove, see `clrecon.mesh.decimate_mesh`; None: none.
     max_deviation_mm: Bound of smoothing and of decimation, mm; None: a quarter of the shortest voxel step.
     purpose: Purpose of the mesh, for which more is measured.  It sets nothing here, see
-        `clrecon.jobs.mesh.for_purpose.settings_for`.
+        `clrecon.jobs.mesh.settings.settings_for`.
     strict: Measure everything that a gate needs, triangles that cut each other included.
-    **shared: See `clrecon.jobs.shared.settings.InputSettings`.
+    **shared: See `clrecon.jobs.options.InputSettings`.
     """
 
     iso_value: float | Sequence[float | Sequence[float]] | None = None
@@ -334,3 +340,175 @@ class MeshSettings(InputSettings):
         if self.keep is not None:
             return True
         return self.split or bool(self.seeds) or self.keep_largest is not None or self.min_volume_ml is not None
+
+
+@dataclass(frozen=True)
+class LabelChoice:
+    """The labels of a map that become meshes, and the kind of their surfaces.
+
+    path: NIfTI, NRRD, DICOM SEG or RTSTRUCT.
+    wanted: Numbers or names; empty means all that have a surface.
+    grow_mm: See `clrecon.operators.surface.labels.extract_labels`.
+    solid: Fill less dense parts within a label.
+    surface: {"hu", "mask"}. HU place the vertices (`clrecon.operators.surface.labels.extract_labels`), or each label
+        has its own surface (`clrecon.operators.surface.label_masks.extract_label_masks`).
+    hidden: Labels that become no mesh.
+    colors: tuple of (str or int, str). Labels and their colours, for PLY, GLB and 3MF.
+    """
+
+    path: str | Path
+    wanted: tuple[str | int, ...] = ()
+    grow_mm: float | None = None
+    solid: bool = False
+    surface: str = "hu"
+    hidden: tuple[str | int, ...] = ()
+    colors: tuple[tuple[str | int, str], ...] = ()
+
+    def __post_init__(self) -> None:
+        from clrecon.rendering.looks.colors import find_color  # numpy: not loaded before a job starts
+
+        for _, color in self.colors:
+            find_color(color)
+        if self.surface not in ("hu", "mask"):
+            raise UsageError(f"labels have no surface {self.surface!r}: it is hu or mask")
+        if self.surface == "mask" and (self.solid or self.grow_mm is not None):
+            raise UsageError(
+                f"the surface of a mask is solid and does not grow: leave out {name_parameter('solid')} and"
+                f" {name_parameter('grow_mm')}"
+            )
+
+    def numbers_of(self, labels: LabelMap) -> list[int]:
+        """Return the numbers of the labels that become meshes."""
+        hidden = {labels.find(label) for label in self.hidden}
+        wanted = [labels.find(label) for label in self.wanted] or list(labels.numbers)
+        left = [number for number in wanted if number not in hidden]
+        if not left:
+            raise UsageError("all labels are hidden: there is no mesh to make")
+        return left
+
+    def colors_of(
+        self, labels: LabelMap, numbers: Sequence[int], distinct: bool
+    ) -> dict[int, tuple[float, float, float]]:
+        """Return the colours of labels: those given, and where wanted distinct ones for all others."""
+        from clrecon.rendering.looks.colors import find_color
+        from clrecon.rendering.looks.label_style import distinct_colors
+
+        given = {}
+        for label, color in self.colors:
+            number = labels.find(label)
+            if number in given:
+                raise UsageError(f"label {number} {labels.name(number)} has two colours")
+            given[number] = _as_tuple(find_color(color))
+        if not distinct:
+            return given
+        own = distinct_colors(len(numbers))
+        return {number: _as_tuple(color) for number, color in zip(numbers, own, strict=True)} | given
+
+
+def _as_tuple(color: Any) -> tuple[float, float, float]:
+    red, green, blue = (float(value) for value in color)
+    return red, green, blue
+
+
+LABEL_SEED = "label:"
+"""What a seed that is a label begins with."""
+
+
+def is_label_seed(seed: object) -> bool:
+    """Return whether a seed is a label of the label map."""
+    return isinstance(seed, str) and seed.startswith(LABEL_SEED)
+
+
+def check_growing(
+    method: str,
+    grow_from: Sequence[str | Sequence[float]],
+    vertex_rule: str,
+    *,
+    topology: str,
+    inside: str,
+    labels: LabelChoice | None,
+) -> None:
+    """Check the seeds, the method and the vertex rule of a mesh job, each and with its other settings."""
+    for seed in grow_from:
+        _check_seed(seed)
+    if method == "t-mc" and not grow_from and vertex_rule == "linear":
+        return  # what every device does: the operators need not be loaded
+    from clrecon.geometry.vertex_rules import check_vertex_rule
+    from clrecon.operators.surface.methods import check_method
+
+    chosen = check_method(
+        method, grows=bool(grow_from), vertex_rule=vertex_rule, topology=topology, plain=inside == "above"
+    )
+    check_vertex_rule(vertex_rule, topology)
+    from_labels = any(map(is_label_seed, grow_from))
+    if from_labels and labels is None:
+        raise UsageError(f"a label to grow from needs its label map: give its file with {name_parameter('labels')}")
+    if from_labels and labels is not None and labels.wanted:
+        raise UsageError("a label map to grow from makes no meshes of its own: leave the labels for meshes out")
+    if labels is not None and not from_labels and (chosen.grows or not chosen.on_device or vertex_rule != "linear"):
+        raise UsageError(
+            f"labels pick the cells of their surfaces: leave {name_parameter('method')},"
+            f" {name_parameter('grow_from')} and {name_parameter('vertex_rule')} out, or grow from label:NAME"
+        )
+
+
+def _check_seed(seed: str | Sequence[float]) -> None:
+    if isinstance(seed, str):
+        if seed != "auto" and not (is_label_seed(seed) and seed[len(LABEL_SEED) :].strip()):
+            raise UsageError(f"{name_parameter('grow_from')} is auto, X,Y,Z in mm or label:NAME, not {seed!r}")
+    elif len(seed) != 3 or not all(map(math.isfinite, seed)):
+        raise UsageError(f"a seed is a point of three numbers in mm, not {tuple(seed)}")
+
+
+def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of `MeshSettings` that a purpose sets, with the given fields, which win.
+
+    given: Fields; None, False and empty values count as not given.
+
+    Returns: The given fields, and ``purpose``.  If components are chosen in another way, the purpose leaves none out.
+        Bone is distinguished from other material only if all iso values are those of bone, from 100 to 1500 HU or
+        ``"auto"``; it is made solid if there is one of them, and ``solid`` is not given as False.  Labels whose surface
+        HU place are made solid one by one.
+    """
+    if name is None:
+        return dict(given)
+    purpose = find_purpose(name)
+    fields = dict(purpose.settings)
+    if purpose.is_for_print:
+        if not given.get("closed", True):
+            raise UsageError(f"a surface for {name} is closed: leave {name_parameter('closed', False)} out")
+        if any(given.get(other) for other in ("seeds", "min_volume_ml", "split", "labels", "all_parts")):
+            del fields["keep_largest"]
+        chosen = any(given.get(other) for other in ("keep_largest", "seeds", "min_volume_ml"))
+        levels = _levels_of_bone(given)
+        if (chosen and not given.get("all_parts")) or not levels:
+            del fields["keep"]
+        if levels != 1 or given.get("solid") is False:
+            del fields["solid"]
+        if given.get("solid") is not False and _are_hollow(given):
+            given = {**given, "labels": replace(given["labels"], solid=True)}
+    elif given.get("region"):
+        fields["preprocess"] += ",region"  # the paper's order
+    taken = {field: value for field, value in fields.items() if not given.get(field)}
+    return {**given, **taken, "purpose": name}
+
+
+def _without_parts(given: dict[str, Any]) -> MeshSettings:
+    """Return the settings of these fields without those that a purpose alone makes valid."""
+    return MeshSettings(**{name: value for name, value in given.items() if name not in ("all_parts", "seal_mm")})
+
+
+def _are_hollow(given: dict[str, Any]) -> bool:
+    """True where these fields of `MeshSettings` ask for surfaces of labels in which marrow leaves walls inside."""
+    settings = _without_parts(given)
+    return settings.labels_pick and settings.labels is not None and settings.labels.surface == "hu"
+
+
+def _levels_of_bone(given: dict[str, Any]) -> int:
+    """Return the number of iso surfaces that these fields of `MeshSettings` ask for, 0 if one is not of bone."""
+    settings = _without_parts(given)
+    if settings.labels is not None or settings.inside != "above":
+        return 0
+    levels = [float(level) for level in settings.levels if not isinstance(level, tuple)]
+    of_bone = all(math.isnan(level) or LOWEST_BONE_HU <= level <= HIGHEST_BONE_HU for level in levels)
+    return len(levels) if of_bone else 0

@@ -1,14 +1,25 @@
-"""The surfaces of a mesh job, and the parts of them that become one file each."""
+"""The surfaces of a mesh job and the parts of them that become one file each, and the choice of their iso value.
+
+The iso value is chosen here if it was not given as a number.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from clrecon.jobs.mesh.settings import name_level
+from clrecon.errors import RefusedInputError
+from clrecon.jobs.mesh.settings import MeshSettings, name_level
+from clrecon.jobs.presets import find_preset, find_purpose
+from clrecon.system.arguments import name_parameter
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.text import format_hu
 
 if TYPE_CHECKING:
+    from clrecon.anatomy.iso_choice import IsoChoice
+    from clrecon.geometry import Volume
     from clrecon.mesh import Mesh
     from clrecon.mesh.quality import MeshQuality
 
@@ -88,3 +99,89 @@ def _digits(value: float) -> str:
     """Write a number for a file name with all its digits, so that different numbers never look the same."""
     text = repr(float(value) + 0.0)  # + 0.0 turns -0 into 0
     return text.removesuffix(".0")
+
+
+THICK_SLICES_MM = 2.5
+"""From this spacing on, thin walls across the slices are blurred so much that the half-way level can be too high: with
+slices of 2 mm it is as good as the best, with 3 mm it loses walls (docs/iso_value.md)."""
+
+
+VALUE_GATES = ("hu_known", "hu_scale", "stored_sign")
+"""Gates of a volume that fail where its values are not HU."""
+
+
+def list_failed_values(volume: Volume) -> list[dict[str, Any]]:
+    """Return the gates of `VALUE_GATES` that failed."""
+    return [gate for gate in volume.report.get("gates", ()) if gate["name"] in VALUE_GATES and gate["ok"] is False]
+
+
+def check_known_values(volume: Volume, settings: MeshSettings) -> None:
+    """Refuse to choose the level of a print where the values are not HU; one in the values' own units is taken."""
+    named = settings.iso_value is not None or isinstance(settings.half_way, Sequence) and settings.half_way != "auto"
+    if settings.purpose is None or not find_purpose(settings.purpose).is_for_print or named or not settings.follows_hu:
+        return
+    failed = list_failed_values(volume)
+    if failed:
+        raise RefusedInputError(
+            f"a print needs a level of bone, and the values of this scan are not known to be HU"
+            f" ({failed[-1]['name']}: {failed[-1]['text']}). Give the level in the scan's own values"
+            f" ({name_parameter('iso_value', 'N')}), or say how HU follow from the stored values"
+            f" ({name_parameter('rescale', 'SLOPE,INTERCEPT')})"
+        )
+
+
+def choose_level(volume: Volume, settings: MeshSettings, progress: Progress = ignore_progress) -> IsoChoice | None:
+    """Return the iso value half way between two materials, measured or given; None if the settings name levels."""
+    from clrecon.anatomy.iso_choice import choose_iso_value, half_iso_value
+
+    if settings.half_way is None:
+        return None
+    if isinstance(settings.half_way, str):
+        return choose_iso_value(volume, progress=progress)
+    return half_iso_value(*settings.half_way)
+
+
+def describe_level(
+    volume: Volume, settings: MeshSettings, choice: IsoChoice | None
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the entries of the report, and warnings."""
+    if not settings.follows_hu:
+        return {"iso_value_reason": "none: the masks of the labels", "iso_value_choice": None}, []
+    if choice is None:
+        preset = settings.preset_used
+        reason = "as given" if preset is None else f"preset {preset}: {find_preset(preset).source}"
+        return {"iso_value_reason": reason, "iso_value_choice": None}, []
+    warnings = []
+    low, high = volume.hu_range or (math.nan, math.nan)
+    for material, hu in (("bone", choice.bone_hu), ("tissue", choice.tissue_hu)):
+        if choice.method == "half" and not low <= hu <= high:
+            warnings.append(
+                f"{material} was given as {hu:g} HU, but the volume runs from {format_hu(low)} to {format_hu(high)} HU:"
+                " the level half way may not be that of this scan"
+            )
+    if choice.method == "auto" and volume.spacing[2] > THICK_SLICES_MM:
+        warnings.append(
+            f"slices are {volume.spacing[2]:.3g} mm apart: walls thinner than that may be lost at"
+            f" {choice.iso_value:g} HU; compare with a lower iso value, such as {name_parameter('preset', 'bone')}"
+        )
+    return {"iso_value_reason": choice.reason, "iso_value_choice": choice.measurements()}, warnings
+
+
+def warn_of_contrast(choice: IsoChoice) -> list[str]:
+    """Warn of contrast medium at the edges by which the iso value was chosen."""
+    from clrecon.anatomy.iso_choice import CONTRAST_SAID
+
+    if choice.flat_share is None or choice.flat_share < CONTRAST_SAID:
+        return []
+    share = f"{100.0 * choice.flat_share:.0f} % of the contrast at the edges ends in flat plateaus below 600 HU"
+    if not choice.contrast_medium_share:
+        return [
+            f"{share}: too much to be left out of the choice of {choice.iso_value:g} HU. Where that is contrast medium"
+            f" and not a body of one material, the level is not that of bone: give it"
+            f" ({name_parameter('iso_value', 'N')})"
+        ]
+    return [
+        f"{share}, as heart, vessels and organs with contrast medium do. They were left out of the choice of"
+        f" {choice.iso_value:g} HU; what of them is brighter is in the surface:"
+        f" {name_parameter('keep', 'bone')} keeps what looks like bone"
+    ]

@@ -1,16 +1,24 @@
-"""The render job: from a CT series to pictures, moving pictures and their report."""
+"""The render job: from a CT series to pictures, moving pictures and their report.
+
+Its files are checked early, and written under temporary names.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from clrecon.errors import UsageError
-from clrecon.jobs.render.files import PictureFiles, check_pictures, format_of, name_view, stage_picture
+from clrecon.jobs.inputs import is_cloud_file, is_mesh_file, read_with_labels, refuse_scan_settings
+from clrecon.jobs.outputs import check_distinct, check_kept, commit_all
+from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
+from clrecon.jobs.render.picture_taker import PictureTaker, read_curve, read_function, read_look
 from clrecon.jobs.render.report import (
     PictureReport,
     describe_picture,
@@ -19,20 +27,13 @@ from clrecon.jobs.render.report import (
     warn_of_picture,
 )
 from clrecon.jobs.render.settings import RenderSettings
-from clrecon.jobs.render.studio import Studio, read_curve, read_function, read_look
-from clrecon.jobs.shared.clouds import is_cloud_file, is_mesh_file, refuse_scan_settings
-from clrecon.jobs.shared.labelled import read_with_labels
-from clrecon.jobs.shared.laps import Laps
-from clrecon.jobs.shared.masking import mask_volume
-from clrecon.jobs.shared.opening import DeviceOpening
-from clrecon.jobs.shared.outputs import check_kept, commit_all
-from clrecon.jobs.shared.preprocess import preprocess_volume
-from clrecon.jobs.shared.region import Band, restrict_volume
-from clrecon.jobs.shared.report import stage_report
+from clrecon.jobs.run import DeviceOpening, Laps, stage_report
 from clrecon.mesh import Mesh
 from clrecon.mesh.reader import read_mesh
 from clrecon.reading import read_selected
+from clrecon.rendering.pictures.modes import check_known
 from clrecon.rendering.pictures.styles import Projection, SurfaceLook
+from clrecon.system.arguments import name_parameter
 from clrecon.system.files import allow_open_files
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.paths import keep_existing
@@ -44,7 +45,8 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.points import PointCloud
     from clrecon.rendering import Rendering
-    from clrecon.system.files import Staged
+    from clrecon.system.files import Staged, StagedFile
+
 
 log = get_logger(__name__)
 
@@ -81,20 +83,20 @@ def make_pictures(
     curve = read_curve(settings.curve)
     meshes = [read_mesh(mesh.path, space=settings.mesh_space) for mesh in settings.meshes]
 
-    subject, labels, device = _open(source, settings, progress, watch)
-    studio = Studio(
+    subject, labels, device = _open_input(source, settings, progress, watch)
+    taker = PictureTaker(
         subject, device, settings, function=function, curve=curve, labels=labels, meshes=meshes, progress=progress
     )
     with (
         keep_existing(no_clobber),
-        studio,
+        taker,
         ExitStack() as staged,
     ):  # all files are on the disk before any of them replaces an older one
-        pictures, written = _take_views(studio, settings, files, staged, watch, progress)
-        turntable, moving = _turn(studio, settings, files, staged, watch, progress)
+        pictures, written = _take_views(taker, settings, files, staged, watch, progress)
+        turntable, moving = _take_turntable(taker, settings, files, staged, watch, progress)
         written += moving
         device = device.current
-        report = describe_pictures(subject, settings, studio, device, pictures, turntable, _seconds(watch))
+        report = describe_pictures(subject, settings, taker, device, pictures, turntable, _seconds(watch))
         if files.report is not None:
             written.append(staged.enter_context(stage_report(files.report, report)))
         commit_all(written)
@@ -103,7 +105,7 @@ def make_pictures(
     return report
 
 
-def _open(
+def _open_input(
     source: str | Path, settings: RenderSettings, progress: Progress, watch: Laps
 ) -> tuple[Volume | PointCloud | Mesh, LabelMap | None, Device]:
     """Read the scan and its labels, the cloud or the mesh, while the device opens and builds its kernels."""
@@ -122,7 +124,7 @@ def _open(
     if is_cloud:
         refuse_scan_settings(settings)
     progress("device", 0, 0)
-    with DeviceOpening(settings.device, partial(_prepare, settings=settings)) as opening:
+    with DeviceOpening(settings.device, partial(_prepare_kernels, settings=settings)) as opening:
         subject: Volume | PointCloud | Mesh
         labels = None
         if is_mesh:
@@ -143,23 +145,23 @@ def _open(
         device = opening.wait()
         watch.lap("device")
     if not (is_cloud or is_mesh):
-        subject = _narrow(subject, settings, device, progress)  # type: ignore[arg-type]
+        subject = _mask_scan(subject, settings, device, progress)  # type: ignore[arg-type]
         watch.lap("mask")
     return subject, labels, device
 
 
-def _narrow(volume: Volume, settings: RenderSettings, device: Device, progress: Progress) -> Volume:
+def _mask_scan(volume: Volume, settings: RenderSettings, device: Device, progress: Progress) -> Volume:
     """Turn what the settings name into air, and run the steps of preprocessing."""
     style = settings.style
     bands: list[Band] = [(style.iso_value, math.inf)] if isinstance(style, SurfaceLook) else []
     volume = mask_volume(volume, settings, progress)
     if isinstance(style, Projection) and style.leaves_out:
-        return _leave_out(volume, settings, device, progress)
+        return _leave_out_surroundings(volume, settings, device, progress)
     volume = restrict_volume(volume, settings, device, bands, progress)
     return preprocess_volume(volume, settings, device, bands, progress)
 
 
-def _leave_out(volume: Volume, settings: RenderSettings, device: Device, progress: Progress) -> Volume:
+def _leave_out_surroundings(volume: Volume, settings: RenderSettings, device: Device, progress: Progress) -> Volume:
     """Leave out what lies outside of the body and of the region, whose voxels get a value above those that count."""
     from clrecon.anatomy.surroundings import LEFT_OUT, leave_out_surroundings
     from clrecon.geometry.certificate import amend
@@ -173,7 +175,7 @@ def _leave_out(volume: Volume, settings: RenderSettings, device: Device, progres
     return volume
 
 
-def _prepare(device: Device, settings: RenderSettings) -> None:
+def _prepare_kernels(device: Device, settings: RenderSettings) -> None:
     """Build the kernels for int16 by taking a small picture of an empty volume, or of one point."""
     import numpy as np
 
@@ -182,23 +184,23 @@ def _prepare(device: Device, settings: RenderSettings) -> None:
 
     if settings.mode == "mesh":
         small = RenderSettings.of("mesh", size=(8, 8))
-        with Studio(Mesh(np.eye(3), [(0, 1, 2)]), device, small, progress=ignore_progress) as studio:
-            studio.take_view("anterior")
+        with PictureTaker(Mesh(np.eye(3), [(0, 1, 2)]), device, small, progress=ignore_progress) as taker:
+            taker.take_view("anterior")
         return
     if settings.mode == "points":
         small = RenderSettings.of("points", size=(8, 8))
-        with Studio(PointCloud([(0.0, 0.0, 0.0)]), device, small, progress=ignore_progress) as studio:
-            studio.take_view("anterior")
+        with PictureTaker(PointCloud([(0.0, 0.0, 0.0)]), device, small, progress=ignore_progress) as taker:
+            taker.take_view("anterior")
         return
     nothing = Volume(np.zeros((2, 2, 2), np.int16), np.eye(4))
     mode = "slice" if settings.mode == "cpr" else settings.mode  # the same kernel, and no curve is needed
     small = RenderSettings.of(mode, size=(8, 8), iso_value=0.0 if mode == "surface" else None)
-    with Studio(nothing, device, small, progress=ignore_progress) as studio:
-        studio.take_view("anterior")
+    with PictureTaker(nothing, device, small, progress=ignore_progress) as taker:
+        taker.take_view("anterior")
 
 
 def _take_views(
-    studio: Studio,
+    taker: PictureTaker,
     settings: RenderSettings,
     files: PictureFiles,
     staged: ExitStack,
@@ -210,23 +212,23 @@ def _take_views(
     written: list[Staged] = []
     if files.picture is None:
         return pictures, written
-    views = studio.views
+    views = taker.views
     for place, view in enumerate(views):
         progress("render", place, len(views) if len(views) > 1 else 0)
-        picture = studio.take_view(view)
+        picture = taker.take_view(view)
         watch.lap("render")
         name = name_view(view, views)
         own = stage_picture(staged, picture, files, name)
         outputs = {what: {"format": format_of(path), "bytes": file.size} for what, (path, file) in own.items()}
         pictures.append(describe_picture(picture, name, view) | outputs)
-        studio.warnings += warn_of_picture(picture, studio.device.warnings)
+        taker.warnings += warn_of_picture(picture, taker.device.warnings)
         written += [file for _, file in own.values()]
         watch.lap("write")
     return pictures, written
 
 
-def _turn(
-    studio: Studio,
+def _take_turntable(
+    taker: PictureTaker,
     settings: RenderSettings,
     files: PictureFiles,
     staged: ExitStack,
@@ -239,7 +241,7 @@ def _turn(
         return None, []
     from clrecon.rendering.movies.movie import animation_kind, stage_animation, turntable_cameras
 
-    first = settings.camera(studio.box, studio.views[0], turning=True)
+    first = settings.camera(taker.box, taker.views[0], turning=True)
     cameras = turntable_cameras(first, turn.frames, turn.degrees)
 
     empty: list[str] | None = []
@@ -247,7 +249,7 @@ def _turn(
     def frames() -> Iterator[Rendering]:
         nonlocal empty
         for camera in cameras:
-            picture = studio.take(camera)
+            picture = taker.take(camera)
             why = None if empty is None else find_emptiness(picture)
             empty = None if empty is None or why is None else [*empty, why]
             yield picture
@@ -257,7 +259,7 @@ def _turn(
         stage_animation(frames(), files.turntable, turn.fps, total=turn.frames, progress=progress)
     )
     seconds = watch.lap("turntable")
-    studio.warnings += (empty or [])[:1]  # one frame that is not empty is enough
+    taker.warnings += (empty or [])[:1]  # one frame that is not empty is enough
     described = {
         "frames": turn.frames,
         "fps": turn.fps,
@@ -274,3 +276,139 @@ def _seconds(watch: Laps) -> dict[str, float]:
     seconds["other"] = max(0.0, watch.total() - sum(seconds.values()))
     seconds["total"] = watch.total()
     return {part: round(value, 4) for part, value in seconds.items()}
+
+
+OPAQUE_ONLY = (".jpg", ".jpeg", ".mp4", ".gif")
+
+
+@dataclass(frozen=True)
+class PictureFiles:
+    """Paths of the outputs of a job; with several views each picture gets its own file names.
+
+    picture: .png, .jpg or .tif.
+    depth, values: .npy or .tif, with the distances to the first hit in mm, and with HU.
+    turntable: See `clrecon.rendering.movies.movie.check_animation`.
+    report: JSON.
+    """
+
+    picture: str | Path | None = None
+    depth: str | Path | None = None
+    values: str | Path | None = None
+    turntable: str | Path | None = None
+    report: str | Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.picture is None and self.turntable is None:
+            raise UsageError(
+                f"there is nothing to write: name a picture ({name_parameter('picture', 'out.png')}) or a turntable"
+                f" ({name_parameter('turntable')})"
+            )
+        if self.picture is None and (self.depth is not None or self.values is not None):
+            raise UsageError(
+                f"depths and values belong to a picture: name it too ({name_parameter('picture', 'out.png')})"
+            )
+
+
+def name_view(view: str, views: Sequence[str]) -> str:
+    """Name of a view between the stem of a file and its extension; empty for a single view.
+
+    Returns: The view's own name, or ``az30_el-15`` for angles.
+    """
+    if len(views) == 1:
+        return ""
+    azimuth, comma, elevation = view.strip().lower().partition(",")
+    return f"az{float(azimuth):g}_el{float(elevation):g}" if comma else azimuth
+
+
+def path_of(path: str | Path, name: str) -> str | Path:
+    """Insert a name into a path: ``out.png`` and ``left`` give ``out_left.png``; an empty name changes nothing."""
+    stem, extension = os.path.splitext(os.fspath(path))
+    return f"{stem}_{name}{extension}" if name else path
+
+
+def format_of(path: str | Path) -> str:
+    """Return the extension of a file in lower case, without the dot; empty for a folder."""
+    return os.path.splitext(os.fspath(path))[1].lower().lstrip(".")
+
+
+def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[str, str | Path]]:
+    """Refuse outputs that cannot be written, before any work is done.
+
+    Returns: list of (str, path). A description of each output, and its path.
+    """
+    from clrecon.rendering.movies.movie import animation_kind, check_animation
+    from clrecon.rendering.pictures.annotations import check_caption
+    from clrecon.rendering.pictures.image_files import check_float_path, check_image_path
+    from clrecon.rendering.pictures.pillow import load_pillow
+    from clrecon.system.files import check_writable
+
+    load_pillow()
+    check_caption(settings.caption)
+    for name in ("depth", "values"):
+        if getattr(files, name) is not None:
+            check_known(settings.mode, name)
+    if files.depth is not None and settings.is_sheet:
+        raise UsageError("a contact sheet has no depths: its slices lie in planes of their own")
+    if settings.background == "transparent":
+        picture = "" if files.picture is None else format_of(files.picture)
+        turntable = "" if files.turntable is None else animation_kind(files.turntable)[1:]
+        for kind in (picture, turntable):
+            if f".{kind}" in OPAQUE_ONLY:
+                raise UsageError(
+                    f"{kind.upper()} cannot hold a transparent background:"
+                    f" choose PNG, TIFF or APNG, or a colour ({name_parameter('background')})"
+                )
+    of_views = {"the picture": files.picture, "the depths": files.depth, "the values": files.values}
+    owned: list[tuple[str, str | Path]] = [] if files.report is None else [("the report", files.report)]
+    for what, path in of_views.items():
+        if path is not None:
+            (check_image_path if what == "the picture" else check_float_path)(path)
+            names = [name_view(view, settings.views_used) for view in settings.views_used]
+            owned += [(f"{what} {name}".rstrip(), path_of(path, name)) for name in names]
+    moving = [] if files.turntable is None else [("the turntable", files.turntable)]
+    check_distinct(owned, moving)
+    for _, path in owned:
+        check_writable(path)
+    if files.turntable is not None and settings.turntable is not None:
+        if check_animation(files.turntable, settings.turntable.fps) == "":
+            _check_outside_frames(files.turntable, owned)
+    return [*owned, *moving]
+
+
+def _check_outside_frames(folder: str | Path, owned: Sequence[tuple[str, str | Path]]) -> None:
+    """Refuse files in the folder of frames, because that folder is replaced as a whole."""
+    frames = Path(os.path.realpath(folder))
+    for what, path in owned:
+        if frames in Path(os.path.realpath(path)).parents:
+            raise UsageError(f"{what} cannot lie in {folder}, which holds frames and nothing else: name another folder")
+
+
+def stage_picture(
+    stack: ExitStack, picture: Rendering, files: PictureFiles, name: str
+) -> dict[str, tuple[str | Path, StagedFile]]:
+    """Write a picture, and its depths and values if asked for, under temporary names.
+
+    Returns: ``output`` and, if asked for, ``depth_output`` and ``values_output``: each with its path and its staged
+        file.
+    """
+    from clrecon.rendering.pictures.image_files import encode_floats, encode_image
+    from clrecon.system.files import stage_file
+
+    def stage(path: str | Path, content: bytes) -> tuple[str | Path, StagedFile]:
+        def write(stream: BinaryIO) -> None:
+            stream.write(content)
+
+        named = path_of(path, name)
+        return named, stack.enter_context(stage_file(named, write, expected_bytes=len(content)))
+
+    assert files.picture is not None
+    staged = {"output": stage(files.picture, encode_image(picture, f".{format_of(files.picture)}"))}
+    if files.depth is not None:
+        staged["depth_output"] = stage(
+            files.depth, encode_floats(picture.depth, f".{format_of(files.depth)}", picture.pixel_mm)
+        )
+    if files.values is not None and picture.values is not None:
+        staged["values_output"] = stage(
+            files.values, encode_floats(picture.values, f".{format_of(files.values)}", picture.pixel_mm)
+        )
+    return staged

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.anatomy.head import SKIN_SEEN_HU, warn_of_face
 from clrecon.geometry.certificate import without_ids
+from clrecon.jobs.inputs import describe_cloud
 from clrecon.jobs.render.settings import LabelLook, RenderSettings
-from clrecon.jobs.shared.clouds import describe_cloud
-from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
-from clrecon.jobs.shared.run_report import RunReport
+from clrecon.jobs.run import RunReport, peak_memory_bytes, platform_name
 from clrecon.rendering.looks.label_style import NO_LABEL, find_shown
 from clrecon.rendering.pictures.annotations import edge_letters
 from clrecon.rendering.pictures.mesh_look import MeshLook
@@ -22,7 +21,7 @@ from clrecon.version import package_version
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
-    from clrecon.jobs.render.studio import Studio
+    from clrecon.jobs.render.picture_taker import PictureTaker
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
@@ -173,7 +172,7 @@ class PictureReport(RunReport):
 def describe_pictures(
     subject: Volume | PointCloud | Mesh,
     settings: RenderSettings,
-    studio: Studio,
+    taker: PictureTaker,
     device: Device,
     pictures: Sequence[dict[str, Any]],
     turntable: dict[str, Any] | None,
@@ -181,7 +180,7 @@ def describe_pictures(
 ) -> PictureReport:
     """Compose the report of a job.
 
-    studio: The studio of the pictures: it knows their transfer function, light and warnings.
+    taker: The taker of the pictures: it knows their transfer function, light and warnings.
     pictures: The entry of each picture from `describe_picture`, with its files.
     """
     from clrecon.geometry import Volume
@@ -191,14 +190,14 @@ def describe_pictures(
     certificate: dict[str, Any] = {}
     if volume is not None:
         certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
-    warnings = [str(text) for text in certificate.pop("warnings", [])] + device.warnings + studio.warnings
+    warnings = [str(text) for text in certificate.pop("warnings", [])] + device.warnings + taker.warnings
     if volume is not None:
-        warnings += warn_of_face(volume, _skin_shown(studio.style), "picture")
+        warnings += warn_of_face(volume, _skin_shown(taker.style), "picture")
     cloud = describe_cloud(subject) if isinstance(subject, PointCloud) else None
-    meshes = _describe_meshes(subject, settings, studio)
+    meshes = _describe_meshes(subject, settings, taker)
     files = [(each or {}).get("file") or {} for each in (cloud, *meshes)]
     warnings = [*(text for file in files for text in file.get("warnings", ())), *warnings]
-    style, lighting = studio.style, studio.lighting
+    style, lighting = taker.style, taker.lighting
     clip = getattr(style, "clip", None)
     surface = style if isinstance(style, SurfaceLook) else None
     colored = style if isinstance(style, SurfaceLook | PointLook | MeshLook) else None
@@ -206,7 +205,7 @@ def describe_pictures(
         affine_ijk_to_lps_mm=subject.report.get("affine_ijk_to_lps_mm") if volume is None else volume.affine.tolist(),
         mode=style.mode,
         preset=settings.preset_used,
-        transfer_function=_describe_function(studio.function),
+        transfer_function=_describe_function(taker.function),
         iso_value_hu=None if surface is None else surface.iso_value,
         color=None if colored is None else colored.color,
         depth_cue=None if surface is None else surface.depth_cue,
@@ -218,7 +217,7 @@ def describe_pictures(
         thickness_mm=style.thickness if isinstance(style, PlaneCut | CurveCut) else None,
         combine=style.combine if isinstance(style, PlaneCut | CurveCut) and style.thickness else None,
         offset_mm=style.offset_mm if isinstance(style, PlaneCut) else None,
-        labels=_describe_labels(settings.labels, studio.labels),
+        labels=_describe_labels(settings.labels, taker.labels),
         meshes=meshes,
         cloud=cloud,
         pictures=list(pictures),
@@ -236,14 +235,14 @@ def describe_pictures(
 
 
 def _describe_meshes(
-    subject: Volume | PointCloud | Mesh, settings: RenderSettings, studio: Studio
+    subject: Volume | PointCloud | Mesh, settings: RenderSettings, taker: PictureTaker
 ) -> list[dict[str, Any]]:
     """Describe the mesh that is the input, and those that are shown with it."""
     from clrecon.mesh import Mesh
 
-    shown = [(subject, studio.style)] if isinstance(subject, Mesh) else []
+    shown = [(subject, taker.style)] if isinstance(subject, Mesh) else []
     described = []
-    for mesh, look in [*shown, *zip(studio.meshes, settings.mesh_looks(), strict=True)]:
+    for mesh, look in [*shown, *zip(taker.meshes, settings.mesh_looks(), strict=True)]:
         assert isinstance(look, MeshLook)
         described.append(
             {

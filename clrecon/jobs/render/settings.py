@@ -13,7 +13,7 @@ from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.boxes import CROPS, Box, crop_box
 from clrecon.geometry.grid import Grid
-from clrecon.jobs.shared.settings import InputSettings
+from clrecon.jobs.options import InputSettings
 from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.looks.label_style import NO_LABEL, distinct_colors
@@ -141,7 +141,7 @@ class RenderSettings(InputSettings):
         1200; for a curved reformation it depends on the curve.
     background: Colour, or "transparent".
     caption: Text that is drawn into the pictures.
-    **shared: See `clrecon.jobs.shared.settings.InputSettings`.
+    **shared: See `clrecon.jobs.options.InputSettings`.
     """
 
     style: Style = VolumeLook()

@@ -1,23 +1,27 @@
-"""Inputs of a view: scans, meshes, clouds and a label map, each read by what the other jobs read it with."""
+"""Settings and inputs of a view: scans, meshes, clouds and a label map, each read by what the other jobs read it with.
+
+Settings of the job that shows are validated on construction; some of them mean nothing where nothing is made.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.jobs.distance.inputs import read_side
+from clrecon.jobs.distance import read_side
+from clrecon.jobs.inputs import crop_labels, is_cloud_file, refuse_other_clouds
 from clrecon.jobs.mesh.labels import open_labels
-from clrecon.jobs.shared.clouds import is_cloud_file, refuse_other_clouds
-from clrecon.jobs.shared.cropping import crop_labels
-from clrecon.jobs.shared.masking import mask_volume
-from clrecon.jobs.view.settings import ViewSettings
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.options import InputSettings
+from clrecon.jobs.preprocess import mask_volume
 from clrecon.mesh import Mesh
 from clrecon.mesh.reader import MESH_INPUTS
 from clrecon.reading import read_selected, tell_format
+from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
 
@@ -25,6 +29,56 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
     from clrecon.points import PointCloud
+
+
+MOST_NAME = 80
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewSettings:
+    """Settings of the job.
+
+    scan: How surfaces are made of inputs that are scans; its `space` is the frame in which places are shown.
+    mesh_space: {"lps", "ras"}. Patient frame of mesh files that do not name theirs; None: LPS, with a warning.
+    names: Names of the inputs, in their order, to be shown; those without one are numbered.  File names are not shown:
+        they can hold the name of a patient.
+    """
+
+    scan: MeshSettings = field(default_factory=MeshSettings)
+    mesh_space: str | None = None
+    names: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        from clrecon.geometry import frame_from_lps
+
+        if self.mesh_space is not None:
+            frame_from_lps(self.mesh_space)
+        for name in self.names:
+            if not name.strip() or len(name) > MOST_NAME or not name.isprintable():
+                raise UsageError(f"a name has 1 to {MOST_NAME} printable characters, not {name[:MOST_NAME]!r}")
+        if self.scan.labels_pick and not self.scan.one_file:  # each label with a colour of its own
+            object.__setattr__(self, "scan", replace(self.scan, one_file=True))
+
+
+_OF_A_VIEW = {"iso_value", "preset", "half_way", "space", "labels", "one_file"}
+"""Settings of meshes that a view has a meaning for; a label map sets the last one by itself."""
+
+
+def check_view_settings(settings: ViewSettings) -> None:
+    """Refuse settings that a view has no meaning for, before anything is read."""
+    scan = settings.scan
+    ignored = {own.name for own in fields(InputSettings)} | _OF_A_VIEW
+    for own in fields(scan):
+        default = own.default if own.default_factory is MISSING else own.default_factory()
+        value = getattr(scan, own.name)
+        if own.name not in ignored and value != default and not (isinstance(value, Sequence) and not value):
+            raise UsageError(
+                f"{name_parameter(own.name)} says how a mesh is made, and a view makes none: leave it out, or write a"
+                " page instead"
+            )
+    if isinstance(scan.iso_value, Sequence) and (len(scan.levels) != 1 or isinstance(scan.levels[0], tuple)):
+        raise UsageError("a view begins with one iso value: give one, and move the slider")
+
 
 _MOST_LABELS = 1000
 """Values up to which whole numbers from 0 are taken for labels; air of a CT is negative."""
@@ -152,8 +206,7 @@ def _open_scan(path: str | Path, settings: ViewSettings, progress: Progress) -> 
         return OpenedInput(labels, (said, *labels.warnings))
     volume = mask_volume(volume, scan, progress)
     if scan.crop is not None or scan.region or scan.preprocess is not None:
-        from clrecon.jobs.shared.preprocess import preprocess_volume
-        from clrecon.jobs.shared.region import restrict_volume
+        from clrecon.jobs.preprocess import preprocess_volume, restrict_volume
         from clrecon.operators import take_device
 
         device = take_device(scan.device)

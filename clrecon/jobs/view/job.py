@@ -1,8 +1,8 @@
-"""Scans and meshes in, a page that shows them together out."""
+"""The job that shows scans and meshes together: as a page."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -12,15 +12,13 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.exchange.formats import stage_assembly, stage_mesh
 from clrecon.exchange.page import read_facts
 from clrecon.geometry.certificate import without_ids
-from clrecon.jobs.distance.inputs import doubt_frames, read_side
+from clrecon.jobs.distance import doubt_frames, read_side
 from clrecon.jobs.mesh.bone import judge_surfaces
 from clrecon.jobs.mesh.make import make_parts
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.shared.laps import Laps
-from clrecon.jobs.shared.outputs import check_kept, commit_all
-from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
-from clrecon.jobs.view.report import ViewReport
-from clrecon.jobs.view.settings import ViewSettings
+from clrecon.jobs.outputs import check_kept, commit_all
+from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name
+from clrecon.jobs.view.inputs import ViewSettings
 from clrecon.mesh import Mesh
 from clrecon.mesh.reader import MESH_INPUTS
 from clrecon.rendering.looks.label_style import distinct_colors
@@ -29,11 +27,13 @@ from clrecon.system.files import check_writable
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.records import Record
 from clrecon.system.text import escape_text
 from clrecon.version import package_version
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
+
 
 log = get_logger(__name__)
 
@@ -42,7 +42,7 @@ _OF_THE_MACHINE = ("device", "memory", "space", "keep_ids")
 
 
 @dataclass(frozen=True, eq=False)
-class _Shown:
+class _ShownInput:
     """What became of an input: its meshes, its entry in the report, and the device that worked on it."""
 
     meshes: list[Mesh]
@@ -82,10 +82,10 @@ def write_view(
     check_kept([("the page", output)], *inputs, None if settings.scan.labels is None else settings.scan.labels.path)
     # Mesh files first: they are read in a moment, and a wrong one is said before the device works on a scan.
     order = sorted(range(len(inputs)), key=lambda place: not is_mesh_file(inputs[place]))
-    found = {place: _read(inputs[place], settings, progress, watch) for place in order}
+    found = {place: _read_input(inputs[place], settings, progress, watch) for place in order}
     shown = [found[place] for place in range(len(inputs))]
     meshes = _name_and_color(shown, settings)
-    warnings = [text for one in shown for text in one.warnings] + _doubt(shown)
+    warnings = [text for one in shown for text in one.warnings] + _doubt_frames(shown)
     progress("write", 0, 0)
     space, keep_ids = settings.scan.space, settings.scan.keep_ids
     stage = stage_mesh(meshes[0], output, space, keep_ids=keep_ids) if len(meshes) == 1 else None
@@ -147,7 +147,7 @@ def _is_set(value: object, default: object) -> bool:
     return value != default and not (isinstance(value, Sequence) and not value)
 
 
-def _read(path: str | Path, settings: ViewSettings, progress: Progress, watch: Laps) -> _Shown:
+def _read_input(path: str | Path, settings: ViewSettings, progress: Progress, watch: Laps) -> _ShownInput:
     if is_mesh_file(path):
         progress("read", 0, 0)
         shown = _read_mesh(path, settings)
@@ -161,7 +161,7 @@ def _read(path: str | Path, settings: ViewSettings, progress: Progress, watch: L
         if len(made.parts) > 1 and "part_name" not in part.mesh.report:
             part.mesh.report["part_name"] = part.name.replace("_", " ")
         meshes.append(part.mesh)
-    return _Shown(
+    return _ShownInput(
         meshes,
         {
             **_describe_scan(path, made.volume, meshes, settings),
@@ -175,7 +175,7 @@ def _read(path: str | Path, settings: ViewSettings, progress: Progress, watch: L
     )
 
 
-def _read_mesh(path: str | Path, settings: ViewSettings) -> _Shown:
+def _read_mesh(path: str | Path, settings: ViewSettings) -> _ShownInput:
     mesh = read_side(path, settings.mesh_space)
     name = escape_text(Path(path).name)
     if not mesh.triangle_count:
@@ -190,7 +190,7 @@ def _read_mesh(path: str | Path, settings: ViewSettings) -> _Shown:
         "volume": None,
         "surface": None,
     }
-    return _Shown([mesh], entry, list(file["warnings"]))
+    return _ShownInput([mesh], entry, list(file["warnings"]))
 
 
 def _describe_scan(path: str | Path, volume: Volume, meshes: Sequence[Mesh], settings: ViewSettings) -> dict[str, Any]:
@@ -206,7 +206,7 @@ def _describe_scan(path: str | Path, volume: Volume, meshes: Sequence[Mesh], set
     }
 
 
-def _name_and_color(shown: Sequence[_Shown], settings: ViewSettings) -> list[Mesh]:
+def _name_and_color(shown: Sequence[_ShownInput], settings: ViewSettings) -> list[Mesh]:
     """Return all meshes with the names and colours under which they are shown."""
     colors = distinct_colors(len(shown))
     for number, one in enumerate(shown, start=1):
@@ -221,7 +221,7 @@ def _name_and_color(shown: Sequence[_Shown], settings: ViewSettings) -> list[Mes
     return [mesh for one in shown for mesh in one.meshes]
 
 
-def _doubt(shown: Sequence[_Shown]) -> list[str]:
+def _doubt_frames(shown: Sequence[_ShownInput]) -> list[str]:
     """Return what speaks against the inputs lying in one frame, each compared with the first."""
     placed = [
         (mesh, {"name": one.entry["name"], "space_from": one.entry["space_from"], "bounds_mm": mesh.bounds})
@@ -233,3 +233,31 @@ def _doubt(shown: Sequence[_Shown]) -> list[str]:
         pair = [{**own, "bounds_mm": own["bounds_mm"].tolist()} for own in (placed[0][1], entry)]
         doubts += doubt_frames([placed[0][0], mesh], pair)
     return doubts
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ViewReport(Record):
+    """Report of `write_view`.
+
+    inputs: Each input: ``name`` of the file or folder without those above it, ``kind`` ("scan", "STL" ...), ``space``
+        and ``space_from`` of a mesh (None for a scan), ``triangles``; of a scan ``volume``, its certificate, and
+        ``surface``, the values that it encloses.
+    parts: ``name``, ``triangles``, ``ml`` and ``color`` of each part that can be switched.
+    half_step_mm: Largest distance along an axis that a vertex is moved by.
+    output: ``format`` and ``bytes``.
+    device: None where no input is a scan.
+    """
+
+    inputs: list[dict[str, Any]]
+    parts: list[dict[str, Any]]
+    vertices: int
+    triangles: int
+    half_step_mm: float
+    space: str
+    output: Mapping[str, Any]
+    device: str | None
+    version: str
+    platform: str
+    warnings: list[str]
+    seconds: Mapping[str, float]
+    peak_memory_bytes: int | None

@@ -6,11 +6,9 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from clrecon.jobs.mesh.levels import choose_level
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.view.inputs import open_inputs
-from clrecon.jobs.view.settings import ViewSettings
-from clrecon.jobs.view.view_settings import check_view_settings
+from clrecon.jobs.mesh.surfaces import choose_level
+from clrecon.jobs.view.inputs import ViewSettings, check_view_settings, open_inputs
 from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.viewer.drawing.painter import Painter

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from clrecon.jobs.view.settings import ViewSettings
-from clrecon.jobs.view.view_settings import check_view_settings
+from clrecon.jobs.view.inputs import ViewSettings, check_view_settings
 from clrecon.system.progress import Progress
 from clrecon.viewer.session.opening import OpenedView, open_view
 from clrecon.viewer.web.listening import has_screen, open_browser

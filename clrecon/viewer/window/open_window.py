@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from clrecon.errors import UsageError
-from clrecon.jobs.view.settings import ViewSettings
-from clrecon.jobs.view.view_settings import check_view_settings
+from clrecon.jobs.view.inputs import ViewSettings, check_view_settings
 from clrecon.system.display import DisplayProbe
 from clrecon.system.files import check_writable
 from clrecon.system.progress import Progress, ignore_progress

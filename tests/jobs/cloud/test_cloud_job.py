@@ -14,10 +14,9 @@ from label_files import write_nrrd
 import clrecon
 from clrecon.cli.main import main
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.jobs.cloud.files import CloudFiles
-from clrecon.jobs.cloud.job import make_cloud
+from clrecon.jobs.cloud.job import CloudFiles, make_cloud
 from clrecon.jobs.cloud.settings import STEPS, CloudSettings, Clustering
-from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS
+from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 
 pytestmark = pytest.mark.first_device
 

@@ -23,7 +23,7 @@ from clrecon.jobs.compare.records import make_record
 from clrecon.jobs.compare.report import MethodRecord
 from clrecon.jobs.compare.request import Request, load_mesh, load_volume, save_mesh, save_volume
 from clrecon.jobs.compare.words import count, join, megabytes, milliseconds, ratio, seconds, share, signed
-from clrecon.jobs.shared.report import peak_memory_bytes
+from clrecon.jobs.run import peak_memory_bytes
 from clrecon.mesh import Mesh
 
 pytestmark = pytest.mark.first_device

@@ -13,10 +13,8 @@ from scipy.ndimage import gaussian_filter
 from clrecon import Volume
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
-from clrecon.jobs.mesh.for_purpose import settings_for
-from clrecon.jobs.mesh.label_choice import LabelChoice
-from clrecon.jobs.mesh.print_facts import warn_of_print
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.refinement import warn_of_print
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings, settings_for
 from clrecon.phantom import PhantomSettings, write_phantom
 
 

@@ -7,9 +7,8 @@ import math
 import pytest
 
 from clrecon.errors import UsageError
-from clrecon.jobs.mesh.label_choice import LabelChoice
-from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS, find_preset
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
+from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS, find_preset
 
 
 def test_bone_is_the_default() -> None:

@@ -14,10 +14,9 @@ from PIL import Image
 import clrecon
 from clrecon.cli.main import main
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
-from clrecon.jobs.render.files import PictureFiles
-from clrecon.jobs.render.job import make_pictures
+from clrecon.jobs.inputs import CLOUD_INPUTS, is_cloud_file
+from clrecon.jobs.render.job import PictureFiles, make_pictures
 from clrecon.jobs.render.settings import RenderSettings
-from clrecon.jobs.shared.clouds import CLOUD_INPUTS, is_cloud_file
 from clrecon.points import PointCloud
 
 pytestmark = pytest.mark.first_device

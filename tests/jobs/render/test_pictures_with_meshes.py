@@ -13,8 +13,7 @@ from sample_meshes import ball
 import clrecon
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
-from clrecon.jobs.render.files import PictureFiles
-from clrecon.jobs.render.job import make_pictures
+from clrecon.jobs.render.job import PictureFiles, make_pictures
 from clrecon.jobs.render.settings import MeshFile, RenderSettings
 
 

@@ -15,10 +15,9 @@ from contract_tables import names_in
 from PIL import Image
 
 from clrecon.errors import DeviceError, OutputError, RefusedInputError, UsageError
-from clrecon.jobs.render.files import PictureFiles, name_view, path_of
-from clrecon.jobs.render.job import make_pictures
+from clrecon.jobs.render.job import PictureFiles, make_pictures, name_view, path_of
+from clrecon.jobs.render.picture_taker import read_function
 from clrecon.jobs.render.settings import LabelLook, RenderSettings, Turntable
-from clrecon.jobs.render.studio import read_function
 from clrecon.phantom import PhantomSettings, write_phantom
 from clrecon.rendering.pictures.styles import Projection, VolumeLook
 
@@ -128,10 +127,12 @@ def test_a_step_that_fails_leaves_the_old_files(
         raise OutputError("the disk is full")
 
     if fails == "second view":
-        from clrecon.jobs.render.studio import Studio
+        from clrecon.jobs.render.picture_taker import PictureTaker
 
-        real = Studio.take_view
-        monkeypatch.setattr(Studio, "take_view", lambda studio, view: fail() if view == "right" else real(studio, view))
+        real = PictureTaker.take_view
+        monkeypatch.setattr(
+            PictureTaker, "take_view", lambda taker, view: fail() if view == "right" else real(taker, view)
+        )
     else:
         home = {
             "encode_floats": "clrecon.rendering.pictures.image_files.encode_floats",

@@ -1,0 +1,377 @@
+"""The points of a cloud job on their way: from a scan or a file, and through the steps, in their one order.
+
+Foreign slices inside the stack (ghosts) are found before anything is masked, named, and dropped if asked for.
+`CloudSteps` has the cloud after each step, and why each of its first points went.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from clrecon.errors import ClreconError, DeviceError, RefusedInputError
+from clrecon.jobs.cloud.settings import CloudSettings
+from clrecon.jobs.presets import DEFAULT_PRESET, find_preset
+from clrecon.points.step import count_numbers
+from clrecon.system.arguments import name_parameter
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.records import Gate
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from clrecon.geometry import Volume
+    from clrecon.labels import LabelMap
+    from clrecon.opencl import Device
+    from clrecon.operators.resident.device_volume import DeviceVolume
+    from clrecon.points import PointCloud, PointStep
+    from clrecon.points.ghost_slices import GhostSlices
+
+
+def take_points(
+    subject: Volume | PointCloud,
+    labels: LabelMap | None,
+    device: Device,
+    settings: CloudSettings,
+    progress: Progress,
+    ghosts: GhostSlices | None = None,
+) -> CloudSteps:
+    """Make the cloud of a volume, or take one that was read, and run the steps on it.
+
+    ghosts: Of the scan before it was masked; None: they are looked for in the volume.
+    """
+    from clrecon.geometry import Volume
+    from clrecon.operators.resident.device_volume import DeviceVolume
+
+    if not isinstance(subject, Volume):
+        steps = CloudSteps(subject)
+        run_steps(steps, settings, device, None, progress)
+        return steps
+    with DeviceVolume(subject, device=device, memory=settings.memory) as resident:
+        if ghosts is None:
+            ghosts = find_ghosts(resident, iso_value_of(settings), settings, progress)
+        steps = _extract_cloud(resident, labels, settings, progress)
+        if settings.ghost_slices == "drop":
+            drop_ghosts(steps, ghosts, subject)
+        else:
+            warn_of_ghosts(steps, ghosts)
+        run_steps(steps, settings, device, resident, progress)
+    return steps
+
+
+def _extract_cloud(
+    resident: DeviceVolume, labels: LabelMap | None, settings: CloudSettings, progress: Progress
+) -> CloudSteps:
+    from clrecon.operators.points.point_extraction import extract_points
+
+    began = CloudSteps.clock()
+    what: dict[str, Any] = {"hu": settings.hu} if settings.is_band else {"iso_value": iso_value_of(settings)}
+    cloud = extract_points(
+        resident, **what, kind=settings.kind, labels=labels, label=settings.label, paper=settings.paper,
+        progress=progress,
+    )  # fmt: skip
+    return CloudSteps(cloud, began)
+
+
+def iso_value_of(settings: CloudSettings) -> float:
+    """Return the iso value that was given, or that of the default preset of meshes."""
+    if settings.hu is None or settings.is_band:
+        return find_preset(DEFAULT_PRESET).iso_value
+    assert not isinstance(settings.hu, (tuple, list))
+    return float(settings.hu)  # type: ignore[arg-type]
+
+
+def prepare_chain(device: Device, settings: CloudSettings, is_cloud: bool) -> None:
+    """Build the kernels by running all steps on a cube of a few voxels; the result is dropped."""
+    from clrecon.geometry import Volume
+    from clrecon.points import PointCloud
+
+    k, j, i = np.indices((12, 12, 12))
+    voxels = (3000 - 600 * np.abs([i - 5, j - 5, k - 5]).max(axis=0)).astype(np.int16)
+    subject: Volume | PointCloud = Volume(voxels, np.eye(4))
+    if is_cloud:
+        subject = PointCloud(np.argwhere(voxels >= 0).astype(np.float32))
+    try:
+        take_points(subject, None, device, settings.for_trial(), ignore_progress)
+    except DeviceError:
+        raise
+    except ClreconError:
+        pass  # a rule that leaves nothing of a cube
+
+
+def run_steps(
+    steps: CloudSteps, settings: CloudSettings, device: Device, resident: DeviceVolume | None, progress: Progress
+) -> None:
+    """Run the steps that are asked for, from the clusters to the spacing.
+
+    steps: Gets the result of each step.
+    resident: The volume of the points; None for clouds that were read.
+    """
+    shared: dict[str, Any] = {"device": device.current, "memory": settings.memory, "progress": progress}
+    for run in (_cluster_points, _remove_sparse, _remove_outliers, _denoise_points, _find_normals, _thin_points):
+        steps.start()
+        run(steps, settings, resident, shared)
+
+
+def _cluster_points(
+    steps: CloudSteps, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]
+) -> None:
+    """Cluster the points; drop noise and the clusters that no keep rule names."""
+    chosen = settings.clustering
+    if chosen is None:
+        return
+    from clrecon.operators.points.clusters import cluster_points
+    from clrecon.points.keep import keep_clusters
+
+    eps, volume = chosen.eps, resident
+    if resident is not None and not steps.cloud.has_ijk:  # points of a surface: free, but of that scan
+        from clrecon.points.stencil import Lattice
+
+        eps, volume = Lattice.of(resident.volume).default_eps if eps is None else eps, None
+    found = cluster_points(steps.cloud, eps, chosen.min_samples, **_with_volume(volume, shared))
+    steps.add("clusters", found)
+    steps.start()
+    rules = rules_in_lps(settings)
+    steps.add("keep", keep_clusters(found.cloud, rules, cores=found.cores, figures=found.figures), takes_noise=True)
+
+
+def _with_volume(resident: DeviceVolume | None, shared: dict[str, Any]) -> dict[str, Any]:
+    """Return the arguments for a function that wants the volume, which has a device of its own."""
+    return shared if resident is None else {"volume": resident, "progress": shared["progress"]}
+
+
+def in_lps(point: Sequence[float], space: str) -> tuple[float, ...]:
+    """Return a point of the frame of the output, mm, in LPS."""
+    x, y, z = point
+    return (x, y, z) if space == "lps" else (-x, -y, z)
+
+
+def rules_in_lps(settings: CloudSettings) -> list[str]:
+    """Return the keep rules with seeds in LPS; they are given in the frame of the output."""
+    if settings.space == "lps":
+        return list(settings.keep)
+    rules = []
+    for rule in settings.keep:
+        kind, _, rest = rule.partition(":")
+        if kind.strip().lower() == "seed":
+            point = in_lps([float(word) for word in rest.split(",")], settings.space)
+            rule = f"seed:{','.join(map(repr, point))}"
+        rules.append(rule)
+    return rules
+
+
+def _remove_sparse(
+    steps: CloudSteps, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]
+) -> None:
+    """Remove what paper B's grid takes for noise."""
+    if "grid" not in settings.denoise:
+        return
+    from clrecon.operators.points.thinning import remove_sparse_cells
+
+    steps.add("sparse cells", remove_sparse_cells(steps.cloud, **shared), takes_noise=True)
+
+
+def _remove_outliers(
+    steps: CloudSteps, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]
+) -> None:
+    if settings.outliers is None:
+        return
+    from clrecon.operators.points.denoising import remove_outliers
+
+    steps.add("outliers", remove_outliers(steps.cloud, deviations=settings.outliers, **shared), takes_noise=True)
+
+
+def _denoise_points(
+    steps: CloudSteps, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]
+) -> None:
+    if "bilateral" not in settings.denoise:
+        return
+    from clrecon.operators.points.denoising import denoise_points
+
+    steps.add("bilateral", denoise_points(steps.cloud, paper=settings.paper, **shared))
+
+
+def _find_normals(
+    steps: CloudSteps, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]
+) -> None:
+    """Estimate normals where the points have none: those of a surface have the normals of its field until they move."""
+    if not settings.normals or steps.cloud.normals is not None:
+        return
+    from clrecon.operators.points.normals import estimate_normals
+
+    inside = None if settings.viewpoint is None else in_lps(settings.viewpoint, settings.space)
+    steps.add("normals", estimate_normals(steps.cloud, viewpoint=inside, **_with_volume(resident, shared)))
+
+
+def _thin_points(
+    steps: CloudSteps, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]
+) -> None:
+    if settings.spacing is None:
+        return
+    from clrecon.operators.points.thinning import thin_points
+
+    steps.add("spacing", thin_points(steps.cloud, settings.spacing, **shared))
+
+
+MOST_NAMED = 10
+"""Most slices that a warning names."""
+
+
+def find_ghosts(resident: DeviceVolume, level: float, settings: CloudSettings, progress: Progress) -> GhostSlices:
+    """Test the slices of a scan by the voxels of the band, or of the iso value `level` and above."""
+    from clrecon.operators.points.slice_overlap import find_ghost_slices
+
+    band = settings.hu if isinstance(settings.hu, Sequence) else (level, math.inf)
+    return find_ghost_slices(resident, band, progress=progress)
+
+
+def drop_ghosts(steps: CloudSteps, found: GhostSlices, volume: Volume) -> None:
+    """Remove the points of ghost slices."""
+    from clrecon.points.ghost_slices import drop_ghost_slices
+
+    steps.start()
+    step = drop_ghost_slices(steps.cloud, found, volume=volume)
+    steps.add("ghost slices", step, takes_noise=True)
+
+
+def warn_of_ghosts(steps: CloudSteps, found: GhostSlices) -> None:
+    """Warn of ghost slices whose points stay."""
+    if not found.slices:
+        return
+    names = ", ".join(map(str, found.slices[:MOST_NAMED]))
+    more = f" and {len(found.slices) - MOST_NAMED} more" if len(found.slices) > MOST_NAMED else ""
+    one = len(found.slices) == 1
+    steps.warnings.append(
+        f"{'slice' if one else 'slices'} {names}{more} of {len(found.points)}, counted from 0,"
+        f" {'is' if one else 'are'} unlike both neighbours, as foreign images are; the points stay: look at"
+        f" {'it' if one else 'them'}, or drop {'its' if one else 'their'} points"
+        f" ({name_parameter('ghost_slices', 'drop')})"
+    )
+
+
+LEAST_KEPT = 0.5
+"""Least share of its points that a step must keep which is there to take noise away."""
+
+_EXTRACTED = (
+    "kind",
+    "iso_value_hu",
+    "band_hu",
+    "voxels",
+    "voxels_in_band",
+    "share",
+    "label",
+    "paper",
+    "slabs",
+    "device_bytes",
+)
+"""Entries of the first cloud's report that its step tells."""
+
+_TAKEN_BY_RULE = ("small cluster", "other cluster")
+"""Reasons that the caller asks for by number or place; they say nothing about noise."""
+
+
+class CloudSteps:
+    """The points of a job, from the first cloud to the last.
+
+    cloud: As it was extracted or read.
+    began: When its extraction began, see `clock`; None for a cloud that was read.
+
+    first, cloud: The first cloud, and what is left of it.
+    entries: That of each step in the report.
+    reasons: All reasons so far for which a point went: number r of `fate` is ``reasons[r - 1]``.
+    fate: ndarray, shape (n,), uint8. For each point of the first cloud 0, or the number of the reason why it went.
+    """
+
+    def __init__(self, cloud: PointCloud, began: float | None = None):
+        self.first = self.cloud = cloud
+        self.entries: list[dict[str, Any]] = []
+        self.reasons: list[str] = []
+        self.fate: NDArray[np.uint8] = np.zeros(len(cloud), np.uint8)
+        self.gates: list[Gate] = []
+        self.warnings: list[str] = []
+        self._there: NDArray[np.intp] | None = None
+        self._lap = time.perf_counter() if began is None else began
+        self.warnings += cloud.report.get("warnings", ())
+        if began is not None:
+            facts = {name: cloud.report[name] for name in _EXTRACTED if name in cloud.report}
+            self.entries.append({"step": "points", "points_after": len(cloud), **facts, "seconds": self._seconds()})
+
+    @staticmethod
+    def clock() -> float:
+        """Return the time from which the seconds of the first step count."""
+        return time.perf_counter()
+
+    def _seconds(self) -> float:
+        return round(time.perf_counter() - self._lap, 4)
+
+    def start(self) -> None:
+        """Begin to count the time of a step."""
+        self._lap = time.perf_counter()
+
+    def add(self, name: str, step: PointStep, *, takes_noise: bool = False) -> None:
+        """Take the result of a step over.
+
+        name: One of `clrecon.jobs.cloud.settings.STEPS`.
+        takes_noise: A step that takes more than half of the points by reasons that are no rule of the caller fails a
+            gate.
+        """
+        numbers = [0]
+        for reason, count in step.counts.items():
+            if count and reason not in self.reasons:
+                self.reasons.append(reason)
+            numbers.append(self.reasons.index(reason) + 1 if count else 0)
+        is_gone = step.removed > 0
+        if is_gone.any():
+            gone, left = np.flatnonzero(is_gone), np.flatnonzero(~is_gone)
+            there = self._there
+            self.fate[gone if there is None else there[gone]] = np.array(numbers, np.uint8)[step.removed[gone]]
+            self._there = left if there is None else there[left]
+        self.cloud = step.cloud
+        told = step.as_dict()
+        self.entries.append({"step": name, **told, "seconds": self._seconds()})
+        self.warnings += step.warnings
+        if takes_noise:
+            self._judge(name, len(step.removed), step.counts)
+
+    def _judge(self, name: str, before: int, counts: Mapping[str, int]) -> None:
+        taken = sum(count for reason, count in counts.items() if reason not in _TAKEN_BY_RULE)
+        share = 1.0 - taken / before if before else 1.0
+        by_reason = ", ".join(f"{count:,} {reason}" for reason, count in counts.items() if count)
+        text = f"{name}: {taken:,} of {before:,} points gone ({by_reason})" if taken else f"{name}: no point gone"
+        self.gates.append(
+            Gate(f"points_kept_{name.replace(' ', '_')}", share, LEAST_KEPT, None, share >= LEAST_KEPT, text)
+        )
+
+    def check(self, allow_point_loss: bool) -> None:
+        """Refuse the loss of more points than noise can be."""
+        failed = [gate for gate in self.gates if gate.ok is False]
+        if not failed:
+            return
+        text = f"{failed[0].text}: more than half is no noise"
+        if not allow_point_loss:
+            raise RefusedInputError(
+                f"{text}; look at its parameters, or allow it ({name_parameter('allow_point_loss', True)})"
+            )
+        self.warnings += [f"{gate.text}: more than half is no noise, and was allowed" for gate in failed]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Points that went, by reason, in the order of the steps."""
+        return count_numbers(self.fate, self.reasons)
+
+    def removed_cloud(self) -> PointCloud:
+        """Return the first cloud with the fate of each point as its label: 0 kept, else the number of the reason."""
+        names = {0: "kept", **dict(enumerate(self.reasons, 1))}
+        report = {**self.first.report, "label_names": names}
+        cloud = self.first.changed(labels=self.fate.astype(np.int32))
+        cloud.report = report
+        return cloud
+
+
+def name_reasons(reasons: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the report's list of labels of the removed points."""
+    return [{"label": number, "reason": reason} for number, reason in enumerate(("kept", *reasons))]

@@ -1,0 +1,457 @@
+"""The corridor job: a CT series and its label map in; corridors, grades, pictures and meshes out.
+
+Corridors are the widest lines through the pedicles of labelled vertebrae.  Screws to be graded are given as six numbers
+and a diameter in a text, or as a file of them (JSON or CSV).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry import frame_from_lps
+from clrecon.geometry.certificate import without_ids
+from clrecon.jobs.corridor_results import (
+    KNOWN_BIAS,
+    NOT_FOR_PLANNING,
+    CorridorReport,
+    cylinder_meshes,
+    describe_vertebra,
+)
+from clrecon.jobs.inputs import read_with_labels
+from clrecon.jobs.outputs import check_distinct, check_kept, commit_all, name_outputs, stage_meshes
+from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name, stage_report
+from clrecon.labels.names import file_suffixes
+from clrecon.labels.resample import resample_labels
+from clrecon.reading import Selection, read_selected
+from clrecon.spine.corridors import VertebraCorridors, measure_corridors
+from clrecon.spine.measures import SCALE, Screw, ScrewGrade, grade_screw
+from clrecon.system.arguments import name_parameter
+from clrecon.system.paths import keep_existing, read_regular
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.text import escape_text
+from clrecon.version import package_version
+
+if TYPE_CHECKING:
+    from clrecon.anatomy.iso_choice import IsoChoice
+    from clrecon.geometry import Volume
+    from clrecon.labels import LabelMap
+    from clrecon.mesh import Mesh
+    from clrecon.system.files import StagedFile
+
+
+LARGEST_MARGIN_MM = 5.0
+
+
+@dataclass(frozen=True)
+class CorridorFiles:
+    """Outputs of the job.
+
+    output: Meshes: the vertebra and a cylinder a side, in files of its name with those of label and side.
+    picture: .png, .jpg or .tif; one for each vertebra.
+    report: JSON.
+    """
+
+    output: str | Path | None = None
+    picture: str | Path | None = None
+    report: str | Path | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorridorSettings(Selection):
+    """Settings of the corridor job.
+
+    series, phase, allow_gaps, force, follow_links, rescale: See `clrecon.reading.Selection`.
+    labels: Label map of the vertebrae.
+    only: Labels of the vertebrae that are looked at; at least one.
+    iso_value: HU of the bone's surface; None: half way, measured in the scan.
+    margin: Distance in mm that a screw of the largest diameter keeps from the surface.
+    screws: Given screws, in mm of the frame `space` where they came from a command, else LPS.
+    space: {"lps", "ras"}. Patient frame of the points in the report, of given screws, and of the meshes.
+    keep_ids: Write the hashes of the UIDs of series and frame of reference into the report.
+    device: For the mesh of the vertebra alone.
+    memory: Bytes that may be taken on the device.
+    """
+
+    labels: str | Path
+    only: tuple[str | int, ...]
+    iso_value: float | None = None
+    margin: float = 1.0
+    screws: tuple[Any, ...] = ()
+    space: str = "lps"
+    keep_ids: bool = False
+    device: str | None = None
+    memory: int | None = None
+
+    def __post_init__(self) -> None:
+        if not self.only:
+            raise UsageError(f"name the vertebrae: {name_parameter('only', 'L3')}, once for each")
+        if not (math.isfinite(self.margin) and 0.0 <= self.margin <= LARGEST_MARGIN_MM):
+            raise UsageError(f"the margin is a length from 0 to {LARGEST_MARGIN_MM:g} mm, not {self.margin:g}")
+        if self.iso_value is not None and not math.isfinite(self.iso_value):
+            raise UsageError(f"the level is a finite number of HU, not {self.iso_value}")
+        frame_from_lps(self.space)
+
+
+CSV_COLUMNS = ("entry_x", "entry_y", "entry_z", "tip_x", "tip_y", "tip_z", "diameter")
+"""Columns of a CSV file, beside ``name`` and ``label``, which may be left out."""
+
+MOST_SCREWS = 200
+LARGEST_FILE = 1 << 20
+
+
+def parse_screw(text: str, space: str, number: int = 1) -> Screw:
+    """Read ``X,Y,Z,X,Y,Z,D``: entry, tip and diameter in mm."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 7:
+        raise UsageError(f"a screw is entry, tip and diameter in mm, X,Y,Z,X,Y,Z,D, not {escape_text(text, 80)!r}")
+    return _make_screw(numbers, space, f"screw {number}", None)
+
+
+def _make_screw(numbers: list[float], space: str, name: str, label: str | None) -> Screw:
+    turn = frame_from_lps(space).T
+    entry, tip = turn @ np.array(numbers[:3]), turn @ np.array(numbers[3:6])
+    return Screw(entry, tip, numbers[6], name, label)
+
+
+def read_screws(path: str | Path, space: str) -> tuple[Screw, ...]:
+    """Read screws from a file; its first character tells JSON from CSV.
+
+    JSON is a list of objects with ``entry`` and ``tip`` (three numbers each, mm of `space`), ``diameter`` and, if
+    wanted, ``name`` and ``label``; or an object with such a list as ``screws``.  CSV has a header with `CSV_COLUMNS`.
+    """
+    shown = escape_text(Path(path).name)
+    try:
+        text = read_regular(path, LARGEST_FILE).decode("utf-8-sig")
+    except OSError as error:
+        raise UsageError(f"the screws in {shown} cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise UsageError(f"{shown} is no text: screws are JSON or CSV") from error
+    rows = _json_rows(text, shown) if text.lstrip()[:1] in ("[", "{") else _csv_rows(text, shown)
+    if not 0 < len(rows) <= MOST_SCREWS:
+        raise UsageError(f"{shown} has {len(rows):,} screws: 1 to {MOST_SCREWS} can be graded")
+    screws = []
+    for number, row in enumerate(rows, start=1):
+        try:
+            numbers = [float(value) for value in row["numbers"]]
+        except (TypeError, ValueError, OverflowError):
+            numbers = []
+        if len(numbers) != 7:
+            raise UsageError(f"screw {number} of {shown} has no three numbers of entry and of tip, and a diameter")
+        name = escape_text(str(row["name"] or f"screw {number}"), 40)
+        screws.append(_make_screw(numbers, space, name, None if row["label"] in (None, "") else str(row["label"])))
+    return tuple(screws)
+
+
+def _json_rows(text: str, shown: str) -> list[dict[str, Any]]:
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{shown} is no JSON: {str(error)[:80]}") from error
+    if isinstance(content, dict):
+        content = content.get("screws")
+    if not isinstance(content, list) or not all(isinstance(entry, dict) for entry in content):
+        raise UsageError(f"{shown} is no list of screws: objects with entry, tip and diameter")
+    rows = []
+    for entry in content:
+        ends = [entry.get("entry"), entry.get("tip")]
+        whole = all(isinstance(end, list) and len(end) == 3 for end in ends)
+        numbers = [*ends[0], *ends[1], entry.get("diameter")] if whole else []  # type: ignore[misc]
+        rows.append({"numbers": numbers, "name": entry.get("name"), "label": entry.get("label")})
+    return rows
+
+
+def _csv_rows(text: str, shown: str) -> list[dict[str, Any]]:
+    reader = csv.DictReader(io.StringIO(text))
+    missing = [name for name in CSV_COLUMNS if name not in (reader.fieldnames or ())]
+    if missing:
+        raise UsageError(f"{shown} has no column {missing[0]}: screws have {', '.join(CSV_COLUMNS)}")
+    return [
+        {"numbers": [row[name] for name in CSV_COLUMNS], "name": row.get("name"), "label": row.get("label")}
+        for row in reader
+    ]
+
+
+_PLACED_BY_LABEL = 0.5
+"""Below this share of points that HU place a corridor says more of the label than of the bone."""
+
+
+def make_corridors(
+    source: str | Path,
+    settings: CorridorSettings,
+    files: CorridorFiles | None = None,
+    *,
+    no_clobber: bool = False,
+    progress: Progress | None = None,
+) -> CorridorReport:
+    """Find the corridors through the pedicles of labelled vertebrae, and grade given screws.
+
+    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
+    no_clobber: Files that exist stay and are an `OutputError`, before any work.
+    progress: ``progress(stage, done, total)``.
+    """
+    files, progress, watch = files or CorridorFiles(), progress or ignore_progress, Laps()
+    with keep_existing(no_clobber):
+        _check_files(source, settings, files)
+    volume, labels = _read_inputs(source, settings, progress)
+    watch.lap("read")
+    numbers = list(dict.fromkeys(labels.find(label) for label in settings.only))
+    names = file_suffixes({number: labels.name(number) for number in numbers})
+    with keep_existing(no_clobber):
+        _name_files(settings, files, list(names.values()))
+    level, choice = _choose_level(volume, settings, progress)
+    watch.lap("choose")
+    taken = resample_labels(labels, volume)
+    found = []
+    for done, number in enumerate(numbers):
+        progress("corridors", done, len(numbers))
+        _check_inside(taken.inside[number], names[number])
+        found.append(measure_corridors(volume, taken.voxels, number, level, names[number]))
+    graded = _grade_screws(found, labels, numbers, settings.screws)
+    watch.lap("corridors")
+    with keep_existing(no_clobber), ExitStack() as stack:
+        staged, outputs = _stage_files(stack, volume, labels, found, numbers, graded, level, settings, files, progress)
+        watch.lap("write")
+        vertebrae = [
+            describe_vertebra(each, number, settings.margin, settings.space, own)
+            for each, number, own in zip(found, numbers, graded, strict=True)
+        ]
+        warnings = [*taken.warnings, *_warn_of_corridors(found)]
+        report = _compose_report(volume, settings, (level, choice), vertebrae, outputs, warnings, watch)
+        if files.report is not None:
+            staged.append(stack.enter_context(stage_report(files.report, report)))
+        commit_all(staged)
+    return report
+
+
+def _check_files(source: str | Path, settings: CorridorSettings, files: CorridorFiles) -> None:
+    """Refuse outputs that cannot be written or would replace an input, as far as their names are known."""
+    from clrecon.exchange.formats import check_format
+    from clrecon.rendering.pictures.image_files import check_image_path
+    from clrecon.system.files import check_writable
+
+    if files.output is not None:
+        check_format(files.output)
+    if files.picture is not None:
+        check_image_path(files.picture)
+    named = [
+        (what, path)
+        for what, path in (("the mesh", files.output), ("the picture", files.picture), ("the report", files.report))
+        if path is not None
+    ]
+    check_distinct(named)
+    check_kept(named, source, settings.labels)
+    for _, path in named:
+        check_writable(path)
+
+
+def _picture_paths(files: CorridorFiles, names: Sequence[str]) -> list[str | Path]:
+    if files.picture is None:
+        return []
+    return name_outputs(files.picture, list(names) if len(names) > 1 else [""])
+
+
+def _name_files(settings: CorridorSettings, files: CorridorFiles, names: Sequence[str]) -> None:
+    """Refuse files that exist and stay, and those that two outputs would share, now that the labels are known."""
+    from clrecon.system.files import check_writable
+
+    pictures = [("the picture", path) for path in _picture_paths(files, names)]
+    meshes: list[tuple[str, str | Path]] = []
+    if files.output is not None:
+        ends = [f"{name}{end}" for name in names for end in ("", "_left", "_right")]
+        meshes = [("the mesh", path) for path in name_outputs(files.output, ends)]
+    report = [] if files.report is None else [("the report", files.report)]
+    check_distinct(pictures, meshes, report)
+    for _, path in (*pictures, *meshes):
+        check_writable(path)
+
+
+def _read_inputs(source: str | Path, settings: CorridorSettings, progress: Progress) -> tuple[Volume, LabelMap]:
+    from clrecon.labels import read_labels
+
+    def read_map(volume: Volume | None) -> LabelMap | None:
+        return read_labels(settings.labels, None, volume=volume)
+
+    volume, labels = read_with_labels(
+        partial(read_selected, source, settings, progress=progress), settings.labels, read_map
+    )
+    assert labels is not None
+    return volume, labels
+
+
+def _choose_level(volume: Volume, settings: CorridorSettings, progress: Progress) -> tuple[float, IsoChoice | None]:
+    if settings.iso_value is not None:
+        return float(settings.iso_value), None
+    from clrecon.anatomy.iso_choice import choose_iso_value
+
+    choice = choose_iso_value(volume, progress=progress)
+    return choice.iso_value, choice
+
+
+def _check_inside(share: float, name: str) -> None:
+    """Refuse a label that goes on beyond the scan."""
+    if share < 1.0:
+        raise RefusedInputError(
+            f"{name} is cut off: {100.0 * (1.0 - share):.3g} % of its label lie outside of the scan; corridors need the"
+            " whole vertebra"
+        )
+
+
+def _grade_screws(
+    found: Sequence[VertebraCorridors], labels: LabelMap, numbers: Sequence[int], screws: Sequence[Screw]
+) -> list[list[tuple[Screw, ScrewGrade]]]:
+    """Grade each screw in the vertebra that it names, or else in the one whose bone its axis lies deepest in."""
+    graded: list[list[tuple[Screw, ScrewGrade]]] = [[] for _ in found]
+    for screw in screws:
+        if screw.label is not None:
+            number = labels.find(screw.label)
+            if number not in numbers:
+                raise UsageError(f"{screw.name} belongs to {labels.name(number)}, which is not among the labels named")
+            place = numbers.index(number)
+        else:
+            axis = screw.entry + np.linspace(0.0, 1.0, 41)[:, None] * (screw.tip - screw.entry)
+            depths = [float(each.bone.depth(axis).mean()) for each in found]
+            place = int(np.argmax(depths))
+        own = found[place]
+        graded[place].append((screw, grade_screw(own.bone, own.frame, screw, own.name)))
+    return graded
+
+
+def _stage_files(
+    stack: ExitStack,
+    volume: Volume,
+    labels: LabelMap,
+    found: Sequence[VertebraCorridors],
+    numbers: Sequence[int],
+    graded: Sequence[list[tuple[Screw, ScrewGrade]]],
+    level: float,
+    settings: CorridorSettings,
+    files: CorridorFiles,
+    progress: Progress,
+) -> tuple[list[Any], list[dict[str, Any]]]:
+    """Write pictures and meshes under temporary names; return them and their entries."""
+    staged: list[StagedFile] = []
+    outputs = []
+    names = [each.name for each in found]
+    for path, each, own in zip(_picture_paths(files, names), found, graded, strict=False):
+        staged.append(stack.enter_context(_stage_picture(path, volume, each, own, level, settings)))
+        outputs.append({"kind": "picture", "name": each.name, "bytes": staged[-1].size})
+    if files.output is None:
+        return list(staged), outputs
+    vertebrae = _extract_vertebrae(volume, labels, numbers, level, settings, progress)
+    meshes: dict[str, Mesh] = {}
+    for number, each, own in zip(numbers, found, graded, strict=True):
+        meshes[each.name] = vertebrae[number]
+        cylinders = cylinder_meshes(each, [screw for screw, _ in own])
+        meshes |= {f"{each.name}_{name}": mesh for name, mesh in cylinders.items()}
+    paths = name_outputs(files.output, list(meshes))
+    written = stage_meshes(stack, list(meshes.values()), paths, settings.space, progress, keep_ids=settings.keep_ids)
+    outputs += [{"kind": "mesh", "name": name, "bytes": each.size} for name, each in zip(meshes, written, strict=True)]
+    return [*staged, *written], outputs
+
+
+def _extract_vertebrae(
+    volume: Volume,
+    labels: LabelMap,
+    numbers: Sequence[int],
+    level: float,
+    settings: CorridorSettings,
+    progress: Progress,
+) -> dict[int, Mesh]:
+    """Extract the surfaces of the vertebrae, filled, as the mesh job does with solid labels."""
+    from clrecon.operators.surface.labels import extract_labels
+
+    return extract_labels(
+        volume, labels, level, device=settings.device, numbers=list(numbers), solid=True, memory=settings.memory,
+        progress=progress,
+    )  # fmt: skip
+
+
+def _stage_picture(
+    path: str | Path,
+    volume: Volume,
+    found: VertebraCorridors,
+    graded: Sequence[tuple[Screw, ScrewGrade]],
+    level: float,
+    settings: CorridorSettings,
+) -> Any:
+    from clrecon.jobs.corridor_results import draw_corridors
+    from clrecon.rendering.pictures.image_files import check_image_path, encode_image
+    from clrecon.system.files import stage_file
+
+    footer = [f"surface at {level:g} HU; green: corridor, yellow: largest screw, red: given screw", NOT_FOR_PLANNING]
+    footer[:0] = [
+        f"{screw.name}: {screw.diameter:g} mm, {grade.side}, grade {grade.grade}"
+        + (f", {grade.breach_mm:.1f} mm {grade.direction}" if grade.direction else "")
+        for screw, grade in graded[:6]
+    ]
+    picture = draw_corridors(volume, found, [screw for screw, _ in graded], settings.margin, footer)
+    content = encode_image(picture, check_image_path(path))
+
+    def write(stream: BinaryIO) -> None:
+        stream.write(content)
+
+    return stage_file(path, write, expected_bytes=len(content))
+
+
+def _warn_of_corridors(found: Sequence[VertebraCorridors]) -> list[str]:
+    warnings: list[str] = []
+    for each in found:
+        warnings += each.warnings
+        for corridor in each.corridors:
+            if corridor.refused is not None:
+                warnings.append(f"{each.name}, {corridor.side}: {corridor.refused}")
+            elif corridor.by_hu_share is not None and corridor.by_hu_share < _PLACED_BY_LABEL:
+                warnings.append(
+                    f"{each.name}, {corridor.side}: HU place {100.0 * corridor.by_hu_share:.0f} % of the walls beside"
+                    " the line, the label's own border the rest: the radius is that of the label"
+                )
+    return warnings
+
+
+def _compose_report(
+    volume: Volume,
+    settings: CorridorSettings,
+    level: tuple[float, IsoChoice | None],
+    vertebrae: list[dict[str, Any]],
+    outputs: list[dict[str, Any]],
+    warnings: Sequence[str],
+    watch: Laps,
+) -> CorridorReport:
+    certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
+    told = [*certificate.pop("warnings", []), *warnings]
+    iso_value, choice = level
+    seconds = {part: round(value, 4) for part, value in watch.seconds.items()}
+    return CorridorReport(
+        notice=NOT_FOR_PLANNING,
+        level_bias=KNOWN_BIAS,
+        iso_value_hu=iso_value,
+        iso_value_reason="as given" if choice is None else choice.reason,
+        iso_value_choice=None if choice is None else choice.measurements(),
+        space=settings.space,
+        margin_mm=float(settings.margin),
+        grade_scale=SCALE if any(each["screws"] for each in vertebrae) else None,
+        vertebrae=vertebrae,
+        outputs=outputs,
+        affine_ijk_to_lps_mm=volume.affine.tolist(),
+        version=package_version(),
+        platform=platform_name(),
+        warnings=list(dict.fromkeys(map(str, told))),
+        volume=certificate,
+        seconds={**seconds, "total": round(watch.total(), 4)},
+        peak_memory_bytes=peak_memory_bytes(),
+    )

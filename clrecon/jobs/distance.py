@@ -1,0 +1,371 @@
+"""The job of distances: two meshes in; figures, a mesh coloured by distance and a picture of it out.
+
+The files of both are read, and doubts are raised where they cannot lie in one frame.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry import frame_from_lps
+from clrecon.jobs.outputs import check_distinct, check_kept, commit_all, stage_picture
+from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name, stage_report
+from clrecon.mesh import Mesh
+from clrecon.mesh.compare.distances import SAMPLES
+from clrecon.mesh.compare.signed import MeshDeviation, measure_distance, measure_vertex_distances
+from clrecon.mesh.reader import read_mesh
+from clrecon.rendering.views.directions import find_view
+from clrecon.system.files import Staged, check_writable
+from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.paths import keep_existing
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.records import Record
+from clrecon.system.text import escape_text, format_digits
+from clrecon.version import package_version
+
+if TYPE_CHECKING:
+    from clrecon.opencl import Device
+    from clrecon.rendering import Rendering
+    from clrecon.rendering.looks.color_scale import ColorScale
+
+
+MOST_SAMPLES = 10_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistanceSettings:
+    """Settings of the job.
+
+    mesh_space: {"lps", "ras"}. Patient frame of files that do not name theirs; None: LPS, with a warning.
+    samples: Points on each surface.
+    range_mm: Distance at which the colours end; None: chosen from the distances.
+    view: View of the picture, see `clrecon.Camera.fit`.
+    space: {"lps", "ras"}. Patient frame of the coloured mesh.
+    device: Name or index of an OpenCL device, for the picture.
+    memory: Most bytes on the device.
+    """
+
+    mesh_space: str | None = None
+    samples: int = SAMPLES
+    range_mm: float | None = None
+    view: str = "anterior"
+    space: str = "lps"
+    device: str | None = None
+    memory: int | None = None
+
+    def __post_init__(self) -> None:
+        frame_from_lps(self.space)
+        if self.mesh_space is not None:
+            frame_from_lps(self.mesh_space)
+        if not 1 <= self.samples <= MOST_SAMPLES:
+            raise UsageError(f"distances need 1 to {MOST_SAMPLES:,} samples on each mesh, not {self.samples:,}")
+        if self.range_mm is not None and not (math.isfinite(self.range_mm) and self.range_mm > 0.0):
+            raise UsageError(f"the colours span a number of mm above 0, not {self.range_mm:g}")
+        find_view(self.view)
+
+
+log = get_logger(__name__)
+
+_LEAST_RANGE_MM = 1e-3
+"""Least distance at which colours end where it is chosen; float32 is as exact 8 m from the origin."""
+
+
+@dataclass(frozen=True)
+class DistanceFiles:
+    """Files that a job writes.
+
+    output: A coloured by its distance from B, ``.ply``.
+    picture: A picture of it with the scale of its colours.
+    report: JSON.
+    """
+
+    output: str | Path | None = None
+    picture: str | Path | None = None
+    report: str | Path | None = None
+
+
+def measure_meshes(
+    mesh: str | Path,
+    reference: str | Path,
+    files: DistanceFiles | None = None,
+    settings: DistanceSettings | None = None,
+    *,
+    no_clobber: bool = False,
+    progress: Progress | None = None,
+) -> DistanceReport:
+    """Measure how far two meshes lie apart.
+
+    mesh, reference: Files A and B, see `clrecon.read_mesh`.
+    no_clobber: Files that exist stay and are an `OutputError`, before any work.
+    progress: ``progress(stage, done, total)``.
+    """
+    files, settings = files or DistanceFiles(), settings or DistanceSettings()
+    progress = progress or ignore_progress
+    watch = Laps()
+    with keep_existing(no_clobber):
+        _check_files(files, (mesh, reference))
+    device = None if files.picture is None else _open_device(settings.device)
+    progress("read", 0, 0)
+    meshes = [read_side(path, settings.mesh_space) for path in (mesh, reference)]
+    entries = [describe_mesh(own, path) for own, path in zip(meshes, (mesh, reference), strict=True)]
+    for entry in entries:
+        if not entry["area_mm2"]:
+            raise NoSurfaceError(f"{entry['name']} has no triangle with an area: there is nothing to measure")
+    watch.lap("read")
+    names = (entries[0]["name"], entries[1]["name"])
+    found = measure_distance(meshes[0], meshes[1], settings.samples, names=names, progress=progress)
+    colored = None
+    if files.output is not None or files.picture is not None:
+        colored = _color_mesh(meshes[0], meshes[1], found, settings, progress)
+    watch.lap("measure")
+    drawn = None
+    if device is not None and colored is not None:
+        progress("render", 0, 0)
+        drawn = _draw_mesh(meshes[0], colored, names[1], settings, device)
+        watch.lap("render")
+    warnings = [text for own in meshes for text in own.report["file"]["warnings"]]
+    warnings += [*doubt_frames(meshes, entries), *found.warnings]
+    with keep_existing(no_clobber), ExitStack() as staged:
+        written = _stage_files(staged, meshes[0], colored, drawn, files, settings)
+        outputs = [
+            {"kind": what, "name": os.path.basename(os.fspath(path)), "bytes": file.size}
+            for what, path, file in written
+        ]
+        watch.lap("write")
+        report = _describe_distances(found, entries, colored, outputs, device, warnings, watch)
+        own: list[Staged] = [file for _, _, file in written]
+        if files.report is not None:
+            own.append(staged.enter_context(stage_report(files.report, report)))
+        commit_all(own)
+    log_warnings(log, report.warnings)
+    return report
+
+
+def _check_files(files: DistanceFiles, sources: tuple[str | Path, str | Path]) -> None:
+    from clrecon.rendering.pictures.image_files import check_image_path
+    from clrecon.rendering.pictures.pillow import load_pillow
+
+    if files.output is not None and not os.fspath(files.output).lower().endswith(".ply"):
+        raise UsageError(
+            f"a mesh coloured by distance is a .ply file, not {os.path.basename(os.fspath(files.output))[-40:]!r}"
+        )
+    if files.picture is not None:
+        load_pillow()
+        check_image_path(files.picture)
+    named = [("the coloured mesh", files.output), ("the picture", files.picture), ("the report", files.report)]
+    outputs: list[tuple[str, str | Path]] = [(what, path) for what, path in named if path is not None]
+    check_distinct(outputs)
+    for _, path in outputs:
+        check_writable(path)
+    check_kept(outputs, *sources)
+
+
+def _open_device(name: str | None) -> Device:
+    from clrecon.operators import take_device
+
+    return take_device(name)
+
+
+@dataclass(frozen=True)
+class _Colored:
+    """Distances of the vertices of A, and their colours."""
+
+    distances: NDArray[np.float64]
+    scale: ColorScale
+
+    @property
+    def colors(self) -> NDArray[np.uint8]:
+        return self.scale.colors(self.distances)
+
+
+def _color_mesh(
+    mesh: Mesh, reference: Mesh, found: MeshDeviation, settings: DistanceSettings, progress: Progress
+) -> _Colored:
+    from clrecon.rendering.looks.color_scale import ColorScale, round_up
+
+    distances, signed = measure_vertex_distances(mesh, reference, progress=progress)
+    limit = settings.range_mm or round_up(max(found.to_reference_mm.p95, _LEAST_RANGE_MM))
+    return _Colored(distances, ColorScale(limit, signed))
+
+
+def _draw_mesh(mesh: Mesh, colored: _Colored, other: str, settings: DistanceSettings, device: Device) -> Rendering:
+    from clrecon.operators.rays.mesh_pictures import box_around, mesh_corners
+    from clrecon.operators.rays.scene import ScenePictures
+    from clrecon.rendering.pictures.mesh_look import MeshLook
+    from clrecon.rendering.pictures.scale_strip import add_scale
+    from clrecon.rendering.views.camera import Camera
+    from clrecon.rendering.views.directions import DEFAULT_SIZE
+
+    camera = Camera.fit(box_around([mesh_corners(mesh)]), settings.view)
+    look = MeshLook(vertex_colors=colored.colors)
+    with ScenePictures([(mesh, look)], device=device, memory=settings.memory) as scene:
+        picture: Rendering = scene.take(camera, DEFAULT_SIZE, "white")
+    title = "mm, + is\noutside of B" if colored.scale.signed else "mm from B"
+    return add_scale(picture.annotated(letters=True, scale_bar=True), colored.scale, title)
+
+
+def _stage_files(
+    staged: ExitStack,
+    mesh: Mesh,
+    colored: _Colored | None,
+    drawn: Rendering | None,
+    files: DistanceFiles,
+    settings: DistanceSettings,
+) -> list[tuple[str, str | Path, Any]]:
+    from clrecon.exchange.file_format import stage_content
+    from clrecon.exchange.formats import FORMATS
+
+    written: list[tuple[str, str | Path, Any]] = []
+    if files.output is not None and colored is not None:
+        content = replace(
+            mesh.describe(settings.space), vertex_colors=colored.colors, distances=colored.distances.astype(np.float32)
+        )
+        counted = f"{mesh.triangle_count} triangles"
+        file = staged.enter_context(stage_content(content, files.output, FORMATS[".ply"], counted, "fewer triangles"))
+        written.append(("mesh", files.output, file))
+    if files.picture is not None and drawn is not None:
+        written.append(("picture", files.picture, stage_picture(staged, drawn, files.picture)))
+    return written
+
+
+def _describe_distances(
+    found: MeshDeviation,
+    entries: list[dict[str, Any]],
+    colored: _Colored | None,
+    outputs: list[dict[str, Any]],
+    device: Device | None,
+    warnings: list[str],
+    watch: Laps,
+) -> DistanceReport:
+    colors = None
+    if colored is not None:
+        limit = colored.scale.limit
+        beyond = float(np.mean(np.abs(colored.distances) > limit))
+        colors = {"range_mm": limit, "signed": colored.scale.signed, "beyond_share": beyond}
+    return DistanceReport(
+        a=entries[0],
+        b=entries[1],
+        hausdorff_mm=found.hausdorff_mm,
+        hd95_mm=found.hd95_mm,
+        assd_mm=found.assd_mm,
+        a_to_b_mm=found.to_reference_mm,  # type: ignore[arg-type]
+        b_to_a_mm=found.from_reference_mm,  # type: ignore[arg-type]
+        a_to_b_signed_mm=found.to_reference_signed_mm,
+        b_to_a_signed_mm=found.from_reference_signed_mm,
+        samples=found.samples,
+        colors=colors,
+        outputs=outputs,
+        device=None if device is None else device.current.label,
+        version=package_version(),
+        platform=platform_name(),
+        warnings=list(dict.fromkeys(warnings)),
+        seconds={part: round(value, 4) for part, value in {**watch.seconds, "total": watch.total()}.items()},
+        peak_memory_bytes=peak_memory_bytes(),
+    )
+
+
+_OTHER_UNIT = 100.0
+"""Ratio of the sizes of two meshes from which on their units are doubted; metres and millimetres differ by 1000."""
+
+
+def read_side(path: str | Path, space: str | None) -> Mesh:
+    """Read a mesh; `space` is the frame of its coordinates if the file does not name one."""
+    mesh = read_mesh(path)
+    if space is not None and mesh.report["file"]["space_from"] == "assumed":
+        return read_mesh(path, space=space)
+    return mesh
+
+
+def describe_mesh(mesh: Mesh, path: str | Path) -> dict[str, Any]:
+    """Return the report's entry of a mesh; the name of its file without folders."""
+    quality = mesh.quality()
+    file = mesh.report["file"]
+    closed = quality.closed and quality.oriented
+    return {
+        "name": escape_text(Path(path).name),
+        "kind": file["kind"],
+        "space": file["space"],
+        "space_from": file["space_from"],
+        "vertices": mesh.vertex_count,
+        "triangles": mesh.triangle_count,
+        "closed": closed,
+        "area_mm2": quality.area_mm2,
+        "volume_ml": abs(quality.volume_ml) if closed else None,
+        "bounds_mm": quality.bounds_mm,
+    }
+
+
+def doubt_frames(meshes: Sequence[Mesh], entries: Sequence[dict[str, Any]]) -> list[str]:
+    """Return what speaks against both meshes lying in one frame and unit."""
+    doubts = []
+    hashes = [_frame_of_reference(mesh) for mesh in meshes]
+    a, b = (entry["name"] for entry in entries)
+    if None not in hashes and hashes[0] != hashes[1]:
+        doubts.append(
+            f"{a} and {b} are from different frames of reference ({hashes[0]}, {hashes[1]}, hashes): nothing vouches"
+            " that they lie together"
+        )
+    boxes = [np.array(entry["bounds_mm"]) for entry in entries if entry["bounds_mm"]]
+    if len(boxes) < 2:
+        return doubts
+    sizes = [float(np.linalg.norm(box[1] - box[0])) for box in boxes]
+    if min(sizes) > 0.0 and max(sizes) / min(sizes) >= _OTHER_UNIT:
+        doubts.append(
+            f"{a} is {format_digits(sizes[0], 4)} mm across and {b} {format_digits(sizes[1], 4)} mm: is"
+            f" one of them in another unit?"
+        )
+    gap = float(np.linalg.norm(np.maximum(0.0, np.maximum(boxes[0][0] - boxes[1][1], boxes[1][0] - boxes[0][1]))))
+    if gap > 0.0:
+        sources = {entry["space_from"] for entry in entries}
+        hint = ": is the frame of the file that names none another?" if "assumed" in sources else ""
+        doubts.append(f"the boxes round {a} and {b} lie {format_digits(gap, 4)} mm apart{hint}")
+    return doubts
+
+
+def _frame_of_reference(mesh: Mesh) -> str | None:
+    lines = mesh.report.get("certificate_lines") or ()
+    return next((line.split()[1] for line in lines if line.startswith("frame_of_reference ")), None)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DistanceReport(Record):
+    """Report of `measure_meshes`; distances are mm.
+
+    a, b: Each mesh: ``name``, ``kind``, ``space`` and ``space_from`` of its file, ``vertices``, ``triangles``,
+        ``closed``, ``area_mm2``, ``volume_ml``, ``bounds_mm`` (LPS).
+    a_to_b_mm, b_to_a_mm: ``mean``, ``rms``, ``p95`` and ``max`` of the distances without sign.
+    a_to_b_signed_mm, b_to_a_signed_mm: See `clrecon.mesh.compare.signed.SideDistance`; None where the other mesh is not
+        closed.
+    colors: ``range_mm``, ``signed`` and ``beyond_share`` of vertices of A: how distances became colours.
+    outputs: ``kind``, ``name`` and ``bytes`` of each file.
+    device: Where a picture was drawn.
+    """
+
+    a: Mapping[str, Any]
+    b: Mapping[str, Any]
+    hausdorff_mm: float
+    hd95_mm: float
+    assd_mm: float
+    a_to_b_mm: Mapping[str, float]
+    b_to_a_mm: Mapping[str, float]
+    a_to_b_signed_mm: Mapping[str, float] | None
+    b_to_a_signed_mm: Mapping[str, float] | None
+    samples: int
+    colors: Mapping[str, Any] | None
+    outputs: list[dict[str, Any]]
+    device: str | None
+    version: str
+    platform: str
+    warnings: list[str]
+    seconds: Mapping[str, float]
+    peak_memory_bytes: int | None

@@ -1,1 +1,0 @@
-"""The job that measures how far two meshes lie apart: figures, a coloured mesh, a picture."""

@@ -1,0 +1,131 @@
+"""Inputs of jobs: clouds and meshes, told by the extension of their files, scans with label maps, and the crop.
+
+Nothing here loads numpy before it is called: help texts name the extensions.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clrecon.errors import UsageError
+from clrecon.jobs.options import InputSettings
+from clrecon.system.arguments import name_parameter
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+    from clrecon.geometry.boxes import Box
+    from clrecon.labels import LabelMap
+    from clrecon.points import PointCloud
+
+
+CLOUD_INPUTS = (".ply", ".vtp", ".npz", ".xyz", ".las", ".csv", ".txt")
+"""Extensions of files that are read as clouds, see `clrecon.read_points`."""
+
+MESH_INPUTS = (".stl", ".ply", ".obj", ".glb", ".3mf", ".vtp")
+"""Extensions of files that are read as meshes, see `clrecon.read_mesh`."""
+
+MESH_ONLY = tuple(extension for extension in MESH_INPUTS if extension not in CLOUD_INPUTS)
+"""Those of them that are not read as clouds."""
+
+OTHER_CLOUDS = (".pcd", ".e57", ".laz", ".pts", ".ptx", ".asc")
+"""Extensions of clouds that are not read."""
+
+_OF_BOTH = ("keep_ids", "device", "memory")
+"""Settings of the input that clouds have too."""
+
+
+def is_cloud_file(source: str | Path) -> bool:
+    """True for a file, or the name of one, whose extension is that of a cloud; folders are scans."""
+    return os.path.splitext(os.fspath(source))[1].lower() in CLOUD_INPUTS and not os.path.isdir(source)
+
+
+def is_mesh_file(source: str | Path) -> bool:
+    """True for a file, or the name of one, whose extension only meshes have; that of PLY is one of clouds too."""
+    return os.path.splitext(os.fspath(source))[1].lower() in MESH_ONLY and not os.path.isdir(source)
+
+
+def refuse_other_clouds(source: str | Path) -> None:
+    """Refuse a file whose extension is that of a cloud of another kind; it would be looked through for a scan."""
+    extension = os.path.splitext(os.fspath(source))[1].lower()
+    if extension in OTHER_CLOUDS and os.path.isfile(source):
+        raise UsageError(
+            f"clouds in files {extension} are not read: convert it to one of {', '.join(CLOUD_INPUTS)} first; text of"
+            " X Y Z only needs the extension .xyz"
+        )
+
+
+def refuse_scan_settings(settings: InputSettings, also: Sequence[str] = (), noun: str = "a cloud of points") -> None:
+    """Refuse settings that have no meaning where the input is a cloud or a mesh.
+
+    also: Further settings that are about a scan.
+    noun: What the input is.
+    """
+    defaults = {own.name: own.default for own in fields(settings)}
+    of_scans = [own.name for own in fields(InputSettings) if own.name not in _OF_BOTH]
+    for name in (*of_scans, *also):
+        if getattr(settings, name) != defaults[name]:
+            raise UsageError(f"the input is {noun}, and {name_parameter(name)} is about a scan: leave it out")
+
+
+def describe_cloud(cloud: PointCloud) -> dict[str, Any]:
+    """Return the report's entry of a cloud: its points, and what is known of them."""
+    known = {name: getattr(cloud, name) is not None for name in ("normals", "hu", "labels")}
+    return {"points": len(cloud), **known, "file": cloud.report.get("file")}
+
+
+def read_with_labels(
+    read_scan: Callable[[], Volume], path: str | Path | None, read_map: Callable[[Volume | None], LabelMap | None]
+) -> tuple[Volume, LabelMap | None]:
+    """Read the labels, then the scan; but labels that take long to unpack after it, to be held against its grid.
+
+    path: File of the labels.
+    read_map: Reads the labels; gets the scan if it was read first.
+    """
+    if path is None:
+        return read_scan(), None
+    from clrecon.labels.reader import is_large_map
+
+    if is_large_map(path):
+        volume = read_scan()
+        return volume, read_map(volume)
+    labels = read_map(None)
+    return read_scan(), labels
+
+
+def crop_scan(volume: Volume, box: Box | None, space: str, *, margin: int = 0) -> Volume:
+    """Return the part of a scan in a box, in mm of the frame `space`; all of it without a box."""
+    if box is None:
+        return volume
+    from clrecon.geometry.crop import crop_volume
+
+    return crop_volume(volume, *box, margin=margin, space=space)
+
+
+def crop_labels(labels: LabelMap, box: Box | None, space: str) -> LabelMap:
+    """Return the part of a label map in a box, as `crop_scan` does a scan."""
+    if box is None:
+        return labels
+    import numpy as np
+
+    from clrecon.geometry import frame_from_lps
+    from clrecon.geometry.blocks import find_block, place_block
+    from clrecon.labels import LabelMap
+
+    turned = np.sort(np.array(box) * np.diag(frame_from_lps(space)), axis=0)
+    origins = labels.affine[:3, 3] + np.arange(labels.shape_ijk[2])[:, None] * labels.affine[:3, 2]
+    block = find_block(labels, origins, turned[0], turned[1])
+    cut = None
+    if block is not None:
+        (i0, j0, k0), (i1, j1, k1) = block
+        cut = labels.voxels[k0:k1, j0:j1, i0:i1]
+    if block is None or cut is None or not cut.any():
+        raise UsageError("nothing is left: no labelled voxel lies in the box of the crop")
+    affine, _ = place_block(labels.affine, origins, False, block)
+    names = {number: labels.name(number) for number in labels.numbers}
+    return LabelMap(
+        cut, affine, names, frame_of_reference_hash=labels.frame_of_reference_hash, warnings=labels.warnings
+    )

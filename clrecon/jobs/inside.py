@@ -1,0 +1,410 @@
+"""The job that looks into vertebrae: a CT series and its labels in, meshes of the parts and their volumes out.
+
+Pictures show one part opaque and others faded.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clrecon.errors import UsageError
+from clrecon.jobs.inputs import read_with_labels
+from clrecon.jobs.outputs import (
+    check_distinct,
+    check_kept,
+    check_outputs,
+    commit_all,
+    name_outputs,
+    refuse_files,
+    stage_meshes,
+    stage_picture,
+)
+from clrecon.jobs.run import DeviceOpening, Laps, RunReport, peak_memory_bytes, platform_name, stage_report
+from clrecon.reading import Selection, read_selected
+from clrecon.system.arguments import name_parameter
+from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.paths import keep_existing
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.version import package_version
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+    from clrecon.labels import LabelMap
+    from clrecon.mesh import Mesh
+    from clrecon.opencl import Device
+    from clrecon.operators.vertebrae.inside import VertebraInside
+    from clrecon.rendering import Rendering
+    from clrecon.system.files import StagedFile
+
+
+DEFAULT_VIEW = "130,20"
+"""From the left, behind and above: body, arch and canal are seen."""
+
+COLORS = {
+    "solid": (0.93, 0.88, 0.76),
+    "dense": (0.93, 0.88, 0.76),
+    "trabecular": (0.80, 0.42, 0.32),
+    "canal": (0.25, 0.55, 0.90),
+}
+
+FADED = {"solid": ("canal",), "dense": ("canal",), "trabecular": ("solid", "canal"), "canal": ("solid",)}
+"""Parts that are seen faded beside each opaque one: those that it does not hide."""
+
+FADED_OPACITY = 0.15
+
+
+def check_pictures(picture: str | Path, view: str) -> None:
+    """Refuse pictures that cannot be made, before any work is done."""
+    from clrecon.rendering.pictures.image_files import check_image_path
+    from clrecon.rendering.pictures.pillow import load_pillow
+    from clrecon.rendering.views.directions import find_view
+
+    load_pillow()
+    check_image_path(picture)
+    find_view(view)
+
+
+def draw_parts(
+    meshes: Mapping[str, Mesh], view: str, device: Device, memory: int | None = None
+) -> dict[str, Rendering]:
+    """Draw each part opaque, with others faded, all from one camera.
+
+    meshes: By the names of `clrecon.operators.vertebrae.inside.PARTS`.
+    view: See `clrecon.Camera.fit`.
+    memory: Most bytes on the device.
+    """
+    from clrecon.operators.rays.mesh_pictures import box_around, mesh_corners
+    from clrecon.operators.rays.scene import ScenePictures
+    from clrecon.rendering.pictures.mesh_look import MeshLook
+    from clrecon.rendering.views.camera import Camera
+    from clrecon.rendering.views.directions import DEFAULT_SIZE
+
+    camera = Camera.fit(box_around([mesh_corners(mesh) for mesh in meshes.values()]), view)
+    pictures = {}
+    for part, mesh in meshes.items():
+        shown = [(mesh, MeshLook(COLORS[part]))]
+        shown += [
+            (meshes[other], MeshLook(COLORS[other], opacity=FADED_OPACITY)) for other in FADED[part] if other in meshes
+        ]
+        with ScenePictures(shown, device=device, memory=memory) as scene:
+            pictures[part] = scene.take(camera, DEFAULT_SIZE, "white")
+    return pictures
+
+
+def describe_picture(part: str, picture: Rendering, path: str | Path, size: int) -> dict[str, Any]:
+    """Return one object of ``pictures``."""
+    kind = os.path.splitext(os.fspath(path))[1].lower().lstrip(".")
+    return {"part": part, "faded": list(FADED[part]), "size": list(picture.size), "format": kind, "bytes": size}
+
+
+@dataclass(frozen=True, kw_only=True)
+class InsideSettings(Selection):
+    """Settings of the job.
+
+    series, phase, allow_gaps, force, follow_links, rescale: See `clrecon.reading.Selection`.
+    labels: Label map: NIfTI, NRRD, MetaImage, DICOM SEG or RTSTRUCT.
+    only: The vertebrae, by numbers or names of their labels.
+    iso_value: HU of the solid bone; None: the labels' own voxels.
+    dense: (low, high). Band of dense bone, HU; None leaves an end open.  Default:
+        `clrecon.operators.vertebrae.inside.DENSE_HU`.
+    close_mm: Radius that closes the solid bone.  Default: `clrecon.operators.vertebrae.solid.CLOSE_MM`.
+    grow_mm: Distance of growth with an iso value, see `clrecon.extract_labels`.
+    space: {"lps", "ras"}. Patient frame of the meshes.
+    view: View of the pictures, see `clrecon.Camera.fit`.
+    keep_ids: Write the hashes of the UIDs of series and frame of reference into the report and the mesh files.
+    device: Name or index of an OpenCL device.
+    memory: Most bytes on the device.
+    """
+
+    labels: str | Path
+    only: Sequence[str | int]
+    iso_value: float | None = None
+    dense: Sequence[float | None] | None = None
+    close_mm: float | None = None
+    grow_mm: float | None = None
+    space: str = "lps"
+    view: str = DEFAULT_VIEW
+    keep_ids: bool = False
+    device: str | None = None
+    memory: int | None = None
+
+    def __post_init__(self) -> None:
+        from clrecon.geometry import frame_from_lps
+
+        frame_from_lps(self.space)
+        if not self.only:
+            raise UsageError(f"choose the vertebrae by their labels: {name_parameter('only', 'L3')}")
+        if self.memory is not None and self.memory < 1:
+            raise UsageError(f"the memory that may be taken must be above 0 bytes, not {self.memory}")
+        if self.grow_mm is not None and self.iso_value is None:
+            raise UsageError(
+                f"the labels' own voxels do not grow: leave {name_parameter('grow_mm')} out, or give an iso value"
+                f" ({name_parameter('iso_value', 'N')})"
+            )
+
+
+log = get_logger(__name__)
+
+
+def make_inside(
+    source: str | Path,
+    output: str | Path,
+    settings: InsideSettings,
+    *,
+    picture: str | Path | None = None,
+    report_path: str | Path | None = None,
+    no_clobber: bool = False,
+    progress: Progress | None = None,
+) -> InsideReport:
+    """Read a CT series and its labels, look into vertebrae, and write the surfaces of their parts.
+
+    The files have the names of the parts: ``inside.stl`` becomes ``inside_solid.stl``, ``inside_dense.stl`` and so on,
+    with several vertebrae ``inside_L3_solid.stl``.  All are written under temporary names, then renamed; the report
+    comes last, as the commit mark.
+
+    source: DICOM folder or file, or a file of another format, see `clrecon.read_volume`.
+    output: Mesh file; its extension gives the format.
+    picture: Picture, .png, .jpg or .tif: one of each part, with names like those of the meshes.
+    report_path: File for the report as JSON.
+    no_clobber: Files that exist stay and are an `OutputError`.
+    progress: ``progress(stage, done, total)``.
+    """
+    from clrecon.operators.vertebrae.inside import PARTS
+
+    progress = progress or ignore_progress
+    watch = Laps()
+    with keep_existing(no_clobber):
+        _check_files(source, output, picture, report_path, settings)
+    volume, labels, device = _open_inputs(source, settings, progress)
+    suffixes = _name_labels(labels, settings)
+    if no_clobber:
+        names = [name_part(suffix, part, several=len(suffixes) > 1) for suffix in suffixes for part in PARTS]
+        refuse_files(name_outputs(output, names) + ([] if picture is None else name_outputs(picture, names)))
+    watch.lap("read")
+    found: list[_FoundVertebra] = []
+    for number, suffix in zip(_find_numbers(labels, settings), suffixes, strict=True):
+        progress("inside", len(found), len(suffixes) if len(suffixes) > 1 else 0)
+        inside = _look_inside(volume, labels, number, settings, device)
+        found.append(_FoundVertebra(suffix, inside, inside.extract_meshes(memory=settings.memory)))
+    watch.lap("inside")
+    if picture is not None:
+        for place, one in enumerate(found):
+            progress("render", place, len(found) if len(found) > 1 else 0)
+            one.pictures = draw_parts(one.meshes, settings.view, device, settings.memory)
+        watch.lap("render")
+    with keep_existing(no_clobber):
+        report = _write_files(found, (output, picture, report_path), volume, settings, device, watch, progress)
+    log_warnings(log, report.warnings, volume.report.get("warnings", ()))
+    log.info("%d vertebrae looked into, on %s in %.3f s", len(found), report.device, report.seconds["total"])
+    return report
+
+
+@dataclass
+class _FoundVertebra:
+    """One vertebra: its name in files, its parts, their surfaces and their pictures."""
+
+    suffix: str
+    inside: VertebraInside
+    meshes: dict[str, Mesh]
+    pictures: dict[str, Rendering] = field(default_factory=dict)
+
+
+def _check_files(
+    source: str | Path,
+    output: str | Path,
+    picture: str | Path | None,
+    report_path: str | Path | None,
+    settings: InsideSettings,
+) -> None:
+    """Refuse outputs that cannot be written or would replace an input."""
+    from clrecon.operators.vertebrae.inside import PARTS
+    from clrecon.system.files import check_writable
+
+    # names of several vertebrae are those of the label map, which is not read yet: their number stands for them
+    first = [part if len(settings.only) == 1 else f"{len(settings.only)}_{part}" for part in PARTS]
+    outputs = check_outputs(output, report_path, first)
+    if picture is not None:
+        check_pictures(picture, settings.view)
+        drawn = [("the picture", path) for path in name_outputs(picture, first)]
+        check_distinct(outputs, drawn)
+        for _, path in drawn:
+            check_writable(path)
+        outputs += drawn
+    check_kept(outputs, source, settings.labels)
+
+
+def _open_inputs(source: str | Path, settings: InsideSettings, progress: Progress) -> tuple[Volume, LabelMap, Device]:
+    """Read the input while the device opens and builds its kernels."""
+    from clrecon.labels import read_labels
+
+    progress("device", 0, 0)
+    with DeviceOpening(settings.device, _prepare_kernels) as opening:
+        volume, labels = read_with_labels(
+            partial(read_selected, source, settings, progress=progress),
+            settings.labels,
+            lambda volume: read_labels(settings.labels, volume=volume),
+        )
+        device = opening.wait()
+    assert labels is not None
+    return volume, labels, device
+
+
+def _prepare_kernels(device: Device) -> None:
+    from clrecon.operators.surface.label_masks import prepare_label_masks
+
+    prepare_label_masks(device)
+
+
+def _find_numbers(labels: LabelMap, settings: InsideSettings) -> list[int]:
+    return list(dict.fromkeys(labels.find(label) for label in settings.only))
+
+
+def _name_labels(labels: LabelMap, settings: InsideSettings) -> list[str]:
+    """Return the names of the vertebrae in files and in the report."""
+    from clrecon.labels import file_suffixes
+
+    return list(file_suffixes({number: labels.name(number) for number in _find_numbers(labels, settings)}).values())
+
+
+def name_part(suffix: str, part: str, *, several: bool) -> str:
+    """Return the name of a part in those of its files; of several vertebrae with that of its own."""
+    return f"{suffix}_{part}" if several else part
+
+
+def _look_inside(
+    volume: Volume, labels: LabelMap, number: int, settings: InsideSettings, device: Device
+) -> VertebraInside:
+    from clrecon.operators.vertebrae.inside import vertebra_inside
+
+    given = {name: getattr(settings, name) for name in ("dense", "close_mm") if getattr(settings, name) is not None}
+    return vertebra_inside(
+        volume, labels, number, settings.iso_value, grow_mm=settings.grow_mm, device=device, memory=settings.memory,
+        **given,
+    )  # fmt: skip
+
+
+def _write_files(
+    found: list[_FoundVertebra],
+    outputs: tuple[str | Path, str | Path | None, str | Path | None],
+    volume: Volume,
+    settings: InsideSettings,
+    device: Device,
+    watch: Laps,
+    progress: Progress,
+) -> InsideReport:
+    """Write all files, with the report of all vertebrae as the last one, and return the report."""
+    from clrecon.operators.vertebrae.solid import CLOSE_MM
+
+    output, picture, report_path = outputs
+    suffixes = [one.suffix for one in found]
+    with ExitStack() as staged:
+        files: list[StagedFile] = []
+        vertebrae: list[dict[str, Any]] = []
+        for one in found:
+            names = [name_part(one.suffix, part, several=len(suffixes) > 1) for part in one.meshes]
+            paths = name_outputs(output, names, report_path)
+            written = stage_meshes(
+                staged, list(one.meshes.values()), paths, settings.space, progress, keep_ids=settings.keep_ids
+            )
+            told: dict[str, Any] = {**one.inside.as_dict(), "name": one.suffix, "pictures": []}
+            parts = zip(one.meshes, one.meshes.values(), paths, written, strict=True)
+            told["meshes"] = [describe_mesh_file(part, mesh, path, file.size) for part, mesh, path, file in parts]
+            files += written
+            for part, drawn in one.pictures.items():
+                assert picture is not None
+                (path,) = name_outputs(picture, [name_part(one.suffix, part, several=len(suffixes) > 1)])
+                files.append(stage_picture(staged, drawn, path))
+                told["pictures"].append(describe_picture(part, drawn, path, files[-1].size))
+                told["warnings"] += drawn.report["warnings"]
+            vertebrae.append(told)
+        watch.lap("write")
+        seconds = {part: round(value, 4) for part, value in {**watch.seconds, "total": watch.total()}.items()}
+        report = describe_inside(
+            volume, vertebrae, settings, device.current, close_mm=settings.close_mm or CLOSE_MM, seconds=seconds
+        )
+        if report_path is not None:
+            files.append(staged.enter_context(stage_report(report_path, report)))
+        commit_all(files)
+    return report
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InsideReport(RunReport):
+    """The report of the job: a `RunReport` with further entries, which docs/contract.md explains.
+
+    vertebrae: One for each label, see `clrecon.VertebraInside.as_dict`, with ``meshes`` beside: ``part``, ``vertices``,
+        ``triangles``, ``format`` and ``bytes`` of each file, and ``pictures``.
+    """
+
+    affine_ijk_to_lps_mm: list[list[float]]
+    vertebrae: list[dict[str, Any]]
+    close_mm: float
+    space: str
+    unit: str = "mm"
+    device: str
+    driver: str
+    memory_allowed_bytes: int | None
+    version: str
+    platform: str
+    warnings: list[str]
+    volume: Mapping[str, Any]
+    seconds: Mapping[str, float]
+    peak_memory_bytes: int | None
+
+
+def describe_mesh_file(part: str, mesh: Mesh, path: str | Path, size: int) -> dict[str, Any]:
+    """Return one object of ``meshes``."""
+    kind = os.path.splitext(os.fspath(path))[1].lower().lstrip(".")
+    return {
+        "part": part,
+        "vertices": mesh.vertex_count,
+        "triangles": mesh.triangle_count,
+        "format": kind,
+        "bytes": size,
+    }
+
+
+def describe_inside(
+    volume: Volume,
+    vertebrae: Sequence[dict[str, Any]],
+    settings: InsideSettings,
+    device: Device,
+    *,
+    close_mm: float,
+    seconds: Mapping[str, float],
+) -> InsideReport:
+    """Compose the report of a job.
+
+    vertebrae: Entries of each vertebra; their warnings become those of the job.
+    """
+    from clrecon.geometry.certificate import without_ids  # numpy: not loaded for the help
+
+    certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
+    told = [*certificate.pop("warnings", []), *device.warnings]
+    several = len(vertebrae) > 1
+    told += [
+        f"{vertebra['name']}: {warning}" if several else warning
+        for vertebra in vertebrae
+        for warning in vertebra["warnings"]
+    ]
+    return InsideReport(
+        affine_ijk_to_lps_mm=volume.affine.tolist(),
+        vertebrae=[dict(vertebra) for vertebra in vertebrae],
+        close_mm=close_mm,
+        space=settings.space.lower(),
+        device=device.label,
+        driver=device.driver,
+        memory_allowed_bytes=settings.memory,
+        version=package_version(),
+        platform=platform_name(),
+        warnings=list(dict.fromkeys(map(str, told))),
+        volume=certificate,
+        seconds=seconds,
+        peak_memory_bytes=peak_memory_bytes(),
+    )

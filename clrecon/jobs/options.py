@@ -1,0 +1,273 @@
+"""Settings that every job shares: which scan, which parts of it become air, and which device.
+
+The region of interest and the steps of preprocessing are told as texts.  Nothing here loads numpy: help texts name the
+forms of both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from clrecon.errors import UsageError
+from clrecon.reading import Selection
+
+if TYPE_CHECKING:
+    from clrecon.geometry.boxes import Box
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputSettings(Selection):
+    """Settings of the input: what is read, which parts become air, and the device for the computation.
+
+    series, phase, allow_gaps, force, follow_links, rescale: See `clrecon.reading.Selection`.
+    remove_table: First turn everything except the patient's body into air, see `clrecon.anatomy.body.remove_table`.
+    allow_bone_loss: Continue even if this removes more than 2 % of the bone, or `preprocess` more than half of what is
+        at the level and above.
+    field_of_view: float or "auto". First turn everything farther from the centre of the slices (mm) into air; "auto":
+        the circle that fits them.
+    clip_box: (x0, x1, y0, y1, z0, z1). Crop the scan to a box by whole voxels, see `clrecon.geometry.crop.crop_volume`;
+        infinite numbers leave a side open.  mm of the frame `space` where the job has one, else LPS; so are the next
+        two.
+    between: (z0, z1). Crop it to these heights.
+    around: (x, y, z, r). Crop it to a cube around a point; `r` is half of its side.
+    region: Rules of the region of interest, outside of which everything becomes air, see
+        `clrecon.jobs.options.parse_region_rules`; mm of the frame `space` where the job has one, else LPS.
+    preprocess: Steps before the surface, see `clrecon.jobs.options.parse_preprocess`.
+    keep_ids: Write the hashes of the UIDs of series and frame of reference into reports and mesh files.
+    device: Name or index of an OpenCL device; None leaves the choice to `choose_device`.
+    memory: Bytes that may be taken on the device; None is all that it has.  A volume that does not fit is processed in
+        slabs.
+    """
+
+    remove_table: bool = False
+    allow_bone_loss: bool = False
+    field_of_view: float | str | None = None
+    clip_box: Sequence[float] | None = None
+    between: Sequence[float] | None = None
+    around: Sequence[float] | None = None
+    region: Sequence[str] | None = None
+    preprocess: str | Sequence[str] | None = None
+    keep_ids: bool = False
+    device: str | None = None
+    memory: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.memory is not None and self.memory < 1:
+            raise UsageError(f"the memory that may be taken must be above 0 bytes, not {self.memory}")
+        if isinstance(self.field_of_view, str):
+            if self.field_of_view != "auto":
+                raise UsageError(f"the field of view is a radius in mm or auto, not {self.field_of_view!r}")
+        elif self.field_of_view is not None and not (math.isfinite(self.field_of_view) and self.field_of_view > 0.0):
+            raise UsageError(f"the radius of the field of view is a length in mm above 0, not {self.field_of_view:g}")
+        if self.allow_bone_loss and not (self.remove_table or self.preprocess is not None):
+            raise UsageError(
+                "a loss of bone is allowed, but nothing takes any: ask for the removal of the table or for"
+                " preprocessing too"
+            )
+        _ = self.crop
+        self._check_region()
+
+    def _check_region(self) -> None:
+
+        if self.region:
+            parse_region_rules(self.region)
+        if self.region_later and not self.region:
+            raise UsageError("a step of preprocessing is the region of interest, and there is none: give its rules")
+
+    @property
+    def crop(self) -> Box | None:
+        """The box that the scan is cropped to; None without a crop."""
+        from clrecon.geometry.boxes import crop_box  # loads numpy, which the help does without
+
+        return crop_box(self.clip_box, self.between, self.around)
+
+    @property
+    def crop_margin(self) -> int:
+        """Voxels that stay beyond the box on each side."""
+        return 0
+
+    @property
+    def region_later(self) -> bool:
+        """True where the region of interest is a step of preprocessing, and does not come before."""
+
+        return self.preprocess is not None and any(step.name == "region" for step in parse_preprocess(self.preprocess))
+
+    @property
+    def space_of_points(self) -> str:
+        """Patient frame of the region's numbers: that of what is written, LPS where a job has none."""
+        return str(getattr(self, "space", "lps"))
+
+
+REGION_FORMS = "box:X0,X1,Y0,Y1,Z0,Z1, hu:LO,HI, label:FILE:NAME, mask:FILE, seed:X,Y,Z, tube:MM and tube:MM:FILE"
+"""The forms of a region rule, for messages and help."""
+
+_REGION_NUMBERS = {"box": 6, "hu": 2, "seed": 3, "tube": 1}
+
+
+@dataclass(frozen=True)
+class RegionRule:
+    """One rule.
+
+    kind: {"box", "hu", "label", "mask", "seed", "tube"}
+    numbers: Of a box (x0, x1, y0, y1, z0, z1), infinite where a side is open; of HU the lowest and the highest; of a
+        seed a point; of a tube its radius.  Lengths are mm.
+    path: Label map, or file of a centre line; a tube without one goes along the spinal canal.
+    name: Label in the map.
+    """
+
+    kind: str
+    numbers: tuple[float, ...] = ()
+    path: str | None = None
+    name: str | None = None
+
+    def __str__(self) -> str:
+        """Describe the rule in its own form; a file by its name alone."""
+        from clrecon.system.text import escape_text
+
+        numbers = ",".join("" if math.isinf(number) else f"{number:g}" for number in self.numbers)
+        file = None if self.path is None else escape_text(self.path.replace("\\", "/").rsplit("/", 1)[-1])
+        return ":".join(part for part in (self.kind, numbers, file, self.name) if part)
+
+
+def parse_region_rules(rules: str | Sequence[str]) -> tuple[RegionRule, ...]:
+    """Read region rules.
+
+    rules: ``box:X0,X1,Y0,Y1,Z0,Z1`` in mm, where an empty side is open; ``hu:LO,HI``, both ends included;
+        ``label:FILE:NAME``, a label of a label map by name or number; ``mask:FILE``, all labels of a label map;
+        ``seed:X,Y,Z``, what is joined to this point; ``tube:MM``, what lies so near to the middle of the spinal canal,
+        or with ``tube:MM:FILE`` to another centre line.
+    """
+    parsed = tuple(_parse_region_rule(str(rule).strip()) for rule in ([rules] if isinstance(rules, str) else rules))
+    kinds = {rule.kind for rule in parsed}
+    if "seed" in kinds and not kinds & {"hu", "label", "mask"}:
+        raise UsageError(
+            "a region's seed grows within HU or labels: give a rule hu:LO,HI, label:FILE:NAME or mask:FILE too"
+        )
+    return parsed
+
+
+def _parse_region_rule(rule: str) -> RegionRule:
+    kind, _, rest = rule.partition(":")
+    kind = kind.lower()
+    numbers: tuple[float, ...] | None = ()
+    path = name = ""
+    if kind == "label":
+        path, _, name = rest.rpartition(":")
+        is_known = bool(path and name.strip())
+    elif kind == "mask":
+        path = rest
+        is_known = bool(path)
+    else:
+        words, _, path = rest.partition(":") if kind == "tube" else (rest, "", "")
+        numbers = _parse_region_numbers(words, ends=kind in ("box", "hu"))
+        is_known = numbers is not None and len(numbers) == _REGION_NUMBERS.get(kind)
+    if numbers is None or not is_known:
+        raise UsageError(f"the region rule {rule!r:.200} is not known: the rules are {REGION_FORMS}")
+    _check_region_numbers(rule, kind, numbers)
+    return RegionRule(kind, numbers, path or None, name.strip() or None)
+
+
+def _parse_region_numbers(text: str, *, ends: bool) -> tuple[float, ...] | None:
+    """Read numbers between commas, None where one is none.  With `ends` an empty one is an open side: an infinite
+    number, downward and upward in turns.
+    """
+    words = [word.strip() for word in text.split(",")]
+    try:
+        return tuple(
+            math.copysign(math.inf, place % 2 - 0.5) if ends and not word else float(word)
+            for place, word in enumerate(words)
+        )
+    except ValueError:
+        return None
+
+
+def _check_region_numbers(rule: str, kind: str, numbers: tuple[float, ...]) -> None:
+    """Refuse numbers that no region can have."""
+    has_ends = kind in ("box", "hu")
+    if any(math.isnan(number) or (math.isinf(number) and not has_ends) for number in numbers):
+        raise UsageError(f"the region rule {rule!r:.200} needs finite numbers")
+    for low, high in zip(numbers[::2], numbers[1::2], strict=True) if has_ends else ():
+        if low > high or (kind == "box" and low == high):
+            raise UsageError(
+                f"the region rule {rule!r:.200} holds nothing: give the lower end first, {high:g} is not above {low:g}"
+            )
+    if kind == "tube" and not numbers[0] > 0.0:
+        raise UsageError(f"the radius of a tube is a length in mm above 0, not {numbers[0]:g} ({rule!r:.200})")
+
+
+FILTERS = {
+    "bilateral": ("sigma_mm", "sigma_hu"),
+    "bilateral-2d": ("sigma_mm", "sigma_hu"),
+    "bilateral-near": ("sigma_mm", "sigma_hu"),
+    "median": ("radius_mm",),
+    "gaussian": ("sigma_mm",),
+    "curvature-flow": ("iterations",),
+    "non-local-means": ("sigma_hu",),
+}
+"""Filters of HU, with the parameters that may follow them."""
+
+COUNTED = ("curvature-flow",)
+"""Filters whose parameter is a whole number."""
+
+MORPHOLOGY = ("erode", "dilate", "open", "close", "fill", "fill-slices")
+"""Steps on the voxels at the level and above."""
+
+_WITH_RADIUS = ("erode", "dilate", "open", "close")
+
+PREPROCESS_FORMS = (
+    "bilateral[:MM[:HU]], bilateral-2d[:MM[:HU]], bilateral-near[:MM[:HU]], median[:MM], gaussian[:MM],"
+    " curvature-flow[:N], non-local-means[:HU], level:HU, erode:MM, dilate:MM, open:MM, close:MM, fill, fill-slices"
+    " and region"
+)
+"""The forms of a step, for messages and help."""
+
+
+@dataclass(frozen=True)
+class PreprocessStep:
+    """One step: its name and the numbers behind it, in the order of `FILTERS`; a radius in mm, a level in HU."""
+
+    name: str
+    numbers: tuple[float, ...] = ()
+
+    def __str__(self) -> str:
+        """Write the step in its own form."""
+        return ":".join((self.name, *(f"{number:g}" for number in self.numbers)))
+
+
+def parse_preprocess(steps: str | Sequence[str]) -> tuple[PreprocessStep, ...]:
+    """Read the steps of preprocessing, which run in this order.
+
+    steps: A text with commas, or its parts.  Filters of HU may have parameters: spatial sigma in mm and range sigma in
+        HU of the bilateral filters, and so on as `FILTERS` says.  ``erode:MM``, ``dilate:MM``, ``open:MM`` and
+        ``close:MM`` take a ball of this radius, ``fill`` and ``fill-slices`` fill holes: all of the voxels at the level
+        of the job and above, or of ``level:HU`` if that stands before.  ``region`` is the place of the region of
+        interest, which else comes first.
+    """
+    words = steps.split(",") if isinstance(steps, str) else [str(step) for step in steps]
+    parsed = tuple(_parse_step(word.strip()) for word in words)
+    if sum(step.name == "region" for step in parsed) > 1:
+        raise UsageError("the region of interest has one place among the steps of preprocessing, it is named twice")
+    return parsed
+
+
+def _parse_step(word: str) -> PreprocessStep:
+    name, *rest = word.lower().split(":")
+    try:
+        numbers = tuple(float(number) for number in rest)
+    except ValueError:
+        numbers = (math.nan,)
+    most = len(FILTERS[name]) if name in FILTERS else int(name in (*_WITH_RADIUS, "level"))
+    least = 0 if name in FILTERS else most
+    known = name in FILTERS or name in MORPHOLOGY or name in ("level", "region")
+    if not known or not least <= len(numbers) <= most or not all(map(math.isfinite, numbers)):
+        raise UsageError(f"the step {word!r:.80} of preprocessing is not known: the steps are {PREPROCESS_FORMS}")
+    if name != "level" and any(number <= 0.0 for number in numbers):
+        raise UsageError(f"the step {word!r:.80} of preprocessing needs numbers above 0")
+    if name in COUNTED:
+        if any(number != int(number) for number in numbers):
+            raise UsageError(f"the step {word!r:.80} of preprocessing needs a whole number")
+        numbers = tuple(int(number) for number in numbers)
+    return PreprocessStep(name, numbers)

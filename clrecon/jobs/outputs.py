@@ -1,0 +1,228 @@
+"""The files of a job: their names, checks that none replaces another or an input, and writing under temporary names."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from contextlib import ExitStack
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+from clrecon.errors import ClreconError, OutputError, UsageError
+from clrecon.system.arguments import name_parameter
+from clrecon.system.progress import Progress
+from clrecon.system.text import count_of
+
+if TYPE_CHECKING:
+    from clrecon.mesh import Mesh
+    from clrecon.rendering import Rendering
+    from clrecon.system.files import Staged, StagedFile
+
+
+MOST_FILES = 1000
+"""Most meshes of a job.  More are useless crumbs, and each keeps a file open until all are written."""
+
+
+def name_outputs(output: str | Path, names: Sequence[str], report_path: str | Path | None = None) -> list[str | Path]:
+    """Name the files of several meshes: ``bone.stl`` and ``200hu`` give ``bone_200hu.stl``; an empty name adds nothing.
+
+    names: One for each mesh, see `clrecon.jobs.mesh.mesh_parts.Part`.
+    """
+    if len(names) > MOST_FILES:
+        raise UsageError(
+            f"{len(names):,} meshes are more than {MOST_FILES:,} files:"
+            f" leave small components out ({name_parameter('min_volume_ml', 'ML')},"
+            f" {name_parameter('keep_largest', 'N')}) or ask for fewer iso values"
+        )
+    stem, extension = os.path.splitext(os.fspath(output))
+    paths = [f"{stem}_{name}{extension}" if name else output for name in names]
+    for name in names:
+        if os.path.basename(name) != name or "\\" in name:
+            raise UsageError(f"{name!r} cannot be a part of the name of a file")
+    owned = [(f"the mesh {name}" if name else "the mesh", path) for name, path in zip(names, paths, strict=True)]
+    check_distinct([] if report_path is None else [("the report", report_path)], owned)
+    return paths
+
+
+def check_distinct(*owned: Sequence[tuple[str, str | Path]]) -> None:
+    """Refuse two outputs that are the same file.
+
+    *owned: sequence of (str, path). Description and path of each file.
+    """
+    owners: dict[str, str] = {}
+    for own, path in chain(*owned):
+        other = owners.get(_identity(path))
+        if other is not None:
+            raise UsageError(f"{own} and {other} cannot be the same file: {path}")
+        owners[_identity(path)] = own
+
+
+def check_kept(outputs: Sequence[tuple[str, str | Path | None]], *inputs: str | Path | None) -> None:
+    """Refuse outputs that would replace files that the job reads, under any name or link.
+
+    Files with the mark of DICOM are never replaced (`clrecon.system.files`). This function protects data sets without
+    the mark, files of other formats with their voxel files, and files with settings.
+
+    outputs: sequence of (str, path or None). Description and path of an output: a file, or a folder that is replaced as
+        a whole.
+    *inputs: Files and folders that are read; None and "" are ignored.
+    """
+    there = [(what, path) for what, path in outputs if path is not None and os.path.exists(path)]
+    read = [path for one in inputs if one and there for path in (one, _find_voxels(one)) if path]
+    for what, path in there:
+        inside = os.path.join(os.path.realpath(path), "")
+        for one in read:
+            same = os.path.exists(one) and (_identity(path) == _identity(one) or os.path.samefile(path, one))
+            if same or os.path.isdir(path) and os.path.realpath(one).startswith(inside):
+                raise UsageError(f"{what} would replace a file that is read: {path}")
+        if os.path.isfile(path) and _is_bare_data_set(path):
+            raise UsageError(f"{what} would replace a DICOM data set: {path}")
+
+
+def _find_voxels(path: str | Path) -> Path | None:
+    """Return the file that a header names for its voxels; None if it is the same file, or there is no header."""
+    if not os.path.isfile(path):
+        return None
+    from clrecon.formats import VOLUME, open_grid, tell_kind  # which a folder of DICOM does not need
+
+    try:
+        kind = tell_kind(Path(path))
+        return open_grid(Path(path), kind, VOLUME).voxel_bytes.path if kind and kind != "DICOM" else None
+    except (ClreconError, OSError):
+        return None  # reading reports the error
+
+
+def _is_bare_data_set(path: str | Path) -> bool:
+    from clrecon.dicom.parse.forced import restore_start
+    from clrecon.system.paths import open_regular
+
+    try:
+        with open_regular(path) as stream:
+            return restore_start(stream.read(256)) is not None
+    except OSError:
+        return False
+
+
+def count_leftovers(output: str | Path, paths: Sequence[str | Path]) -> int:
+    """Count the numbered files of `output` that are not among `paths`: components of an earlier run that had more.
+
+    The job must not remove them, but a user who takes all files of that name would mix them up with the new ones.
+    """
+    stem, extension = os.path.splitext(os.path.basename(output))
+    numbered = re.compile(rf"{re.escape(stem)}(?:_.+)?_[0-9]{{3,}}{re.escape(extension)}")
+    own = {_identity(path) for path in paths}
+    with os.scandir(os.path.dirname(output) or ".") as entries:
+        return sum(bool(numbered.fullmatch(entry.name)) and _identity(entry.path) not in own for entry in entries)
+
+
+def refuse_files(paths: Sequence[str | Path]) -> None:
+    """Raise `OutputError` if one of the files exists."""
+    from clrecon.system.paths import keep_existing, refuse_existing, resolve_target
+
+    with keep_existing():
+        for path in paths:
+            refuse_existing(path, resolve_target(path))
+
+
+def refuse_numbered(output: str | Path) -> None:
+    """Raise `OutputError` in a block of `keep_existing` if components of an earlier run have names of `output`."""
+    from clrecon.system.paths import existing_stay
+
+    if existing_stay() and (found := count_leftovers(output, [])):
+        raise OutputError(
+            f"{count_of(found, 'numbered file')} of {output} exist{'s' * (found == 1)} already and"
+            f" stay{'s' * (found == 1)} ({name_parameter('no_clobber', True)}):"
+            " name another"
+        )
+
+
+def _identity(path: str | Path) -> str:
+    """Return a key that is equal for two names of one file, also with links and on systems that ignore case."""
+    from clrecon.system.paths import resolve_target
+
+    return str(resolve_target(path)).casefold()
+
+
+def check_outputs(
+    output: str | Path, report_path: str | Path | None, names: Sequence[str] = ("",)
+) -> list[tuple[str, str | Path]]:
+    """Refuse outputs that cannot be written, before any work is done.
+
+    Returns: list of (str, path). Description and path of each output.
+    """
+    from clrecon.exchange.formats import check_format
+    from clrecon.system.files import check_writable
+
+    check_format(output)
+    outputs = [("the mesh", path) for path in name_outputs(output, names, report_path)]
+    if report_path is not None:
+        outputs.append(("the report", report_path))
+    for _, path in outputs:
+        check_writable(path)
+    return outputs
+
+
+def stage_meshes(
+    stack: ExitStack,
+    meshes: Sequence[Mesh],
+    paths: Sequence[str | Path],
+    space: str,
+    progress: Progress,
+    *,
+    keep_ids: bool = False,
+) -> list[StagedFile]:
+    """Write all meshes under temporary names that `stack` removes unless they are committed."""
+    from clrecon.exchange.formats import stage_mesh
+    from clrecon.system.files import allow_open_files
+
+    allow_open_files(len(meshes))
+    staged: list[StagedFile] = []
+    for mesh, path in zip(meshes, paths, strict=True):
+        progress("write", len(staged), len(meshes) if len(meshes) > 1 else 0)
+        staged.append(stack.enter_context(stage_mesh(mesh, path, space, keep_ids=keep_ids)))
+    return staged
+
+
+def stage_together(
+    stack: ExitStack,
+    meshes: Sequence[Mesh],
+    path: str | Path,
+    space: str,
+    progress: Progress,
+    *,
+    keep_ids: bool = False,
+) -> StagedFile:
+    """Write all meshes as named objects of one file under a temporary name, as `stage_meshes` does several files."""
+    from clrecon.exchange.formats import stage_assembly
+
+    progress("write", 0, 0)
+    return stack.enter_context(stage_assembly(meshes, path, space, keep_ids=keep_ids))
+
+
+def commit_all(files: Sequence[Staged]) -> None:
+    """Move staged files to their places, one after the other; Ctrl-C waits until all are there."""
+    from clrecon.system.files import hold_interrupts
+
+    with hold_interrupts():
+        for done, file in enumerate(files):
+            try:
+                file.commit()
+            except OutputError as error:
+                if done == 0:
+                    raise
+                raise OutputError(f"{error} ({done} of {len(files)} files of this job are in place already)") from error
+
+
+def stage_picture(stack: ExitStack, picture: Rendering, path: str | Path) -> StagedFile:
+    """Write a picture under a temporary name that `stack` removes unless it is committed."""
+    from clrecon.rendering.pictures.image_files import encode_image
+    from clrecon.system.files import stage_file
+
+    content = encode_image(picture, os.path.splitext(os.fspath(path))[1].lower())
+
+    def write(stream: BinaryIO) -> None:
+        stream.write(content)
+
+    return stack.enter_context(stage_file(path, write, expected_bytes=len(content)))

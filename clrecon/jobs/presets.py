@@ -1,0 +1,138 @@
+"""Words that stand for settings: presets of iso values, purposes of meshes, and all words that a setting can be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from clrecon.errors import UsageError
+from clrecon.system.text import guess_word, unknown_name
+
+
+@dataclass(frozen=True)
+class Preset:
+    """An iso value with its name and its reason.
+
+    iso_value: HU.
+    description: One line about the surface.
+    source: Origin of the value.
+    """
+
+    name: str
+    iso_value: float
+    description: str
+    source: str
+
+
+DEFAULT_PRESET = "bone"
+
+LOWEST_BONE_HU, HIGHEST_BONE_HU = 100.0, 1500.0
+"""Iso values of bone: muscle and organs without contrast medium are below, enamel and metal above."""
+
+_INVESALIUS = "InVesalius 3, lower bound of its preset"
+
+PRESETS: dict[str, Preset] = {
+    preset.name: preset
+    for preset in (
+        Preset(
+            "bone",
+            200.0,
+            "all bone: high enough to leave muscle and organs out, low enough to keep thin cortex whole",
+            "dicom2stl, tissue 'bone'; thin vertebral cortex in slices of 4 mm needs 150 to 200 HU",
+        ),
+        Preset("spongy-bone", 148.0, "cortical and spongy bone, with some contrast-filled vessels",
+               f"{_INVESALIUS} 'Spongial Bone (Adult)'"),
+        Preset("cortical-bone", 662.0, "dense bone only", f"{_INVESALIUS} 'Compact Bone (Adult)'"),
+        Preset("enamel", 1553.0, "teeth", f"{_INVESALIUS} 'Enamel (Adult)'"),
+        Preset("metal", 2500.0, "screws, rods and implants",
+               "above cortical bone (about 2000 HU), below the end of the 12-bit scale at 3071 HU"),
+        Preset("soft-tissue", -25.0, "muscle and organs without fat",
+               "half way between fat (about -100 HU) and muscle (about 50 HU)"),
+        Preset("skin", -500.0, "the outside of the body (and of the air inside of it)",
+               "half way between air (-1000 HU) and soft tissue (about 0 HU), where a blurred edge keeps its place"),
+    )
+}  # fmt: skip
+
+
+def find_preset(name: str) -> Preset:
+    """Return the preset called `name`, in upper or lower case."""
+    try:
+        return PRESETS[name.lower()]
+    except (KeyError, AttributeError):
+        raise UsageError(f"{unknown_name('preset', name, PRESETS)}, or give the iso value in HU") from None
+
+
+@dataclass(frozen=True)
+class Purpose:
+    """A name that stands for settings.
+
+    settings: Fields of `MeshSettings` that it sets if they are not given.
+    description: One line.
+    is_for_print: The surface has to be closed and of bone, and what a printer needs to know of it is measured.
+    """
+
+    name: str
+    settings: dict[str, Any]
+    description: str
+    is_for_print: bool = False
+
+
+PURPOSES: dict[str, Purpose] = {
+    purpose.name: purpose
+    for purpose in (
+        Purpose(
+            "print",
+            {"keep": "bone", "keep_largest": 1, "solid": True, "smooth": 20, "decimate": 0.9, "strict": True},
+            "one closed piece, of solid bone at iso values of bone; size and thickness of walls are said",
+            is_for_print=True,
+        ),
+        Purpose(
+            "paper-b",
+            {"preprocess": "bilateral-2d,open:1", "method": "i-mc", "vertex_rule": "golden"},
+            "improved marching cubes as Liu et al. 2019 have it; the vertex rule linear is more exact",
+        ),
+    )
+}
+
+
+def find_purpose(name: str) -> Purpose:
+    """Return the purpose of this name."""
+    if name not in PURPOSES:
+        raise UsageError(f"a mesh can be for {', '.join(PURPOSES)}, not for {name!r}{guess_word(name, PURPOSES)}")
+    return PURPOSES[name]
+
+
+def list_words(command: str, setting: str) -> list[str]:
+    """Return the words that a setting can be; an empty list where it takes numbers, files or free text.
+
+    command: Name of a command: a preset of pictures is not one of meshes.
+    setting: Name of the option's value, such as ``preset``.
+    """
+    from clrecon.phantom.settings import KINDS, TABLE_NAMES
+    from clrecon.rendering.looks.colors import COLORS
+    from clrecon.rendering.looks.presets import PRESETS as LOOKS
+    from clrecon.rendering.pictures.modes import MODES
+    from clrecon.rendering.pictures.styles import CURVED_KINDS
+    from clrecon.rendering.views.directions import DIRECTIONS
+    from clrecon.rendering.views.plane import PLANES
+
+    tables: dict[tuple[str, str], Iterable[str]] = {
+        ("render", "preset"): LOOKS,
+        ("render", "mode"): MODES,
+        ("render", "view"): [*DIRECTIONS, *PLANES],
+        ("render", "color"): COLORS,
+        ("render", "background"): COLORS,
+        ("render", "cpr"): CURVED_KINDS,
+        ("render", "combine"): ("mean", "max", "min"),
+        ("inside", "view"): DIRECTIONS,
+        ("mesh", "preset"): PRESETS,
+        ("compare", "preset"): PRESETS,
+        ("mesh", "purpose"): PURPOSES,
+        ("mesh", "topology"): ("separated", "trilinear"),
+        ("phantom", "kind"): KINDS,
+        ("phantom", "table"): TABLE_NAMES,
+    }
+    if setting == "device":
+        return ["cpu", "gpu"]
+    return list(tables.get((command, setting), ()))

@@ -1,0 +1,209 @@
+"""`PictureTaker`: a volume on a device, of which it takes all kinds of pictures."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any, cast
+
+from clrecon.jobs.render.settings import SPINES, LabelLook, RenderSettings
+from clrecon.rendering.looks.colors import is_transparent
+from clrecon.rendering.looks.label_style import NO_LABEL
+from clrecon.rendering.looks.presets import find_preset
+from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.styles import (
+    SPINE,
+    CurveCut,
+    SlicesInSpace,
+    Style,
+    SurfaceLook,
+    VolumeLook,
+)
+from clrecon.rendering.views.default_view import default_view
+from clrecon.rendering.views.seen import check_center
+from clrecon.system.base_classes import Closing
+from clrecon.system.progress import Progress
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+    from clrecon.geometry.affine import Float64Array
+    from clrecon.geometry.grid import Grid
+    from clrecon.labels import LabelMap
+    from clrecon.mesh import Mesh
+    from clrecon.opencl import Device
+    from clrecon.points import PointCloud
+    from clrecon.rendering import Lighting, Rendering, TransferFunction
+    from clrecon.rendering.views.camera import Camera
+
+
+def read_function(named: str | None) -> TransferFunction | None:
+    """Read the transfer function ``FILE`` or ``FILE:NAME``; None if no file is given."""
+    if named is None:
+        return None
+    from clrecon.rendering.looks.transfer_files import load_transfer_function
+
+    path, colon, name = named.rpartition(":")
+    if colon and not os.path.exists(named) and os.path.exists(path):
+        return load_transfer_function(path, name)
+    return load_transfer_function(named)
+
+
+def read_curve(named: str | None) -> Float64Array | None:
+    """Read the points (n, 3) in LPS mm of a centre line; None if no file is given or the spinal canal is meant."""
+    if named is None or named in SPINES:
+        return None
+    from clrecon.rendering.views.centre_line_files import read_curve_points
+
+    return read_curve_points(named)
+
+
+def read_look(look: LabelLook | None, volume: Volume | None = None) -> LabelMap | None:
+    """Read the label map; None if no file is given.  With the scan, a large one is held against its grid first."""
+    if look is None:
+        return None
+    from clrecon.labels.reader import read_all_labels
+
+    opacities = [label for label in look.opacities if label.strip() != str(NO_LABEL)]
+    named = [*look.colors, *opacities]  # they get the voxels that they share with others
+    labels = read_all_labels(look.path, named or None, volume=volume)
+    for label in named:
+        labels.find(label)
+    return labels
+
+
+class PictureTaker(Closing):
+    """Taker of the pictures that settings ask for; a context manager that frees the memory of the device.
+
+    function: Transfer function from a file; None means that of the preset.
+    curve: ndarray, shape (n, 3). Centre line of curved reformations in LPS mm; None means that of the style.
+    meshes: Those of the settings.
+    """
+
+    def __init__(
+        self,
+        subject: Volume | PointCloud | Mesh,
+        device: Device,
+        settings: RenderSettings,
+        *,
+        function: TransferFunction | None = None,
+        curve: Float64Array | None = None,
+        labels: LabelMap | None = None,
+        meshes: Sequence[Mesh] = (),
+        progress: Progress,
+    ):
+        self.meshes = list(meshes)
+        self._subject, self.device, self._settings = subject, device, settings
+        self.labels, self._progress = labels, progress
+        self.style = settings.style_with(function, curve, labels)
+        self.function = _shown_function(settings, self.style) if function is None else function
+        self.warnings: list[str] = []
+        self._stack = ExitStack()
+        self._renderer: Any = None
+        self._box: Grid | None = None
+
+    def close(self) -> None:
+        """Free the memory of the device."""
+        self._stack.close()
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """The views of the pictures; without any, that from which the slices of this scan show."""
+        if self._settings.views or not isinstance(self.style, SlicesInSpace):
+            return self._settings.views_used
+        return (default_view(self.style.mode, cast("Volume", self._subject)),)
+
+    @property
+    def box(self) -> Grid:
+        """The grid that cameras fit: the volume or the box of what is left of it, or the box of the cloud."""
+        if self._box is None:
+            self._box = self._find_box()
+            if self._settings.center is not None:
+                check_center(self._settings.center, self._box)
+        return self._box
+
+    def _find_box(self) -> Grid:
+        from clrecon.geometry.grid import Grid
+        from clrecon.operators.rays.point_pictures import cloud_box
+
+        if self._is_scene:
+            return cast("Grid", self._open_scene().box)
+        if not isinstance(self._subject, Grid):
+            return cloud_box(cast("PointCloud", self._subject))
+        return cast("Grid", self._open_volume().frame(self.style))
+
+    @property
+    def lighting(self) -> Lighting | None:
+        """The light of shaded pictures, None in modes without shading."""
+        shaded = VolumeLook | SurfaceLook | PointLook | MeshLook
+        return self.style.light if isinstance(self.style, shaded) else None
+
+    def take_view(self, view: str) -> Rendering:
+        """Take the picture of one view, with its annotations."""
+        settings = self._settings
+        if not isinstance(self.style, CurveCut):
+            return self.take(settings.camera(self.box, view))
+        if self.style.curve == SPINE:
+            self._progress("curve", 0, 0)
+        return self._render(view=view, up=settings.up, size=settings.size)
+
+    def take(self, camera: Camera) -> Rendering:
+        """Take the picture of a camera."""
+        return self._render(camera=camera, size=self._settings.size_used)
+
+    def _render(self, **place: Any) -> Rendering:
+        settings = self._settings
+        if self._is_scene:
+            picture = self._open_scene().take(place["camera"], place["size"], self._ground)
+        elif isinstance(self.style, PointLook):
+            picture = self._take_points(self.style, place["camera"], place["size"])
+        else:
+            picture = self._open_volume().render(self.style, background=settings.background, **place)
+        letters = settings.letters and not settings.is_sheet  # each slice of a sheet has its own
+        return picture.annotated(letters=letters, scale_bar=settings.scale_bar, caption=settings.caption)
+
+    def _open_volume(self) -> Any:
+        from clrecon.operators.rays.render import VolumeRenderer
+
+        if self._renderer is None:
+            opened = VolumeRenderer(cast("Volume", self._subject), device=self.device, memory=self._settings.memory)
+            self._renderer = self._stack.enter_context(opened)
+        return self._renderer
+
+    def _take_points(self, style: PointLook, camera: Camera, size: tuple[int, int]) -> Rendering:
+        from clrecon.operators.rays.point_pictures import PointPictures
+
+        if self._renderer is None:
+            opened = PointPictures(cast("PointCloud", self._subject), device=self.device, memory=self._settings.memory)
+            self._renderer = self._stack.enter_context(opened)
+        picture: Rendering = self._renderer.take(style, camera, size, self._ground)
+        return picture
+
+    @property
+    def _ground(self) -> str | None:
+        background = self._settings.background
+        return None if is_transparent(background) else background
+
+    @property
+    def _is_scene(self) -> bool:
+        return bool(self.meshes) or isinstance(self.style, MeshLook)
+
+    def _open_scene(self) -> Any:
+        from clrecon.operators.rays.scene import ScenePictures
+
+        if self._renderer is None:
+            looks = self._settings.mesh_looks()
+            objects = [(self._subject, self.style), *zip(self.meshes, looks, strict=True)]
+            opened = ScenePictures(objects, device=self.device, memory=self._settings.memory)
+            self._renderer = self._stack.enter_context(opened)
+        return self._renderer
+
+
+def _shown_function(settings: RenderSettings, style: Style) -> TransferFunction | None:
+    """Return the transfer function of a style, or that of the preset that the style was made from."""
+    if settings.preset_used is not None:
+        return find_preset(settings.preset_used).transfer_function
+    if isinstance(style, VolumeLook):
+        return style.function
+    return style.transfer_function if isinstance(style, SlicesInSpace) else None

@@ -1,1 +1,0 @@
-"""The common parts of jobs: checks, outputs, reports, masks."""

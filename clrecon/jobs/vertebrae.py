@@ -1,0 +1,333 @@
+"""The vertebrae job: a CT series in, a first guess of a label map out, with a picture to judge it by.
+
+The picture of every run is the straightened spine with planes and vertebrae drawn over it.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, fields
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry.certificate import without_ids
+from clrecon.jobs.outputs import check_distinct, check_kept, commit_all
+from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name, stage_report
+from clrecon.reading import Selection, read_selected
+from clrecon.rendering.looks.label_style import distinct_colors
+from clrecon.rendering.pictures.pillow import load_font, load_pillow
+from clrecon.system.files import Staged, StagedFile, stage_file
+from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.paths import keep_existing
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.records import Record
+from clrecon.version import package_version
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+    from clrecon.labels import LabelMap
+    from clrecon.spine import VertebraSplit
+
+
+@dataclass(frozen=True, kw_only=True)
+class VertebraeSettings(Selection):
+    """Settings of the search for vertebrae.
+
+    series, phase, allow_gaps, force, follow_links, rescale: See `clrecon.reading.Selection`.
+    level: HU from which on a voxel is bone, see `clrecon.split_vertebrae`.
+    seeds: sequence of (x, y, z). Points in LPS mm, one in the body of each vertebra, in place of the search for discs.
+    name_at: ((x, y, z), str). A point in LPS mm and the level of the vertebra there.
+    first: Level of the uppermost vertebra that is found; not together with `name_at`.
+    keep_unsure: Write vertebrae of low confidence too.
+    keep_ids: Write the hashes of the UIDs of series and frame of reference into the report.
+    """
+
+    level: float | None = None
+    seeds: Sequence[Sequence[float]] = ()
+    name_at: tuple[Sequence[float], str] | None = None
+    first: str | None = None
+    keep_unsure: bool = False
+    keep_ids: bool = False
+
+    def __post_init__(self) -> None:
+        from clrecon.spine.split import check_landmark
+
+        if self.level is not None and not math.isfinite(self.level):
+            raise UsageError(f"the level of bone is a number of HU, not {self.level!r}")
+        points = [*self.seeds, *([] if self.name_at is None else [self.name_at[0]])]
+        for point in points:
+            if len(point) != 3 or not all(math.isfinite(value) for value in point):
+                raise UsageError(f"a point is three numbers in mm, not {list(point)!r}")
+        if len(self.seeds) == 1:
+            raise UsageError("one seed is too few: give a point in each vertebra, two at least")
+        check_landmark(self.name_at, self.first)
+
+
+log = get_logger(__name__)
+
+
+def make_vertebrae(
+    source: str | Path,
+    output: str | Path,
+    settings: VertebraeSettings | None = None,
+    *,
+    picture_path: str | Path | None = None,
+    with_picture: bool = True,
+    report_path: str | Path | None = None,
+    no_clobber: bool = False,
+    progress: Progress | None = None,
+) -> VertebraeReport:
+    """Read a CT series, find its vertebrae, and write a label map and a picture of the discs and labels.
+
+    No device is needed.
+
+    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
+    output: Label map: .nii.gz or .nii; .dcm is a DICOM SEG, for a scan in DICOM.
+    picture_path: PNG; by default beside the label map, with its name.
+    with_picture: False: without `picture_path` there is no picture.
+    report_path: File for the report as JSON.
+    no_clobber: Files that exist stay and are an `OutputError`, before any work.
+    progress: ``progress(stage, done, total)``.
+    """
+    from clrecon.spine import split_vertebrae
+
+    settings = settings or VertebraeSettings()
+    progress = progress or ignore_progress
+    picture = picture_beside(output) if picture_path is None and with_picture else picture_path
+    watch = Laps()
+    with keep_existing(no_clobber):
+        check_files(source, output, picture, report_path)
+    volume = read_selected(source, settings, progress=progress)
+    watch.lap("read")
+    split = split_vertebrae(
+        volume,
+        level=settings.level,
+        seeds=list(settings.seeds) or None,
+        name_at=settings.name_at,
+        first=settings.first,
+        keep_unsure=settings.keep_unsure,
+        progress=progress,
+    )
+    watch.lap("split")
+    progress("write", 0, 0)
+    content = _encode_map(split.labels, output, source, settings)
+    with keep_existing(no_clobber), ExitStack() as staged:
+        files: list[Staged] = [_stage_content(staged, output, content)]
+        if picture is not None:
+            files.append(_stage_content(staged, picture, draw_vertebrae(split)))
+        watch.lap("write")
+        seconds = {part: round(value, 4) for part, value in {**watch.seconds, "total": watch.total()}.items()}
+        facts = {"format": map_format(output), "bytes": len(content)}
+        report = describe_split(volume, split, settings, facts, seconds)
+        if report_path is not None:
+            files.append(staged.enter_context(stage_report(report_path, report)))
+        commit_all(files)
+    log_warnings(log, report.warnings, volume.report.get("warnings", ()))
+    return report
+
+
+def _encode_map(labels: LabelMap, output: str | Path, source: str | Path, settings: VertebraeSettings) -> bytes:
+    kind = map_format(output)
+    if kind in SEGMENTATION:
+        from clrecon.dicom.reader import list_slices
+        from clrecon.labels.write_segmentation import encode_segmentation
+
+        of_values = {"rescale"}  # the other fields of a selection say which slices are read
+        names = {field.name for field in fields(Selection)} - of_values
+        chosen = {name: getattr(settings, name) for name in names}
+        return encode_segmentation(labels, list_slices(source, **chosen))
+    from clrecon.labels.write_nifti import encode_nifti
+
+    return encode_nifti(labels, packed=kind.endswith(".gz"))
+
+
+def _write_content(content: bytes, stream: BinaryIO) -> None:
+    stream.write(content)
+
+
+def _stage_content(stack: ExitStack, path: str | Path, content: bytes) -> StagedFile:
+    return stack.enter_context(stage_file(path, partial(_write_content, content), expected_bytes=len(content)))
+
+
+NIFTI, SEGMENTATION = ("nii", "nii.gz"), ("dcm",)
+
+
+def map_format(path: str | Path) -> str:
+    """Return ``nii``, ``nii.gz`` or ``dcm``."""
+    name = os.path.basename(os.fspath(path)).lower()
+    for kind in (*NIFTI[::-1], *SEGMENTATION):
+        if name.endswith(f".{kind}") and name != f".{kind}":
+            return kind
+    raise UsageError(f"a label map is written as .nii.gz, .nii (NIfTI) or .dcm (DICOM SEG), not {name[-40:]!r}")
+
+
+def picture_beside(output: str | Path) -> str:
+    """Return the name of the picture beside a label map: ``spine.nii.gz`` has ``spine.png``."""
+    text = os.fspath(output)
+    return text[: -len(map_format(output)) - 1] + ".png"
+
+
+def check_files(
+    source: str | Path, output: str | Path, picture: str | Path | None, report: str | Path | None
+) -> list[tuple[str, str | Path]]:
+    """Refuse outputs that cannot be written, before any work is done; return what each is, and its path."""
+    from clrecon.labels.write_nifti import load_nibabel
+    from clrecon.reading import tell_format
+    from clrecon.system.files import check_writable
+
+    kind = map_format(output)
+    if kind in NIFTI:
+        load_nibabel()
+    elif (found := tell_format(source)) is not None:
+        raise UsageError(f"DICOM SEG belongs to a scan in DICOM, and this is {found}: write the label map as .nii.gz")
+    if picture is not None and not os.fspath(picture).lower().endswith(".png"):
+        raise UsageError(f"the picture of the discs is a .png file, not {os.path.basename(os.fspath(picture))[-40:]!r}")
+    if picture is not None:
+        load_pillow()
+    named = (("the label map", output), ("the picture", picture), ("the report", report))
+    owned = [(what, path) for what, path in named if path is not None]
+    check_distinct(owned)
+    for _, path in owned:
+        check_writable(path)
+    check_kept(owned, source)
+    return list(owned)
+
+
+PIXELS_PER_MM = 3
+WINDOW_HU = (-150.0, 650.0)
+TINT = 0.35
+"""Share of a vertebra's colour in its pixels."""
+LOW_COLOR = (255, 40, 40)
+LINE_COLOR = (255, 230, 0)
+TEXT_MM = 6.0
+NAMES_MM = 62
+"""Width of the column with names, mm."""
+
+
+def draw_vertebrae(split: VertebraSplit) -> bytes:
+    """Return the picture as PNG: from the side, names and confidence, and from the front.
+
+    The spine is straightened along the canal; a row is a millimetre of it.  Planes between vertebrae are yellow,
+    vertebrae have colours of their own, and those of low confidence are hatched in red.
+    """
+    load_pillow()
+    from PIL import Image, ImageDraw
+
+    plane = split.plane
+    colors = (255 * distinct_colors(len(split.vertebrae))).astype(np.uint8)
+    shades = {one.number: np.array(shade) for one, shade in zip(split.vertebrae, colors, strict=True)}
+    doubted = [one.number for one in split.low_confidence]
+    left = _tint_slice(plane.sagittal, plane.sagittal_labels, shades, doubted)
+    right = _tint_slice(plane.coronal, plane.coronal_labels, shades, doubted)
+    gap = np.zeros((len(left), NAMES_MM * PIXELS_PER_MM, 3), np.uint8)
+    picture = Image.fromarray(np.concatenate([left, gap, right], axis=1))
+    pen = ImageDraw.Draw(picture)
+    for front, back in plane.lines:
+        ends = [((column + 0.5) * PIXELS_PER_MM, (row + 0.5) * PIXELS_PER_MM) for row, column in (front, back)]
+        pen.line(ends, fill=LINE_COLOR, width=2)
+        row = 0.5 * (front[0] + back[0])
+        at = left.shape[1] + gap.shape[1], (row + 0.5) * PIXELS_PER_MM
+        pen.line([at, (picture.width, at[1])], fill=LINE_COLOR, width=1)
+    font = load_font(TEXT_MM * PIXELS_PER_MM)
+    for one, row in zip(split.vertebrae, split.plane.rows, strict=True):
+        text = (
+            f"{one.name}  {one.confidence:.2f}" + ("" if one.is_confident else "  low") + ("" if one.whole else "  cut")
+        )
+        color = tuple(int(value) for value in shades[one.number]) if one.is_confident else LOW_COLOR
+        pen.text((left.shape[1] + 6, (row + 0.5) * PIXELS_PER_MM), text, color, font, "lm")
+    stream = BytesIO()
+    picture.save(stream, "PNG")
+    return stream.getvalue()
+
+
+def _tint_slice(
+    values: NDArray[np.float32], labels: NDArray[np.int32], shades: dict[int, NDArray[np.uint8]], doubted: list[int]
+) -> NDArray[np.uint8]:
+    """Return grey values with the colours of the vertebrae over them, enlarged."""
+    low, high = WINDOW_HU
+    grey = np.clip((np.nan_to_num(values, nan=low) - low) / (high - low), 0.0, 1.0) * 255.0
+    large = np.repeat(np.repeat(grey, PIXELS_PER_MM, axis=0), PIXELS_PER_MM, axis=1)
+    numbers = np.repeat(np.repeat(labels, PIXELS_PER_MM, axis=0), PIXELS_PER_MM, axis=1)
+    picture = np.repeat(large[..., None], 3, axis=2)
+    rows, columns = np.indices(numbers.shape)
+    for number, shade in shades.items():
+        own = numbers == number
+        if number in doubted:
+            own &= (rows + columns) % 12 < 4
+            shade = np.array(LOW_COLOR)
+        picture[own] = (1.0 - TINT) * picture[own] + TINT * shade
+    return np.asarray(np.rint(picture), dtype=np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class VertebraeReport(Record):
+    """Report of `make_vertebrae`.
+
+    vertebrae: All that were found, from the head downwards, see `clrecon.spine.split.Vertebra`.
+    low_confidence: How many of them have a confidence below 0.5.
+    written: How many the label map has.
+    discs: ``centre_mm`` and ``normal`` (downwards) of each disc, LPS.
+    output: ``format`` and ``bytes`` of the label map.
+    volume: The certificate of the volume without its warnings.
+    """
+
+    vertebrae: list[Any]
+    low_confidence: int
+    written: int
+    discs: list[dict[str, list[float]]]
+    left_out: list[str]
+    level_hu: float
+    output: Mapping[str, Any]
+    version: str
+    platform: str
+    warnings: list[str]
+    volume: Mapping[str, Any]
+    seconds: Mapping[str, float]
+    peak_memory_bytes: int | None
+
+
+def describe_split(
+    volume: Volume,
+    split: VertebraSplit,
+    settings: VertebraeSettings,
+    output: Mapping[str, Any],
+    seconds: Mapping[str, float],
+) -> VertebraeReport:
+    """Describe the result of a job."""
+    certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
+    told = [str(warning) for warning in certificate.pop("warnings", [])]
+    fate = "is in the label map all the same" if settings.keep_unsure else "is not in the label map"
+    told += [
+        f"{one.name} has low confidence ({one.confidence:.2f}) and {fate}: {'; '.join(one.doubts)}"
+        for one in split.low_confidence
+    ]
+    if (settings.name_at or settings.first) is not None and split.low_confidence:
+        told.append("names are counted past vertebrae of low confidence: check them with the picture")
+    rounded = [
+        {"centre_mm": [round(float(v), 2) for v in centre], "normal": [round(float(v), 4) for v in normal]}
+        for centre, normal in zip(split.discs_mm, split.disc_normals, strict=True)
+    ]
+    return VertebraeReport(
+        vertebrae=split.vertebrae,
+        low_confidence=len(split.low_confidence),
+        written=len(split.labels.numbers),
+        discs=rounded,
+        left_out=split.left_out,
+        level_hu=split.level_hu,
+        output=output,
+        version=package_version(),
+        platform=platform_name(),
+        warnings=list(dict.fromkeys(told)),
+        volume=certificate,
+        seconds=seconds,
+        peak_memory_bytes=peak_memory_bytes(),
+    )

@@ -1,0 +1,125 @@
+"""Region rules and steps of preprocessing: their forms, and what they refuse."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from clrecon.errors import UsageError
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.options import (
+    FILTERS,
+    MORPHOLOGY,
+    PREPROCESS_FORMS,
+    REGION_FORMS,
+    PreprocessStep,
+    RegionRule,
+    parse_preprocess,
+    parse_region_rules,
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "rule"),
+    [
+        ("box:-1,2,3.5,4,5,6", RegionRule("box", (-1.0, 2.0, 3.5, 4.0, 5.0, 6.0))),
+        ("box:,2,3,,5,", RegionRule("box", (-math.inf, 2.0, 3.0, math.inf, 5.0, math.inf))),
+        ("HU:200,", RegionRule("hu", (200.0, math.inf))),
+        ("hu:100,100", RegionRule("hu", (100.0, 100.0))),
+        ("label:spine.nii.gz:T12", RegionRule("label", (), "spine.nii.gz", "T12")),
+        ("label:C:\\maps\\spine.nii:28", RegionRule("label", (), "C:\\maps\\spine.nii", "28")),
+        ("mask:a/b:c.nrrd", RegionRule("mask", (), "a/b:c.nrrd")),
+        ("tube:30", RegionRule("tube", (30.0,))),
+        ("tube:30:line.csv", RegionRule("tube", (30.0,), "line.csv")),
+    ],
+)
+def test_a_rule_is_read(text: str, rule: RegionRule) -> None:
+    assert parse_region_rules(text) == (rule,)
+
+
+def test_a_rule_describes_itself_without_folders() -> None:
+    rules = parse_region_rules(["label:maps/of/spine.nii:T12", "box:,2,3,,5,", "tube:30:a\\b\\line.csv"])
+    assert [str(rule) for rule in rules] == ["label:spine.nii:T12", "box:,2,3,,5,", "tube:30:line.csv"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "is not known"),
+        ("ball:1,2,3", "is not known: the rules are"),
+        ("box:1,2,3", "is not known"),
+        ("box:1,2,3,4,5,six", "is not known"),
+        ("box:2,1,3,4,5,6", "1 is not above 2"),
+        ("box:1,1,3,4,5,6", "holds nothing"),
+        ("box:nan,1,3,4,5,6", "finite"),
+        ("hu:300,200", "holds nothing"),
+        ("hu:200", "is not known"),
+        ("label:spine.nii", "is not known"),
+        ("mask:", "is not known"),
+        ("tube:0", "above 0, not 0"),
+        ("tube:-3", "above 0, not -3"),
+        ("tube:inf", "finite"),
+        ("seed:1,2,3", "grows within HU or labels"),
+        ("seed:1,2,", "is not known"),
+    ],
+)
+def test_a_rule_of_another_form_is_refused(text: str, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        parse_region_rules(text)
+
+
+def test_steps_are_read_in_their_order() -> None:
+    steps = parse_preprocess("bilateral, Open:1.5,level:250,fill,bilateral-2d:0.7:36,region,fill-slices")
+    assert [str(step) for step in steps] == [
+        "bilateral", "open:1.5", "level:250", "fill", "bilateral-2d:0.7:36", "region", "fill-slices",
+    ]  # fmt: skip
+    assert parse_preprocess(["erode:1", "dilate:2"]) == (
+        PreprocessStep("erode", (1.0,)),
+        PreprocessStep("dilate", (2.0,)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "is not known"),
+        ("open", "'open' of preprocessing is not known: the steps are"),
+        ("open:1,5", "'5'"),
+        ("open:1:5", "is not known"),
+        ("open:0", "above 0"),
+        ("open:-1", "above 0"),
+        ("open:nan", "is not known"),
+        ("open:1.5mm", "is not known"),
+        ("fill:3", "is not known"),
+        ("level", "is not known"),
+        ("bilateral:1:2:3", "is not known"),
+        ("region,fill,region", "named twice"),
+        ("sharpen", "is not known"),
+        ("curvature-flow:2.5", "needs a whole number"),
+    ],
+)
+def test_a_step_of_another_form_is_refused(text: str, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        parse_preprocess(text)
+
+
+def test_help_names_every_form() -> None:
+    for name in (*FILTERS, *MORPHOLOGY, "level", "region"):
+        assert name in PREPROCESS_FORMS
+    for kind in ("box:", "hu:", "label:", "mask:", "seed:", "tube:"):
+        assert kind in REGION_FORMS
+
+
+def test_settings_refuse_a_place_for_no_region() -> None:
+    with pytest.raises(UsageError, match="there is none"):
+        MeshSettings(preprocess="open:1,region")
+    settings = MeshSettings(preprocess="open:1,region", region=("tube:30",), space="ras")
+    assert settings.region_later and settings.space_of_points == "ras"
+    assert not MeshSettings(region=("tube:30",)).region_later
+
+
+def test_bone_loss_is_allowed_where_something_takes_bone() -> None:
+    with pytest.raises(UsageError, match="nothing takes any"):
+        MeshSettings(allow_bone_loss=True)
+    assert MeshSettings(allow_bone_loss=True, preprocess="erode:1").allow_bone_loss
