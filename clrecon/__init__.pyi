@@ -14,7 +14,6 @@ from clrecon.errors import NoSurfaceError as NoSurfaceError
 from clrecon.errors import OutputError as OutputError
 from clrecon.errors import RefusedInputError as RefusedInputError
 from clrecon.errors import UsageError as UsageError
-from clrecon.formats.write_volume import write_volume as write_volume
 from clrecon.geometry import Volume as Volume
 from clrecon.labels import LabelMap as LabelMap
 from clrecon.labels import read_labels as read_labels
@@ -76,6 +75,7 @@ from clrecon.points import keep_clusters as keep_clusters
 from clrecon.points.reader import read_points as read_points
 from clrecon.reading import list_series as list_series
 from clrecon.reading import read_volume as read_volume
+from clrecon.reading.grids.write_volume import write_volume as write_volume
 from clrecon.rendering import Lighting as Lighting
 from clrecon.rendering import Rendering as Rendering
 from clrecon.rendering import TransferFunction as TransferFunction

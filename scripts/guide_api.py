@@ -12,7 +12,7 @@ __all__ = ["SUBJECTS", "names_by_subject", "write_api"]
 SUBJECTS = {
     "volumes": (
         "Volumes: read, cut, write",
-        "clrecon.reading clrecon.geometry clrecon.formats clrecon.operators.resident",
+        "clrecon.reading clrecon.geometry clrecon.operators.resident",
     ),
     "surfaces": ("Surfaces", "clrecon.operators.surface clrecon.anatomy.iso_choice"),
     "meshes": ("Meshes: files, smoothing, decimation", "clrecon.mesh"),

@@ -8,14 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clrecon.formats.write_volume import (
-    FORMATS,
-    check_holds,
-    check_volume_format,
-    describe_shear,
-    stage_volume,
-    stored_values,
-)
 from clrecon.geometry.certificate import without_ids
 from clrecon.geometry.crop import find_extent
 from clrecon.geometry.resample import resample_volume
@@ -25,6 +17,14 @@ from clrecon.jobs.outputs import check_distinct, check_kept, commit_all
 from clrecon.jobs.preprocess import mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name, stage_report
 from clrecon.reading import read_selected
+from clrecon.reading.grids.write_volume import (
+    FORMATS,
+    check_holds,
+    check_volume_format,
+    describe_shear,
+    stage_volume,
+    stored_values,
+)
 from clrecon.system.files import Staged, check_writable
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.paths import keep_existing, refuse_existing, resolve_target

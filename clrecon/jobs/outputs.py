@@ -85,7 +85,7 @@ def _find_voxels(path: str | Path) -> Path | None:
     """Return the file that a header names for its voxels; None if it is the same file, or there is no header."""
     if not os.path.isfile(path):
         return None
-    from clrecon.formats import VOLUME, open_grid, tell_kind  # which a folder of DICOM does not need
+    from clrecon.reading.grids import VOLUME, open_grid, tell_kind  # which a folder of DICOM does not need
 
     try:
         kind = tell_kind(Path(path))
@@ -95,7 +95,7 @@ def _find_voxels(path: str | Path) -> Path | None:
 
 
 def _is_bare_data_set(path: str | Path) -> bool:
-    from clrecon.dicom.parse.forced import restore_start
+    from clrecon.reading.dicom.parse.elements import restore_start
     from clrecon.system.paths import open_regular
 
     try:

@@ -138,8 +138,8 @@ def make_vertebrae(
 def _encode_map(labels: LabelMap, output: str | Path, source: str | Path, settings: VertebraeSettings) -> bytes:
     kind = map_format(output)
     if kind in SEGMENTATION:
-        from clrecon.dicom.reader import list_slices
         from clrecon.labels.write_segmentation import encode_segmentation
+        from clrecon.reading.dicom.reader import list_slices
 
         of_values = {"rescale"}  # the other fields of a selection say which slices are read
         names = {field.name for field in fields(Selection)} - of_values

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
-from clrecon.formats.grid_file import LABEL_MAP, GridFile
-from clrecon.formats.kinds import name_of_grid, open_grid, tell_kind
 from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap
 from clrecon.labels.names import find_number
 from clrecon.labels.overlap import Wanted
 from clrecon.labels.stream import empty_labels, iterate_labels
+from clrecon.reading.grids.grid_file import LABEL_MAP, GridFile
+from clrecon.reading.grids.reader import name_of_grid, open_grid, tell_kind
 from clrecon.system.progress import Progress
 from clrecon.system.text import count_of, escape_text
 

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
-from clrecon.formats.grid_file import GridFile
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.overlap import Painter, Wanted
 from clrecon.labels.stream import empty_labels, iterate_labels
+from clrecon.reading.grids.grid_file import GridFile
 from clrecon.system.progress import Progress, ignore_progress
 
 _LABEL = re.compile(

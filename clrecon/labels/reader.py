@@ -11,8 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
-from clrecon.formats.grid_file import LABEL_MAP, GridFile
-from clrecon.formats.kinds import name_of_grid, open_grid, tell_kind
 from clrecon.geometry.grid import Grid
 from clrecon.geometry.volume import Volume
 from clrecon.labels.folder import open_masks, read_masks
@@ -22,6 +20,8 @@ from clrecon.labels.names import check_wanted
 from clrecon.labels.overlap import Wanted
 from clrecon.labels.segmentation import SEGMENTATION_CLASSES, read_segmentation, tell_pixel_bytes
 from clrecon.labels.structures import STRUCTURE_SET, read_structures
+from clrecon.reading.grids.grid_file import LABEL_MAP, GridFile
+from clrecon.reading.grids.reader import name_of_grid, open_grid, tell_kind
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text

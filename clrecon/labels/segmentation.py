@@ -15,17 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.dicom.headers.multiframe import find_data_set
-from clrecon.dicom.parse.raw import EXPLICIT_LITTLE, IMPLICIT_LITTLE
-from clrecon.dicom.parse.sequences import Schema, read_sequences
-from clrecon.dicom.parse.transfer_syntaxes import RLE
-from clrecon.dicom.parse.values import ValueProblem
 from clrecon.errors import ClreconError, RefusedInputError
-from clrecon.formats.stream import check_size
 from clrecon.labels.frames import FrameStack, place_frames
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.overlap import Painter, Wanted
 from clrecon.labels.stream import empty_labels
+from clrecon.reading.dicom.headers.multiframe import find_data_set
+from clrecon.reading.dicom.parse.plain import EXPLICIT_LITTLE, IMPLICIT_LITTLE
+from clrecon.reading.dicom.parse.transfer_syntaxes import RLE
+from clrecon.reading.dicom.parse.values import Schema, ValueProblem, read_sequences
+from clrecon.reading.grids.grid_file import check_size
 from clrecon.system.paths import open_regular
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text, hash_uid

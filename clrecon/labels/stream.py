@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
-from clrecon.formats.grid_file import GridFile
 from clrecon.labels.label_map import LARGEST_NUMBER
+from clrecon.reading.grids.grid_file import GridFile
 from clrecon.system.memory import physical_memory_bytes
 
 

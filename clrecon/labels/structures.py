@@ -12,10 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.dicom.headers.multiframe import find_data_set
-from clrecon.dicom.parse.raw import EXPLICIT_LITTLE, IMPLICIT_LITTLE
-from clrecon.dicom.parse.sequences import Item, Schema, read_sequences
-from clrecon.dicom.parse.values import ValueProblem
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
 from clrecon.geometry.affine import slice_normal
 from clrecon.geometry.volume import Volume
@@ -25,6 +21,9 @@ from clrecon.labels.label_map import LabelMap
 from clrecon.labels.names import find_number
 from clrecon.labels.overlap import Painter, Wanted
 from clrecon.labels.stream import empty_labels
+from clrecon.reading.dicom.headers.multiframe import find_data_set
+from clrecon.reading.dicom.parse.plain import EXPLICIT_LITTLE, IMPLICIT_LITTLE
+from clrecon.reading.dicom.parse.values import Item, Schema, ValueProblem, read_sequences
 from clrecon.system.paths import open_regular
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import count_of, escape_text, hash_uid

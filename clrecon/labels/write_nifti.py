@@ -12,10 +12,9 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from clrecon.formats.extras import import_extra
-from clrecon.formats.grid_file import LABEL_MAP
 from clrecon.geometry.nifti import place_in_header
 from clrecon.labels.label_map import LabelMap
+from clrecon.reading.grids.grid_file import LABEL_MAP, import_extra
 
 CARET_CODE = 30
 """Code of the extension that holds Caret's XML."""

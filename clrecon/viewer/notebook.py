@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.points import PointCloud
+    from clrecon.reading.common.source_facts import SeriesListing
     from clrecon.rendering import Rendering
-    from clrecon.sources.listing import SeriesListing
 
 log = get_logger(__name__)
 
@@ -55,7 +55,7 @@ def to_html(shown: Mesh | Volume | PointCloud | LabelMap | SeriesListing) -> str
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.points import PointCloud
-    from clrecon.sources.listing import SeriesListing
+    from clrecon.reading.common.source_facts import SeriesListing
 
     kinds: list[tuple[type, Any]] = [
         (Mesh, _show_mesh), (Volume, _show_volume), (PointCloud, _show_cloud), (LabelMap, _show_labels),

@@ -114,7 +114,7 @@ def _load_readers() -> dict[str, Callable[[str], Any]]:
 
 
 def _load_scan() -> Callable[[Path], Any]:
-    from clrecon.dicom.series.scan import scan_path
+    from clrecon.reading.dicom.series.scan import scan_path
 
     return scan_path
 

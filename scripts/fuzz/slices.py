@@ -34,8 +34,8 @@ from pydicom.datadict import dictionary_VR, tag_for_keyword
 from pydicom.uid import ExplicitVRLittleEndian
 from trials import Answer, Trial, digest
 
-from clrecon.dicom import list_series, read_volume
 from clrecon.geometry import Volume
+from clrecon.reading.dicom import list_series, read_volume
 
 GEOMETRY = (
     "ImagePositionPatient ImageOrientationPatient PixelSpacing SliceThickness SpacingBetweenSlices SliceLocation"

@@ -8,9 +8,9 @@ import pytest
 from uneven_volume import positions, uneven
 
 from clrecon import Volume
-from clrecon.dicom import read_volume
 from clrecon.errors import UsageError
 from clrecon.geometry.crop import crop_volume
+from clrecon.reading.dicom import read_volume
 
 pytestmark = pytest.mark.unit
 

@@ -12,11 +12,11 @@ from dicom_series import rotation
 from uneven_volume import positions, uneven
 
 from clrecon import DeviceVolume, LabelMap, Volume, resample_labels
-from clrecon.dicom import read_volume
 from clrecon.errors import UsageError
 from clrecon.geometry import compose_affine, is_left_handed
 from clrecon.geometry.crop import crop_volume
 from clrecon.geometry.orientation import describe_orientation
+from clrecon.reading.dicom import read_volume
 
 pytestmark = pytest.mark.unit
 

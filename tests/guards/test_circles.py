@@ -20,7 +20,7 @@ def test_files_import_each_other_in_one_direction() -> None:
 
 
 def room_imports(imports: dict[str, set[str]], packages: set[str]) -> dict[str, set[str]]:
-    """The same between rooms and the rooms in them: ``dicom.series``, ``dicom`` (what lies in no inner room)."""
+    """The same between rooms and the rooms in them: ``reading.dicom``, ``reading`` (what lies in no inner room)."""
 
     def room_of(module: str) -> str:
         return module if module in packages else module.rpartition(".")[0]

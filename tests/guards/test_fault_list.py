@@ -50,8 +50,8 @@ def test_every_row_has_a_test() -> None:
         ({row: ROWS[row] for row in ROWS if row != 7}, "row 7 is not in the list"),
         ({**ROWS, 7: ("a fault", ())}, "row 7 has no test"),
         (
-            {**ROWS, 7: ("a fault", ("dicom/test_phases.py::test_gone",))},
-            "row 7: dicom/test_phases.py::test_gone is not",
+            {**ROWS, 7: ("a fault", ("reading/dicom/test_phases.py::test_gone",))},
+            "row 7: reading/dicom/test_phases.py::test_gone is not",
         ),
     ],
 )

@@ -64,7 +64,9 @@ def test_a_heavy_import_would_be_seen(tmp_path: Path) -> None:
 
 
 def test_geometry_dicom_mesh_and_phantom_work_without_pyopencl(tmp_path: Path) -> None:
-    code = "import clrecon, clrecon.dicom, clrecon.mesh, clrecon.phantom, clrecon.reference\nprint(clrecon.Volume)"
+    code = (
+        "import clrecon, clrecon.reading.dicom, clrecon.mesh, clrecon.phantom, clrecon.reference\nprint(clrecon.Volume)"
+    )
     done = run_python(f"{NO_PYOPENCL}\n{code}", tmp_path)
     assert done.returncode == 0, done.stderr
     assert "Volume" in done.stdout
@@ -93,7 +95,7 @@ def test_surfaces_load_no_label_maps_and_no_dicom(tmp_path: Path) -> None:
     """Label maps load pydicom, a quarter of a second that a surface need not wait for."""
     code = "import clrecon; clrecon.extract_isosurface, clrecon.SurfaceExtractor, clrecon.DeviceVolume"
     loaded = loaded_after(code, tmp_path)
-    assert "numpy" in loaded and not loaded & {"pydicom", "scipy", "clrecon.labels", "clrecon.dicom"}
+    assert "numpy" in loaded and not loaded & {"pydicom", "scipy", "clrecon.labels", "clrecon.reading.dicom"}
 
 
 @pytest.mark.first_device

@@ -11,9 +11,9 @@ import pydicom
 import pytest
 
 from clrecon.cli.main import main
-from clrecon.dicom import read_volume
 from clrecon.jobs.phantom import make_phantom
 from clrecon.labels import read_labels, resample_labels
+from clrecon.reading.dicom import read_volume
 
 pytest.importorskip("nibabel")
 

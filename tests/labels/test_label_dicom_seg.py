@@ -9,12 +9,12 @@ import pytest
 from label_files import ct_slices, write_seg
 from pydicom.uid import DeflatedExplicitVRLittleEndian, RLELossless
 
-from clrecon.dicom import read_volume
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.certificate import amend
 from clrecon.labels import read_labels, resample_labels
 from clrecon.labels.reader import is_large_map, read_all_labels
+from clrecon.reading.dicom import read_volume
 
 pytest.importorskip("highdicom")
 

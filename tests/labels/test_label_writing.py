@@ -7,12 +7,12 @@ import numpy as np
 import pydicom
 import pytest
 
-from clrecon.dicom import read_volume
-from clrecon.dicom.reader import list_slices
 from clrecon.errors import RefusedInputError
 from clrecon.labels import LabelMap, read_labels, resample_labels
 from clrecon.labels.write_nifti import encode_nifti
 from clrecon.labels.write_segmentation import encode_segmentation
+from clrecon.reading.dicom import read_volume
+from clrecon.reading.dicom.reader import list_slices
 
 PLANS = {
     "oblique": dicom_series.Plan(shape=(7, 6, 9), angles=(10, -20, 35), gap=1.25),

@@ -11,10 +11,10 @@ from label_files import OBLIQUE, make_labels, write_nifti, write_nrrd
 from volume_files import write_metaimage
 
 from clrecon.cli.main import main
-from clrecon.dicom import read_volume
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.labels import read_labels
 from clrecon.labels.reader import is_large_map, read_all_labels
+from clrecon.reading.dicom import read_volume
 
 pytestmark = pytest.mark.unit
 SHAPE = (4, 6, 7)

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clrecon.dicom import list_series, read_volume
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.phantom import PhantomSettings, apply_point_spread, make_phantom, parse_missing, write_phantom
 from clrecon.phantom.ghosts import TEXT_HU, draw_ghosts
 from clrecon.phantom.placement import place_slices
 from clrecon.phantom.spine import draw_spine
+from clrecon.reading.dicom import list_series, read_volume
 
 SMALL = {"size": (24, 20), "slices": 20, "spacing": (11.0, 10.0, 2.5)}
 CLEAN = {"noise": 0.0, "point_spread_mm": 0.0}

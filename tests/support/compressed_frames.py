@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from dicom_series import Plan, write_series
 
-from clrecon.dicom.headers.header import SliceHeader, read_headers
-from clrecon.dicom.pixels.stored import StoredPixels
+from clrecon.reading.dicom.headers.header import SliceHeader, read_headers
+from clrecon.reading.dicom.pixels.stored import StoredPixels
 
 imagecodecs = pytest.importorskip("imagecodecs")
 rle = pytest.importorskip("rle.rle")

@@ -14,9 +14,9 @@ from pydicom.encaps import encapsulate, encapsulate_extended
 from pydicom.uid import EnhancedCTImageStorage, ExplicitVRBigEndian
 from tolerances import AFFINE_MM
 
-from clrecon.dicom import read_volume
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
+from clrecon.reading.dicom import read_volume
 
 FileChange = Callable[[Dataset], None]
 SHARED = ("PlaneOrientationSequence", "PixelMeasuresSequence", "CTImageFrameTypeSequence")

@@ -6,11 +6,11 @@ the file below tests/.  The guard is guards/test_fault_list.py.
 
 from __future__ import annotations
 
-TRAPS = "dicom/test_trap_matrix.py::test_a_row_of_the_matrix"
-GEOMETRY = "dicom/test_stack_geometry.py::"
-PIXELS = "dicom/test_pixels.py::"
-SERIES = "dicom/test_series_choice.py::"
-HOSTILE = "dicom/test_hostile_files.py::"
+TRAPS = "reading/dicom/test_trap_matrix.py::test_a_row_of_the_matrix"
+GEOMETRY = "reading/dicom/test_stack_geometry.py::"
+PIXELS = "reading/dicom/test_pixels.py::"
+SERIES = "reading/dicom/test_series_choice.py::"
+HOSTILE = "reading/dicom/test_hostile_files.py::"
 BAD_INPUT = "cli/test_bad_input.py::"
 FILES = "system/test_files.py::"
 SLABS = "operators/surface/test_slabs.py::"
@@ -21,7 +21,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     3: ("tilt of 1, 2.5, 12, -20 degrees: exact by shear, told", (TRAPS, GEOMETRY + "test_tilt_is_reported")),
     4: (
         "one slice missing: refused; --allow-gaps: true positions, told",
-        (TRAPS, "dicom/test_trap_matrix.py::test_a_refused_row_read_on_request"),
+        (TRAPS, "reading/dicom/test_trap_matrix.py::test_a_refused_row_read_on_request"),
     ),
     5: ("spacing changes half way: exact positions, told", (TRAPS,)),
     6: ("drift of 0.19 mm a gap: exact positions, told", (TRAPS,)),
@@ -30,14 +30,14 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     9: ("duplicate slices: equal ones dropped and told, else phases", (TRAPS,)),
     10: (
         "two phases or times in one series: refused with their list; --phase",
-        (TRAPS, "dicom/test_phases.py::test_phases_are_listed_and_chosen"),
+        (TRAPS, "reading/dicom/test_phases.py::test_phases_are_listed_and_chosen"),
     ),
     11: ("localizer in the series: left out and told", (TRAPS, SERIES + "test_a_localizer_in_the_series_is_parted")),
     12: (
         "two series or patients: refused with their list; --series",
         (
             SERIES + "test_two_series_of_equal_size_need_a_choice",
-            "dicom/test_phases.py::test_of_several_patients_none_is_taken_unasked",
+            "reading/dicom/test_phases.py::test_of_several_patients_none_is_taken_unasked",
         ),
     ),
     13: ("two FrameOfReferenceUIDs: refused", (TRAPS, GEOMETRY + "test_mixed_values_are_refused")),
@@ -89,7 +89,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     ),
     26: (
         "padding of -2000 with a skin threshold: no tube",
-        ("dicom/test_padding.py::test_no_tube_at_any_iso_value_where_air_has_no_noise",),
+        ("reading/dicom/test_padding.py::test_no_tube_at_any_iso_value_where_air_has_no_noise",),
     ),
     27: (
         "12-bit signed pixels under overlay bits: right HU",
@@ -100,7 +100,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
         (
             PIXELS + "test_doubtful_values_are_kept_with_a_warning",
             PIXELS + "test_images_that_are_no_ct_slice_are_refused",
-            "dicom/test_doubtful_headers.py::test_a_secondary_capture_with_a_position_is_refused",
+            "reading/dicom/test_doubtful_headers.py::test_a_secondary_capture_with_a_position_is_refused",
         ),
     ),
     29: (
@@ -125,14 +125,14 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
             "geometry/test_iso_rule.py::test_values_that_are_not_finite_are_refused",
         ),
     ),
-    33: ("metal cut off at 3071 HU: told", ("dicom/test_doubtful_headers.py::test_saturated_metal_is_told",)),
+    33: ("metal cut off at 3071 HU: told", ("reading/dicom/test_doubtful_headers.py::test_saturated_metal_is_told",)),
     34: ("lossy compression: told", (PIXELS + "test_doubtful_values_are_kept_with_a_warning",)),
     35: (
         "empty, text, PNG, cut at every byte: refused or passed over, never a traceback",
         (
             BAD_INPUT + "test_mesh_refuses_input",
-            "dicom/test_truncation.py::test_a_slice_cut_anywhere",
-            "dicom/test_lost_slices.py::test_what_may_be_left_of_a_slice",
+            "reading/dicom/test_truncation.py::test_a_slice_cut_anywhere",
+            "reading/dicom/test_lost_slices.py::test_what_may_be_left_of_a_slice",
         ),
     ),
     36: ("no preamble or meta header: only with --force", ()),
@@ -140,7 +140,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     38: ("deflate, RLE, JPEG 2000 bombs: refused before inflating", ()),
     39: (
         "65535 x 65535 voxels, 2^31 - 1 frames: refused before memory is taken",
-        ("dicom/test_multiframe_faults.py::test_what_is_wrong_is_refused_by_name",),
+        ("reading/dicom/test_multiframe_faults.py::test_what_is_wrong_is_refused_by_name",),
     ),
     40: ("garbage for JPEG 2000 or JPEG-LS, a decoder that crashes: that file refused", ()),
     41: (
@@ -166,8 +166,8 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     46: (
         "bad character set, no permission, a file that vanishes, a disk that hangs: named",
         (
-            "dicom/test_lost_slices.py::test_a_file_that_cannot_be_opened",
-            "dicom/test_lost_slices.py::test_a_folder_that_cannot_be_read",
+            "reading/dicom/test_lost_slices.py::test_a_file_that_cannot_be_opened",
+            "reading/dicom/test_lost_slices.py::test_a_folder_that_cannot_be_read",
         ),
     ),
     47: ("100,000 files, 10,000 series: headers only, bounded memory", ()),

@@ -25,11 +25,8 @@ _layer("opencl", "errors", "version", "system")
 _layer("geometry", "errors", "system")
 _layer("anatomy", "errors", "system", "geometry")
 _layer("exchange", "errors", "version", "system", "geometry")
-_layer("sources", "errors", "system", "geometry")
-_layer("dicom", "errors", "system", "geometry", "sources")
-_layer("formats", "errors", "system", "geometry", "exchange", "sources")
-_layer("reading", "errors", "system", "geometry", "sources", "dicom", "formats")
-_layer("labels", "errors", "version", "system", "geometry", "dicom", "formats")
+_layer("reading", "errors", "system", "geometry", "exchange")
+_layer("labels", "errors", "version", "system", "geometry", "reading")
 _layer("spine", "errors", "system", "geometry", "anatomy", "labels")
 _layer("mesh", "errors", "system", "geometry", "anatomy", "exchange")
 _layer("points", "errors", "system", "geometry", "exchange")
@@ -46,8 +43,6 @@ _layer(
     "geometry",
     "anatomy",
     "exchange",
-    "dicom",
-    "formats",
     "reading",
     "labels",
     "spine",
@@ -66,8 +61,7 @@ _layer(
     "geometry",
     "anatomy",
     "exchange",
-    "sources",
-    "formats",
+    "reading",
     "labels",
     "mesh",
     "points",
@@ -85,7 +79,6 @@ _layer(
     "opencl",
     "geometry",
     "anatomy",
-    "formats",
     "reading",
     "labels",
     "spine",
@@ -102,9 +95,7 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "system": frozenset({"numpy"}),
     "geometry": frozenset({"numpy"}),
     "anatomy": frozenset({"numpy"}),
-    "dicom": frozenset({"numpy", "pydicom"}),
-    "formats": frozenset({"numpy"}),
-    "sources": frozenset({"numpy"}),
+    "reading": frozenset({"numpy", "pydicom"}),
     "labels": frozenset({"numpy"}),
     "mesh": frozenset({"numpy"}),
     "points": frozenset({"numpy"}),
@@ -121,8 +112,7 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
 INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "geometry": frozenset({"scipy", "pyvista", "nibabel", "SimpleITK"}),
     "anatomy": frozenset({"scipy"}),
-    "dicom": frozenset({"imagecodecs", "openjpeg", "rle", "jpeg_ls", "pylibjpeg"}),
-    "formats": frozenset({"nibabel", "nrrd", "SimpleITK"}),
+    "reading": frozenset({"imagecodecs", "openjpeg", "rle", "jpeg_ls", "pylibjpeg", "nibabel", "nrrd", "SimpleITK"}),
     "labels": frozenset({"pydicom", "scipy"}),
     "exchange": frozenset({"vtk", "vtkmodules", "laspy"}),
     "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification", "trimesh"}),

@@ -25,6 +25,7 @@ from clrecon.operators.points.clusters import Clustering
 from clrecon.operators.points.neighbours import Neighbours
 from clrecon.phantom import PhantomSettings, phantom_truth
 from clrecon.points import PointCloud, PointStep
+from clrecon.reading.common.source_facts import SeriesEntry, SeriesListing
 from clrecon.rendering import Lighting, Rendering, TransferFunction
 from clrecon.rendering.looks.label_style import LabelStyle
 from clrecon.rendering.pictures.mesh_look import MeshLook
@@ -40,7 +41,6 @@ from clrecon.rendering.pictures.styles import (
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.clip import Clip
-from clrecon.sources.listing import SeriesEntry, SeriesListing
 from clrecon.spine.split import MiddlePlane, Vertebra, VertebraSplit
 from clrecon.system.records import at_most
 

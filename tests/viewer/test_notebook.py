@@ -17,7 +17,7 @@ from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
 from clrecon.points import PointCloud
-from clrecon.sources.listing import SeriesEntry, SeriesListing
+from clrecon.reading.common.source_facts import SeriesEntry, SeriesListing
 from clrecon.viewer import notebook
 
 VOLUME = Volume(np.arange(6 * 8 * 10, dtype=np.int16).reshape(6, 8, 10) * 4 - 900, np.diag([1.0, 1.0, 2.0, 1.0]))

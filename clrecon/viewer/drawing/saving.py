@@ -12,11 +12,11 @@ import numpy as np
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange.clouds.formats import CLOUD_FORMATS
 from clrecon.exchange.formats import ASSEMBLIES, FORMATS, stage_assembly
-from clrecon.formats.write_volume import FORMATS as VOLUME_FORMATS
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 from clrecon.operators.masks.mask import Mask
 from clrecon.points import PointCloud
+from clrecon.reading.grids.write_volume import FORMATS as VOLUME_FORMATS
 from clrecon.rendering.pictures.image_files import IMAGE_FORMATS
 from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress

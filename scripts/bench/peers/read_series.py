@@ -58,8 +58,8 @@ def scan_tree(folder: str) -> dict[str, Any]:
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     from child import forget_peak, resident_bytes
 
-    from clrecon.dicom.series.scan import scan_path
-    from clrecon.dicom.series.series import group_series
+    from clrecon.reading.dicom.series.scan import scan_path
+    from clrecon.reading.dicom.series.series import group_series
 
     small = next(path for path in sorted(Path(folder).rglob("*")) if path.is_file())
     group_series(scan_path(small))

@@ -19,7 +19,7 @@ import view_scenes as scenes
 from web_views import browsing
 
 from clrecon.cli.main import main
-from clrecon.formats.write_volume import write_volume
+from clrecon.reading.grids.write_volume import write_volume
 from clrecon.viewer.web.listening import bind_port
 
 SECONDS_TO_END = 10.0

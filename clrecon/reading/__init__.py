@@ -1,0 +1,213 @@
+"""`read_volume` and `list_series` for every kind of input: a folder or file of DICOM, or one file of another format.
+
+The kind is told from the content of the file; its name is not trusted.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.reading.common.selection import check_rescale
+from clrecon.system.arguments import explains_arguments
+from clrecon.system.text import escape_text
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+    from clrecon.reading.common.source_facts import SeriesListing
+    from clrecon.system.progress import Progress
+
+_OTHER_FORMATS = ("NIfTI", "NRRD", "MetaImage")
+_NAMES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
+"""File extensions of these formats, only for messages."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """The part of an input that is read.
+
+    series: Series of the input; None leaves the choice to `read_volume`.
+    phase: Number of the phase, if the series has several.
+    allow_gaps: Read a stack with missing slices.
+    force: Read data sets without preamble or meta header.
+    follow_links: Read the files and folders that symbolic links out of the folder lead to.
+    rescale: (slope, intercept). In place of what the files say.
+    """
+
+    series: int | str | None = None
+    phase: int | None = None
+    allow_gaps: bool = False
+    force: bool = False
+    follow_links: bool = False
+    rescale: tuple[float, float] | None = None
+
+
+def read_selected(path: str | os.PathLike[str], selection: Selection, *, progress: Progress | None = None) -> Volume:
+    """Read the part of an input that a selection names, see `read_volume`."""
+    chosen = {field.name: getattr(selection, field.name) for field in fields(Selection)}
+    return read_volume(path, **chosen, progress=progress)
+
+
+@explains_arguments
+def read_volume(
+    path: str | os.PathLike[str],
+    series: int | str | None = None,
+    *,
+    phase: int | None = None,
+    allow_gaps: bool = False,
+    force: bool = False,
+    follow_links: bool = False,
+    rescale: tuple[float, float] | None = None,
+    progress: Progress | None = None,
+) -> Volume:
+    """Read a volume in HU and LPS mm, from DICOM or from a NIfTI, NRRD or MetaImage file.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A folder of DICOM files, searched with its subfolders; one DICOM file; or a file with a grid and its affine:
+        NIfTI (.nii, .nii.gz, .hdr with .img), NRRD (.nrrd, .nhdr), MetaImage (.mha, .mhd), which needs the
+        package SimpleITK.  Told from the content.
+    series : int or str, optional
+        Which series of a DICOM folder: its number in the listing (from 1), SeriesInstanceUID, its hash, the start of
+        one of these, or description.  Default: the CT series with most slices; of those with a similar number original
+        images come before derived ones, then the thinnest slices.  The warnings name the others and the reason.
+    phase : int, optional
+        Number of the phase, where a series holds several volumes at the same places (`list_series` lists them).
+    allow_gaps : bool
+        True: read a stack with missing slices; the existing slices are placed exactly, with a warning.
+    force : bool
+        True: also read data sets without preamble or meta header, with a guessed encoding, and ignore surplus bytes
+        after the pixels; each gives a warning.
+    follow_links : bool
+        True: also read the files and folders that symbolic links out of the folder lead to, as in a git-annex or
+        DataLad repository.  False: a series beside which such links stand is refused, because they may be its slices.
+    rescale : (slope, intercept), optional
+        Values are ``slope * stored + intercept``, regardless of the files: where a header lacks the rescale, is wrong
+        about it, or a scanner has a scale of its own.  The certificate says that it was given.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)`` with stage "scan" or "read", or "no answer yet from NAME" where the
+        disk hangs.
+
+    Returns
+    -------
+    Volume
+        ``voxels`` (nk, nj, ni) int16, int32 or float32; ``affine`` index (i, j, k) to LPS mm; ``report`` the
+        certificate.  Unevenly spaced slices keep their own positions (``Volume.uneven``). For files other than DICOM
+        the values are those of the file (with its slope and intercept): whole numbers of any stored type become int16
+        or int32, others float32, NaN -1024.
+
+    Raises
+    ------
+    NoDicomError
+        There is nothing at the path, no DICOM, or no CT.
+    RefusedInputError
+        Files are corrupt, or geometry or values cannot be trusted; the message names files and figures.
+    UsageError
+        ``series`` matches no series or several; the ``phase`` does not exist; an option for DICOM is given with another
+        format; a package is missing; or ``path`` is empty.
+    """
+    given = check_rescale(rescale)
+    kind = tell_format(path)
+    if kind is None:
+        from clrecon.reading.dicom import read_volume as read_dicom
+
+        return read_dicom(
+            path,
+            series,
+            phase=phase,
+            allow_gaps=allow_gaps,
+            force=force,
+            follow_links=follow_links,
+            rescale=given,
+            progress=progress,
+        )
+    _refuse_options(kind, series=series, phase=phase, allow_gaps=allow_gaps, force=force, follow_links=follow_links)
+    from clrecon.reading.grids import read_grid
+
+    return read_grid(Path(path), kind, rescale=given, progress=progress)
+
+
+@explains_arguments
+def list_series(
+    path: str | os.PathLike[str],
+    series: int | str | None = None,
+    *,
+    phase: int | None = None,
+    allow_gaps: bool = False,
+    force: bool = False,
+    follow_links: bool = False,
+    rescale: tuple[float, float] | None = None,
+    pixels: bool = False,
+    progress: Progress | None = None,
+) -> SeriesListing:
+    """List everything at a path that `read_volume` can read, with the certificate of the part that it would read.
+
+    Parameters
+    ----------
+    path, series, phase, allow_gaps, force, follow_links, rescale, progress
+        As in `read_volume`.
+    pixels : bool
+        True: also read the voxels, for entries that depend on them.  False: read only headers.
+
+    Returns
+    -------
+    SeriesListing
+        One entry for a file other than DICOM.
+
+    Raises
+    ------
+    NoDicomError, RefusedInputError, UsageError
+        There is nothing to list; all DICOM files, or a file of another format, are corrupt; ``series`` or ``phase``
+        names nothing or several; a package is missing; or an option for DICOM is given with another format.
+    """
+    given = check_rescale(rescale)
+    kind = tell_format(path)
+    if kind is None:
+        from clrecon.reading.dicom import list_series as list_dicom
+
+        return list_dicom(
+            path,
+            series,
+            phase=phase,
+            allow_gaps=allow_gaps,
+            force=force,
+            follow_links=follow_links,
+            rescale=given,
+            pixels=pixels,
+            progress=progress,
+        )
+    _refuse_options(kind, series=series, phase=phase, allow_gaps=allow_gaps, force=force, follow_links=follow_links)
+    from clrecon.reading.grids import list_grid
+
+    return list_grid(Path(path), kind, rescale=given, pixels=pixels, progress=progress)
+
+
+def _refuse_options(kind: str, **options: Any) -> None:
+    given = [name for name, value in options.items() if value is not None and value is not False]
+    if given:
+        raise UsageError(f"{' and '.join(given)}: only for DICOM, the input is a {kind} file")
+
+
+def tell_format(path: str | os.PathLike[str]) -> str | None:
+    """Return the format of a file other than DICOM; None leaves the input and its errors to the DICOM reader."""
+    try:
+        file = Path(path)
+        if not os.fspath(path).strip() or not file.is_file():  # a folder, a missing file, a device
+            return None
+        from clrecon.reading.grids import tell_kind  # which a folder does not need
+
+        kind = tell_kind(file)
+    except (TypeError, ValueError, OSError):
+        return None
+    if kind in _OTHER_FORMATS:
+        return kind
+    if kind is None and file.name.lower().endswith(_NAMES):
+        pair = "; of a NIfTI pair give the .hdr" if file.name.lower().endswith((".img", ".img.gz")) else ""
+        raise RefusedInputError(
+            f"{escape_text(file.name)} is no NIfTI, NRRD or MetaImage file, whatever its name says{pair}"
+        )
+    return None

@@ -1,0 +1,316 @@
+"""The gate ``hu_scale``: whether air and soft tissue have the values that a CT gives them.
+
+Headers may be wrong about rescale, and cone-beam scanners often have a scale of their own: no check of the geometry
+notices.  What tells is the two materials of which nearly every scan holds much.  The gate fails only where both are in
+the wrong places: a dry bone has no soft tissue, a crop of a body no air, bone in water neither, and raw values of a
+micro-CT may be any.
+
+Shares and peaks are those of a sample of the values, in a few milliseconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.reading.common.source_facts import PixelFacts
+from clrecon.system.records import Gate, none_of, unmeasured
+
+SAMPLED_SLICES, SAMPLED_VOXELS = 16, 1 << 16
+LEAST_SAMPLE = 1000
+"""Least number of sampled voxels for stating a share."""
+SPIKE_SHARE, SPIKE_RATIO = 0.01, 10.0
+"""A value that so many voxels have, so many times more than have the values next to it, was not measured."""
+
+
+def sample_slices(count: int) -> range:
+    """Return the places of the slices that are sampled, of `count`."""
+    return range(0, count, -(-count // SAMPLED_SLICES))
+
+
+class ValueSample:
+    """Sorted values of voxels; `between` returns the share in a range."""
+
+    def __init__(self, values: NDArray[Any]):
+        self.values = values
+
+    @classmethod
+    def of(cls, voxels: NDArray[Any], facts: PixelFacts) -> ValueSample | None:
+        """Take a sample of the measured voxels; None where it is too small for shares."""
+        places = sample_slices(voxels.shape[0])
+        step = max(1, int((len(places) * voxels[0].size / SAMPLED_VOXELS) ** 0.5))
+        values = voxels[:: places.step, ::step, ::step].ravel()
+        if facts.padding_hu is not None:
+            values = values[values != facts.padding_hu]  # measured air of this value is left out too
+        return cls(np.sort(values)) if len(values) >= LEAST_SAMPLE else None
+
+    def between(self, low: float, high: float) -> float:
+        """Return the share with ``low <= value < high``."""
+        first, end = np.searchsorted(self.values, (low, high))
+        return float(end - first) / len(self.values)
+
+    def median_between(self, low: float, high: float) -> float:
+        """Return the median of the values with ``low <= value < high``, of which there must be some."""
+        first, end = np.searchsorted(self.values, (low, high))
+        return float(self.values[(first + end) // 2])
+
+    def commonest_below(self, limit: float) -> tuple[float, float] | None:
+        """Return the most frequent value below `limit`, and its share of all voxels."""
+        low = self.values[: np.searchsorted(self.values, limit)]
+        if not len(low):
+            return None
+        found, counts = np.unique(low, return_counts=True)
+        return float(found[counts.argmax()]), float(counts.max()) / len(self.values)
+
+    def without_spikes(self, low: float, high: float) -> ValueSample | None:
+        """Return the sample without values outside of a range that stand out of the values beside them; None where too
+        few are left.
+        """
+        found, counts = np.unique(self.values, return_counts=True)
+        before, after = np.pad(counts, (1, 0))[:-1], np.pad(counts, (0, 1))[1:]
+        beside = (before + after) / 2.0
+        spikes = (counts >= SPIKE_SHARE * len(self.values)) & (counts >= SPIKE_RATIO * beside)
+        spikes &= (found < low) | (found > high)
+        values = self.values[np.repeat(~spikes, counts)]
+        return ValueSample(values) if len(values) >= LEAST_SAMPLE else None
+
+
+SMOOTHING, FINEST_BIN, MOST_BINS = 20.0, 5.0, 8000
+"""Standard deviation of the smoothing and width of a bin, HU; of wider ranges the bins get wider."""
+TAILS = 0.0005
+"""Share of the values that is left out at either end."""
+VALLEY = 0.5
+"""Two peaks are two where the histogram between them falls below this share of the lower one."""
+LEAST_PEAK_SHARE = 0.02
+
+
+class Peak(NamedTuple):
+    """A peak: its place, its width at half of its height, and the share of the values within that width."""
+
+    at: float
+    width: float
+    share: float
+
+    @property
+    def height(self) -> float:
+        """The share for each HU of the width."""
+        return self.share / self.width
+
+
+def find_peaks(values: NDArray[Any]) -> list[Peak]:
+    """Return the peaks of sorted values that hold `LEAST_PEAK_SHARE` of them, from the lowest to the highest."""
+    end = int(TAILS * len(values))
+    inner = values[end : len(values) - end].astype(np.float64)
+    low, high = float(inner[0]), float(inner[-1])
+    width = max(FINEST_BIN, (high - low) / MOST_BINS)
+    sigma = max(SMOOTHING / width, 1.0)
+    border = int(4 * sigma) + 1
+    counts = np.bincount(((inner - low) / width).astype(np.int64) + border)
+    weights = np.exp(-0.5 * (np.arange(-border, border + 1) / sigma) ** 2)
+    smooth = np.convolve(np.pad(counts, (0, border)), weights / weights.sum(), mode="same")
+    peaks = []
+    for top in _find_tops(smooth):
+        below, above = (np.flatnonzero(half <= smooth[top] / 2.0) for half in (smooth[:top], smooth[top:]))
+        first, last = (int(below[-1]) if len(below) else 0), top + (int(above[0]) if len(above) else len(smooth))
+        share = float(smooth[first : last + 1].sum()) / len(values)
+        if share >= LEAST_PEAK_SHARE:
+            peaks.append(Peak(low + (top - border + 0.5) * width, (last - first) * width, share))
+    return peaks
+
+
+def _find_tops(smooth: NDArray[np.float64]) -> list[int]:
+    """Return the places of the maxima with a valley between each two of them."""
+    inner = smooth[1:-1]
+    tops = np.flatnonzero((inner > smooth[:-2]) & (inner >= smooth[2:])) + 1
+    floors = np.array([smooth[a : b + 1].min() for a, b in zip(tops[:-1], tops[1:], strict=True)])
+    while len(tops) > 1:
+        depths = floors / np.minimum(smooth[tops[:-1]], smooth[tops[1:]])
+        shallow = int(np.argmax(depths))
+        if depths[shallow] <= VALLEY:
+            break
+        lower = shallow + int(smooth[tops[shallow]] >= smooth[tops[shallow + 1]])
+        beside = floors[max(lower - 1, 0) : lower + 1].min()
+        tops, floors = np.delete(tops, lower), np.delete(floors, shallow)
+        if 0 < lower <= len(floors):
+            floors[lower - 1] = beside
+    return [int(top) for top in tops]
+
+
+SCALE_SAID = "peaks of air (near -1000 HU) and soft tissue (0 to 80 HU) that lie elsewhere"
+
+FEWEST_VALUES = 4000
+
+LOWEST_AIR_HU, HIGHEST_AIR_HU = -1100, -900
+"""Range of the peak of air.  Noise may be lower, but no value that many voxels share."""
+TISSUE_HU = (-150, 200)
+"""Range of the peaks of fat, water, muscle, organs and blood with contrast medium."""
+
+OFFSET_AIR_HU = (-880, -160)
+"""Range in which the air of an offset scan is looked for; from there on it lies among fat and water."""
+LUNG_HU, LUNG_WIDTH = -700, 115
+"""Lung may be as low as this; its peak is wider than that."""
+STEP_HU, CT_STEP_HU = (450, 1200), (850, 1200)
+"""Range of the step from air to soft tissue, and that of a CT, from fat to blood."""
+FAT_STEP_HU, MUSCLE_STEP_HU = (860, 940), (1000, 1130)
+BELOW_AIR_HU, MOST_BEYOND = 150, 0.002
+"""So far below the peak of air is at most this share, and so it is in other ranges that a shift leaves empty."""
+
+INTERCEPT_HU = 1024
+LEAST_SHARE, LEAST_TISSUE, TISSUE_PART = 0.02, 0.1, 0.6
+"""Least share of air (within 100 HU) and, for a shift by `INTERCEPT_HU`, of soft tissue (within 150 HU): of all values,
+and of those as dense or denser.  Brain and its skull are no air and soft tissue."""
+LEAST_OFFSET_TISSUE = 0.05
+EMPTY_HU, MOST_IN_EMPTY = (-150, 100), 0.2
+"""Range where soft tissue belongs, and the most that lies there in an offset scan, as a share of what lies within 100
+HU of its soft tissue: partial volume.  Contrast medium beside lung has more there, of walls and muscle."""
+LEAST_HEIGHT = 0.1
+"""Least height of the peak of faint soft tissue, as a share of the highest one: lower ones are partial volume."""
+LEAST_RAW_HU = -300
+"""Stored values without their intercept are not negative; soft tissue and fat alone are not below this."""
+
+FAINT_HU, FAINT_SHARE, MOST_DENSE = (-800, -200), 0.05, 0.03
+"""Range and share of soft tissue where the slope is too small, and the largest share above `TISSUE_HU` begins."""
+STRETCHED_HU, NARROW, DENSE, LEAST_DENSE = 300, 0.08, (1.25, 2.3), 0.02
+"""Soft tissue where the slope is too large: a peak above this value with half of what is not air within this share of
+its step from air, and at least the last share of it at these multiples of the step, as of bone."""
+
+
+class _Doubt(NamedTuple):
+    """Air and soft tissue as found, on a scale that is not that of HU, and the likely reason."""
+
+    air: float
+    tissue: float
+    reason: str
+
+
+def judge_scale(
+    sample: ValueSample | None, facts: PixelFacts, slopes: Sequence[float] = (1.0,), known: bool = True
+) -> tuple[Gate, dict[str, float]]:
+    """Judge the gate ``hu_scale``; where it fails, return the places of ``air`` and ``soft_tissue`` too.
+
+    sample: Values of the measured voxels; None where there are too few.
+    slopes: Slopes of the rescale.  Where all are 1, one that is too large cannot be told from a dry specimen.
+    known: False: the header does not say that the values are HU.  Then only a missing or doubled intercept is told.
+    """
+    if sample is None or len(sample.values) < FEWEST_VALUES:
+        return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: too few voxels"), {}
+    doubt = _find_shift(sample, facts)
+    if doubt is None and not known:
+        return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: the values are not known to be HU"), {}
+    peaks: list[Peak] = []
+    if doubt is None:
+        measured = sample.without_spikes(LOWEST_AIR_HU, HIGHEST_AIR_HU)
+        peaks = find_peaks(measured.values) if measured is not None else []
+        doubt = _find_doubt(sample, peaks, slopes)
+    if doubt is not None:
+        text = (
+            f"air lies near {doubt.air:.0f} HU and soft tissue near {doubt.tissue:.0f} HU, where a CT has -1000 and 0"
+            f" to 80: {doubt.reason}; thresholds in HU do not fit these values"
+        )
+        found = {"air": round(doubt.air, 1), "soft_tissue": round(doubt.tissue, 1)}
+        return Gate("hu_scale", 2, 0, None, False, text), found
+    places = [f"{peak.at:.0f}" for peak in peaks if _is_air(peak) or _is_tissue(peak)]
+    if not places:
+        return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: neither was found"), {}
+    return none_of("hu_scale", 0, f"{SCALE_SAID} (found at {', '.join(places)} HU)"), {}
+
+
+def _is_air(peak: Peak) -> bool:
+    return LOWEST_AIR_HU <= peak.at <= HIGHEST_AIR_HU
+
+
+def _is_tissue(peak: Peak) -> bool:
+    return TISSUE_HU[0] <= peak.at <= TISSUE_HU[1]
+
+
+def _find_shift(sample: ValueSample, facts: PixelFacts) -> _Doubt | None:
+    """Find an intercept that is missing or was applied twice, for which the values need not be known to be HU."""
+    raw = not _fits(sample, 0) and sample.between(-np.inf, LEAST_RAW_HU) < MOST_BEYOND
+    if facts.hu_min < LOWEST_AIR_HU and _fits(sample, -INTERCEPT_HU) and not _is_padded_specimen(sample):
+        shift, reason = -INTERCEPT_HU, "have been applied twice"
+    elif raw and _fits(sample, INTERCEPT_HU):
+        shift, reason = INTERCEPT_HU, "be missing"
+    else:
+        return None
+    air, tissue = sample.median_between(shift - 1100, shift - 900), sample.median_between(shift - 150, shift + 150)
+    return _Doubt(air, tissue, f"the rescale intercept seems to {reason}")
+
+
+def _fits(sample: ValueSample, shift: int) -> bool:
+    """True if air and soft tissue lie where a shift of the HU by `shift` puts them, with less between them than
+    tissue.
+    """
+    air = sample.between(shift - 1100, shift - 900)
+    tissue = sample.between(shift - 150, shift + 150)
+    least = max(LEAST_TISSUE, TISSUE_PART * sample.between(shift - 300, np.inf)) if shift else LEAST_SHARE
+    return air >= LEAST_SHARE and tissue >= least and sample.between(shift - 800, shift - 300) < tissue
+
+
+def _is_padded_specimen(sample: ValueSample) -> bool:
+    """True for dense bone in air with padding of one value: it looks like soft tissue and air 1024 HU too low."""
+    found = sample.commonest_below(LOWEST_AIR_HU)
+    padded = found is not None and found[1] > 0.9 * sample.between(-np.inf, LOWEST_AIR_HU)
+    return padded and sample.between(500, np.inf) >= MOST_BEYOND
+
+
+def _find_doubt(sample: ValueSample, peaks: Sequence[Peak], slopes: Sequence[float]) -> _Doubt | None:
+    if len(peaks) < 2:
+        return None
+    lowest, above = peaks[0], peaks[1:]
+    air, tissue = any(map(_is_air, peaks)), any(map(_is_tissue, peaks))
+    if lowest.at < LOWEST_AIR_HU:
+        return None if air and tissue else _describe_step(lowest, max(above, key=lambda peak: peak.share))
+    if air:
+        return None if tissue else _find_wrong_slope(sample, lowest, above, slopes)
+    return _find_offset(sample, lowest, above)
+
+
+def _find_offset(sample: ValueSample, air: Peak, above: Sequence[Peak]) -> _Doubt | None:
+    """Take the lowest peak for air that lies too high."""
+    lower = sample.between(-np.inf, air.at - max(BELOW_AIR_HU, 1.3 * air.width))
+    lung = air.at < LUNG_HU and air.width > LUNG_WIDTH
+    if not OFFSET_AIR_HU[0] <= air.at <= OFFSET_AIR_HU[1] or lower >= MOST_BEYOND or lung:
+        return None
+    fitting = [peak for peak in above if STEP_HU[0] <= peak.at - air.at <= STEP_HU[1]]
+    tissue = max(fitting, key=lambda peak: peak.share, default=None)
+    if tissue is None or tissue.share < LEAST_OFFSET_TISSUE:
+        return None
+    first, last = max(EMPTY_HU[0], air.at + 1.5 * air.width), EMPTY_HU[1]
+    empty = sample.between(first, max(first, last)) < MOST_IN_EMPTY * sample.between(tissue.at - 100, tissue.at + 100)
+    if tissue.at > TISSUE_HU[1] and empty:
+        return _describe_step(air, tissue)
+    steps = [peak.at - air.at for peak in above[:2]]  # fat and muscle together tell that what lies at 100 HU is fat
+    pair = len(steps) == 2 and all(
+        low <= step <= high for step, (low, high) in zip(steps, (FAT_STEP_HU, MUSCLE_STEP_HU), strict=True)
+    )
+    return _describe_step(air, above[1]) if pair else None
+
+
+def _find_wrong_slope(sample: ValueSample, air: Peak, above: Sequence[Peak], slopes: Sequence[float]) -> _Doubt | None:
+    """Look for soft tissue, given air in its place and no peak where soft tissue belongs."""
+    tissue = max(above, key=lambda peak: peak.share)
+    step = tissue.at - air.at
+    faint = FAINT_HU[0] <= tissue.at <= FAINT_HU[1] and tissue.share >= FAINT_SHARE
+    faint = faint and tissue.height >= LEAST_HEIGHT * max(air.height, tissue.height)
+    if faint and sample.between(TISSUE_HU[0], np.inf) < MOST_DENSE:
+        return _describe_step(air, tissue)
+    if tissue.at <= STRETCHED_HU or set(slopes) == {1.0}:
+        return None
+    solid = sample.between(air.at + step / 2.0, np.inf)
+    narrow = sample.between(tissue.at - NARROW * step, tissue.at + NARROW * step)
+    dense = sample.between(air.at + DENSE[0] * step, air.at + DENSE[1] * step)
+    is_body = narrow >= solid / 2.0 and dense >= LEAST_DENSE * solid
+    return _describe_step(air, tissue) if is_body else None
+
+
+def _describe_step(air: Peak, tissue: Peak) -> _Doubt:
+    """Give the likely reason for the places of air and soft tissue."""
+    off = air.at + 1000.0
+    if CT_STEP_HU[0] <= tissue.at - air.at <= CT_STEP_HU[1]:
+        return _Doubt(
+            air.at, tissue.at, f"the rescale intercept seems to be {abs(off):.0f} HU too {'high' if off > 0 else 'low'}"
+        )
+    return _Doubt(air.at, tissue.at, "the rescale slope seems to be wrong, or the scanner has a scale of its own")

@@ -1,0 +1,127 @@
+"""Facts of an input of any format: what its voxels showed, how they were stored, what a listing says of it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+from clrecon.errors import ClreconError
+from clrecon.geometry.certificate import Certificate
+from clrecon.system.packages import public_function
+
+
+@dataclass(frozen=True)
+class PixelFacts:
+    """Figures of the pixels that were read.
+
+    padding_share: Share of the voxels, 0 to 1.
+    hu_min, hu_max: Lowest and highest HU of the volume, padding included.
+    padding_hu: HU that padding was filled with; None without padding.
+    stray: Number of values that lost bits of their own, see `clrecon.reading.dicom.pixels.voxels`.
+    stray_text: One line about these values; empty if there are none.
+    padding_text: One line about padding that no header declares and that was found by its shape, or about declared
+        padding that masks tissue; empty if there is none.
+    """
+
+    padding_share: float
+    hu_min: float
+    hu_max: float
+    padding_hu: float | None = None
+    stray: int = 0
+    stray_text: str = ""
+    padding_text: str = ""
+
+
+class StoredValues(Protocol):
+    """What a header says of the values of its slice.
+
+    slope, intercept: Of the rescale to HU.
+    """
+
+    @property
+    def bits_stored(self) -> int: ...
+    @property
+    def signed(self) -> bool: ...
+    @property
+    def slope(self) -> float: ...
+    @property
+    def intercept(self) -> float: ...
+
+
+class StoredRange(NamedTuple):
+    """The same of a file that has one type for all slices."""
+
+    bits_stored: int
+    signed: bool
+    slope: float
+    intercept: float
+
+
+@dataclass(frozen=True)
+class SeriesEntry:
+    """One line of a listing; `as_dict` is the documented machine-readable form.
+
+    number: From 1, the value that ``series=`` takes.
+    patient, study: Numbers of the patient and the study among those found, from 1; their identifiers are not given.
+        None where the files do not tell.
+    kind: {"stack", "localizer", "capture", "other"}. Only stacks are read.
+    phases: ``{"number", "keyword", "value", "slices"}`` of each volume, where slices share places; else empty.
+    slices: Number of images, with copies and all phases.
+    uid_hash: First 16 hexadecimal digits of the SHA-256 of the SeriesInstanceUID, None where the files have none.
+    shape_ijk, spacing_mm, affine_ijk_to_lps_mm, tilt_deg: None where the geometry is unknown or refused.
+    grid_residual_max_mm: Largest distance of a slice position from the affine.
+    gap_mm: "min", "max" and "median" distance of neighbouring slices along the normal, None where unknown.
+    extent_mm: Size of the box of whole voxels along rows, columns and the slice normal.
+    slice_thickness_mm: As stated; not used for the geometry.
+    dropped: Maps a reason to the number of slices left out of the stack.
+    """
+
+    number: int
+    uid_hash: str | None
+    description: str
+    modality: str
+    slices: int
+    shape_ijk: list[int] | None
+    spacing_mm: list[float] | None
+    affine_ijk_to_lps_mm: list[list[float]] | None
+    tilt_deg: float | None
+    grid_residual_max_mm: float | None
+    gap_mm: dict[str, float | None]
+    uneven: bool | None
+    warnings: list[str]
+    problems: list[str]
+    patient: int | None = None
+    study: int | None = None
+    kind: str = "stack"
+    phases: list[dict[str, Any]] = field(default_factory=list)
+    extent_mm: list[float] | None = None
+    slice_thickness_mm: float | None = None
+    dropped: dict[str, int] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The entry as a dict of JSON types."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class SeriesListing:
+    """The series at a path.
+
+    chosen: Number of the series that `read_volume` reads for the same ``series``; None where it would not choose.
+    skipped: Maps a reason to the number of files passed over.
+    certificate: Certificate of the chosen series, as in ``volume.report``, even if the series is refused; None where no
+        series is chosen or none of its slices has a valid header.
+    refusal: The reason why no series is chosen; `warnings` contains its text too.
+    """
+
+    series: list[SeriesEntry]
+    chosen: int | None
+    skipped: dict[str, int]
+    warnings: list[str]
+    certificate: Certificate | None = None
+    refusal: ClreconError | None = None
+
+    def _repr_html_(self) -> str | None:
+        """Return the HTML that a notebook shows: a table; None where it shows the text."""
+        html: str | None = public_function("to_html")(self)
+        return html

@@ -1,0 +1,398 @@
+"""The certificate of a DICOM series, without patient data: its origin and geometry, and the gates that it must meet.
+
+People put names into file names and series descriptions: warnings and reports contain neither, only counts and
+positions.
+
+A gate covers a fact that moves a surface in the patient or changes its level, without the user of the mesh seeing it.
+Everything else that is unusual gives only a warning; docs/certificate.md lists both, with the reasons.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import RefusedInputError
+from clrecon.geometry import column_spacing
+from clrecon.geometry.certificate import Certificate
+from clrecon.geometry.orientation import describe_orientation
+from clrecon.reading.common.likeness import Likeness
+from clrecon.reading.common.plausibility import (
+    PADDING_SHARE,
+    VoxelFindings,
+    judge_figures,
+    judge_steps,
+    leave_unexamined,
+    list_odd_values,
+)
+from clrecon.reading.common.source_facts import PixelFacts
+from clrecon.reading.dicom.headers.slice_header import SliceHeader
+from clrecon.reading.dicom.parse.transfer_syntaxes import SYNTAX_NAMES
+from clrecon.reading.dicom.series.census import describe_numbers, judge_numbers
+from clrecon.reading.dicom.series.phases import choose_phase, describe_spacing
+from clrecon.reading.dicom.series.scan import Scan
+from clrecon.reading.dicom.series.series import Series
+from clrecon.reading.dicom.stack.fit import (
+    ORIENTATION_EXACT,
+    ORIENTATION_LIMIT,
+    ORIENTATION_SPREAD_RAD,
+    STATED_GAP_TOLERANCE,
+    Stack,
+    describe_thickness,
+    group_places,
+    measure_directions,
+    measure_extent,
+    measure_stated_gap,
+    median_thickness,
+    summarise_gaps,
+)
+from clrecon.reading.dicom.stack.mixtures import describe_differences
+from clrecon.system.arguments import name_parameter
+from clrecon.system.records import Gate, at_most, none_of, unmeasured
+from clrecon.system.text import count_of, hash_uid
+
+GAP_THICKNESSES = 2.0
+"""Largest gap in units of the slice thickness.  Beyond it more is left out than measured: a high-resolution lung scan
+has 10, and no usable surface."""
+SLOPES, INTERCEPTS = (1e-3, 100.0), (-40_000.0, 40_000.0)
+"""Ranges of slope and intercept.  Scanners write the slope 1, a fraction of 1 or a few; below 0 bone would be dark.
+Stored 16-bit values in the middle of their range need an intercept of 32768."""
+STRAY = "values beyond the stored bits"
+
+
+def judge_series(
+    series: Series,
+    stack: Stack | None,
+    facts: PixelFacts | None = None,
+    likeness: Likeness | None = None,
+    value_gates: Sequence[Gate] | None = None,
+) -> list[Gate]:
+    """Judge a series by the gates.
+
+    stack: Its slices as they are or would be read.
+    facts: Figures of its pixels; without them the gates on pixels are not measured.
+    likeness: Likeness of its slices; also None where they are too few or too small.
+    value_gates: Gates of the values of the voxels, see `clrecon.reading.common.plausibility.examine_voxels`.
+
+    Returns: See `clrecon.system.records.Gate`.  The texts hold no file names.
+    """
+    refused = len(series.problems)
+    gates = [
+        none_of("usable", refused, "reasons to refuse the series"),
+        none_of("readable", len(series.corrupt) + len(series.others), "files that may hold slices of it, unreadable"),
+    ]
+    if stack is None:
+        return gates
+    gates.append(_judge_spacing(stack))
+    gates += _gates_of_places(stack)
+    what = "slices at the place of another that differ from it and are no phases"
+    gates.append(judge_numbers(series.census, stack, _count_copies(series)))
+    gates.append(none_of("duplicate_slices", _count_doubled(series), what))
+    gates.append(_judge_one_volume(series, likeness))
+    gates += _gates_of_values(stack.slices)
+    gates.append(_judge_hu(stack.slices, facts))
+    gates += leave_unexamined() if value_gates is None else value_gates
+    share = "share of voxels without a measurement (padding)"
+    if facts is None:
+        gates.append(unmeasured("padding_share", PADDING_SHARE, None, f"{share}: the pixels were not read"))
+        gates.append(unmeasured("stored_bits", 0, None, f"{STRAY}: the pixels were not read"))
+    else:
+        gates.append(none_of("stored_bits", facts.stray, facts.stray_text or STRAY))
+        gates.append(at_most("padding_share", facts.padding_share, PADDING_SHARE, None, share))
+    return gates
+
+
+def _gates_of_places(stack: Stack) -> Iterator[Gate]:
+    directions = measure_directions(stack.slices)
+    what = "ImageOrientationPatient is off unit length or right angle by"
+    yield at_most("orientation_exact", directions.deviation, ORIENTATION_EXACT, None, what)
+    what = "ImageOrientationPatient of a slice differs from the mean by"
+    if directions.deviation > ORIENTATION_LIMIT:
+        yield unmeasured("orientation_same", ORIENTATION_SPREAD_RAD, "rad", f"{what}: there is no mean")
+    else:
+        yield at_most("orientation_same", directions.spread_rad, directions.spread_allowed_rad, "rad", what)
+    line = stack.line
+    what = "largest distance of a slice from even positions"
+    if line.residual_max_mm is None or line.tolerance_mm is None:
+        yield unmeasured("grid_residual", 0.01, "mm", f"{what}: there is one slice")
+        return
+    yield at_most("grid_residual", line.residual_max_mm, line.tolerance_mm, "mm", what)
+    yield none_of("missing_slices", stack.missing, "slices missing in between")
+    yield _judge_thickness(stack)
+    yield _judge_stated_gap(stack)
+
+
+def _judge_spacing(stack: Stack) -> Gate:
+    first = stack.slices[0]
+    return judge_steps((first.di_mm, first.dj_mm), stack.line.gap_median_mm)
+
+
+def _judge_thickness(stack: Stack) -> Gate:
+    """Compare gaps with SliceThickness: how much of the tissue was measured."""
+    what = "largest gap between slices as a multiple of SliceThickness; above 1 the tissue between was not measured"
+    thickness = np.array([header.slice_thickness_mm or 0.0 for header in stack.slices])
+    if (thickness <= 0.0).any():
+        return unmeasured("gap_thickness", GAP_THICKNESSES, None, f"{what}: the thickness is not stated")
+    gaps = np.diff(stack.distances_mm)
+    worst = int(np.argmax(2.0 * gaps / (thickness[1:] + thickness[:-1])))
+    ratio = float(2.0 * gaps[worst] / (thickness[worst] + thickness[worst + 1]))
+    if ratio > GAP_THICKNESSES:
+        what += f" ({gaps[worst]:g} mm at a thickness of {thickness[worst]:g} mm)"
+    return at_most("gap_thickness", ratio, GAP_THICKNESSES, None, what)
+
+
+def _judge_hu(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> Gate:
+    """Judge whether rescale, lowest and densest voxel are those of a CT; without pixels the rescale alone."""
+    odd = []
+    for name, values, (low, high) in (
+        ("RescaleSlope", [header.slope for header in headers], SLOPES),
+        ("RescaleIntercept", [header.intercept for header in headers], INTERCEPTS),
+    ):
+        odd += [f"{name} {value:g}" for value in (min(values), max(values)) if not low <= value <= high][:1]
+    if facts is not None and facts.hu_min <= facts.hu_max and not count_unknown(headers):
+        odd += list_odd_values(facts)
+    return judge_figures(odd)
+
+
+def _judge_one_volume(series: Series, likeness: Likeness | None) -> Gate:
+    """Judge whether neighbours differ more than slices farther apart, and whether an element alternates from slice to
+    slice.
+    """
+    doubts = 0 if series.stack is None or series.find_doubt() == "" else 1
+    what = "signs of several volumes between each other: a header that alternates, neighbours less alike than others"
+    if likeness is None and not doubts:
+        return unmeasured("one_volume", 0, None, f"{what}: the pixels were not read, or too few")
+    return none_of("one_volume", doubts + (likeness is not None and likeness.is_mixed), what)
+
+
+def _count_copies(series: Series) -> int:
+    try:
+        return series.places.copies
+    except RefusedInputError:
+        return 0
+
+
+def _count_doubled(series: Series) -> int:
+    try:
+        places = series.places
+    except RefusedInputError:
+        return 0  # the pixels cannot be compared: already counted as a reason for refusal
+    return len(places.headers) - len(group_places(places.headers)) if places.problem and not places.phases else 0
+
+
+def _judge_stated_gap(stack: Stack) -> Gate:
+    """Compare SpacingBetweenSlices with the positions: a sign that every second slice is missing."""
+    what, bound = "SpacingBetweenSlices differs from the positions by", 100.0 * STATED_GAP_TOLERANCE
+    found = measure_stated_gap(stack.slices, stack.positions_mm, stack.line.gap_median_mm)
+    if found is None:
+        return unmeasured("stated_gap", bound, "%", f"{what}: it is not stated")
+    return at_most("stated_gap", 100.0 * found[2], bound, "%", what)
+
+
+def count_unknown(headers: Sequence[SliceHeader]) -> int:
+    """Count slices whose values are not known to be HU."""
+    return sum(
+        not (h.has_slope and h.has_intercept) or h.rescale_type not in ("", "HU") or h.modality_lut for h in headers
+    )
+
+
+def _gates_of_values(headers: Sequence[SliceHeader]) -> Iterator[Gate]:
+    yield none_of("hu_known", count_unknown(headers), "slices whose values are not known to be HU")
+    yield none_of("lossless", sum(h.lossy for h in headers), "slices with lossy compression")
+    yield none_of("measured_images", sum(bool(h.derived) for h in headers), "slices that were computed from others")
+
+
+SAID_BY_GATES = (
+    "complete_series",
+    "padding_share",
+    "stored_bits",
+    "plausible_spacing",
+    "gap_thickness",
+    "plausible_hu",
+    "hu_scale",
+    "stored_sign",
+)
+"""Gates whose text becomes a warning when they fail; for the other gates a separate warning says more."""
+
+
+def collect_scan_warnings(scan: Scan) -> list[str]:
+    """Return warnings about files that claim to be DICOM but were passed over, or that could not be examined."""
+    warnings = []
+    if scan.skipped["corrupt"]:
+        warnings.append(f"{scan.skipped['corrupt']} corrupt file{'s' * (scan.skipped['corrupt'] > 1)} skipped")
+    warnings += [f"{count} skipped: {reason}" for reason, count in Counter(s.reason for s in scan.suspects).items()]
+    for reason in ("not readable", "folder not readable"):
+        if scan.skipped[reason]:
+            warnings.append(f"{scan.skipped[reason]} skipped: {reason}")
+    return warnings
+
+
+def collect_series_warnings(series: Series) -> list[str]:
+    """Return warnings about one series, from its headers and its geometry."""
+    if series.stack is None or series.kind == "other":
+        return []
+    headers = series.stack.slices
+    warnings = [*_describe_what_was_left(series), *series.stack.warnings]
+    for text in dict.fromkeys(text for header in headers for text in header.warnings):
+        warnings.append(f"{text} ({_place(series.stack, lambda h, text=text: text in h.warnings)})")  # type: ignore[misc]
+    checks: tuple[tuple[Callable[[SliceHeader], bool], str], ...] = (
+        (
+            lambda h: not h.has_slope,
+            "no RescaleSlope: slope 1, intercept {intercept} taken: maybe not HU",
+        ),
+        (
+            lambda h: h.has_slope and not h.has_intercept,
+            "no RescaleIntercept: slope {slope}, intercept 0 taken: maybe not HU",
+        ),
+        (lambda h: h.rescale_type not in ("", "HU"), "RescaleType is '{type}': the values are not HU"),
+        (
+            lambda h: h.modality_lut,
+            "the files have a Modality LUT Sequence (0028,3000), which is not applied: slope {slope}, intercept"
+            f" {{intercept}} taken, the values are not HU; {name_parameter('rescale')} says how HU follow from them",
+        ),
+        (
+            lambda h: h.quadruped,
+            "AnatomicalOrientationType (0010,2210) is QUADRUPED, an animal: along its trunk x runs to its left, y to"
+            " dorsal, z to cranial; read P as dorsal, A as ventral, S as cranial and I as caudal. In head and limbs the"
+            " letters mean other directions, and rules for people (couch, front and back, vertebrae) may not fit",
+        ),
+        (lambda h: h.photometric == "MONOCHROME1", "MONOCHROME1: meant to be shown inverted; the values are kept"),
+        (lambda h: h.lossy, "lossy compression: the values are not those that were measured"),
+    )
+    for is_so, text in checks:
+        odd = next((header for header in headers if is_so(header)), None)
+        if odd is not None:
+            text = text.format(type=odd.rescale_type, intercept=f"{odd.intercept:g}", slope=f"{odd.slope:g}")
+            warnings.append(f"{text} ({_place(series.stack, is_so)})")
+    warnings += [f"{text} ({_place(series.stack, is_so)})" for text, is_so in describe_differences(headers)]
+    doubt = series.find_doubt()
+    if doubt and not any(doubt in text for text in warnings):
+        warnings.append(doubt)
+    return warnings
+
+
+def _describe_what_was_left(series: Series) -> list[str]:
+    """Describe copies, the other phases of a series, and mixed reconstructions."""
+    try:
+        places = series.places
+    except RefusedInputError:
+        return []
+    warnings = []
+    if places.copies:
+        some = "slices" if places.copies > 1 else "slice"
+        warnings.append(f"{places.copies} duplicate {some} dropped: same place, same pixels as another")
+    if places.phases and series.phase is not None:
+        chosen = choose_phase(places, series.phase)
+        left = sum(len(phase.headers) for phase in places.phases) - len(chosen.headers)
+        which = f"phase {chosen.number} of {len(places.phases)} ({chosen.keyword} {chosen.value})"
+        spacing = f": {describe_spacing(places.phases, chosen)}" if places.interleaved else ""
+        warnings.append(f"{which} read, {count_of(left, 'slice')} of others left{spacing}")
+        most = max(len(phase.headers) for phase in places.phases)
+        if not places.interleaved and len(chosen.headers) < most:
+            warnings.append(f"phase {chosen.number} has {count_of(len(chosen.headers), 'slice')}, another one {most}")
+    kernels = (
+        {dict(header.phase).get("ConvolutionKernel", "") for header in series.stack.slices} if series.stack else ()
+    )
+    if len(kernels) > 1:
+        warnings.append(f"ConvolutionKernel differs between slices ({len(kernels)} kernels): sharp and soft are mixed")
+    return warnings
+
+
+def _describe_identity(series: Series) -> dict[str, Any]:
+    identity = series.identity
+    return {"number": series.number, "uid_hash": hash_uid(identity.uid), "modality": identity.modality}
+
+
+def _describe_phase(series: Series) -> dict[str, Any] | None:
+    if series.phase is None or not series.places.phases:
+        return None
+    chosen = choose_phase(series.places, series.phase)
+    return {"number": chosen.number, "of": len(series.places.phases), "keyword": chosen.keyword, "value": chosen.value}
+
+
+def _place(stack: Stack, is_so: Callable[[SliceHeader], bool]) -> str:
+    """Describe slices by count and position along the normal; their file names may contain the patient's name."""
+    positions = [place for header, place in zip(stack.slices, stack.distances_mm, strict=True) if is_so(header)]
+    if len(positions) == len(stack.slices):
+        return "all slices"
+    first = "the first " * (len(positions) > 1)
+    return f"{len(positions)} of {len(stack.slices)} slices, {first}at {positions[0]:.2f} mm"
+
+
+def _describe_rescale(headers: Sequence[SliceHeader], scan: Scan, findings: VoxelFindings | None) -> dict[str, Any]:
+    slopes, intercepts = [h.slope for h in headers], [h.intercept for h in headers]
+    return {
+        "slope": [min(slopes), max(slopes)],
+        "intercept": [min(intercepts), max(intercepts)],
+        "type": headers[0].rescale_type or None,
+        **({"given": True} if scan.rescale is not None else {}),
+        **({} if findings is None else findings.materials),
+    }
+
+
+def certify(
+    series: Series,
+    stack: Stack,
+    facts: PixelFacts | None,
+    scan: Scan,
+    affine: NDArray[np.float64] | None,
+    warnings: Sequence[str],
+    likeness: Likeness | None = None,
+    findings: VoxelFindings | None = None,
+) -> Certificate:
+    """Build the certificate of a series: the report of its volume, and what ``clrecon info`` shows.
+
+    series, stack: The series that was or would be read, and its stack.
+    facts: None: the pixels were not read, and entries that depend on them are None.
+    affine: ndarray, shape (4, 4), or None. None: the series is refused.
+    likeness: Likeness of the slices; None: the pixels were not read, or there are too few slices.
+    findings: What the voxels say of their values; None: the pixels were not read.
+    """
+    headers, first, line = stack.slices, stack.slices[0], stack.line
+    stated = next((h.stated_gap_mm for h in headers if h.stated_gap_mm is not None), None)
+    lay = {h.patient_position for h in headers}
+    gates = judge_series(series, stack, facts, likeness, None if findings is None else findings.gates)
+    unsaid = [gate.text for gate in gates if gate.name in SAID_BY_GATES and gate.ok is False]
+    return Certificate(
+        format="DICOM",
+        series=_describe_identity(series),
+        phase=_describe_phase(series),
+        slices=len(headers),
+        slices_missing=stack.missing,
+        shape_ijk=[first.columns, first.rows, len(headers)],
+        spacing_mm=None if affine is None else list(column_spacing(affine)),
+        extent_mm=None if affine is None else measure_extent(stack),
+        affine_ijk_to_lps_mm=None if affine is None else affine.tolist(),
+        orientation=None if affine is None else describe_orientation(affine),
+        patient_position=(lay.pop() or None) if len(lay) == 1 else None,
+        anatomical_orientation="QUADRUPED" if any(h.quadruped for h in headers) else None,
+        tilt_deg=stack.tilt_deg,
+        grid_residual_max_mm=line.residual_max_mm,
+        grid_residual_rms_mm=line.residual_rms_mm,
+        grid_tolerance_mm=line.tolerance_mm,
+        gap_mm={"min": line.gap_min_mm, "max": line.gap_max_mm, "median": line.gap_median_mm},
+        uneven=line.uneven,
+        gap_runs=summarise_gaps(stack.distances_mm) if line.uneven else None,
+        slice_positions_mm=stack.positions_mm.tolist() if line.uneven else None,
+        slice_thickness_mm=median_thickness(headers),
+        thickness=describe_thickness(headers, stack.distances_mm),
+        stated_gap_mm=stated,
+        numbering=describe_numbers(series.census, stack),
+        frame_of_reference_hash=hash_uid(first.frame_of_reference),
+        padding_share=None if facts is None else facts.padding_share,
+        padding_hu=None if facts is None else facts.padding_hu,
+        transfer_syntaxes=sorted({h.transfer_syntax for h in headers}),
+        transfer_syntax_names=sorted({SYNTAX_NAMES[h.transfer_syntax] for h in headers}),
+        lossy=any(h.lossy for h in headers),
+        rescale=_describe_rescale(headers, scan, findings),
+        hu_range=None if facts is None else [facts.hu_min, facts.hu_max],
+        files={"found": scan.files, "used": len({h.file for h in headers}), "skipped": dict(scan.skipped)},
+        dropped=series.dropped,
+        gates=gates,
+        warnings=[*warnings, *unsaid],
+        problems=list(series.problems),
+    )

@@ -1,0 +1,377 @@
+"""Several slices at one place: copies of each other, or the phases of a series that holds more than one volume.
+
+Copies are slices with the same pixels and the same geometry; one of them is kept.  Other slices at one place are
+distinguished by an element of the headers (a temporal position, an acquisition, a time, a reconstruction kernel): the
+first one that divides the slices into stacks with one slice at each place.  Slices of several volumes may also lie
+between each other at different places: see `clrecon.reading.dicom.stack.mixtures`. No phase is chosen here.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+
+import numpy as np
+
+from clrecon.errors import UsageError
+from clrecon.reading.dicom.headers.slice_header import PHASE_KEYWORDS, SliceHeader
+from clrecon.reading.dicom.pixels.stored import StoredPixels
+from clrecon.reading.dicom.pixels.voxels import read_voxels
+from clrecon.reading.dicom.stack.fit import measure_gap
+from clrecon.reading.dicom.stack.mixtures import Alternation, find_mixture, values_of
+from clrecon.reading.dicom.stack.spacing import measure_unit
+from clrecon.system.arguments import name_parameter
+from clrecon.system.text import join_names
+
+PLACES_SHOWN = 4
+PHASES_SHOWN = 12
+SMALLEST_PHASE = 3
+"""With more groups than slices at the fullest place, groups are phases only if each has this many slices."""
+TIME_KEYWORDS = ("AcquisitionTime", "ContentTime")
+DATE_KEYWORDS = ("AcquisitionDate", "ContentDate")
+HALF_A_DAY_S = 43_200.0
+SAME_POSITION_MM = 0.01
+SAME_SPACING = 1e-5
+SAME_DIRECTION = 1e-4
+"""Tolerances for the geometry of copies, for rounding: those of `clrecon.reading.dicom.stack.fit`."""
+RANK_KEYWORDS = (
+    ("TemporalPositionIdentifier",),
+    ("TriggerTime",),
+    ("AcquisitionDate", "AcquisitionTime"),
+    ("AcquisitionTime",),
+    ("ContentDate", "ContentTime"),
+    ("ContentTime",),
+)
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One of several volumes in a series.
+
+    number: From 1; the value that ``phase=`` takes.
+    keyword, value: The element that distinguishes the phases, and its value for this phase; times count from the first
+        phase.
+    """
+
+    number: int
+    keyword: str
+    value: str
+    headers: tuple[SliceHeader, ...]
+
+    def __str__(self) -> str:
+        count = len(self.headers)
+        return f"{self.number}: {self.keyword} {self.value}, {count} slice{'s' * (count != 1)}"
+
+
+@dataclass(frozen=True)
+class Places:
+    """Slices grouped by their places.
+
+    headers: The slices without copies.
+    copies: Number of slices that were left out as copies.
+    phases: Empty where each place has one slice; none is chosen yet.
+    problem: Why the slices are no volume and no phase of them is one; empty if there is no problem.
+    interleaved: The phases share no place, and the slices of one lie between those of another.
+    doubt: Description of an alternation along the stack that may still be one volume; empty if there is none.
+    """
+
+    headers: tuple[SliceHeader, ...]
+    copies: int = 0
+    phases: tuple[Phase, ...] = field(default=())
+    problem: str = ""
+    interleaved: bool = False
+    doubt: str = ""
+
+
+def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHeader, SliceHeader], bool]) -> Places:
+    """Leave out copies and find phases.
+
+    places: The slices at each place, in the order of the places.
+    same: Function that is true for two slices with the same pixels.
+    """
+    sorted_out = [_sort_copies(slices, same) for slices in places]
+    kept = [[copies[0] for copies in found] for found in sorted_out]
+    count = sum(map(len, places))
+    headers = tuple(header for slices in kept for header in slices)
+    if len(places) == 1 and count > 1:
+        phases = _find_phases(sorted_out)
+        problem = _describe_one_place(count, headers, phases)
+        return Places(headers, count - len(headers), phases, problem=problem)
+    if max(map(len, kept), default=0) <= 1:
+        phases = _part(find_mixture(headers))
+        return Places(headers, count - len(headers), phases, interleaved=bool(phases))
+    phases = _find_phases(sorted_out)
+    if phases:
+        # A slice that is equal in two phases (air, at the ends) is a copy, but belongs to both.
+        headers = tuple(header for phase in phases for header in phase.headers)
+        return Places(headers, count - len(headers), phases)
+    crowded = [slices for slices in kept if len(slices) > 1]
+    shown = "; ".join(join_names(header.name for header in slices) for slices in crowded[:PLACES_SHOWN])
+    more = f"; and {len(crowded) - PLACES_SHOWN} more" if len(crowded) > PLACES_SHOWN else ""
+    alike = all(lie_alike(slices[0], header) for slices in crowded for header in slices[1:])
+    return Places(
+        headers,
+        count - len(headers),
+        problem=f"duplicate slices with different pixels{'' if alike else ' or geometry'} at {len(crowded)} "
+        f"place{'s' * (len(crowded) > 1)}, and no element of their headers parts them into phases: {shown}{more}"
+        f"{_describe_digits(headers)}",
+    )
+
+
+def _describe_digits(headers: Sequence[SliceHeader]) -> str:
+    """Say that places fall together because positions have too few digits; empty if they have enough."""
+    normal = np.cross(headers[0].row_cosines, headers[0].column_cosines)
+    unit, digits = measure_unit(headers, normal)
+    thickness = headers[0].slice_thickness_mm or 0.0
+    if not 0.0 < thickness < unit:
+        return ""
+    return (
+        f"; positions are written with {digits} decimal{'s' * (digits != 1)}, too few for slices of {thickness:g} mm: "
+        "write them with more digits"
+    )
+
+
+def _describe_one_place(count: int, headers: Sequence[SliceHeader], phases: Sequence[Phase]) -> str:
+    """Describe the problem of a series whose images all lie at one place."""
+    what = "copies of each other"
+    if phases:
+        what = f"{len(phases)} phases of one slice each, which differ in {phases[0].keyword}"
+    elif len(headers) > 1:
+        what = f"{len(headers)} of them with different pixels, and no element of their headers parts them into phases"
+    at = ", ".join(f"{value:g}" for value in headers[0].position_mm)
+    return (
+        f"all {count} images lie in one plane, at ImagePositionPatient ({at}) mm ({what}): a single slice cannot make"
+        f" a volume{', and choosing a phase does not help' if phases else ''}. If one slice was scanned repeatedly"
+        " (cine, perfusion, bolus tracking), use another series; if these are different slices, their positions were"
+        " lost or overwritten: export the series again"
+    )
+
+
+def part_alternating(places: Places, found: Alternation) -> Places:
+    """Divide the same slices into phases by an alternation along them; the phases share no place.
+
+    places: Places with one slice each.
+    """
+    members = [tuple(places.headers[k] for k in group) for group in found.groups]
+    if not found.tag:
+        shown = [f"{number} of {len(members)}" for number in range(1, len(members) + 1)]
+        keyword = "place"
+    elif found.heaps:
+        shown, keyword = [str(number) for number in range(1, len(members) + 1)], f"order of {found.name}"
+    elif found.name in PHASE_KEYWORDS:
+        keyword = found.name
+        shown = _show((keyword,), [values_of(headers[0], (keyword,)) for headers in members])
+    else:  # free text may contain anything
+        shown = ["(none)" if number == found.absent else f"value {number + 1}" for number in range(len(members))]
+        keyword = found.name
+    phases = tuple(
+        Phase(number, keyword, text, headers)
+        for number, (text, headers) in enumerate(zip(shown, members, strict=True), start=1)
+    )
+    return replace(places, phases=phases, interleaved=True, doubt="")
+
+
+def lie_alike(one: SliceHeader, other: SliceHeader) -> bool:
+    """True when two slices at one place along the normal have the same geometry, in the same frame of reference.
+
+    This is needed because empty slices have equal pixels at every place.
+    """
+    return (
+        one.frame_of_reference == other.frame_of_reference
+        and _is_near(one.position_mm, other.position_mm, SAME_POSITION_MM)
+        and _is_near((one.di_mm, one.dj_mm), (other.di_mm, other.dj_mm), SAME_SPACING * min(one.di_mm, one.dj_mm))
+        and _is_near(one.row_cosines, other.row_cosines, SAME_DIRECTION)
+        and _is_near(one.column_cosines, other.column_cosines, SAME_DIRECTION)
+    )
+
+
+def _is_near(one: Sequence[float], other: Sequence[float], tolerance: float) -> bool:
+    return all(abs(a - b) <= tolerance for a, b in zip(one, other, strict=True))
+
+
+def have_same_pixels(one: SliceHeader, other: SliceHeader, source: StoredPixels | None = None) -> bool:
+    """True when two slices hold the same HU; reads both, from `source` where many are compared."""
+    if (one.rows, one.columns) != (other.rows, other.columns):
+        return False
+    return bool(np.array_equal(read_voxels([one], source=source)[0], read_voxels([other], source=source)[0]))
+
+
+def _sort_copies(
+    slices: Sequence[SliceHeader], same: Callable[[SliceHeader, SliceHeader], bool]
+) -> list[list[SliceHeader]]:
+    """Sort the slices at one place so that copies are together."""
+    found: list[list[SliceHeader]] = []
+    for header in slices:
+        for copies in found:
+            if lie_alike(copies[0], header) and same(copies[0], header):
+                copies.append(header)
+                break
+        else:
+            found.append([header])
+    return found
+
+
+def _find_phases(places: Sequence[Sequence[Sequence[SliceHeader]]]) -> tuple[Phase, ...]:
+    """Find phases among slices that are grouped by place, and at each place by copies."""
+    kept = [[copies[0] for copies in found] for found in places]
+    for keywords in _keyword_choices(kept):
+        groups: dict[tuple[str, ...], list[SliceHeader]] = defaultdict(list)
+        clean, most = True, 0
+        for found in places:
+            here = [{values_of(header, keywords): header for header in reversed(copies)} for copies in found]
+            values = [value for one in here for value in one]
+            clean, most = clean and len(set(values)) == len(values), max(most, len(values))
+            for one in here:
+                for value, header in one.items():
+                    groups[value].append(header)
+        if clean and (len(groups) == most or min(map(len, groups.values())) >= SMALLEST_PHASE):
+            return _part((keywords, groups))
+    everything = [[header for copies in found for header in copies] for found in places]
+    return _rank_by_time(kept) or _rank_by_time(everything)
+
+
+def _part(found: tuple[tuple[str, ...], Mapping[tuple[str, ...], Sequence[SliceHeader]]] | None) -> tuple[Phase, ...]:
+    """Make phases of groups of slices, by the values of keywords."""
+    if found is None:
+        return ()
+    keywords, groups = found
+    ordered = sorted(groups, key=_order)
+    shown = _show(keywords, ordered)
+    return tuple(
+        Phase(number, " and ".join(keywords), text, tuple(groups[value]))
+        for number, (value, text) in enumerate(zip(ordered, shown, strict=True), start=1)
+    )
+
+
+def _keyword_choices(places: Sequence[Sequence[SliceHeader]]) -> Iterator[tuple[str, ...]]:
+    """Return the keywords that differ at some place, single ones first, then pairs; the most specific first."""
+    present: dict[str, None] = dict.fromkeys(PHASE_KEYWORDS)
+    differing: set[str] = set()
+    for slices in places:
+        for keyword in dict.fromkeys(keyword for header in slices for keyword, _ in header.phase):
+            present.setdefault(keyword)
+            if len({values_of(header, (keyword,)) for header in slices}) > 1:
+                differing.add(keyword)
+    ordered = [keyword for keyword in present if keyword in differing]
+    yield from ((keyword,) for keyword in ordered)
+    yield from combinations(ordered, 2)
+
+
+def _rank_by_time(places: Sequence[Sequence[SliceHeader]]) -> tuple[Phase, ...]:
+    """Rank slices by time where every place was visited equally often and each visit has a time: first visits, second
+    visits...
+    """
+    most = max(map(len, places))
+    if any(len(slices) != most for slices in places):
+        return ()
+    for keywords in RANK_KEYWORDS:
+        ordered = [sorted(slices, key=lambda header: _order(values_of(header, keywords))) for slices in places]
+        values = [[values_of(header, keywords) for header in slices] for slices in ordered]
+        if any(len(set(visits)) < most or any("" in value for value in visits) for visits in values):
+            continue
+        if _are_passes(values, keywords):
+            return tuple(
+                Phase(number, f"order of {' and '.join(keywords)}", str(number), tuple(group))
+                for number, group in enumerate(zip(*ordered, strict=True), start=1)
+            )
+    return ()
+
+
+def _are_passes(values: Sequence[Sequence[tuple[str, ...]]], keywords: tuple[str, ...]) -> bool:
+    """True when the n-th visits of all places were one pass: before any place was visited again.
+
+    Where the table stopped at some places for all their visits before it moved on, this must hold for each stop.  Times
+    of reconstruction tell nothing about stops.  Without a date, times around midnight have no order.
+    """
+    if keywords in (("AcquisitionTime",), ("ContentTime",)):
+        seconds = [_seconds(value[0]) or 0.0 for visits in values for value in visits]
+        if max(seconds) - min(seconds) > HALF_A_DAY_S:
+            return False
+    ranks = {value: rank for rank, value in enumerate(sorted({v for visits in values for v in visits}, key=_order))}
+    times = np.array([[ranks[value] for value in visits] for visits in values])
+    times = times[np.argsort(times[:, 0], kind="stable")]
+    if keywords[-1] == "ContentTime":
+        stops = [times]
+    else:
+        ends = np.maximum.accumulate(times[:, -1])
+        stops = np.split(times, np.flatnonzero(times[1:, 0] > ends[:-1]) + 1)
+    return all(bool((stop[:, :-1].max(axis=0) < stop[:, 1:].min(axis=0)).all()) for stop in stops)
+
+
+def _order(value: tuple[str, ...]) -> list[tuple[int, float, str]]:
+    """Return a sort key: numbers by size, before text."""
+    return [(0, number, "") if (number := _number(part)) is not None else (1, 0.0, part) for part in value]
+
+
+def _number(text: str) -> float | None:
+    try:
+        number = float(text)
+    except ValueError:
+        return None
+    return number if np.isfinite(number) else None
+
+
+def _show(keywords: Sequence[str], values: Sequence[tuple[str, ...]]) -> list[str]:
+    """Return values for a listing; of dates and times, which may identify the patient, only the time since the first
+    one.
+    """
+    columns = []
+    for place, keyword in enumerate(keywords):
+        column = [value[place] for value in values]
+        if keyword in TIME_KEYWORDS:
+            seconds = [_seconds(text) for text in column]
+            column = _since_first(seconds, "s")
+        elif keyword in DATE_KEYWORDS:
+            column = [f"date {1 + sorted(set(column)).index(text)}" for text in column]
+        columns.append([text or "(none)" for text in column])
+    return [", ".join(parts) for parts in zip(*columns, strict=True)]
+
+
+def _seconds(text: str) -> float | None:
+    number = _number(text)
+    if number is None:
+        return None
+    hours, rest = divmod(number, 10000)
+    minutes, seconds = divmod(rest, 100)
+    return hours * 3600 + minutes * 60 + seconds
+
+
+def _since_first(seconds: Sequence[float | None], unit: str) -> list[str]:
+    known = [value for value in seconds if value is not None]
+    first = min(known, default=0.0)
+    return ["(none)" if value is None else f"+{value - first:g} {unit}" for value in seconds]
+
+
+def describe_phases(places: Places) -> str:
+    """Describe the problem of a series with several phases of which none was chosen."""
+    if places.problem:
+        return places.problem
+    phases = places.phases
+    shown = [str(phase) for phase in phases[:PHASES_SHOWN]]
+    more = f" and {len(phases) - PHASES_SHOWN} more" if len(phases) > PHASES_SHOWN else ""
+    where = "whose slices lie between each other" if places.interleaved else "at the same places"
+    spacing = f"; {describe_spacing(phases, phases[0])}" if places.interleaved else ""
+    return (
+        f"{len(phases)} phases {where}, choose one with {name_parameter('phase')}: [{'], ['.join(shown)}]{more}"
+        f"{spacing}"
+    )
+
+
+def describe_spacing(phases: Sequence[Phase], chosen: Phase) -> str:
+    """Say what the choice of one of several interleaved phases does to the distance of the slices."""
+    everything = [header for phase in phases for header in phase.headers]
+    return (
+        f"slices of phase {chosen.number} lie {measure_gap(chosen.headers):.4g} mm apart, those of all phases "
+        f"{measure_gap(everything):.4g} mm"
+    )
+
+
+def choose_phase(places: Places, wanted: int) -> Phase:
+    """Return the phase of that number."""
+    for phase in places.phases:
+        if phase.number == wanted:
+            return phase
+    known = describe_phases(places) if places.phases or places.problem else "the series has one slice at each place"
+    raise UsageError(f"there is no phase {wanted!r}: {known}")

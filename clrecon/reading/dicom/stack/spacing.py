@@ -1,0 +1,196 @@
+"""Steps from slice to slice: gaps too wide for their neighbours, and positions written with few digits.
+
+Rounded positions: even steps that were written with few digits look like gaps, or like missing slices.
+
+Steps of 0.0105 mm written with two digits are 0.01 mm, and every twentieth 0.02 mm.  A slice that is missing leaves the
+same gap.  The two are told apart by the digits and by a distance that the headers state beside the positions: where all
+positions are even steps of that distance, each rounded to its last digit, none is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.reading.dicom.headers.slice_header import SliceHeader
+
+
+def median(values: Sequence[float] | NDArray[Any]) -> float:
+    """Return the same as `numpy.median` of one or more values.
+
+    `numpy.median` loads numpy's masked arrays, 10 ms at every start of the program, and is slow for few values.
+    """
+    ordered = np.sort(values)
+    middle = len(ordered) // 2
+    return float(ordered[middle] if len(ordered) % 2 else (ordered[middle - 1] + ordered[middle]) / 2)
+
+
+Float64Array = NDArray[np.float64]
+
+MISSING_RATIO = 1.5
+RUN_LENGTH = 3
+RUN_TOLERANCE = 0.05
+"""A gap over 1.5 times the usual gap means missing slices, unless it belongs to a run: at least 3 consecutive gaps that
+are equal within 5 %. A run is a change of feed, a hole is not.  The usual gap is the median, with an even count the
+smaller of the two in the middle, so that equally many holes and whole gaps do not make the holes usual.  Beside a run
+the usual gap is that of the run (of two runs, the coarser), so that a hole where the feed is fine is found however
+coarse it is elsewhere."""
+PLACES_SHOWN = 4
+
+
+@dataclass(frozen=True)
+class Holes:
+    """Gaps in a stack that are too wide, by the rule at `MISSING_RATIO`.
+
+    places: The gap k lies between the slices k and k + 1.
+    ends_mm: tuple of (float, float). Positions along the normal of the slices before and after the gap.
+    usual_mm: The gap that would be there without a hole.
+    """
+
+    places: tuple[int, ...] = ()
+    gaps_mm: tuple[float, ...] = ()
+    ends_mm: tuple[tuple[float, float], ...] = ()
+    usual_mm: tuple[float, ...] = ()
+
+    @property
+    def missing(self) -> int:
+        """Number of slices that would fill the gaps at the usual distance."""
+        return sum(self._counts())
+
+    def _counts(self) -> list[int]:
+        return [max(round(gap / usual) - 1, 1) for gap, usual in zip(self.gaps_mm, self.usual_mm, strict=True)]
+
+    def describe(self, names: Sequence[str] = ()) -> str:
+        """Describe where the holes are; given the names of all slices, also between which slices."""
+        texts = []
+        columns = (self.places, self.gaps_mm, self.ends_mm, self.usual_mm, self._counts())
+        for k, gap, (low, high), usual, count in zip(*columns, strict=True):
+            between = f": {names[k]}, {names[k + 1]}" if names else ""
+            texts.append(
+                f"{count} slice{'s' * (count > 1)} missing between {low:.2f} and {high:.2f} mm "
+                f"(gap {gap:.3f} mm, usual {usual:.3f} mm){between}"
+            )
+        return _join_places(texts)
+
+
+def find_holes(distances: Float64Array) -> Holes:
+    """Find missing slices among sorted positions (n,) along the normal; with only two slices there are none."""
+    gaps = np.diff(distances)
+    if len(gaps) < 2:
+        return Holes()
+    if gaps.max() <= MISSING_RATIO * gaps.min():
+        return Holes()  # the usual case
+    usual = float(np.sort(gaps)[(len(gaps) - 1) // 2])
+    if usual <= 0.0:
+        return Holes()  # only where the directions are wrong
+    in_run = _find_runs(gaps)
+    runs = np.flatnonzero(in_run)
+    wide, usuals = [], []
+    for k in np.flatnonzero(~in_run).tolist():
+        after = int(np.searchsorted(runs, k))
+        beside = max(gaps[runs[max(after - 1, 0) : after + 1]].tolist(), default=usual)
+        if gaps[k] > MISSING_RATIO * min(usual, beside):
+            wide.append(k)
+            usuals.append(beside if gaps[k] > MISSING_RATIO * beside else usual)
+    ends = tuple((float(distances[k]), float(distances[k + 1])) for k in wide)
+    return Holes(tuple(wide), tuple(float(gaps[k]) for k in wide), ends, tuple(usuals))
+
+
+def _find_runs(gaps: Float64Array) -> NDArray[np.bool_]:
+    """Mark gaps in runs: at least `RUN_LENGTH` consecutive gaps that are equal within `RUN_TOLERANCE`."""
+    in_run = np.zeros(len(gaps), dtype=bool)
+    for place, gap in enumerate(gaps.tolist()):
+        low, high = max(place - RUN_LENGTH + 1, 0), min(place + RUN_LENGTH, len(gaps))
+        like = (np.abs(gaps[low:high] - gap) <= RUN_TOLERANCE * gap).tolist()
+        first = last = place - low
+        while first > 0 and like[first - 1]:
+            first -= 1
+        while last < len(like) - 1 and like[last + 1]:
+            last += 1
+        in_run[place] = last - first + 1 >= RUN_LENGTH
+    return in_run
+
+
+def _join_places(places: list[str]) -> str:
+    shown = "; ".join(places[:PLACES_SHOWN])
+    return shown if len(places) <= PLACES_SHOWN else f"{shown}; and {len(places) - PLACES_SHOWN} more"
+
+
+SLACK = 1e-6
+"""Relative excess over the unit of the last digit that is due to float64."""
+WHOLE = 1e-3
+"""A distance that is a multiple of the unit, within this part of it, is not changed by rounding."""
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """Even steps that explain the written positions.
+
+    unit_mm: Unit of the last digit, along the normal.
+    digits: Number of decimals of the positions.
+    keyword: The element that states the distance of the slices.
+    """
+
+    unit_mm: float
+    digits: int
+    keyword: str
+    stated_mm: float
+
+    def __str__(self) -> str:
+        plural = "s" * (self.digits != 1)
+        return (
+            f"positions are written with {self.digits} decimal{plural}, too few for slices that are "
+            f"{self.stated_mm:g} mm apart by {self.keyword}: all of them are even steps, rounded"
+        )
+
+
+def measure_unit(headers: Sequence[SliceHeader], normal: Float64Array) -> tuple[float, int]:
+    """Return the unit in mm of the last digit of the positions along the normal, and the decimals of its main axis.
+
+    Writers leave out zeros at the end, so the slice with most digits counts.
+    """
+    digits = np.max([header.position_digits for header in headers], axis=0)
+    return float(np.abs(normal) @ 10.0 ** -digits.astype(np.float64)), int(digits[np.argmax(np.abs(normal))])
+
+
+def find_rounding(
+    headers: Sequence[SliceHeader], distances: Float64Array, normal: Float64Array, tolerance: float
+) -> Rounding | None:
+    """Explain uneven positions by their digits.
+
+    headers: In the order of their places.
+    distances: ndarray, shape (n,). Positions along the normal, mm, n >= 2.
+    normal: ndarray, shape (3,)
+    tolerance: Largest distance in mm that counts as rounding anyway.
+
+    Returns: None where positions have digits enough, no distance is stated, or a stated one does not explain them.
+    """
+    unit, digits = measure_unit(headers, normal)
+    if len(headers) < 3 or unit / 2.0 <= SLACK or np.ptp(np.diff(distances)) < min(unit / 2.0, tolerance):
+        return None
+    k = np.arange(len(distances), dtype=np.float64)
+    fitted = float((k - k.mean()) @ distances / np.sum((k - k.mean()) ** 2))
+    for keyword, stated in (
+        ("SpacingBetweenSlices", _stated(headers, "stated_gap_mm")),
+        ("SliceThickness", _stated(headers, "slice_thickness_mm")),
+    ):
+        if stated is None or stated <= unit or abs(stated / unit - round(stated / unit)) < WHOLE:
+            continue
+        # A missing slice would move the ends by a whole step against even steps of the stated distance.
+        steps = [stated, fitted] if abs(fitted - stated) * (len(distances) - 1) < stated / 2.0 else [stated]
+        if any(float(np.ptp(distances - k * step)) <= unit * (1.0 + SLACK) for step in steps):
+            return Rounding(unit, digits, keyword, stated)
+    return None
+
+
+def _stated(headers: Sequence[SliceHeader], field: str) -> float | None:
+    """Return the distance that the headers state, if all of them state it and about the same one."""
+    values = [getattr(header, field) for header in headers]
+    if any(value is None or value <= 0.0 for value in values):
+        return None
+    middle = median(values)
+    return middle if max(values) - min(values) <= WHOLE * middle else None

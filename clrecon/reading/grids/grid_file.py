@@ -1,0 +1,279 @@
+"""`GridFile`: the header of a file in our words and frame (LPS), and its numbers as a stream, slice by slice.
+
+A header may be wrong or hostile: a small file can promise a huge array, or name any file of the machine.  No memory is
+taken before the promised size is compared with the bytes that are there, and compressed voxels are inflated slice by
+slice.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from math import prod
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import RefusedInputError
+from clrecon.geometry.affine import Float64Array
+from clrecon.reading.common.selection import Rescale
+from clrecon.system.packages import import_package
+from clrecon.system.paths import open_regular
+from clrecon.system.progress import Progress
+from clrecon.system.text import escape_text
+
+DEFLATE_RATIO = 1032
+"""Highest compression ratio of Deflate (zlib's technical note)."""
+
+LARGEST_GRID = 2**32
+"""Most voxels of a grid: 1000 slices of 2048 x 2048."""
+
+LARGEST_SLICE_BYTES = 2**28
+"""Most stored bytes of a slice; slices are inflated one at a time."""
+
+LARGEST_SURPLUS = 4096
+"""Most bytes that may follow the last number: some writers fill up a block."""
+
+_CHUNK = 2**18
+
+
+@dataclass(frozen=True)
+class VoxelBytes:
+    """The place of a grid's numbers in a file.
+
+    path: The file itself, or the file that its header names.
+    offset: Bytes in the file before the numbers, or before their compressed stream.
+    packing: {"raw", "gzip", "zlib"}
+    skip: Inflated bytes before the numbers.
+    """
+
+    path: Path
+    offset: int = 0
+    packing: str = "raw"
+    skip: int = 0
+
+    @property
+    def compressed(self) -> bool:
+        """True when the numbers are compressed."""
+        return self.packing != "raw"
+
+    @property
+    def file_bytes(self) -> int:
+        """Size of the file."""
+        return self.path.stat().st_size
+
+    @contextmanager
+    def open(self, name: str) -> Iterator[BinaryIO]:
+        """Open the stream at the first number; `name` is for messages."""
+        with open_regular(self.path) as file:
+            file.seek(self.offset)
+            stream: BinaryIO = file
+            if self.packing == "gzip":
+                stream = cast(BinaryIO, gzip.GzipFile(fileobj=file))
+            elif self.packing == "zlib":
+                stream = cast(BinaryIO, ZlibFile(file))
+            read_bytes(stream, self.skip, name, "its header")
+            yield stream
+
+
+class ZlibFile(io.RawIOBase):
+    """The inflated bytes of a zlib stream; its checksum is compared at the end."""
+
+    def __init__(self, file: BinaryIO):
+        super().__init__()
+        self._file, self._inflater = file, zlib.decompressobj()
+
+    def readable(self) -> bool:
+        """Always True."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """Fill `buffer` with what one step inflates; return the number of bytes, 0 at the end."""
+        target = memoryview(buffer).cast("B")
+        while len(target) and not self._inflater.eof:  # 0 would mean no limit
+            packed = self._inflater.unconsumed_tail or self._file.read(_CHUNK)
+            part = self._inflater.decompress(packed, len(target))
+            if part:
+                target[: len(part)] = part
+                return len(part)
+            if not packed:
+                raise EOFError("the compressed data end early")
+        return 0
+
+
+def check_size(name: str, shape: tuple[int, ...], item_bytes: int, file_bytes: int, compressed: bool) -> None:
+    """Compare the size that a header promises with what the file can hold.
+
+    name: Name of the file.
+    item_bytes: Bytes of one number.
+    file_bytes: Size of the file.
+    compressed: The data are compressed.
+    """
+    if min(shape) < 1 or prod(shape) > LARGEST_GRID:
+        raise RefusedInputError(
+            f"{name} says that it has {' x '.join(map(str, shape))} voxels: at least 1 an axis and at most"
+            f" {LARGEST_GRID:,} altogether are read"
+        )
+    if prod(shape[:-1]) * item_bytes > LARGEST_SLICE_BYTES:
+        raise RefusedInputError(
+            f"{name} says that a slice has {' x '.join(map(str, shape[:-1]))} numbers of {item_bytes} bytes: at most"
+            f" {LARGEST_SLICE_BYTES:,} bytes are read"
+        )
+    promised = prod(shape) * item_bytes
+    possible = file_bytes * (DEFLATE_RATIO if compressed else 1)
+    if promised > possible:
+        raise RefusedInputError(
+            f"{name} is cut or corrupt: {' x '.join(map(str, shape))} numbers of {item_bytes} bytes cannot come from"
+            f" a file of {file_bytes:,} bytes"
+        )
+
+
+def read_bytes(stream: BinaryIO, count: int, name: str, where: str) -> bytes:
+    """Read exactly `count` bytes of a stream, which may be compressed."""
+    parts, missing = [], count
+    try:
+        while missing > 0:
+            part = stream.read(missing)
+            if not part:
+                raise RefusedInputError(f"{name} is cut: it ends in {where}, {missing:,} bytes before its end")
+            parts.append(part)
+            missing -= len(part)
+    except (EOFError, zlib.error, OSError) as error:
+        raise RefusedInputError(f"{name} is cut or corrupt in {where}: {escape_text(str(error))}") from error
+    return parts[0] if len(parts) == 1 else b"".join(parts)
+
+
+def check_end(stream: BinaryIO, name: str) -> None:
+    """Read to the end of the data, where the checksum of a compressed stream is."""
+    found = 0
+    try:
+        while part := stream.read(LARGEST_SURPLUS + 1):
+            found += len(part)
+            if found > LARGEST_SURPLUS:
+                raise RefusedInputError(f"{name} is corrupt: it holds more numbers than its header says")
+    except (EOFError, zlib.error, OSError) as error:
+        raise RefusedInputError(f"{name} is cut or corrupt at its end: {escape_text(str(error))}") from error
+
+
+def file_beside(header: Path, named: str) -> Path:
+    """Return the file of voxels that a header names, in the folder of the header or below it."""
+    name, shown = escape_text(header.name), escape_text(named)
+    paths = (PurePosixPath(named), PureWindowsPath(named))
+    if "\0" in named or any(path.anchor or ".." in path.parts for path in paths):
+        raise RefusedInputError(f"{name} says that its voxels are in '{shown}': only files beside it are read")
+    folder = header.parent.resolve()
+    try:
+        found = (folder / named).resolve(strict=True)
+    except (OSError, RuntimeError) as error:
+        raise RefusedInputError(f"{name} says that its voxels are in '{shown}', which is not there") from error
+    if not found.is_relative_to(folder):
+        raise RefusedInputError(f"{name} says that its voxels are in '{shown}', a link to another folder: not read")
+    if not found.is_file():
+        raise RefusedInputError(f"{name} says that its voxels are in '{shown}', which is no regular file")
+    return found
+
+
+@dataclass(frozen=True)
+class Purpose:
+    """The purpose of reading a file, for messages: its noun."""
+
+    noun: str
+
+
+LABEL_MAP = Purpose("label map")
+VOLUME = Purpose("volume")
+
+
+@dataclass(frozen=True)
+class GridFile:
+    """A grid of numbers in a file.
+
+    name: Name of the file, for messages on the terminal; it is never written to reports.
+    kind: "NIfTI-1", "NIfTI-2", "NRRD" or "MetaImage".
+    shape_ijk: (ni, nj, nk).
+    layers: Numbers of one voxel, side by side in the file; 1 except for layered label maps.
+    dtype: Type as stored, with its byte order.
+    slope, intercept: The value of a stored number is ``stored * slope + intercept``.
+    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm.
+    voxel_bytes: Where the numbers are.
+    warnings: Doubtful points of the header; they contain no names.
+    extension: The bytes between the header and the voxels (NIfTI).
+    fields: All fields of the header (NRRD).
+    rescale: Slope and intercept that the user gave in place of those of the header.
+    """
+
+    name: str
+    purpose: Purpose
+    kind: str
+    shape_ijk: tuple[int, int, int]
+    dtype: np.dtype[Any]
+    affine: Float64Array
+    voxel_bytes: VoxelBytes
+    slope: float = 1.0
+    intercept: float = 0.0
+    layers: int = 1
+    warnings: tuple[str, ...] = ()
+    extension: bytes = b""
+    fields: Mapping[str, Any] = field(default_factory=dict)
+    rescale: Rescale | None = None
+
+    def __post_init__(self) -> None:
+        shape = self.shape_ijk if self.layers == 1 else (self.layers, *self.shape_ijk)
+        check_size(self.name, shape, self.dtype.itemsize, self.voxel_bytes.file_bytes, self.voxel_bytes.compressed)
+
+    @property
+    def scaled(self) -> bool:
+        """True when the stored numbers have to be scaled to get the values."""
+        return (self.slope, self.intercept) != (1.0, 0.0)
+
+    def iterate_slices(self) -> Iterator[NDArray[Any]]:
+        """Yield the stored slices in the order of k, shape (nj, ni), with layers (nj, ni, layers); read-only."""
+        ni, nj, nk = self.shape_ijk
+        shape = (nj, ni) if self.layers == 1 else (nj, ni, self.layers)
+        count = nj * ni * self.layers * self.dtype.itemsize
+        try:
+            with self.voxel_bytes.open(self.name) as stream:
+                for k in range(nk):
+                    raw = read_bytes(stream, count, self.name, self.place(k))
+                    yield np.frombuffer(raw, dtype=self.dtype).reshape(shape)
+                check_end(stream, self.name)
+        except OSError as error:
+            raise RefusedInputError(f"{self.name} cannot be read: {error.strerror or error}") from error
+
+    def place(self, k: int) -> str:
+        """Describe slice `k` for messages."""
+        return f"slice {k + 1} of {self.shape_ijk[2]}"
+
+
+_PACKAGES = {"nrrd": "pynrrd"}
+
+
+def import_extra(module: str, purpose: Purpose) -> Any:
+    """Import `module`."""
+    return import_package(module, f"this {purpose.noun}", _PACKAGES.get(module))
+
+
+PACKING = 1
+"""Level of gzip, as nibabel has it.  Level 6 takes four times as long for a tenth of the bytes."""
+
+
+@dataclass(frozen=True, eq=False)
+class VolumeContent:
+    """What a volume file holds.
+
+    voxels: ndarray, shape (nk, nj, ni). int16, int32 or float32.
+    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm.
+    lines: The certificate, plain ASCII, one fact a line: name, blank, value.
+    progress: ``progress("write", done, total)``.
+    """
+
+    voxels: NDArray[Any]
+    affine: Float64Array
+    lines: tuple[str, ...]
+    progress: Progress

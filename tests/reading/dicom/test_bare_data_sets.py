@@ -1,0 +1,145 @@
+"""Data sets without preamble or meta header (read on demand alone), and programs in the preamble."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from dicom_series import Plan, make_dataset, save_dataset, write_series
+from enhanced_image import make_enhanced
+from hostile_bytes import NATIVE, make_series, save_bytes
+from pydicom.uid import JPEG2000Lossless
+
+from clrecon.cli.main import main
+from clrecon.errors import NoDicomError, RefusedInputError
+from clrecon.reading.dicom import list_series, read_volume
+
+PLAN = Plan(shape=(3, 3, 4))
+MARK_END = 132
+ENCODINGS = {
+    "explicit": "explicit VR little endian",
+    "implicit": "implicit VR little endian",
+    "big endian": "explicit VR big endian",
+}
+
+
+def meta_end(data: bytes) -> int:
+    return 144 + int.from_bytes(data[140:144], "little")
+
+
+def cut_all(data: bytes) -> bytes:
+    return data[meta_end(data) :]
+
+
+def cut_preamble(data: bytes) -> bytes:
+    return data[MARK_END:]
+
+
+def cut_zeros(data: bytes) -> bytes:
+    return data[128:]
+
+
+def cut_meta(data: bytes) -> bytes:
+    return data[:MARK_END] + data[meta_end(data) :]
+
+
+def write_cut(folder, files, cut):
+    folder.mkdir(exist_ok=True)
+    for k, data in enumerate(files):
+        (folder / f"{k}").write_bytes(cut(data))
+    return folder
+
+
+@pytest.mark.parametrize("cut", [cut_all, cut_meta])
+@pytest.mark.parametrize("name", ENCODINGS)
+def test_row_36_a_bare_data_set_is_read_on_demand_alone(tmp_path, name, cut):
+    folder = write_cut(tmp_path / "ct", make_series(NATIVE[name]), cut)
+    with pytest.raises((NoDicomError, RefusedInputError), match="force=True") as caught:
+        read_volume(folder)
+    assert isinstance(caught.value, NoDicomError if cut is cut_all else RefusedInputError)
+    volume = read_volume(folder, force=True)
+    assert np.array_equal(volume.voxels, PLAN.hu())
+    assert volume.report["warnings"] == [f"no meta header: read on demand, {ENCODINGS[name]} taken (all slices)"]
+    assert list_series(folder, force=True).series[0].slices == 3
+
+
+@pytest.mark.parametrize("cut", [cut_preamble, cut_zeros])
+@pytest.mark.parametrize("syntax", [*NATIVE.values(), JPEG2000Lossless])
+def test_row_36_a_meta_header_without_preamble_is_read_on_demand_alone(tmp_path, syntax, cut):
+    files = make_series(syntax)
+    whole = read_volume(write_cut(tmp_path / "whole", files, bytes))
+    folder = write_cut(tmp_path / "ct", files, cut)
+    with pytest.raises(NoDicomError, match="3 like a data set without preamble"):
+        read_volume(folder)
+    volume = read_volume(folder, force=True)
+    assert np.array_equal(volume.voxels, whole.voxels)
+    assert "no preamble: read on demand (all slices)" in volume.report["warnings"]
+
+
+def test_row_36_one_bare_slice_is_not_lost_in_silence(tmp_path):
+    folder = write_cut(tmp_path / "ct", make_series(NATIVE["explicit"]), bytes)
+    (folder / "2").write_bytes(cut_all((folder / "2").read_bytes()))
+    with pytest.raises(RefusedInputError, match=r"2: a data set without preamble \(force=True"):
+        read_volume(folder)
+    volume = read_volume(folder, force=True)
+    assert volume.voxels.shape[0] == 3
+    assert "explicit VR little endian taken (1 of 3 slices, at -397.50 mm)" in volume.report["warnings"][0]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"\x89PNG\r\n\x1a\n" + bytes(300), b"plain text\n" * 40, b"PK\x03\x04" + bytes(300), b"\x08\0", bytes(500)],
+)
+def test_row_36_force_makes_nothing_of_other_files(tmp_path, content):
+    (tmp_path / "file").write_bytes(content)
+    with pytest.raises(NoDicomError, match="no DICOM images"):
+        read_volume(tmp_path, force=True)
+
+
+def test_row_36_a_bare_enhanced_image_is_refused_with_its_reason(tmp_path):
+    (tmp_path / "image").write_bytes(cut_all(save_bytes(make_enhanced(PLAN))))
+    with pytest.raises(RefusedInputError, match="image: multi-frame image without preamble or meta header"):
+        read_volume(tmp_path, force=True)
+
+
+def test_row_36_on_the_command_line(tmp_path, capsys):
+    folder = write_cut(tmp_path / "ct", make_series(NATIVE["implicit"]), cut_all)
+    assert main(["info", str(folder)]) == 2
+    assert "--force" in capsys.readouterr().err
+    assert main(["info", str(folder), "--force"]) == 0
+    assert "implicit VR little endian taken" in capsys.readouterr().out
+
+
+def test_long_headers_and_cut_pixels(tmp_path):
+    """Bytes are counted in the file itself, not in what stands for its start."""
+    plan = Plan(shape=(3, 3, 4))
+    for k in range(3):
+        ds = make_dataset(plan, k)
+        ds.add_new(0x00091001, "OB", bytes(40_000))
+        save_dataset(ds, tmp_path / f"{k}")
+        (tmp_path / f"{k}").write_bytes(cut_all((tmp_path / f"{k}").read_bytes()))
+    assert np.array_equal(read_volume(tmp_path, force=True).voxels, plan.hu())
+    (tmp_path / "1").write_bytes((tmp_path / "1").read_bytes()[:-1])
+    with pytest.raises(RefusedInputError, match="1: truncated: 24 bytes of pixels expected .*, 23 found"):
+        read_volume(tmp_path, force=True)
+
+
+@pytest.mark.parametrize(("start", "kind"), [(b"MZ\x90\0", "Windows"), (b"\x7fELF\x02", "Linux")])
+def test_row_44_a_program_in_the_preamble_is_told(tmp_path, start, kind):
+    plan = write_series(tmp_path, Plan(name="{}".format))
+    for k in (0, 3):
+        data = (tmp_path / f"{k}").read_bytes()
+        (tmp_path / f"{k}").write_bytes(start + bytes(128 - len(start)) + data[128:])
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu())
+    said = f"the preamble starts a program ({kind}): neither run nor copied (2 of 7 slices, the first at -400.00 mm)"
+    assert volume.report["warnings"] == [said]
+
+
+def test_row_44_a_picture_in_the_preamble_is_nothing_odd(tmp_path):
+    """Files that are TIFF pictures too are a use that the standard names."""
+    plan = write_series(tmp_path, Plan(name="{}".format))
+    for k in range(7):
+        data = (tmp_path / f"{k}").read_bytes()
+        (tmp_path / f"{k}").write_bytes(b"II*\0" + bytes(124) + data[128:])
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu()) and volume.report["warnings"] == []

@@ -1,0 +1,120 @@
+"""Row 48 of the fault list: archives and other files in place of DICOM are named, never opened."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import lzma
+import tarfile
+import zipfile
+
+import pytest
+from dicom_series import Plan, write_series
+
+from clrecon.errors import NoDicomError
+from clrecon.mesh import Mesh
+from clrecon.reading.dicom import read_volume
+from clrecon.reading.dicom.series.foreign_files import advise_on, describe_container
+
+
+def make_zip(data):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("slice.dcm", data)
+    return file.getvalue()
+
+
+def make_tar(data):
+    file = io.BytesIO()
+    with tarfile.open(fileobj=file, mode="w") as archive:
+        info = tarfile.TarInfo("../slice.dcm")
+        info.size = len(data)
+        archive.addfile(info, io.BytesIO(data))
+    return file.getvalue()
+
+
+PACKED = {
+    "zip archive": make_zip,
+    "tar archive": make_tar,
+    "gzip file": gzip.compress,
+    "bzip2 file": bz2.compress,
+    "xz file": lzma.compress,
+}
+
+
+@pytest.mark.parametrize("kind", PACKED)
+def test_row_48_a_packed_series_is_named_with_what_to_do(tmp_path, kind):
+    plan = write_series(tmp_path / "ct", Plan(shape=(2, 5, 6)))
+    (tmp_path / "packed").write_bytes(PACKED[kind]((tmp_path / "ct" / plan.name(0)).read_bytes()))
+    with pytest.raises(NoDicomError, match=rf"1 file looked at \({kind}: 1\); unpack each {kind} and name the folder"):
+        read_volume(tmp_path / "packed")
+
+
+def test_row_48_an_archive_beside_the_slices_is_counted(tmp_path):
+    write_series(tmp_path, Plan(shape=(2, 5, 6)))
+    (tmp_path / "backup").write_bytes(make_zip(b"x"))
+    assert read_volume(tmp_path).report["files"]["skipped"] == {"zip archive": 1}
+
+
+@pytest.mark.parametrize(
+    ("start", "kind"),
+    [
+        (b"7z\xbc\xaf\x27\x1c", "7z archive"),
+        (b"Rar!\x1a\x07\x01\0", "rar archive"),
+        (b"\x89PNG\r\n\x1a\n", "PNG image"),
+        (b"\xff\xd8\xff\xe0", "JPEG image"),
+        (b"%PDF-1.7", "PDF document"),
+        (b"\x5c\x01\0\0" + bytes(340) + b"n+1\0", "NIfTI volume"),
+        (b"NRRD0004\n", "NRRD volume"),
+        (b"\x7fELF", "program"),
+        (b"plain text", ""),
+        (b"", ""),
+        (bytes(257), ""),
+    ],
+)
+def test_kinds(start, kind):
+    assert describe_container(start) == kind
+
+
+def test_a_mesh_in_place_of_a_scan_is_called_one(tmp_path):
+    mesh = Mesh([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
+    for extension, kind in ((".3mf", "3MF mesh"), (".glb", "GLB mesh")):
+        mesh.save(tmp_path / f"a{extension}")
+        with pytest.raises(NoDicomError, match=rf"\({kind}: 1\); a mesh is shown with clrecon render"):
+            read_volume(tmp_path / f"a{extension}")
+
+
+def test_advice_is_for_what_can_be_unpacked():
+    assert advise_on(["PNG image", "not DICOM"]) == ""
+    assert advise_on(["zip archive", "PNG image", "tar archive"]) == (
+        "unpack each tar archive and zip archive and name the folder"
+    )
+    assert advise_on(["NRRD volume", "MetaImage volume"]) == (
+        "a MetaImage volume or NRRD volume is read when the file itself is named"
+    )
+    assert advise_on(["gzip file"]).endswith("; a NIfTI volume (.nii.gz) is read when the file itself is named")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (
+            b"1 2 3\n4 5 6\n",
+            r"\(not DICOM: 1\); it is text, not a scan; scans are folders or files of DICOM, and NIfTI",
+        ),
+        (b"\xef\xbb\xbf1;2;3\r\n", "it is text, not a scan"),
+        (
+            b"\x93NUMPY\1\0v\0",
+            r"\(NumPy array: 1\); a NumPy array says no place in space.*; scans are folders or files",
+        ),
+        (
+            bytes(range(256)),
+            r"\(not DICOM: 1\); scans are folders or files of DICOM, and NIfTI, NRRD and MetaImage files$",
+        ),
+    ],
+)
+def test_a_single_file_is_named_as_what_it_is(tmp_path, content, words):
+    (tmp_path / "a.asc").write_bytes(content)
+    with pytest.raises(NoDicomError, match=words):
+        read_volume(tmp_path / "a.asc")

@@ -1,0 +1,321 @@
+"""Decoding in processes with limits: rows 38 (bombs) and 40 (garbage, decoder crash) of the fault list."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clrecon.reading.dicom.pixels import decoder_pool, decoder_process
+from clrecon.reading.dicom.pixels.decoder_pool import DecoderError, DecoderPool
+
+PIXELS = np.arange(12 * 9, dtype=np.int16).reshape(12, 9)
+LINUX = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="how processes end is looked up in /proc")
+
+
+def make_pool(*names, **limits):
+    return DecoderPool([f"hostile_decoders:{name}" for name in ("copy", *names)], PIXELS.nbytes, **limits)
+
+
+def decode(pool, name="copy"):
+    out = np.zeros_like(PIXELS)
+    pool.decode(PIXELS.tobytes(), f"hostile_decoders:{name}", out)
+    return out
+
+
+def is_alive(pid: int) -> bool:
+    """True while a process runs; a zombie does not count as one, and does as a fault where we are its parent."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_for_end(pids, seconds=10.0):
+    end = time.monotonic() + seconds
+    while any(map(is_alive, pids)) and time.monotonic() < end:
+        time.sleep(0.02)
+    return not any(map(is_alive, pids))
+
+
+def test_frames_come_back_as_they_went():
+    with make_pool() as pool:
+        assert np.array_equal(decode(pool), PIXELS)
+        assert np.array_equal(decode(pool), PIXELS)
+        assert len(pool.process_ids()) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("crash", r"crash the decoder \(signal 11\)"),
+        ("leave", r"crash the decoder \(exit code 7\)"),
+        ("give_another_shape", r"do not decode \(an image of shape \(13, 9\), int16\)"),
+        ("fail", r"do not decode \(ValueError: no such\\nmarker \\x1b\[31m\)"),
+    ],
+)
+def test_row_40_a_decoder_that_fails_is_one_error_and_the_next_frame_decodes(name, words):
+    with make_pool(name) as pool:
+        assert np.array_equal(decode(pool), PIXELS)
+        with pytest.raises(DecoderError, match=words):
+            decode(pool, name)
+        assert np.array_equal(decode(pool), PIXELS)
+
+
+def test_row_40_a_decoder_that_hangs_is_ended():
+    with make_pool("hang", seconds=1.5) as pool:
+        assert np.array_equal(decode(pool), PIXELS)
+        start = time.monotonic()
+        with pytest.raises(DecoderError, match=r"take longer than 1\.5 s to decode"):
+            decode(pool, "hang")
+        assert time.monotonic() - start < 10
+        assert np.array_equal(decode(pool), PIXELS)
+
+
+@LINUX
+def test_a_process_may_wait_for_its_next_frame():
+    """A disk or network drive may be slower than any decoder."""
+    with make_pool(seconds=0.9) as pool:
+        assert np.array_equal(decode(pool), PIXELS)
+        time.sleep(6.0)
+        assert np.array_equal(decode(pool), PIXELS)
+
+
+def test_time_in_which_the_whole_program_stood_still_counts_for_nothing(monkeypatch):
+    """Ctrl-Z and fg, or a debugger: the processes stood still with it."""
+    clock, stood_still = time.monotonic, [0.0]
+    monkeypatch.setattr(decoder_pool.time, "monotonic", lambda: clock() + stood_still[0])
+    with make_pool("nap", seconds=20.0) as pool:
+        stop = threading.Timer(0.5, lambda: stood_still.__setitem__(0, 1000.0))
+        stop.start()
+        assert np.array_equal(decode(pool, "nap"), PIXELS)
+        stop.join()
+        assert np.array_equal(decode(pool, "nap"), PIXELS)
+
+
+def test_row_38_a_decoder_that_takes_all_memory_is_stopped():
+    with make_pool("allocate", memory_bytes=100 * 2**20) as pool:
+        with pytest.raises(DecoderError, match="need more than 100 MiB of memory to decode"):
+            decode(pool, "allocate")
+        assert np.array_equal(decode(pool), PIXELS)
+
+
+def test_limits_grow_with_the_frame():
+    small, large = DecoderPool([], 512 * 512 * 2), DecoderPool([], 8192 * 8192 * 2)
+    assert 60 <= small.seconds < 61 and 2**28 <= small.memory_bytes < 2**29
+    assert 180 < large.seconds < 200 and 2**32 <= large.memory_bytes < 2**33
+
+
+def test_what_a_decoder_prints_disturbs_nothing(capfd):
+    with make_pool("print_much") as pool:
+        assert np.array_equal(decode(pool, "print_much"), PIXELS)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_decoder_that_cannot_be_imported_is_said():
+    with (
+        DecoderPool(["no_such_module:decode"], 8) as pool,
+        pytest.raises(DecoderError, match=r"does not start \(ModuleNotFoundError: No module named 'no_such_module'\)"),
+    ):
+        pool.decode(b"", "no_such_module:decode", np.zeros((1, 1), np.int16))
+
+
+@pytest.mark.parametrize("executable", ["/no/such/python", "", "/bin/false"])
+def test_no_process_is_an_error_and_nothing_decodes_here(monkeypatch, executable):
+    monkeypatch.setattr(sys, "executable", executable)
+    words = r"no process can be started|has none|the process for it does not start \(exit code 1\)"
+    with make_pool() as pool:
+        with pytest.raises(DecoderError, match=words):
+            decode(pool)
+        assert pool.process_ids() == []
+
+
+@LINUX
+def test_processes_inherit_no_handles_and_leave_none(tmp_path):
+    before = sorted(os.listdir("/proc/self/fd"))
+    with open(tmp_path / "secret", "w") as file:
+        os.set_inheritable(file.fileno(), True)
+        with make_pool("list_handles") as pool:
+            handles = decode(pool, "list_handles")
+            # Standard input, output, errors, replies, the lifeline, and the folder that is being listed.
+            assert np.count_nonzero(handles) == 5
+            pids = pool.process_ids()
+    assert not any(Path(f"/proc/{pid}").exists() for pid in pids)  # no zombie either
+    assert sorted(os.listdir("/proc/self/fd")) == before
+
+
+@LINUX
+def test_many_threads_have_a_process_each_and_all_end():
+    with make_pool() as pool:
+        barrier = threading.Barrier(3)
+        results: list = []
+
+        def work():
+            barrier.wait()
+            results.extend(np.array_equal(decode(pool), PIXELS) for _ in range(20))
+
+        threads = [threading.Thread(target=work) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        pids = pool.process_ids()
+    assert results == [True] * 60 and 1 <= len(pids) <= 3
+    assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
+
+
+def test_stopping_ends_a_decoder_in_another_thread():
+    with make_pool("hang") as pool:
+        caught = []
+
+        def work():
+            try:
+                decode(pool, "hang")
+            except DecoderError as error:
+                caught.append(str(error))
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        time.sleep(0.3)
+        pool.kill()
+        thread.join(10)
+        assert caught == ["are not decoded: reading was stopped"]
+        with pytest.raises(DecoderError, match="reading was stopped"):
+            decode(pool)
+
+
+SCRIPT = """
+import sys, threading, time
+import numpy as np
+sys.path[:0] = {path!r}
+from clrecon.reading.dicom.pixels.decoder_pool import DecoderPool
+pool = DecoderPool(["hostile_decoders:copy", "hostile_decoders:hang"], 16)
+out = np.zeros((2, 2), np.int16)
+pool.decode(bytes(8), "hostile_decoders:copy", out)
+threading.Thread(target=pool.decode, args=(bytes(8), {name!r}, out), daemon=True).start()
+time.sleep(0.2)
+print(*pool.process_ids(), flush=True)
+time.sleep(60)
+"""
+
+
+STREAMS_CLOSED = """
+import os, sys
+sys.path[:0] = {path!r}
+for number in {numbers!r}:
+    os.close(number)
+import numpy as np
+from clrecon.reading.dicom.pixels.decoder_pool import DecoderPool
+out = np.zeros((2, 2), np.int16)
+with DecoderPool(["hostile_decoders:copy"], 16) as pool:
+    pool.decode(bytes(range(8)), "hostile_decoders:copy", out)
+    pool.decode(bytes(range(8)), "hostile_decoders:copy", out)
+os._exit(0 if out.tobytes() == bytes(range(8)) else 9)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="numbers of open files")
+@pytest.mark.parametrize("numbers", [(0,), (1,), (0, 1, 2), (0, 2)])
+def test_closed_standard_streams_disturb_nothing(numbers):
+    """Services start programs so; what is opened next takes the numbers of the streams."""
+    code = STREAMS_CLOSED.format(path=[entry for entry in sys.path if entry], numbers=numbers)
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+def test_no_module_comes_from_the_current_folder(tmp_path, monkeypatch):
+    """A folder of scans is anybody's: a numpy.py in it must not run."""
+    (tmp_path / "numpy.py").write_text("open('ran', 'w')")
+    (tmp_path / "own_decoder.py").write_text("open('ran', 'w')")
+    monkeypatch.chdir(tmp_path)
+    for entry in ("", ".", str(tmp_path)):
+        monkeypatch.setattr(sys, "path", [entry, *sys.path])
+    with make_pool() as pool:
+        assert np.array_equal(decode(pool), PIXELS)
+    with DecoderPool(["own_decoder:decode"], 8) as pool, pytest.raises(DecoderError, match="No module named"):
+        pool.decode(b"", "own_decoder:decode", np.zeros((1, 1), np.int16))
+    assert not (tmp_path / "ran").exists()
+
+
+@LINUX
+@pytest.mark.parametrize("name", ["hostile_decoders:copy", "hostile_decoders:hang"], ids=["idle", "in a decoder"])
+def test_processes_end_with_a_parent_that_is_killed(name):
+    """A script without a guard around its start, killed while its decoder is idle or at work."""
+    code = SCRIPT.format(path=[entry for entry in sys.path if entry], name=name)
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
+        pids = [int(word) for word in parent.stdout.readline().split()]
+        assert len(pids) == 1 and is_alive(pids[0])
+        parent.kill()
+        assert wait_for_end(pids)
+
+
+def test_the_process_imports_neither_clrecon_nor_pydicom():
+    code = Path(decoder_pool.SCRIPT).read_text(encoding="utf-8")
+    assert "import clrecon" not in code and "from clrecon" not in code and "pydicom import" not in code
+
+
+@LINUX
+def test_the_lifeline_tells_this_process_when_its_other_end_closes():
+    """The steps of the process, taken in this one, which is told by the same signal and does not end."""
+    import fcntl
+
+    told = []
+    before = signal.signal(signal.SIGIO, lambda number, frame: told.append(number))
+    ours, theirs = os.pipe()
+    try:
+        fcntl.fcntl(ours, fcntl.F_SETFL, fcntl.fcntl(ours, fcntl.F_GETFL) | os.O_NONBLOCK)
+        decoder_process.end_with(ours)
+        assert fcntl.fcntl(ours, fcntl.F_GETFL) & os.O_ASYNC and not os.get_blocking(ours)
+        assert fcntl.fcntl(ours, fcntl.F_GETOWN) == os.getpid() and not told
+        os.close(theirs)
+        assert told == [signal.SIGIO]
+        with monkeypatch_exit() as codes:
+            decoder_process.end_with(ours)
+        assert codes == [1]  # it had ended before we asked
+    finally:
+        os.close(ours)
+        signal.signal(signal.SIGIO, before)
+
+
+@contextmanager
+def monkeypatch_exit():
+    codes: list[int] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "_exit", codes.append)
+        yield codes
+
+
+@pytest.mark.parametrize(("lifeline", "is_orphan"), [(-1, True), (0, False), (3, False)])
+def test_only_a_process_without_a_lifeline_needs_the_alarm(monkeypatch, lifeline, is_orphan):
+    """The main function in this process, with what changes the process itself put aside."""
+    settings = {"path": sys.path, "decoders": ["hostile_decoders:copy"], "memory_bytes": 1, "seconds": 4.0}
+    request = {"decoder": "hostile_decoders:copy", "dtype": "<i2", "rows": 12, "columns": 9, "length": PIXELS.nbytes}
+    lines = f"{json.dumps(settings)}\n{json.dumps(request)}\n".encode()
+    source, sink = io.BytesIO(lines + PIXELS.tobytes()), io.BytesIO()
+    limits: list[object] = []
+    alarms: list[int] = []
+    for name, aside in {
+        "end_with": lambda number: None,
+        "take_standard_output": lambda: sink,
+        "limit_memory": lambda count: limits.append(count),
+        "limit_time": lambda *arguments: limits.append(arguments),
+    }.items():
+        monkeypatch.setattr(decoder_process, name, aside)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr(signal, "alarm", alarms.append)
+    monkeypatch.setattr(sys, "argv", ["decoder_process.py", str(lifeline)])
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(source))
+    decoder_process.main()
+    assert limits == [1, (4.0, is_orphan)] and alarms == [0]
+    head = struct.pack(decoder_process.REPLY, decoder_process.READY, 0)
+    assert sink.getvalue() == head + struct.pack(decoder_process.REPLY, decoder_process.DONE, 216) + PIXELS.tobytes()

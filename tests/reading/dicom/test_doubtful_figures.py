@@ -1,0 +1,167 @@
+"""Figures that no scanner writes: told with the figure, and a gate fails."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from dicom_series import Plan, set_values, write_series
+
+from clrecon.reading.dicom import list_series, read_volume
+
+
+def judge(folder):
+    """Warnings, and names of the gates that fail."""
+    report = read_volume(folder).report
+    return report["warnings"], [gate["name"] for gate in report["gates"] if gate["ok"] is False]
+
+
+# --- spacing and thickness ---
+@pytest.mark.parametrize(
+    ("plan", "gate", "words"),
+    [
+        (Plan(pixel_spacing=(0.003, 0.003)), "plausible_spacing", "(pixels of 0.003 mm): 1, none allowed"),
+        (Plan(pixel_spacing=(12.0, 11.0)), "plausible_spacing", "(pixels of 11 mm, pixels of 12 mm): 2"),
+        (Plan(gap=1000.0), "gap_thickness", "(1000 mm at a thickness of 5 mm): 200, at most 2"),
+        (Plan(gap=10.5), "gap_thickness", "(10.5 mm at a thickness of 5 mm): 2.1, at most 2"),
+        (Plan(pixel_spacing=(0.006, 0.006), gap=0.006), None, ""),
+        (Plan(gap=9.9), None, ""),
+    ],
+    ids=["too small", "too large", "a metre", "over twice", "micro-CT", "under twice"],
+)
+def test_spacings(tmp_path, plan, gate, words):
+    write_series(tmp_path, plan)
+    warnings, failed = judge(tmp_path)
+    assert (gate in failed) if gate else not {"plausible_spacing", "gap_thickness"} & set(failed)
+    assert not gate or any(words in text for text in warnings), warnings
+
+
+def test_headers_alone_tell_spacings_and_rescale(tmp_path):
+    write_series(tmp_path, Plan(pixel_spacing=(0.003, 0.003)), set_values(RescaleSlope=-1))
+    certificate = list_series(tmp_path).certificate
+    failed = {gate["name"] for gate in certificate["gates"] if gate["ok"] is False}
+    assert failed == {"plausible_spacing", "plausible_hu"}
+    assert any("(RescaleSlope -1): 1, none allowed" in text for text in certificate["warnings"])
+
+
+def test_a_thickness_that_is_not_stated(tmp_path):
+    write_series(tmp_path, Plan(gap=30.0), set_values(SliceThickness=None))
+    assert judge(tmp_path)[1] == []
+
+
+# --- HU ---
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"RescaleSlope": -1}, "RescaleSlope -1"),
+        ({"RescaleSlope": 100000}, "RescaleSlope 100000; lowest voxel 8.9999e+07 HU, expected -10000 to 1000; d"),
+        ({"RescaleIntercept": 100000}, "RescaleIntercept 100000; lowest voxel 100900 HU, expected -10000 to 1000; d"),
+        ({"RescaleIntercept": -15000}, "lowest voxel -14100 HU, expected -10000 to 1000; densest voxel -13831 HU"),
+        ({"RescaleSlope": 0.5}, None),
+        ({"RescaleSlope": 8, "RescaleIntercept": -8192}, None),
+    ],
+)
+def test_rescale_and_range(tmp_path, values, words):
+    write_series(tmp_path, change=set_values(**values))
+    warnings, failed = judge(tmp_path)
+    assert ("plausible_hu" in failed) == (words is not None)
+    assert words is None or any(words in text for text in warnings), warnings
+
+
+def test_one_slice_with_another_slope(tmp_path):
+    write_series(tmp_path, change=set_values(only=3, RescaleSlope=-1))
+    warnings, failed = judge(tmp_path)
+    assert "plausible_hu" in failed and any("RescaleSlope -1" in text for text in warnings)
+
+
+# --- bits above HighBit ---
+def set_stored(values, **elements):
+    def change(ds, k):
+        ds.PixelData = values(np.frombuffer(ds.PixelData, "i2").reshape(5, 6).astype(int), k).astype("<u2").tobytes()
+        set_values(**elements)(ds, k)
+
+    return change
+
+
+def put(value, count, only=3):
+    """`value` in place of the first values of a slice."""
+
+    def change(stored, k):
+        if k == only:
+            stored.flat[:count] = value
+        return stored
+
+    return change
+
+
+def twelve_bits(signed):
+    return Plan(bits_stored=12, signed=signed)
+
+
+def test_values_beyond_the_stored_bits_are_told(tmp_path):
+    write_series(tmp_path, twelve_bits(False), set_stored(put(4200, 29)))
+    warnings, failed = judge(tmp_path)
+    assert failed == ["stored_bits"]
+    assert warnings == [
+        "values beyond the 12 stored bits (bits above HighBit 11, neither sign nor overlay) in 1 of the slices, cut "
+        "off, so that their HU wrap around (stored 4200 is read as 104): 29, none allowed"
+    ]
+
+
+def test_large_values_beside_signs_that_go_on_are_told(tmp_path):
+    """3000 has the highest of 12 bits set: where others are negative to bit 15 it is no negative number."""
+
+    def both(stored, k):
+        stored.flat[:4] = -1000
+        stored.flat[4:7] = 3000
+        return stored
+
+    write_series(tmp_path, twelve_bits(True), set_stored(both))
+    warnings, failed = judge(tmp_path)
+    assert failed == ["stored_bits"] and "(stored 3000 is read as -1096): 21, none allowed" in warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("plan", "change"),
+    [
+        (twelve_bits(True), set_stored(put(-1000, 9))),
+        (twelve_bits(True), set_stored(put(-1000 & 0x0FFF, 9))),
+        (twelve_bits(True), set_stored(put(-3000 & 0xFFFF, 9), PixelPaddingValue=-3000)),
+        (twelve_bits(False), set_stored(put(63536, 9), PixelPaddingValue=63536)),
+        (twelve_bits(False), set_stored(put(4095, 5))),
+        (Plan(bits_stored=12, signed=False), set_stored(lambda s, k: (s << 4) | 0x9, HighBit=15)),
+    ],
+    ids=["sign", "sign of 12 bits alone", "padding", "padding without sign", "ceiling", "high bits"],
+)
+def test_signs_and_padding_are_no_stray_bits(tmp_path, plan, change):
+    write_series(tmp_path, plan, change)
+    assert "stored_bits" not in judge(tmp_path)[1]
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_overlays_count_where_the_header_says_where_they_are(tmp_path, signed):
+    def mark(stored, k):
+        return (stored - 1000 * signed & 0x0FFF) | 0x5000 * (np.arange(30).reshape(5, 6) % 7 == 0)
+
+    def declare(ds, k):
+        set_stored(mark)(ds, k)
+        for group, bit in ((0x6000, 12), (0x6002, 14)):
+            ds.add_new((group, 0x0100), "US", 16)
+            ds.add_new((group, 0x0102), "US", bit)
+
+    plan = twelve_bits(signed)
+    write_series(tmp_path / "declared", plan, declare)
+    warnings, failed = judge(tmp_path / "declared")
+    assert "stored_bits" not in failed
+    write_series(tmp_path / "silent", plan, set_stored(mark))
+    assert "stored_bits" in judge(tmp_path / "silent")[1]
+    same = [read_volume(tmp_path / name).voxels for name in ("declared", "silent")]
+    assert np.array_equal(*same) and np.array_equal(same[0], plan.hu() - 1000 * signed)
+
+
+@pytest.mark.parametrize(
+    "folder", ["lumbar_4p25mm", "thoracic_0p8mm", "head_tilt_gaps", "thoracolumbar_labels/ct_2mm_jpeg2000"]
+)
+def test_real_scans_have_plausible_figures(real_data, folder):
+    report = read_volume(real_data / folder).report
+    names = {"plausible_spacing", "gap_thickness", "plausible_hu", "stored_bits"}
+    assert {gate["name"]: gate["ok"] for gate in report["gates"] if gate["name"] in names} == dict.fromkeys(names, True)

@@ -1,0 +1,312 @@
+"""The plain parser answers what the careful one (pydicom) answers, or nothing; reads of the start of a file."""
+
+from __future__ import annotations
+
+import io
+import os
+import random
+import struct
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pydicom
+import pytest
+from dicom_series import Plan, make_dataset, save_dataset, write_series
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydicom.datadict import DicomDictionary
+from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian, ImplicitVRLittleEndian
+from pydicom.valuerep import EXPLICIT_VR_LENGTH_16, EXPLICIT_VR_LENGTH_32
+
+from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading.dicom.parse import elements, plain
+from clrecon.reading.dicom.parse import transfer_syntaxes as codecs
+from clrecon.reading.dicom.parse.elements import parse_carefully
+from clrecon.reading.dicom.parse.plain import CorruptFileError
+from clrecon.reading.dicom.parse.values import WANTED_TAGS
+
+CORPUS = Path(pydicom.__file__).parent / "data" / "test_files"
+MUTATIONS = 6000
+TOKENS = [
+    bytes.fromhex(digits)
+    for digits in (
+        "feff00e0 feff0de0 feffdde0 feff00e0ffffffff feff0de000000000 feffdde000000000 ffffffff e07f1000 e07f0800"
+        " 08000500 53510000ffffffff 554e0000ffffffff e17f1000 4f57 554e 0000 1000"
+    ).split()
+]
+"""What mutations put in: delimiters, undefined lengths, pixel tags, a character set, value representations."""
+
+
+def check_alike(data: bytes, size: int) -> bool:
+    """True where the plain parser answers; then the careful one gives the same."""
+    found = plain.parse_plainly(data, size, WANTED_TAGS)
+    if found is None:
+        return False
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            expected = parse_carefully(io.BytesIO(data), size, WANTED_TAGS)
+        except (CorruptFileError, OSError) as error:
+            pytest.fail(f"the careful parser refuses ({error}) what the plain one reads: {data.hex()}")
+    assert found == expected
+    return True
+
+
+def corpus() -> dict[str, bytes]:
+    """pydicom's own files with the mark of DICOM: the header and a little more."""
+    found = {}
+    for path in sorted(CORPUS.rglob("*")):
+        if path.is_file():
+            data = path.read_bytes()
+            if data[128:132] == b"DICM":
+                found[str(path.relative_to(CORPUS))] = data
+    return found
+
+
+def test_the_tables_are_those_of_pydicom() -> None:
+    assert set(plain.SHORT_VRS.values()) == {str(vr) for vr in EXPLICIT_VR_LENGTH_16}
+    assert set(plain.LONG_VRS.values()) == {str(vr) for vr in EXPLICIT_VR_LENGTH_32}
+    assert {DicomDictionary[tag][0] for tag in plain.SEQUENCE_TAGS} == {"SQ"}
+    assert not any(tag >> 16 & 1 for tag in DicomDictionary)  # private elements are known by their items alone
+    assert plain.CHARACTER_SET in WANTED_TAGS
+    assert all(UID(uid).name == name for uid, name in codecs.SYNTAX_NAMES.items())
+    assert not any(codecs.describe_undecodable(uid) for uid in codecs.SYNTAX_NAMES)
+
+
+def test_files_of_pydicom_give_the_same() -> None:
+    files = corpus()
+    taken = [name for name, data in files.items() if check_alike(data, len(data))]
+    assert len(files) > 120
+    assert len(taken) > len(files) // 2
+    assert {"CT_small.dcm", "MR_small.dcm", "MR_small_implicit.dcm", "J2K_pixelrep_mismatch.dcm"} <= set(taken)
+
+
+@pytest.mark.fuzz
+def test_mutated_files_give_the_same_or_nothing() -> None:
+    bases = []
+    for data in corpus().values():
+        found = plain.parse_plainly(data, len(data), WANTED_TAGS)
+        if found is not None:
+            bases.append(data[: found.pixel_offset + 40])
+    dice = random.Random(46)
+    taken = 0
+    for _ in range(MUTATIONS):
+        mutated = bytearray(dice.choice(bases))
+        for _ in range(dice.choice((1, 1, 1, 2, 3, 6))):
+            mutate(mutated, dice)
+        taken += check_alike(bytes(mutated), len(mutated) + dice.choice((0, 5000)))
+    assert MUTATIONS // 10 < taken < MUTATIONS * 9 // 10
+
+
+def mutate(data: bytearray, dice: random.Random) -> None:
+    place = dice.randrange(128, len(data)) if len(data) > 200 else 128
+    kind = dice.randrange(6)
+    token = dice.choice(TOKENS)
+    if kind == 0:
+        data[place] = dice.randrange(256)
+    elif kind == 1:
+        data[place : place + len(token)] = token
+    elif kind == 2:
+        data[place:place] = token
+    elif kind == 3:
+        del data[place : place + dice.choice((1, 2, 4, 8, 20))]
+    elif kind == 4:
+        other = dice.randrange(128, len(data))
+        data[place:place] = data[other : other + dice.choice((8, 12, 16, 40, 100))]
+    else:
+        data[place] ^= 1 << dice.randrange(8)
+
+
+def encode(tag: tuple[int, int], vr: bytes, value: bytes, implicit: bool, length: int | None = None) -> bytes:
+    """One element; `length` in place of the true one."""
+    length = len(value) if length is None else length
+    if implicit:
+        return struct.pack("<HHL", *tag, length) + value
+    if vr in plain.SHORT_VRS:
+        return struct.pack("<HH2sH", *tag, vr, length & 0xFFFF) + value
+    return struct.pack("<HH2sHL", *tag, vr, 0, length) + value
+
+
+def wrap(body: bytes, implicit: bool) -> bytes:
+    """A whole file around the elements of `body`."""
+    syntax = b"1.2.840.10008.1.2\0" if implicit else b"1.2.840.10008.1.2.1\0"
+    meta = encode((2, 0x0002), b"UI", b"1.2.840.10008.5.1.4.1.1.2\0", False)
+    meta += encode((2, 0x0010), b"UI", syntax, False)
+    return bytes(128) + b"DICM" + meta + body + encode((0x7FE0, 0x0010), b"OW", bytes(8), implicit)
+
+
+TAGS = st.sampled_from(
+    [(tag >> 16, tag & 0xFFFF) for tag in (*WANTED_TAGS, 0x00081110, 0x00081140, 0x00400275, 0x00080016)]
+    + [(0x0009, 0x0010), (0x0029, 0x1010), (0x7FE1, 0x0010), (0x7FE0, 0x0001), (0x6000, 0x3000), (0x0008, 0x9999)]
+)
+VRS = st.sampled_from([b"CS", b"DS", b"UI", b"US", b"LO", b"SQ", b"UN", b"OB", b"OW", b"UT", b"ZZ", b"\0\0"])
+VALUES = st.binary(max_size=12).map(lambda value: value + bytes(len(value) % 2))
+
+
+@st.composite
+def element_bytes(draw: st.DrawFn, implicit: bool, depth: int = 3) -> bytes:
+    tag, vr = draw(TAGS), draw(VRS)
+    if draw(st.integers(0, 15)) == 0:
+        return struct.pack("<HHL", 0xFFFE, draw(st.sampled_from([0xE000, 0xE00D, 0xE0DD])), 0)
+    if depth == 0 or draw(st.integers(0, 2)):
+        wrong = draw(st.sampled_from([None] * 12 + [0, 2, 0xFFFFFFFF]))
+        return encode(tag, vr, draw(VALUES), implicit, wrong)
+    items = b""
+    for _ in range(draw(st.integers(0, 2))):
+        content = b"".join(draw(st.lists(element_bytes(implicit, depth - 1), max_size=3)))
+        if draw(st.booleans()):
+            items += struct.pack("<HHL", 0xFFFE, 0xE000, 0xFFFFFFFF) + content
+            items += struct.pack("<HHL", 0xFFFE, 0xE00D, draw(st.sampled_from([0, 0, 0, 0, 8])))
+        else:
+            off = draw(st.sampled_from([0] * 10 + [-2, 2, 8]))
+            items += struct.pack("<HHL", 0xFFFE, 0xE000, max(len(content) + off, 0)) + content
+    tag = draw(st.sampled_from([(0x0008, 0x1110), (0x0040, 0x0275), (0x0009, 0x1010), (0x6000, 0x3000), tag]))
+    vr = draw(st.sampled_from([b"SQ", b"SQ", b"SQ", vr]))
+    if draw(st.booleans()):
+        return encode(tag, vr, items, implicit)
+    end = struct.pack("<HHL", 0xFFFE, 0xE0DD, 0)
+    return encode(tag, vr, items + draw(st.sampled_from([end] * 6 + [b""])), implicit, 0xFFFFFFFF)
+
+
+@pytest.mark.fuzz
+@settings(max_examples=300, deadline=None)
+@given(data=st.data(), implicit=st.booleans())
+def test_built_headers_give_the_same_or_nothing(data: st.DataObject, implicit: bool) -> None:
+    whole = wrap(b"".join(data.draw(st.lists(element_bytes(implicit), max_size=6))), implicit)
+    check_alike(whole, len(whole))
+
+
+def item(content: bytes, defined: bool = True) -> bytes:
+    if defined:
+        return struct.pack("<HHL", 0xFFFE, 0xE000, len(content)) + content
+    return struct.pack("<HHL", 0xFFFE, 0xE000, 0xFFFFFFFF) + content + struct.pack("<HHL", 0xFFFE, 0xE00D, 0)
+
+
+def nest(levels: int, implicit: bool = False) -> bytes:
+    content = b""
+    for _ in range(levels):
+        content = encode((0x0008, 0x1110), b"SQ", item(content, False) + SEQUENCE_END, implicit, 0xFFFFFFFF)
+    return content
+
+
+SEQUENCE_END = struct.pack("<HHL", 0xFFFE, 0xE0DD, 0)
+ITEM_END = struct.pack("<HHL", 0xFFFE, 0xE00D, 0)
+NAME = encode((0x0008, 0x0060), b"CS", b"CT", True)
+NESTED_CHARSET = encode((0x0008, 0x0005), b"CS", b"x\0y ", False)
+
+
+def sequence(items: bytes, implicit: bool, tag: tuple[int, int] = (0x0008, 0x1110)) -> bytes:
+    return encode(tag, b"SQ", items + SEQUENCE_END, implicit, 0xFFFFFFFF)
+
+
+DOUBTFUL = {
+    "a character set inside, which pydicom refuses": (False, sequence(item(NESTED_CHARSET), False)),
+    "an item that ends before its length": (True, sequence(item(ITEM_END + NAME), True)),
+    "an element over the end of its item": (True, sequence(item(NAME)[:-2] + NAME[8:] + b"..", True)),
+    "no item in a sequence": (True, sequence(NAME, True)),
+    "a delimiter between elements": (True, ITEM_END),
+    "nested deeper than anybody writes": (False, nest(plain.DEEPEST + 1)),
+    "bytes of undefined length": (
+        False,
+        encode((0x0009, 0x1010), b"OB", item(b"1234") + SEQUENCE_END, False, 0xFFFFFFFF),
+    ),
+    "an unknown element of undefined length": (True, sequence(item(NAME), True, (0x6000, 0x3000))),
+    "an unknown representation": (False, encode((0x0009, 0x1010), b"ZZ", b"1234", False)),
+    "a character set that pydicom looks up": (False, NESTED_CHARSET),
+    "explicit under implicit": (True, encode((0x0008, 0x0060), b"CS", b"CT", False)),
+    "implicit under explicit": (False, NAME),
+}
+
+
+@pytest.mark.parametrize("case", DOUBTFUL)
+def test_what_is_in_doubt_is_left_open(case: str) -> None:
+    implicit, doubtful = DOUBTFUL[case]
+    assert plain.parse_plainly(wrap(b"", implicit), 500, WANTED_TAGS) is not None
+    assert plain.parse_plainly(wrap(doubtful, implicit), 500, WANTED_TAGS) is None
+
+
+def test_as_deep_as_the_plain_parser_goes() -> None:
+    assert check_alike(wrap(nest(plain.DEEPEST), False), 5000)
+    assert check_alike(wrap(nest(plain.DEEPEST, implicit=True), True), 5000)
+
+
+@pytest.mark.parametrize("syntax", [plain.IMPLICIT_LITTLE, "1.2.840.10008.1.2.1"])
+def test_sequences_of_undefined_length_are_plain(tmp_path: Path, syntax: str) -> None:
+    """The quick way is taken for them: nearly every archive writes some."""
+    ds = make_dataset(Plan(syntax=syntax), 0)
+    inner = pydicom.Dataset()
+    inner.ReferencedSOPInstanceUID = "1.2.3"
+    inner.is_undefined_length_sequence_item = True
+    block = ds.private_block(0x0009, "clrecon test", create=True)
+    for tag in (0x00081110, block.get_tag(0x10)):
+        ds.add_new(tag, "SQ", [inner, pydicom.Dataset()])
+        ds[tag].is_undefined_length = True
+    save_dataset(ds, tmp_path / "file")
+    data = (tmp_path / "file").read_bytes()
+    assert data.count(b"\xff\xff\xff\xff") == 4
+    assert check_alike(data, len(data))
+
+
+@pytest.mark.parametrize("cut", range(1, 12))
+def test_a_header_that_is_not_whole_is_left_open(tmp_path: Path, cut: int) -> None:
+    write_series(tmp_path, Plan(shape=(1, 4, 4)))
+    data = (tmp_path / "slice000.dcm").read_bytes()
+    end = plain.parse_plainly(data, len(data), WANTED_TAGS).pixel_offset
+    assert plain.parse_plainly(data[: end - cut], len(data), WANTED_TAGS) is None
+    assert check_alike(data[:end], len(data))
+
+
+@pytest.mark.parametrize("large", [20_000, 300_000])
+def test_headers_longer_than_what_is_read_first(tmp_path: Path, large: int) -> None:
+    """Longer than the first prefix; longer than the second too."""
+
+    def change(ds: pydicom.Dataset, k: int) -> None:
+        ds.private_block(0x0009, "clrecon test", create=True).add_new(0x10, "OB", bytes(large))
+
+    plan = write_series(tmp_path, change=change)
+    assert (read_volume(tmp_path).voxels == plan.hu()).all()
+
+
+@pytest.mark.parametrize(
+    ("syntax", "careful"),
+    [
+        (plain.IMPLICIT_LITTLE, False),
+        ("1.2.840.10008.1.2.1", False),
+        (DeflatedExplicitVRLittleEndian, True),
+    ],
+)
+def test_what_takes_long_to_load_is_loaded_only_where_it_is_needed(tmp_path: Path, syntax: str, careful: bool) -> None:
+    write_series(tmp_path, Plan(syntax=syntax))
+    code = "import sys, clrecon; clrecon.read_volume(sys.argv[1]); print([n in sys.modules for n in sys.argv[2:]])"
+    environment = {**os.environ, "PYTHONPATH": str(Path(elements.__file__).parents[4])}
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path), "pydicom", "numpy.ma", "clrecon.anatomy.iso_choice"],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=True,
+    )
+    assert done.stdout.strip() == str([careful, False, False])
+
+
+@pytest.mark.parametrize(
+    "charset", ["ISO_IR 100", "NOT_A_CHARSET", "ISO 2022 IR 6\\ISO 2022 IR 87", "\\ISO 2022 IR 149", "UTF-8", "latin1 "]
+)
+def test_row_46_a_bad_character_set_spoils_no_image(tmp_path: Path, charset: str) -> None:
+    from dicom_series import set_raw
+
+    plan = write_series(tmp_path, change=set_raw("SpecificCharacterSet", charset))
+    for file in tmp_path.iterdir():
+        check_alike(file.read_bytes(), file.stat().st_size)
+    assert (read_volume(tmp_path).voxels == plan.hu()).all()
+    assert list_series(tmp_path).series[0].description == "series 1"
+
+
+def test_what_is_not_plain_is_left_to_the_careful_parser(tmp_path: Path) -> None:
+    for syntax in (ImplicitVRLittleEndian, DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian):
+        ds = make_dataset(Plan(syntax=syntax), 0)
+        save_dataset(ds, tmp_path / "file")
+        data = (tmp_path / "file").read_bytes()
+        assert check_alike(data, len(data)) == (syntax == ImplicitVRLittleEndian)

@@ -1,0 +1,126 @@
+"""Float and Double Float Pixel Data, and row 32 of the fault list: volumes that hold no image."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from dicom_series import Plan, set_values, write_series
+from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian, ImplicitVRLittleEndian
+from stored_pixels import set_pixels
+
+from clrecon.errors import RefusedInputError
+from clrecon.reading.dicom import read_volume
+
+
+def set_floats(make, width=32, **values):
+    """A change that puts Float (or Double Float) Pixel Data in place of Pixel Data: -1024 HU up in steps of 0.5."""
+
+    def change(ds, k):
+        array = (np.frombuffer(ds.PixelData, np.int16).astype(f"f{width // 8}") * 0.5 - 1474).reshape(5, 6)
+        del ds.PixelData, ds.BitsStored, ds.HighBit, ds.PixelRepresentation, ds.RescaleSlope, ds.RescaleIntercept
+        ds.BitsAllocated = width
+        keyword = "FloatPixelData" if width == 32 else "DoubleFloatPixelData"
+        setattr(ds, keyword, np.ascontiguousarray(make(array, k)).tobytes())
+        set_values(**values)(ds, k)
+
+    return change
+
+
+def keep(array, k):
+    return array
+
+
+@pytest.mark.parametrize("width", [32, 64])
+@pytest.mark.parametrize("syntax", [ExplicitVRLittleEndian, ImplicitVRLittleEndian, DeflatedExplicitVRLittleEndian])
+def test_float_pixels_are_hu(tmp_path, width, syntax):
+    plan = write_series(tmp_path, Plan(syntax=syntax), set_floats(keep, width))
+    volume = read_volume(tmp_path)
+    assert volume.voxels.dtype == np.float32
+    assert np.array_equal(volume.voxels, (plan.hu() + 1024) * 0.5 - 1474)
+    assert volume.report["hu_range"] == [-1024, volume.voxels.max()]
+
+
+@pytest.mark.parametrize("width", [32, 64])
+@pytest.mark.parametrize(("value", "limit"), [(-3000.5, None), (-3000.5, -2990), (np.nan, None)])
+def test_float_padding_becomes_air(tmp_path, width, value, limit):
+    def pad(array, k):
+        array[0, :3] = value
+        if limit is not None:
+            array[0, 1] = -2995
+        return array
+
+    prefix = "" if width == 32 else "Double"
+    values = {f"{prefix}FloatPixelPaddingValue": value}
+    if limit is not None:
+        values[f"{prefix}FloatPixelPaddingRangeLimit"] = limit
+    plan = write_series(tmp_path, change=set_floats(pad, width, **values))
+    volume = read_volume(tmp_path)
+    expected = (plan.hu() + 1024) * 0.5 - 1474
+    expected[:, 0, :3] = volume.report["padding_hu"]
+    assert -1024 <= volume.report["padding_hu"] <= -900
+    assert np.array_equal(volume.voxels, expected)
+    assert volume.report["padding_share"] == pytest.approx(3 / 30)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (np.nan, "1 NaN and 0 infinite values of 30"),
+        (-np.inf, "0 NaN and 1 infinite values of 30"),
+        (3e38, "values from -964 to 3e\\+38"),
+    ],
+)
+def test_row_32_nan_and_infinite_voxels(tmp_path, value, words):
+    def spoil(array, k):
+        if k == 3:
+            array[2, 2] = value
+        return array
+
+    write_series(tmp_path, change=set_floats(spoil))
+    with pytest.raises(RefusedInputError, match=rf"slice003\.dcm: Float Pixel Data holds {words}: those are no HU"):
+        read_volume(tmp_path)
+
+
+def test_row_32_all_nan(tmp_path):
+    write_series(tmp_path, change=set_floats(lambda array, k: array * np.nan))
+    with pytest.raises(RefusedInputError, match="holds 30 NaN and 0 infinite values of 30"):
+        read_volume(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            set_pixels(lambda array, k: array * 0 + 7),
+            "all 210 voxels are -1017 HU: the volume is constant",
+        ),
+        (
+            set_pixels(lambda array, k: array * 0 - 2000, PixelPaddingValue=-2000),
+            "all 210 voxels are padding",
+        ),
+        (set_floats(lambda array, k: array * 0 + 3.5), "all 210 voxels are 3.5 HU"),
+    ],
+)
+def test_row_32_constant_volumes(tmp_path, change, words):
+    write_series(tmp_path, change=change)
+    with pytest.raises(RefusedInputError, match=words):
+        read_volume(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"RescaleSlope": 2}, "RescaleSlope (0028,1053) is '2.0', expected none beside Float Pixel Data"),
+        (
+            {"RescaleIntercept": -1024},
+            "RescaleIntercept (0028,1052) is '-1024.0', expected none beside Float Pixel Data",
+        ),
+        ({"BitsAllocated": 16}, "BitsAllocated (0028,0100) is 16, expected 32 for float pixels of this width"),
+        ({"Rows": 6}, "truncated: 144 bytes of pixels expected (6 x 6 x 32 bit), 120 found"),
+    ],
+)
+def test_float_pixels_without_sense_are_refused(tmp_path, values, words):
+    write_series(tmp_path, change=set_floats(keep, **values))
+    with pytest.raises(RefusedInputError) as caught:
+        read_volume(tmp_path)
+    assert f"slice000.dcm: {words}" in str(caught.value)

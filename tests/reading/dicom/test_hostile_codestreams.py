@@ -1,0 +1,143 @@
+"""Compressed frames that lie, are cut or are garbage: rows 38, 40 and 41 of the fault list."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+from compressed_frames import (
+    COLUMNS,
+    ENCODERS,
+    END,
+    IMAGES,
+    JPEG,
+    RLE,
+    ROWS,
+    encode_jpeg_2000,
+    encode_rle,
+    even,
+    item,
+    make_headers,
+    place,
+)
+from dicom_series import Plan, make_dataset, save_dataset, write_series
+from pydicom.encaps import encapsulate
+
+from clrecon.errors import RefusedInputError
+from clrecon.reading.dicom import read_volume
+from clrecon.reading.dicom.pixels import stored
+from clrecon.reading.dicom.pixels.stored import StoredPixels
+
+
+def cut_end(data):
+    return data[:-2] + b"\0\0"
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil", "words"),
+    [
+        ("JPEG 2000", lambda d: b"\xff\xd8" + d[2:], "is no JPEG 2000 codestream"),
+        ("JPEG 2000", lambda d: d[:8] + struct.pack(">2L", 65535, 65535) + d[16:], "is 65535 x 65535, the header"),
+        ("JPEG 2000", lambda d: d[:40] + b"\0\x03" + d[42:], "has 3 components, a CT slice has one"),
+        ("JPEG 2000", lambda d: d[:42] + b"\x1f" + d[43:], "has 32 bits a pixel, the header allocates 16"),
+        ("JPEG 2000", lambda d: d[:43] + b"\2\2" + d[45:], "fewer samples than pixels"),
+        ("JPEG 2000", cut_end, "truncated: the compressed frame has no end mark"),
+        ("JPEG-LS", cut_end, "truncated: the compressed frame has no end mark"),
+        ("JPEG-LS", lambda d: d.replace(b"\xff\xf7", b"\xff\xc3", 1), "is no JPEG-LS codestream"),
+        ("JPEG lossless 1", lambda d: d.replace(b"\xff\xc3", b"\xff\xc1", 1), "is no JPEG lossless codestream"),
+        ("JPEG lossless 1", lambda d: b"\xff\xd8" + b"\xff" * 5000, "is no JPEG lossless codestream"),
+        ("JPEG 2000", lambda d: d[:80] + bytes(len(d) - 82) + d[-2:], "do not decode"),
+        ("RLE", lambda d: d[:40], "shorter than the head of an RLE frame"),
+        ("RLE", lambda d: struct.pack("<L", 3) + d[4:], "has 3 segments, 2 expected"),
+        ("RLE", lambda d: d[:8] + struct.pack("<L", 10**9) + d[12:], "damaged table of segments"),
+        ("RLE", lambda d: d[:4] + struct.pack("<L", 0) + d[8:], "damaged table of segments"),
+        ("RLE", lambda d: d[: struct.unpack("<L", d[8:12])[0] + 10], "truncated: an RLE segment of 10 bytes for 1395"),
+        ("RLE", lambda d: d[:-200], "do not decode"),
+    ],
+)
+def test_rows_38_and_40_codestreams_that_lie_or_are_cut(tmp_path, name, spoil, words):
+    syntax, encode = ENCODERS[name]
+    data = item(b"") + item(even(spoil(encode(IMAGES[0])))) + END
+    with pytest.raises(RefusedInputError, match=f"^pixels: .*({words})"):
+        place(tmp_path, data, syntax)
+
+
+def test_row_38_small_bytes_for_a_large_frame_are_a_bomb(tmp_path):
+    """In the head of codestream and header alike: the size is the same lie."""
+    data = encode_jpeg_2000(IMAGES[0])
+    data = data[:8] + struct.pack(">2L", 65535, 65535) + data[16:]
+    with pytest.raises(RefusedInputError, match=r"bytes would unfold to 8589672450, more than 1000 times as many"):
+        stored.read_codestream(data, JPEG + "90", 65535, 65535, 16)
+    air = np.zeros((512, 512), np.uint16)
+    (pixels,) = place(tmp_path, encapsulate([encode_jpeg_2000(air)]) + END, rows=512, columns=512)
+    assert not pixels.any()
+
+
+@pytest.mark.parametrize("name", ["JPEG-LS", "JPEG 2000", "JPEG lossless 1", "RLE", "HTJ2K"])
+def test_row_40_random_damage_is_refused_or_decodes_to_the_declared_size(tmp_path, name):
+    random = np.random.default_rng(11)
+    syntax, encode = ENCODERS[name]
+    good = even(encode(IMAGES[0]))
+    frames = []
+    for _ in range(20):
+        bad = bytearray(good)
+        for where in random.integers(0, len(bad), 8):
+            bad[where] = random.integers(256)
+        frames.append(bytes(bad))
+    path = tmp_path / "pixels"
+    path.write_bytes(item(b"") + b"".join(map(item, [good, *frames])) + END)
+    headers = make_headers(path, syntax, 21)
+    refused = 0
+    with StoredPixels(headers) as source:
+        for header in headers[1:]:
+            try:
+                pixels = source.load(header, np.zeros((ROWS, COLUMNS), np.int16))
+            except RefusedInputError:
+                refused += 1
+            else:
+                assert pixels.shape == (ROWS, COLUMNS) and pixels.dtype == np.uint16
+        assert np.array_equal(source.load(headers[0], np.zeros((ROWS, COLUMNS), np.int16)), IMAGES[0])
+    assert refused > 0
+
+
+def test_row_40_the_file_that_does_not_decode_is_named(tmp_path):
+    plan = Plan(shape=(3, ROWS, COLUMNS), signed=False)
+    for k in range(3):
+        ds = make_dataset(plan, k)
+        ds.file_meta.TransferSyntaxUID = RLE
+        frame = bytearray(encode_rle(plan.stored(k)))
+        if k == 1:
+            frame = frame[:-30]
+        ds.PixelData = encapsulate([bytes(frame)])
+        ds["PixelData"].VR = "OB"
+        save_dataset(ds, tmp_path / f"{k}.dcm")
+    with pytest.raises(
+        RefusedInputError, match=rf"^1\.dcm: the compressed pixels \(transfer syntax {RLE}\) do not dec"
+    ):
+        read_volume(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("uid", "name"),
+    [
+        ("1.2.840.113619.5.2", "implicit VR big endian, private to GE"),
+        ("1.2.840.10008.1.2.8.1", "Deflated Image Frame Compression"),
+        (JPEG + "94", "JPIP Referenced"),
+        (JPEG + "102", "MPEG-4 AVC/H.264 High Profile / Level 4.1"),
+        (JPEG + "50", r"JPEG Baseline \(Process 1\)"),
+        ("1.2.3.4.5", "private or unknown"),
+    ],
+)
+def test_row_41_other_transfer_syntaxes_are_named(tmp_path, uid, name):
+    plan = write_series(tmp_path, Plan(shape=(2, 5, 6)))
+    for k in range(2):
+        file = tmp_path / plan.name(k)
+        data = file.read_bytes()
+        old = b"1.2.840.10008.1.2.1\0"
+        start = data.index(b"\x02\0\x10\0UI") + 6
+        assert data[start + 2 : start + 22] == old
+        new = even(uid.encode())
+        file.write_bytes(data[:start] + struct.pack("<H", len(new)) + new + data[start + 22 :])
+    with pytest.raises(RefusedInputError, match=rf"transfer syntax {uid} \({name}.*\) cannot be decoded: convert"):
+        read_volume(tmp_path)

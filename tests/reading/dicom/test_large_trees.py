@@ -1,0 +1,229 @@
+"""Rows 46 and 47 of the fault list: trees of many files and series, disks that hang, files that cannot be had."""
+
+from __future__ import annotations
+
+import gc
+import os
+import stat
+import threading
+import time
+import tracemalloc
+from pathlib import Path
+
+import pytest
+from dicom_series import write_series
+from tolerances import HEADER_BYTES, SCAN_PEAK_BYTES_A_FILE
+
+from clrecon.errors import RefusedInputError
+from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading.dicom.headers import header
+from clrecon.reading.dicom.parse import elements, plain
+from clrecon.reading.dicom.parse.elements import PREFIX_BYTES, read_start
+from clrecon.reading.dicom.series import scan
+from clrecon.reading.dicom.series import scan as disk
+from clrecon.reading.dicom.series.scan import CorruptFile, scan_path
+from clrecon.reading.dicom.series.series import group_series
+
+
+def copy_series(folder: Path, series: int, slices: int) -> int:
+    """A tree of `series` folders, made from one file by replacing what tells slices and series apart."""
+    write_series(folder / "one")
+    template = (folder / "one" / "slice000.dcm").read_bytes()
+    (folder / "one").rename(folder.parent / "one")
+    uid, place = b"\x20\0\x0e\0UI\x1a\0" + b"1.2.826.0.1.3680043.10.1.1", b"-12.5\\31.25\\-400.0"
+    assert template.count(uid) == 1 and template.count(place) == 1
+    for number in range(series):
+        own = template.replace(uid, uid[:8] + b"1.2.826.0.1.3680043.10.%03d" % number)
+        (folder / f"{number:05d}").mkdir()
+        for k in range(slices):
+            data = own.replace(place, b"-12.5\\31.25\\%06.1f" % (1.5 * k))
+            assert len(data) == len(template)
+            (folder / f"{number:05d}" / f"{k:05d}").write_bytes(data)
+    return series * slices
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("series", "slices"), [(300, 10), (3, 1000)])
+def test_row_47_many_files_are_walked_once_and_stay_small(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, series: int, slices: int
+) -> None:
+    """Every header is read once, from its first bytes, with no pixels; what is kept of it is bounded."""
+    (tmp_path / "tree").mkdir()
+    count = copy_series(tmp_path / "tree", series, slices)
+    starts: list[int] = []
+    parses: list[int] = []
+    heads = header.read_headers
+
+    def count_start(file: str, limit: int = PREFIX_BYTES) -> disk.FileStart:
+        starts.append(limit)
+        return read_start(file, limit)
+
+    monkeypatch.setattr(disk, "read_start", count_start)
+    monkeypatch.setattr(scan, "read_headers", lambda *given: parses.append(1) or heads(*given))  # type: ignore[func-returns-value]
+    monkeypatch.setattr(elements, "parse_carefully", None)
+    calls: list[tuple[str, int, int]] = []
+    gc.collect()
+    tracemalloc.start()
+    found = scan_path(tmp_path / "tree", lambda *call: calls.append(call))
+    kept, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(found.slices) == count and starts == [PREFIX_BYTES] * count and len(parses) == count
+    assert kept / count < HEADER_BYTES
+    assert peak / count < SCAN_PEAK_BYTES_A_FILE
+    assert len(calls) <= scan.PROGRESS_STEPS + 1 and calls[-1] == ("scan", count, count)
+    assert [len(part.headers) for part in group_series(found)] == [slices] * series
+
+
+def test_slices_share_what_they_have_in_common(tmp_path: Path) -> None:
+    write_series(tmp_path)
+    first, second, *_ = scan_path(tmp_path).slices
+    for name in ("series", "phase", "row_cosines", "patient_hash", "frame_of_reference", "transfer_syntax", "warnings"):
+        assert getattr(first, name) is getattr(second, name), name
+    assert not hasattr(first, "__dict__")
+
+
+def test_bad_files_beside_many_series_are_looked_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Work grows with files and series, not with their product."""
+    (tmp_path / "tree").mkdir()
+    copy_series(tmp_path / "tree", 50, 1)
+    found = scan_path(tmp_path / "tree")
+    found.corrupt = [CorruptFile(tmp_path / "bad" / f"{k}", "cut") for k in range(100)]
+    shown: list[CorruptFile] = []
+    plain_text = CorruptFile.__str__
+    monkeypatch.setattr(CorruptFile, "__str__", lambda self: shown.append(self) or plain_text(self))
+    series = group_series(found)
+    assert all(part.corrupt is series[0].corrupt for part in series)
+    assert series[0].corrupt == found.corrupt
+    assert all("and 95 more" in part.problems[0] for part in series)
+    assert len(shown) == 5 * len(series)
+
+
+def test_of_other_files_only_the_start_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_series(tmp_path)
+    for k in range(100):
+        (tmp_path / f"{k}.png").write_bytes(b"\x89PNG" + bytes(100_000))
+    read: list[int] = []
+    system_read = os.read
+
+    def count_bytes(descriptor: int, limit: int) -> bytes:
+        data = system_read(descriptor, limit)
+        read.append(len(data))
+        return data
+
+    monkeypatch.setattr(os, "read", count_bytes)
+    assert scan_path(tmp_path).skipped == {"not DICOM": 100}
+    assert len(read) == 107 and max(read) <= PREFIX_BYTES
+
+
+@pytest.fixture
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(disk, "NOTICE_S", 0.02)
+    monkeypatch.setattr(disk, "GIVE_UP_S", 0.1)
+
+
+def test_row_46_a_file_that_hangs_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hurried: None) -> None:
+    write_series(tmp_path)
+    answer = threading.Event()
+
+    def hang(file: str, limit: int = PREFIX_BYTES) -> disk.FileStart:
+        if file.endswith("slice003.dcm"):
+            answer.wait(20)
+        return read_start(file, limit)
+
+    monkeypatch.setattr(disk, "read_start", hang)
+    calls: list[tuple[str, int, int]] = []
+    try:
+        with pytest.raises(RefusedInputError, match=r"slice003\.dcm: no answer from the disk or network drive"):
+            read_volume(tmp_path, progress=lambda *call: calls.append(call))
+    finally:
+        answer.set()
+    assert ("no answer yet from slice003.dcm", 0, 7) in calls
+
+
+def test_row_46_a_folder_that_hangs_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hurried: None) -> None:
+    write_series(tmp_path / "there")
+    (tmp_path / "gone").mkdir()
+    answer = threading.Event()
+    scandir = os.scandir
+
+    def hang(folder: str) -> object:
+        if str(folder).endswith("gone"):
+            answer.wait(20)
+        return scandir(folder)
+
+    monkeypatch.setattr(os, "scandir", hang)
+    try:
+        with pytest.raises(RefusedInputError, match="gone: no answer from the disk or network drive"):
+            list_series(tmp_path)
+    finally:
+        answer.set()
+
+
+def test_a_slow_disk_is_waited_for_by_several_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = []
+    for k in range(3 * disk.CHUNK + 5):
+        (tmp_path / f"{k}").write_bytes(b"%d" % k)
+        files.append(str(tmp_path / f"{k}"))
+    (tmp_path / "7").unlink()
+    here: list[int] = []
+    at_once: list[int] = []
+
+    def slow(file: str, limit: int = PREFIX_BYTES) -> disk.FileStart:
+        here.append(1)
+        at_once.append(len(here))
+        time.sleep(0.002)
+        here.pop()
+        return read_start(file, limit)
+
+    monkeypatch.setattr(disk, "read_start", slow)
+    with disk.DiskReader() as reader:
+        found = list(reader.read_starts(files))
+    assert isinstance(found.pop(7), FileNotFoundError)
+    del files[7]
+    assert [start.prefix for start in found if isinstance(start, disk.FileStart)] == [
+        Path(file).name.encode() for file in files
+    ]
+    assert max(at_once[: disk.CHUNK]) == 1 and 2 < max(at_once) <= disk.MOST_THREADS
+
+
+def test_row_46_a_file_that_vanishes_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_series(tmp_path)
+
+    def vanish(file: str, limit: int = PREFIX_BYTES) -> disk.FileStart:
+        if file.endswith("slice006.dcm"):
+            os.unlink(file)
+        return read_start(file, limit)
+
+    monkeypatch.setattr(disk, "read_start", vanish)
+    with pytest.raises(RefusedInputError, match=r"slice006\.dcm: not readable: No such file"):
+        read_volume(tmp_path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes on this system")
+def test_row_46_a_pipe_in_the_place_of_a_file_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    assert stat.S_ISFIFO(os.stat(tmp_path / "pipe").st_mode)
+    with pytest.raises(OSError, match="no regular file"):
+        read_start(tmp_path / "pipe")
+
+
+def test_errors_beside_the_caller_reach_him() -> None:
+    def fail() -> None:
+        raise KeyError("inside")
+
+    with disk.DiskReader() as reader, pytest.raises(KeyError, match="inside"):
+        reader.run(fail)
+
+
+def test_the_plain_parser_reads_every_test_series(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_series(tmp_path)
+    answers = []
+    parse = plain.parse_plainly
+
+    def watch(*given: object) -> object:
+        answers.append(parse(*given))  # type: ignore[arg-type]
+        return answers[-1]
+
+    monkeypatch.setattr("clrecon.reading.dicom.parse.elements.parse_plainly", watch)
+    assert len(scan_path(tmp_path).slices) == 7
+    assert len(answers) == 7 and None not in answers

@@ -1,0 +1,276 @@
+"""Multi-frame images that are wrong, old or hostile: refused with file, frame and tag, and nothing worse."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from dicom_series import Plan, make_dataset, save_dataset, set_raw, set_values, write_series
+from enhanced_series import (
+    assert_right,
+    frame_groups,
+    item,
+    make_enhanced,
+    real_world,
+    refusal,
+    without_rescale,
+    write_enhanced,
+)
+from pydicom.dataset import Dataset
+from tolerances import THOUSAND_FRAMES_S
+
+from clrecon.errors import NoDicomError, RefusedInputError
+from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading.dicom.headers import multiframe
+
+
+def per_frame(change, only=None):
+    def spoil(ds):
+        for number, groups in enumerate(ds.PerFrameFunctionalGroupsSequence):
+            if only is None or number == only:
+                change(groups)
+
+    return spoil
+
+
+def drop(keyword, inner=None, only=2):
+    def change(groups):
+        if inner is None:
+            delattr(groups, keyword)
+        else:
+            delattr(getattr(groups, keyword)[0], inner)
+
+    return per_frame(change, only)
+
+
+def put(keyword, only=2, **values):
+    def change(groups):
+        setattr(groups, keyword, [item(**values)])
+
+    return per_frame(change, only)
+
+
+def set_frames(text):
+    return lambda ds: set_raw("NumberOfFrames", text)(ds, 0)
+
+
+PVT = "PixelValueTransformationSequence"
+FAULTS = {
+    "no position": (drop("PlanePositionSequence"), "mf frame 3: ImagePositionPatient (0020,0032) is missing or empty"),
+    "empty position": (
+        per_frame(lambda groups: setattr(groups, "PlanePositionSequence", []), 2),
+        "mf frame 3: ImagePositionPatient (0020,0032) is missing or empty",
+    ),
+    "position without a value": (
+        drop("PlanePositionSequence", "ImagePositionPatient"),
+        "mf frame 3: ImagePositionPatient (0020,0032) is missing or empty",
+    ),
+    "position of two numbers": (
+        put("PlanePositionSequence", ImagePositionPatient=[1, 2]),
+        "mf frame 3: ImagePositionPatient (0020,0032) is '1.0\\2.0', expected 3 finite numbers",
+    ),
+    "two positions": (
+        per_frame(lambda groups: groups.PlanePositionSequence.append(item(ImagePositionPatient=[1, 2, 3])), 2),
+        "mf frame 3: PlanePositionSequence (0020,9113) holds 2 items, expected 1",
+    ),
+    "no orientation": (
+        drop("PlaneOrientationSequence"),
+        "mf frame 3: ImageOrientationPatient (0020,0037) is missing or empty",
+    ),
+    "no spacing": (drop("PixelMeasuresSequence"), "mf frame 3: PixelSpacing (0028,0030) is missing or empty"),
+    "spacing 0": (
+        put("PixelMeasuresSequence", PixelSpacing=[0, 0]),
+        "mf frame 3: PixelSpacing (0028,0030) is '0.0\\0.0'",
+    ),
+    "other spacing": (put("PixelMeasuresSequence", PixelSpacing=[0.7, 0.6]), "PixelSpacing differs within the series"),
+    "slope 0": (put(PVT, RescaleSlope=0, RescaleIntercept=0), "mf frame 3: RescaleSlope (0028,1053) is '0.0'"),
+    "geometry at the top level": (
+        lambda ds: (drop("PlaneOrientationSequence")(ds), setattr(ds, "ImageOrientationPatient", [1, 0, 0, 0, 1, 0])),
+        "mf frame 3: ImageOrientationPatient (0020,0037) is missing or empty",
+    ),
+    "no groups": (
+        lambda ds: delattr(ds, "PerFrameFunctionalGroupsSequence"),
+        "mf: PerFrameFunctionalGroupsSequence (5200,9230) is missing or empty",
+    ),
+    "no shared group": (
+        lambda ds: (delattr(ds, "SharedFunctionalGroupsSequence"), drop("PixelMeasuresSequence", only=None)(ds)),
+        "mf frame 1: PixelSpacing (0028,0030) is missing or empty",
+    ),
+    "two shared groups": (
+        lambda ds: ds.SharedFunctionalGroupsSequence.append(Dataset()),
+        "mf: SharedFunctionalGroupsSequence (5200,9229) holds 2 items, expected 1",
+    ),
+    "empty groups": (
+        lambda ds: setattr(ds, "PerFrameFunctionalGroupsSequence", [Dataset() for _ in range(7)]),
+        "mf frame 1: PixelSpacing (0028,0030) is missing or empty",
+    ),
+    "shared and own differ": (
+        lambda ds: setattr(ds.SharedFunctionalGroupsSequence[0], PVT, [item(RescaleSlope=2, RescaleIntercept=0)]),
+        f"mf frame 1: {PVT} (0028,9145) is in the shared and in the frame's groups, and they differ",
+    ),
+    "fewer frames than groups": (
+        set_frames("6"),
+        "mf: NumberOfFrames (0028,0008) is 6, PerFrameFunctionalGroupsSequence (5200,9230) holds 7 items",
+    ),
+    "more frames than groups": (
+        set_frames("8"),
+        "mf: NumberOfFrames (0028,0008) is 8, PerFrameFunctionalGroupsSequence (5200,9230) holds 7 items",
+    ),
+    "no frames": (set_frames("0"), "mf: NumberOfFrames (0028,0008) is '0', expected a whole number from 1 to 65536"),
+    "negative frames": (set_frames("-7"), "mf: NumberOfFrames (0028,0008) is '-7', expected a whole number"),
+    "frames in words": (set_frames("seven"), "mf: NumberOfFrames (0028,0008) is 'seven', expected a whole number"),
+    "no number of frames": (
+        lambda ds: delattr(ds, "NumberOfFrames"),
+        "mf: NumberOfFrames (0028,0008) is missing or empty, expected a whole number",
+    ),
+    "fault 39: 2^31 - 1 frames": (set_frames("2147483647"), "mf: NumberOfFrames (0028,0008) is '2147483647'"),
+    "fault 39: 65535 x 65535": (
+        lambda ds: (setattr(ds, "Rows", 65535), setattr(ds, "Columns", 65535)),
+        "truncated: 60127707150 bytes of pixels expected (7 x 65535 x 65535 x 16 bit), 420 found",
+    ),
+    "short pixels": (
+        lambda ds: setattr(ds, "PixelData", ds.PixelData[:-60]),
+        "truncated: 420 bytes of pixels expected (7 x 6 x 5 x 16 bit), 360 found",
+    ),
+    "colour": (
+        put("CTImageFrameTypeSequence", FrameType=["DERIVED", "PRIMARY", "VOLUME", "NONE"], PixelPresentation="COLOR"),
+        "mf frame 3: PixelPresentation (0008,9205) is 'COLOR', expected MONOCHROME",
+    ),
+    "bent": (
+        put("CTImageFrameTypeSequence", FrameType=["DERIVED"], VolumetricProperties="DISTORTED"),
+        "mf frame 3: VolumetricProperties (0008,9206) is 'DISTORTED': the frame is no plane of the patient",
+    ),
+    "rendered": (
+        put("CTImageFrameTypeSequence", FrameType=["DERIVED"], VolumeBasedCalculationTechnique="SURFACE_RENDER"),
+        "mf frame 3: VolumeBasedCalculationTechnique (0008,9207) is 'SURFACE_RENDER'",
+    ),
+    "mixed types": (
+        lambda ds: (drop("CTImageFrameTypeSequence")(ds), setattr(ds, "ImageType", ["MIXED", "PRIMARY"])),
+        "mf frame 3: FrameType (0008,9007) is missing, and ImageType (0008,0008) is MIXED",
+    ),
+    "real world NaN": (
+        lambda ds: without_rescale([real_world(float("nan"), 0.0)])(ds),
+        "mf frame 1: RealWorldValueSlope (0040,9225) is nan, expected a finite number",
+    ),
+    "part 0": (
+        lambda ds: (setattr(ds, "ConcatenationUID", "1.2.3"), setattr(ds, "InConcatenationNumber", 0)),
+        "mf: InConcatenationNumber (0020,9162) is missing or 0",
+    ),
+    "one place twice": (
+        lambda ds: setattr(frame_groups(ds, 3), "PlanePositionSequence", frame_groups(ds, 2).PlanePositionSequence),
+        "no element of their headers parts them into phases: mf frame 3, mf frame 4",
+    ),
+}
+
+
+@pytest.mark.filterwarnings("ignore:Invalid value for VR IS")
+@pytest.mark.parametrize("change, words", FAULTS.values(), ids=FAULTS)
+def test_what_is_wrong_is_refused_by_name(tmp_path, change, words):
+    write_enhanced(tmp_path / "mf", change=change, shared=())
+    start = time.process_time()
+    assert words in refusal(tmp_path)
+    assert time.process_time() - start < THOUSAND_FRAMES_S
+    assert list_series(tmp_path).series[0].problems
+
+
+def test_a_broken_multi_frame_series_is_not_passed_over(tmp_path):
+    write_series(tmp_path, Plan(series=1, shape=(5, 5, 6)))
+    write_enhanced(tmp_path / "mf", Plan(series=2), drop("PlanePositionSequence"), shared=())
+    assert "series 2: mf frame 3: ImagePositionPatient" in refusal(tmp_path)
+    assert [entry.slices for entry in list_series(tmp_path).series] == [5, 7]
+
+
+@pytest.mark.parametrize("frames", [3, 300])
+def test_old_multi_frame_images_have_no_places(tmp_path, frames):
+    ds = make_dataset(Plan(), 0)
+    ds.NumberOfFrames = frames
+    ds.add_new(0x00201041, "DS", "1")
+    ds.PixelData *= frames
+    save_dataset(ds, tmp_path / "old")
+    assert f"old: multi-frame image of {frames} frames, SOP class 1.2.840.10008.5.1.4.1.1.2: the places" in refusal(
+        tmp_path
+    )
+
+
+def test_one_slice_that_says_one_frame_is_a_slice(tmp_path):
+    plan = write_series(tmp_path, change=set_values(NumberOfFrames=1))
+    assert_right(read_volume(tmp_path), plan)
+
+
+def test_multi_frame_captures_and_other_modalities_are_refused(tmp_path):
+    write_enhanced(tmp_path / "mf", change=lambda ds: setattr(ds, "Modality", "MR"))
+    with pytest.raises(NoDicomError, match="found 1 series of modality MR, no CT series"):
+        read_volume(tmp_path)
+
+    def to_capture(ds):
+        ds.SOPClassUID = ds.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.7.3"
+
+    write_enhanced(tmp_path / "mf", change=to_capture)
+    assert "mf: secondary capture (SOP class 1.2.840.10008.5.1.4.1.1.7.3)" in refusal(tmp_path)
+
+
+# --- hostile bytes ---
+
+
+def nest(levels):
+    """A private sequence of undefined length, `levels` deep, to stand in place of an element of the same length."""
+    head = b"\x11\x00\x10\x10SQ\0\0\xff\xff\xff\xff"
+    opened, closed = b"\xfe\xff\x00\xe0\xff\xff\xff\xff", b"\xfe\xff\x0d\xe0\0\0\0\0"
+    end = b"\xfe\xff\xdd\xe0\0\0\0\0"
+    return head + (opened + head) * levels + end + (closed + end) * levels
+
+
+@pytest.mark.parametrize("levels", [10, 300, 5000])
+def test_fault_37_nests_in_the_groups(tmp_path, levels):
+    payload = nest(levels)
+    marker = bytes([0xA5]) * (len(payload) - 12)
+
+    plan = write_enhanced(tmp_path / "mf", change=lambda ds: frame_groups(ds, 1).add_new(0x00111010, "OB", marker))
+    data = (tmp_path / "mf").read_bytes()
+    place = data.index(marker) - 12
+    (tmp_path / "mf").write_bytes(data[:place] + payload + data[place + len(payload) :])
+    if levels == 10:
+        assert_right(read_volume(tmp_path), plan)
+    else:
+        assert "sequences are nested too deep" in refusal(tmp_path)
+
+
+def test_every_cut_of_the_groups_is_refused(tmp_path):
+    write_enhanced(tmp_path / "mf", Plan(shape=(2, 2, 2)))
+    data = (tmp_path / "mf").read_bytes()
+    for end in range(len(data) - 700, len(data), 7):
+        (tmp_path / "mf").write_bytes(data[:end])
+        assert "mf: " in refusal(tmp_path) or "truncated" in refusal(tmp_path)
+
+
+@pytest.mark.untraced
+def test_wrong_bytes_in_the_groups_do_no_harm(tmp_path):
+    """Each byte of the groups wrong in turn: the volume, or a refusal."""
+    plan = write_enhanced(tmp_path / "mf", Plan(shape=(2, 2, 2)))
+    data = bytearray((tmp_path / "mf").read_bytes())
+    start = data.index(b"\x00\x52\x29\x92")
+    refused = 0
+    for place in range(start, len(data), 3):
+        old, data[place] = data[place], data[place] ^ 0xFF
+        (tmp_path / "mf").write_bytes(data)
+        try:
+            assert read_volume(tmp_path).voxels.shape == plan.shape
+        except (RefusedInputError, NoDicomError):
+            refused += 1
+        data[place] = old
+    assert refused > 100
+
+
+def test_items_without_end_are_not_all_taken(tmp_path):
+    """Empty items cost 8 bytes each: as many as a file holds must not become objects."""
+    plan = Plan()
+    ds = make_enhanced(plan)
+    frame_groups(ds, 0).PlanePositionSequence = [Dataset() for _ in range(2000)]
+    save_dataset(ds, tmp_path / "mf")
+    assert f"the sequences hold more than {multiframe.ITEMS_PER_FRAME * 8} items" in refusal(tmp_path)
+
+
+def test_long_headers_are_not_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(multiframe, "HEADER_BYTES_LIMIT", 1000)
+    write_enhanced(tmp_path / "mf")
+    assert "bytes, no more than 1000 are read" in refusal(tmp_path)

@@ -1,0 +1,55 @@
+"""PixelPaddingValue in the writings that are found in files."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from dicom_series import Plan, set_values, write_series
+from pydicom.dataelem import RawDataElement
+from pydicom.tag import Tag
+
+from clrecon.errors import RefusedInputError
+from clrecon.reading.dicom import read_volume
+
+
+@pytest.mark.parametrize(
+    ("bits", "vr", "raw", "cell"),
+    [
+        (16, "UL", (63536).to_bytes(4, "little"), 0xF830),
+        (16, "SL", (-2000).to_bytes(4, "little", signed=True), 0xF830),
+        (12, "US", (0x0830).to_bytes(2, "little"), 0xF830),
+        (12, "US", (0x0830).to_bytes(2, "little"), 0x0830),
+        (12, "US", (0xF830).to_bytes(2, "little"), 0x0830),
+        (12, "US", (0x8000).to_bytes(2, "little"), 0x8000),
+    ],
+)
+def test_padding_in_any_writing_of_its_bits(tmp_path, bits, vr, raw, cell):
+    """Signed pixels, with and without the sign in the unused bits, and the value in another width or sign."""
+
+    def change(ds, k):
+        array = plan.stored(k).astype(np.uint16) & ((1 << bits) - 1)
+        array[0, :3] = cell
+        set_values(BitsStored=bits, HighBit=bits - 1, PixelData=array.astype(np.uint16).tobytes())(ds, k)
+        tag = Tag("PixelPaddingValue")
+        ds[tag] = RawDataElement(tag, vr, len(raw), raw, 0, False, True)
+
+    plan = Plan()
+    write_series(tmp_path, plan, change)
+    volume = read_volume(tmp_path)
+    expected = plan.hu()
+    expected[:, 0, :3] = volume.report["padding_hu"]
+    assert np.array_equal(volume.voxels, expected)
+    assert volume.report["padding_share"] == pytest.approx(3 / 30)
+
+
+@pytest.mark.parametrize(
+    ("vr", "raw"), [("DS", b"-200"), ("IS", b"-2000 "), ("US", b"\x30\xf8" * 2)], ids=["DS", "IS", "two values"]
+)
+def test_padding_that_is_no_binary_number_is_refused(tmp_path, vr, raw):
+    def change(ds, k):
+        tag = Tag("PixelPaddingValue")
+        ds[tag] = RawDataElement(tag, vr, len(raw), raw, 0, False, True)
+
+    write_series(tmp_path, change=change)
+    with pytest.raises(RefusedInputError, match=r"PixelPaddingValue \(0028,0120\) is .* expected one binary number"):
+        read_volume(tmp_path)

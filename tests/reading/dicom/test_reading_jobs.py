@@ -1,0 +1,82 @@
+"""Reading as work for threads and processes: how many, how it ends early, and how much memory it may take."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from compressed_frames import encode_rle
+from dicom_series import Plan, write_series
+from pydicom.encaps import encapsulate
+from pydicom.uid import RLELossless
+
+from clrecon.reading.dicom import read_volume
+from clrecon.reading.dicom.pixels import voxels as pixels
+from clrecon.system import memory
+
+
+def test_an_interrupt_ends_reading_while_slices_are_still_being_handed_out(tmp_path, monkeypatch):
+    write_series(tmp_path, Plan(shape=(60, 5, 6)))
+    read, submitted, submit = [], [], ThreadPoolExecutor.submit
+
+    def slow(source, header, out):
+        read.append(header)
+        time.sleep(0.05)
+        return None, 0.0, 0.0
+
+    def interrupt(*arguments):
+        submitted.append(arguments)
+        if len(submitted) == 50:
+            raise KeyboardInterrupt
+        return submit(*arguments)
+
+    monkeypatch.setattr(pixels, "_fill_slice", slow)
+    monkeypatch.setattr(ThreadPoolExecutor, "submit", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        read_volume(tmp_path)
+    assert len(read) <= 2 * pixels.MAX_READERS
+
+
+@pytest.mark.parametrize(("slices", "expected"), [(2, 1), (7, 1), (40, 5)])
+def test_few_frames_start_few_decoders(tmp_path, monkeypatch, slices, expected):
+    """A process takes longer to start than a small frame to decode."""
+    monkeypatch.setattr(pixels, "DECODER_WORTH_BYTES", 600)
+    counts = []
+    monkeypatch.setattr(pixels, "count_readers", lambda slices, most: counts.append(most) or 1)
+    plan = Plan(shape=(slices, 5, 6), syntax=RLELossless)
+
+    def compress(ds, k):
+        ds.PixelData = encapsulate([encode_rle(plan.stored(k))])
+        ds["PixelData"].VR, ds["PixelData"].is_undefined_length = "OB", True
+
+    write_series(tmp_path, plan, compress)
+    assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
+    assert counts == [expected]
+
+
+@pytest.mark.parametrize(
+    ("line", "files"),
+    [
+        ("0::/pod/box", {"pod/memory.max": 9 << 20, "pod/memory.current": 5 << 20, "pod/box/memory.max": "max"}),
+        ("0::/not/seen/from/within", {"memory.max": 9 << 20, "memory.current": 5 << 20}),
+        ("4:cpu,memory:/box", {"memory/box/memory.limit_in_bytes": 9 << 20,
+                               "memory/box/memory.usage_in_bytes": 5 << 20}),
+        ("0::/box", {"box/memory.max": "max", "box/memory.current": 5 << 20}),
+        ("3:cpu:/box", {"box/memory.max": 9 << 20, "box/memory.current": 5 << 20}),
+    ],
+    ids=["group around it", "its own as the root", "version 1", "no limit", "another group"],
+)  # fmt: skip
+def test_row_39_memory_is_that_of_the_container(tmp_path, line, files):
+    proc, groups = tmp_path / "proc", tmp_path / "groups"
+    (proc / "self").mkdir(parents=True)
+    (proc / "meminfo").write_text("MemTotal: 2097152 kB\nMemAvailable: 1048576 kB\n")
+    (proc / "self" / "cgroup").write_text(line + "\n")
+    for name, value in files.items():
+        (groups / name).parent.mkdir(parents=True, exist_ok=True)
+        (groups / name).write_text(f"{value}\n")
+        stat = "anon 5\ninactive_file 1048576\ntotal_inactive_file 1048576\n"
+        (groups / name).with_name("memory.stat").write_text(stat)
+    limited = 9 << 20 in files.values() and "3:cpu" not in line
+    assert memory.available_memory_bytes(proc, groups) == (5 << 20 if limited else 1 << 30)

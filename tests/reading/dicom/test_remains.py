@@ -1,0 +1,218 @@
+"""Files without suffix beside the slices: what may be left of one is a reason to refuse, what is none is not."""
+
+from __future__ import annotations
+
+import gzip
+import random
+
+import numpy as np
+import pytest
+from dicom_series import Plan, make_dataset, save_dataset, set_values, write_series
+
+from clrecon.errors import RefusedInputError
+from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading.dicom.series.foreign_files import UNKNOWN, Stranger, describe_start, find_remains
+from clrecon.reading.dicom.series.scan import scan_path
+
+COUNT = 12
+UID = "1.2.826.0.1.3680043.10.1.77.{}"
+STYLES = {
+    "IM0001": lambda k: f"IM{k + 1:04d}",
+    "I10": lambda k: f"I{10 * (k + 1)}",
+    "UID": lambda k: UID.format(1000 + 37 * k),
+    "numbers": lambda k: f"{k + 1}",
+    "suffix number": lambda k: f"CT.{k:03d}",
+    "hexadecimal": lambda k: random.Random(k).randbytes(4).hex().upper(),
+    "counted with letters": lambda k: "IM00000" + "0123456789ABCDEFGHIJ"[k + 4],
+    "folders": lambda k: f"S{k:03d}/IMAGE",
+}
+JUNK = random.Random(5).randbytes(5000)
+
+
+def damage_mark(data):
+    return data[:128] + b"DIXM" + data[132:]
+
+
+def swap_media_class(data):
+    """Storage of CT images becomes that of a DICOMDIR."""
+    old, new = b"1.2.840.10008.5.1.4.1.1.2\0", b"1.2.840.10008.1.3.10" + bytes(6)
+    assert data.count(old) == 2
+    return data.replace(old, new, 1)
+
+
+DAMAGE = {
+    "empty": (lambda data: b"", "empty"),
+    "zeroed": (lambda data: bytes(len(data)), "blank, all bytes 00"),
+    "erased": (lambda data: b"\xff" * len(data), "blank, all bytes FF"),
+    "gzipped": (gzip.compress, "of the kind gzip file"),
+    "mark": (damage_mark, "without the mark at byte 128"),
+    "preamble cut": (lambda data: data[100:], "but not where it should be"),
+    "mark and preamble cut": (lambda data: data[132:], "data set without preamble"),
+    "shifted": (lambda data: b"\r" + data, "but not where it should be"),
+    "first sector": (lambda data: bytes(512) + data[512:], "but no DICOM"),
+    "junk": (lambda data: JUNK[: len(data)], "but no DICOM"),
+    "pointer": (lambda data: b"version https://git-lfs.github.com/spec/v1\n", "but text"),
+}
+
+
+def plan_with(style):
+    return Plan(shape=(COUNT, 5, 6), name=STYLES[style])
+
+
+@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_what_is_left_of_an_end_slice(tmp_path, style, damage):
+    plan = write_series(tmp_path, plan_with(style))
+    change, words = DAMAGE[damage]
+    file = tmp_path / plan.name(COUNT - 1)
+    file.write_bytes(change(file.read_bytes()))
+    with pytest.raises(RefusedInputError, match=r"may belong to it \(restore or remove them\): ") as caught:
+        read_volume(tmp_path)
+    assert f"{file.name}: " in str(caught.value) and words in str(caught.value)
+    listing = list_series(tmp_path)
+    gates = {gate["name"]: gate for gate in listing.certificate["gates"]}
+    assert gates["readable"]["ok"] is False and gates["readable"]["measured"] == 1
+    assert [text for text in listing.warnings if text.startswith("1 skipped: ")]
+    assert len(file.name) < 4 or not any(file.name in text for text in listing.warnings)
+    file.unlink()
+    assert read_volume(tmp_path).voxels.shape[0] == COUNT - 1
+
+
+@pytest.mark.parametrize("added", [".gz", ".bz2", ".part", ".tmp"])
+def test_a_packed_slice_and_a_packed_copy(tmp_path, added):
+    plan = write_series(tmp_path, plan_with("IM0001"))
+    last = tmp_path / plan.name(COUNT - 1)
+    packed = last.with_name(last.name + added)
+    packed.write_bytes(gzip.compress(last.read_bytes()))
+    assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
+    last.unlink()
+    with pytest.raises(RefusedInputError, match=f"{packed.name}: named like slices, but of the kind gzip file"):
+        read_volume(tmp_path)
+
+
+def test_a_slice_under_another_name(tmp_path):
+    """Neither name nor place tells; that it is as large as a slice does."""
+    plan = write_series(tmp_path, plan_with("IM0001"))
+    last = tmp_path / plan.name(COUNT - 1)
+    content = random.Random(1).randbytes(last.stat().st_size)
+    last.rename(tmp_path / "FOUND.CHK")
+    (tmp_path / "FOUND.CHK").write_bytes(content)
+    with pytest.raises(RefusedInputError, match="FOUND.CHK: as large as the slices beside it, but no DICOM"):
+        read_volume(tmp_path)
+    (tmp_path / "FOUND.CHK").write_bytes(content + bytes(300))
+    assert read_volume(tmp_path).report["warnings"] == []
+
+
+def test_what_lies_beside_slices_and_is_none(tmp_path):
+    plan = write_series(tmp_path, plan_with("IM0001"))
+    size = (tmp_path / plan.name(0)).stat().st_size
+    beside = {
+        "LICENSE": b"Permission is hereby granted\n" * 40,
+        "README": b"x" * size,
+        "README.1ST": b"read me",
+        "VERSION": b"",
+        "LOCKFILE": b"",
+        "AUTORUN.INF": b"[autorun]\r\n",
+        "VIEWER.EXE": b"MZ" + JUNK,
+        "viewer.so": b"\x7fELF" + JUNK,
+        "JPEG.DLL": b"MZ\x90" + bytes(size - 3),
+        "Thumbs.db": b"\xd0\xcf\x11\xe0" + bytes(size - 4),
+        ".DS_Store": b"\0\0\0\1Bud1" + bytes(size - 8),
+        "._IM0001": b"\0\5\x16\7" + bytes(size - 4),
+        "index.xml": b"<?xml version='1.0'?><file>1.2.840.10008.5.1.4.1.1.2</file>",
+        "IM0001.jpg": b"\xff\xd8\xff\xe0" + JUNK,
+        "IM0013.jpg": b"\xff\xd8\xff\xe0" + JUNK,
+        "IM0001.xml": b"<a/>",
+        "database.sqlite": b"SQLite format 3\0" + JUNK + b"1.2.840.10008.1.2.1\0",
+        "slices.nii.gz": gzip.compress(bytes(900)),
+        "IM0001.gz": gzip.compress(b"a copy"),
+        "pad.bin": bytes(200),
+    }
+    for name, content in beside.items():
+        (tmp_path / name).write_bytes(content)
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu())
+    assert volume.report["warnings"] == [] and all(gate["ok"] is not False for gate in volume.report["gates"])
+    assert volume.report["files"]["found"] == COUNT + len(beside)
+
+
+def test_a_dicomdir_is_no_image(tmp_path):
+    from pydicom.data import get_testdata_file
+
+    plan = write_series(tmp_path, plan_with("IM0001"))
+    with open(str(get_testdata_file("DICOMDIR")), "rb") as file:
+        (tmp_path / "DICOMDIR").write_bytes(file.read())
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu())
+    assert volume.report["files"]["skipped"] == {"DICOMDIR": 1} and volume.report["warnings"] == []
+
+
+def test_an_image_that_says_it_is_a_dicomdir(tmp_path):
+    plan = write_series(tmp_path, plan_with("IM0001"))
+    last = tmp_path / plan.name(COUNT - 1)
+    last.write_bytes(swap_media_class(last.read_bytes()))
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu())
+    assert "the meta header says that it is a DICOMDIR: read as the image that it holds" in volume.report["warnings"][0]
+
+
+def test_a_damaged_modality_is_no_other_series(tmp_path):
+    write_series(tmp_path, plan_with("IM0001"), set_values(only=COUNT - 1, Modality="C_T"))
+    words = "IM0012: Modality \\(0008,0060\\) is no term of the standard, expected CT in a CT image"
+    with pytest.raises(RefusedInputError, match=words):
+        read_volume(tmp_path)
+
+
+@pytest.mark.parametrize("path", [".", "../ct", "ct/../../ct/"])
+def test_a_folder_by_any_name(tmp_path, monkeypatch, path):
+    plan = write_series(tmp_path / "ct", plan_with("IM0001"))
+    (tmp_path / "ct" / "ct").mkdir()
+    (tmp_path / "ct" / plan.name(COUNT - 1)).write_bytes(b"")
+    monkeypatch.chdir(tmp_path / "ct")
+    with pytest.raises(RefusedInputError, match="IM0012: named like slices, but empty"):
+        read_volume(path)
+
+
+def test_both_ends_at_once(tmp_path):
+    plan = write_series(tmp_path, plan_with("IM0001"))
+    for k in (0, COUNT - 1):
+        (tmp_path / plan.name(k)).write_bytes(b"")
+    with pytest.raises(RefusedInputError, match="IM0001: named like slices, but empty, IM0012: named like slices"):
+        read_volume(tmp_path)
+
+
+def test_what_lies_apart_is_a_warning(tmp_path):
+    """In a folder without slices, where all slices are in one other, nothing can be of their stack."""
+    plan = write_series(tmp_path / "ct", plan_with("IM0001"))
+    save_dataset(make_dataset(plan, 0), tmp_path / "old" / "IM0001")
+    file = tmp_path / "old" / "IM0001"
+    file.write_bytes(damage_mark(file.read_bytes()))
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu())
+    assert volume.report["warnings"] == ["1 skipped: DICOM by its header, but without the mark at byte 128"]
+
+
+@pytest.mark.parametrize(
+    ("start", "what"), [(b"", "empty"), (b"\0", "blank, all bytes 00"), (b"ab", "text"), (b"a\0b", "no DICOM")]
+)
+def test_starts(start, what):
+    assert describe_start(start) == what
+
+
+@pytest.mark.parametrize("size", [0, 1, 255, 256, 257])
+def test_broken_files_lend_their_names_and_not_their_size(tmp_path, size):
+    """Beside files of which no size is known nothing is as large as the slices; a name that counts on is a remain."""
+    near, alike = (str(tmp_path / name) for name in ("notes", "IM2"))
+    strangers = [Stranger(near, size, UNKNOWN), Stranger(alike, size, UNKNOWN)]
+    known = [(str(tmp_path / "IM1"), None)]
+    assert find_remains(strangers, known) == [(tmp_path / "IM2", "named like slices, but no DICOM")]
+    sized = find_remains(strangers[:1], [*known, (str(tmp_path / "IM3"), 256)])
+    assert sized == [(tmp_path / "notes", "as large as the slices beside it, but no DICOM")]
+
+
+def test_a_small_file_beside_a_broken_one_is_no_remain(tmp_path):
+    write_series(tmp_path, plan_with("IM0001"), set_values(only=COUNT - 1, Modality="C_T"))
+    (tmp_path / "notes").write_bytes(b"a\0b")
+    found = scan_path(tmp_path)
+    assert [image.kind for image in found.others] == ["broken"] and len(found.strangers) == 1
+    assert found.suspects == []

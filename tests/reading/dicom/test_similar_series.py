@@ -1,0 +1,90 @@
+"""Numbers of series, and the choice among those of similar size: by kind, direction and thickness."""
+
+from __future__ import annotations
+
+import hashlib
+
+import pytest
+from dicom_series import ROOT, Plan, set_values, write_series
+
+from clrecon.errors import RefusedInputError
+from clrecon.reading.dicom import list_series, read_volume
+
+
+def hash_of(series: int) -> str:
+    return hashlib.sha256(f"{ROOT}.{series}".encode()).hexdigest()[:16]
+
+
+@pytest.fixture
+def two_series(tmp_path):
+    """Series 2 of 7 slices and series 5 of 4."""
+    write_series(tmp_path, Plan(series=5, shape=(4, 5, 6), name="a{}".format))
+    write_series(tmp_path, Plan(series=2, name="sub/b{}".format))
+    return tmp_path
+
+
+def test_series_are_numbered_by_patient_and_study(tmp_path):
+    """As in the listing: what one patient has comes together, unknown patients last."""
+    for number, patient, study in ((1, "P2", "9"), (2, "P1", "8"), (3, "P2", "9"), (4, None, None), (5, "P1", "7")):
+        change = set_values(PatientID=patient or "", StudyInstanceUID=f"{ROOT}.{study}" if study else "")
+        write_series(tmp_path, Plan(series=number, shape=(3, 5, 6), name=f"{number}-{{}}".format), change)
+    found = list_series(tmp_path).series
+    assert [entry.number for entry in found] == [1, 2, 3, 4, 5]
+    assert [entry.description for entry in found] == [f"series {number}" for number in (1, 3, 2, 5, 4)]
+    assert [entry.patient for entry in found] == [1, 1, 2, 2, None]
+    assert read_volume(tmp_path, 2).report["series"]["uid_hash"] == hash_of(3)
+
+
+AXIAL, CORONAL = (0, 0, 0), (-90, 0, 0)
+DERIVED = ["DERIVED", "SECONDARY", "REFORMATTED"]
+
+
+def write_candidates(folder, *candidates):
+    """Write series 1, 2, ... of slices, angles, thickness and ImageType."""
+    for number, (slices, angles, thickness, image_type) in enumerate(candidates, start=1):
+        plan = Plan(series=number, shape=(slices, 5, 6), angles=angles, name=f"{number}-{{}}".format)
+        write_series(folder, plan, set_values(SliceThickness=thickness, ImageType=image_type))
+
+
+def test_original_axial_images_come_before_derived_ones(tmp_path):
+    write_candidates(tmp_path, (8, CORONAL, 2, DERIVED), (6, AXIAL, 2, ["ORIGINAL", "PRIMARY", "AXIAL"]))
+    volume = read_volume(tmp_path)
+    assert volume.report["series"]["number"] == 2
+    assert volume.report["warnings"][-1] == (
+        "1 other CT series not used: [1: CT, 8 slices];"
+        " series 2 is read, original axial images before derived ones in other directions"
+    )
+
+
+def test_the_thinnest_of_similar_series_is_taken(tmp_path):
+    write_candidates(tmp_path, (8, AXIAL, 5, None), (7, AXIAL, 1.25, None), (3, AXIAL, 0.6, None))
+    volume = read_volume(tmp_path)
+    assert volume.report["series"]["number"] == 2  # and not the third, with less than half of the slices
+    assert volume.report["warnings"][-1].endswith("series 2 is read, with the thinnest slices, 1.25 mm")
+
+
+def test_a_far_larger_series_is_taken_whatever_it_is(tmp_path):
+    write_candidates(tmp_path, (9, CORONAL, 2, DERIVED), (4, AXIAL, 1, ["ORIGINAL", "PRIMARY"]))
+    assert read_volume(tmp_path).report["series"]["number"] == 1
+
+
+def test_similar_series_in_different_directions_are_asked_for(tmp_path):
+    write_candidates(tmp_path, (8, CORONAL, 2, None), (6, AXIAL, 2, None), (7, AXIAL, 2, DERIVED))
+    with pytest.raises(RefusedInputError) as caught:
+        read_volume(tmp_path)
+    assert str(caught.value) == (
+        "2 CT series of similar size run in different directions, choose one with series:"
+        " [1: CT, 8 slices, coronal], [2: CT, 6 slices, axial]"
+    )
+    listing = list_series(tmp_path)
+    assert (listing.chosen, listing.warnings) == (None, [str(caught.value)])
+    assert read_volume(tmp_path, 1).report["warnings"] == []
+
+
+def test_one_file_of_a_series_says_to_name_the_folder(two_series):
+    with pytest.raises(RefusedInputError, match=r"single slice .*one file of a series: name the folder that holds"):
+        read_volume(two_series / "a0")
+    write_series(two_series / "lone", Plan(series=9, shape=(1, 5, 6)))
+    with pytest.raises(RefusedInputError) as caught:
+        read_volume(two_series / "lone")
+    assert "name the folder" not in str(caught.value)

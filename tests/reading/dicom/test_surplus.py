@@ -1,0 +1,305 @@
+"""More bytes than the header's pixels take: padding, further elements, or a picture that would come out wrong."""
+
+from __future__ import annotations
+
+import os
+import struct
+
+import numpy as np
+import pytest
+from dicom_series import Plan, edit_value, make_dataset, save_dataset, write_series
+from enhanced_image import make_enhanced
+from hostile_bytes import COMPRESSED, NATIVE, make_series, save_bytes
+from pydicom.uid import (
+    DeflatedExplicitVRLittleEndian,
+    ExplicitVRBigEndian,
+    ExplicitVRLittleEndian,
+    ImplicitVRLittleEndian,
+)
+
+from clrecon.errors import RefusedInputError
+from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading.dicom.headers import surplus
+
+NAME = "IM{:04d}".format
+PLAN = Plan(shape=(3, 8, 10), name=NAME)
+SYNTAXES = [ExplicitVRLittleEndian, ImplicitVRLittleEndian, ExplicitVRBigEndian, DeflatedExplicitVRLittleEndian]
+TEXT = "it was sent as text"
+
+
+def write(folder, change=None, syntax=ExplicitVRLittleEndian, plan=PLAN):
+    """The slices of a plan, in any transfer syntax."""
+    plan = Plan(**{**vars(plan), "syntax": syntax})
+
+    def swap_and_change(ds, k):
+        if syntax == ExplicitVRBigEndian:
+            ds.PixelData = plan.stored(k).astype(">i2").tobytes()
+        if change is not None:
+            change(ds, k)
+
+    write_series(folder, plan, swap_and_change)
+    return plan
+
+
+def check_refused(folder, *words):
+    with pytest.raises(RefusedInputError) as caught:
+        read_volume(folder)
+    for word in words:
+        assert word in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def add(extra):
+    return lambda ds, k: setattr(ds, "PixelData", ds.PixelData + extra)
+
+
+# --- within the pixel data ---
+@pytest.mark.parametrize("syntax", SYNTAXES)
+def test_zeros_behind_the_pixels_are_padding_and_said(tmp_path, syntax):
+    plan = write(tmp_path, add(bytes(96)), syntax)
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu())
+    text = "Pixel Data has 256 bytes, 10 x 8 x 16 bit take 160: the rest is zeros, taken as padding (all slices)"
+    assert text in volume.report["warnings"]
+
+
+@pytest.mark.parametrize("syntax", SYNTAXES)
+def test_other_bytes_behind_the_pixels_are_refused_unless_forced(tmp_path, syntax):
+    plan = write(tmp_path, add(bytes(40) + b"\1\0"), syntax)
+    words = "IM0000: Pixel Data has 202 bytes, 10 x 8 x 16 bit take 160: more pixels than the header says"
+    check_refused(tmp_path, words, "force=True")
+    assert any(words in problem for problem in list_series(tmp_path).series[0].problems)
+    volume = read_volume(tmp_path, force=True)
+    assert np.array_equal(volume.voxels, plan.hu())
+    assert "the rest was left out on demand (all slices)" in "; ".join(volume.report["warnings"])
+
+
+@pytest.mark.parametrize("change", [{"Columns": 9}, {"Rows": 7}, {"BitsAllocated": 8, "BitsStored": 8, "HighBit": 7}])
+def test_a_header_with_fewer_pixels_than_there_are(tmp_path, change):
+    write(tmp_path, lambda ds, k: ds.update(change))
+    check_refused(tmp_path, "Pixel Data has 160 bytes", "more pixels than the header says")
+
+
+@pytest.mark.parametrize("hidden", [1, 3])
+def test_a_picture_that_ends_in_zeros_shows_its_columns(tmp_path, hidden):
+    """The bytes that one column less leaves over are zeros here: only the picture tells them from padding."""
+    plan = Plan(shape=(3, 32, 32), name=NAME, signed=False, intercept=-1024)
+    j, i = np.mgrid[:32, :32]
+    disc = np.where((i - 15.5) ** 2 + (j - 15.5) ** 2 < 144, 1000 + 20 * i, 0).astype("u2")
+
+    def change(ds, k):
+        ds.PixelData = disc.tobytes()
+        ds.Columns = 32 - hidden
+
+    write_series(tmp_path, plan, change)
+    check_refused(tmp_path, f"Pixel Data has 2048 bytes, {32 - hidden} x 32 x 16 bit take {64 * (32 - hidden)}",
+                  "rows are more alike with 32 columns")  # fmt: skip
+
+    def pad(ds, k):
+        ds.PixelData = disc[:, : 32 - hidden].tobytes() + bytes(64 * hidden)
+        ds.Columns = 32 - hidden
+
+    write_series(tmp_path, plan, pad)
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels[0], disc[:, : 32 - hidden].astype(int) - 1024)
+    assert "the rest is zeros, taken as padding" in volume.report["warnings"][0]
+
+
+def test_an_odd_count_of_pixels_has_a_byte_of_padding(tmp_path):
+    plan = Plan(shape=(3, 5, 7), name=NAME, bits_stored=8, signed=False)
+
+    def change(ds, k):
+        ds.BitsAllocated = 8
+        ds["PixelData"].VR = "OB"
+        ds.PixelData = bytes(range(220, 255)) + b"\0"
+
+    write_series(tmp_path, plan, change)
+    assert read_volume(tmp_path).report["warnings"] == []
+
+
+def test_pixel_data_longer_than_the_file_is_cut(tmp_path):
+    """All that the header asks for is there, but the file ends within its pixel data."""
+    plan = write(tmp_path, add(bytes(96)))
+    for file in tmp_path.iterdir():
+        file.write_bytes(file.read_bytes()[:-50])
+    check_refused(tmp_path, "Pixel Data has 256 bytes, 10 x 8 x 16 bit take 160, 206 are there: the file is cut")
+    assert np.array_equal(read_volume(tmp_path, force=True).voxels, plan.hu())
+
+
+@pytest.mark.parametrize("syntax", SYNTAXES[:2])
+def test_frames_with_more_than_their_pixels(tmp_path, syntax):
+    ds = make_enhanced(Plan(**{**vars(PLAN), "syntax": syntax}))
+    ds.PixelData += bytes(64)
+    save_dataset(ds, tmp_path / "one")
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, PLAN.hu())
+    text = "Pixel Data has 544 bytes, 3 x 10 x 8 x 16 bit take 480: the rest is zeros, taken as padding (all slices)"
+    assert text in volume.report["warnings"]
+    ds.NumberOfFrames = 2
+    ds.PerFrameFunctionalGroupsSequence = ds.PerFrameFunctionalGroupsSequence[:2]
+    save_dataset(ds, tmp_path / "one")
+    check_refused(tmp_path, "2 x 10 x 8 x 16 bit take 320: more pixels than the header says")
+
+
+# --- behind the pixel data ---
+def element(tag, vr, value, syntax):
+    order = ">" if syntax == ExplicitVRBigEndian else "<"
+    head = struct.pack(order + "HH", tag >> 16, tag & 0xFFFF)
+    if syntax == ImplicitVRLittleEndian:
+        return head + struct.pack("<L", len(value)) + value
+    return head + vr + struct.pack(order + "HL", 0, len(value)) + value
+
+
+def append(folder, data):
+    for file in folder.iterdir():
+        file.write_bytes(file.read_bytes() + data)
+
+
+@pytest.mark.parametrize("syntax", SYNTAXES[:3])
+def test_elements_behind_the_pixels(tmp_path, syntax):
+    plan = write(tmp_path, None, syntax)
+    private = element(0x7FE10010, b"OB", b"MAKER ", syntax) + element(0x7FE11010, b"OB", b"\n" * 50, syntax)
+    append(tmp_path, private + element(0xFFFCFFFC, b"OB", bytes(30), syntax))
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu()) and volume.report["warnings"] == []
+
+
+@pytest.mark.parametrize("syntax", SYNTAXES[:2])
+def test_a_sequence_without_length_behind_the_pixels(tmp_path, syntax):
+    plan = write(tmp_path, None, syntax)
+    head = element(0xFFFAFFFA, b"SQ", b"", syntax)[:-4] + b"\xff" * 4
+    item = struct.pack("<HHL", 0xFFFE, 0xE000, 0xFFFFFFFF) + element(0x04000005, b"OB", b"ab", syntax)
+    ends = struct.pack("<HHLHHL", 0xFFFE, 0xE00D, 0, 0xFFFE, 0xE0DD, 0)
+    append(tmp_path, head + item + ends)
+    assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
+    append(tmp_path, head[:-4])
+    check_refused(tmp_path, "bytes behind the pixel data are no elements of DICOM")
+
+
+@pytest.mark.parametrize("syntax", SYNTAXES[:3])
+@pytest.mark.parametrize("fault", ["junk", "short", "falling", "pixels again", "behind the padding", "too long", "one"])
+def test_what_is_no_element_behind_the_pixels(tmp_path, syntax, fault):
+    write(tmp_path, None, syntax)
+    padding = element(0xFFFCFFFC, b"OB", b"ab", syntax)
+    append(tmp_path, {
+        "junk": bytes(range(200, 250)),
+        "short": b"\xfc\xff\xfc\xff",
+        "falling": element(0x7FE11010, b"OB", b"ab", syntax) + element(0x00280030, b"OB", b"7\\7 ", syntax),
+        "pixels again": element(0x7FE00010, b"OW", bytes(160), syntax),
+        "behind the padding": padding + element(0xFFFFFFFF, b"OB", b"ab", syntax),
+        "too long": padding[:-1],
+        "one": b"\1",
+    }[fault])  # fmt: skip
+    check_refused(tmp_path, "IM0000: ", "bytes behind the pixel data are no elements of DICOM")
+
+
+def test_zeros_behind_the_pixel_data_are_left_out_on_demand_only(tmp_path):
+    plan = write(tmp_path)
+    append(tmp_path, bytes(512))
+    check_refused(tmp_path, "IM0000: 512 zero bytes behind the pixel data", "force=True")
+    volume = read_volume(tmp_path, force=True)
+    assert np.array_equal(volume.voxels, plan.hu())
+    assert "512 zero bytes behind the pixel data: left out on demand (all slices)" in volume.report["warnings"]
+
+
+# --- sent as text ---
+def noise(ds, k):
+    values = np.random.default_rng(k).integers(0, 4000, 6400)
+    values[::50] = int.from_bytes(b"\r\n", "little")
+    ds.PixelData = values.astype("<i2").tobytes()
+
+
+NOISY = Plan(shape=(3, 80, 80), name=NAME)
+
+
+@pytest.mark.parametrize("syntax", [ExplicitVRLittleEndian, ImplicitVRLittleEndian])
+@pytest.mark.parametrize(("old", "new"), [(b"\n", b"\r\n"), (b"\r\n", b"\n"), (b"\r", b"\r\n")])
+@pytest.mark.parametrize("whole", [True, False])
+def test_line_ends_that_were_changed_on_the_way(tmp_path, syntax, old, new, whole):
+    write(tmp_path, noise, syntax, NOISY)
+    for file in tmp_path.iterdir():
+        data = file.read_bytes()
+        start = 132 if whole else len(data) - 2 * 6400
+        file.write_bytes(data[:start] + data[start:].replace(old, new))
+    with pytest.raises(RefusedInputError) as caught:
+        read_volume(tmp_path)
+    if not whole:
+        words = {b"\n": TEXT, b"\r\n": "truncated: 12800 bytes of pixels expected", b"\r": "are no elements of DICOM"}
+        assert words[old] in str(caught.value)
+
+
+@pytest.mark.parametrize("tail", [b"", element(0xFFFCFFFC, b"OB", bytes(5000), ExplicitVRLittleEndian)])
+def test_frames_that_were_sent_as_text(tmp_path, tail):
+    ds = make_enhanced(NOISY)
+    noise(ds, 1)
+    ds.PixelData *= 3
+    data = save_bytes(ds)
+    head, pixels = data[:-38400], data[-38400:]
+    for changed in (pixels.replace(b"\n", b"\r\n"), pixels.replace(b"\r\n", b"\n")):
+        (tmp_path / "one").write_bytes(head + changed + tail)
+        check_refused(tmp_path, "one")
+
+
+@pytest.mark.parametrize("name", [*COMPRESSED, "deflated"])
+def test_compressed_pixels_that_were_sent_as_text(tmp_path, name):
+    for k in range(3):
+        ds = make_dataset(Plan(**{**vars(NOISY), "syntax": NATIVE.get(name, ExplicitVRLittleEndian)}), k)
+        noise(ds, k)
+        if name in COMPRESSED:
+            ds.compress(COMPRESSED[name], generate_instance_uid=False)
+        data = save_bytes(ds)
+        assert data.count(b"\n") > 9
+        (tmp_path / NAME(k)).write_bytes(data[:132] + data[132:].replace(b"\n", b"\r\n"))
+    check_refused(tmp_path, "IM000")
+
+
+# --- compressed ---
+@pytest.mark.parametrize("name", COMPRESSED)
+def test_what_follows_compressed_pixels(tmp_path, name):
+    for k, data in enumerate(make_series(COMPRESSED[name])):
+        (tmp_path / NAME(k)).write_bytes(data)
+    whole = read_volume(tmp_path).voxels
+    append(tmp_path, element(0xFFFCFFFC, b"OB", bytes(30), ExplicitVRLittleEndian))
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, whole) and volume.report["warnings"] == []
+    append(tmp_path, b"\1\2\3")
+    check_refused(tmp_path, "45 bytes behind the pixel data are no elements of DICOM")
+
+
+@pytest.mark.parametrize("name", [*COMPRESSED, *NATIVE])
+def test_two_files_in_one(tmp_path, name):
+    """The second is not read in silence: neither its pixels nor that it is there."""
+    files = make_series((COMPRESSED | NATIVE)[name])
+    for k, data in enumerate(files):
+        (tmp_path / NAME(k)).write_bytes(data + files[0])
+    check_refused(tmp_path, "bytes behind the ")
+
+
+@pytest.mark.parametrize("name", COMPRESSED)
+@pytest.mark.parametrize(("keyword", "value"), [("Columns", 31), ("Rows", 31), ("Columns", 16)])
+def test_compressed_pixels_of_another_size(tmp_path, name, keyword, value):
+    for k, data in enumerate(make_series(COMPRESSED[name])):
+        (tmp_path / NAME(k)).write_bytes(data)
+        edit_value(tmp_path / NAME(k), keyword, lambda old: struct.pack("<H", value))
+    check_refused(tmp_path, "IM000")
+
+
+def test_a_sparse_file_is_not_read_to_its_end(tmp_path):
+    """Zeros without end take no space on the disk, and neither time nor memory here."""
+    write(tmp_path)
+    for file in tmp_path.iterdir():
+        os.truncate(file, 1 << 36)
+    check_refused(tmp_path, "bytes behind the pixel data are no elements of DICOM")
+
+
+def test_a_file_in_plain_order_is_not_opened_again(tmp_path, monkeypatch):
+    write(tmp_path)
+
+    def fail(*args):
+        raise AssertionError("looked at a file that has no surplus")
+
+    monkeypatch.setattr(surplus, "open_regular", fail)
+    assert list_series(tmp_path).series[0].slices == 3
+    append(tmp_path, b"\0\0")
+    with pytest.raises(AssertionError, match="no surplus"):
+        list_series(tmp_path)

@@ -1,0 +1,81 @@
+"""Every row of the trap matrix: voxels where they were written, or a refusal that says why; nothing is silent."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tolerances import AFFINE_MM, FAR_AFFINE_MM, JITTER_AFFINE_MM, ROUNDED_AFFINE_MM
+from trap_cases import BACKGROUND_HU, CASES, EXACT, REFUSED, WARNED, Case, Marks, Size
+from trap_plan import BODY_HU
+
+from clrecon.errors import ClreconError, RefusedInputError
+from clrecon.geometry import Volume
+from clrecon.reading.dicom import read_volume
+
+BOUNDS_MM = {"written": AFFINE_MM, "rounded": ROUNDED_AFFINE_MM, "far": FAR_AFFINE_MM, "jitter": JITTER_AFFINE_MM}
+
+
+def check_marks(volume: Volume, truth: Marks, bound_mm: float) -> None:
+    """Every mark of the stack is there once, at its place, and nothing else is."""
+    assert volume.voxels.shape[0] == truth.slices
+    kji = np.argwhere((volume.voxels != BACKGROUND_HU) & (volume.voxels != BODY_HU))
+    hu = volume.voxels[tuple(kji.T)]
+    order, expected = np.argsort(hu), np.argsort(truth.hu)
+    assert np.array_equal(hu[order], truth.hu[expected])
+    errors = np.linalg.norm(volume.ijk_to_lps(kji[order, ::-1]) - truth.lps_mm[expected], axis=1)
+    assert errors.max() < bound_mm
+
+
+def check_warnings(volume: Volume, verdict: str, words: tuple[str, ...]) -> None:
+    text = "; ".join(volume.report["warnings"])
+    assert bool(text) == (verdict == WARNED), text
+    for word in words:
+        assert word in text
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_a_row_of_the_matrix(tmp_path: Path, case: Case) -> None:
+    truth = case.write(tmp_path, Size())
+    if case.verdict == REFUSED:
+        with pytest.raises(ClreconError) as caught:
+            read_volume(tmp_path)
+        assert isinstance(caught.value, RefusedInputError), caught.value
+        for word in case.words:
+            assert word in str(caught.value)
+        assert "\n" not in str(caught.value)
+        return
+    volume = read_volume(tmp_path)
+    check_warnings(volume, case.verdict, case.words)
+    check_marks(volume, truth, BOUNDS_MM[case.bound])
+
+
+@pytest.mark.parametrize(
+    "case", [c for c in CASES.values() if c.again], ids=[c.name for c in CASES.values() if c.again]
+)
+def test_a_refused_row_read_on_request(tmp_path: Path, case: Case) -> None:
+    truth = case.write(tmp_path, Size())
+    volume = read_volume(tmp_path, **dict(case.again or {}))
+    check_warnings(volume, EXACT if "series" in dict(case.again or {}) else WARNED, case.again_words)
+    check_marks(volume, truth, BOUNDS_MM[case.bound])
+
+
+def test_the_check_sees_a_shift_and_a_swap(tmp_path: Path) -> None:
+    truth = CASES["regular, non-square pixels"].write(tmp_path, Size())
+    volume = read_volume(tmp_path)
+    check_marks(volume, truth, AFFINE_MM)
+    shifted = np.array(volume.affine)
+    shifted[:3, 2] *= 1.00001
+    for wrong in (Volume(volume.voxels, shifted), Volume(volume.voxels[::-1], volume.affine)):
+        with pytest.raises(AssertionError, match="assert"):
+            check_marks(wrong, truth, AFFINE_MM)
+
+
+def test_every_verdict_is_there() -> None:
+    def count(verdict: Any) -> int:
+        return sum(case.verdict == verdict for case in CASES.values())
+
+    assert min(count(EXACT), count(WARNED), count(REFUSED)) >= 9 and len(CASES) >= 40
+    assert all(case.words for case in CASES.values() if case.verdict != EXACT)

@@ -1,0 +1,70 @@
+"""A file cut at every byte: refused by name, or read as it was; never anything else, and never another volume."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hostile_bytes import Seed, phantom_seeds
+
+from clrecon.errors import ClreconError, RefusedInputError
+from clrecon.reading.dicom import list_series, read_volume
+
+PIXEL_STRIDE = 7
+SERIES_STRIDE = 11
+"""Odd, so that cuts meet every byte of the heads of elements; a listing of the one file is cut at every byte."""
+SEEDS = phantom_seeds()
+
+
+def lengths(seed: Seed) -> list[int]:
+    """Every byte up to the pixel data and over its head, then some of the value, then every byte of the end."""
+    value = len(seed.data) if seed.deflated_from >= 0 else seed.elements[-1].value
+    strided = range(value + 8, len(seed.data) - 16, PIXEL_STRIDE)
+    return sorted({*range(min(value + 8, len(seed.data))), *strided, *range(len(seed.data) - 16, len(seed.data))})
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize("name", SEEDS)
+def test_a_slice_cut_anywhere(tmp_path, name, capfd):
+    seed = SEEDS[name]
+    folder = tmp_path / "ct"
+    folder.mkdir()
+    for k, data in enumerate(seed.series):
+        (folder / f"{k}").write_bytes(data)
+    whole = read_volume(folder)
+    cut = folder / f"{len(seed.series) // 2}"
+    read = []
+    for length in lengths(seed)[::SERIES_STRIDE]:
+        cut.write_bytes(seed.data[:length])
+        try:
+            volume = read_volume(folder)
+        except RefusedInputError as error:
+            text = str(error)
+            assert text.isprintable() and (cut.name in text or len(seed.series) == 1)
+        except ClreconError:
+            assert len(seed.series) == 1 and length < 140  # nothing is left of the only file
+        else:
+            read.append(length)
+            if length:
+                assert np.array_equal(volume.voxels, whole.voxels)
+            else:  # an empty file without an extension is nobody's slice
+                assert volume.voxels.shape[0] == 2 and volume.report["files"]["skipped"] == {"not DICOM": 1}
+    # Nothing is missed where a few bytes of padding, or the end mark of the last item, are gone.
+    assert [length for length in read if 0 < length < len(seed.data) - 8] == []
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize("name", SEEDS)
+def test_listing_a_file_cut_at_every_byte(tmp_path, name):
+    seed = SEEDS[name]
+    outcomes = set()
+    for length in lengths(seed)[:: 1 if len(seed.series) > 1 else 2]:
+        (tmp_path / "0").write_bytes(seed.data[:length])
+        try:
+            entries = list_series(tmp_path).series
+        except ClreconError as error:
+            outcomes.add(type(error).__name__)
+        else:
+            assert len(entries) == 1 and entries[0].problems
+            outcomes.add("listed")
+    assert {"NoDicomError", "RefusedInputError"} <= outcomes <= {"NoDicomError", "RefusedInputError", "listed"}

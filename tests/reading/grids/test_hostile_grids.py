@@ -1,0 +1,353 @@
+"""Grid files by strangers: cut, damaged, lying about sizes, without a position, pointing elsewhere."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tracemalloc
+
+import numpy as np
+import pytest
+from label_files import OBLIQUE, write_nifti, write_nrrd
+from volume_files import WRITERS, make_ct, write_metaimage
+
+import clrecon
+from clrecon.errors import ClreconError, RefusedInputError
+from clrecon.reading.grids.metaimage import UNUSED_NUMBERS
+
+nibabel = pytest.importorskip("nibabel")
+pytest.importorskip("nrrd")
+pytest.importorskip("SimpleITK")
+
+
+def edit(path, old, new):
+    """Replace text in a header that is text."""
+    content = path.read_bytes()
+    assert old in content
+    path.write_bytes(content.replace(old, new, 1))
+    return path
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize("name", WRITERS)
+def test_cut_anywhere_it_is_refused(tmp_path, name):
+    path = WRITERS[name](tmp_path / name, make_ct((6, 12, 12)), OBLIQUE)
+    beside = [other for other in tmp_path.iterdir() if other != path]
+    for part in (path, *beside):
+        content = part.read_bytes()
+        # without its last line breaks the header of an .mhd or .nhdr still says everything
+        for length in {*range(0, len(content), 29), len(content) - (4 if part.suffix in (".mhd", ".nhdr") else 1)}:
+            part.write_bytes(content[:length])
+            with pytest.raises(ClreconError) as caught:
+                clrecon.read_volume(path)
+            assert type(caught.value) is RefusedInputError or length < 16, (part.name, length)
+        part.write_bytes(content)
+    assert clrecon.read_volume(path).voxels.shape == (6, 12, 12)
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize("name", ["a.nii.gz", "gzip.nrrd", "packed.mha", "packed.mhd"])
+def test_damaged_compressed_voxels_are_refused(tmp_path, name):
+    path = WRITERS[name](tmp_path / name, make_ct((6, 12, 12)), OBLIQUE)
+    part = path.with_suffix(".zraw") if path.suffix == ".mhd" else path
+    content = part.read_bytes()
+    for at in range(len(content) - 1200, len(content) - 10, 13):
+        damaged = bytearray(content)
+        damaged[at] ^= 0x5A
+        part.write_bytes(damaged)
+        with pytest.raises(RefusedInputError, match="is cut|is cut or corrupt|holds more numbers"):
+            clrecon.read_volume(path)
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize("name", ["a.nii", "raw.nrrd"])
+def test_a_damaged_header_is_read_or_refused(tmp_path, name):
+    content = WRITERS[name](tmp_path / name, make_ct(), OBLIQUE).read_bytes()
+    random = np.random.default_rng(5)
+    refused = 0
+    for _ in range(200):
+        damaged = bytearray(content)
+        for at in random.integers(0, 350, 2):
+            damaged[at] = random.integers(0, 256)
+        (tmp_path / "b").write_bytes(damaged)
+        try:
+            clrecon.read_volume(tmp_path / "b")
+        except ClreconError:
+            refused += 1
+    assert 20 < refused < 200
+
+
+MUTATE = """
+import sys
+import numpy as np
+import clrecon
+from clrecon.errors import ClreconError
+content = open(sys.argv[1], "rb").read()
+head = content.index(b"LOCAL")
+random = np.random.default_rng(7)
+words = [b"100000", b"-1", b"nan", b"=", b"\\n", b"1e999", b"0", b" 1", b"x" * 300, b"LIST", b"NDims", b"MET_INT"]
+read = 0
+for _ in range(400):
+    damaged = bytearray(content)
+    for _ in range(random.integers(1, 3)):
+        at = int(random.integers(0, head + 6))
+        damaged[at : at + int(random.integers(0, 4))] = words[random.integers(len(words))]
+    open(sys.argv[2], "wb").write(damaged)
+    try:
+        clrecon.read_volume(sys.argv[2])
+        read += 1
+    except ClreconError:
+        pass
+print("read", read)
+"""
+
+
+@pytest.mark.fuzz
+def test_a_damaged_metaimage_header_never_ends_the_process(tmp_path):
+    path = write_metaimage(tmp_path / "a.mha", make_ct())
+    done = subprocess.run(
+        [sys.executable, "-c", MUTATE, str(path), str(tmp_path / "b.mha")], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert 10 < int(done.stdout.split()[-1]) < 300  # some changes do no harm: comments, one digit for another
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("NDims", "100000", "NDims is '100000', expected a volume has three axes"),
+        ("NDims", "2", "NDims is '2'"),
+        ("NDims", None, "is no NIfTI|NDims is missing"),
+        ("DimSize", "7 6", "DimSize is '7 6', expected 3 finite numbers"),
+        ("DimSize", "7 6 4000", "cannot come from a file of"),
+        ("DimSize", "70000 60000 40000", "at most 4,294,967,296"),
+        ("DimSize", "7 6 -4", "DimSize is '7 6 -4'"),
+        ("DimSize", "7 6 1.5", "whole numbers from 1"),
+        ("ElementType", "MET_SHORT_ARRAY", "one real number a voxel"),
+        ("ElementType", "MET_STRING", "one real number a voxel"),
+        ("ElementNumberOfChannels", "3", "ElementNumberOfChannels is '3', expected 1"),
+        ("ElementSpacing", None, "ElementSpacing is missing, expected 3 finite numbers: it does not say where it lies"),
+        ("ElementSpacing", "0.7 -0.5 2", "steps above 0 mm"),
+        ("ElementSpacing", "0.7 nan 2", "expected 3 finite numbers"),
+        ("ElementSpacing", "0.7 1e999 2", "expected 3 finite numbers"),
+        ("Offset", None, "Offset is missing, expected 3 finite numbers: it does not say where it lies"),
+        ("TransformMatrix", None, "TransformMatrix is missing, expected 9 finite numbers: it does not say where"),
+        ("TransformMatrix", "1 0 0 1 0 0 0 0 1", "cannot read its header|cannot be placed"),
+        ("Origin", "0 0 0", "says Offset and Origin"),
+        ("offset", "0 0 0", "says offset twice"),
+        ("HeaderSize", "-1", "HeaderSize is '-1', expected 0"),
+        ("BinaryData", "False", "voxels written as text are not read"),
+        ("CompressedData", "Maybe", "expected True or False"),
+        ("CompressedData", "True", "cut or corrupt in slice 1 of 4"),
+        ("DistanceUnits", "inch", "DistanceUnits is 'inch', expected mm, cm or um"),
+        ("ElementToIntensityFunctionSlope", "2", "expected 1"),
+        ("CenterOfRotation", "1e9990 0", "CenterOfRotation is '1e9990 0', expected 3 finite numbers"),
+        ("ElementSize", "1 1", "expected 3 finite numbers"),
+        ("Color", "1 0 0", "Color is '1 0 0', expected 4 finite numbers"),
+        ("CompressedDataSize", "z", "CompressedDataSize is 'z', expected a finite number"),
+        ("ObjectType", "Scene", "ObjectType is 'Scene', expected Image"),
+        ("Comment", "x" * 5000, "does not end|no line 'ElementDataFile"),
+        ("ElementDataFile", "../a.raw", "voxels are in '../a.raw': only files beside it are read"),
+        ("ElementDataFile", "/etc/passwd", "'/etc/passwd': only files beside it"),
+        ("ElementDataFile", "C:\\a.raw", "only files beside it"),
+        ("ElementDataFile", "sub\\..\\..\\a.raw", "only files beside it"),
+        ("ElementDataFile", "LIST", "expected LOCAL or one file, not several"),
+        ("ElementDataFile", "a%03d.raw 1 4 1", "expected LOCAL or one file, not several"),
+        ("ElementDataFile", "none.raw", "'none.raw', which is not there"),
+        ("ElementDataFile", "folder", "'folder', which is no regular file"),
+        ("ElementDataFile", "pipe", "'pipe', which is no regular file"),
+        ("ElementDataFile", "link", "'link', a link to another folder"),
+        ("ElementDataFile", "", "expected LOCAL or one file"),
+    ],
+)  # fmt: skip
+def test_hostile_metaimages_are_refused(tmp_path, capfd, key, value, message):
+    folder = tmp_path / "here"
+    folder.mkdir()
+    (folder / "folder").mkdir()
+    os.mkfifo(folder / "pipe")
+    (tmp_path / "secret").write_bytes(bytes(1000))
+    (folder / "link").symlink_to(tmp_path / "secret")
+    fields = {"ElementDataFile": None, key: value, "Last": None} if key != "ElementDataFile" else {key: value}
+    path = write_metaimage(folder / "a.mha", make_ct(), **{k: v for k, v in fields.items() if k != "ElementDataFile"})
+    if key == "ElementDataFile":
+        path = write_metaimage(folder / "a.mha", make_ct(), ElementDataFile=value)
+    elif value is not None:  # a new field goes before the last one
+        head, _, data = path.read_bytes().partition(b"ElementDataFile = LOCAL\n")
+        lines = [line for line in head.decode("latin-1").splitlines() if not line.startswith(f"{key} =")]
+        text = "\n".join([*lines, f"{key} = {value}", "ElementDataFile = LOCAL\n"])
+        path.write_bytes(text.encode("latin-1") + data)
+    with pytest.raises(RefusedInputError, match=message):
+        clrecon.read_volume(path)
+    if key in UNUSED_NUMBERS:  # the library was not asked
+        assert capfd.readouterr().err == ""
+
+
+def test_units_of_length_become_mm(tmp_path):
+    micron = np.diag((1e3, 1e3, 1e3, 1.0)) @ OBLIQUE
+    volume = clrecon.read_volume(write_metaimage(tmp_path / "a.mha", make_ct(), micron, DistanceUnits="um"))
+    assert np.allclose(volume.affine, OBLIQUE, atol=1e-9)
+    volume = clrecon.read_volume(write_nrrd(tmp_path / "a.nrrd", make_ct(), micron, **{"space units": ["um"] * 3}))
+    assert np.allclose(volume.affine, OBLIQUE, atol=1e-9)
+    path = write_nrrd(tmp_path / "b.nrrd", make_ct(), **{"space units": ["mm", "mm", "parsec"]})
+    with pytest.raises(RefusedInputError, match="unknown units"):
+        clrecon.read_volume(path)
+    for code, scale in ((1, 1000.0), (3, 1e-3), (0, 1.0)):
+        path = write_nifti(tmp_path / "a.nii", make_ct(), np.diag((2.0, 3.0, 4.0, 1.0)))
+        content = bytearray(path.read_bytes())
+        content[123] = code
+        path.write_bytes(content)
+        volume = clrecon.read_volume(path)
+        assert volume.spacing == pytest.approx((2 * scale, 3 * scale, 4 * scale))
+        assert any("spacings that no scanner has" in text for text in volume.report["warnings"]) == (scale != 1.0)
+
+
+def test_the_byte_order_of_a_metaimage_that_does_not_say_is_a_warning(tmp_path):
+    voxels = make_ct()
+    volume = clrecon.read_volume(write_metaimage(tmp_path / "a.mha", voxels, BinaryDataByteOrderMSB=None))
+    assert np.array_equal(volume.voxels, voxels)
+    assert "byte order is not said" in volume.report["warnings"][1]
+
+
+@pytest.mark.parametrize("field", ["ElementMin =", "ImagePosition = 1"])
+def test_a_field_that_swallows_the_spacing_is_refused(tmp_path, field):
+    """SimpleITK takes the name of the next field for a number, and 1 mm for the spacing that it then does not see."""
+    path = write_metaimage(tmp_path / "a.mha", make_ct())
+    edit(path, b"ElementSpacing", f"{field}\nElementSpacing".encode())
+    with pytest.raises(RefusedInputError, match="it can be read in two ways"):
+        clrecon.read_volume(path)
+
+
+@pytest.mark.parametrize("frames", [1, 5])
+def test_one_point_in_time_is_a_volume_and_several_are_refused(tmp_path, frames):
+    voxels = np.stack([make_ct(seed=n) for n in range(frames)])
+    steps = np.diag((1.0, 1.0, 1.0, 1.0))
+    fields = {
+        "NDims": "4", "DimSize": f"7 6 4 {frames}", "ElementSpacing": "1 1 1 1", "Offset": "0 0 0 0",
+        "TransformMatrix": "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "CenterOfRotation": "0 0 0 0",
+    }  # fmt: skip
+    directions = np.vstack([steps[:3, :3], np.full((1, 3), np.nan)])
+    nrrd_header = {"space directions": directions, "kinds": ["domain"] * 3 + ["time"]}
+    paths = [
+        write_nifti(tmp_path / "a.nii.gz", voxels, steps),
+        write_metaimage(tmp_path / "a.mha", voxels.reshape(4 * frames, 6, 7), steps, **fields),
+        write_nrrd_frames(tmp_path / "a.nrrd", voxels, nrrd_header),
+    ]
+    for path in paths:
+        if frames == 1:
+            assert np.array_equal(clrecon.read_volume(path).voxels, voxels[0])
+        else:
+            with pytest.raises(RefusedInputError, match=r"has 4 axes \(7 x 6 x 4 x 5\): a volume has three.*5"):
+                clrecon.read_volume(path)
+
+
+def write_nrrd_frames(path, voxels, fields):
+    import nrrd
+
+    header = {"space": "left-posterior-superior", "space origin": np.zeros(3), **fields}
+    nrrd.write(str(path), voxels.transpose(3, 2, 1, 0), header)
+    return path
+
+
+def test_colours_are_refused(tmp_path):
+    colours = np.zeros((7, 6, 4), dtype=[("R", "u1"), ("G", "u1"), ("B", "u1")])
+    nibabel.save(nibabel.Nifti1Image(colours, np.eye(4)), tmp_path / "a.nii")
+    with pytest.raises(RefusedInputError, match="is not a volume: its voxels are colours"):
+        clrecon.read_volume(tmp_path / "a.nii")
+    path = write_nrrd(tmp_path / "a.nrrd", np.zeros((4, 6, 7, 3), np.uint8), kinds=["RGB-color"] + ["domain"] * 3)
+    with pytest.raises(RefusedInputError, match="has 4 axes"):
+        clrecon.read_volume(path)
+    path = write_nrrd(tmp_path / "b.nrrd", np.zeros((4, 6, 7, 2), np.uint8))
+    with pytest.raises(RefusedInputError, match="has 4 axes"):
+        clrecon.read_volume(path)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_single_slice_is_no_volume(tmp_path, name):
+    path = WRITERS[name](tmp_path / name, make_ct((1, 6, 7)), OBLIQUE)
+    with pytest.raises(RefusedInputError, match="7 x 6 x 1 voxels: a volume has two at least along each axis"):
+        clrecon.read_volume(path)
+
+
+def test_a_field_of_nrrd_without_its_value_is_refused(tmp_path):
+    path = edit(write_nrrd(tmp_path / "a.nrrd", make_ct()), b"space origin: ", b"space origin: \n#")
+    with pytest.raises(RefusedInputError, match="corrupt NRRD header"):
+        clrecon.read_volume(path)
+
+
+def test_without_a_position_it_is_refused(tmp_path):
+    with pytest.raises(RefusedInputError, match="does not say where it lies"):
+        clrecon.read_volume(write_nifti(tmp_path / "a.nii", make_ct(), sform=False))
+    path = edit(write_nrrd(tmp_path / "a.nrrd", make_ct()), b"space: left-posterior-superior\n", b"")
+    with pytest.raises(RefusedInputError, match="does not say where it lies"):
+        clrecon.read_volume(path)
+
+
+def test_an_analyze_file_is_refused(tmp_path):
+    nibabel.save(nibabel.AnalyzeImage(make_ct().transpose(2, 1, 0), np.eye(4)), tmp_path / "a.hdr")
+    with pytest.raises(RefusedInputError, match="Analyze files do not say where they lie"):
+        clrecon.read_volume(tmp_path / "a.hdr")
+
+
+def test_the_voxels_of_a_pair_stay_beside_their_header(tmp_path):
+    (tmp_path / "in").mkdir()
+    path = WRITERS["a.hdr"](tmp_path / "in" / "a.hdr", make_ct(), OBLIQUE)
+    with pytest.raises(RefusedInputError, match="of a NIfTI pair give the .hdr"):
+        clrecon.read_volume(tmp_path / "in" / "a.img")
+    (tmp_path / "in" / "a.img").rename(tmp_path / "a.img")
+    (tmp_path / "in" / "a.img").symlink_to(tmp_path / "a.img")
+    with pytest.raises(RefusedInputError, match="a link to another folder"):
+        clrecon.read_volume(path)
+
+
+def test_pixdim_that_is_not_the_spacing_of_the_sform_is_said(tmp_path):
+    path = write_nifti(tmp_path / "a.nii", make_ct())
+    assert len(clrecon.read_volume(path).report["warnings"]) == 1
+    content = bytearray(path.read_bytes())
+    content[88:92] = np.float32(5).tobytes()
+    path.write_bytes(content)
+    volume = clrecon.read_volume(path)
+    assert volume.spacing == pytest.approx(np.linalg.norm(OBLIQUE[:3, :3], axis=0))
+    assert "pixdim says a spacing of 0.7071 x 0.5123 x 5 mm, the affine" in volume.report["warnings"][1]
+
+
+def test_more_numbers_than_the_header_says_are_refused(tmp_path):
+    voxels = make_ct((6, 40, 40))
+    for name, old, new in (("raw.nrrd", b"sizes: 40 40 6", b"sizes: 40 40 3"), ("a.mha", b"40 40 6", b"40 40 3"),
+                           ("packed.mha", b"40 40 6", b"40 40 3")):  # fmt: skip
+        path = edit(WRITERS[name](tmp_path / name, voxels, OBLIQUE), old, new)
+        with pytest.raises(RefusedInputError, match="holds more numbers than its header says"):
+            clrecon.read_volume(path)
+
+
+def test_sform_and_qform_that_differ_are_said(tmp_path):
+    path = write_nifti(tmp_path / "a.nii", make_ct(), np.diag((1.0, 1.0, 2.0, 1.0)), qform=True)
+    content = bytearray(path.read_bytes())
+    content[292:296] = np.float32(5).tobytes()
+    path.write_bytes(content)
+    assert "sform and qform lie 5 mm apart: the sform is used" in clrecon.read_volume(path).report["warnings"]
+
+
+def test_a_small_file_that_would_fill_the_memory_is_refused(tmp_path, monkeypatch):
+    from clrecon.system import memory
+
+    path = write_nifti(tmp_path / "a.nii.gz", np.zeros((60, 400, 400), np.int16))
+    assert path.stat().st_size < 100_000
+    monkeypatch.setattr(memory, "available_memory_bytes", lambda: 2**20)
+    tracemalloc.start()
+    with pytest.raises(
+        RefusedInputError, match="a.nii.gz: the volume of 400 x 400 x 60 voxels needs 0.02 GiB of memory, 0.00 GiB are"
+    ):
+        clrecon.read_volume(path)
+    assert tracemalloc.get_traced_memory()[1] < 8e6
+    tracemalloc.stop()
+
+
+def test_texts_of_a_file_are_escaped_and_never_in_the_report(tmp_path):
+    path = write_metaimage(tmp_path / "Jane\x1b[31mDoe.mha", make_ct(), Comment="Doe^Jane\x1b]0;x")
+    volume = clrecon.read_volume(path)
+    assert "Doe" not in str(volume.report) and "Doe" not in str(clrecon.list_series(path))
+    with pytest.raises(RefusedInputError) as caught:
+        clrecon.read_volume(write_metaimage(path, make_ct(), ElementSpacing="\x1b[31m"))
+    assert re.search(r"[\x00-\x1f]", str(caught.value)) is None
