@@ -23,15 +23,15 @@ from clrecon.mesh import Mesh as Mesh
 from clrecon.mesh.compare.cells import GridCells as GridCells
 from clrecon.mesh.compare.cells import find_mesh_cells as find_mesh_cells
 from clrecon.mesh.compare.cells import measure_cells as measure_cells
-from clrecon.mesh.compare.cut_cells import find_cut_cells as find_cut_cells
 from clrecon.mesh.compare.distances import compare_meshes as compare_meshes
+from clrecon.mesh.compare.mesh_slices import measure_slices as measure_slices
 from clrecon.mesh.compare.signed import measure_distance as measure_distance
 from clrecon.mesh.compare.signed import measure_vertex_distances as measure_vertex_distances
-from clrecon.mesh.compare.slices import measure_slices as measure_slices
+from clrecon.mesh.compare.truth import find_cut_cells as find_cut_cells
 from clrecon.mesh.compare.truth import measure_truth as measure_truth
-from clrecon.mesh.reader import read_mesh as read_mesh
+from clrecon.mesh.mesh_reader import read_mesh as read_mesh
+from clrecon.mesh.refine.decimation import smooth_mesh as smooth_mesh
 from clrecon.mesh.refine.quadric import collapse_quadric as collapse_quadric
-from clrecon.mesh.refine.smoothing import smooth_mesh as smooth_mesh
 from clrecon.opencl import list_devices
 from clrecon.operators import choose_device
 from clrecon.operators.filters.bilateral import filter_bilateral as filter_bilateral
@@ -72,7 +72,7 @@ from clrecon.points import PointStep as PointStep
 from clrecon.points import drop_ghost_slices as drop_ghost_slices
 from clrecon.points import fill_ghost_slices as fill_ghost_slices
 from clrecon.points import keep_clusters as keep_clusters
-from clrecon.points.reader import read_points as read_points
+from clrecon.points.cloud_reader import read_points as read_points
 from clrecon.reading import list_series as list_series
 from clrecon.reading import read_volume as read_volume
 from clrecon.reading.grids.write_volume import write_volume as write_volume

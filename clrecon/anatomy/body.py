@@ -28,8 +28,8 @@ from clrecon.anatomy.dense_pieces import (
     judge_circle,
 )
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.geometry.base import AIR_HU
 from clrecon.geometry.certificate import amend
+from clrecon.geometry.grid import AIR_HU
 from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.pieces import in_threads

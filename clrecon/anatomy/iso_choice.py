@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import METAL_HU
-from clrecon.geometry.base import AIR_HU
+from clrecon.geometry.grid import AIR_HU
 from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.progress import Progress, ignore_progress

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from clrecon.anatomy.body import BODY_STEPS, MARGIN_MM, TISSUE_HU, find_body, find_unmeasured
 from clrecon.anatomy.body_cells import count_cells, grow
 from clrecon.errors import NoSurfaceError, RefusedInputError
-from clrecon.geometry.base import AIR_HU
 from clrecon.geometry.certificate import amend
+from clrecon.geometry.grid import AIR_HU
 from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, Steps

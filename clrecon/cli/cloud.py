@@ -15,7 +15,7 @@ from clrecon.cli.masking import add_masking
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.points import parse_point
 from clrecon.cli.reading import add_reading
-from clrecon.jobs.cloud.settings import DENOISERS, GHOSTS, KINDS, STEPS, CloudSettings
+from clrecon.jobs.cloud.settings import DENOISERS, GHOSTS, POINT_KINDS, STEPS, CloudSettings
 from clrecon.jobs.inputs import CLOUD_INPUTS
 from clrecon.system.text import count_of, format_band
 
@@ -100,7 +100,7 @@ def _add_points(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--points",
         type=str.lower,
-        metavar="|".join(KINDS),
+        metavar="|".join(POINT_KINDS),
         help="surface: where the HU cross the iso value, between the voxels; voxels: the centres of those within;"
         " shell: of these the outer ones (default: surface, with a band voxels)",
     )

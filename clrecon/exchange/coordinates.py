@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.geometry.precision import float32_step, is_far
+from clrecon.geometry.vertices import float32_step, is_far
 
 _MOST_STEPS_APART = 64
 
@@ -18,7 +18,7 @@ def as_stored(points: NDArray[Any]) -> NDArray[np.floating]:
     points: ndarray, shape (n, 3), mm
 
     Returns: ndarray, shape (n, 3), C-contiguous. float32; float64 where they are not float32 already and lie so far
-        from the origin that float32 would round them by more than 2e-4 mm, see `clrecon.geometry.precision`.
+        from the origin that float32 would round them by more than 2e-4 mm, see `clrecon.geometry.vertices`.
     """
     dtype = np.float64 if points.dtype != np.float32 and is_far(points) else np.float32
     return np.ascontiguousarray(points, dtype=dtype)

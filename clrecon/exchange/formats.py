@@ -20,7 +20,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange import glb, obj, page, ply, stl, threemf, vtp
 from clrecon.exchange.content import Assembly, Content, Writable
 from clrecon.exchange.file_format import FOUR_GIB, NO_LIMIT, FileFormat, find_extension, stage_content
-from clrecon.geometry.precision import float32_step
+from clrecon.geometry.vertices import float32_step
 from clrecon.system.files import StagedFile
 
 # STL: the format could hold more, but many programs keep offsets in 32 bits.  GLB: its length field has 32 bits.

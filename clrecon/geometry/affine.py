@@ -1,14 +1,20 @@
-"""The affine from voxel indices (i, j, k) to patient millimetres, and the spacing, normal and tilt that follow from it.
+"""The affine from voxel indices (i, j, k) to patient millimetres, what follows from it, and patient frames.
 
 An affine is always a 4x4 float64 array that maps column vectors (i, j, k, 1) to (x, y, z, 1) in LPS mm:
 its columns are the step from one column of a slice to the next, from one row to the next, from one slice to
 the next, and the centre of voxel (0, 0, 0).  The slice step is a full vector: with a tilted gantry it is not
 parallel to the slice normal, and the affine is then an exact shear.
 
+Inside clrecon everything is LPS mm; RAS exists only at the border, under its own name.  LPS: x to the patient's left,
+y to the posterior, z to the superior (DICOM).  RAS: x right, y anterior (NIfTI).
+
 Source: DICOM PS3.3 C.7.6.2.1.1 (Image Position and Image Orientation), with the slice step added.
 """
 
 from __future__ import annotations
+
+import itertools
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -122,3 +128,72 @@ def is_left_handed(affine: Float64Array) -> bool:
 def normal_matrix(affine: Float64Array) -> Float64Array:
     """Inverse transpose of the 3x3 part: maps gradients per index step to gradients per mm."""
     return np.asarray(np.linalg.inv(affine[:3, :3]).T, dtype=np.float64)
+
+
+def facts_of_orientation(affine: Float64Array) -> dict[str, Any]:
+    """Describe the directions of index space in the patient.
+
+    Returns: ``row``, ``column``, ``normal``: unit vectors in LPS along i, along j, and row x column.  ``axes``: for i,
+        j and the normal, the letter of the patient direction nearest to it (L left, R right, P posterior, A anterior, S
+        superior, I inferior).  ``off_axis_deg``: angle between the normal and the nearest patient axis.
+        ``right_handed``: the determinant of the affine is above zero.
+    """
+    row, column = (affine[:3, axis] / np.linalg.norm(affine[:3, axis]) for axis in (0, 1))
+    normal = slice_normal(affine)
+    directions = np.stack((row, column, normal))
+    weights = np.abs(directions)
+    axes = max(itertools.permutations(range(3)), key=lambda order: weights[range(3), order].sum())
+    letters = ["LPS"[axis] if directions[place, axis] > 0 else "RAI"[axis] for place, axis in enumerate(axes)]
+    return {
+        "row": row.tolist(),
+        "column": column.tolist(),
+        "normal": normal.tolist(),
+        "axes": "".join(letters),
+        "off_axis_deg": float(np.degrees(np.arctan2(np.linalg.norm(np.delete(normal, axes[2])), weights[2, axes[2]]))),
+        "right_handed": not is_left_handed(affine),
+    }
+
+
+SPACES = ("lps", "ras")
+
+
+def frame_from_lps(space: str) -> NDArray[np.float64]:
+    """Return the 3x3 rotation from LPS mm to `space`.
+
+    space: {"lps", "ras"}. Upper or lower case.
+    """
+    name = str(space).lower()
+    if name == "lps":
+        return np.eye(3)
+    if name == "ras":
+        return np.diag((-1.0, -1.0, 1.0))
+    raise UsageError(f"unknown space {space!r}: use one of {', '.join(SPACES)}")
+
+
+def lps_affine_from_ras(affine: ArrayLike) -> NDArray[np.float64]:
+    """Turn an affine to RAS mm (NIfTI, FreeSurfer) into one to LPS mm; its own inverse.
+
+    affine: array_like, shape (4, 4). Index (i, j, k) to RAS mm.
+
+    Returns: ndarray, shape (4, 4), float64
+    """
+    return np.asarray(np.diag((-1.0, -1.0, 1.0, 1.0)) @ np.asarray(affine, dtype=np.float64), dtype=np.float64)
+
+
+def choose_space(asked: str | None, named: object, what: str) -> str:
+    """Return ``LPS`` or ``RAS``: the patient frame of what another library holds.
+
+    asked: That of the caller; None: that which `named` says, else LPS.
+    named: What the data themselves say, None where they say nothing.
+    what: The data, for messages.
+    """
+    if asked is not None:
+        frame_from_lps(asked)
+    if named is None:
+        return "LPS" if asked is None else asked.upper()
+    told = str(named).upper()
+    if told.lower() not in SPACES:
+        raise UsageError(f"{what} names the frame {str(named)[:40]!r}: {' or '.join(SPACES)} are known")
+    if asked is not None and asked.upper() != told:
+        raise UsageError(f"{what} says that its coordinates are {told}, {asked.upper()} was asked for: leave space out")
+    return told

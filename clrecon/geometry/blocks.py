@@ -1,17 +1,22 @@
-"""Blocks of a grid: the voxels in a box of millimetres, the affine of the block, and what a certificate says of it."""
+"""Parts of a volume: blocks of whole voxels, cut in millimetres or by indices, and what a certificate says of them.
+
+``volume[k0:k1, j0:j1, i0:i1]`` and crops leave voxels at their places in the patient.
+"""
 
 from __future__ import annotations
 
+import math
+import operator
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from clrecon.geometry.affine import Float64Array, signed_tilt, slice_normal
-from clrecon.geometry.grid import Grid
-from clrecon.geometry.orientation import describe_orientation
-from clrecon.geometry.uneven import fit_even
+from clrecon.errors import UsageError
+from clrecon.geometry.affine import Float64Array, facts_of_orientation, frame_from_lps, signed_tilt, slice_normal
+from clrecon.geometry.certificate import amend
+from clrecon.geometry.grid import BaseVolume, Grid, fit_even
 
 ON_EDGE_MM = 1e-6
 """A voxel centre this near to the side of a box lies in the box."""
@@ -89,7 +94,7 @@ def place_block(affine: Float64Array, origins: Float64Array, uneven: bool, block
     return placed, positions
 
 
-def describe_place(report: Mapping[str, Any], volume: Any) -> dict[str, Any]:
+def facts_of_place(report: Mapping[str, Any], volume: Any) -> dict[str, Any]:
     """Return the entries of a report that change with the shape and the place of a volume, as far as it has them.
 
     report: Of the volume that `volume` was made of.
@@ -108,7 +113,7 @@ def describe_place(report: Mapping[str, Any], volume: Any) -> dict[str, Any]:
         "spacing_mm": [di, dj, dk],
         "extent_mm": [ni * di, nj * dj, float(gaps.sum()) + usual if nk > 1 else usual],
         "affine_ijk_to_lps_mm": volume.affine.tolist(),
-        "orientation": describe_orientation(volume.affine),
+        "orientation": facts_of_orientation(volume.affine),
         "tilt_deg": signed_tilt(volume.affine),
         "gap_mm": {"min": float(gaps.min()), "max": float(gaps.max()), "median": usual},
         "uneven": volume.uneven,
@@ -120,3 +125,187 @@ def describe_place(report: Mapping[str, Any], volume: Any) -> dict[str, Any]:
         entries["grid_residual_max_mm"] = float(off.max()) if volume.uneven else None
         entries["grid_residual_rms_mm"] = float(np.sqrt(np.mean(off**2))) if volume.uneven else None
     return {name: value for name, value in entries.items() if name in report}
+
+
+Own = TypeVar("Own", bound=BaseVolume)
+
+
+def crop_volume(volume: Own, low: ArrayLike, high: ArrayLike, *, margin: int = 0, space: str = "lps") -> Own:
+    """Crop a volume to the smallest block of whole voxels that holds every voxel centre in a box.
+
+    Voxels keep their places; slices of an uneven volume keep their own positions.  Where the volume lies oblique to the
+    patient, the block also holds voxels beyond the box.
+
+    low, high: array_like, shape (3,). Corners of the box along the axes of the patient, mm of the frame `space`;
+        infinite numbers leave a side open.
+    margin: Voxels more on each side, as far as the volume goes.
+    space: {"lps", "ras"}
+
+    Returns: Its voxels are a view of those of `volume` where they can be.  ``report["crop"]`` has the figures.
+    """
+    try:
+        box = np.array([low, high], dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        box = np.empty(0)
+    if box.shape != (2, 3) or np.isnan(box).any():
+        raise UsageError(f"a box has two corners of three numbers in mm, not {low!r} and {high!r}")
+    for axis, (below, above) in zip("xyz", box.T, strict=True):
+        if not below <= above:
+            raise UsageError(
+                f"the box runs from {below:g} to {above:g} mm along {axis}: it holds nothing; give the lower end first"
+            )
+    if not isinstance(margin, int | np.integer) or margin < 0:
+        raise UsageError(f"the margin of a crop is a number of voxels from 0, not {margin!r}")
+    turned = np.sort(box * np.diag(frame_from_lps(space)), axis=0)
+    block = find_block(volume, volume.slice_origins(), turned[0], turned[1], margin)
+    if block is None:
+        raise UsageError(
+            f"nothing is left: no voxel lies in the box {_describe_box(box)} mm ({space.upper()});"
+            f" {describe_extent(volume, space)}"
+        )
+    return _certify(volume, cut_block(volume, block), block, box, space)
+
+
+def cut_block(volume: Own, block: Block) -> Own:
+    """Return a block of a volume with the report of the whole."""
+    (i0, j0, k0), (i1, j1, k1) = block
+    affine, positions = place_block(volume.affine, volume.slice_origins(), volume.uneven, block)
+    return type(volume)(volume.voxels[k0:k1, j0:j1, i0:i1], affine, volume.report, positions)
+
+
+def _certify(volume: Own, cropped: Own, block: Block, box: np.ndarray, space: str) -> Own:
+    every, kept = math.prod(volume.shape_ijk), math.prod(cropped.shape_ijk)
+    place = facts_of_place(volume.report, cropped)
+    size = [n * step for n, step in zip(cropped.shape_ijk, cropped.spacing, strict=True)]
+    whole = [n * step for n, step in zip(volume.shape_ijk, volume.spacing, strict=True)]
+    facts = {
+        "space": space.lower(),
+        "box_mm": [[float(end) if math.isfinite(end) else None for end in corner] for corner in box],
+        "first_ijk": list(block.first),
+        "shape_ijk_before": list(volume.shape_ijk),
+        "voxels": kept,
+        "voxels_all": every,
+    }
+    said = (
+        f"cropped to {_describe_box(box)} mm ({space.upper()}): {kept:,} of {every:,} voxels stay"
+        f" ({100.0 * kept / every:.3g} %), {_describe_size(size)} of {_describe_size(whole)} mm"
+    )
+    warnings = [*volume.report.get("warnings", ()), said]
+    cropped.report = amend(volume.report, crop=facts, warnings=warnings, **place)
+    return cropped
+
+
+def find_extent(volume: BaseVolume) -> tuple[Float64Array, Float64Array]:
+    """Return the lowest and highest (x, y, z) of the box of the voxels' centres, LPS mm."""
+    ni, nj, _ = volume.shape_ijk
+    in_plane = np.array([(i, j) for i in (0, ni - 1) for j in (0, nj - 1)]) @ volume.affine[:3, :2].T
+    corners = (volume.slice_origins()[:, None] + in_plane).reshape(-1, 3)
+    return corners.min(axis=0), corners.max(axis=0)
+
+
+def describe_extent(volume: BaseVolume, space: str) -> str:
+    """Describe the box of the voxels' centres, mm of the frame `space`, and their HU."""
+    low, high = np.sort(np.array(find_extent(volume)) * np.diag(frame_from_lps(space)), axis=0)
+    box = ", ".join(f"{name} {a:.1f} to {b:.1f}" for name, a, b in zip("xyz", low, high, strict=True))
+    hu = volume.hu_range
+    values = "" if hu is None else f" and from {hu[0]:g} to {hu[1]:g} HU"
+    return f"the scan runs from {box} mm ({space.upper()}){values}"
+
+
+def _describe_box(box: np.ndarray) -> str:
+    """Describe the sides of a box that are not open: ``x -20 to 30, z from 900``."""
+    words = []
+    for axis, (low, high) in zip("xyz", box.T, strict=True):
+        if math.isfinite(low) and math.isfinite(high):
+            words.append(f"{axis} {low:g} to {high:g}")
+        elif math.isfinite(low) or math.isfinite(high):
+            words.append(f"{axis} from {low:g}" if math.isfinite(low) else f"{axis} to {high:g}")
+    return ", ".join(words) or "all"
+
+
+def _describe_size(size: list[float]) -> str:
+    return " x ".join(f"{length:.4g}" for length in size)
+
+
+_AXES = "kji"
+
+
+def slice_volume(volume: Own, key: Any) -> Own:
+    """Return a part of a volume with the affine, and the slice positions where they are uneven, of that part.
+
+    The rules are those of nibabel's ``image.slicer``, in the order of the array: ``volume[key].voxels`` is
+    ``volume.voxels[key]``.
+
+    key: Along k, j, i; ``...`` stands for whole axes.  A step of 2 takes every other voxel and doubles the spacing,
+        without smoothing.  A step below zero turns an axis round: index space may become left-handed.
+
+    Returns: Its voxels are a view of those of `volume` where they can be.  ``report["sliced"]`` has the figures.
+    """
+    slices = _checked_slices(key)
+    ranges = [range(*one.indices(size)) for one, size in zip(slices, volume.shape, strict=True)]
+    for axis, kept, one, size in zip(_AXES, ranges, slices, volume.shape, strict=True):
+        if not kept:
+            raise UsageError(f"nothing is left: {_slice_text(one)} holds none of the {size} indices along {axis}")
+    along_ijk = ranges[::-1]
+    affine = np.array(volume.affine)
+    for column, kept in enumerate(along_ijk):
+        # A single voxel has no neighbour to be further away from: it keeps the step of the volume.
+        step = kept.step if len(kept) > 1 else math.copysign(1, kept.step)
+        affine[:3, column] = affine[:3, column] * step + 0.0  # which turns -0 into 0
+    aside = volume.affine[:3, :2] @ [kept.start for kept in along_ijk[:2]]
+    origins = volume.slice_origins()[np.array(along_ijk[2])] + aside
+    shape = tuple(len(kept) for kept in along_ijk)
+    placed, positions = place_block(affine, origins, volume.uneven, Block((0, 0, 0), shape))  # type: ignore[arg-type]
+    made = type(volume)(volume.voxels[slices], placed, None, positions)
+    said = f"sliced to {', '.join(map(_slice_text, slices))} of k, j, i: {made.voxels.size:,} of {volume.voxels.size:,}"
+    made.report = amend(
+        volume.report,
+        sliced={
+            "first_ijk": [kept.start for kept in along_ijk],
+            "step_ijk": [kept.step for kept in along_ijk],
+            "shape_ijk_before": list(volume.shape_ijk),
+        },
+        warnings=[*volume.report.get("warnings", ()), f"{said} voxels stay"],
+        **facts_of_place(volume.report, made),
+    )
+    return made
+
+
+def _checked_slices(key: Any) -> tuple[slice, slice, slice]:
+    """Return one slice for each of k, j, i."""
+    given = key if isinstance(key, tuple) else (key,)
+    places = [place for place, one in enumerate(given) if one is Ellipsis]
+    if len(places) == 1:
+        given = (*given[: places[0]], *[slice(None)] * max(0, 4 - len(given)), *given[places[0] + 1 :])
+    if len(given) > 3:
+        raise UsageError(f"a volume has three axes, k, j, i, and is cut by as many slices, not by {len(given)}")
+    for axis, one in zip(_AXES, given, strict=False):
+        _check_slice(axis, one)
+    k, j, i = [*given, slice(None), slice(None), slice(None)][:3]
+    return k, j, i
+
+
+def _check_slice(axis: str, one: Any) -> None:
+    if isinstance(one, slice):
+        try:
+            one.indices(1)
+        except (TypeError, ValueError) as error:
+            raise UsageError(f"{_slice_text(one)} along {axis} is no range of indices: {error}") from error
+        return
+    try:
+        number = operator.index(one)
+    except TypeError:
+        raise UsageError(
+            f"a volume is cut by slices such as 10:20 along k, j, i, not by {type(one).__name__} along {axis}: for an"
+            " array take volume.voxels[...], for a mask clrecon.Mask"
+        ) from None
+    end = "" if number == -1 else number + 1
+    raise UsageError(
+        f"the index {number} along {axis} leaves no volume: take {number}:{end} for a slab of one, or"
+        " volume.voxels[...] for the array"
+    )
+
+
+def _slice_text(one: slice) -> str:
+    ends = ["" if end is None else str(end)[:20] for end in (one.start, one.stop)]
+    return ":".join([*ends, *([] if one.step is None else [str(one.step)[:20]])])

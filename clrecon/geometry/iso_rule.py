@@ -16,9 +16,14 @@ from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry.affine import normal_matrix
-from clrecon.geometry.base import AIR_HU
-from clrecon.geometry.precision import find_vertex_origin, float32_step, largest_coordinate, power_of_two_over
-from clrecon.geometry.vertex_rules import check_vertex_rule
+from clrecon.geometry.grid import AIR_HU
+from clrecon.geometry.vertices import (
+    check_vertex_rule,
+    find_vertex_origin,
+    float32_step,
+    largest_coordinate,
+    power_of_two_over,
+)
 from clrecon.geometry.volume import Volume
 from clrecon.system.text import format_digits
 

@@ -1,18 +1,133 @@
-"""`resample_volume`: a copy of a volume on a regular grid."""
+"""Regular grids that enclose sheared or uneven grids, and copies of volumes on them."""
 
 from __future__ import annotations
 
 import math
-from typing import Any, TypeVar
+from itertools import product
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.geometry.base import AIR_HU, BaseVolume
-from clrecon.geometry.blocks import describe_place
+from clrecon.geometry.affine import Float64Array, apply_affine
+from clrecon.geometry.blocks import facts_of_place
 from clrecon.geometry.certificate import amend
-from clrecon.geometry.regular import RegularGrid, regular_grid, resample_grid
+from clrecon.geometry.grid import AIR_HU, BaseVolume, Grid
 from clrecon.system.progress import Progress, ignore_progress
+
+LARGEST_SHEAR_DEGREES = 0.01
+"""Axes this near to right angles count as rectangular, because directions in headers are rounded.  A file or an image
+gets the affine's own axes, so its points are those of the volume."""
+
+ON_GRID = 1e-6
+"""Tolerance in steps: a volume that ends this near to a point of the regular grid needs no further point."""
+
+
+class RegularGrid(NamedTuple):
+    """Points in even steps along axes at right angles.
+
+    affine: ndarray, shape (4, 4), float64. Index to LPS mm, right-handed.
+    """
+
+    affine: Float64Array
+    shape_ijk: tuple[int, int, int]
+
+
+def shear_degrees(affine: Float64Array) -> float:
+    """Largest deviation of the angles between the three axes from right angles, degrees."""
+    axes = affine[:3, :3] / np.linalg.norm(affine[:3, :3], axis=0)
+    cosines = axes.T @ axes
+    return float(np.degrees(np.arcsin(np.clip(np.abs(cosines - np.diag(np.diag(cosines))).max(), 0.0, 1.0))))
+
+
+def describe_unevenness(origins: Float64Array) -> str:
+    """Describe slices that lie at positions (n, 3) in uneven steps."""
+    gaps = np.linalg.norm(np.diff(origins, axis=0), axis=1)
+    return f"the slices of this volume are uneven ({gaps.min():.4g} to {gaps.max():.4g} mm apart)"
+
+
+def regular_grid(grid: Grid, origins: Float64Array, step_mm: float | None = None) -> RegularGrid:
+    """Return the smallest regular grid that encloses all voxel centres of a grid.
+
+    i runs as in the grid, j within the plane of the slices, k along their normal.  Without `step_mm`, i and j have the
+    steps of the grid and k the smallest distance of slices along the normal: where a volume is sheared but even, the
+    planes are those of its slices.
+
+    origins: ndarray, shape (nk, 3). LPS mm of voxel (0, 0, k) of each slice.
+    step_mm: Step along all three axes.
+    """
+    di, dj, _ = grid.spacing
+    first = grid.affine[:3, 0] / di
+    second = grid.affine[:3, 1] - (grid.affine[:3, 1] @ first) * first
+    second /= np.linalg.norm(second)
+    axes = np.column_stack([first, second, np.cross(first, second)])
+    ni, nj, nk = grid.shape_ijk
+    in_plane = np.array([(i, j) for i, j in product((0, ni - 1), (0, nj - 1))]) @ grid.affine[:3, :2].T
+    places = (origins[:, None, :] + in_plane).reshape(-1, 3) @ axes
+    heights = origins @ axes[:, 2]
+    dk = np.abs(np.diff(heights)).min() if nk > 1 else abs(grid.affine[:3, 2] @ axes[:, 2])
+    spacing = np.array([di, dj, dk]) if step_mm is None else np.full(3, step_mm)
+    low, high = places.min(axis=0), places.max(axis=0)
+    counts = np.ceil((high - low) / spacing - ON_GRID).astype(int) + 1
+    affine = np.eye(4)
+    affine[:3, :3] = axes * spacing
+    affine[:3, 3] = axes @ low
+    return RegularGrid(affine, (int(counts[0]), int(counts[1]), int(counts[2])))
+
+
+def resample_grid(grid: Grid, regular: RegularGrid, air: float, progress: Progress = ignore_progress) -> NDArray[Any]:
+    """Resample a grid (trilinear) at the points of a regular one, plane by plane; `air` beyond its voxels.
+
+    Returns: ndarray, shape (nk, nj, ni). In the type of the voxels; integers are rounded.
+    """
+    ni, nj, nk = regular.shape_ijk
+    dtype = grid.voxels.dtype
+    values = np.full((nk, nj, ni), air, dtype)
+    for k, plane in enumerate(values):
+        progress("resample", k, nk)
+        # The plane is parallel to the slices: one k for all of it, and i and j run linearly along its rows and columns.
+        corners = grid.lps_to_ijk(apply_affine(regular.affine, [[0.0, 0.0, k], [1.0, 0.0, k], [0.0, 1.0, k]]))
+        first, columns, rows = corners[0], corners[1] - corners[0], corners[2] - corners[0]
+        if not -0.5 <= first[2] <= grid.voxels.shape[0] - 0.5:
+            continue
+        found, inside = _sample_plane(_slice_at(grid, first[2]), first, columns, rows, (nj, ni))
+        if dtype.kind != "f":
+            np.rint(found, out=found)
+        np.copyto(plane, found, where=inside, casting="unsafe")
+    return values
+
+
+def _slice_at(grid: Grid, k: float) -> NDArray[np.float32]:
+    """Return the slice at a fractional index, shape (nj, ni); beyond the ends the outermost slice."""
+    k = min(max(k, 0.0), grid.voxels.shape[0] - 1.0)
+    below = int(k)
+    values = grid.voxels[below].astype(np.float32)
+    if k > below:
+        values += np.float32(k - below) * (grid.voxels[below + 1].astype(np.float32) - values)
+    return values
+
+
+def _sample_plane(
+    values: NDArray[np.float32], first: Float64Array, columns: Float64Array, rows: Float64Array, shape: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """A slice (bilinear, its outer values beyond it) at ``first + column * columns + row * rows``.
+
+    Returns:
+    found: ndarray of `shape`, float32
+    inside: ndarray of `shape`, bool. At most half a voxel beyond the outer centres.
+    """
+    from scipy import ndimage
+
+    matrix = np.array([[rows[1], columns[1]], [rows[0], columns[0]]])
+    found = ndimage.affine_transform(values, matrix, first[1::-1], shape, np.float32, order=1, mode="nearest")
+    row, column = np.ogrid[: shape[0], : shape[1]]
+    inside = np.ones(shape, dtype=bool)
+    for axis, count in enumerate(values.shape[::-1]):
+        place = first[axis] + row * rows[axis] + column * columns[axis]
+        inside &= (place >= -0.5) & (place <= count - 0.5)
+    return found, inside
+
 
 Own = TypeVar("Own", bound=BaseVolume)
 
@@ -68,6 +183,6 @@ def resample_volume(volume: Own, step_mm: float, *, progress: Progress | None = 
         volume.report,
         resampled={"step_mm": float(step_mm), "method": "trilinear"},
         warnings=[*volume.report.get("warnings", ()), said],
-        **describe_place(volume.report, made),
+        **facts_of_place(volume.report, made),
     )
     return made

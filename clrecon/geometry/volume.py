@@ -10,14 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry.base import BaseVolume
+from clrecon.geometry.blocks import crop_volume, find_extent, slice_volume
 from clrecon.geometry.boxes import CROPS, crop_box
-from clrecon.geometry.crop import crop_volume, find_extent
-from clrecon.geometry.images import image_of
-from clrecon.geometry.itk import make_sitk, take_sitk
-from clrecon.geometry.nifti import make_nibabel, take_nibabel
+from clrecon.geometry.grid import BaseVolume
+from clrecon.geometry.images import image_of, make_nibabel, make_sitk, take_nibabel, take_sitk
 from clrecon.geometry.resample import resample_volume
-from clrecon.geometry.slicing import slice_volume
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.packages import public_function
 from clrecon.system.paths import keep_existing

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry.affine import Float64Array, is_left_handed
-from clrecon.geometry.frames import choose_space, frame_from_lps
+from clrecon.geometry.affine import Float64Array, choose_space, frame_from_lps, is_left_handed
 from clrecon.geometry.images import Image, Taken
 
 _TURNED = "in reverse order: the volume's axes are left-handed"

@@ -23,7 +23,7 @@ from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name, stage_repor
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SAMPLES
 from clrecon.mesh.compare.signed import MeshDeviation, measure_distance, measure_vertex_distances
-from clrecon.mesh.reader import read_mesh
+from clrecon.mesh.mesh_reader import read_mesh
 from clrecon.rendering.views.directions import find_view
 from clrecon.system.files import Staged, check_writable
 from clrecon.system.log import get_logger, log_warnings

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from clrecon.geometry.blocks import find_extent
 from clrecon.geometry.certificate import without_ids
-from clrecon.geometry.crop import find_extent
 from clrecon.geometry.resample import resample_volume
 from clrecon.jobs.inputs import crop_scan
 from clrecon.jobs.options import InputSettings
@@ -52,7 +52,7 @@ class ExportSettings(InputSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        from clrecon.geometry.frames import frame_from_lps
+        from clrecon.geometry.affine import frame_from_lps
         from clrecon.geometry.resample import check_step
 
         frame_from_lps(self.space)

@@ -100,7 +100,7 @@ def crop_scan(volume: Volume, box: Box | None, space: str, *, margin: int = 0) -
     """Return the part of a scan in a box, in mm of the frame `space`; all of it without a box."""
     if box is None:
         return volume
-    from clrecon.geometry.crop import crop_volume
+    from clrecon.geometry.blocks import crop_volume
 
     return crop_volume(volume, *box, margin=margin, space=space)
 

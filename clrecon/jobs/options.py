@@ -28,9 +28,9 @@ class InputSettings(Selection):
         at the level and above.
     field_of_view: float or "auto". First turn everything farther from the centre of the slices (mm) into air; "auto":
         the circle that fits them.
-    clip_box: (x0, x1, y0, y1, z0, z1). Crop the scan to a box by whole voxels, see `clrecon.geometry.crop.crop_volume`;
-        infinite numbers leave a side open.  mm of the frame `space` where the job has one, else LPS; so are the next
-        two.
+    clip_box: (x0, x1, y0, y1, z0, z1). Crop the scan to a box by whole voxels, see
+        `clrecon.geometry.blocks.crop_volume`; infinite numbers leave a side open.  mm of the frame `space` where the
+        job has one, else LPS; so are the next two.
     between: (z0, z1). Crop it to these heights.
     around: (x, y, z, r). Crop it to a cube around a point; `r` is half of its side.
     region: Rules of the region of interest, outside of which everything becomes air, see

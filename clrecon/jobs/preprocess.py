@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
-from clrecon.geometry.base import AIR_HU
+from clrecon.geometry.blocks import describe_extent
 from clrecon.geometry.certificate import amend
-from clrecon.geometry.crop import describe_extent
+from clrecon.geometry.grid import AIR_HU
 from clrecon.jobs.inputs import crop_scan
 from clrecon.jobs.options import (
     FILTERS,

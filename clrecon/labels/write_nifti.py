@@ -12,7 +12,7 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from clrecon.geometry.nifti import place_in_header
+from clrecon.geometry.images import place_in_header
 from clrecon.labels.label_map import LabelMap
 from clrecon.reading.grids.grid_file import LABEL_MAP, import_extra
 

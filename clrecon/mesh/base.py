@@ -18,8 +18,8 @@ from clrecon.exchange.coordinates import as_stored
 from clrecon.exchange.formats import write_mesh
 from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import apply_affine, checked_affine, normal_matrix
-from clrecon.mesh.normals import vertex_normals
-from clrecon.mesh.pieces import find_pieces
+from clrecon.mesh.quality import find_pieces
+from clrecon.mesh.triangles import vertex_normals
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.base_classes import Message
 from clrecon.system.paths import keep_existing
@@ -38,7 +38,7 @@ def _rows_of_three(values: ArrayLike, name: str) -> NDArray[Any]:
     return array
 
 
-def _numbers(values: ArrayLike, name: str) -> NDArray[Any]:
+def _checked_numbers(values: ArrayLike, name: str) -> NDArray[Any]:
     array = _rows_of_three(values, name)
     if array.dtype.kind not in "fiu":
         raise UsageError(f"{name} are numbers, these are {array.dtype}")
@@ -69,10 +69,10 @@ class BaseMesh(Message):
         *,
         trusted: bool = False,
     ):
-        self._vertices = as_stored(_numbers(vertices, "vertices"))
+        self._vertices = as_stored(_checked_numbers(vertices, "vertices"))
         self._triangles = _as_indices(triangles)
         self._normals = (
-            None if normals is None else np.ascontiguousarray(_numbers(normals, "normals"), dtype=np.float32)
+            None if normals is None else np.ascontiguousarray(_checked_numbers(normals, "normals"), dtype=np.float32)
         )
         if len(self._vertices) > _MOST_VERTICES:
             raise UsageError(f"a mesh has at most {_MOST_VERTICES} vertices, this one has {len(self._vertices)}")

@@ -14,8 +14,8 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange.coordinates import rounding_step
 from clrecon.mesh.base import BaseMesh
 from clrecon.mesh.connectivity import label_components
-from clrecon.mesh.nearest import find_nearest_triangle
-from clrecon.mesh.pieces import measure_components
+from clrecon.mesh.quality import measure_components
+from clrecon.mesh.triangles import find_nearest_triangle
 from clrecon.system.arguments import name_parameter
 from clrecon.system.text import count_of, format_digits
 
@@ -44,8 +44,8 @@ class _Chosen:
     """Components of a mesh, and which of them are kept.
 
     label_of_vertex, label_of_triangle: ndarray, int64. Number of the component; -1 for vertices that no triangle uses.
-    ranked: ndarray, shape (count,), int64. Components from the largest area to the smallest, see `_rank`; in their own
-        order if no rank was asked for.
+    ranked: ndarray, shape (count,), int64. Components from the largest area to the smallest, see `_rank_areas`; in
+        their own order if no rank was asked for.
     keep: ndarray, shape (count,), bool
     facts: Entries for the report of the result.
     """
@@ -86,11 +86,11 @@ def select_components(
         dropped.  Its report has ``components_found`` and ``components_kept``, and with seeds ``seed_distances_mm``: how
         far the surface lies from each.
     """
-    chosen = _choose(mesh, keep_largest, min_volume_ml, seeds, labelled, among)
+    chosen = _choose_components(mesh, keep_largest, min_volume_ml, seeds, labelled, among)
     if chosen.keep.all():
         mesh.report.update(chosen.facts)
         return mesh
-    return _take(mesh, chosen.keep[chosen.label_of_triangle], {**mesh.report, **chosen.facts})
+    return _take_triangles(mesh, chosen.keep[chosen.label_of_triangle], {**mesh.report, **chosen.facts})
 
 
 def split_components(
@@ -112,7 +112,7 @@ def split_components(
     Returns: One mesh for each component, the largest area first (the first of equal ones). Vertices and triangles keep
         their order, normals and report are taken over.
     """
-    chosen = _choose(mesh, keep_largest, min_volume_ml, seeds, labelled, among, rank=True)
+    chosen = _choose_components(mesh, keep_largest, min_volume_ml, seeds, labelled, among, rank=True)
     kept = np.flatnonzero(chosen.keep)
     if most is not None and len(kept) > most:
         _, volumes = measure_components(
@@ -147,7 +147,7 @@ def _group(ranks: NDArray[np.int64], count: int) -> tuple[NDArray[np.intp], NDAr
     return order, np.searchsorted(ranks[order], np.arange(count + 1))
 
 
-def _choose(
+def _choose_components(
     mesh: BaseMesh,
     keep_largest: int | None,
     min_volume_ml: float | None,
@@ -179,7 +179,7 @@ def _choose(
         areas=rank or keep_largest is not None or min_volume_ml is not None,
         volumes=min_volume_ml is not None,
     )
-    ranked = _rank(areas, rounding_step(mesh.vertices)) if rank or keep_largest is not None else np.arange(count)
+    ranked = _rank_areas(areas, rounding_step(mesh.vertices)) if rank or keep_largest is not None else np.arange(count)
     keep = np.ones(count, dtype=bool) if among is None else np.array(among, dtype=bool)
     if min_volume_ml is not None:
         # Rounding moves a vertex by at most half a step along each axis, and so changes the volume by at most the area
@@ -201,7 +201,7 @@ def _choose(
     return _Chosen(labels, label_of_triangle, ranked, keep, facts)
 
 
-def _rank(areas: NDArray[np.float64], step: float) -> NDArray[np.int64]:
+def _rank_areas(areas: NDArray[np.float64], step: float) -> NDArray[np.int64]:
     """Components from the largest area to the smallest, those of equal area in their own order.
 
     Areas are equal when they differ from the first of their group by no more than rounding explains.
@@ -246,7 +246,7 @@ def _find_at_seeds(
     return found, distances
 
 
-def _take(mesh: Own, keep_triangle: NDArray[np.bool_], report: dict[str, object]) -> Own:
+def _take_triangles(mesh: Own, keep_triangle: NDArray[np.bool_], report: dict[str, object]) -> Own:
     triangles = mesh.triangles[keep_triangle]
     keep_vertex = np.zeros(mesh.vertex_count, dtype=bool)
     keep_vertex[triangles.reshape(-1)] = True

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry.frames import choose_space, frame_from_lps
+from clrecon.geometry.affine import choose_space, frame_from_lps
 from clrecon.mesh.base import BaseMesh
 from clrecon.mesh.components import select_components, split_components
 from clrecon.mesh.quality import MeshQuality, measure_quality, measure_triangles

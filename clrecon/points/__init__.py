@@ -9,18 +9,20 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from clrecon.points.cloud import PointCloud
+    from clrecon.points.cloud import PointCloud, PointStep
     from clrecon.points.ghost_slices import drop_ghost_slices, fill_ghost_slices
     from clrecon.points.keep import keep_clusters
-    from clrecon.points.step import PointStep
+
 
 __all__ = ["PointCloud", "PointStep", "drop_ghost_slices", "fill_ghost_slices", "keep_clusters"]
 
+POINT_KINDS = ("surface", "shell", "voxels")
+"""See `clrecon.extract_points`."""
+
 _MODULES = {
-    "cloud": ("PointCloud",),
+    "cloud": ("PointCloud", "PointStep"),
     "ghost_slices": ("drop_ghost_slices", "fill_ghost_slices"),
     "keep": ("keep_clusters",),
-    "step": ("PointStep",),
 }
 
 

@@ -1,8 +1,10 @@
-"""`PointCloud`: points in LPS mm with what is known of each of them."""
+"""`PointCloud`: points in LPS mm with what is known of each of them, and `PointStep`: what a step made of a cloud."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
@@ -13,7 +15,6 @@ from clrecon.exchange.clouds.formats import write_cloud
 from clrecon.exchange.content import PointContent, describe_facts
 from clrecon.exchange.coordinates import as_stored
 from clrecon.geometry import frame_from_lps
-from clrecon.points.voxel_numbers import VoxelNumbers
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.base_classes import Message
 from clrecon.system.packages import install_command, public_function
@@ -43,7 +44,7 @@ def _check_finite(points: NDArray[np.floating], name: str) -> None:
         )
 
 
-def _take(values: NDArray[Any] | VoxelNumbers, numbers: NDArray[np.intp]) -> Any:
+def _take_values(values: NDArray[Any] | VoxelNumbers, numbers: NDArray[np.intp]) -> Any:
     """Return the values of some points."""
     return values.take(numbers) if isinstance(values, VoxelNumbers) else values.take(numbers, axis=0)
 
@@ -217,7 +218,7 @@ class PointCloud(Message):
         numbers = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
         points = as_stored(self._points.take(numbers, axis=0))  # those far from the origin may be gone
         of_points = {"normals": self._normals, "hu": self._hu, "labels": self._labels, "ijk": self._ijk}
-        taken = {name: _take(values, numbers) for name, values in of_points.items() if values is not None}
+        taken = {name: _take_values(values, numbers) for name, values in of_points.items() if values is not None}
         return PointCloud.of_known(points, **taken, report=dict(self.report))
 
     @explains_arguments
@@ -306,3 +307,74 @@ class PointCloud(Message):
     def __repr__(self) -> str:
         known = [name for name in ("normals", "hu", "labels", "ijk") if getattr(self, name) is not None]
         return f"PointCloud({len(self)} points{', with ' if known else ''}{', '.join(known)}, LPS mm)"
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelNumbers:
+    """Voxels of a volume by number.
+
+    numbers: ndarray, shape (n,), uint32 or int64. ``i + ni * (j + nj * k)``.
+    shape_ijk: (ni, nj, nk)
+    """
+
+    numbers: NDArray[Any]
+    shape_ijk: tuple[int, int, int]
+
+    def slices(self) -> NDArray[Any]:
+        """Return the slice k of each voxel, shape (n,)."""
+        ni, nj, _ = self.shape_ijk
+        kind = self.numbers.dtype.type
+        return self.numbers // kind(ni) // kind(nj)  # a slice may have 2^32 voxels, their product is no uint32 then
+
+    def take(self, chosen: NDArray[np.intp]) -> VoxelNumbers:
+        """Return some of the voxels, by their places in the list."""
+        return VoxelNumbers(self.numbers.take(chosen), self.shape_ijk)
+
+    def indices(self) -> NDArray[np.int32]:
+        """Return the voxel indices (i, j, k), shape (n, 3)."""
+        ni, nj, _ = self.shape_ijk
+        found = np.empty((len(self.numbers), 3), np.int32)
+        rows = self.numbers // self.numbers.dtype.type(ni)
+        slices = rows // self.numbers.dtype.type(nj)
+        found[:, 0] = self.numbers - rows * self.numbers.dtype.type(ni)
+        found[:, 1] = rows - slices * self.numbers.dtype.type(nj)
+        found[:, 2] = slices
+        return found
+
+
+def count_numbers(numbers: NDArray[np.uint8], reasons: Sequence[str]) -> dict[str, int]:
+    """Return how many points have the number of each reason, from 1: a pass for each is faster than one for all."""
+    return {reason: int(np.count_nonzero(numbers == number)) for number, reason in enumerate(reasons, 1)}
+
+
+@dataclass(frozen=True, eq=False)
+class PointStep:
+    """The result of a function that takes a cloud and gives another one.
+
+    cloud: The new cloud: the points that are kept, in the order of the input.
+    removed: ndarray, shape (n,), uint8. For each point of the input 0 if it is kept, or the number of the reason why it
+        was removed, from 1.
+    reasons: The reasons: number r is ``reasons[r - 1]``, for example "noise" or "sheet".
+    facts: Further entries of the step's report: parameters as they were used, figures measured, doubtful points.
+    warnings: A line each.
+    """
+
+    cloud: PointCloud
+    removed: NDArray[np.uint8]
+    reasons: tuple[str, ...] = ()
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of removed points for each reason."""
+        return count_numbers(self.removed, self.reasons)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the entries of the step's report: points before and after, removed by reason, facts."""
+        return {
+            "points_before": len(self.removed),
+            "points_after": len(self.cloud),
+            "removed": self.counts,
+            **self.facts,
+        }

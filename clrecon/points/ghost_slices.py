@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.points.cloud import PointCloud
-from clrecon.points.step import PointStep
+from clrecon.points.cloud import PointCloud, PointStep
 from clrecon.system.arguments import explains_arguments
 
 GHOST_SHARE = 0.75

@@ -1,19 +1,139 @@
-"""Which clusters of a cloud are kept."""
+"""Which clusters of a cloud are kept, and the figures that tell: size, place, extent, and sheets without thickness."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.points.cloud import PointCloud
-from clrecon.points.cluster_figures import SHEET_POINTS, SHEET_RATIO, ClusterFigures, measure_clusters
-from clrecon.points.step import PointStep
+from clrecon.points.cloud import PointCloud, PointStep
 from clrecon.system.arguments import explains_arguments, name_parameter
+from clrecon.system.pieces import chunks
+
+SHEET_POINTS = 500
+"""Fewest points of a cluster that may be a sheet: fewer say little about its form."""
+
+SHEET_RATIO = 15.0
+"""Ratio of the two smaller principal standard deviations above which a cluster is a sheet.  Table tops and headrests of
+five scans have 27 and more, clusters among bone up to 5."""
+
+
+PIECE = 1 << 16
+"""Points that are measured at a time: the caches of a core hold what is made of them."""
+
+LEAST_RUN = 4
+"""Points of one cluster in a row, on the average, from which they are summed run by run."""
+
+
+@dataclass(frozen=True)
+class ClusterFigures:
+    """The clusters of a cloud, an entry of each array for each.
+
+    points: ndarray, shape (c,), int64. Number of points.
+    centres: ndarray, shape (c, 3), float64. Mean of the points, LPS mm.
+    boxes: ndarray, shape (c, 2, 3), float64. Lowest and highest coordinates, LPS mm.
+    deviations: ndarray, shape (c, 3), float64. Standard deviations along the principal axes, mm, ascending.
+    """
+
+    points: NDArray[np.int64]
+    centres: NDArray[np.float64]
+    boxes: NDArray[np.float64]
+    deviations: NDArray[np.float64]
+
+    @property
+    def sheets(self) -> NDArray[np.bool_]:
+        """True for clusters without thickness: at least 500 points, second deviation over 15 times the first."""
+        thin: NDArray[np.bool_] = self.deviations[:, 1] > SHEET_RATIO * self.deviations[:, 0]
+        return thin & (self.points >= SHEET_POINTS)
+
+    def order(self) -> NDArray[np.int64]:
+        """Return the numbers of the clusters, those with most points first, ties by number."""
+        return np.argsort(-self.points, kind="stable")
+
+    def as_dicts(self, most: int) -> list[dict[str, Any]]:
+        """Return the entries of a report: the `most` largest clusters, and all that are sheets."""
+        order, sheets = self.order(), self.sheets
+        chosen = [*order[:most].tolist(), *(number for number in order[most:].tolist() if sheets[number])]
+        return [
+            {
+                "cluster": int(number),
+                "points": int(self.points[number]),
+                "center_lps_mm": np.round(self.centres[number], 3).tolist(),
+                "box_lps_mm": np.round(self.boxes[number], 3).tolist(),
+                "principal_sd_mm": np.round(self.deviations[number], 4).tolist(),
+                "is_sheet": bool(sheets[number]),
+            }
+            for number in chosen
+        ]
+
+
+class _Runs:
+    """A piece of a cloud by runs of points of one cluster, which neighbours in the order of a cloud mostly are."""
+
+    def __init__(self, labels: NDArray[np.int32]):
+        begins = np.ones(len(labels), bool)
+        np.not_equal(labels[1:], labels[:-1], out=begins[1:])
+        self._starts: NDArray[np.intp] | None = np.flatnonzero(begins)
+        if LEAST_RUN * len(self._starts) > len(labels):
+            self._starts = None  # a run is a point
+        else:
+            self._lengths = np.diff(self._starts, append=len(labels))
+            labels = labels[self._starts]
+        self._labels = np.maximum(labels, -1).astype(np.intp)
+        self._labels += 1  # 0 is noise
+        self.clusters = int(self._labels.max(initial=0))
+
+    def count(self, sizes: NDArray[np.int64]) -> None:
+        """Add the number of points to that of their clusters; entry 0 of these and further figures is noise."""
+        np.add.at(sizes, self._labels, 1 if self._starts is None else self._lengths)
+
+    def add(self, sums: NDArray[np.float64], values: NDArray[np.float64]) -> None:
+        """Add values of points to the sums of their clusters."""
+        np.add.at(sums, self._labels, values if self._starts is None else np.add.reduceat(values, self._starts))
+
+    def widen(self, low: NDArray[np.floating], high: NDArray[np.floating], values: NDArray[np.floating]) -> None:
+        """Take values of points into the range of their clusters."""
+        for extreme, ends in ((np.minimum, low), (np.maximum, high)):
+            extreme.at(ends, self._labels, values if self._starts is None else extreme.reduceat(values, self._starts))
+
+    def spread(self, figures: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return for each point the figure of its cluster."""
+        of_runs = figures.take(self._labels)
+        return of_runs if self._starts is None else np.repeat(of_runs, self._lengths)
+
+
+def measure_clusters(cloud: PointCloud) -> ClusterFigures:
+    """Measure each cluster of a cloud with labels; noise is left out."""
+    if cloud.labels is None:
+        raise UsageError("the points have no labels: cluster them first")
+    points = cloud.points
+    pieces = [(where, _Runs(cloud.labels[where])) for where in chunks(len(cloud), PIECE)]
+    entries = max((runs.clusters for _, runs in pieces), default=0) + 1
+    sizes, sums, squares = np.zeros(entries, np.int64), np.zeros((3, entries)), np.zeros((3, 3, entries))
+    low, high = np.full((3, entries), np.inf, points.dtype), np.full((3, entries), -np.inf, points.dtype)
+    for where, runs in pieces:
+        runs.count(sizes)
+        for axis in range(3):
+            own = np.ascontiguousarray(points[where, axis])
+            runs.widen(low[axis], high[axis], own)
+            runs.add(sums[axis], own.astype(np.float64))
+    shares = 1.0 / np.maximum(sizes, 1)
+    centres = sums * shares
+    for where, runs in pieces:
+        around = [points[where, axis] - runs.spread(centres[axis]) for axis in range(3)]
+        for axis in range(3):
+            for other in range(axis + 1):
+                runs.add(squares[axis, other], around[axis] * around[other])
+    spread = np.moveaxis(squares * shares, 2, 0)[1:]  # eigvalsh reads the lower triangles
+    lengths = np.linalg.eigvalsh(spread) if len(spread) else np.zeros((0, 3))
+    boxes = np.stack([low.T, high.T], axis=1)[1:].astype(np.float64)
+    return ClusterFigures(sizes[1:], centres.T[1:], boxes, np.sqrt(np.maximum(lengths, 0.0)))
+
 
 KEEP_FORMS = "largest, largest:N, min:POINTS, seed:X,Y,Z and no-sheets"
 """The forms of a keep rule, for messages and help."""
@@ -34,10 +154,10 @@ class KeepRule:
 
 def parse_keep_rules(rules: str | Sequence[str]) -> tuple[KeepRule, ...]:
     """Read keep rules: ``largest``, ``largest:N``, ``min:POINTS``, ``seed:X,Y,Z`` in LPS mm, ``no-sheets``."""
-    return tuple(_parse(rule) for rule in ([rules] if isinstance(rules, str) else rules))
+    return tuple(_parse_keep_rule(rule) for rule in ([rules] if isinstance(rules, str) else rules))
 
 
-def _parse(rule: str) -> KeepRule:
+def _parse_keep_rule(rule: str) -> KeepRule:
     kind, _, rest = str(rule).strip().lower().partition(":")
     try:
         numbers = tuple(float(word) for word in rest.split(",")) if rest else ()
@@ -85,13 +205,13 @@ def keep_clusters(
     labels = np.asarray(cloud.labels)
     if labels.max(initial=-1) >= len(figures.points):
         raise UsageError(f"the figures are of {len(figures.points):,} clusters, the cloud has others: leave them out")
-    fate, facts = _judge(cloud, figures, wanted, cores)
+    fate, facts = _judge_clusters(cloud, figures, wanted, cores)
     removed = np.append(np.uint8(1), fate).take(np.maximum(labels, -1) + 1)  # the first one is that of noise
     kept = removed == 0
     if not kept.any():
         raise NoSurfaceError(_describe_nothing(labels, figures, fate))
     facts = {
-        "keep": [_write(rule) for rule in wanted],
+        "keep": [_as_text(rule) for rule in wanted],
         "clusters_before": len(figures.points),
         "clusters_after": int((fate == 0).sum()),
         "sheets": int(figures.sheets.sum()),
@@ -110,18 +230,18 @@ def _warn_of_seeds(cloud: PointCloud, rules: tuple[KeepRule, ...], facts: Mappin
     low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     far = facts.get("seed_distances_mm")
     return tuple(
-        f"{_write(seed)} (mm LPS) lies outside of the box of the points, {distance:,.1f} mm from the nearest one in a"
+        f"{_as_text(seed)} (mm LPS) lies outside of the box of the points, {distance:,.1f} mm from the nearest one in a"
         " cluster, which was kept"
         for seed, distance in zip(seeds, far if isinstance(far, list) else [], strict=True)
         if not (np.all(low <= seed.numbers) and np.all(seed.numbers <= high))
     )
 
 
-def _write(rule: KeepRule) -> str:
+def _as_text(rule: KeepRule) -> str:
     return rule.kind + (":" + ",".join(f"{number:g}" for number in rule.numbers) if rule.numbers else "")
 
 
-def _judge(
+def _judge_clusters(
     cloud: PointCloud, figures: ClusterFigures, rules: tuple[KeepRule, ...], cores: ArrayLike | None
 ) -> tuple[NDArray[np.uint8], dict[str, object]]:
     """Return for each cluster 0 or the number of the reason why it goes, and the facts about seeds."""

@@ -1,4 +1,9 @@
-"""The mean spacing of a cloud, from the number of small cubes that it occupies."""
+"""Distances in a cloud: its mean spacing, and paper B's grid of cells and ratio of distances D_i with its threshold D0.
+
+The mean spacing follows from the number of small cubes that the points occupy.  Of paper B's equations of a grid,
+equation 1 prints the margin as "natural constant 2.71828", equation 2 has none: here both begin at the lowest
+coordinates less the same small margin.
+"""
 
 from __future__ import annotations
 
@@ -66,3 +71,79 @@ def _count_cells(
     occupied = np.zeros(int(np.prod(counts)), np.bool_)
     occupied[place] = True
     return int(np.count_nonzero(occupied))
+
+
+MARGIN = 1e-3
+"""Margin around the points, in edges of a cell."""
+
+
+def count_cells(points: NDArray[np.floating], edge: float) -> tuple[int, int, int]:
+    """Return the number of cells along each axis: ``int(((max + e) - (min - e)) / edge) + 1``.
+
+    points: ndarray, shape (n, 3). mm; at least one.
+    edge: Edge of the cells in mm.
+
+    References
+    ----------
+    Liu et al. 2019, equation 1.
+    """
+    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    margin = MARGIN * edge
+    nx, ny, nz = (((high + margin) - (low - margin)) / edge).astype(np.int64) + 1
+    return int(nx), int(ny), int(nz)
+
+
+def find_cell_numbers(points: NDArray[np.floating], edge: float) -> NDArray[np.int64]:
+    """Return the number of the cell of each point: ``a + nx (b + ny c)`` with ``a = int((x - (min - e)) / edge)``.
+
+    points: ndarray, shape (n, 3). mm; at least one.
+    edge: Edge of the cells in mm.
+
+    Returns: ndarray, shape (n,), int64
+
+    References
+    ----------
+    Liu et al. 2019, equation 2.
+    """
+    nx, ny, _ = count_cells(points, edge)
+    a, b, c = ((points - (points.min(axis=0).astype(np.float64) - MARGIN * edge)) / edge).astype(np.int64).T
+    return np.asarray(a + nx * (b + ny * c))
+
+
+D0_OF_MEDIAN = 1.2
+"""D0 over the median of all D_i: the paper gives no value."""
+
+VARIATION_OF_FEATURES = 0.05
+"""Surface variation from which on a point is a feature: 0 on a plane, 1/3 where neighbours spread evenly."""
+
+
+def distance_ratios(
+    means: NDArray[np.floating], nearest: NDArray[np.floating], cells: NDArray[np.integer]
+) -> NDArray[np.float64]:
+    """Return D_i of paper B, section 2.2, for each point: mean distance to its neighbours over the cell's spacing.
+
+    The paper's "mean point distance" of the cell is read as the mean distance of its points to their nearest ones.
+
+    means: ndarray, shape (n,), mm. Mean distance of each point to its neighbours, itself not among them.
+    nearest: ndarray, shape (n,), mm. Distance of each point to the nearest other one.
+    cells: ndarray, shape (n,), whole numbers from 0. Cell of each point.
+
+    Returns: ndarray, shape (n,), float64. Infinite where all points of a cell coincide with others and the neighbours
+        do not, 0 where these do too.
+    """
+    counts = np.bincount(cells)
+    spacing = np.bincount(cells, nearest) / np.maximum(counts, 1)
+    own = spacing[cells]
+    apart = np.asarray(means, dtype=np.float64)
+    return np.divide(apart, own, out=np.where(apart > 0.0, np.inf, 0.0), where=own > 0.0)
+
+
+def ratio_threshold(ratios: NDArray[np.floating]) -> float:
+    """Return D0: `D0_OF_MEDIAN` times the median of all D_i."""
+    return D0_OF_MEDIAN * float(np.median(ratios))
+
+
+def find_features(ratios: NDArray[np.floating], threshold: float) -> NDArray[np.bool_]:
+    """Return True for features: D_i > D0.  What is equal is none, which the paper leaves open."""
+    features: NDArray[np.bool_] = np.asarray(ratios) > threshold
+    return features

@@ -14,7 +14,7 @@ from clrecon.errors import NoSurfaceError, OutputError, RefusedInputError, Usage
 from clrecon.exchange.clouds.formats import CLOUD_FORMATS, describe_cloud_losses, write_cloud
 from clrecon.exchange.file_format import FileFormat
 from clrecon.points import PointCloud
-from clrecon.points.reader import read_points
+from clrecon.points.cloud_reader import read_points
 
 pytestmark = pytest.mark.unit
 

@@ -20,7 +20,7 @@ from clrecon.geometry import (
     tilt_degrees,
 )
 from clrecon.geometry.affine import checked_affine
-from clrecon.geometry.precision import largest_coordinate
+from clrecon.geometry.vertices import largest_coordinate
 
 ROW = np.array([0.8, 0.6, 0.0])
 COLUMN = np.array([-0.36, 0.48, 0.8])

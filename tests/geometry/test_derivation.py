@@ -11,7 +11,7 @@ from dicom_series import Plan, set_values, write_series
 
 from clrecon import Volume, read_volume
 from clrecon.geometry import compose_affine, is_left_handed, normal_matrix, slice_normal, tilt_degrees
-from clrecon.geometry.frames import frame_from_lps
+from clrecon.geometry.affine import frame_from_lps
 from clrecon.geometry.iso_rule import layer_normal_matrices, slice_normal_matrices
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "geometry.md"

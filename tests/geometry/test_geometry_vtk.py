@@ -11,7 +11,7 @@ from dicom_series import rotation
 
 from clrecon.errors import UsageError
 from clrecon.geometry import AIR_HU, Volume, compose_affine
-from clrecon.geometry.regular import regular_grid, shear_degrees
+from clrecon.geometry.resample import regular_grid, shear_degrees
 from clrecon.mesh import Mesh
 from clrecon.reference.surface.extract import extract_isosurface
 

@@ -7,7 +7,7 @@ import pytest
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume, frame_from_lps
-from clrecon.geometry.precision import (
+from clrecon.geometry.vertices import (
     describe_far,
     find_vertex_origin,
     float32_step,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from clrecon.geometry import Volume
-from clrecon.geometry.regular import RegularGrid, regular_grid, resample_grid
+from clrecon.geometry.resample import RegularGrid, regular_grid, resample_grid
 
 
 def test_voxels_reach_half_a_step_beyond_their_centres():

@@ -14,8 +14,8 @@ from uneven_volume import positions, uneven
 from clrecon import DeviceVolume, LabelMap, Volume, resample_labels
 from clrecon.errors import UsageError
 from clrecon.geometry import compose_affine, is_left_handed
-from clrecon.geometry.crop import crop_volume
-from clrecon.geometry.orientation import describe_orientation
+from clrecon.geometry.affine import facts_of_orientation
+from clrecon.geometry.blocks import crop_volume
 from clrecon.reading.dicom import read_volume
 
 pytestmark = pytest.mark.unit
@@ -174,7 +174,7 @@ def test_the_certificate_is_that_of_the_part(tmp_path, tilt):
     assert own["sliced"] == {"first_ijk": [0, 1, 5], "step_ijk": [1, 1, -2], "shape_ijk_before": [9, 6, 7]}
     assert np.allclose(own.affine_ijk_to_lps_mm, part.affine) and own.hu_range == list(part.hu_range)
     assert own.gap_mm["median"] == pytest.approx(2 * volume.certificate.gap_mm["median"])
-    assert own.orientation == describe_orientation(part.affine) and not own.orientation["right_handed"]
+    assert own.orientation == facts_of_orientation(part.affine) and not own.orientation["right_handed"]
     assert own.tilt_deg == pytest.approx(volume.certificate.tilt_deg, abs=1e-6)
     assert abs(own.tilt_deg) == pytest.approx(abs(tilt), abs=1e-3) and own.tilt_deg * tilt <= 0.0
     assert own.frame_of_reference_hash == volume.certificate.frame_of_reference_hash is not None

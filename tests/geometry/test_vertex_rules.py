@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clrecon.errors import UsageError
-from clrecon.geometry.vertex_rules import (
+from clrecon.geometry.vertices import (
     GOLDEN,
     check_vertex_rule,
     cubic_value,

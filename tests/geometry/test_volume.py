@@ -10,7 +10,7 @@ import pytest
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.base import DEVICE_DTYPES
+from clrecon.geometry.grid import DEVICE_DTYPES
 
 OBLIQUE = np.array([[0.7, 0.1, 0.05, -250.0], [-0.1, 0.5, 0.2, -300.0], [0.0, 0.05, 2.5, -846.0], [0, 0, 0, 1.0]])
 

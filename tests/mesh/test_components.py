@@ -9,7 +9,7 @@ import sample_meshes as samples
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh import Mesh, select_components, split_components
 from clrecon.mesh.connectivity import label_components
-from clrecon.mesh.pieces import measure_components
+from clrecon.mesh.quality import measure_components
 from clrecon.mesh.triangles import enclosed_ml
 
 pytestmark = pytest.mark.unit

@@ -12,7 +12,7 @@ import clrecon
 from clrecon import Mesh
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.exchange.meshes.read_stl import join_corners
-from clrecon.mesh.reader import MESH_INPUTS
+from clrecon.mesh.mesh_reader import MESH_INPUTS
 
 BALL = Mesh(*ball(8.0, 12))
 

@@ -7,8 +7,8 @@ import pytest
 import sample_meshes as samples
 import tolerances
 
-from clrecon.mesh import nearest as searching
-from clrecon.mesh.nearest import find_nearest_triangle
+from clrecon.mesh import triangles as searching
+from clrecon.mesh.triangles import find_nearest_triangle
 
 pytestmark = pytest.mark.unit
 

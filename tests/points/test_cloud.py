@@ -11,7 +11,7 @@ import pytest
 
 from clrecon.errors import UsageError
 from clrecon.points import PointCloud, PointStep
-from clrecon.points.voxel_numbers import VoxelNumbers
+from clrecon.points.cloud import VoxelNumbers
 
 
 def a_cloud(n: int = 5) -> PointCloud:

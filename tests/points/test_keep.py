@@ -7,8 +7,7 @@ import pytest
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.points import PointCloud
-from clrecon.points.cluster_figures import measure_clusters
-from clrecon.points.keep import keep_clusters, parse_keep_rules
+from clrecon.points.keep import keep_clusters, measure_clusters, parse_keep_rules
 
 
 def block(n: int, corner: tuple[float, float, float]) -> np.ndarray:

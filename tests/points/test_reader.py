@@ -12,7 +12,7 @@ from sample_meshes import LongTable
 
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
 from clrecon.points import PointCloud
-from clrecon.points.reader import _check_points, read_points
+from clrecon.points.cloud_reader import _check_points, read_points
 
 pytestmark = pytest.mark.unit
 

@@ -166,7 +166,7 @@ def statements_of(source: str) -> Iterator[ast.stmt]:
 
 
 def layer_of(module: str) -> str:
-    """``clrecon.mesh.refine.smoothing`` -> ``mesh``; ``clrecon`` -> ``__init__``."""
+    """``clrecon.mesh.refine.decimation`` -> ``mesh``; ``clrecon`` -> ``__init__``."""
     parts = module.split(".")
     return parts[1] if len(parts) > 1 else "__init__"
 

@@ -108,7 +108,7 @@ def _open_input(
     subject: Volume | PointCloud
     with DeviceOpening(settings.device, partial(prepare_chain, settings=settings, is_cloud=is_cloud)) as opening:
         if is_cloud:
-            from clrecon.points.reader import read_points
+            from clrecon.points.cloud_reader import read_points
 
             progress("read", 0, 0)
             subject = read_points(source, space=settings.input_space)

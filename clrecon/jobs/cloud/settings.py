@@ -9,7 +9,7 @@ from pathlib import Path
 
 from clrecon.errors import UsageError
 from clrecon.jobs.options import InputSettings
-from clrecon.points.kinds import KINDS
+from clrecon.points import POINT_KINDS
 from clrecon.system.arguments import name_parameter
 
 DENOISERS = ("grid", "bilateral")
@@ -108,7 +108,7 @@ class CloudSettings(InputSettings):
         from clrecon.geometry import frame_from_lps  # numpy: not loaded before a job starts
 
         frame_from_lps(self.space)
-        _check_choice("points are", self.points, KINDS)
+        _check_choice("points are", self.points, POINT_KINDS)
         _check_choice("points of ghost slices are kept or dropped:", self.ghost_slices, GHOSTS)
         for name in self.denoise:
             _check_choice("clouds are denoised by", name, DENOISERS)

@@ -16,7 +16,7 @@ import numpy as np
 from clrecon.errors import ClreconError, DeviceError, RefusedInputError
 from clrecon.jobs.cloud.settings import CloudSettings
 from clrecon.jobs.presets import DEFAULT_PRESET, find_preset
-from clrecon.points.step import count_numbers
+from clrecon.points.cloud import count_numbers
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Gate

@@ -18,7 +18,7 @@ from clrecon.jobs.run import to_json
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.cells import GridCells, find_mesh_cells, measure_cells
 from clrecon.mesh.compare.distances import SAMPLES, SurfaceDistance, compare_meshes, summarise_distances
-from clrecon.mesh.compare.slices import measure_slices
+from clrecon.mesh.compare.mesh_slices import measure_slices
 from clrecon.mesh.compare.truth import REACH_MM, measure_truth
 
 MEASURES = ("quality", "cells", "slices", "surfaces", "truth", "points")

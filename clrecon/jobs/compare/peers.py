@@ -13,7 +13,7 @@ from clrecon.errors import NoSurfaceError
 from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
-from clrecon.mesh.normals import vertex_normals
+from clrecon.mesh.triangles import vertex_normals
 
 FILTERS = {"vtk-mc": "vtkMarchingCubes", "vtk-fe": "vtkFlyingEdges3D"}
 

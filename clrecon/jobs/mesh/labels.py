@@ -155,9 +155,9 @@ def judge_label_volumes(parts: Sequence[Part], closed: bool) -> list[dict[str, A
     `closed` says that surfaces are closed at the border of the scan.  Each part of a label gets ``label_mesh_ml`` and
     ``label_compared_ml`` among its `facts`.
 
-    Returns: A gate for each label and iso value, see `clrecon.mesh.compare.gates.judge_label_volume`.
+    Returns: A gate for each label and iso value, see `clrecon.mesh.compare.mesh_gates.judge_label_volume`.
     """
-    from clrecon.mesh.compare.gates import judge_label_volume
+    from clrecon.mesh.compare.mesh_gates import judge_label_volume
     from clrecon.mesh.triangles import enclosed_ml
 
     by_surface: dict[Surface, list[Part]] = {}

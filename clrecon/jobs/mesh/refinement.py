@@ -38,9 +38,8 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress:
     if not settings.refines:
         return mesh
     from clrecon.mesh.compare.distances import compare_meshes
-    from clrecon.mesh.refine.decimation import BOUND_VOXEL, default_deviation
+    from clrecon.mesh.refine.decimation import BOUND_VOXEL, default_deviation, smooth_mesh
     from clrecon.mesh.refine.quadric import collapse_quadric
-    from clrecon.mesh.refine.smoothing import smooth_mesh
     from clrecon.operators.surface.decimation import decimate_mesh
 
     raw = mesh
@@ -113,13 +112,14 @@ def judge_parts(
     volume: The volume that they were made from.
     progress: Called as ``progress("distance", parts done, parts)``.
 
-    Returns: All gates, see `clrecon.mesh.compare.gates.judge_mesh`, each with ``mesh``, the name of its part or None.
+    Returns: All gates, see `clrecon.mesh.compare.mesh_gates.judge_mesh`, each with ``mesh``, the name of its part or
+        None.
     """
     if not (settings.refines or any(part.quality for part in parts)):
         for part in parts:
             part.facts |= {"iso_distance": None, "refinement": None}
         return []
-    from clrecon.mesh.compare.gates import judge_mesh
+    from clrecon.mesh.compare.mesh_gates import judge_mesh
 
     gates = []
     steps = Steps(progress, "distance", len(parts))
@@ -206,12 +206,12 @@ def describe_print(mesh: Mesh, found: dict[str, float], kept: dict[str, float]) 
     mesh: The mesh as it is written.
     found, kept: `measure_pieces` of the surface as it was extracted, and of what was kept of it.
 
-    Returns: ``size_mm`` : x, y, z of the box around it ``wall`` : see `clrecon.mesh.compare.thickness.measure_walls`
+    Returns: ``size_mm`` : x, y, z of the box around it ``wall`` : see `clrecon.mesh.compare.distances.measure_walls`
         ``left_out`` : pieces and cavities as in `measure_pieces`; cavities that are left out are filled; and
         ``not_bone``, ``not_bone_ml``, the pieces whose walls are not like bone or that are crumbs, None where that was
         not asked ``pieces``, ``pieces_ml``, ``cavities``, ``cavities_ml`` : those that are in it
     """
-    from clrecon.mesh.compare.thickness import measure_walls
+    from clrecon.mesh.compare.distances import measure_walls
 
     size = mesh.vertices.max(axis=0).astype(float) - mesh.vertices.min(axis=0)
     return {

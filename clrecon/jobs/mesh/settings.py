@@ -433,7 +433,7 @@ def check_growing(
         _check_seed(seed)
     if method == "t-mc" and not grow_from and vertex_rule == "linear":
         return  # what every device does: the operators need not be loaded
-    from clrecon.geometry.vertex_rules import check_vertex_rule
+    from clrecon.geometry.vertices import check_vertex_rule
     from clrecon.operators.surface.methods import check_method
 
     chosen = check_method(

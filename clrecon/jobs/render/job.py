@@ -29,7 +29,7 @@ from clrecon.jobs.render.report import (
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.jobs.run import DeviceOpening, Laps, stage_report
 from clrecon.mesh import Mesh
-from clrecon.mesh.reader import read_mesh
+from clrecon.mesh.mesh_reader import read_mesh
 from clrecon.reading import read_selected
 from clrecon.rendering.pictures.modes import check_known
 from clrecon.rendering.pictures.styles import Projection, SurfaceLook
@@ -131,7 +131,7 @@ def _open_input(
             progress("read", 0, 0)
             subject = read_mesh(source, space=settings.mesh_space)
         elif is_cloud:
-            from clrecon.points.reader import read_points
+            from clrecon.points.cloud_reader import read_points
 
             progress("read", 0, 0)
             subject = read_points(source)

@@ -13,8 +13,8 @@ from clrecon.operators.masks.voxel_mask import VoxelMask, mark_band, mark_voxels
 from clrecon.operators.points.slice_overlap import count_overlaps
 from clrecon.operators.points.voxel_clusters import ClusterSearch, pad_for
 from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.points.cloud import VoxelNumbers
 from clrecon.points.stencil import Lattice, make_stencil
-from clrecon.points.voxel_numbers import VoxelNumbers
 from clrecon.reference.points import clusters as cluster_twin
 from clrecon.reference.points import slice_overlap as overlap_twin
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from clrecon.jobs.selftest.check import Check, require_close, require_equal
 from clrecon.mesh.compare.near_distances import NearDistance, triangle_distances
-from clrecon.mesh.refine.bounds import MIDDLES, SurfaceBounds
+from clrecon.mesh.refine.deviation import MIDDLES, SurfaceBounds
 from clrecon.opencl import Device
 from clrecon.operators.surface.decimation import DeviceBounds
 

@@ -15,7 +15,7 @@ from clrecon.operators.points.denoising import denoise_points, remove_outliers
 from clrecon.operators.points.normals import estimate_normals, find_gradients
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
-from clrecon.points.features import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
+from clrecon.points.spacing import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
 from clrecon.reference.points import bilateral as filter_twin
 from clrecon.reference.points import gradients as gradients_twin
 from clrecon.reference.points import neighbours as neighbours_twin

@@ -19,7 +19,7 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.options import InputSettings
 from clrecon.jobs.preprocess import mask_volume
 from clrecon.mesh import Mesh
-from clrecon.mesh.reader import MESH_INPUTS
+from clrecon.mesh.mesh_reader import MESH_INPUTS
 from clrecon.reading import read_selected, tell_format
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
@@ -182,7 +182,7 @@ def _open_mesh(path: str | Path, space: str | None) -> OpenedInput:
 
 
 def _open_cloud(path: str | Path, space: str | None) -> OpenedInput:
-    from clrecon.points.reader import read_points
+    from clrecon.points.cloud_reader import read_points
 
     cloud = read_points(path)
     if space is not None and cloud.report["file"]["space_from"] == "assumed":

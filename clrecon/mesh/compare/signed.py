@@ -23,9 +23,8 @@ from clrecon.mesh.compare.distances import (
 )
 from clrecon.mesh.connectivity import find_edges, opposite_half_edges
 from clrecon.mesh.mesh import Mesh
-from clrecon.mesh.normals import vertex_normals
 from clrecon.mesh.quality import MeshQuality, measure_quality
-from clrecon.mesh.triangles import cross_products
+from clrecon.mesh.triangles import cross_products, vertex_normals
 from clrecon.mesh.vtk import CellLocator
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.pieces import chunks, local_origin
@@ -196,14 +195,14 @@ def measure_distance(
     sides, signed, warnings = [], [], []
     for one, other, name in ((mesh, reference, names[1]), (reference, mesh, names[0])):
         points = sample_surface(one.vertices, one.triangles, samples)
-        measure, has_sign, remark = _open(other, name)
+        measure, has_sign, remark = _measurer_of(other, name)
         distances = np.empty(samples)
         for where in chunks(samples, _PIECE):
             told("compare", done + where.start, 2 * samples)
             distances[where] = measure(points[where])
         done += samples
         sides.append(summarise_distances(np.abs(distances)))
-        signed.append(_summarise(distances) if has_sign else None)
+        signed.append(_summarise_sides(distances) if has_sign else None)
         warnings += remark
     told("compare", done, 2 * samples)
     return MeshDeviation(
@@ -244,7 +243,7 @@ def measure_vertex_distances(
         The reference is empty.
     """
     told = progress or ignore_progress
-    measure, has_sign, _ = _open(reference, "the reference")
+    measure, has_sign, _ = _measurer_of(reference, "the reference")
     distances = np.empty(mesh.vertex_count)
     for where in chunks(mesh.vertex_count, _PIECE):
         told("compare", where.start, mesh.vertex_count)
@@ -253,7 +252,7 @@ def measure_vertex_distances(
     return distances, has_sign
 
 
-def _open(mesh: Mesh, name: str) -> tuple[SignedDistance | SurfaceDistance, bool, list[str]]:
+def _measurer_of(mesh: Mesh, name: str) -> tuple[SignedDistance | SurfaceDistance, bool, list[str]]:
     """Return what measures distances from a mesh, whether they have a sign, and what is to be said of it."""
     mesh.check()
     if not mesh.triangle_count:
@@ -266,7 +265,7 @@ def _open(mesh: Mesh, name: str) -> tuple[SignedDistance | SurfaceDistance, bool
     return SignedDistance(mesh.vertices, mesh.triangles, outward=quality.outward), True, turned
 
 
-def _summarise(distances: NDArray[np.float64]) -> SideDistance:
+def _summarise_sides(distances: NDArray[np.float64]) -> SideDistance:
     p5, median, p95 = np.percentile(distances, (5, 50, 95)).tolist()
     return SideDistance(
         mean=float(distances.mean()),

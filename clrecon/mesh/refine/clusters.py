@@ -8,11 +8,17 @@ from numpy.typing import NDArray
 from clrecon.exchange.coordinates import as_stored, find_coincident
 from clrecon.mesh.connectivity import Edges, Fans, find_edges, label_components
 from clrecon.mesh.intersections import FindCrossings, find_changed_intersections, find_self_intersections
-from clrecon.mesh.refine.bounds import WITNESSES
 from clrecon.mesh.refine.collapses import Collapses, Quadrics, last_of_collapses
-from clrecon.mesh.refine.deviation import Deviation
-from clrecon.mesh.refine.faults import any_corner, find_faults_beside, find_sheets, find_torn
-from clrecon.mesh.refine.topology import TopologyChange, compare_topology, measure_topology
+from clrecon.mesh.refine.deviation import WITNESSES, Deviation
+from clrecon.mesh.refine.topology import (
+    TopologyChange,
+    any_corner,
+    compare_topology,
+    find_faults_beside,
+    find_sheets,
+    find_torn,
+    measure_topology,
+)
 from clrecon.mesh.triangles import cross_products
 from clrecon.system.pieces import side_by_side
 

@@ -17,10 +17,10 @@ from clrecon.mesh.compare.distances import SAMPLES, SurfaceDistance, sample_surf
 from clrecon.mesh.compare.near_distances import NearDistance
 from clrecon.mesh.connectivity import find_edges, label_components
 from clrecon.mesh.mesh import Mesh
-from clrecon.mesh.normals import vertex_normals
 from clrecon.mesh.refine.collapses import last_of_collapses
 from clrecon.mesh.refine.decimation import carry_on, check_share, check_triangles
 from clrecon.mesh.refine.topology import TopologyChange, compare_topology, measure_topology
+from clrecon.mesh.triangles import vertex_normals
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress, ignore_progress
@@ -83,9 +83,9 @@ def collapse_quadric(mesh: Mesh, fraction: float, *, progress: Progress | None =
         )
     progress("decimate", 1, 3)
     vertices, triangles = as_stored(points + origin), triangles.astype(np.uint32)
-    topology, lost = _compare(mesh, triangles, last_of_collapses(collapses, mesh.vertex_count))
+    topology, lost = _compare_topology(mesh, triangles, last_of_collapses(collapses, mesh.vertex_count))
     progress("decimate", 2, 3)
-    gates = _judge(topology)
+    gates = _gates_of_topology(topology)
     said: dict[str, Any] = {
         "fraction": fraction,
         "reached": 1.0 - len(triangles) / mesh.triangle_count,
@@ -103,7 +103,7 @@ def collapse_quadric(mesh: Mesh, fraction: float, *, progress: Progress | None =
     return Mesh(vertices, triangles, vertex_normals(vertices, triangles), report)
 
 
-def _compare(
+def _compare_topology(
     mesh: Mesh, triangles: NDArray[np.uint32], names: NDArray[np.int64]
 ) -> tuple[TopologyChange, NDArray[np.int64]]:
     """Compare the topology with that before; return also the vertices of components that were lost."""
@@ -119,7 +119,7 @@ def _compare(
     return compare_topology(before, after), np.flatnonzero(gone[labels])
 
 
-def _judge(found: TopologyChange) -> list[Gate]:
+def _gates_of_topology(found: TopologyChange) -> list[Gate]:
     lost = f"components of {found.components_before:,} that collapsing edges by their quadric error has lost"
     opened = max(found.loose_edges_after - found.loose_edges_before, 0)
     return [

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from clrecon.anatomy.noise import measure_noise
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.regular import shear_degrees
+from clrecon.geometry.resample import shear_degrees
 from clrecon.operators.filters.settings import checked_length, report_filter
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.system.arguments import explains_arguments

@@ -27,7 +27,7 @@ from clrecon.opencl import (
 )
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import voxel_variants
-from clrecon.points.voxel_numbers import VoxelNumbers
+from clrecon.points.cloud import VoxelNumbers
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_band

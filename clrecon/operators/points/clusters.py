@@ -19,10 +19,9 @@ from clrecon.operators.points.point_extraction import extract_points
 from clrecon.operators.points.voxel_clusters import ClusterSearch, checked_min_samples, pad_for, search_bytes
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points import PointCloud, PointStep
-from clrecon.points.cluster_figures import ClusterFigures, measure_clusters
-from clrecon.points.keep import REPORTED
+from clrecon.points.cloud import VoxelNumbers
+from clrecon.points.keep import REPORTED, ClusterFigures, measure_clusters
 from clrecon.points.stencil import Lattice, Stencil, checked_eps, make_stencil
-from clrecon.points.voxel_numbers import VoxelNumbers
 from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.progress import Progress
 

@@ -29,7 +29,7 @@ from clrecon.operators.points.grid import fill_grid, plan_grid
 from clrecon.operators.points.neighbours import NeighbourSearch, Part, check_neighbours, take_points
 from clrecon.operators.points.normals import FEWEST_NEIGHBOURS, PlaneFits
 from clrecon.points import PointCloud, PointStep
-from clrecon.points.features import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
+from clrecon.points.spacing import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
-from clrecon.geometry.precision import is_far
+from clrecon.geometry.vertices import is_far
 from clrecon.opencl import (
     Device,
     Program,
@@ -26,7 +26,7 @@ from clrecon.opencl import (
     wait,
 )
 from clrecon.operators.primitives.scan import exclusive_scan, prepare_sort, radix_sort, sort_bytes
-from clrecon.points.cells import MARGIN
+from clrecon.points.spacing import MARGIN
 
 STEPS_A_POINT = 16
 """Steps with each point of a cloud that a work-item may make where all others are candidates: four passes at least."""
@@ -59,7 +59,7 @@ class GridPlan:
 
     points: ndarray, shape (n, 3), float32. mm relative to `base`.
     base: ndarray, shape (3,), float64. LPS mm: whole millimetres near the centre of a far cloud, see
-        `clrecon.geometry.precision`, else zeros.
+        `clrecon.geometry.vertices`, else zeros.
     corner: ndarray, shape (3,), float32. Corner of cell (0, 0, 0) relative to `base`: the lowest coordinates less 1e-3
         of the edge.
     edge: numpy.float32. Edge of the cells in mm.

@@ -14,7 +14,7 @@ from clrecon.anatomy.head import warn_of_face
 from clrecon.errors import DeviceError, DeviceFailedError, DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import data_range
-from clrecon.geometry.precision import describe_far, find_vertex_origin
+from clrecon.geometry.vertices import describe_far, find_vertex_origin
 from clrecon.opencl import (
     Device,
     Program,
@@ -33,10 +33,8 @@ from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.resident.tables import label_variants, voxel_variants
 from clrecon.operators.surface.marching_cubes import pad4, split_steps
 from clrecon.operators.surface.slabs import OUTPUT_SHARE
-from clrecon.points import PointCloud
-from clrecon.points.cloud import MOST_POINTS
-from clrecon.points.kinds import KINDS
-from clrecon.points.voxel_numbers import VoxelNumbers
+from clrecon.points import POINT_KINDS, PointCloud
+from clrecon.points.cloud import MOST_POINTS, VoxelNumbers
 from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.progress import Progress
 from clrecon.system.text import format_hu
@@ -392,8 +390,8 @@ def _check(iso_value: object, kind: str | None, hu: object, labels: object, labe
     if iso_value is not None and hu is not None:
         raise UsageError(f"give an iso value or {name_parameter('hu', '(LOW, HIGH)')}, not both")
     kind = kind or ("surface" if hu is None else "voxels")
-    if kind not in KINDS:
-        raise UsageError(f"there are no points of the kind {kind!r}: use one of {', '.join(KINDS)}")
+    if kind not in POINT_KINDS:
+        raise UsageError(f"there are no points of the kind {kind!r}: use one of {', '.join(POINT_KINDS)}")
     if label is not None and labels is None:
         raise UsageError(f"{name_parameter('label')} needs {name_parameter('labels')}: the map that has it")
     if paper and kind == "surface":

@@ -13,7 +13,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import Grid
 from clrecon.mesh import Mesh
-from clrecon.mesh.normals import vertex_normals
+from clrecon.mesh.triangles import vertex_normals
 from clrecon.opencl import Device, Stopwatch, allocate, kernel_number, launch, load_program, upload
 from clrecon.operators.primitives.scan import exclusive_scan
 from clrecon.operators.rays.picture_buffers import highlight_table

@@ -14,8 +14,7 @@ import numpy as np
 from clrecon.anatomy.surroundings import LEFT_OUT, leave_out_surroundings
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.base import AIR_HU
-from clrecon.geometry.grid import Grid
+from clrecon.geometry.grid import AIR_HU, Grid
 from clrecon.labels import resample_labels
 from clrecon.opencl import Device
 from clrecon.operators.rays.picture_buffers import DrawnVolume

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.mesh import Mesh
-from clrecon.mesh.compare.frames import rounding_of_bounds
+from clrecon.mesh.compare.near_distances import rounding_of_bounds
 from clrecon.mesh.connectivity import Fans
 from clrecon.mesh.intersections import find_self_intersections
 from clrecon.mesh.refine import decimation
-from clrecon.mesh.refine.bounds import WITNESSES, SurfaceBounds
+from clrecon.mesh.refine.deviation import WITNESSES, SurfaceBounds
 from clrecon.opencl import (
     Device,
     Program,
@@ -202,7 +202,7 @@ PART = 1 << 20
 """Points or triangles of a launch: each stays short, and its arrays fit beside the surface."""
 
 if kernel_constant("surface/near_faces.cl", "WITNESSES") != WITNESSES:
-    raise ImportError("cl/surface/near_faces.cl and clrecon.mesh.refine.bounds differ in the number of witnesses")
+    raise ImportError("cl/surface/near_faces.cl and clrecon.mesh.refine.deviation differ in the number of witnesses")
 
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]

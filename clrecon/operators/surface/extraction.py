@@ -13,8 +13,7 @@ from clrecon.anatomy.head import warn_of_face
 from clrecon.errors import ClreconError, DeviceError, DeviceMemoryError, NoSurfaceError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, data_range
-from clrecon.geometry.precision import describe_far
-from clrecon.geometry.vertex_rules import describe_rule
+from clrecon.geometry.vertices import describe_far, describe_rule
 from clrecon.opencl import Device, Program, Stopwatch, result_pages
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import BrickStates, brick_bytes, compare_bricks, measure_bricks

@@ -17,14 +17,14 @@ from numpy.typing import DTypeLike, NDArray
 from clrecon.errors import DeviceMemoryError, RefusedInputError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule
-from clrecon.geometry.precision import describe_far
+from clrecon.geometry.vertices import describe_far
 from clrecon.labels import LabelMap
 from clrecon.labels.enclosed import FACES_PER_AREA, Borders, choose_levels, count_faces, find_enclosed, level_biases
 from clrecon.labels.occupancy import FULL, KEEP, REACH, STEEPNESS, next_level
 from clrecon.labels.solid import Box, find_boxes
 from clrecon.labels.volumes import label_ml
 from clrecon.mesh import Mesh
-from clrecon.mesh.compare.gates import judge_label_volume
+from clrecon.mesh.compare.mesh_gates import judge_label_volume
 from clrecon.mesh.triangles import enclosed_ml
 from clrecon.opencl import (
     Device,

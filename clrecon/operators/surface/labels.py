@@ -17,7 +17,7 @@ from clrecon.anatomy.head import SKIN_HU, warn_of_skin
 from clrecon.errors import DeviceMemoryError, NoSurfaceError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
-from clrecon.geometry.precision import describe_far
+from clrecon.geometry.vertices import describe_far
 from clrecon.labels import LabelMap, ResampledLabels
 from clrecon.labels.growth import Growth
 from clrecon.labels.solid import Box, fill_solid, find_boxes

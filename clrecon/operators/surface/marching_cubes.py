@@ -15,7 +15,7 @@ from numpy.typing import DTypeLike, NDArray
 from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import layer_margins, layer_normal_matrices, slice_normal_matrices, vertex_margin
-from clrecon.geometry.precision import find_vertex_origin
+from clrecon.geometry.vertices import find_vertex_origin
 from clrecon.opencl import (
     Device,
     Program,

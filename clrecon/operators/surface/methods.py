@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.iso_rule import IsoRule, Level, choose_iso_rule
-from clrecon.geometry.vertex_rules import linear_fraction
+from clrecon.geometry.vertices import linear_fraction
 from clrecon.mesh import Mesh
-from clrecon.mesh.normals import vertex_normals
+from clrecon.mesh.triangles import vertex_normals
 from clrecon.opencl import Device
 from clrecon.opencl.sources import read_kernel_source
 from clrecon.operators.resident.device_volume import DeviceVolume

@@ -27,7 +27,7 @@ import numpy as np
 
 from clrecon.errors import OutputError, RefusedInputError, UsageError
 from clrecon.geometry.affine import Float64Array, checked_affine
-from clrecon.geometry.itk import make_sitk
+from clrecon.geometry.images import make_sitk
 from clrecon.reading.grids.grid_file import (
     VOLUME,
     GridFile,

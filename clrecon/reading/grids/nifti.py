@@ -19,9 +19,8 @@ from typing import Any, BinaryIO, cast
 import numpy as np
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.geometry.affine import Float64Array, checked_affine
-from clrecon.geometry.frames import lps_affine_from_ras
-from clrecon.geometry.nifti import MM_PER_UNIT, place_in_header
+from clrecon.geometry.affine import Float64Array, checked_affine, lps_affine_from_ras
+from clrecon.geometry.images import MM_PER_UNIT, place_in_header
 from clrecon.reading.grids.grid_file import (
     PACKING,
     VOLUME,

@@ -24,9 +24,8 @@ from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import AIR_HU, Volume
-from clrecon.geometry.affine import column_spacing, signed_tilt, slice_normal, tilt_degrees
+from clrecon.geometry.affine import column_spacing, facts_of_orientation, signed_tilt, slice_normal, tilt_degrees
 from clrecon.geometry.certificate import Certificate
-from clrecon.geometry.orientation import describe_orientation
 from clrecon.reading.common.likeness import Likeness, judge_slices
 from clrecon.reading.common.plausibility import (
     PADDING_SHARE,
@@ -288,7 +287,7 @@ def certify_grid(
         spacing_mm=list(spacing),
         extent_mm=[ni * spacing[0], nj * spacing[1], nk * gap],
         affine_ijk_to_lps_mm=grid.affine.tolist(),
-        orientation=describe_orientation(grid.affine),
+        orientation=facts_of_orientation(grid.affine),
         tilt_deg=signed_tilt(grid.affine),
         gap_mm={"min": gap, "max": gap, "median": gap},
         transfer_syntax_names=[f"{grid.kind}, {grid.dtype.name}"],

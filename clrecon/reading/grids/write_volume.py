@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.exchange.certificate import certificate_lines
-from clrecon.geometry.regular import LARGEST_SHEAR_DEGREES, describe_unevenness, shear_degrees
-from clrecon.geometry.resample import resample_volume
+from clrecon.geometry.resample import LARGEST_SHEAR_DEGREES, describe_unevenness, resample_volume, shear_degrees
 from clrecon.geometry.volume import Volume
 from clrecon.reading.grids.grid_file import VOLUME, VolumeContent, import_extra
 from clrecon.reading.grids.metaimage import write_metaimage

@@ -18,7 +18,7 @@ from clrecon.geometry.iso_rule import (
     slice_normal_matrices,
     vertex_margin,
 )
-from clrecon.geometry.vertex_rules import golden_fraction, search_fraction
+from clrecon.geometry.vertices import golden_fraction, search_fraction
 from clrecon.reference.surface.case_table import CORNERS, EDGES, case_table
 from clrecon.reference.surface.trilinear import find_row, place_cell_vertices
 from clrecon.reference.surface.trilinear_table import CELL_VERTEX

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.mesh import Mesh
-from clrecon.mesh.normals import vertex_normals
+from clrecon.mesh.triangles import vertex_normals
 
 TRIANGLES_A_CELL = 2.0
 """Triangles that a surface leaves in each cell that it passes through."""

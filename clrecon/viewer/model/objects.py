@@ -155,7 +155,7 @@ def _with_normals(mesh: Mesh) -> Mesh:
         raise UsageError("a mesh has no triangle: there is nothing to show")
     if mesh.normals is not None:
         return mesh
-    from clrecon.mesh.normals import vertex_normals
+    from clrecon.mesh.triangles import vertex_normals
 
     normals = vertex_normals(mesh.vertices, mesh.triangles)
     return Mesh(mesh.vertices, mesh.triangles, normals, dict(mesh.report), trusted=True)

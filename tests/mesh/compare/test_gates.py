@@ -8,7 +8,7 @@ import sample_meshes as samples
 
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import compare_meshes
-from clrecon.mesh.compare.gates import judge_label_volume, judge_mesh
+from clrecon.mesh.compare.mesh_gates import judge_label_volume, judge_mesh
 from clrecon.mesh.triangles import enclosed_ml
 from clrecon.system.records import Gate, failed_gates
 

@@ -12,10 +12,9 @@ from clrecon.exchange.vtk import make_polydata
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
-from clrecon.mesh.compare import lattice as lattices
+from clrecon.mesh.compare import mesh_slices as lattices
 from clrecon.mesh.compare.iso_distance import trilinear_values
-from clrecon.mesh.compare.lattice import Lattice, count_points, exclusive_or, find_level_runs
-from clrecon.mesh.compare.parity import find_piercings
+from clrecon.mesh.compare.mesh_slices import Lattice, count_points, exclusive_or, find_level_runs, find_piercings
 
 pytestmark = pytest.mark.unit
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 
-from clrecon.mesh.compare import thickness
-from clrecon.mesh.compare.thickness import measure_walls, wall_thickness
+from clrecon.mesh.compare import distances
+from clrecon.mesh.compare.distances import measure_walls, wall_thickness
 
 pytestmark = pytest.mark.unit
 
@@ -49,7 +49,7 @@ def test_an_open_sheet_has_no_wall():
 def test_the_figures_of_known_thicknesses(monkeypatch):
     """From 0 to 100 mm in steps of 1 mm: each percentile is its own number."""
     lengths = np.append(np.arange(101.0), [np.nan, np.nan])
-    monkeypatch.setattr(thickness, "wall_thickness", lambda *_: lengths)
+    monkeypatch.setattr(distances, "wall_thickness", lambda *_: lengths)
     vertices, triangles = samples.box()
     found = measure_walls(vertices, triangles.astype(np.uint32), 25.0, len(lengths))
     assert (found["min_mm"], found["p5_mm"], found["median_mm"]) == (0.0, 5.0, 50.0)

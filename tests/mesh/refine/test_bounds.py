@@ -7,7 +7,7 @@ import pytest
 from near_surfaces import FLAT_BOUND, FLAT_CASES, flat_case, sheet
 
 from clrecon.mesh.compare.distances import SurfaceDistance
-from clrecon.mesh.refine.bounds import SurfaceBounds
+from clrecon.mesh.refine.deviation import SurfaceBounds
 
 pytestmark = pytest.mark.unit
 

@@ -8,7 +8,7 @@ import sample_meshes as samples
 
 from clrecon.mesh.refine.clusters import _any_witness
 from clrecon.mesh.refine.deviation import Deviation, _inner_weights
-from clrecon.mesh.refine.faults import any_corner
+from clrecon.mesh.refine.topology import any_corner
 
 pytestmark = pytest.mark.unit
 

@@ -8,7 +8,7 @@ import sample_meshes as samples
 
 from clrecon.mesh.connectivity import find_edges
 from clrecon.mesh.refine.clusters import Clusters
-from clrecon.mesh.refine.faults import find_faults_beside, find_sheets, find_torn
+from clrecon.mesh.refine.topology import find_faults_beside, find_sheets, find_torn
 
 pytestmark = pytest.mark.unit
 

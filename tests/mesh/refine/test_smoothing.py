@@ -12,11 +12,10 @@ from clrecon.exchange.coordinates import find_coincident
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.intersections import count_self_intersections
-from clrecon.mesh.normals import vertex_normals
-from clrecon.mesh.refine import smoothing
-from clrecon.mesh.refine.decimation import default_deviation
+from clrecon.mesh.refine import decimation
+from clrecon.mesh.refine.decimation import _PASS_BAND, default_deviation, smooth_mesh
 from clrecon.mesh.refine.shifts import move_vertices, shorten_steps
-from clrecon.mesh.refine.smoothing import _PASS_BAND, smooth_mesh
+from clrecon.mesh.triangles import vertex_normals
 from clrecon.mesh.vtk import smooth_windowed_sinc
 
 pytestmark = pytest.mark.unit
@@ -246,7 +245,7 @@ def test_steps_that_are_not_finite_are_not_made(value, monkeypatch):
         places[7, 1] = value
         return places
 
-    monkeypatch.setattr(smoothing, "smooth_windowed_sinc", spoil)
+    monkeypatch.setattr(decimation, "smooth_windowed_sinc", spoil)
     smooth = smooth_mesh(rough, 20, 0.5)
     assert np.isfinite(smooth.vertices).all() and np.std(radial_error(smooth)) < 0.5 * np.std(radial_error(rough))
     assert smooth.report["refinement"]["smooth"]["vertices_not_finite"] == 1

@@ -11,7 +11,7 @@ from clrecon.errors import UsageError
 from clrecon.operators.points import neighbours
 from clrecon.operators.points.denoising import denoise_points
 from clrecon.points import PointCloud
-from clrecon.points.features import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
+from clrecon.points.spacing import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
 from clrecon.reference.points import bilateral as twin
 from clrecon.reference.points import grid as grid_twin
 from clrecon.reference.points.neighbours import find_neighbours

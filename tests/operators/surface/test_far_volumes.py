@@ -12,7 +12,7 @@ from clrecon.exchange.formats import FORMATS, describe_rounding
 from clrecon.exchange.page import parse_page, read_facts
 from clrecon.exchange.page_coding import decode_surface
 from clrecon.geometry import Volume
-from clrecon.geometry.precision import FAR_MM, find_vertex_origin, float32_step
+from clrecon.geometry.vertices import FAR_MM, find_vertex_origin, float32_step
 from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
 from clrecon.operators.surface.extract import extract_isosurface

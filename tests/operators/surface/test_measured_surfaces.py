@@ -14,7 +14,7 @@ from uneven_volume import uneven
 
 from clrecon.geometry import Volume
 from clrecon.mesh.compare.cells import find_mesh_cells, measure_cells
-from clrecon.mesh.compare.slices import measure_slices
+from clrecon.mesh.compare.mesh_slices import measure_slices
 from clrecon.mesh.compare.truth import measure_truth
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.methods import extract_by_method

@@ -13,7 +13,7 @@ from dicom_series import Plan, set_raw, set_values, write_series
 from clrecon import list_series, read_volume
 from clrecon.cli.main import main
 from clrecon.geometry import compose_affine
-from clrecon.geometry.orientation import describe_orientation
+from clrecon.geometry.affine import facts_of_orientation
 from clrecon.reading.dicom import reader
 from clrecon.reading.dicom.stack.fit import summarise_gaps
 
@@ -120,7 +120,7 @@ def test_thickness_that_leaves_tissue_unmeasured(tmp_path):
 )
 def test_directions_in_the_patient(steps, axes, right_handed, off_axis):
     i_step, j_step, k_step = steps
-    found = describe_orientation(compose_affine(i_step, j_step, k_step, (0, 0, 0)))
+    found = facts_of_orientation(compose_affine(i_step, j_step, k_step, (0, 0, 0)))
     assert (found["axes"], found["right_handed"]) == (axes, right_handed)
     assert found["off_axis_deg"] == pytest.approx(off_axis)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from clrecon.errors import RefusedInputError
-from clrecon.geometry.uneven import POSITION_TOLERANCE_GAPS, POSITION_TOLERANCE_MM
+from clrecon.geometry.grid import POSITION_TOLERANCE_GAPS, POSITION_TOLERANCE_MM
 from clrecon.reading.dicom.headers.slice_header import Concatenation
 from clrecon.reading.dicom.pixels import stored
 from clrecon.reading.dicom.pixels import voxels as stray_bits

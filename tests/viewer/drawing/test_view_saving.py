@@ -8,8 +8,8 @@ import view_scenes as scenes
 from open_views import open_sessions
 
 from clrecon.errors import UsageError
-from clrecon.mesh.reader import read_mesh
-from clrecon.points.reader import read_points
+from clrecon.mesh.mesh_reader import read_mesh
+from clrecon.points.cloud_reader import read_points
 from clrecon.reading import read_volume
 
 PATIENCE = 60.0

@@ -233,7 +233,7 @@ def test_clip_planes_and_a_box_cut(page) -> None:
 def test_what_is_shown_is_saved_as_a_download(page, folder: Path) -> None:
     from selenium.webdriver.support.ui import Select
 
-    from clrecon.mesh.reader import read_mesh
+    from clrecon.mesh.mesh_reader import read_mesh
 
     Select(page.find_element("id", "format")).select_by_value(".stl")
     page.find_element("id", "save").click()

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import column_spacing
+from clrecon.geometry.affine import facts_of_orientation
 from clrecon.geometry.certificate import Certificate
-from clrecon.geometry.orientation import describe_orientation
 from clrecon.reading.common.likeness import Likeness
 from clrecon.reading.common.plausibility import (
     PADDING_SHARE,
@@ -367,7 +367,7 @@ def certify(
         spacing_mm=None if affine is None else list(column_spacing(affine)),
         extent_mm=None if affine is None else measure_extent(stack),
         affine_ijk_to_lps_mm=None if affine is None else affine.tolist(),
-        orientation=None if affine is None else describe_orientation(affine),
+        orientation=None if affine is None else facts_of_orientation(affine),
         patient_position=(lay.pop() or None) if len(lay) == 1 else None,
         anatomical_orientation="QUADRUPED" if any(h.quadruped for h in headers) else None,
         tilt_deg=stack.tilt_deg,

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import compose_affine, signed_tilt
 from clrecon.geometry.affine import TILT_REPORT_DEG
-from clrecon.geometry.uneven import fit_line, position_tolerance
+from clrecon.geometry.grid import fit_line, position_tolerance
 from clrecon.reading.dicom.headers.slice_header import SliceHeader
 from clrecon.reading.dicom.stack.spacing import Holes, Rounding, find_holes, find_rounding, median
 from clrecon.system.arguments import name_parameter

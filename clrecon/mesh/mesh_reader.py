@@ -90,7 +90,7 @@ def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh
     if named is None and asked is None:
         warnings.append(f"{name} names no patient frame: its coordinates are taken as LPS")
     source = "file" if named else "argument" if asked else "assumed"
-    report = _describe(raw, used, source)
+    report = _report_of_file(raw, used, source)
     try:
         mesh = Mesh(vertices, raw.triangles, normals, report)
     except UsageError as error:
@@ -100,7 +100,7 @@ def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh
     return mesh
 
 
-def _describe(raw: RawMesh, space: str, source: str) -> dict[str, Any]:
+def _report_of_file(raw: RawMesh, space: str, source: str) -> dict[str, Any]:
     """Return the report of a mesh: what the file says of it, and where its frame is known from."""
     facts: dict[str, Any] = {
         "kind": raw.kind,

@@ -1,0 +1,401 @@
+"""A mesh cut into slices again, against the voxels that it was made from.
+
+Both are compared on a lattice of points finer than the voxels: the rows of it pierce the mesh, and the trilinear HU
+reach a level in them.  What is inside is written by its ends, as rows of runs.  A row of the lattice runs along i; each
+point from which on the state differs from that of the point before has a key, (k * nj + j) * (ni + 1) + i.  The state
+before a row is outside, and where its last point is inside the run ends at i = ni, beyond the row: every row has an
+even number of keys.  Memory grows with the surface, not with the lattice.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
+from clrecon.mesh.mesh import Mesh
+from clrecon.system.arguments import explains_arguments
+from clrecon.system.pieces import chunks
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.records import Record
+
+FINER = 3
+"""Points of the lattice for each voxel, along each axis."""
+
+OFFSETS = (0.137, 0.271, 0.389)
+"""Where the lattice begins, in its own steps along i, j, k: off the planes of the voxels and of each other."""
+
+_MOST_ODD = 0.01
+"""Share of the rows with the mesh that it may pierce an odd number of times before it is refused as open."""
+
+
+@dataclass(frozen=True, eq=False)
+class SliceOverlap(Record):
+    """How far a mesh, filled in slices, agrees with the voxels' trilinear HU.
+
+    dice: 2 common / (points in the mesh + points in the HU) on the fine lattice.
+    voxel_dice: The same on the voxels' own lattice.  It cannot see where on its edge a vertex lies.
+    finer: Points of the fine lattice for each voxel and axis.
+    points_mesh, points_hu, points_common: Points of the fine lattice inside of the mesh, at the level or above, and
+        both.
+    rows_odd: Rows of the fine lattice that the mesh pierces an odd number of times, where it is open; left out.
+    """
+
+    dice: float
+    voxel_dice: float
+    finer: int
+    points_mesh: int
+    points_hu: int
+    points_common: int
+    rows_odd: int
+
+
+@explains_arguments
+def measure_slices(
+    mesh: Mesh,
+    volume: Volume,
+    iso_value: float,
+    *,
+    closed: bool = True,
+    finer: int = FINER,
+    offsets: Sequence[float] = OFFSETS,
+    progress: Progress | None = None,
+) -> SliceOverlap:
+    """Cut a mesh into slices again and compare them with the HU, on a lattice finer than the voxels and off their
+    planes.
+
+    A point of the lattice is in the mesh when a row of the lattice has pierced it an odd number of times before.  A
+    row that runs through an edge or a vertex pierces one of the triangles there, by half-open intervals.  A point is
+    in the bone when the trilinear HU reach the level.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Closed; the patient frame is that of the volume.
+    volume : Volume
+        The voxels, uneven ones too.
+    iso_value : float
+        HU, that of the mesh.
+    closed : bool
+        The mesh was closed where it leaves the volume: see `extract_isosurface`.
+    finer : int
+        Points of the lattice for each voxel and axis, 1 to 16.
+    offsets : three floats
+        Where the lattice begins, in its own steps along i, j, k, from 0 to below 1.
+    progress : callable, optional
+        Called as ``progress("slices", layers of cells done, all layers)``.
+
+    Returns
+    -------
+    SliceOverlap
+
+    Raises
+    ------
+    UsageError
+        The mesh is open: more than one row in a hundred is pierced an odd number of times.  Or an argument is wrong,
+        or the mesh lies wholly outside of the volume.
+    NoSurfaceError
+        The mesh is empty.
+    """
+    mesh.check()
+    if mesh.triangle_count == 0:
+        raise NoSurfaceError("a mesh without triangles has no slices")
+    shifts = _check_lattice(finer, offsets)
+    if np.ndim(iso_value):
+        raise UsageError(f"slices are compared at one iso value, not at {iso_value!r}")
+    rule = choose_iso_rule(volume, iso_value, closed)
+    ijk = volume.lps_to_ijk(mesh.vertices)
+    _check_place(ijk, volume, rule)
+    told = progress or ignore_progress
+    lattices = (Lattice.over(volume, rule, int(finer), shifts), Lattice.over(volume, rule, 1, (0.0, 0.0, 0.0)))
+    layers = lattices[0].cells_ijk[2]
+    found = []
+    for n, lattice in enumerate(lattices):
+        tell = functools.partial(_tell_slices, told, n * layers, 2 * layers)
+        found.append(_count_overlap(ijk, mesh.triangles, volume, rule, lattice, tell))
+    fine, own = found
+    told("slices", 2 * layers, 2 * layers)
+    return SliceOverlap(
+        dice=fine.dice,
+        voxel_dice=own.dice,
+        finer=int(finer),
+        points_mesh=fine.mesh,
+        points_hu=fine.hu,
+        points_common=fine.common,
+        rows_odd=fine.odd,
+    )
+
+
+def _tell_slices(told: Progress, before: int, total: int, done: int) -> None:
+    told("slices", before + done, total)
+
+
+def _check_lattice(finer: int, offsets: Sequence[float]) -> tuple[float, float, float]:
+    if isinstance(finer, bool) or not isinstance(finer, int | np.integer) or not 1 <= finer <= 16:
+        raise UsageError(f"the lattice is a whole number of times finer than the voxels, 1 to 16, not {finer!r}")
+    if len(offsets) != 3 or not all(0.0 <= offset < 1.0 for offset in offsets):
+        raise UsageError(f"the lattice has three offsets from 0 to below 1, not {tuple(offsets)}")
+    return float(offsets[0]), float(offsets[1]), float(offsets[2])
+
+
+def _check_place(ijk: NDArray[np.float64], volume: Volume, rule: IsoRule) -> None:
+    low, high = ijk.min(axis=0), ijk.max(axis=0)
+    if (high < -rule.border).any() or (low > np.array(volume.shape_ijk) - 1 + rule.border).any():
+        raise UsageError(
+            f"the mesh lies outside of the volume: it runs from {low.round(1).tolist()} to {high.round(1).tolist()} in"
+            f" voxels (i, j, k) of {list(volume.shape_ijk)}; see whether both are in the same patient frame"
+        )
+
+
+@dataclass(frozen=True)
+class _Counts:
+    mesh: int
+    hu: int
+    common: int
+    odd: int
+
+    @property
+    def dice(self) -> float:
+        both = self.mesh + self.hu
+        return 2.0 * self.common / both if both else 0.0
+
+
+def _count_overlap(
+    ijk: NDArray[np.float64],
+    triangles: NDArray[np.uint32],
+    volume: Volume,
+    rule: IsoRule,
+    lattice: Lattice,
+    told: Callable[[int], None],
+) -> _Counts:
+    """Count the points of a lattice that are in the mesh, in the HU, and in both."""
+    mesh, hu = find_piercings(ijk, triangles, lattice), find_level_runs(volume, rule, lattice, told)
+    rows, ends = np.unique(lattice.row_of(mesh), return_counts=True)
+    odd = rows[ends % 2 == 1]
+    if len(odd) > _MOST_ODD * len(rows):
+        raise UsageError(
+            f"the mesh is open: {len(odd)} of {len(rows)} rows through it pierce it an odd number of times, and what"
+            " lies inside is not defined; close it first"
+        )
+    if len(odd):
+        mesh, hu = (keys[~np.isin(lattice.row_of(keys), odd)] for keys in (mesh, hu))
+    own, wanted, apart = count_points(mesh), count_points(hu), count_points(exclusive_or(mesh, hu))
+    return _Counts(own, wanted, (own + wanted - apart) // 2, len(odd))
+
+
+_PIECE = 1 << 16
+"""Triangles at a time."""
+
+Float64Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+def find_piercings(ijk: Float64Array, triangles: NDArray[np.uint32], lattice: Lattice) -> IntArray:
+    """Find the points of a lattice from which on rows along i have passed through a mesh once more.
+
+    A triangle is cut by the planes of the lattice, and the line of the cut by its rows.  An edge takes part in the
+    planes from its lower end on up to, but without, its upper end, and so does a line of a cut in rows.  The two
+    triangles at an edge compute the same point there, in the same order of operations: a closed mesh is pierced an
+    even number of times by every row, whatever the rounding.
+
+    ijk: ndarray, shape (n, 3), float64. Vertices in index coordinates of the voxels.
+    triangles: ndarray, shape (m, 3), uint32
+
+    Returns: ndarray, shape (p,), int64, ascending. Ends of runs of points inside, see the head of this file;
+        those that would be there an even number of times are not.
+    """
+    points = lattice.number(ijk)
+    found = [np.zeros(0, dtype=np.int64)]
+    found += [_pierce(points[triangles[where]], lattice.shape_ijk) for where in chunks(len(triangles), _PIECE)]
+    keys = np.sort(np.concatenate(found))
+    fresh = np.flatnonzero(np.diff(keys, prepend=-1))
+    odd = np.diff(fresh, append=len(keys)) % 2 == 1
+    return keys[fresh[odd]]
+
+
+def _spread_rows(first: IntArray, end: IntArray) -> tuple[IntArray, IntArray]:
+    """Return, for intervals of whole numbers, the interval of each number and the number."""
+    count = np.maximum(end - first, 0)
+    row = np.repeat(np.arange(len(count)), count)
+    return row, np.arange(len(row)) + (first - np.cumsum(count) + count)[row]
+
+
+def _pierce(corners: Float64Array, shape_ijk: tuple[int, int, int]) -> IntArray:
+    """Return the numbers of `find_piercings` for triangles, shape (m, 3, 3)."""
+    ni, nj, nk = shape_ijk
+    order = np.argsort(corners[:, :, 2], axis=1, kind="stable")
+    a, b, c = (corners[np.arange(len(corners)), order[:, n]] for n in range(3))
+    row, plane = _spread_rows(*(_first_from(end[:, 2], nk) for end in (a, c)))
+    a, b, c = a[row], b[row], c[row]
+    upper = (plane >= b[:, 2])[:, None]
+    one = _points_at(a, c, plane, 2)
+    other = _points_at(np.where(upper, b, a), np.where(upper, c, b), plane, 2)
+    swapped = (one[:, 1] > other[:, 1])[:, None]
+    one, other = np.where(swapped, other, one), np.where(swapped, one, other)
+    line, at_row = _spread_rows(*(_first_from(end[:, 1], nj) for end in (one, other)))
+    place = _points_at(one[line], other[line], at_row, 1)[:, 0]
+    i = _first_from(place, ni)
+    return np.asarray((plane[line] * nj + at_row) * (ni + 1) + i)
+
+
+def _first_from(values: Float64Array, size: int) -> IntArray:
+    """Return the first whole number that is not below each value, from 0 to `size`."""
+    return np.clip(np.ceil(values), 0, size).astype(np.int64)
+
+
+def _points_at(low: Float64Array, high: Float64Array, place: IntArray, axis: int) -> Float64Array:
+    """Return the points of lines from `low` to `high` at a coordinate along an axis; its two other coordinates."""
+    share = (place - low[:, axis]) / (high[:, axis] - low[:, axis])
+    return low[:, :axis] + share[:, None] * (high[:, :axis] - low[:, :axis])
+
+
+_SLAB_VOXELS = 1 << 23
+"""Voxels at a time: some 200 MB with what is computed from them."""
+
+Keys = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Points that divide each cell between voxel centres alike.
+
+    finer: Points in a cell along each axis.
+    offsets: Where the points of a cell begin, in steps of the lattice, from 0 to below 1.
+    border: Layers of samples around the voxels.
+    cells_ijk: Cells along each axis, those of the border included.
+    """
+
+    finer: int
+    offsets: tuple[float, float, float]
+    border: int
+    cells_ijk: tuple[int, int, int]
+
+    @classmethod
+    def over(cls, volume: Volume, rule: IsoRule, finer: int, offsets: tuple[float, float, float]) -> Lattice:
+        """Return the lattice over a volume and its border."""
+        ni, nj, nk = (size + 2 * rule.border - 1 for size in volume.shape_ijk)
+        return cls(finer, offsets, rule.border, (ni, nj, nk))
+
+    @property
+    def shape_ijk(self) -> tuple[int, int, int]:
+        """Number of points along each axis."""
+        ni, nj, nk = (cells * self.finer for cells in self.cells_ijk)
+        return ni, nj, nk
+
+    def number(self, ijk: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return index coordinates of the voxels, shape (n, 3), in numbers of points from the first."""
+        return (ijk + self.border) * self.finer - np.array(self.offsets)
+
+    def shares(self, axis: int) -> list[float]:
+        """Return where the points of a cell lie along an axis, as shares of the cell."""
+        return [(point + self.offsets[axis]) / self.finer for point in range(self.finer)]
+
+    def row_of(self, keys: Keys) -> Keys:
+        """Return the number of the row of each key."""
+        return keys // (self.shape_ijk[0] + 1)
+
+
+def count_points(keys: Keys) -> int:
+    """Return the number of points inside, from the ends of their runs in ascending order."""
+    return int((keys[1::2] - keys[::2]).sum())
+
+
+def exclusive_or(one: Keys, other: Keys) -> Keys:
+    """Return the ends of the runs of points that are in one but not in the other."""
+    keys = np.sort(np.concatenate([one, other]), kind="stable")  # merges two ascending parts
+    alone = np.ones(len(keys), dtype=bool)
+    equal = keys[1:] == keys[:-1]
+    alone[1:] &= ~equal
+    alone[:-1] &= ~equal
+    return np.asarray(keys[alone])
+
+
+def find_level_runs(volume: Volume, rule: IsoRule, lattice: Lattice, told: Callable[[int], None]) -> Keys:
+    """Find the runs of points at which the trilinear HU reach the level of a rule.
+
+    A trilinear field has its extremes at the corners of a cell: only cells with corners on both sides have points on
+    both sides.
+
+    rule: Of one level, with what lies above it inside.
+    told: Called with the number of layers of cells that are done.
+
+    Returns: ndarray, shape (n,), int64, ascending. Ends of runs.
+    """
+    layers = lattice.cells_ijk[2]
+    ni, nj, _ = volume.shape_ijk
+    step = max(1, _SLAB_VOXELS // (ni * nj))
+    found = [np.zeros(0, dtype=np.int64)]
+    for first in range(0, layers, step):
+        told(first)
+        samples = _slices_with_border(volume, rule, first, min(first + step, layers) + 1)
+        found.append(np.sort(_runs_in(samples, rule, lattice, first)))
+    return np.concatenate(found)
+
+
+def _slices_with_border(volume: Volume, rule: IsoRule, first: int, end: int) -> NDArray[Any]:
+    """Return slices of the volume with its border, counted with it, shape (end - first, nj + 2 b, ni + 2 b)."""
+    border = rule.border
+    slices = volume.voxels[max(first - border, 0) : max(end - border, 0)]
+    if not border:
+        return slices
+    before = max(border - first, 0)
+    after = end - first - before - len(slices)
+    widths = ((before, after), (border, border), (border, border))
+    return np.pad(slices, widths, constant_values=np.array(rule.outside).astype(slices.dtype))
+
+
+def _join_corners(corners: NDArray[np.bool_], join: Callable[..., NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    """Join the eight corners of every cell."""
+    corners = join(corners[1:], corners[:-1])
+    corners = join(corners[:, 1:], corners[:, :-1])
+    return join(corners[:, :, 1:], corners[:, :, :-1])
+
+
+def _runs_in(samples: NDArray[Any], rule: IsoRule, lattice: Lattice, first: int) -> Keys:
+    """Return the ends of runs in some layers of cells, in no order."""
+    inside = rule.mark_inside(samples)
+    touched = _join_corners(inside, np.logical_or)
+    wanted = touched & ~_join_corners(inside, np.logical_and)
+    wanted[:, :, 1:] |= wanted[:, :, :-1].copy()  # a run may end before the first point of the next cell
+    wanted[:, :, [0, -1]] |= touched[:, :, [0, -1]]
+    k, j, i = np.nonzero(wanted)
+    if len(i) == 0:
+        return np.zeros(0, dtype=np.int64)
+    corners = {
+        (c, b, a): samples[k + c, j + b, i + a].astype(np.float32) for c, b, a in itertools.product((0, 1), repeat=3)
+    }
+    ni, nj, _ = lattice.shape_ijk
+    finer = lattice.finer
+    base = ((k + first) * finer * nj + j * finer) * (ni + 1) + i * finer
+    # Where the cell before is left out, all its points have the state of the corner that both share.
+    follows = np.concatenate([[False], (np.diff(i) == 1) & (np.diff(j) == 0) & (np.diff(k) == 0)])
+    shared = inside[k, j, i] & (i > 0)
+    last = np.flatnonzero(i == lattice.cells_ijk[0] - 1)
+    found = []
+    for (row_k, tk), (row_j, tj) in itertools.product(enumerate(lattice.shares(2)), enumerate(lattice.shares(1))):
+        if row_j == 0:
+            edges = {
+                (b, a): _blend(corners[0, b, a], corners[1, b, a], tk) for b, a in itertools.product((0, 1), repeat=2)
+            }
+        low, high = (_blend(edges[0, a], edges[1, a], tj) for a in (0, 1))
+        states = [_blend(low, high, ti) >= np.float32(rule.iso_level) for ti in lattice.shares(0)]
+        before = shared.copy()
+        before[follows] = states[-1][np.flatnonzero(follows) - 1]
+        row = base + (row_k * nj + row_j) * (ni + 1)
+        for point, state in enumerate(states):
+            found.append(row[state != before] + point)
+            before = state
+        found.append(row[last[before[last]]] + finer)
+    return np.concatenate(found)
+
+
+def _blend(low: NDArray[np.float32], high: NDArray[np.float32], share: float) -> NDArray[np.float32]:
+    return np.asarray(low + np.float32(share) * (high - low))
