@@ -57,8 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="FILE",
-        help="what the key s of the window writes: a mesh, cloud, volume or picture by its extension; numbered where it"
-        " exists; repeat it for several (default: clrecon-view.stl)",
+        help="what the key s writes: a mesh, cloud, volume or picture by its extension; numbered where it exists;"
+        " repeat it for several (default: clrecon-view.stl, with --web a download)",
     )
     shown.add_argument("--html", metavar="FILE", help="write a page that shows the inputs: .html")
     shown.add_argument("--web", action="store_true", help="show them in a browser of this computer, until Ctrl-C")
@@ -144,8 +144,8 @@ def _check_faces(options: argparse.Namespace) -> None:
         raise UsageError("-q hides the address that is to be opened: leave it out, or ask for --open too")
     if options.web and options.no_clobber:
         raise UsageError("--web writes no file by itself: leave --no-clobber out")
-    if options.save_as and (options.web or options.html is not None):
-        raise UsageError("--save-as says what the window writes: leave out --web and --html, or it")
+    if options.save_as and options.html is not None:
+        raise UsageError("--save-as says what is written while you look: leave out --html, or it")
     if options.html is None and not options.web and options.no_clobber:
         raise UsageError("a window replaces no file: leave --no-clobber out")
 
@@ -199,7 +199,16 @@ def _serve(options: argparse.Namespace, settings: ViewSettings, console: Console
         )
         console.finish()
 
-    serve_view(options.inputs, settings, port=options.port, opens=options.open, progress=console.progress, ready=ready)
+    serve_view(
+        options.inputs,
+        settings,
+        port=options.port,
+        opens=options.open,
+        save_as=options.save_as,
+        wrote=lambda line: console.say(f"wrote    {printable(line)}"),
+        progress=console.progress,
+        ready=ready,
+    )
     return 0
 
 

@@ -89,9 +89,9 @@ class Views:
 
 
 @contextlib.contextmanager
-def serving(open_session: Any, port: int | None = None) -> Iterator[WebServer]:
+def serving(open_session: Any, port: int | None = None, **given: Any) -> Iterator[WebServer]:
     """A server in a thread; it has ended when the block is left."""
-    with WebServer(port) as server:
+    with WebServer(port, **given) as server:
         ready = threading.Event()
         thread = threading.Thread(target=server.serve, args=(open_session, lambda folder: ready.set()))
         thread.start()
@@ -111,6 +111,8 @@ class Client:
     ----------
     facts : dict or None
         The latest.
+    fixed : dict
+        What does not change while it is connected.
     notes : list of dict
     pictures : list of (dict, Image)
     shows : bool
@@ -120,6 +122,7 @@ class Client:
     def __init__(self, socket: Any) -> None:
         self.socket = socket
         self.facts: dict[str, Any] = {}
+        self.fixed: dict[str, Any] = {}
         self.notes: list[dict[str, Any]] = []
         self.pictures: list[tuple[dict[str, Any], Image.Image]] = []
         self.shows = True
@@ -153,6 +156,7 @@ class Client:
             else:
                 told = json.loads(message.data)
                 self.facts = told.pop("facts", self.facts)
+                self.fixed = told.pop("fixed", self.fixed)
                 self.notes += [told] if told else []
             self._news.set()
         self.close_code = self.socket.close_code

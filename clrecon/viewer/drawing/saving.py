@@ -18,6 +18,7 @@ from clrecon.operators.masks.mask import Mask
 from clrecon.points import PointCloud
 from clrecon.reading.grids.write_volume import FORMATS as VOLUME_FORMATS
 from clrecon.rendering.pictures.image_files import IMAGE_FORMATS
+from clrecon.system.files import check_writable
 from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress
 from clrecon.system.text import count_of, escape_text
@@ -50,6 +51,38 @@ def check_target(path: str | os.PathLike[str], painter: Painter, state: ViewStat
     if kind == "mesh" and not [each for each in shown if not isinstance(each, ShownCloud)]:
         raise UsageError("nothing that has a surface is shown: show a part first, or write a cloud or a picture")
     return kind
+
+
+def free_name(wanted: str | Path) -> Path:
+    """Return a name that no file has: the wanted one, else with the first number from 2 on that is free.
+
+    >>> free_name("bone.stl")  # bone.stl is there already
+    PosixPath('bone-2.stl')
+
+    ``bone.nii.gz`` becomes ``bone-2.nii.gz``.
+    """
+    path = Path(wanted)
+    ends = (
+        "".join(path.suffixes[-2:]) if path.name.lower().endswith((".nii.gz", ".xyz.gz", ".seg.nrrd")) else path.suffix
+    )
+    stem = path.name.removesuffix(ends)
+    number, tried = 1, path
+    while tried.exists() or tried.is_symlink():
+        number += 1
+        tried = path.with_name(f"{stem}-{number}{ends}")
+    return tried
+
+
+def check_names(names: Sequence[str]) -> None:
+    """Refuse names of files that cannot be written, before anything is read."""
+    known = [ending for endings in KINDS.values() for ending in endings]
+    for name in names:
+        if not any(name.lower().endswith(ending) for ending in known):
+            raise UsageError(
+                f"{escape_text(Path(name).name)}: the extension says as what it is written, one of"
+                f" {', '.join(dict.fromkeys(known))}"
+            )
+        check_writable(free_name(name))
 
 
 def save_shown(

@@ -108,6 +108,10 @@ class ChangingView:
             made = replace(camera, parallel_scale=camera.half_height() * camera.distance, view_angle=None)
         self._change("perspective", "the perspective", camera=made)
 
+    def toggle_perspective(self) -> None:
+        """Change between a parallel and a perspective camera."""
+        self.set_perspective(self.camera.is_parallel)
+
     # Parts
 
     def show(self, key: str, visible: bool) -> None:
@@ -152,6 +156,10 @@ class ChangingView:
             replace(each, color=colors[each.key]) if each.key in colors else each for each in self.state.parts
         )
         self._change("colors", "the colours", parts=parts)
+
+    def toggle_colors(self) -> None:
+        """Give every part of scans a colour of its own, or take the colours away."""
+        self.color_parts(not any(each.color for each in self.state.parts if each.kind == "cluster"))
 
     def set_opacity(self, key: str, value: float) -> None:
         """Make a part translucent: 0 to 1; at 0 it is not seen, but stays in the list as shown."""

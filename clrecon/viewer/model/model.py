@@ -26,6 +26,9 @@ from clrecon.viewer.model.objects import ShownLabels, ShownObject, ShownScan
 from clrecon.viewer.model.state import Box, Point, ShownPart, ViewState, as_point
 from clrecon.viewer.model.tools import POINTS_OF, TOOLS, ClipPlane, Measure, Pick, clip_direction, measure_points
 
+BOX_SHARE = 0.5
+"""Of what there is along each axis, in a clip box about the cross."""
+
 
 class ViewModel(ChangingView):
     """The state of one view.
@@ -147,11 +150,22 @@ class ViewModel(ChangingView):
             )
         self._change("iso", f"the iso value {format_hu(self.iso_value)} HU", iso_value=value)
 
+    def step_iso(self, by: float) -> None:
+        """Move the iso value by HU, to the end of the slider at most."""
+        (step,) = checked_numbers("a step of the iso value", by)
+        low, high = self.iso_range
+        self.set_iso(min(max(self.iso_value + step, low), high))
+
     def set_mode(self, name: str) -> None:
         """Set the mode, one of `modes`."""
         if name not in self.modes:
             raise UsageError(unknown_name("mode", name, self.modes))
         self._change("mode", f"the mode {self.mode}", mode=name, picture_window=None)
+
+    def step_mode(self, steps: int) -> None:
+        """Go to a mode further down the list, behind the last one to the first."""
+        names = list(self.modes)
+        self.set_mode(names[(names.index(self.mode) + steps) % len(names)])
 
     def set_window(self, low: float, high: float, of: str = "slices") -> None:
         """Set the HU that are black and white.
@@ -214,6 +228,11 @@ class ViewModel(ChangingView):
         self._change("point", f"the {tool}", points=(), measures=(*self.state.measures, made))
         return made
 
+    def add_seed(self, pick: Pick) -> None:
+        """Keep a place as a seed, whatever tool is used."""
+        made = measure_points("seed", [pick.point])
+        self._change("point", "the seed", measures=(*self.state.measures, made))
+
     def end_tool(self) -> Measure | None:
         """Put the tool away; the points of a curve become a measure, other unfinished points are dropped."""
         tool, points = self.state.tool, [each.point for each in self.state.points]
@@ -275,6 +294,16 @@ class ViewModel(ChangingView):
             raise UsageError("a clip box has two corners, or none")
         self._change("clip box", "the clip box", clip_box=box)
 
+    def toggle_clip_box(self) -> None:
+        """Show a box about the cross, half of what there is along each axis; or take the box away."""
+        if self.state.clip_box is not None:
+            self.set_clip_box(None, None)
+            return
+        low, high = self._span(self.objects)
+        half = 0.5 * BOX_SHARE * (high - low)
+        middle = np.clip(np.array(self.cross), low + half, high - half)
+        self.set_clip_box((middle - half).tolist(), (middle + half).tolist())
+
     # What panels show
 
     def facts(self) -> dict[str, Any]:
@@ -296,13 +325,13 @@ class ViewModel(ChangingView):
             "picture_window": list(state.picture_window or mode.window or ()) or None,
             "table": state.table,
             "cross": [round(value, 3) for value in state.cross],
-            "cross_text": self._say_place(state.cross),
+            "cross_text": self.say_place(state.cross),
             "parts": [each.describe() for each in state.parts],
             "parts_known": self.parts_known,
             "tool": state.tool,
             "points": [each.describe() for each in state.points],
             "measures": [
-                {**each.describe(), "text": self._say_place(each.points[0]) if each.kind == "seed" else each.text}
+                {**each.describe(), "text": self.say_place(each.points[0]) if each.kind == "seed" else each.text}
                 for each in state.measures
             ],
             "clips": [each.describe() for each in state.clips],
@@ -340,7 +369,8 @@ class ViewModel(ChangingView):
             notes.append(f"one scan is shown in mode {mode.name}, {others} by the surface")
         return notes
 
-    def _say_place(self, point: Sequence[float]) -> str:
+    def say_place(self, point: Sequence[float]) -> str:
+        """Return a place, LPS mm, as words in `space`."""
         place = self.signs * np.array(point) + 0.0
         return f"{', '.join(f'{value:.1f}' for value in place)} mm {self.space.upper()}"
 

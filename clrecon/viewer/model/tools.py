@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import UsageError
+from clrecon.rendering.pictures.annotations import orientation_letters
 from clrecon.rendering.views.directions import DIRECTIONS, checked_vector
 from clrecon.system.text import unknown_name
 
@@ -128,6 +129,7 @@ class ClipPlane:
         at = self.low + self.share * (self.high - self.low)
         return {
             "name": self.name,
+            "words": f"{self.name if self.name.isalpha() else orientation_letters(np.array(self.direction))} side",
             "direction": [round(value, 5) for value in self.direction],
             "share": round(self.share, 5),
             "at_mm": round(at, 2),

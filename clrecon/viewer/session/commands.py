@@ -108,11 +108,15 @@ _model("zoom", "show larger; at: from the middle, in shares of the height", "zoo
 _model("roll", "turn the picture clockwise, degrees", "roll", degrees=_number)
 _model("look", "look from a side of the patient, or azimuth and elevation", "look", view=_view)
 _model("set_perspective", "a perspective or a parallel camera", "set_perspective", on=_flag)
+_model("toggle_perspective", "a perspective camera for a parallel one, or back", "toggle_perspective")
 _model("set_iso", "iso value of the surfaces, HU", "set_iso", hu=_number)
+_model("step_iso", "move the iso value by HU, as far as the slider goes", "step_iso", by=_number)
 _model("set_mode", "what scans are shown as", "set_mode", name=_text)
+_model("step_mode", "go so many modes further down the list", "step_mode", steps=_whole)
 _model("set_window", "HU of black and white; of: slices or picture", "set_window",
        low=_number, high=_number, takes={"of": _text})  # fmt: skip
 _session("set_table", "show or take away table and blankets", "set_table", shown=_flag)
+_session("toggle_table", "take table and blankets away, or show them", "toggle_table")
 _model("scroll", "move a slice by steps of its voxels", "scroll", plane=_text, steps=_number)
 _model("set_cross", "move the slices to a place, LPS mm", "set_cross", point=_numbers(3))
 _session("find_parts", "find the parts of the scans at the iso value", "find_parts")
@@ -121,6 +125,7 @@ _model("only", "show one part alone", "only", key=_text)
 _model("show_all", "show all parts", "show_all")
 _model("set_color", "colour of a part, 0 to 1; null: its own", "set_color", key=_text, rgb=_or_none(_numbers(3)))
 _model("color_parts", "a colour for each part of scans", "color_parts", takes={"distinct": _flag})
+_model("toggle_colors", "a colour for each part of scans, or none", "toggle_colors")
 _model("set_opacity", "opacity of a part, 0 to 1", "set_opacity", key=_text, value=_number)
 _AT = {"x": _number, "y": _number, "size": _size}
 _session("pick", "what is seen at a pixel; plane: of a slice", "pick", takes={"plane": _or_none(_text)}, **_AT)
@@ -128,6 +133,7 @@ _session("hide_at", "hide the part at a pixel", "hide_at", takes={"plane": _or_n
 _session("only_at", "show the part at a pixel alone", "only_at", takes={"plane": _or_none(_text)}, **_AT)
 _session("cross_at", "move the slices to what is seen at a pixel", "cross_at", takes={"plane": _or_none(_text)}, **_AT)
 _session("add_point", "add what is seen at a pixel to the tool", "add_point", takes={"plane": _or_none(_text)}, **_AT)
+_session("mark_at", "keep the place at a pixel as a seed", "mark_at", takes={"plane": _or_none(_text)}, **_AT)
 _model("start_tool", "take points for: distance, angle, curve, seed", "start_tool", name=_text)
 _model("end_tool", "put the tool away; a curve is made", "end_tool")
 _model("clear_measures", "drop all measures", "clear_measures")
@@ -137,6 +143,7 @@ _model("flip_clip", "take the other side of a plane away", "flip_clip", n=_whole
 _model("remove_clip", "drop a plane", "remove_clip", n=_whole)
 _model("set_clip_box", "show a box, LPS mm; null: all", "set_clip_box",
        low=_or_none(_numbers(3)), high=_or_none(_numbers(3)))  # fmt: skip
+_model("toggle_clip_box", "show a box about the cross, or all", "toggle_clip_box")
 _session("undo", "take the last change back", "undo")
 _session("save", "write what is shown; the extension says as what", "save_to", path=_text, takes={"size": _size})
 _session("cancel", "stop the work in the background", "cancel")

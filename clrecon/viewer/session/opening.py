@@ -12,8 +12,24 @@ from clrecon.jobs.view.inputs import ViewSettings, check_view_settings, open_inp
 from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.viewer.drawing.painter import Painter
-from clrecon.viewer.model.objects import ShownScan, wrap_inputs
+from clrecon.viewer.model.objects import ShownObject, ShownScan, wrap_inputs
 from clrecon.viewer.session.session import ViewSession
+
+
+def read_objects(inputs: Sequence[str | Path], settings: ViewSettings, progress: Progress) -> list[ShownObject]:
+    """Read the inputs of a view; see `clrecon.jobs.view.inputs.open_inputs`."""
+    return wrap_inputs(open_inputs(inputs, settings, progress=progress), settings.names)
+
+
+def choose_iso(objects: Sequence[ShownObject], scan: MeshSettings, progress: Progress) -> float | None:
+    """Return the iso value to begin with, by the first scan; None: that of the model."""
+    first = next((each for each in objects if isinstance(each, ShownScan)), None)
+    if first is None or (scan.iso_value, scan.preset, scan.half_way) == (None, None, None):
+        return None
+    choice = choose_level(first.volume, scan, progress)
+    level = scan.levels[0] if choice is None else choice.iso_value
+    assert isinstance(level, float | int) and math.isfinite(level)
+    return float(level)
 
 
 class OpenedView(Closing):
@@ -31,22 +47,11 @@ class OpenedView(Closing):
         progress: Progress = ignore_progress,
     ):
         scan = settings.scan
-        opened = open_inputs(inputs, settings, progress=progress)
-        self.objects = wrap_inputs(opened, settings.names)
+        self.objects = read_objects(inputs, settings, progress)
         self.said = list(dict.fromkeys(text for each in self.objects for text in each.said))
-        self._iso_value = self._choose_iso(scan, progress)
+        self._iso_value = choose_iso(self.objects, scan, progress)
         self._space, self._keep_ids = scan.space, scan.keep_ids
         self.painter = Painter(self.objects, device=scan.device, memory=scan.memory)
-
-    def _choose_iso(self, scan: MeshSettings, progress: Progress) -> float | None:
-        """Return the iso value to begin with; None: that of the model."""
-        first = next((each for each in self.objects if isinstance(each, ShownScan)), None)
-        if first is None or (scan.iso_value, scan.preset, scan.half_way) == (None, None, None):
-            return None
-        choice = choose_level(first.volume, scan, progress)
-        level = scan.levels[0] if choice is None else choice.iso_value
-        assert isinstance(level, float | int) and math.isfinite(level)
-        return float(level)
 
     def session(self, on_change: Callable[[], None] | None = None) -> ViewSession:
         """Open a view, see `ViewSession`."""

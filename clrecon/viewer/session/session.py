@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 import os
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from time import monotonic
 from typing import Any
+
+import numpy as np
 
 from clrecon.errors import ClreconError, UsageError
 from clrecon.opencl import Device
@@ -15,12 +17,14 @@ from clrecon.rendering import Rendering
 from clrecon.rendering.views.directions import checked_size
 from clrecon.system.base_classes import Closing
 from clrecon.system.log import get_logger
+from clrecon.system.text import format_volume
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.drawing.saving import check_target, save_shown
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import ShownMesh, ShownObject
 from clrecon.viewer.model.tools import Pick
 from clrecon.viewer.session.commands import check_command
+from clrecon.viewer.session.picture_facts import picture_key, seen_pieces
 from clrecon.viewer.session.worker import CLOSE_S, Job, Worker
 
 log = get_logger(__name__)
@@ -83,6 +87,8 @@ class ViewSession(Closing):
         self._error: str | None = None
         self._said: str | None = None
         self._timing: dict[str, Any] = {}
+        self._shown: Rendering | None = None
+        self._parts_failed = False
         self._closed = False
         self._pictures = Worker("view-pictures", self._failed)
         self._work = Worker("view-work", self._failed, self._changed)
@@ -110,8 +116,8 @@ class ViewSession(Closing):
         then: Called with the `Rendering` in a thread of the session.
         """
         width, height = checked_size(size)
+        self.fit(size)
         with self._lock:
-            self.model.set_aspect(width / height)
             state = self.model.snapshot()
 
         def take(job: Job) -> None:
@@ -129,10 +135,21 @@ class ViewSession(Closing):
                     "slabs": made.report.get("slabs", 1),
                     "warnings": list(made.report["warnings"]),
                 }
+                self._shown = made
             if not job.cancelled():
                 then(made)
 
         self._pictures.ask("picture", take, rank=0, gives_way=not moving)
+
+    def fit(self, size: Sequence[int]) -> None:
+        """Tell the (width, height) of the picture: the view of the start fits it."""
+        width, height = checked_size(size)
+        with self._lock:
+            self.model.set_aspect(width / height)
+
+    def picture_key(self, view: str) -> Hashable:
+        """Return what the picture of a view depends on, see `clrecon.viewer.session.picture_facts`."""
+        return picture_key(self.model.snapshot(), view)
 
     def slice(self, plane: str, size: Sequence[int], then: Callable[[Rendering], None]) -> None:
         """Ask for a slice through the cross: "axial", "coronal" or "sagittal"; the latest of each plane wins."""
@@ -182,6 +199,7 @@ class ViewSession(Closing):
             notes = self.model.facts()
             return {
                 **notes,
+                "seen_lines": self._seen_lines(),
                 "busy": busy,
                 "error": self._error,
                 "said": self._said,
@@ -190,10 +208,10 @@ class ViewSession(Closing):
             }
 
     def rest(self) -> None:
-        """Say that nothing moves: parts that are hidden, coloured or listed are found again where they are outdated."""
+        """Say that nothing moves: parts are found where those in the list are outdated."""
         with self._lock:
             state = self.model.snapshot()
-            wanted = state.parts_at is not None or any(not part.is_plain for part in state.parts)
+            wanted = bool(self.model.scans) and not self._parts_failed
             known = self.model.parts_known and self.painter.has_parts(state)
         if wanted and not known and "parts" not in self._work.busy:
             self.find_parts()
@@ -234,6 +252,10 @@ class ViewSession(Closing):
 
         self._work.ask("table", remove, rank=3)
 
+    def toggle_table(self) -> None:
+        """Take the table away, or show it."""
+        self.set_table(not self.model.state.table)
+
     def _apply_table(self, shown: bool) -> None:
         self.model.set_table(shown)
         if not shown:
@@ -248,14 +270,14 @@ class ViewSession(Closing):
     def pick(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Return what is seen at a pixel of the picture, or of a slice."""
         found = self._pick(x, y, size, plane)
-        return {"pick": None if found is None else found.describe()}
+        return {"pick": self._describe_pick(found)}
 
     def cross_at(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Move the slices to what is seen at a pixel."""
         found = self._pick(x, y, size, plane)
         if found is not None:
             self.model.set_cross(found.point)
-        return {"pick": None if found is None else found.describe()}
+        return {"pick": self._describe_pick(found)}
 
     def add_point(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Add what is seen at a pixel to the tool that is used."""
@@ -263,7 +285,14 @@ class ViewSession(Closing):
         if found is None:
             return {"pick": None, "measure": None}
         made = self.model.add_point(found)
-        return {"pick": found.describe(), "measure": None if made is None else made.describe()}
+        return {"pick": self._describe_pick(found), "measure": None if made is None else made.describe()}
+
+    def mark_at(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
+        """Keep what is seen at a pixel as a seed, without a tool."""
+        found = self._pick(x, y, size, plane)
+        if found is not None:
+            self.model.add_seed(found)
+        return {"pick": self._describe_pick(found)}
 
     def hide_at(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Hide the part at a pixel; parts that are not known yet are found first, in the background."""
@@ -343,13 +372,13 @@ class ViewSession(Closing):
         found = self._pick(x, y, size, plane)
         if found is None:
             return {"pick": None}
-        state = self.model.state
+        state, described = self.model.state, self._describe_pick(found)
         part = None if found.part is None else state.part(found.part)
         divided = self.model.parts_known and self.painter.has_parts(state)
         if divided or (part is not None and part.kind in ("mesh", "cloud", "label")):
             if found.part is not None:
                 apply(found.part)
-            return {"pick": found.describe()}
+            return {"pick": described}
 
         def again() -> None:
             at = self._pick(x, y, size, plane)
@@ -357,7 +386,29 @@ class ViewSession(Closing):
                 apply(at.part)
 
         self.find_parts(again)
-        return {"pick": found.describe()}
+        return {"pick": described}
+
+    def _describe_pick(self, found: Pick | None) -> dict[str, Any] | None:
+        """Return a pick for JSON, with words that say what it is and where."""
+        if found is None:
+            return None
+        part = None if found.part is None else self.model.state.part(found.part)
+        words = [] if part is None else [part.name]
+        if part is not None and part.ml is not None:
+            words.append(format_volume(part.ml))
+        if found.hu is not None:
+            words.append(f"{found.hu:.0f} HU")
+        return {**found.describe(), "words": ", ".join([*words, self.model.say_place(found.point)])}
+
+    def _seen_lines(self) -> list[list[list[float]]]:
+        """Return the pieces of measured lines that are not hidden in the picture that was taken last."""
+        state = self.model.state
+        lines = [*(each.points for each in state.measures), tuple(each.point for each in state.points)]
+        if self._shown is None or not any(len(line) > 1 for line in lines):
+            return []
+        mode = self.model.modes[state.mode]
+        expected = mode.kind not in ("surface", "labels")
+        return seen_pieces(self._shown, [np.array(line) for line in lines if len(line) > 1], expected=expected)
 
     def _steer(self, made: Rendering, size: tuple[int, int]) -> None:
         """Choose the width of the next coarse picture by the time of this one."""
@@ -383,6 +434,7 @@ class ViewSession(Closing):
         log.warning("%s: %s", kind, words)
         with self._lock:
             self._error = words
+            self._parts_failed |= kind == "parts"
         self._changed()
 
     def _changed(self) -> None:

@@ -10,17 +10,18 @@ import asyncio
 import contextlib
 import json
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-import numpy as np
-
 from clrecon.errors import ClreconError, UsageError
 from clrecon.system.log import get_logger
+from clrecon.viewer.drawing.saving import KINDS, free_name
+from clrecon.viewer.session.keys import page_words
+from clrecon.viewer.session.picture_facts import REST_SECONDS, SCENE, SLICES, VIEWS
 from clrecon.viewer.web.downloads import Downloads
-from clrecon.viewer.web.pacing import SCENE, SLICES, VIEWS, Asked, Pace
+from clrecon.viewer.web.pacing import Asked, Pace
 from clrecon.viewer.web.picture_coding import encode_picture
 
 if TYPE_CHECKING:
@@ -30,9 +31,6 @@ if TYPE_CHECKING:
     from clrecon.viewer.model.model import ViewModel
 
 log = get_logger(__name__)
-
-REST_SECONDS = 0.2
-"""After the last change until pictures are drawn sharp."""
 
 LARGEST_SIDE = 2048
 """Pixels of a picture; larger views get one with fewer pixels."""
@@ -47,6 +45,10 @@ _NOT_FOR_BROWSERS = frozenset({"save"})
 """Commands with a path on this computer: a browser gets a file as a download."""
 
 
+def ignore_line(line: str) -> None:
+    """Drop a line that is said."""
+
+
 class Session(Protocol):
     """What a connection needs of `clrecon.viewer.session.session.ViewSession`."""
 
@@ -54,6 +56,8 @@ class Session(Protocol):
 
     def do(self, command: Mapping[str, Any]) -> dict[str, Any]: ...
     def facts(self) -> dict[str, Any]: ...
+    def fit(self, size: tuple[int, int]) -> None: ...
+    def picture_key(self, view: str) -> Hashable: ...
     def picture(self, size: tuple[int, int], moving: bool, then: Callable[[Rendering], None]) -> None: ...
     def slice(self, plane: str, size: tuple[int, int], then: Callable[[Rendering], None]) -> None: ...
     def curve_picture(self, size: tuple[int, int], then: Callable[[Rendering], None]) -> None: ...
@@ -69,16 +73,26 @@ class Connection:
     open_session: Makes its session; called with a function that the session calls, in any thread, when something
         happened.
     folder: For files that it asks for.
+    save_as: Files on this computer that it may have written; numbered where they exist.
+    wrote: Called with a line for each of these.
+    quit: Ends the server.
     """
 
     def __init__(
-        self, open_session: Callable[[Callable[[], None]], Session], socket: web.WebSocketResponse, folder: Path
+        self,
+        open_session: Callable[[Callable[[], None]], Session],
+        socket: web.WebSocketResponse,
+        folder: Path,
+        *,
+        save_as: Sequence[str] = (),
+        wrote: Callable[[str], object] = ignore_line,
+        quit: Callable[[], object],
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._socket = socket
         self._session = open_session(lambda: self._later(self._hear))
         self.downloads = Downloads(folder)
-        self._fixed = {"bounds": _bounds(self._session.model), "formats": _formats(self._session.model)}
+        self._save_as, self._wrote, self._quit = tuple(save_as), wrote, quit
         self._pace = Pace()
         self._keys: dict[str, Any] = {}
         self._ground = (0, 0, 0)
@@ -99,6 +113,8 @@ class Connection:
         """Serve the browser until it leaves."""
         from aiohttp import WSMsgType
 
+        fixed = {**page_words(), "formats": _formats(self._session.model), "save_as": self._save_as}
+        await self._socket.send_str(json.dumps({"fixed": fixed}))
         tasks = [asyncio.ensure_future(work()) for work in (self._write, self._command)]
         try:
             self._look_again()
@@ -140,7 +156,9 @@ class Connection:
         """Take a message: what concerns the connection at once, commands one after the other."""
         if not isinstance(message, Mapping):
             raise TypeError("a message is a mapping")
-        if "shown" in message:
+        if "do" in message:  # set_table has an argument `shown` too
+            await self._waiting.put(message)
+        elif "shown" in message:
             self._under_way = False
             self._wake.set()
             self._draw()
@@ -149,8 +167,13 @@ class Connection:
             if (red, green, blue) != self._ground:
                 self._ground = (red, green, blue)
                 self._keys.clear()
-            self._pace.resize({view: _fit(size) for view, size in message["sizes"].items() if view in VIEWS})
+            sizes = {view: _fit(size) for view, size in message["sizes"].items() if view in VIEWS}
+            if SCENE in sizes:
+                self._session.fit(sizes[SCENE])
+            self._pace.resize(sizes)
             self._look_again()
+        elif "quit" in message:
+            self._quit()
         else:
             await self._waiting.put(message)
 
@@ -160,7 +183,7 @@ class Connection:
             message = await self._waiting.get()
             try:
                 if "save" in message:
-                    self._save(message["save"], message.get("size"))
+                    self._save(message["save"], _fit(message.get("size") or (1024, 1024)))
                     continue
                 if message.get("do") in _NOT_FOR_BROWSERS:
                     raise UsageError(f"the command {message['do']} is not for browsers")
@@ -176,8 +199,11 @@ class Connection:
                     self._say(**once)
             self._look_again()
 
-    def _save(self, format: Any, size: Any) -> None:
-        """Let a file be made, and offer it when it is finished."""
+    def _save(self, format: Any, size: tuple[int, int]) -> None:
+        """Let a file be made, and offer it when it is finished; without a format those of `save_as`."""
+        if format is None:
+            self._save_here(list(self._save_as), size)
+            return
         if not isinstance(format, str) or not format.startswith(".") or not format[1:].replace(".", "").isalnum():
             raise UsageError("a format is an extension such as .stl")
         download = self.downloads.reserve(f"view{format}")
@@ -186,10 +212,26 @@ class Connection:
             self._later(self._offer, download)
 
         try:
-            self._session.save(download.path, finish, _fit(size or (1024, 1024)))
+            self._session.save(download.path, finish, size)
         except ClreconError:
             self.downloads.drop(download)
             raise
+
+    def _save_here(self, names: list[str], size: tuple[int, int]) -> None:
+        """Write files on this computer, one after the other: the session takes one at a time."""
+        if not names:
+            return
+
+        def written(lines: list[str]) -> None:
+            for line in lines:
+                self._wrote(line)
+            self._say(written="; ".join(lines))
+            self._save_here(names[1:], size)
+
+        try:
+            self._session.save(free_name(names[0]), lambda lines: self._later(written, lines), size)
+        except ClreconError as error:
+            self._say(error=str(error))
 
     def _offer(self, download: Any) -> None:
         self.downloads.offer(download)
@@ -214,7 +256,7 @@ class Connection:
 
     def _look_again(self) -> None:
         """Find out what is stale, and draw it."""
-        keys = {view: _key(self._session.model, view) for view in VIEWS}
+        keys = {view: self._session.picture_key(view) for view in VIEWS}
         changed = [view for view, key in keys.items() if self._keys.get(view, self) != key]
         if changed:
             self._keys = keys
@@ -288,7 +330,7 @@ class Connection:
         facts = self._session.facts()
         facts["device"] = facts.pop("timing").get("device")
         facts["settled"] = self._pace.is_done and not (self._drawing or self._ready or self._under_way)
-        return {**facts, **self._fixed}
+        return facts
 
     def _later(self, function: Callable[..., None], *arguments: Any) -> None:
         """Call a function in the thread of the server; from any thread."""
@@ -300,29 +342,8 @@ class Connection:
             function(*arguments)
 
 
-def _key(model: ViewModel, view: str) -> Any:
-    """Return what the picture of a view depends on: equal keys, equal pictures."""
-    state = model.state
-    if view == SCENE:
-        sliced = (state.cross, state.window) if state.mode == "slices" else None
-        cut = (state.clips, state.clip_box)
-        shown = (state.mode, state.iso_value, state.picture_window, state.table, state.parts, state.parts_at)
-        return (state.camera, *shown, *cut, sliced)
-    if view in SLICES:
-        return (state.cross, state.window, state.table, state.parts, state.parts_at)
-    return (tuple(model.curve), state.window, state.table)
-
-
-def _bounds(model: ViewModel) -> list[list[float]]:
-    """Return the lowest and highest corner of all objects, LPS mm."""
-    corners = np.concatenate([each.corners for each in model.objects])
-    return [corners.min(axis=0).tolist(), corners.max(axis=0).tolist()]
-
-
 def _formats(model: ViewModel) -> dict[str, list[str]]:
     """Return the extensions that can be saved, by what they hold; meshes first."""
-    from clrecon.viewer.drawing.saving import KINDS
-
     kinds = ("mesh", "cloud", "volume", "picture") if model.scans else ("mesh", "cloud", "picture")
     return {kind: list(KINDS[kind]) for kind in kinds}
 

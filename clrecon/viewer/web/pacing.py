@@ -8,9 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import NamedTuple
 
-SCENE, SLICES = "scene", ("axial", "coronal", "sagittal")
-VIEWS = (SCENE, *SLICES, "curve")
-"""The picture in three dimensions, the three slices, and the reformation along the points of the curve tool."""
+from clrecon.viewer.session.picture_facts import VIEWS
 
 
 class Asked(NamedTuple):

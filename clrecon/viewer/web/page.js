@@ -1,27 +1,13 @@
 (() => {
   const SLICES = ["axial", "coronal", "sagittal"];
-  const PRESETS = { bone: [300, 1500], soft: [50, 400], lung: [-600, 1500], brain: [40, 80] };
-  // As far as there are both, the keys of the window (clrecon/viewer/window/window_keys.py).
-  const KEYS = {
-    "1 to 6": "view from anterior, posterior, left, right, superior, inferior", f: "parallel or perspective",
-    "o, O": "next mode, the one before", b: "table and blankets away, or shown",
-    m: "distance by two clicks", a: "angle by three clicks", k: "curve by clicks; again: its picture",
-    e: "a place by a click", "M": "drop all measures", x: "hide the part under the pointer", X: "show only that part",
-    A: "show all parts", l: "a colour for each part", "c, C": "clip plane, clip box", u: "undo",
-    "s, p": "save what is shown, save the picture", Esc: "put the tool away",
-    drag: "turn; with Shift or another button move; with Ctrl roll", wheel: "zoom; scroll a slice",
-    "right drag on a slice": "window: right wider, down higher",
-    touch: "one finger turns or scrolls, two move and zoom; in a slice two are the window",
-  };
-  const HINTS = {
-    distance: "Click two points.", angle: "Click three points, the angle is at the second.",
-    curve: "Click points along a curve, then end: the scan is shown along it.", seed: "Click a place.",
-    only: "Click the part to keep.", hide: "Click the parts to hide, then end.",
-  };
   const TOOLS = { distance: "distance", angle: "angle", trace: "curve", seed: "seed", only: "only", hide: "hide" };
   const SVG = "http://www.w3.org/2000/svg";
 
-  let facts = null, choosing = "", pictures = 0, asked = false, held = 0;
+  // Axis of the patient across each slice, and the colour of its plane.
+  const ACROSS = { sagittal: 0, coronal: 1, axial: 2 };
+  const CROSS_PIXELS = 11, GAP = 7;
+
+  let fixed = null, facts = null, choosing = "", chosen = "", curveOff = false, pictures = 0, asked = false, held = 0;
   const message = find("message");
 
   // The connection: commands as JSON, pictures and facts back.
@@ -39,11 +25,13 @@
   socket.onmessage = ({ data }) => {
     if (data instanceof ArrayBuffer) { showPicture(data); return; }
     const told = JSON.parse(data);
+    if (told.fixed) takeFixed(told.fixed);
     if (told.facts) takeFacts(told.facts);
     if (told.error !== undefined) hint(told.error, true);
     if (told.pick !== undefined) picked(told.pick);
     if (told.undone !== undefined) hint(told.undone ? `Taken back: ${told.undone}.` : "There is nothing to take back.");
     if (told.saved) fetchSaved(told.saved);
+    if (told.written !== undefined) find("saved").textContent = told.written;
   };
 
   function hint(text, wrong = false) {
@@ -112,7 +100,7 @@
   // What lies over a picture: sides of the patient, scale, cross, measures.
 
   function annotate(view) {
-    if (!isShown(view) || !view.camera) { view.over.replaceChildren(); return; }
+    if (!isShown(view) || !(view.camera || view.name === "curve")) { view.over.replaceChildren(); return; }
     const width = view.box.clientWidth, height = view.box.clientHeight, camera = view.camera, drawn = [];
     const make = (kind, more) => {
       const one = document.createElementNS(SVG, kind);
@@ -125,6 +113,11 @@
       one.textContent = text;
     };
     const line = (points, name) => make("polyline", { points: points.map((point) => point.join()).join(" "), class: name });
+    const segments = (drawn, name) => {
+      for (const [from, to] of drawn) line([from, to], name);
+    };
+    if (view.name !== "scene") write(view.name === "curve" ? "along the curve" : view.name, 10, 14, `name ${view.name}`, "start");
+    if (!camera) { view.over.replaceChildren(...drawn); return; }  // a curve is straightened: it has no sides
     const less = (row) => row.map((value) => -value);
     write(sideOf(camera.up), width / 2, 14, "side");
     write(sideOf(less(camera.up)), width / 2, height - 14, "side");
@@ -135,14 +128,27 @@
     const end = 14 + length / mm, low = height - 16;
     line([[14, low - 6], [14, low], [end, low], [end, low - 6]], "halo");
     line([[14, low - 6], [14, low], [end, low], [end, low - 6]], "bar");
-    write(sayLength(length), 14, low - 17, "side", "start");
-    if (facts && SLICES.includes(view.name)) {
-      const [x, y] = project(view, facts.cross);
-      line([[0, y], [width, y]], "cross");
-      line([[x, 0], [x, height]], "cross");
-    }
+    write(sayLength(length) + (camera.parallel ? "" : " in the middle"), 14, low - 17, "side", "start");
+    if (facts && facts.iso) annotateCross(view, segments, width, height);
     if (facts) annotateMeasures(view, line, write, width, height);
     view.over.replaceChildren(...drawn);
+  }
+
+  // Where the slices meet: in a slice the lines of the two others, in the picture a short line along each axis.
+  function annotateCross(view, segments, width, height) {
+    const [x, y] = project(view, facts.cross) || [];
+    if (x === undefined) return;
+    for (const [plane, axis] of Object.entries(ACROSS)) {
+      if (view.name === "scene") {
+        const mm = (facts.camera.height_mm / height) * CROSS_PIXELS;
+        const ends = [-mm, mm].map((by) => project(view, facts.cross.map((value, at) => value + (at === axis ? by : 0))));
+        if (ends.every(Boolean)) segments([ends], `cross ${plane}`);
+      } else if (plane !== view.name) {
+        const upright = Math.abs(view.camera.right[axis]) > Math.abs(view.camera.up[axis]);
+        segments(upright ? [[[x, 0], [x, y - GAP]], [[x, y + GAP], [x, height]]]
+          : [[[0, y], [x - GAP, y]], [[x + GAP, y], [width, y]]], `cross ${plane}`);
+      }
+    }
   }
 
   // Texts of measures stand in the nearer upper corner, with a thin line to what they belong to: bone stays free.
@@ -153,7 +159,7 @@
       const points = measure.points.map((point) => project(view, point)).filter(Boolean);
       if (points.length !== measure.points.length || !isNear(view, measure.points)) continue;
       for (const name of ["halo", "line"]) {
-        if (points.length > 1) line(points, name);
+        if (points.length > 1) line(points, view.name === "scene" ? `${name} behind` : name);
         for (const [x, y] of points) { line([[x - 5, y], [x + 5, y]], name); line([[x, y - 5], [x, y + 5]], name); }
       }
       if (!measure.text) continue;
@@ -163,6 +169,11 @@
       const y = 18 + 20 * placed[side]++;
       line([[x + (side === "start" ? 1 : -1) * (4 + 8 * measure.text.length), y], middle], "lead");
       write(measure.text, x, y, "measure", side);
+    }
+    if (view.name !== "scene") return;
+    for (const piece of facts.seen_lines) {  // what no bone hides
+      const ends = piece.map((point) => project(view, point));
+      if (ends.every(Boolean)) line(ends, "line seen");
     }
   }
 
@@ -251,6 +262,8 @@
         const apart = (finger) => Math.max(Math.hypot(finger[0] - other[0], finger[1] - other[1]), 1);
         sumUp("pan", x / 2 / height, y / 2 / height);
         zoomBy(view, apart(now) / apart(before), (now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
+      } else if (event.ctrlKey && event.shiftKey) {
+        zoomBy(view, 6 ** (-y / height), view.box.clientWidth / 2, height / 2);
       } else if (event.ctrlKey) turnAt(view, ...now);
       else if (event.shiftKey || event.buttons & 6) sumUp("pan", x / height, y / height);
       else sumUp("turn", x / height, y / height);
@@ -259,7 +272,7 @@
     for (const name of ["pointerup", "pointercancel"]) {
       view.box.addEventListener(name, (event) => {
         fingers.delete(event.pointerId);
-        if (name === "pointerup" && moved < 4 && event.button === 0) click(view, at(event));
+        if (name === "pointerup" && moved < 4 && event.button === 0) click(view, at(event), event.shiftKey);
       });
     }
     view.box.addEventListener("pointerleave", () => { view.pointer = null; });
@@ -284,17 +297,22 @@
     return { x: inX, y: inY, size, plane: view.name === "scene" ? null : view.name };
   }
 
-  function click(view, place) {
-    if (view.name === "curve" || (!choosing && view.name === "scene")) return;
-    run({ "": "cross_at", only: "only_at", hide: "hide_at" }[choosing] || "add_point", pixel(view, place));
+  function click(view, place, asks) {
+    if (view.name === "curve" || (!choosing && !asks && view.name === "scene")) return;
+    const use = { "": "cross_at", only: "only_at", hide: "hide_at" }[choosing] || "add_point";
+    run(asks ? "cross_at" : use, pixel(view, place));
   }
 
   function picked(pick) {
     if (!pick) { hint("Nothing is shown there.", true); return; }
-    const part = facts.parts.find(({ key }) => key === pick.part), ras = facts.space === "RAS";
-    const place = pick.point.map((value, axis) => (ras && axis < 2 ? -value : value).toFixed(1)).join(", ");
-    hint([part && part.name, `${place} mm ${facts.space}`, pick.hu !== null && `${pick.hu.toFixed(0)} HU`].filter(Boolean).join(", "));
+    if (pick.part) choosePart(pick.part);
+    hint(pick.words);
     if (choosing === "only") choose("");
+  }
+
+  function choosePart(key) {
+    chosen = key;
+    for (const row of find("parts").children) row.classList.toggle("chosen", row.dataset.key === key);
   }
 
   // The parts tools live in the page; the others are the model's, whose facts say which one is used.
@@ -303,7 +321,7 @@
     choosing = name;
     if (name && !["only", "hide"].includes(name)) run("start_tool", { name });
     else if (before && !["only", "hide"].includes(before)) run("end_tool");
-    hint(HINTS[name] || "");
+    hint(fixed.hints[name] || "");
     showTools();
   }
 
@@ -311,6 +329,32 @@
     for (const [id, name] of Object.entries(TOOLS)) find(id).setAttribute("aria-pressed", String(choosing === name));
     find("end").hidden = !choosing;
     for (const view of Object.values(views)) view.box.classList.toggle("picks", choosing !== "");
+  }
+
+  // What does not change while the page is open: formats, windows, keys.
+
+  function takeFixed(now) {
+    fixed = now;
+    const kinds = now.save_as.length ? { "--save-as": [""], ...now.formats } : now.formats;
+    find("format").replaceChildren(...Object.entries(kinds).map(([kind, endings]) => {
+      const group = element("optgroup", "", { label: kind });
+      group.append(...endings.map((ending) => element("option", ending || now.save_as.join(", "), { value: ending })));
+      return group;
+    }));
+    find("presets").replaceChildren(...Object.entries(now.windows).map(([name, [low, high]]) => {
+      const button = element("button", name, { type: "button", title: `level ${(low + high) / 2}, width ${high - low}` });
+      button.onclick = () => run("set_window", { low, high });
+      return button;
+    }));
+    find("keylist").replaceChildren(...Object.entries(now.help).map(([title, rows]) => {
+      const body = element("tbody");
+      body.append(element("th", title, { colSpan: 2 }), ...rows.map((cells) => {
+        const row = element("tr");
+        row.append(...cells.map((words) => element("td", words)));
+        return row;
+      }));
+      return body;
+    }));
   }
 
   // Facts: what the panels show.
@@ -326,13 +370,6 @@
     if (told("modes")) {
       find("mode").replaceChildren(...now.modes.map(({ name, words }) => element("option", `${name}: ${words}`, { value: name })));
     }
-    if (told("formats")) {
-      find("format").replaceChildren(...Object.entries(now.formats).map(([kind, endings]) => {
-        const group = element("optgroup", "", { label: kind });
-        group.append(...endings.map((ending) => element("option", ending, { value: ending })));
-        return group;
-      }));
-    }
     find("mode").value = now.mode;
     find("table").checked = now.table;
     find("perspective").checked = !now.camera.parallel;
@@ -341,16 +378,20 @@
     if (told("window")) showWindow();
     if (told("parts") && !held) showParts();
     const clusters = now.parts.filter(({ kind }) => kind === "cluster");
-    find("find").hidden = !now.iso || now.parts_known;
     find("colors").hidden = !clusters.length;
     find("colors").setAttribute("aria-pressed", String(clusters.some(({ color }) => color)));
     if (told("measures")) showMeasures();
     if ((told("clips") || told("clip_box")) && !held) showClips();
-    if (told("notes") || told("objects")) showAbout();
+    if (told("notes") || told("objects") || told("warnings")) showAbout();
+    if (told("said") && now.said) hint(now.said);
     showTools();
-    const curved = now.measures.some(({ kind }) => kind === "curve") || (now.tool === "curve" && now.points.length > 1);
-    if (views.curve.box.hidden === Boolean(curved && now.iso) || !before) {
-      views.curve.box.hidden = !(curved && now.iso);
+    const curves = (all) => all.measures.filter(({ kind }) => kind === "curve").length;
+    if (before && curves(now) > curves(before)) curveOff = false;
+    const curved = Boolean(now.iso && (curves(now) || (now.tool === "curve" && now.points.length > 1)));
+    find("curved").hidden = !curved;
+    find("along").checked = !curveOff;
+    if (views.curve.box.hidden === (curved && !curveOff) || !before) {
+      views.curve.box.hidden = !curved || curveOff;
       layOut();
     }
     for (const view of Object.values(views)) annotate(view);
@@ -363,6 +404,13 @@
       if (held === input || document.activeElement === find("exact") && id === "exact") continue;
       Object.assign(input, { min: Math.ceil(facts.iso.low), max: Math.floor(facts.iso.high), value: Math.round(facts.iso.hu) });
     }
+    const { low, high } = facts.iso, step = roundLength((high - low) / 5), marks = [];
+    for (let hu = Math.ceil(low / step) * step; hu <= high; hu += step) marks.push(hu);
+    find("marks").replaceChildren(...marks.map((hu) => {
+      const mark = element("span", String(hu).replace("-", "\u2212"));
+      mark.style.left = `calc(8px + ${(hu - low) / (high - low)} * (100% - 16px))`;
+      return mark;
+    }));
   }
 
   function showWindow() {
@@ -389,9 +437,17 @@
   const hexadecimal = (color) => `#${color.map((value) => Math.round(255 * value).toString(16).padStart(2, "0")).join("")}`;
   const channels = (color) => [1, 3, 5].map((at) => parseInt(color.slice(at, at + 2), 16) / 255);
 
+  // Ml of what is enclosed, else how many points or triangles there are.
+  function saySize({ ml, count }) {
+    if (ml !== null || count === null) return sayMl(ml);
+    return count < 1e5 ? count.toLocaleString("en") : `${(count / 1e6).toFixed(2)} M`;
+  }
+
   function showParts() {
     find("parts").replaceChildren(...facts.parts.map((part) => {
       const row = element("li", "", { className: ["cluster", "label", "rest"].includes(part.kind) ? "" : "whole" });
+      row.dataset.key = part.key;
+      row.classList.toggle("chosen", part.key === chosen);
       const input = (type, label, more) => element("input", "", { type, ariaLabel: `${label} ${part.name}`, ...more });
       const shown = input("checkbox", "show", { checked: part.visible });
       const color = input("color", "colour of", { value: hexadecimal(part.color || [0.9, 0.86, 0.78]), disabled: part.kind === "rest" });
@@ -400,9 +456,13 @@
       shown.onchange = () => run("show", { key: part.key, visible: shown.checked });
       hold(color, () => last("set_color", { key: part.key, rgb: channels(color.value) }, `color ${part.key}`));
       hold(opacity, () => last("set_opacity", { key: part.key, value: Number(opacity.value) }, `opacity ${part.key}`));
+      const name = element("span", part.name, { className: "name" });
+      const plain = element("button", "plain", { type: "button", title: `${part.name} as it looks by itself` });
       alone.onclick = () => run("only", { key: part.key });
-      row.append(shown, color, element("span", part.name, { className: "name" }),
-        element("span", sayMl(part.ml), { className: "ml" }), alone, opacity);
+      name.onclick = () => choosePart(chosen === part.key ? "" : part.key);
+      plain.onclick = () => run("set_color", { key: part.key, rgb: null });
+      plain.hidden = !part.color;
+      row.append(shown, color, name, element("span", saySize(part), { className: "ml" }), alone, opacity, plain);
       return row;
     }));
   }
@@ -420,7 +480,7 @@
       hold(place, () => last("move_clip", { n, share: Number(place.value) }, `clip ${n}`));
       flip.onclick = () => run("flip_clip", { n });
       drop.onclick = () => run("remove_clip", { n });
-      row.append(element("span", `${clip.name} side`), flip, drop, place);
+      row.append(element("span", clip.words), flip, drop, place);
       return row;
     }));
     const box = facts.clip_box, ends = facts.bounds;
@@ -444,14 +504,15 @@
 
   function showAbout() {
     const lines = facts.objects.flatMap(({ name, said }) => [name, ...said]);
-    find("about").replaceChildren(...[...facts.notes, ...lines, "Not a medical device."].map((text) => element("p", text)));
+    find("about").replaceChildren(...[...facts.notes, ...lines, ...facts.warnings.filter((text) => !lines.includes(text)),
+      "Not a medical device."].map((text) => element("p", text)));
   }
 
   // Saving: the file is made by the program and then fetched by its ticket.
 
   function save(format) {
     find("saved").textContent = "The file is being made.";
-    tell({ save: format, size: [views.scene.box.clientWidth, views.scene.box.clientHeight].map((value) => 2 * value) });
+    tell({ save: format || null, size: [views.scene.box.clientWidth, views.scene.box.clientHeight].map((value) => 2 * value) });
   }
 
   function fetchSaved({ ticket, name, bytes }) {
@@ -469,11 +530,6 @@
     const button = element("button", letter, { type: "button", title: name, ariaLabel: `view from ${name}` });
     button.onclick = () => look(letter);
     find("views").append(button);
-  }
-  for (const [name, [level, width]] of Object.entries(PRESETS)) {
-    const button = element("button", name, { type: "button", title: `level ${level}, width ${width}` });
-    button.onclick = () => run("set_window", { low: level - width / 2, high: level + width / 2 });
-    find("presets").append(button);
   }
   for (const [id, name] of Object.entries(TOOLS)) find(id).onclick = () => choose(choosing === name ? "" : name);
   hold(find("hu"), () => {
@@ -496,49 +552,54 @@
   find("mode").onchange = () => run("set_mode", { name: find("mode").value });
   find("table").onchange = () => run("set_table", { shown: find("table").checked });
   find("perspective").onchange = () => run("set_perspective", { on: find("perspective").checked });
+  find("iso").addEventListener("wheel", (event) => {
+    event.preventDefault();
+    const by = -Math.sign(event.deltaY) * fixed.iso_step;
+    gather("step_iso", (old) => ({ do: "step_iso", more: { by: by + (old ? old.more.by : 0) } }));
+  }, { passive: false });
   find("sliced").onchange = layOut;
   find("end").onclick = () => choose("");
+  find("along").onchange = () => { curveOff = !find("along").checked; takeFacts(facts); };
   find("clear").onclick = () => run("clear_measures");
   find("all").onclick = () => run("show_all");
-  find("find").onclick = () => run("find_parts");
-  find("colors").onclick = () => run("color_parts", { distinct: find("colors").getAttribute("aria-pressed") === "false" });
+  find("colors").onclick = () => run("toggle_colors");
   find("cut").onclick = () => run("add_clip", { direction: find("direction").value });
-  find("boxed").onclick = () => run("set_clip_box", facts.clip_box ? { low: null, high: null } : { low: facts.bounds[0], high: facts.bounds[1] });
+  find("boxed").onclick = () => run("toggle_clip_box");
   find("save").onclick = () => save(find("format").value);
   find("photo").onclick = () => save(".png");
   find("undo").onclick = () => run("undo");
-  find("keylist").replaceChildren(...Object.entries(KEYS).map(([key, words]) => {
-    const row = element("tr");
-    row.append(element("td", key), element("td", words));
-    return row;
-  }));
   find("help").onclick = () => find("keys").showModal();
   find("closekeys").onclick = () => find("keys").close();
 
-  function usePart(use) {
-    const view = Object.values(views).find(({ pointer }) => pointer);
-    if (view && view.name === "scene") run(use, pixel(view, view.pointer));
-  }
-
-  function nextMode(step) {
-    const names = facts.modes.map(({ name }) => name), at = names.indexOf(facts.mode) + step;
-    run("set_mode", { name: names[(at + names.length) % names.length] });
-  }
-
+  // What the page does itself at a key; what else keys do are commands of the session.
   const press = (id) => () => { if (!find(id).hidden) find(id).click(); };
-  const ACTIONS = {
-    f: press("perspective"), o: () => nextMode(1), O: () => nextMode(-1), b: () => facts.iso && find("table").click(),
-    m: press("distance"), a: press("angle"), k: press("trace"), e: press("seed"), M: press("clear"),
-    x: () => usePart("hide_at"), X: () => usePart("only_at"), A: press("all"), l: press("colors"),
-    c: press("cut"), C: press("boxed"), s: press("save"), p: press("photo"), u: press("undo"), h: press("help"),
-    Escape: () => choose(""),
+  const OWN = {
+    distance: press("distance"), angle: press("angle"), save: press("save"), photo: press("photo"), help: press("help"),
+    curve: () => { if (choosing === "curve" || find("curved").hidden) find("trace").click(); else find("along").click(); },
+    escape: () => { if (choosing) choose(""); else { run("cancel"); run("dismiss"); hint(""); } },
+    quit: () => tell({ quit: true }),
   };
+
+  // A command for what lies under the pointer; elsewhere what is like it for the part that was chosen in the list.
+  function runAtPointer(name) {
+    const view = Object.values(views).find(({ pointer }) => pointer);
+    if (view && view.name !== "curve") run(name, pixel(view, view.pointer));
+    else if (chosen && name === "hide_at") run("show", { key: chosen, visible: false });
+    else if (chosen && name === "only_at") run("only", { key: chosen });
+    else if (name === "mark_at") find("seed").click();
+    else hint("Point at a picture first.");
+  }
+
   document.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey || !facts) return;
-    if (/^(SELECT|INPUT)$/.test(event.target.tagName) && event.target.type !== "range") return;
-    const view = Object.keys(VIEW_NAMES)[Number(event.key) - 1];
-    if (view) look(view);
-    else if (ACTIONS[event.key]) ACTIONS[event.key]();
+    if (event.ctrlKey || event.metaKey || event.altKey || !facts || find("keys").open) return;
+    const { tagName, type } = event.target, isRange = type === "range";
+    if (/^(SELECT|INPUT)$/.test(tagName) && !isRange && type !== "checkbox") return;
+    if (isRange && event.key.startsWith("Arrow")) return;
+    const does = fixed.keys[event.key];
+    if (does === undefined) return;
+    if (typeof does === "string") OWN[does]();
+    else if (fixed.at_pointer.includes(event.key)) runAtPointer(does.do);
+    else tell(does);
   });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", layOut);
   new ResizeObserver(layOut).observe(find("stage"));

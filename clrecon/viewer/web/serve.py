@@ -7,7 +7,9 @@ from pathlib import Path
 
 from clrecon.jobs.view.inputs import ViewSettings, check_view_settings
 from clrecon.system.progress import Progress
+from clrecon.viewer.drawing.saving import check_names
 from clrecon.viewer.session.opening import OpenedView, open_view
+from clrecon.viewer.web.connection import ignore_line
 from clrecon.viewer.web.listening import has_screen, open_browser
 from clrecon.viewer.web.server import WebServer
 
@@ -18,6 +20,8 @@ def serve_view(
     *,
     port: int | None = None,
     opens: bool = False,
+    save_as: Sequence[str] = (),
+    wrote: Callable[[str], object] = ignore_line,
     progress: Progress | None = None,
     ready: Callable[[WebServer, OpenedView, list[str]], object] = lambda server, view, warnings: None,
 ) -> None:
@@ -28,13 +32,16 @@ def serve_view(
     inputs: See `clrecon.jobs.view.inputs.open_inputs`.
     port: Default: a free one.
     opens: Open the user's browser.
+    save_as: Files that a save writes into the current folder, in place of a download; numbered where they exist.
+    wrote: Called with a line for each of these.
     progress: Of the reading.
     ready: Called with the server, what was read and warnings, once the address can be opened.
     """
     settings = settings or ViewSettings()
     check_view_settings(settings)
+    check_names(save_as)
     with (
-        WebServer(port) as server,
+        WebServer(port, save_as=save_as, wrote=wrote) as server,
         open_view(inputs, settings, progress=progress) as view,
         view.session() as first,  # nobody looks through it: it builds kernels while the address is being opened
     ):

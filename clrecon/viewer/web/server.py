@@ -8,7 +8,7 @@ import logging
 import signal
 import sys
 import tempfile
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ from clrecon.errors import ClreconError
 from clrecon.system.log import get_logger
 from clrecon.system.packages import import_package
 from clrecon.viewer.web.admission import LOOPBACK, make_secret, refuse_request
-from clrecon.viewer.web.connection import Connection, Session
+from clrecon.viewer.web.connection import Connection, Session, ignore_line
 from clrecon.viewer.web.downloads import Download
 from clrecon.viewer.web.listening import bind_port
 from clrecon.viewer.web.page import compose_page
@@ -48,12 +48,16 @@ class WebServer:
     The port is taken at once, so that one that is not free is said before a scan is read.  Use it in a ``with`` block.
 
     port: Default: a free one.
+    save_as, wrote: See `Connection`.
 
     address: To be opened in a browser; it holds the secret.
     """
 
-    def __init__(self, port: int | None = None) -> None:
+    def __init__(
+        self, port: int | None = None, *, save_as: Sequence[str] = (), wrote: Callable[[str], object] = ignore_line
+    ) -> None:
         import_package("aiohttp", "a view in the browser")
+        self._save_as, self._wrote = save_as, wrote
         self._listener = bind_port(port)
         self._secret = make_secret()
         self.port: int = self._listener.getsockname()[1]
@@ -161,7 +165,9 @@ class WebServer:
             await socket.close(code=1013, message=f"{MOST_BROWSERS} browsers are open already".encode())
             return socket
         try:
-            connection = Connection(self._open_session, socket, self._downloads)
+            connection = Connection(
+                self._open_session, socket, self._downloads, save_as=self._save_as, wrote=self._wrote, quit=self.stop
+            )
         except ClreconError as error:
             await socket.close(code=1011, message=str(error).encode()[:_MOST_REASON])
             return socket

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import re
@@ -12,15 +13,18 @@ import numpy as np
 import pytest
 import view_scenes as scenes
 from browser import open_browser, outside_requests, severe_lines, wait_for
+from open_views import search_for_ever
 from web_views import PATIENCE, serving
 
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.model.objects import show_objects
+from clrecon.viewer.session.keys import KEYS
 from clrecon.viewer.session.session import ViewSession
 
 pytestmark = [pytest.mark.slow, pytest.mark.opencl]
 
 SETTLED = "return clrecon.facts && clrecon.facts.settled && clrecon.pictures > 0"
+PARTS = "return clrecon.facts.parts.filter((part) => part.kind === 'cluster').length === 3"
 ISO = scenes.ISO
 
 
@@ -39,6 +43,7 @@ def browser(folder):
 @pytest.fixture(scope="module")
 def served(device):
     objects = show_objects([scenes.make_scan(), scenes.make_mesh()])
+    objects[1] = dataclasses.replace(objects[1], said=("a ball of triangles",))
     with (
         Painter(objects, device=device) as painter,
         serving(lambda heard: ViewSession(objects, painter, iso_value=ISO, on_change=heard)) as running,
@@ -90,15 +95,36 @@ def drag(page, element, x: int, y: int, dx: int, dy: int, steps: int = 15) -> No
     actions.release().perform()
 
 
-def click(page, name: str, point: np.ndarray) -> None:
-    """Click at the place of a point of the patient."""
+def point_at(page, name: str, point: np.ndarray) -> None:
+    """Move the pointer to the place of a point of the patient."""
     from selenium.webdriver import ActionChains
 
     element = page.find_element("id", name)
     x, y = page.execute_script("return clrecon.project(arguments[0], arguments[1])", name, [float(v) for v in point])
     ActionChains(page).move_to_element_with_offset(
         element, round(x - element.size["width"] / 2), round(y - element.size["height"] / 2)
-    ).click().perform()
+    ).perform()
+
+
+def click(page, name: str, point: np.ndarray, *held: str) -> None:
+    """Click at the place of a point of the patient, with keys held."""
+    from selenium.webdriver import ActionChains
+
+    point_at(page, name, point)
+    actions = ActionChains(page)
+    for key in held:
+        actions.key_down(key)
+    actions.click()
+    for key in held:
+        actions.key_up(key)
+    actions.perform()
+
+
+def press(page, *keys: str) -> None:
+    """Press keys with the pointer where it is."""
+    from selenium.webdriver import ActionChains
+
+    ActionChains(page).send_keys(*keys).perform()
 
 
 def test_a_drag_turns_the_picture_and_leaves_the_slices(page) -> None:
@@ -174,8 +200,7 @@ def test_a_distance_by_two_clicks_is_that_of_the_places(page) -> None:
 
 
 def test_a_part_is_hidden_by_a_click_and_listed_with_its_ml(page) -> None:
-    page.find_element("id", "find").click()
-    wait_for(page, "return clrecon.facts.parts.filter((part) => part.kind === 'cluster').length === 3")
+    wait_for(page, PARTS)
     settle(page)
     before = picture(page)
     page.find_element("id", "hide").click()
@@ -188,6 +213,167 @@ def test_a_part_is_hidden_by_a_click_and_listed_with_its_ml(page) -> None:
     assert re.search(r"0\.\d+ ml", page.find_element("id", "parts").text)
     page.find_element("id", "all").click()
     wait_for(page, "return clrecon.facts.parts.every((part) => part.visible)")
+
+
+def test_shift_and_click_says_what_it_is_and_the_slices_go_there(page) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    wait_for(page, PARTS)
+    click(page, "scene", scenes.middle(1), Keys.SHIFT)
+    wait_for(page, "return document.getElementById('hint').textContent.endsWith('mm LPS')")
+    said = page.find_element("id", "hint").text
+    assert re.match(r"part 2, 0\.\d+ ml, (299|300|301) HU, ", said), said
+    assert np.linalg.norm(np.array(facts(page)["cross"]) - scenes.middle(1)) == pytest.approx(5.0, abs=0.3)
+    (row,) = page.find_elements("css selector", "#parts li.chosen")
+    assert "part 2" in row.text
+    page.find_element("id", "level").send_keys(Keys.TAB)  # the pointer stays, the focus goes
+    row.find_element("css selector", ".name").click()
+    assert page.find_elements("css selector", "#parts li.chosen") == []
+
+
+def test_the_cross_is_seen_in_the_picture_and_slices_have_names_and_colours(page) -> None:
+    def colors(name: str) -> set[str]:
+        return set(
+            page.execute_script(
+                "const lines = document.querySelectorAll(`#${arguments[0]} .cross`);"
+                "return [...lines].map((line) => getComputedStyle(line).stroke)",
+                name,
+            )
+        )
+
+    every = colors("scene")
+    assert len(every) == 3
+    for name in ("axial", "coronal", "sagittal"):
+        label = page.find_element("css selector", f"#{name} .name")
+        assert label.text == name
+        own = page.execute_script("return getComputedStyle(arguments[0]).fill", label)
+        assert colors(name) == every - {own}
+    marks = page.find_elements("css selector", "#marks span")
+    assert 4 < len(marks) < 20 and "0" in [mark.text for mark in marks]
+
+
+def test_left_right_and_the_wheel_step_the_iso_value(page) -> None:
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
+    from selenium.webdriver.common.keys import Keys
+
+    point_at(page, "scene", scenes.middle(0))
+    press(page, Keys.ARROW_RIGHT)
+    wait_for(page, f"return clrecon.facts.iso.hu === {ISO + 5}")
+    press(page, Keys.ARROW_LEFT, Keys.ARROW_LEFT)
+    wait_for(page, f"return clrecon.facts.iso.hu === {ISO - 5}")
+    hu = page.find_element("id", "hu")
+    ActionChains(page).scroll_from_origin(ScrollOrigin.from_element(hu), 0, -100).perform()
+    wait_for(page, f"return clrecon.facts.iso.hu === {ISO}")
+
+
+def test_keys_use_what_lies_under_the_pointer_in_slices_too(page) -> None:
+    wait_for(page, PARTS)
+    point_at(page, "scene", scenes.middle(1))
+    press(page, "e")
+    wait_for(page, "return clrecon.facts.measures.length === 1")
+    (seed,) = facts(page)["measures"]
+    assert (seed["kind"], facts(page)["tool"]) == ("seed", None)
+    assert "place" in page.find_element("id", "measures").text
+    page.execute_script("clrecon.run('set_cross', { point: arguments[0] })", scenes.middle(0).tolist())
+    wait_for(page, f"return Math.abs(clrecon.facts.cross[2] - {scenes.middle(0)[2]}) < 0.01")
+    settle(page)
+    point_at(page, "axial", scenes.middle(0))
+    press(page, "x")
+    wait_for(page, "return clrecon.facts.parts.some((part) => part.name === 'part 1' && !part.visible)")
+    press(page, "A")
+    wait_for(page, "return clrecon.facts.parts.every((part) => part.visible)")
+    page.find_element("xpath", "//ul[@id='parts']//span[text()='part 2']").click()  # away from the pictures
+    press(page, "X")
+    wait_for(page, "return clrecon.facts.parts.filter((part) => part.kind === 'cluster' && part.visible).length === 1")
+    assert [part["name"] for part in facts(page)["parts"] if part["visible"] and part["kind"] == "cluster"] == [
+        "part 2"
+    ]
+
+
+def test_a_line_is_faint_where_bone_lies_before_it(page) -> None:
+    page.find_element("id", "distance").click()
+    for number in (0, 1):
+        click(page, "scene", scenes.middle(number))
+        wait_for(page, f"return clrecon.facts.points.length + 2 * clrecon.facts.measures.length === {number + 1}")
+    page.execute_script("clrecon.run('look', { view: 'posterior' })")
+    settle(page)
+    (measure,) = facts(page)["measures"]
+    first, last = (np.array(point) for point in measure["points"])
+    seen = np.array(facts(page)["seen_lines"])
+    assert len(seen) == 1  # between the balls, not behind them
+    assert 2.0 < np.linalg.norm(seen[0, 1] - seen[0, 0]) < np.linalg.norm(last - first) - 6.0
+    assert len(page.find_elements("css selector", "#scene .line.seen")) == 1
+    page.execute_script("clrecon.run('look', { view: 'anterior' })")
+    settle(page)
+    seen = np.array(facts(page)["seen_lines"])
+    assert np.linalg.norm(seen[:, 1] - seen[:, 0], axis=1).sum() > 0.7 * np.linalg.norm(last - first)
+
+
+def test_a_clip_box_lies_about_the_cross_and_an_oblique_plane_is_named_by_letters(page) -> None:
+    press(page, "C")
+    box = np.array(wait_for(page, "return clrecon.facts.clip_box"))
+    low, high = np.array(facts(page)["bounds"])
+    assert box[1] - box[0] == pytest.approx(0.5 * (high - low), abs=0.01)
+    assert box.mean(axis=0) == pytest.approx(facts(page)["cross"], abs=0.01)
+    press(page, "C")
+    wait_for(page, "return !clrecon.facts.clip_box")
+    page.execute_script("clrecon.run('turn', { dx: 0.2, dy: 0 })")
+    press(page, "c")
+    wait_for(page, "return clrecon.facts.clips.length === 1")
+    assert re.match(r"[APLR]{2} side", page.find_element("id", "clips").text)
+
+
+def test_a_part_gets_its_own_look_back_and_a_mesh_says_its_triangles(page) -> None:
+    page.execute_script("clrecon.run('set_color', { key: '2', rgb: [1, 0, 0] })")
+    wait_for(page, "return clrecon.facts.parts.find(({ key }) => key === '2').color")
+    (row,) = [each for each in page.find_elements("css selector", "#parts li") if "mesh" in each.text]
+    assert re.search(r"\d,\d{3}", row.text)
+    row.find_element("xpath", ".//button[text()='plain']").click()
+    wait_for(page, "return !clrecon.facts.parts.find(({ key }) => key === '2').color")
+
+
+def test_k_makes_a_curve_shows_its_picture_and_takes_that_away(page) -> None:
+    curve = page.find_element("id", "curve")
+    press(page, "k")
+    for number in (1, 2):
+        click(page, "scene", scenes.middle(number))
+        wait_for(page, f"return clrecon.facts.points.length === {number}")
+    press(page, "k")
+    wait_for(page, "return clrecon.facts.measures.length === 1 && !clrecon.facts.tool")
+    settle(page)
+    assert curve.is_displayed() and curve.find_element("css selector", ".name").text == "along the curve"
+    press(page, "k")
+    assert not curve.is_displayed()
+    page.find_element("id", "along").click()
+    assert curve.is_displayed()
+
+
+def test_escape_stops_the_work(page, served, monkeypatch) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    wait_for(page, PARTS)
+    monkeypatch.setattr(Painter, "find_parts", lambda self, state, progress: search_for_ever(state, progress))
+    page.execute_script("clrecon.run('set_iso', { hu: 310 })")
+    wait_for(page, "return clrecon.facts.busy.includes('finding parts')")
+    press(page, Keys.ESCAPE)
+    wait_for(page, "return !clrecon.facts.busy.length")
+
+
+def test_what_has_to_be_said_is_said(page) -> None:
+    assert "a ball of triangles" in page.find_element("id", "about").text
+    page.find_element("id", "table").click()
+    wait_for(page, "return /of the voxels are air now/.test(document.getElementById('hint').textContent)")
+
+
+def test_the_list_of_keys_is_that_of_the_session(page) -> None:
+    press(page, "h")
+    text = page.find_element("id", "keys").text
+    for key in KEYS.values():
+        assert key.words in text
+    press(page, "h")  # keys do nothing while it is open
+    page.find_element("id", "closekeys").click()
+    assert not page.find_element("id", "keys").is_displayed()
 
 
 def test_the_wheel_scrolls_a_slice_and_a_right_drag_is_its_window(page) -> None:
@@ -243,6 +429,31 @@ def test_what_is_shown_is_saved_as_a_download(page, folder: Path) -> None:
         time.sleep(0.05)
     mesh = read_mesh(folder / "view.stl", space="lps")
     assert mesh.triangle_count > 1000
+
+
+def test_files_that_were_named_are_written_here_and_q_ends_it(browser, device, tmp_path: Path) -> None:
+    from clrecon.mesh.reader import read_mesh
+
+    objects = show_objects([scenes.make_mesh()])
+    wrote: list[str] = []
+    names = [str(tmp_path / name) for name in ("shown.ply", "shown.png")]
+    with (
+        Painter(objects, device=device) as painter,
+        serving(lambda heard: ViewSession(objects, painter, on_change=heard), save_as=names, wrote=wrote.append) as own,
+    ):
+        browser.get(own.address)
+        wait_for(browser, SETTLED)
+        for count in (2, 4):
+            press(browser, "s")
+            end = time.monotonic() + PATIENCE
+            while len(wrote) < count:
+                assert time.monotonic() < end, browser.find_element("id", "saved").text
+                time.sleep(0.05)
+        press(browser, "q")
+        wait_for(browser, "return document.documentElement.dataset.closed === '1001'")
+        assert "the server has ended" in browser.find_element("id", "message").text
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["shown-2.ply", "shown-2.png", "shown.ply", "shown.png"]
+    assert read_mesh(tmp_path / "shown-2.ply", space="lps").triangle_count == scenes.make_mesh().triangle_count
 
 
 def test_another_browser_has_a_view_of_its_own(page, served) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from clrecon.viewer.web.pacing import SCENE, Asked, Pace
+from clrecon.viewer.session.picture_facts import SCENE
+from clrecon.viewer.web.pacing import Asked, Pace
 
 pytestmark = pytest.mark.unit
 

@@ -1,4 +1,4 @@
-"""The page of the view: what it shares with the window, and that it stands alone."""
+"""The page of the view: keys and commands that there are, and that it stands alone."""
 
 from __future__ import annotations
 
@@ -7,21 +7,33 @@ from importlib.resources import files
 
 import pytest
 
-from clrecon.rendering.looks.window import WINDOWS
-from clrecon.viewer.session.commands import COMMANDS
+from clrecon.viewer.session.commands import COMMANDS, check_command
+from clrecon.viewer.session.keys import KEYS, page_words
 from clrecon.viewer.web.page import compose_page
-from clrecon.viewer.window.window_keys import KEYS
 
 pytestmark = pytest.mark.unit
 
 SCRIPT = (files("clrecon.viewer.web") / "page.js").read_text(encoding="utf-8")
 
 
-def test_its_keys_are_those_of_the_window() -> None:
-    (block,) = re.findall(r"const ACTIONS = \{(.*?)\n  \};", SCRIPT, re.DOTALL)
-    keys = set(re.findall(r"(?<![\w.])(\w+): (?:press|\(\))", block))
-    assert len(keys) > 15
-    assert keys - set(KEYS) == set()
+def test_keys_are_commands_or_what_the_page_does_itself() -> None:
+    (block,) = re.findall(r"const OWN = \{(.*?)\n  \};", SCRIPT, re.DOTALL)
+    own = set(re.findall(r"(?<![\w.])(\w+): (?:press|\(\))", block))
+    assert own == {key.does for key in KEYS.values() if isinstance(key.does, str)}
+    at = {"x": 1, "y": 1, "size": [2, 2], "plane": None}
+    for key in KEYS.values():
+        if not isinstance(key.does, str):
+            check_command({**key.does, **(at if key.at_pointer else {})})
+
+
+def test_every_key_and_tool_has_words() -> None:
+    words = page_words()
+    listed = [name for rows in words["help"].values() for name, _ in rows]
+    for name, key in KEYS.items():
+        assert (key.name or name) in listed or not key.words
+    tools = re.search(r"const TOOLS = \{(.*?)\};", SCRIPT)
+    assert tools is not None
+    assert set(re.findall(r': "(\w+)"', tools[1])) == set(words["hints"])
 
 
 def test_it_asks_for_commands_that_there_are() -> None:
@@ -35,13 +47,3 @@ def test_it_holds_no_place_that_was_not_filled_and_no_address() -> None:
     page = compose_page("127.0.0.1:1").content.decode()
     assert not re.search(r"@[A-Z]+@", page)
     assert set(re.findall(r"https?://[\w.]+", page)) == {"http://www.w3.org"}  # the name of SVG
-
-
-def test_its_windows_are_those_of_pictures() -> None:
-    script = (files("clrecon.viewer.web") / "page.js").read_text(encoding="utf-8")
-    presets = re.search(r"const PRESETS = \{(.*?)\};", script)
-    assert presets is not None
-    found = re.findall(r"(\w+): \[(-?\d+), (\d+)\]", presets[1])
-    assert len(found) == 4
-    for name, level, width in found:
-        assert WINDOWS[name] == (int(level) - 0.5 * int(width), int(level) + 0.5 * int(width))

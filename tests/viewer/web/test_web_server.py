@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import dataclasses
 import hashlib
 import http.client
 import json
@@ -156,7 +157,7 @@ def test_a_browser_gets_facts_and_pictures_of_the_size_that_it_has(served: WebSe
             await client.lay_out(scene=[120, 90], axial=[40, 30])
             await client.until(lambda: {head["view"] for head, _ in client.pictures} == {"scene", "axial"})
             assert client.facts["iso"]["hu"] == 200.0 and client.facts["device"] == "no device"
-            assert client.facts["formats"]["mesh"][0] == ".stl"
+            assert client.fixed["formats"]["mesh"][0] == ".stl"
             head, image = client.pictures[0]
             assert image.size == (120, 90) == tuple(head["size"]) and head["camera"]["parallel"]
             assert abs(grey(client.pictures[0]) - 200) <= 2
@@ -267,7 +268,50 @@ def test_a_click_tells_what_was_picked(served: WebServer) -> None:
     asyncio.run(look())
 
 
+def test_a_cross_that_moves_and_parts_that_look_plain_leave_the_picture(served: WebServer, views: Views) -> None:
+    async def look() -> None:
+        async with browsing(served) as client:
+            await client.tell(do="set_mode", name="slices")
+            await client.lay_out(scene=[120, 90], axial=[40, 30])
+            await client.until(lambda: client.facts and client.facts["settled"] and len(client.pictures) >= 2)
+            views.painter.drawn.clear()
+            await client.tell(do="scroll", plane="axial", steps=1)
+            await client.until(lambda: ("axial", True) in views.painter.drawn and client.facts["settled"])
+            views.sessions[0].model.state = dataclasses.replace(views.sessions[0].model.state, parts_at=200.0)
+            await client.tell(do="dismiss")
+            await client.tell(do="start_tool", name="seed")
+            await client.until(lambda: client.facts["tool"] == "seed" and client.facts["settled"])
+            assert {view for view, _ in views.painter.drawn} == {"axial"}
+
+    asyncio.run(look())
+
+
 # Files
+
+
+def test_named_files_are_written_one_after_the_other_and_said(
+    views: Views, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def save(self, path, then, size=None) -> None:
+        path.write_bytes(b"x")
+        then([f"wrote {path.name}"])
+
+    monkeypatch.setattr("clrecon.viewer.session.session.ViewSession.save", save)
+    wrote: list[str] = []
+    names = [str(tmp_path / name) for name in ("a.stl", "b.png")]
+
+    async def look(running: WebServer) -> None:
+        async with browsing(running) as client:
+            await client.tell(save=None)
+            await client.until(lambda: len(client.notes) == 2)
+            assert list(client.fixed["save_as"]) == names
+            await client.tell(save=None)
+            await client.until(lambda: len(client.notes) == 4)
+
+    with serving(views.open, save_as=names, wrote=wrote.append) as running:
+        asyncio.run(look(running))
+    assert wrote == ["wrote a.stl", "wrote b.png", "wrote a-2.stl", "wrote b-2.png"]
+    assert len(list(tmp_path.iterdir())) == 4
 
 
 def test_a_file_is_fetched_once_with_its_ticket(views: Views, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -330,6 +374,18 @@ def test_when_the_server_ends_browsers_are_told(views: Views) -> None:
     with serving(views.open) as running:
         asyncio.run(look(running))
     assert views.sessions[0]._closed
+
+
+def test_a_browser_can_end_the_server(views: Views) -> None:
+    async def look(running: WebServer) -> None:
+        async with browsing(running) as one, browsing(running) as other:
+            await other.until(lambda: other.facts)
+            await one.tell(quit=True)
+            for client in (one, other):
+                await client.until(lambda client=client: client.close_code == 1001)
+
+    with serving(views.open) as running:
+        asyncio.run(look(running))
 
 
 def test_too_many_browsers_are_told_so(views: Views, monkeypatch: pytest.MonkeyPatch) -> None:
