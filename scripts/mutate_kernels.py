@@ -127,10 +127,9 @@ def serve(device_index: int) -> None:
 
 
 def _try(device: Any, mutation: Mutation, lines: Any) -> dict[str, Any]:
-    from clrecon.jobs.selftest.child import run_check
-    from clrecon.jobs.selftest.table import checks_of
+    from clrecon.proof.run import CHECKS, run_check
 
-    checks = checks_of(mutation.kernel)
+    checks = [check for check in CHECKS if mutation.kernel in check.kernels]
     for check in checks:
         lines.write(json.dumps({"check": check.name}) + "\n")
         outcome = run_check(device, check)
@@ -144,7 +143,8 @@ def _try(device: Any, mutation: Mutation, lines: Any) -> dict[str, Any]:
 def key_of(mutation: Mutation) -> str:
     """Return a hash of a mutation and of all checks: what a result is valid for."""
     digest = hashlib.sha256(mutation.key().encode())
-    for path in sorted((ROOT / "clrecon" / "jobs" / "selftest").glob("*.py")):
+    proof = ROOT / "clrecon" / "proof"
+    for path in sorted([*proof.glob("*/*_checks.py"), *proof.glob("checking/*.py")]):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -8,7 +8,7 @@
  * deviation of the heights.  The sign of n cancels.  Where sigma_s is below 1e-6 mm the point stays.
  *
  * Reference: S. Fleishman, I. Drori, D. Cohen-Or, "Bilateral mesh denoising", 2003, for a point and its neighbours; the
- * paper of the grid and its eq. 3 to 5 are named in clrecon/reference/points/bilateral.py.
+ * paper of the grid and its eq. 3 to 5 are named in clrecon/proof/points/neighbours.py.
  *
  * Passes
  *   1. filter_points    for each part of the points, after list_neighbours and fit_planes

@@ -4,7 +4,7 @@
  * the segment is taken in PARTS parts, with values of a parabola through these samples (pre-integrated tables take a
  * line: Engel, Kraus and Ertl 2001, "High-quality pre-integrated volume rendering"; lines cut the tops of thin bone
  * off), and its light and colour are those of the place where it is seen: without that, surfaces have rings like the
- * grain of wood.  What the twin in clrecon/reference/rays/render.py does without leaps comes out the same: bricks that show
+ * grain of wood.  What the twin in clrecon/proof/rays/render.py does without leaps comes out the same: bricks that show
  * nothing hold no values between which something shows. */
 #ifndef CLRECON_STEEP_SEGMENTS_H
 #define CLRECON_STEEP_SEGMENTS_H

@@ -1,6 +1,6 @@
 /* Samples inside of labels: the label map tells to which label a sample belongs, HU tell whether it is dense.
  *
- * The rules are our own; clrecon/reference/surface/labels.py states them.
+ * The rules are our own; clrecon/proof/surface/labels.py states them.
  *
  * Passes
  *   1. own_samples      for each sample the label that it is inside of, or 0

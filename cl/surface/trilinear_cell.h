@@ -20,7 +20,7 @@
  *      joined: a c > b d   apart             in sizes of the corners' heights
  *
  * References: Nielson and Hamann 1991 (faces); Chernyaev 1995 (interiors); Grosso 2016 (the waist of a tunnel).
- * Derivation and twin: clrecon/reference/surface/trilinear_table.py and trilinear.py. */
+ * Derivation and twin: clrecon/proof/surface/trilinear_table.py and trilinear.py. */
 #ifndef CLRECON_TRILINEAR_CELL_H
 #define CLRECON_TRILINEAR_CELL_H
 

@@ -18,8 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.devices import run_device_selftest
-    from clrecon.jobs.selftest.table import CHECKS
+    from clrecon.proof.run import CHECKS, run_device_selftest
 
     width = max(len(check.name) for check in CHECKS)
     told: list[dict[str, Any]] = []

@@ -1,13 +1,11 @@
-"""The OpenCL devices of this machine, and a test of the operators on one of them."""
+"""The OpenCL devices of this machine."""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from clrecon.errors import DeviceError
-from clrecon.system.progress import Progress, device_seconds, ignore_progress
 
 
 def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError | None]:
@@ -43,42 +41,3 @@ def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError
         "warnings": list(warnings),
     }
     return survey, problem
-
-
-def run_device_selftest(
-    name: str | None = None,
-    *,
-    progress: Progress | None = None,
-    tell: Callable[[dict[str, Any], dict[str, Any]], None] | None = None,
-) -> dict[str, Any]:
-    """Compare every kernel with its twin, in a process of its own.
-
-    name: Device name or index.
-    progress: Called as ``progress("selftest", checks done, all checks)``.
-    tell: Called with the device and each result, as they are returned, as soon as it is there.
-
-    Returns: ``{"device": {...}, "passed": bool, "operators": [{"operator", "passed", "detail", "seconds"}], "warnings":
-        [text]}``.
-    """
-    from clrecon.jobs.selftest.run import run_selftest
-    from clrecon.jobs.selftest.table import CHECKS
-    from clrecon.opencl import choose_unchecked
-
-    progress = progress or ignore_progress
-    device = choose_unchecked(name)
-    results: list[dict[str, Any]] = []
-    progress("selftest", 0, len(CHECKS))
-    for result in run_selftest(device, CHECKS, silent_seconds=min(device_seconds(), threading.TIMEOUT_MAX)):
-        results.append(result)
-        if tell is not None:
-            tell(device.describe(), result)
-        progress("selftest", len(results), len(CHECKS))
-    place = {check.name: n for n, check in enumerate(CHECKS)}
-    results.sort(key=lambda result: place.get(result["operator"], len(place)))  # processes run side by side
-    passed = bool(results) and all(result["passed"] for result in results)
-    return {
-        "device": device.describe(),
-        "passed": passed,
-        "operators": results,
-        "warnings": device.warnings,
-    }

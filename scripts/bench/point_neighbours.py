@@ -126,8 +126,8 @@ def measure_filter(job: Job) -> dict[str, Any]:
 
     from clrecon.operators.points.denoising import denoise_points
     from clrecon.points import PointCloud
-    from clrecon.reference.points.bilateral import denoise_points as filter_twin
-    from clrecon.reference.points.normals import principal_axes
+    from clrecon.proof.points.neighbours import denoise_points as filter_twin
+    from clrecon.proof.points.neighbours import principal_axes
 
     def with_numpy(points: Any) -> Any:
         _, indices = cKDTree(points).query(points, K, workers=THREADS)

@@ -42,7 +42,7 @@ def test_the_table_goes_and_the_patient_stays_to_the_bit(gap, lungs):
 
 
 def test_bone_surface_within_the_body_is_the_same_surface():
-    from clrecon.reference.surface.extract import extract_isosurface
+    from clrecon.proof.surface.extract import extract_isosurface
 
     hu, patient = make_patient(arms=False)
     plain = as_volume(hu)

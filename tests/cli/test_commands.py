@@ -255,8 +255,8 @@ def test_no_driver_says_how_to_get_one(
 
 
 def test_selftest_passes(device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """With the first checks of the table; all of them run in tests/jobs/selftest."""
-    from clrecon.jobs.selftest import table
+    """With the first checks of the table; all of them run in tests/proof."""
+    from clrecon.proof import run as table
 
     monkeypatch.setattr(table, "CHECKS", table.CHECKS[:2])
     assert main(["selftest", "--json", "--device", str(device.index)]) == 0
@@ -269,7 +269,7 @@ def test_selftest_passes(device: Any, monkeypatch: pytest.MonkeyPatch, capsys: p
 def test_selftest_that_fails_exits_5(
     device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from clrecon.jobs.selftest import run
+    from clrecon.proof import run
 
     wrong = [{"operator": "compact", "passed": False, "detail": "wrong positions", "seconds": 0.1}]
     monkeypatch.setattr(run, "run_selftest", lambda chosen, checks, **_: iter(wrong))

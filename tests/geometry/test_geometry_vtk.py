@@ -13,7 +13,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import AIR_HU, Volume, compose_affine
 from clrecon.geometry.resample import regular_grid, shear_degrees
 from clrecon.mesh import Mesh
-from clrecon.reference.surface.extract import extract_isosurface
+from clrecon.proof.surface.extract import extract_isosurface
 
 pyvista = pytest.importorskip("pyvista")
 

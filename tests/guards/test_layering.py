@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 
 import pytest
-from house import LEFT_OF, ROOT, find_layer_faults, layer_of, package_modules, walk_imports
+from house import LEFT_OF, PACKAGE, ROOT, find_layer_faults, layer_of, package_modules, walk_imports
 
 
 def test_every_module_keeps_to_its_layer() -> None:
@@ -53,10 +53,10 @@ def test_no_layer_imports_one_that_imports_it() -> None:
         ("clrecon.geometry.volume", "def f():\n    import clrecon.opencl.select", "may not import clrecon.opencl"),
         ("clrecon.exchange.stl", "from ..reading.dicom import read_volume", "may not import clrecon.reading.dicom"),
         ("clrecon.phantom.shapes", "from clrecon.mesh import Mesh", "may not import clrecon.mesh"),
-        ("clrecon.operators.surface.extract", "from clrecon import reference", "may not import clrecon.reference"),
+        ("clrecon.operators.surface.extract", "from clrecon import proof", "may not import clrecon.proof"),
         ("clrecon.cli.main", "from clrecon.geometry import Volume", "may not import clrecon.geometry"),
         ("clrecon.mesh.quality", "import scipy.spatial", "scipy at module level"),
-        ("clrecon.reference.surface.extract", "def f():\n    import pyopencl", "may not import pyopencl"),
+        ("clrecon.proof.surface.extract", "def f():\n    import pyopencl", "may not import pyopencl"),
         ("clrecon.jobs.mesh.job", "try:\n    import pyvista\nexcept ImportError:\n    pass", "pyvista at module level"),
         ("clrecon.novelty.thing", "", "not in the table"),
         ("clrecon.errors", "import numpy", "numpy at module level"),
@@ -71,7 +71,7 @@ def test_a_wrong_import_is_found(module: str, source: str, expected: str) -> Non
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("clrecon.jobs.selftest", "from clrecon.reference.surface import extract"),
+        ("clrecon.proof.surface.surface_checks", "from clrecon.operators.surface import extract"),
         ("clrecon.mesh.quality", "def f():\n    import scipy.spatial"),
         (
             "clrecon.jobs.mesh.job",
@@ -133,3 +133,17 @@ def test_vtk_is_known_in_one_file_of_a_room() -> None:
     assert others == VTK_ELSEWHERE
     assert imports_vtk("def f():\n    from vtkmodules.vtkCommonCore import vtkPoints")
     assert not imports_vtk("from clrecon.exchange.vtk import make_polydata")
+
+
+def test_twins_know_nothing_of_what_they_prove() -> None:
+    rooms = {path.parent.name for path in (PACKAGE / "operators").glob("*/__init__.py")}
+    twins = [
+        path for room in sorted(rooms) for path in (PACKAGE / "proof" / room).glob("*.py") if "_check" not in path.name
+    ]
+    assert len(twins) > 15
+    for path in twins:
+        source = path.read_text(encoding="utf-8")
+        imported = {
+            layer_of(name) for name, *_ in walk_imports(ast.parse(source), path.stem, False) if "clrecon" in name
+        }
+        assert imported <= {"errors", "geometry", "labels", "rendering", "proof"}, path

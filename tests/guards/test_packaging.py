@@ -121,7 +121,7 @@ def install_alone(wheel: Path, folder: Path) -> Path:
 SELFTEST = """
 import sys
 from clrecon.cli.main import main
-from clrecon.jobs.selftest import table
+from clrecon.proof import table
 table.CHECKS = table.CHECKS[:5]  # a program is found, or it is not
 sys.exit(main(["selftest"]))
 """

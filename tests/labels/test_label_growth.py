@@ -13,8 +13,8 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume, compose_affine
 from clrecon.labels.growth import Growth, _checked
 from clrecon.mesh import Mesh
-from clrecon.reference.surface.extract import extract_isosurface
-from clrecon.reference.surface.labels import extract_label, find_solid, own_labels
+from clrecon.proof.surface.extract import extract_isosurface
+from clrecon.proof.surface.labels import extract_label, find_solid, own_labels
 
 CENTER = np.array((0.31, -0.17, 0.23))
 

@@ -81,12 +81,12 @@ def test_row_59_reports_of_other_commands_and_pictures_have_the_warnings(device,
     from clrecon.geometry import Volume
     from clrecon.jobs import devices
     from clrecon.jobs.bench import job as bench_job
-    from clrecon.jobs.selftest import table
     from clrecon.operators.reformat.cut import cut_slice
+    from clrecon.proof import run
 
-    monkeypatch.setattr(table, "CHECKS", ())
+    monkeypatch.setattr(run, "CHECKS", ())
     monkeypatch.setattr(device, "_remarks", ["a remark"])
-    assert devices.run_device_selftest(str(device.index))["warnings"] == ["a remark"]
+    assert run.run_device_selftest(str(device.index))["warnings"] == ["a remark"]
     assert devices.survey_devices(str(device.index))[0]["warnings"] == ["a remark"]
     volume = Volume(np.zeros((3, 3, 3), np.int16), np.eye(4))
     assert cut_slice(volume, "axial", device=device).report["warnings"].count("a remark") == 1

@@ -8,9 +8,7 @@ from point_shapes import cube, plane, sphere
 from scipy.stats import rankdata
 
 from clrecon.points.spacing import D0_OF_MEDIAN, VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
-from clrecon.reference.points.neighbours import find_neighbours
-from clrecon.reference.points.normals import principal_axes
-from clrecon.reference.points.outliers import mean_distances
+from clrecon.proof.points.neighbours import find_neighbours, mean_distances, principal_axes
 
 
 def ratios_of(points, k=16):

@@ -8,7 +8,7 @@ import numpy as np
 
 from clrecon.opencl import download
 from clrecon.points import PointCloud
-from clrecon.reference.points import field as twin
+from clrecon.proof.points import field as twin
 
 
 def sphere_cloud(

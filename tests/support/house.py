@@ -32,7 +32,6 @@ _layer("mesh", "errors", "system", "geometry", "anatomy", "exchange")
 _layer("points", "errors", "system", "geometry", "exchange")
 _layer("rendering", "errors", "version", "system", "geometry", "labels")
 _layer("phantom", "errors", "version", "system", "geometry")
-_layer("reference", "errors", "geometry", "labels", "rendering")
 _layer("operators", "errors", "system", "opencl", "geometry", "anatomy", "labels", "mesh", "points", "rendering")
 _layer(
     "jobs",
@@ -50,8 +49,8 @@ _layer(
     "points",
     "rendering",
     "phantom",
-    "reference",
     "operators",
+    "proof",
 )
 _layer(
     "viewer",
@@ -69,7 +68,8 @@ _layer(
     "operators",
     "jobs",
 )
-_layer("cli", "errors", "version", "system", "jobs", "viewer")
+_layer("proof", "errors", "system", "opencl", "geometry", "labels", "mesh", "points", "rendering", "operators")
+_layer("cli", "errors", "version", "system", "jobs", "viewer", "proof")
 _layer("__main__", "cli")
 _layer(
     "__init__",
@@ -100,13 +100,13 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "mesh": frozenset({"numpy"}),
     "points": frozenset({"numpy"}),
     "exchange": frozenset({"numpy"}),
-    "reference": frozenset({"numpy"}),
     "rendering": frozenset({"numpy"}),
     "phantom": frozenset({"numpy", "pydicom"}),
     "opencl": frozenset({"numpy"}),
     "operators": frozenset({"numpy"}),
     "jobs": frozenset({"numpy"}),
     "viewer": frozenset({"numpy"}),
+    "proof": frozenset({"numpy"}),
     "spine": frozenset({"numpy"}),
 }
 INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
@@ -117,7 +117,6 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "exchange": frozenset({"vtk", "vtkmodules", "laspy"}),
     "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification", "trimesh"}),
     "points": frozenset({"pyvista", "open3d"}),
-    "reference": frozenset({"scipy"}),
     "rendering": frozenset({"scipy", "PIL", "skimage", "imageio_ffmpeg", "pyvista", "vtk", "vtkmodules"}),
     "phantom": frozenset({"scipy"}),
     "opencl": frozenset({"pyopencl"}),
@@ -125,6 +124,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     # vtkmodules: peers of the bench and of the comparison, whose page has plots and pictures.
     "jobs": frozenset({"pyvista", "skimage", "vtkmodules", "matplotlib", "PIL"}),
     "viewer": frozenset({"aiohttp", "PIL", "pyvista", "vtk", "vtkmodules"}),
+    "proof": frozenset({"scipy"}),
     "cli": frozenset({"rich"}),
     "spine": frozenset({"scipy", "skimage"}),
 }

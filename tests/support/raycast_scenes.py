@@ -12,8 +12,8 @@ import pytest
 from dicom_series import rotation
 
 from clrecon.geometry import Volume
-from clrecon.reference.rays.render import cast_rays
-from clrecon.reference.rays.surface import cast_surface
+from clrecon.proof.rays.render import cast_rays
+from clrecon.proof.rays.surface import cast_surface
 from clrecon.rendering import UNSHADED, Lighting, TransferFunction
 from clrecon.rendering.views.camera import Camera
 

@@ -139,7 +139,7 @@ def _rays_cpu(scene: Scene) -> Product:
 
 
 def _cast_twin(scene: Scene, size: tuple[int, int]) -> Rendering:
-    from clrecon.reference.rays.render import cast_rays
+    from clrecon.proof.rays.render import cast_rays
     from clrecon.rendering.looks.presets import find_preset
 
     camera, _ = scene.request.views()["view"]

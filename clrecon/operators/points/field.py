@@ -195,7 +195,7 @@ class _Decision:
 def decide_signs(
     masks: Masks, limits: MemoryLimits, rounds: int, *, memory: int | None = None, taken: int = 0
 ) -> Signs:
-    """Decide which nodes are inside; see `clrecon.reference.points.field.decide_signs`.
+    """Decide which nodes are inside; see `clrecon.proof.points.field.decide_signs`.
 
     masks: Its `negative_d` is used up.
     rounds: Nodes that signs flood from a far node on.

@@ -213,7 +213,7 @@ def make_grid(
     edge: Edge of the cells in mm.
     memory: Bytes that may be taken on the device; None is all of its memory.
 
-    Returns: Equal on every device, and to `clrecon.reference.points.grid.make_grid`.
+    Returns: Equal on every device, and to `clrecon.proof.points.grid.make_grid`.
     """
     return fill_grid(device, plan_grid(points, edge), memory=memory, stopwatch=stopwatch)
 

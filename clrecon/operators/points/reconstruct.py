@@ -73,7 +73,7 @@ class Walls:
 
 
 def find_walls(near: Words, negative: Words, inside: Words, nx: int) -> Walls:
-    """Count the faces of a surface and those without support; see `clrecon.reference.points.field.find_walls`.
+    """Count the faces of a surface and those without support; see `clrecon.proof.points.field.find_walls`.
 
     near, negative, inside: ndarray, shape (nz, ny, words), uint32. Masks of nodes, bit b of word w is node 32 w + b:
         within the bridge of a point, the sign of the field there, and the decided sign.

@@ -13,7 +13,7 @@ from clrecon.jobs.mesh.surfaces import Part, Surface
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.walls import WallLook
 from clrecon.mesh.connectivity import label_components
-from clrecon.reference.surface.extract import extract_isosurface
+from clrecon.proof.surface.extract import extract_isosurface
 
 
 @pytest.mark.parametrize("without_table", [False, True])

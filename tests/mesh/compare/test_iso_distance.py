@@ -18,7 +18,7 @@ from clrecon.mesh.compare.iso_distance import (
     smallest_voxel_mm,
     trilinear_field,
 )
-from clrecon.reference.surface.extract import extract_isosurface
+from clrecon.proof.surface.extract import extract_isosurface
 
 pytestmark = pytest.mark.unit
 

@@ -21,7 +21,7 @@ from clrecon.mesh.compare.walls import (
 )
 from clrecon.mesh.connectivity import label_components
 from clrecon.phantom import KINDS, PhantomSettings, make_phantom
-from clrecon.reference.surface.extract import extract_isosurface
+from clrecon.proof.surface.extract import extract_isosurface
 
 AFFINE = np.diag((1.0, 1.0, 1.5, 1.0))
 SHAPE = (24, 40, 48)

@@ -19,7 +19,7 @@ from clrecon.mesh.refine.clusters import Clusters, _find_flat
 from clrecon.mesh.refine.collapses import Quadrics
 from clrecon.mesh.refine.decimation import _collapse, _mend, check_refinement, decimate_mesh, smooth_mesh
 from clrecon.mesh.refine.deviation import Deviation
-from clrecon.reference.surface.extract import extract_isosurface
+from clrecon.proof.surface.extract import extract_isosurface
 
 pytestmark = pytest.mark.unit
 

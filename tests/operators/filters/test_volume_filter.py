@@ -16,8 +16,8 @@ from clrecon.opencl import Stopwatch, download, list_devices
 from clrecon.operators.filters.bilateral import SlicesThere, list_mixed_groups, row_words, run_bilateral
 from clrecon.operators.filters.settings import BilateralSettings
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.reference.filters import bilateral as twin
-from clrecon.reference.filters import near_level as near_twin
+from clrecon.proof.filters import filter_twins as near_twin
+from clrecon.proof.filters import filter_twins as twin
 
 SHAPES = [(1, 1, 40), (3, 2, 1), (5, 4, 15), (4, 5, 16), (3, 6, 17), (2, 3, 31), (2, 3, 33), (7, 8, 70)]
 

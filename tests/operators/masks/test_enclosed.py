@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enclosed_twin as twin
 import numpy as np
 import pytest
 from surface_volumes import MIRRORED, OBLIQUE
@@ -13,7 +14,6 @@ from clrecon.geometry import Volume
 from clrecon.labels.volumes import slice_voxel_ml
 from clrecon.operators.masks import enclosed
 from clrecon.phantom import PhantomSettings, make_phantom
-from clrecon.reference.masks import enclosed as twin
 
 TILTED = np.array([[0.6, 0.0, 0.0, -20.0], [0.0, 0.6, 0.4, 5.0], [0.0, 0.0, 1.4, 100.0], [0, 0, 0, 1.0]])
 

@@ -12,11 +12,9 @@ from clrecon.operators.points import neighbours
 from clrecon.operators.points.denoising import denoise_points
 from clrecon.points import PointCloud
 from clrecon.points.spacing import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
-from clrecon.reference.points import bilateral as twin
-from clrecon.reference.points import grid as grid_twin
-from clrecon.reference.points.neighbours import find_neighbours
-from clrecon.reference.points.normals import principal_axes
-from clrecon.reference.points.outliers import mean_distances
+from clrecon.proof.points import grid as grid_twin
+from clrecon.proof.points import neighbours as twin
+from clrecon.proof.points.neighbours import find_neighbours, mean_distances, principal_axes
 
 
 def run_twin(points, k=16, factor=2.0, features=None):

@@ -12,7 +12,7 @@ from clrecon.opencl import memory_limits, upload
 from clrecon.operators.points.field import MOST_NODES, FieldSettings, Masks, NodeField, decide_signs, plan_nodes
 from clrecon.operators.points.grid import plan_grid
 from clrecon.points import PointCloud
-from clrecon.reference.points import field as twin
+from clrecon.proof.points import field as twin
 
 
 def scattered_cloud(n, size=(9.0, 7.0, 8.0), seed=3):

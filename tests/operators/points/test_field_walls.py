@@ -8,7 +8,7 @@ from cloud_shapes import cube_cloud, sphere_cloud
 
 from clrecon import PointCloud, reconstruct_surface
 from clrecon.operators.points.reconstruct import find_walls
-from clrecon.reference.points import field as twin
+from clrecon.proof.points import field as twin
 
 
 def pack(mask):

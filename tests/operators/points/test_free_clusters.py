@@ -15,9 +15,9 @@ from clrecon.operators.points.clusters import cluster_points
 from clrecon.operators.points.free_clusters import ClusterSearch, cluster_free_points, find_clusters, plan_cells
 from clrecon.operators.points.grid import fill_grid
 from clrecon.points import PointCloud
-from clrecon.reference.points import clusters as twin
-from clrecon.reference.points import free_clusters as passes_twin
-from clrecon.reference.points import grid as grid_twin
+from clrecon.proof.points import clusters as passes_twin
+from clrecon.proof.points import clusters as twin
+from clrecon.proof.points import grid as grid_twin
 
 
 @pytest.fixture(params=["own form", "other form"])

@@ -19,7 +19,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.phantom import PhantomSettings, make_phantom, write_phantom
 from clrecon.points import PointCloud, drop_ghost_slices, fill_ghost_slices, keep_clusters
 from clrecon.points.ghost_slices import judge_slices
-from clrecon.reference.points import slice_overlap as twin
+from clrecon.proof.points import voxels as twin
 
 BONE = (200, np.inf)
 

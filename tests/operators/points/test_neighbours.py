@@ -13,7 +13,7 @@ from clrecon.operators.points import neighbours
 from clrecon.operators.points.grid import fill_grid, plan_grid
 from clrecon.operators.points.neighbours import choose_cell_edge, find_neighbours
 from clrecon.points import PointCloud
-from clrecon.reference.points import neighbours as twin
+from clrecon.proof.points import neighbours as twin
 
 RNG = np.random.default_rng(7)
 CLOUDS = {

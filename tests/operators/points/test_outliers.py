@@ -10,8 +10,7 @@ from tolerances import MEAN_DISTANCE_SHARE
 from clrecon.errors import UsageError
 from clrecon.operators.points.denoising import remove_outliers
 from clrecon.points import PointCloud
-from clrecon.reference.points.neighbours import find_neighbours
-from clrecon.reference.points.outliers import find_outliers, mean_distances
+from clrecon.proof.points.neighbours import find_neighbours, find_outliers, mean_distances
 
 
 @pytest.mark.parametrize("deviations", [0.0, 1.0, 2.0, 3.5])

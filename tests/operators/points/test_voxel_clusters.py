@@ -20,7 +20,7 @@ from clrecon.operators.points.voxel_clusters import ClusterSearch, pad_for
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
 from clrecon.points.stencil import Lattice, make_stencil
-from clrecon.reference.points import clusters as twin
+from clrecon.proof.points import clusters as twin
 
 FINE = np.diag((0.5, 0.5, 0.8, 1.0))
 

@@ -9,8 +9,8 @@ from clrecon.errors import UsageError
 from clrecon.opencl import download, upload
 from clrecon.opencl.device import GROUP_SIZE
 from clrecon.operators.primitives.scan import SCAN_PER_ITEM, compact, exclusive_scan
-from clrecon.reference.primitives import compact as compact_twin
-from clrecon.reference.primitives import scan as scan_twin
+from clrecon.proof.primitives import primitive_twins as compact_twin
+from clrecon.proof.primitives import primitive_twins as scan_twin
 
 BLOCK = GROUP_SIZE * SCAN_PER_ITEM
 BORDERS = (SCAN_PER_ITEM, GROUP_SIZE, BLOCK, BLOCK * GROUP_SIZE)

@@ -13,7 +13,7 @@ from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.operators.rays.surface_pictures import cast_surface
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.reference.surface.labels import find_solid
+from clrecon.proof.surface.labels import find_solid
 from clrecon.rendering import Lighting, Rendering
 from clrecon.rendering.pictures.styles import SurfaceLook
 from clrecon.rendering.views.camera import Camera

@@ -21,7 +21,7 @@ from soft_function import SOFT
 from clrecon.geometry import Volume
 from clrecon.operators.rays import ray_slabs
 from clrecon.operators.rays.ray_slabs import BRICK_CELLS, plan_ray_slabs
-from clrecon.reference.rays.render import MODES
+from clrecon.proof.rays.render import MODES
 from clrecon.rendering import Lighting
 
 

@@ -21,7 +21,7 @@ from raycast_scenes import (
 
 from clrecon.geometry import Volume
 from clrecon.operators.surface.extract import extract_isosurface
-from clrecon.reference.surface.extract import extract_isosurface as extract_twin
+from clrecon.proof.surface.extract import extract_isosurface as extract_twin
 from clrecon.rendering import Lighting
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip

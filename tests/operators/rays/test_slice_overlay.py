@@ -13,7 +13,7 @@ from clrecon.geometry import Volume
 from clrecon.operators.rays import slices as operator
 from clrecon.operators.rays.slices import choose_slices
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.reference.rays.slices import overlay_slices as overlay_twin
+from clrecon.proof.rays.surface import overlay_slices as overlay_twin
 from clrecon.rendering import TransferFunction
 from clrecon.rendering.pictures.styles import SlicesInSpace
 from clrecon.rendering.views.camera import Camera

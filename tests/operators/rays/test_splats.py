@@ -13,7 +13,7 @@ from clrecon.errors import DeviceError, UsageError
 from clrecon.operators.rays import point_pictures
 from clrecon.operators.rays.point_pictures import MOST_NAMED, PointPictures, cloud_box, draw_splats
 from clrecon.points import PointCloud
-from clrecon.reference.rays.splats import find_splats, shade_splats
+from clrecon.proof.rays.objects import find_splats, shade_splats
 from clrecon.rendering import UNSHADED, Lighting
 from clrecon.rendering.pictures.point_look import PointLook
 from clrecon.rendering.views.camera import Camera

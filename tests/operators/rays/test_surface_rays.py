@@ -12,7 +12,7 @@ from clrecon.geometry import Volume
 from clrecon.operators.rays.surface_pictures import cast_surface
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.extract import extract_isosurface
-from clrecon.reference.rays.surface import cast_surface as cast_twin
+from clrecon.proof.rays.surface import cast_surface as cast_twin
 from clrecon.rendering import Lighting, Rendering
 from clrecon.rendering.pictures.styles import SurfaceLook
 from clrecon.rendering.views.camera import Camera

@@ -14,7 +14,7 @@ from clrecon import Mesh, MeshLook
 from clrecon.errors import DeviceError, UsageError
 from clrecon.operators.rays.mesh_pictures import make_part
 from clrecon.operators.rays.scene import LAYERS, draw_layers
-from clrecon.reference.rays.triangles import find_meetings, nth_layer, shade_layer
+from clrecon.proof.rays.objects import find_meetings, nth_layer, shade_layer
 from clrecon.rendering import UNSHADED, Lighting
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip

@@ -9,7 +9,7 @@ import tolerances
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.operators.reformat.cut import reformat_curve
-from clrecon.reference.reformat.cut import reformat_sheet
+from clrecon.proof.reformat.sheets import reformat_sheet
 from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.curved import straightened_sheet
 from clrecon.rendering.views.plane import slab_samples

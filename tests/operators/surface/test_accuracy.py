@@ -8,7 +8,7 @@ import tolerances
 
 from clrecon.geometry import Volume, compose_affine
 from clrecon.operators.surface.extract import extract_isosurface
-from clrecon.reference.surface import extract as twin
+from clrecon.proof.surface import extract as twin
 
 pytestmark = pytest.mark.every_device
 

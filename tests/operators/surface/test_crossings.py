@@ -10,7 +10,7 @@ from clrecon.errors import Cancelled
 from clrecon.mesh.intersections import find_self_intersections
 from clrecon.operators.surface import decimation
 from clrecon.operators.surface.decimation import find_crossings, mark_crossings, plan_crossings
-from clrecon.reference.surface import crossings as twin
+from clrecon.proof.surface import crossings as twin
 from clrecon.system.progress import Steps
 
 

@@ -17,7 +17,7 @@ from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.labels import extract_labels
-from clrecon.reference.surface import extract as twin
+from clrecon.proof.surface import extract as twin
 
 OBLIQUE = np.array([[0.5, 0.05, 0.1, -12.0], [-0.05, 0.7, 0.3, -14.0], [0.0, 0.1, 1.25, -19.0], [0, 0, 0, 1.0]])
 FAR = np.array([1e5, -1e5, 5e4])

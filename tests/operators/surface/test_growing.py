@@ -21,8 +21,8 @@ from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurfa
 from clrecon.operators.surface.seeds import AUTO_SHARE
 from clrecon.operators.surface.slabs import SampleGrid
 from clrecon.phantom import PhantomSettings, make_phantom
-from clrecon.reference.surface.extract import extract_isosurface as extract_twin
-from clrecon.reference.surface.growing import choose_largest, count_visited, grow_cells, label_cells
+from clrecon.proof.surface.extract import extract_isosurface as extract_twin
+from clrecon.proof.surface.growing import choose_largest, count_visited, grow_cells, label_cells
 
 
 def blocks(affine: np.ndarray = OBLIQUE, dtype: str = "int16") -> Volume:

@@ -11,12 +11,11 @@ from variants import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume, compose_affine, iso_rule
-from clrecon.jobs.selftest.child import run_check
-from clrecon.jobs.selftest.table import CHECKS
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface, extract_isosurfaces
-from clrecon.reference.surface import extract as twin
+from clrecon.proof.run import CHECKS, run_check
+from clrecon.proof.surface import extract as twin
 
 
 @pytest.mark.every_device

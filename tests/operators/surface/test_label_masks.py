@@ -10,13 +10,13 @@ from scipy.spatial import cKDTree
 from clrecon.errors import DeviceError, RefusedInputError, UsageError
 from clrecon.geometry import apply_affine
 from clrecon.labels import LabelMap
-from clrecon.labels.enclosed import count_faces, find_enclosed
+from clrecon.labels.enclosed import Borders, choose_levels, count_faces, find_enclosed
 from clrecon.labels.occupancy import FULL, KEEP
 from clrecon.labels.solid import find_boxes
 from clrecon.mesh.triangles import enclosed_ml
 from clrecon.opencl import Stopwatch
 from clrecon.operators.surface.label_masks import extract_label_masks, survey_labels
-from clrecon.reference.surface import label_masks as twin
+from clrecon.proof.surface import labels as twin
 
 OBLIQUE = np.array([[0.7, 0.1, 0.05, -250.0], [-0.1, 0.5, 0.2, -300.0], [0.0, 0.05, 2.5, -846.0], [0, 0, 0, 1.0]])
 MIRRORED = OBLIQUE @ np.diag((-1.0, 1.0, 1.0, 1.0))
@@ -93,7 +93,18 @@ def test_the_level_is_that_of_the_twin(device):
 def test_the_levels_of_enclosed_labels_are_those_of_the_twin(device):
     labels = np.where(mask_of((12, 13, 14), 3.0), 2, mask_of((12, 13, 14), 5.2)).astype(np.uint8)
     meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device=device)
-    levels = twin.choose_enclosed(labels, OBLIQUE)
+    voxel_ml = abs(np.linalg.det(OBLIQUE[:3, :3])) / 1000.0
+
+    def measure(levels: dict[int, int]) -> dict[int, float]:
+        made = {
+            number: twin.extract_label_mask(labels, OBLIQUE, number, levels[number], enclosed=levels)
+            for number in levels
+        }
+        return {
+            number: enclosed_ml(vertices, triangles) / voxel_ml for number, (vertices, _, triangles) in made.items()
+        }
+
+    levels = choose_levels(Borders.of(labels, find_enclosed(labels, count_faces(labels))), measure)
     assert set(levels) == {1, 2}
     for number, mesh in meshes.items():
         assert abs(mesh.report["mask_level"] * FULL - levels[number]) <= 2

@@ -18,7 +18,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import labels as operator
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.labels import extract_labels
-from clrecon.reference.surface import labels as twin
+from clrecon.proof.surface import labels as twin
 
 OBLIQUE = np.array([[0.7, 0.1, 0.05, -250.0], [-0.1, 0.5, 0.2, -300.0], [0.0, 0.05, 2.5, -846.0], [0, 0, 0, 1.0]])
 MIRRORED = OBLIQUE @ np.diag((-1.0, 1.0, 1.0, 1.0))

@@ -18,7 +18,7 @@ from clrecon.operators.surface.growing import find_cell_near
 from clrecon.operators.surface.marching_cubes import classify
 from clrecon.operators.surface.seeds import SEED_REACH_MM
 from clrecon.operators.surface.slabs import SampleGrid, Slab
-from clrecon.reference.surface.growing import find_active
+from clrecon.proof.surface.growing import find_active
 
 SHEARED = np.array([[0.7, 0.0, 0.4, -80.0], [0.0, 0.8, 0.5, 3.0], [0.0, 0.1, 2.0, 40.0], [0.0, 0.0, 0.0, 1.0]])
 

@@ -13,7 +13,7 @@ from clrecon.geometry import Volume
 from clrecon.mesh.compare.iso_distance import measure_iso_distance, rule_of_report
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
-from clrecon.reference.surface import extract as twin
+from clrecon.proof.surface import extract as twin
 
 CASES = [((30, 60), {}), ((30.5, 60.2), {}), ((-5, 40), {}), ((50, 300_000), {}), (40, {"below": True}),
          (40.5, {"below": True, "topology": "trilinear"})]  # fmt: skip

@@ -13,8 +13,8 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume, compose_affine
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
-from clrecon.reference.surface import extract as twin
-from clrecon.reference.surface.trilinear_table import find_states
+from clrecon.proof.surface import extract as twin
+from clrecon.proof.surface.trilinear_table import find_states
 
 
 def extract(volume, iso_value, device, **options):

@@ -14,7 +14,7 @@ from clrecon.labels import LabelMap
 from clrecon.mesh.compare.iso_distance import distances_to_iso_surface
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.labels import extract_labels
-from clrecon.reference.surface.extract import extract_isosurface as extract_twin
+from clrecon.proof.surface.extract import extract_isosurface as extract_twin
 
 GAPS = (1.0,) * 9 + (0.4,) * 3 + (1.9,) * 8 + (1.0,) * 4
 TURN = rotation((15.0, -25.0, 40.0))

@@ -10,9 +10,9 @@ import pytest
 from dicom_series import Plan, set_values, write_series
 
 from clrecon.geometry import AIR_HU
+from clrecon.proof.surface.extract import extract_isosurface
 from clrecon.reading.dicom import read_volume
 from clrecon.reading.dicom.pixels.padding import PaddingMasks, pack_mask
-from clrecon.reference.surface.extract import extract_isosurface
 
 SHAPE = (6, 40, 40)
 CENTRE, RADIUS = 19.5, 18.0

@@ -1,0 +1,3 @@
+"""Proof, right of the product: numpy twins with their checks, phantoms, comparison, bench."""
+
+from __future__ import annotations

@@ -1,0 +1,1 @@
+"""What every check of the self-test needs."""

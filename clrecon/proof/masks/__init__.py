@@ -1,0 +1,1 @@
+"""Twins of `clrecon.operators.masks`, in plain numpy, and the checks that compare them."""

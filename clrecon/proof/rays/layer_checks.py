@@ -1,0 +1,237 @@
+"""Checks of triangles and of the layers of a picture."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry import Volume
+from clrecon.geometry.affine import Float64Array
+from clrecon.mesh import Mesh
+from clrecon.opencl import Device, download
+from clrecon.operators.rays.mesh_pictures import make_part
+from clrecon.operators.rays.picture_buffers import Between
+from clrecon.operators.rays.scene import LayeredPicture, ScenePictures, Still, draw_layers
+from clrecon.proof.checking.check import Check, require_close, require_equal, require_share, require_whole
+from clrecon.proof.checking.scenes import OBLIQUE, blobs, centre_of, look_at
+from clrecon.proof.rays.objects import Meetings, find_meetings, nth_layer, shade_layer
+from clrecon.proof.rays.render import cast_rays
+from clrecon.proof.rays.surface import overlay_slices as overlay_twin
+from clrecon.rendering import UNSHADED, Lighting, TransferFunction
+from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.rendering.pictures.styles import SlicesInSpace, VolumeLook
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
+
+SIZE = (160, 104)
+"""Pixels, of which 32 are a work-item of the kernel that counts them."""
+
+WITH_VOLUME = (96, 60)
+"""Pixels: 720 work-items that take eight rays each."""
+
+TRIANGLES, SPLIT = 660, 90
+"""All triangles, every seventh of which fills a quarter of the picture; from `SPLIT` on they are opaque."""
+
+OPACITY = 0.35
+COLOR_255, DEPTH_MM, EDGE_SHARE = 2.0, 1e-3, 0.01
+BETWEEN_255 = 3.5
+"""As COLOR_255, and the hundredth behind what is nearly opaque, which rays leave out."""
+
+FIXED = Lighting(0.15, 0.7, 0.4, 20.0, direction=(0.4, -1.0, 0.8))
+
+
+def _soup() -> tuple[Mesh, NDArray[np.uint8]]:
+    """Return triangles anywhere within 7 mm, and a colour for each vertex."""
+    rng, count = np.random.default_rng(31), TRIANGLES
+    size = np.where(np.arange(count) % 7 < 6, 0.4, 3.0)[:, None, None]
+    corners = rng.uniform(-6.0, 6.0, (count, 1, 3)) + size * rng.normal(size=(count, 3, 3))
+    normals = rng.normal(size=(3 * count, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    mesh = Mesh(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), normals)
+    return mesh, rng.integers(0, 256, (3 * count, 3)).astype(np.uint8)
+
+
+def _still(camera: Camera) -> Still:
+    """Return a sheet in the middle of the triangles, opaque in a third of the picture, translucent in another."""
+    width, height = SIZE
+    along = camera.rays(SIZE)[1] @ camera.basis().forward
+    depth = (camera.distance / along).astype(np.float32)
+    image = np.full((height, width, 4), (40, 90, 200, 255), np.uint8)
+    image[:, : width // 3, 3] = 100
+    depth[:, 2 * width // 3 :] = np.nan
+    image[np.isnan(depth)] = 0
+    return Still(image, depth)
+
+
+def _blend(
+    mesh: Mesh, colors: NDArray[np.uint8], camera: Camera, still: Still
+) -> tuple[list[Float64Array], Float64Array, Float64Array, Float64Array]:
+    """Return the depths of all layers, premultiplied colours, first and expected depths; see `SPLIT`."""
+    count, (width, height) = mesh.triangle_count, SIZE
+    met = find_meetings(mesh.vertices, mesh.triangles, camera, SIZE)
+    along = np.ones((height, width)) if camera.is_parallel else camera.rays(SIZE)[1] @ camera.basis().forward
+    sheet = np.flatnonzero(~np.isnan(still.depth))
+    depths = np.concatenate([met.depths, (still.depth * along).ravel()[sheet].astype(np.float32)])
+    pixels = np.concatenate([met.pixels, sheet])
+    numbers = np.concatenate([met.triangles, np.full(len(sheet), count)])
+    shares = np.concatenate([met.shares, np.full((len(sheet), 3), 1 / 3)])
+    order = np.lexsort((numbers, depths, pixels))
+    every = Meetings(pixels[order], numbers[order], depths[order], shares[order])
+    triangles = np.concatenate([mesh.triangles, [[0, 1, 2]]])
+    color, opacity = np.zeros((height, width, 3)), np.zeros((height, width))
+    first, way, layers = np.full((height, width), np.nan), np.zeros((height, width)), []
+    for layer in range(int(np.bincount(pixels).max())):
+        places = np.where(opacity < 1.0, nth_layer(every, layer, SIZE), -1)
+        assert mesh.normals is not None
+        rgb, depth = shade_layer(
+            every, places, mesh.vertices, triangles, mesh.normals, colors / 255.0, camera, FIXED
+        )  # fmt: skip
+        own = np.where(places >= 0, every.triangles[places], 0)
+        is_sheet = own == count
+        rgb[is_sheet] = still.image[is_sheet][:, :3] / 255.0
+        share = np.where(is_sheet, still.image[..., 3] / 255.0, np.where(own >= SPLIT, 1.0, OPACITY))
+        weight = np.where(places >= 0, (1.0 - opacity) * share, 0.0)
+        color, opacity = color + weight[..., None] * rgb, opacity + weight
+        way += weight * np.nan_to_num(depth)
+        first = np.where(np.isnan(first), depth, first)
+        layers.append(np.where(np.isnan(depth), np.inf, depth))
+    with np.errstate(invalid="ignore"):
+        return layers, np.concatenate([color, opacity[..., None]], axis=-1), first, way / opacity
+
+
+def _check_layers(device: Device) -> str:
+    """Draw translucent and opaque triangles with a sheet between them, in parallel and in perspective."""
+    mesh, colors = _soup()
+    worst = 0.0
+    halves = [(slice(0, SPLIT), OPACITY), (slice(SPLIT, None), 1.0)]
+    parts = [
+        make_part(
+            Mesh(mesh.vertices, mesh.triangles[own], mesh.normals),
+            MeshLook(vertex_colors=colors, opacity=opacity, lighting=FIXED),
+        )
+        for own, opacity in halves
+    ]
+    for scale in ({"parallel_scale": 6.0}, {"view_angle": 14.0}):
+        camera = Camera((-20.0, -40.0, 15.0), (0.3, 0.2, 0.1), (0.1, 0.2, 1.0), **scale)
+        still = _still(camera)
+        ways: list[Any] = []
+
+        def note(between: Between, ways: list[Any] = ways) -> None:
+            held = (between.nearest_d, between.farthest_d)
+            ways.append([download(device, np.empty(SIZE[::-1], np.float32), each) for each in held])
+
+        found = draw_layers(device, parts, camera, SIZE, still=still, volume=note)
+        layers, rgba, depth, mean = _blend(mesh, colors, camera, still)
+        _compare_ways(ways, layers, found)
+        first = draw_layers(device, parts, camera, SIZE, still=still, most=1)
+        more = np.isfinite(layers[0]) & (first.image[..., 3] < 255)
+        require_equal(first.open_pixels, np.count_nonzero(more), "pixels that may have a second layer")
+        require_close(found.depth, depth, DEPTH_MM, "depths of triangles, in mm")
+        require_close(found.expected_depth, mean, DEPTH_MM, "expected depths of triangles, in mm")
+        opacity = found.image[..., 3:].astype(np.float64)
+        shown = np.concatenate([found.image[..., :3] * (opacity / 255.0), opacity], axis=-1)
+        away = np.abs(shown - 255.0 * rgba).max(axis=-1)
+        worst = max(worst, require_close(away, np.zeros_like(away), COLOR_255, "colours of triangles, of 255"))
+    return f"2 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
+
+
+def _compare_ways(ways: list[Any], layers: list[Float64Array], found: LayeredPicture) -> None:
+    """Compare where rays begin and end between layers; beyond the last one with something there may be an empty one."""
+    require_equal(found.open_pixels, 0, "pixels with further layers")
+    ends = [*layers, np.full(SIZE[::-1], np.inf), np.full(SIZE[::-1], np.inf)]
+    nearest = np.full(SIZE[::-1], -np.inf)
+    for number, ((begin, end), farthest) in enumerate(zip(ways, ends, strict=False)):
+        for what, own, expected in (("begin", begin, nearest), ("end", end, farthest)):
+            one, other = (np.sign(depths) * np.isinf(depths) for depths in (own, expected))  # before or behind all
+            require_equal(one, other, f"pixels without a {what} of the way before layer {number}")
+            finite, wanted = (np.where(np.isinf(depths), 0.0, depths) for depths in (own, expected))
+            require_close(finite, wanted, DEPTH_MM, f"{what}s of the way before layer {number}, in mm")
+        nearest = farthest
+
+
+def _screen(volume: Volume, camera: Camera) -> tuple[Mesh, Clip, Clip]:
+    """Return two triangles across a volume, aslant, and the half-spaces before and behind them."""
+    centre, toward = centre_of(volume), -camera.basis().forward + (0.2, 0.3, -0.25)
+    normal = toward / np.linalg.norm(toward)
+    one = np.cross(normal, (0.0, 0.0, 1.0))
+    one, other = 200.0 * one, 200.0 * np.cross(normal, one)
+    corners = [centre - one - other, centre + one - other, centre + one + other, centre - one + other]
+    return Mesh(corners, [(0, 1, 2), (0, 2, 3)]), Clip.plane(centre, normal), Clip.plane(centre, -normal)
+
+
+def _check_between(device: Device, slices: bool) -> str:
+    """Show a volume with a translucent screen across it: the twin's part before it, the screen, and the part behind."""
+    worst, opacity, color = 0.0, 0.4, np.array([0.2, 0.9, 0.4])
+    function = TransferFunction([(-300, 0.9, 0.2, 0.1, 0.0), (200, 1, 0.7, 0.4, 0.15), (900, 1, 1, 0.9, 0.6)])
+    screen = MeshLook(tuple(color.tolist()), opacity=opacity, lighting=UNSHADED)
+    window, chosen = (-500.0, 700.0), [1, 4, 7, 9, 12]
+
+    def grey(hu: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.clip((hu - window[0]) / (window[1] - window[0]), 0.0, 1.0)[:, None].repeat(3, axis=1)
+
+    for perspective in (False, True):
+        volume = blobs((16, 26, 22), OBLIQUE, "int16")
+        camera = look_at(volume, (0.4, 0.9, -0.5), 7.0, perspective)
+        step = 0.5 * min(volume.spacing)
+        mesh, before, behind = _screen(volume, camera)
+        look: VolumeLook | SlicesInSpace = VolumeLook(function, lighting=FIXED)
+        if slices:
+            look = SlicesInSpace(chosen, opacity=0.4, lowest_hu=-300.0, window=window)
+        with ScenePictures([(volume, look), (mesh, screen)], device=device) as pictures:
+            found = pictures.take(camera, WITH_VOLUME)
+        require_whole(found.report)
+        sides = []
+        for clip in (before, behind):
+            if slices:
+                rgba, _ = overlay_twin(volume, camera, WITH_VOLUME, chosen, 0.4, -300.0, grey, clip.planes)
+            else:
+                rgba = cast_rays(volume, function, camera, WITH_VOLUME, step, FIXED, clip).rgba
+            sides.append(np.clip(rgba, 0.0, 1.0))
+        rest = opacity * np.append(color, 1.0) + (1.0 - opacity) * sides[1]
+        expected = sides[0] + (1.0 - sides[0][..., 3:]) * rest
+        alpha = found.image[..., 3:].astype(np.float64)
+        shown = np.concatenate([found.image[..., :3] * (alpha / 255.0), alpha], axis=-1)
+        away = np.abs(shown - 255.0 * expected).max(axis=-1)
+        worst = max(
+            worst, require_share(away, np.zeros_like(away), BETWEEN_255, EDGE_SHARE, "colours about a screen, of 255")
+        )
+    return f"2 pictures of {WITH_VOLUME[0]} x {WITH_VOLUME[1]} pixels within {worst:.1f} of 255"
+
+
+RENDERED = ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along", "enter_tiles", "look_ahead")
+
+CHECKS = (
+    Check(
+        "a volume before and behind triangles",
+        (*RENDERED, "composite_rays"),
+        partial(_check_between, slices=False),
+        {"rays/composite.cl": ("BETWEEN",)},
+    ),
+    Check(
+        "slices before and behind triangles",
+        ("overlay_slices",),
+        partial(_check_between, slices=True),
+        {"rays/slices.cl": ("BETWEEN",)},
+    ),
+    Check(
+        "triangles and layers",
+        (
+            "place_vertices",
+            "count_pieces",
+            "draw_triangles",
+            "draw_pieces",
+            "shade_triangles",
+            "clear_rays",
+            "fill_depths",
+            "begin_layer",
+            "show_still",
+            "blend_layer",
+            "count_open",
+            "finish_rays",
+        ),
+        _check_layers,
+    ),
+)

@@ -1,0 +1,431 @@
+"""Checks of pictures by rays: leaps over empty bricks, entries of tiles, volume rendering, projections, surfaces
+without a mesh, slices in space.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry import Volume
+from clrecon.labels import LabelMap
+from clrecon.opencl import Device, Stopwatch, download, upload
+from clrecon.operators.rays.picture_buffers import TILE, PictureBuffers, RayView
+from clrecon.operators.rays.point_pictures import draw_splats
+from clrecon.operators.rays.ray_pictures import MainWay, enter_tiles, look_ahead, take_picture
+from clrecon.operators.rays.ray_slabs import (
+    BRICK_CELLS,
+    FARTHEST,
+    LeapMap,
+    RaySlab,
+    find_leaps,
+    measure_cells,
+    ray_slabs,
+)
+from clrecon.operators.rays.slices import overlay_slices
+from clrecon.operators.rays.surface_pictures import cast_surface
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.resident.tables import volume_box
+from clrecon.proof.checking.check import Check, require_close, require_equal, require_share, require_whole
+from clrecon.proof.checking.scenes import OBLIQUE, blobs, centre_of, look_at, stack
+from clrecon.proof.rays.objects import find_splats, shade_splats
+from clrecon.proof.rays.render import cast_rays
+from clrecon.proof.rays.surface import cast_surface as surface_twin
+from clrecon.proof.rays.surface import overlay_slices as overlay_twin
+from clrecon.rendering import UNSHADED, Lighting, Rendering, TransferFunction
+from clrecon.rendering.pictures.styles import Projection, SlicesInSpace, SurfaceLook, VolumeLook
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
+
+LEAP_SHAPE = (185, 193, 17)
+"""Voxels (k, j, i) of 46 x 48 x 4 bricks: four rows of bricks a work-item are more than 500."""
+
+BEFORE = 5 * BRICK_CELLS
+"""Slices before the first bright one within which a tile may begin: bricks around it, and rays aside of the middle."""
+
+TYPES = ("int16", "uint8", "float32")
+
+
+def _count_cells(voxels: NDArray[Any], take: np.ufunc) -> NDArray[Any]:
+    """Reduce the voxels around the cells of each brick: bricks share the voxels between them."""
+    for axis in range(3):
+        starts = np.arange(0, voxels.shape[axis] - 1, BRICK_CELLS)
+        ends = np.take(voxels, np.minimum(starts + BRICK_CELLS, voxels.shape[axis] - 1), axis=axis)
+        voxels = take(take.reduceat(voxels, starts, axis=axis), ends)
+    return voxels
+
+
+def _spread(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Return the Chebyshev distance of each brick to the nearest that shows, at most `FARTHEST`."""
+    distances = np.where(shown, 0, FARTHEST).astype(np.uint8)
+    for axis in range(3):
+        lines = np.moveaxis(distances, axis, 0)
+        best = lines.copy()
+        for way in range(1, FARTHEST):
+            for one, other in ((np.s_[way:], np.s_[:-way]), (np.s_[:-way], np.s_[way:])):
+                best[one] = np.minimum(best[one], np.maximum(lines[other], way))
+        distances = np.moveaxis(best, 0, axis)
+    return distances
+
+
+def _count_ahead(distances: NDArray[np.uint8], way: MainWay) -> NDArray[np.uint8]:
+    """Return what is free ahead of each brick along the main way, with the bricks beside it that rays drift to."""
+    free = distances.T > 0
+    own = free
+    for axis in {0, 1, 2} - {way.axis}:
+        numbers = np.arange(free.shape[axis])
+        offset = np.float32(0.5) + numbers - way.eye[axis] if way.eye[3] else np.full(len(numbers), way.eye[axis])
+        drift = np.where(np.abs(offset) <= way.aside, 0, np.sign(offset)).astype(int)
+        own = own & np.take(own, np.clip(numbers + drift, 0, len(numbers) - 1), axis=axis)
+    lines = np.moveaxis(own, way.axis, 0)
+    counts, count = np.zeros(lines.shape, np.uint8), np.full(lines.shape[1:], FARTHEST)
+    for n in range(len(lines))[:: -way.ahead]:
+        count = np.where(lines[n], np.minimum(count + 1, FARTHEST), 0)
+        counts[n] = count
+    return np.moveaxis(counts, 0, way.axis).T
+
+
+def _open(device: Device, volume: Volume) -> tuple[DeviceVolume, RaySlab]:
+    resident = DeviceVolume(volume, device=device)
+    return resident, next(ray_slabs(resident, volume.shape_ijk[2], np.inf, Stopwatch()))
+
+
+def _check_leaps(device: Device) -> str:
+    rng, stopwatch = np.random.default_rng(24), Stopwatch()
+    for dtype in TYPES:
+        voxels = rng.integers(0, 40, LEAP_SHAPE).astype(dtype)
+        for _ in range(60):
+            voxels[tuple(rng.integers(0, LEAP_SHAPE))] = 100
+        resident, slab = _open(device, stack(voxels, np.eye(4)))
+        counts = slab.bricks[::-1]
+        with stopwatch.running(device):
+            ranges = np.empty((*counts, 2), dtype)
+            download(device, ranges, measure_cells(resident, slab, stopwatch))
+            leaps = find_leaps(resident, slab, "key", np.arange(100) > 50, 0.0, 1.0, stopwatch)
+            distances = download(device, np.empty(counts, np.uint8), leaps.distances_d)
+        low, high = _count_cells(voxels, np.minimum), _count_cells(voxels, np.maximum)
+        require_equal(ranges, np.stack([low, high], axis=-1), f"ranges of bricks of {dtype} voxels")
+        expected = _spread(high > 50)
+        require_equal(distances, expected, f"distances of bricks of {dtype} voxels")
+        for eye, aside in (((0.01, -0.5, 0.7, 0.0), 0.02), ((-3.0, 20.0, 10.0, 1.0), 0.5)):
+            for axis in range(3):
+                way = MainWay(axis, 1 if axis else -1, np.array(eye, np.float32), aside)
+                with stopwatch.running(device):
+                    known = LeapMap(upload(device, expected), None)
+                    ways_d = look_ahead(resident, slab, way, known, stopwatch)
+                    ways = download(device, np.empty(counts, np.uint8), ways_d)
+                require_equal(ways >> 4, _count_ahead(expected, way), f"free bricks ahead along axis {axis}")
+                require_equal(ways & FARTHEST, expected, "distances of bricks, copied")
+    return f"{np.prod(counts):,} bricks of {len(TYPES)} types of voxels equal"
+
+
+def _check_tiles(device: Device) -> str:
+    """Look at a stair of bright voxels, straight on: each tile begins before it, at most a few bricks."""
+    nk, nj, ni = 90, 64, 80
+    stair = 30 + np.arange(ni) // 2
+    voxels = np.where(np.arange(nk)[:, None, None] >= stair, 1000, np.zeros((nk, nj, ni))).astype(np.int16)
+    size, distance, stopwatch = (ni * TILE, nj * TILE), 50.0, Stopwatch()
+    for uneven in (False, True):
+        volume = stack(voxels, np.eye(4), uneven)
+        resident, slab = _open(device, volume)
+        middle = np.array([(ni - 1) / 2, (nj - 1) / 2, 0.0])
+        camera = Camera(tuple(middle - (0.0, 0.0, distance)), tuple(middle), (0.0, -1.0, 0.0), parallel_scale=nj / 2)
+        box = volume_box(volume)
+        view = RayView.of(volume, camera, size, 0.5, box=box, focus=box)
+        output = PictureBuffers(device, size, None, False)
+        with stopwatch.running(device):
+            leaps = find_leaps(resident, slab, "key", np.arange(100) > 50, 0.0, 0.1, stopwatch)
+            entries_d = enter_tiles(resident, slab, view, leaps, output, stopwatch)
+            entries = download(device, np.empty((nj, ni), np.float32), entries_d) + view.table[-1, 0]
+        heights = volume.slice_origins()[:, 2]
+        first, last = (heights[np.maximum(stair - n, 0)] + distance for n in (BEFORE, 0))
+
+        allowed = 0.5 * (last - first)
+        what = f"entries of tiles{' of uneven slices' if uneven else ''}"
+        require_close((entries - 0.5 * (first + last)) / allowed, np.zeros_like(entries), 1.0, what)
+    return f"{2 * ni * nj:,} tiles begin up to {BEFORE} slices before the first that shows"
+
+
+LEAP_CHECKS = (
+    Check(
+        "leaps of rays",
+        ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along", "look_ahead"),
+        _check_leaps,
+    ),
+    Check(
+        "entries of tiles",
+        ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along", "enter_tiles"),
+        _check_tiles,
+        {"rays/leaps.cl": ("UNEVEN",), "rays/tiles.cl": ("UNEVEN",)},
+    ),
+)  # fmt: skip
+
+
+SIZE = (96, 60)
+"""Pixels: 720 work-items that take eight rays each."""
+
+PICTURE_SHAPE = (16, 26, 22)
+"""Voxels (k, j, i)."""
+
+COLOR_255 = 2.0
+"""Largest difference of a colour of 8 bits: rounding, and float32 sums."""
+
+DEPTH_MM = 0.01
+"""Largest difference of a depth of 150 mm: sums in float32."""
+
+VALUE_HU = 0.5
+"""Largest difference of a value along a ray: float32 places between voxels that differ by hundreds of HU."""
+
+EDGE_SHARE = 0.01
+"""Pixels that may differ: at edges float32 takes the other side."""
+
+FIXED = Lighting(0.15, 0.7, 0.4, 20.0, direction=(0.4, -1.0, 0.8))
+SOFT = TransferFunction([(-300, 0.9, 0.2, 0.1, 0.0), (200, 1, 0.7, 0.4, 0.15), (900, 1, 1, 0.9, 0.6)])
+STEEP = TransferFunction([(-200, 0.8, 0.1, 0.1, 0), (100, 1, 0.6, 0.3, 0), (130, 1, 0.9, 0.7, 0.9), (800, 1, 1, 1, 1)])
+BY_GRADIENT = TransferFunction(SOFT.points, unit_distance=2.0, gradient_opacity=[(20.0, 0.0), (150.0, 1.0), (600, 0.3)])
+DIM = TransferFunction([(20, 0.9, 0.2, 0.1, 0.0), (90, 1, 0.7, 0.4, 0.2), (130, 1, 1, 0.9, 0.6)])
+"""A transfer function for voxels of 8 bits."""
+
+
+def _premultiplied(image: NDArray[np.uint8]) -> NDArray[np.float64]:
+    opacity = image[..., 3:].astype(np.float64)
+    return np.concatenate([image[..., :3] * (opacity / 255.0), opacity], axis=-1)
+
+
+def _compare(found: Rendering, image: NDArray[Any], depth: NDArray[Any], what: str) -> float:
+    """Compare colours over black and depths, pixel by pixel."""
+    require_whole(found.report)
+    both = np.isfinite(found.depth) & np.isfinite(depth)
+    require_share(np.isfinite(found.depth), np.isfinite(depth), 0.0, EDGE_SHARE, f"hits of {what}")
+    require_share(found.depth[both], depth[both], DEPTH_MM, 2.0 * EDGE_SHARE, f"depths of {what}, in mm")
+    away = np.abs(_premultiplied(found.image) - image).max(axis=-1)
+    return require_share(away, np.zeros_like(away), COLOR_255, EDGE_SHARE, f"colours of {what}, of 255")
+
+
+def _cut(volume: Volume) -> Clip:
+    centre = centre_of(volume)
+    return Clip.box(centre - 5.0, centre + (6.0, 7.0, 4.0)) & Clip.plane(centre, (0.5, 0.4, 1.0))
+
+
+def _check_composite(device: Device, scenes: tuple[tuple[str, TransferFunction, bool, dict[str, Any]], ...]) -> str:
+    worst = 0.0
+    for dtype, function, uneven, options in scenes:
+        volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven)
+        lighting, jitter = options.get("lighting", FIXED), options.get("jitter", False)
+        clip = _cut(volume) if options.get("cut") else None
+        camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, options.get("perspective", True))
+        step = options.get("step", 0.5 * min(volume.spacing))
+        style = VolumeLook(function, lighting=lighting, jitter=jitter, clip=clip)
+        found = take_picture(DeviceVolume(volume, device=device), style, camera, SIZE, step)
+        twin = cast_rays(volume, function, camera, SIZE, step, lighting, clip, "dvr", jitter)
+        image = 255.0 * np.clip(twin.rgba, 0.0, 1.0)
+        worst = max(worst, _compare(found, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}"))
+    return f"{len(scenes)} pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
+
+
+def _stripes(dtype: str) -> tuple[Volume, LabelMap, Camera]:
+    """Return a block of one HU with labels in stripes of eight columns, and a camera with a pixel for each column."""
+    width, height = SIZE
+    affine, shape = np.diag([0.7, 0.5, 1.1, 1.0]), (height + 4, 10, width)
+    numbers = np.broadcast_to(np.arange(width) // 8 % 4, shape).astype(dtype)
+    volume = Volume(np.full(shape, 100, np.int16), affine)
+    middle = volume.ijk_to_lps([((width - 1) / 2, 4.5, (height + 3) / 2)])[0]
+    scale = 0.35 * height
+    return (
+        volume,
+        LabelMap(numbers, affine),
+        Camera(tuple(middle - (0, 50, 0)), tuple(middle), (0, 0, 1), parallel_scale=scale),
+    )
+
+
+def _check_composite_labels(device: Device) -> str:
+    """Labels scale the opacity of a block of known thickness, and tint it; a pixel is a column of voxels."""
+    grey = TransferFunction([(0, 0.5, 0.5, 0.5, 0.1), (200, 0.5, 0.5, 0.5, 0.1)], unit_distance=2.0)
+    for dtype in ("uint8", "uint16"):
+        volume, labels, camera = _stripes(dtype)
+        style = VolumeLook(
+            grey, lighting=UNSHADED, labels=labels, label_colors={3: "red"}, label_opacity={1: 0.25, 3: 0.5}
+        )
+        found = take_picture(DeviceVolume(volume, device=device), style, camera, SIZE, 0.3)
+        require_whole(found.report)
+        column = np.arange(SIZE[0]) // 8 % 4
+        factor = np.choose(column, (1.0, 0.25, 1.0, 0.5))
+        opacity = 1.0 - (1.0 - 0.1 * factor) ** (10 * 0.5 / grey.unit_distance)
+        tint = np.where((column == 3)[:, None], (0.9, 0.1, 0.1), (0.5, 0.5, 0.5))
+        row = 255.0 * np.concatenate([tint * opacity[:, None], opacity[:, None]], axis=1)
+        inner = (np.arange(SIZE[0]) % 8 > 0) & (np.arange(SIZE[0]) % 8 < 7)
+        away = np.abs(_premultiplied(found.image) - row)[:, inner].max(axis=-1)
+        require_close(away, np.zeros_like(away), COLOR_255, f"colours of labels of type {dtype}, of 255")
+    return f"2 pictures with labels of {SIZE[0]} x {SIZE[1]} pixels as computed"
+
+
+def _check_projections(device: Device, kinds: tuple[str, ...], uneven: bool) -> str:
+    worst = 0.0
+    for kind in kinds:
+        for dtype in ("int16", "float32") if uneven else ("int16", "uint8", "float32"):
+            volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven)
+            clip = _cut(volume) if dtype == "float32" else None
+            camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=dtype != "uint8")
+            step = 0.5 * min(volume.spacing)
+            style = Projection(kind, clip=clip)
+            found = take_picture(DeviceVolume(volume, device=device), style, camera, SIZE, step)
+            twin = cast_rays(volume, None, camera, SIZE, step, None, clip, kind)
+            what = f"{kind} of {dtype} voxels{' of uneven slices' * uneven}"
+            require_whole(found.report)
+            assert found.values is not None
+            worst = max(worst, require_share(found.values, twin.values, VALUE_HU, EDGE_SHARE, what))
+            if kind in ("mip", "minip") and dtype != "uint8":  # 8 bits have several places of one value
+                both = np.isfinite(found.depth) & np.isfinite(twin.depth)
+                require_equal(both.any(), True, f"depths of {what}")
+                require_share(found.depth[both], twin.depth[both], DEPTH_MM, 2.0 * EDGE_SHARE, f"depths of {what}")
+    return f"values of {', '.join(kinds)} within {worst:.1g}"
+
+
+def _check_surfaces(device: Device, uneven: bool) -> str:
+    worst = 0.0
+    for dtype, iso_value, shadows in (("int16", 100.0, False), ("uint8", 75.0, False), ("float32", 100.0, True)):
+        volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven)
+        clip = _cut(volume) if dtype == "float32" else None
+        camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=dtype == "float32")
+        step = 0.5 * min(volume.spacing)
+        style = SurfaceLook(iso_value, color="white", shadows=shadows, lighting=FIXED, clip=clip)
+        found = cast_surface(DeviceVolume(volume, device=device), style, camera, SIZE, step)
+        twin = surface_twin(volume, iso_value, camera, SIZE, step, FIXED, clip, shadows=shadows)
+        image = 255.0 * np.clip(twin.rgba, 0.0, 1.0)
+        worst = max(worst, _compare(found, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}"))
+    return f"3 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
+
+
+def _check_surface_labels(device: Device) -> str:
+    """A block whose labels lie in stripes shows their colours, and what lies behind a translucent one."""
+    for dtype in ("uint8", "uint16"):
+        volume, labels, camera = _stripes(dtype)
+        style = SurfaceLook(
+            50.0, color="white", lighting=Lighting(1.0, 0.0, 0.0), labels=labels,
+            label_colors={1: "red", 2: "blue"}, label_opacity={3: 0.4},
+        )  # fmt: skip
+        found = cast_surface(DeviceVolume(volume, device=device), style, camera, SIZE, 0.2)
+        require_whole(found.report)
+        column = np.arange(SIZE[0]) // 8 % 4
+        colors = 255.0 * np.array([(1, 1, 1, 1), (1, 0, 0, 1), (0, 0, 1, 1), (0.4, 0.4, 0.4, 0.4)])
+        inner = (np.arange(SIZE[0]) % 8 > 1) & (np.arange(SIZE[0]) % 8 < 6)
+        rows = slice(3, SIZE[1] - 3)
+        away = np.abs(_premultiplied(found.image) - colors[column])[rows, inner].max(axis=-1)
+        require_close(away, np.zeros_like(away), COLOR_255, f"colours of labels of type {dtype}, of 255")
+    return f"2 pictures with labels of {SIZE[0]} x {SIZE[1]} pixels as computed"
+
+
+def _check_slices(device: Device) -> str:
+    worst, window = 0.0, (-500.0, 700.0)
+
+    def grey(hu: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.clip((hu - window[0]) / (window[1] - window[0]), 0.0, 1.0)[:, None].repeat(3, axis=1)
+
+    for dtype, uneven in (("int16", False), ("uint8", False), ("float32", True)):
+        volume = blobs(PICTURE_SHAPE, OBLIQUE, dtype, uneven)
+        camera, chosen = look_at(volume, (0.4, 0.8, -0.7), 7.0, perspective=uneven), [1, 4, 7, 12]
+        clip = _cut(volume) if uneven else None
+        style = SlicesInSpace(chosen, opacity=0.4, lowest_hu=-300.0, window=window, clip=clip)
+        found = overlay_slices(DeviceVolume(volume, device=device), style, camera, SIZE)
+        rgba, depth = overlay_twin(
+            volume, camera, SIZE, chosen, 0.4, -300.0, grey, None if clip is None else clip.planes
+        )
+        worst = max(worst, _compare(found, 255.0 * rgba, depth, f"slices of {dtype} voxels"))
+    return f"3 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
+
+
+def _check_points(device: Device) -> str:
+    """Draw a ball of points, with normals and without: each pixel shows the point that the twin finds."""
+    rng, radius, worst = np.random.default_rng(25), 0.6, 0.0
+    normals = rng.normal(size=(3000, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    points, colors = (6.0 * normals).astype(np.float32), rng.integers(0, 256, (3000, 4)).astype(np.uint8)
+    for perspective, own in ((False, None), (True, normals.astype(np.float32))):
+        scale = {"view_angle": 9.0} if perspective else {"parallel_scale": 7.0}
+        camera = Camera((-30.0, -80.0, 25.0), (0.3, 0.2, 0.1), (0.1, 0.2, 1.0), **scale)
+        found = draw_splats(device, points, colors, own, camera, SIZE, radius, lighting=FIXED)
+        require_equal(found.parts, 1, "parts of a cloud of 3,000 points")
+        depth, numbers = find_splats(points, camera, SIZE, radius)
+        apart = round(radius / camera.pixel_mm(SIZE))
+        rgba, far = shade_splats(depth, numbers, colors[:, :3] / 255.0, own, camera, FIXED, apart)
+        require_equal(found.image[..., 3] > 0, numbers >= 0, "pixels with a point")
+        require_close(found.depth, far, DEPTH_MM, "depths of points, in mm")
+        away = np.abs(_premultiplied(found.image) - 255.0 * rgba).max(axis=-1)
+        worst = max(worst, require_close(away, np.zeros_like(away), COLOR_255, "colours of points, of 255"))
+    return f"2 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
+
+
+PREPARED = ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along")
+RENDERED = (*PREPARED, "enter_tiles", "look_ahead", "composite_rays")
+PROJECTED = ("measure_cells", "project_rays")
+TRACED = (*PREPARED, "trace_surface")
+
+
+def _check(name: str, kernels: tuple[str, ...], run: Any, *macros: str, **options: Any) -> Check:
+    """Return a check whose last kernel is built with macros; the kernels before it know only uneven slices."""
+    file = {
+        "composite_rays": "rays/composite.cl",
+        "project_rays": "rays/project.cl",
+        "trace_surface": "rays/surface.cl",
+    }
+    variants = {file[kernels[-1]]: macros} if macros else {}
+    if "UNEVEN" in macros:
+        variants["rays/leaps.cl"] = ("UNEVEN",)
+        if "enter_tiles" in kernels:
+            variants["rays/tiles.cl"] = ("UNEVEN",)
+    return Check(name, kernels, partial(run, **options), variants)
+
+
+PICTURE_CHECKS = (
+    _check(
+        "volume rendering",
+        RENDERED,
+        _check_composite,
+        scenes=(
+            ("int16", SOFT, False, {}),
+            ("uint8", DIM, False, {}),
+            ("float32", SOFT, False, {"cut": True, "jitter": True}),
+        ),
+    ),
+    _check(
+        "gradient opacity",
+        RENDERED,
+        _check_composite,
+        "GRADIENT_OPACITY",
+        scenes=(("int16", BY_GRADIENT, False, {}), ("float32", BY_GRADIENT, False, {})),
+    ),
+    _check(
+        "steep transfer functions",
+        RENDERED,
+        _check_composite,
+        "TAKES_PARTS",
+        scenes=(("int16", STEEP, False, {"step": 0.17}), ("float32", STEEP, False, {"step": 0.17})),
+    ),
+    _check(
+        "volume rendering of uneven slices",
+        RENDERED,
+        _check_composite,
+        "UNEVEN",
+        scenes=(("int16", SOFT, True, {}), ("float32", SOFT, True, {"cut": True})),
+    ),
+    _check("labels in volume rendering", RENDERED, _check_composite_labels, "LABELS"),
+    _check("projections", PROJECTED, _check_projections, kinds=("mip", "minip", "mean"), uneven=False),
+    _check("radiographs", PROJECTED, _check_projections, "LEAST_VALUE", kinds=("drr",), uneven=False),
+    _check(
+        "projections of uneven slices",
+        PROJECTED,
+        _check_projections,
+        "LEAST_VALUE",
+        "UNEVEN",
+        kinds=("mip", "minip", "mean", "drr"),
+        uneven=True,
+    ),
+    _check("surfaces without a mesh", TRACED, _check_surfaces, uneven=False),
+    _check("surfaces of uneven slices", TRACED, _check_surfaces, "UNEVEN", uneven=True),
+    _check("labels on surfaces", TRACED, _check_surface_labels, "LABELS"),
+    Check("slices in space", ("overlay_slices",), _check_slices),
+    Check("points as discs", ("clear_splats", "splat_depths", "splat_numbers", "shade_splats"), _check_points),
+)

@@ -1,0 +1,371 @@
+"""Twin of the raycaster: dvr, mip, minip, mean and drr in plain numpy, in float64, one sample of all rays at a time.
+
+References: Levoy 1988, "Display of surfaces from volume data" (compositing front to back, gradient opacity); Phong
+1975 (shading, see `clrecon.rendering.looks.lighting`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.iso_rule import slice_normal_matrices, takes_parts
+from clrecon.proof.rays.rays import Planes, box_of, find_interval, jitter_pixels, sample_field, voxel_gradients
+from clrecon.rendering import Lighting, TransferFunction
+from clrecon.rendering.looks.lighting import LEAST_SOFT_GRADIENT
+from clrecon.rendering.looks.steepness import DENSE, PARTS, STEEP, Steepness
+from clrecon.rendering.views.camera import Camera
+
+MODES = ("dvr", "mip", "minip", "mean", "drr")
+
+AIR_HU = -1000.0
+"""HU that attenuates nothing; lower values (padding, voxels removed by a mask) count as this."""
+
+TABLE_NODES = 4096
+"""Entries of the table of a transfer function."""
+
+OPAQUE = 0.99
+"""Opacity at which a ray ends."""
+
+VISIBLE = 1.0 / 255.0
+"""Opacity of a ray above which its current sample is the first hit."""
+
+FLAT_GRADIENT = 1e-6
+"""HU per mm; smaller gradients have no direction."""
+
+PART_SLACK = 1e-3
+"""Tolerance as a share of a sample: a step that divides the distance of slice planes up to rounding divides it."""
+
+PLANE_SLACK = 1.0 / 4096.0
+"""Tolerance as a share of a sample: a plane just outside the way of a ray, within rounding, counts as inside."""
+
+
+@dataclass
+class RayPicture:
+    """The results of rays.
+
+    rgba: ndarray, shape (h, w, 4), float64. Colours times opacity, and opacity; zero for modes that show values.
+    depth: ndarray, shape (h, w), float64. First hit, mm along the ray; NaN where nothing is hit.  In mip and minip the
+        first place of the value; NaN in mean and drr.
+    expected_depth: ndarray, shape (h, w), float64. Mean depth, weighted by the opacity that each sample adds; in mip
+        and minip the depth of the value.
+    values: ndarray, shape (h, w), float64. HU in mip, minip and mean, NaN outside of the volume; in drr mm of water, 0
+        there; NaN everywhere in dvr.
+    """
+
+    rgba: Float64Array
+    depth: Float64Array
+    expected_depth: Float64Array
+    values: Float64Array
+
+    def image(self) -> NDArray[np.uint8]:
+        """Red, green, blue, opacity, not premultiplied, as in `clrecon.Rendering.image`: shape (h, w, 4), uint8."""
+        opacity = self.rgba[..., 3:]
+        colour = np.divide(self.rgba[..., :3], opacity, out=np.zeros_like(self.rgba[..., :3]), where=opacity > 0)
+        straight = np.concatenate([colour, opacity], axis=-1)
+        return np.floor(255.0 * np.clip(straight, 0.0, 1.0) + 0.5).astype(np.uint8)
+
+
+class _Rays:
+    """The rays of a picture with their way through a volume."""
+
+    def __init__(self, volume: Volume, camera: Camera, size: Sequence[int], clip: Planes | None):
+        origins, directions = camera.rays(size)
+        self.volume = volume
+        self.origins, self.directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
+        self.count = len(self.origins)
+        nearest = -np.inf if camera.is_parallel else 0.0
+        self.t_in, self.t_out, _ = find_interval(self.origins, self.directions, box_of(volume), clip, nearest)
+        self.last_ijk = np.array(volume.shape_ijk) - 1.0
+
+    def places(self, ray: NDArray[np.int64], t: Float64Array) -> tuple[Float64Array, NDArray[np.bool_]]:
+        """Return index coordinates at t of rays, and which of them lie in their slice (all in an even stack)."""
+        ijk = self.volume.lps_to_ijk(self.origins[ray] + t[:, None] * self.directions[ray])
+        if not self.volume.uneven:
+            return ijk, np.ones(len(ijk), dtype=bool)
+        in_slice = (ijk[:, :2] >= -0.5) & (ijk[:, :2] <= self.last_ijk[:2] + 0.5)
+        return ijk, np.asarray(in_slice.all(axis=1))
+
+
+def cast_rays(
+    volume: Volume,
+    transfer_function: TransferFunction | None,
+    camera: Camera,
+    size: Sequence[int],
+    ray_step: float | None = None,
+    lighting: Lighting | None = None,
+    clip: Planes | None = None,
+    mode: str = "dvr",
+    jitter: bool = False,
+) -> RayPicture:
+    """Send a ray through each pixel.
+
+    The field is trilinear between voxel centres; up to half a voxel beyond the outermost centres it has their values.
+    A ray is divided into segments of `ray_step` from where it enters the volume within the clip planes; the last
+    segment ends where it leaves.  Each segment has a sample in its middle, or with jitter at a place that depends on
+    the pixel alone.  A mean is the integral along the ray divided by its length.  A radiograph is the integral of
+    attenuation relative to water; its field interpolates max(HU, -1000) / 1000 + 1 between voxels.
+
+    transfer_function: For dvr.
+    size: Width and height of the picture.
+    ray_step: Mm; default half the smallest spacing.
+    lighting: None: no shading.
+    mode: {"dvr", "mip", "minip", "mean", "drr"}. Compositing; highest, lowest or mean value along the ray; thickness of
+        water with the same attenuation as the ray.
+    jitter: Only in dvr: extremes have their samples on slice planes, and integrals in the middles of segments.
+    """
+    if mode not in MODES:
+        raise UsageError(f"there is no mode {mode!r}: it is one of {', '.join(MODES)}")
+    step = 0.5 * min(volume.spacing) if ray_step is None else float(ray_step)
+    rays = _Rays(volume, camera, size, clip)
+    width, height = size
+    part = jitter_pixels(width, height).ravel() if jitter else np.full(rays.count, 0.5)
+    if mode == "dvr":
+        if transfer_function is None:
+            raise UsageError("dvr needs a transfer function")
+        found = _composite(rays, transfer_function, lighting, step, part)
+    elif mode in ("mean", "drr"):
+        found = _integrate(rays, step, as_water=mode == "drr")
+    else:
+        found = _find_extreme(rays, step, 1.0 if mode == "mip" else -1.0)
+    shape = (height, width)
+    rgba, depth, expected_depth, values = found
+    return RayPicture(
+        rgba.reshape(*shape, 4), depth.reshape(shape), expected_depth.reshape(shape), values.reshape(shape)
+    )
+
+
+Found = tuple[Float64Array, Float64Array, Float64Array, Float64Array]
+"""rgba (n, 4), depth, expected depth and values (n,)."""
+
+
+def look_up(transfer_function: TransferFunction, hu: Float64Array) -> Float64Array:
+    """Return red, green, blue, opacity (n, 4) as in the device's table, float32 values as float64.
+
+    The nearest of `TABLE_NODES` evenly spaced HU is used, which cover the function's range with both ends.
+    """
+    low, high = transfer_function.range_hu
+    nodes = transfer_function.table(low, high, TABLE_NODES).astype(np.float64)
+    number = np.floor((hu - low) * ((TABLE_NODES - 1) / (high - low)) + 0.5)
+    return np.asarray(nodes[np.clip(number, 0, TABLE_NODES - 1).astype(np.int64)])
+
+
+def shade(
+    colours: Float64Array,
+    gradients: Float64Array,
+    directions: Float64Array,
+    lighting: Lighting,
+    lit: ArrayLike = 1.0,
+    soft_gradient: float = 0.0,
+) -> Float64Array:
+    """Shade colours (n, 3) after Phong with gradients (n, 3) as normals, seen along directions (n, 3).
+
+    Normals are turned towards the camera, and a fixed light only lights surfaces that face it.  A zero gradient has no
+    direction: its colour gets full diffuse light and no highlight.  `lit` 0 means in shadow: only ambient light.  With
+    `soft_gradient` (HU per mm) directions of small gradients count less, see `clrecon.rendering.Lighting`. Colours
+    above 1 become 1.
+    """
+    magnitude = np.linalg.norm(gradients, axis=1)
+    flat = magnitude < FLAT_GRADIENT
+    normals = gradients / np.where(flat, 1.0, magnitude)[:, None]
+    to_camera = -directions
+    to_light = to_camera
+    if lighting.direction is not None:
+        fixed = np.array(lighting.direction, dtype=np.float64)
+        to_light = np.broadcast_to(fixed / np.linalg.norm(fixed), to_camera.shape)
+    half_way = to_light + to_camera
+    length = np.linalg.norm(half_way, axis=1, keepdims=True)
+    half_way = np.divide(half_way, length, out=np.zeros_like(half_way), where=length > 1e-6)
+    along = (normals * to_light).sum(axis=1)
+    faces_light = along * (normals * to_camera).sum(axis=1) > 0.0  # light and camera on the same side
+    diffuse = np.where(flat, 1.0, np.where(faces_light, np.abs(along), 0.0))
+    shine = np.abs((normals * half_way).sum(axis=1)) ** lighting.specular_power
+    highlight = np.where(flat | ~faces_light, 0.0, shine)
+    certain = magnitude**2 / (magnitude**2 + max(soft_gradient, FLAT_GRADIENT) ** 2)
+    diffuse, highlight = 1.0 + certain * (diffuse - 1.0), certain * highlight
+    share = np.broadcast_to(np.asarray(lit, dtype=np.float64), magnitude.shape)
+    light = lighting.ambient + share * lighting.diffuse * diffuse
+    return np.minimum(colours * light[:, None] + (share * lighting.specular * highlight)[:, None], 1.0)
+
+
+def _composite(
+    rays: _Rays, transfer_function: TransferFunction, lighting: Lighting | None, step: float, part: Float64Array
+) -> Found:
+    voxels = rays.volume.voxels
+    gradients = voxel_gradients(voxels, slice_normal_matrices(rays.volume, 0))
+    rgba = np.zeros((rays.count, 4))
+    depth, weighted = np.full(rays.count, np.nan), np.zeros(rays.count)
+    steep = _SteepSegments(rays, transfer_function, step, part)
+    for number, (ray, t, length) in enumerate(_segments(rays, step, part, rgba[:, 3])):
+        ijk, there = rays.places(ray, t)
+        values = sample_field(voxels, ijk)
+        opacity = look_up(transfer_function, values)[:, 3]
+        if steep.is_there:
+            t, values, opacity = steep.take_parts(number, ray, t, length, values, opacity)
+        opacity = np.where(there, opacity, 0.0)
+        seen = opacity > 0.0
+        ray, t, length, opacity = ray[seen], t[seen], length[seen], opacity[seen]
+        colour = look_up(transfer_function, values[seen])[:, :3]
+        ijk, _ = rays.places(ray, t)
+        slope = sample_field(gradients, ijk)
+        opacity = opacity * transfer_function.gradient_factor(np.linalg.norm(slope, axis=1))
+        if lighting is not None:
+            softness = max(lighting.soft_gradient, LEAST_SOFT_GRADIENT)
+            colour = shade(colour, slope, rays.directions[ray], lighting, soft_gradient=softness)
+        opacity = 1.0 - (1.0 - opacity) ** (length / transfer_function.unit_distance)
+        weight = (1.0 - rgba[ray, 3]) * opacity
+        rgba[ray, :3] += weight[:, None] * colour
+        rgba[ray, 3] += weight
+        weighted[ray] += weight * t
+        first = np.isnan(depth[ray]) & (rgba[ray, 3] > VISIBLE)
+        depth[ray[first]] = t[first]
+    any_weight = rgba[:, 3] > 0.0
+    expected = np.divide(weighted, rgba[:, 3], out=np.full(rays.count, np.nan), where=any_weight)
+    return rgba, depth, expected, np.full(rays.count, np.nan)
+
+
+class _SteepSegments:
+    """Divides segments into parts where the transfer function is steep between their sample and the neighbouring ones.
+
+    Values in between come from a parabola through the three samples, limited to the range of the samples.  The parts
+    are blended, and their common colour is lit at their mean visible place.
+    """
+
+    def __init__(self, rays: _Rays, function: TransferFunction, step: float, part: Float64Array):
+        self.rays, self.function, self.step, self.part = rays, function, step, part
+        low, high = function.range_hu
+        self.low, self.scale = low, (TABLE_NODES - 1) / (high - low)
+        table = function.table(low, high, TABLE_NODES)[:, 3].astype(np.float64)
+        self.clear = (1.0 - table) ** (step / function.unit_distance)
+        self.steepness = Steepness.of((1.0 - self.clear).astype(np.float32), self.scale)
+        self.is_there = self.steepness.is_steep and takes_parts(rays.volume, step)
+        shown = np.flatnonzero(self.clear < 1.0)
+        first, end = (int(shown[0]), int(shown[-1]) + 1) if len(shown) else (TABLE_NODES, -1)
+        # Values beyond the first and the last node count as these nodes.
+        self.first = -np.inf if first == 0 else float(first)
+        self.last = np.inf if end == TABLE_NODES else float(end)
+
+    def nodes(self, values: Float64Array) -> NDArray[np.int64]:
+        """Convert values to fractional nodes of the table."""
+        return np.clip(values, 0, TABLE_NODES - 1).astype(np.int64)
+
+    def sample(self, number: float | Float64Array, ray: NDArray[np.int64]) -> Float64Array:
+        """Return values of samples of rays, in nodes; after the last sample its own value."""
+        rays, part = self.rays, self.part[ray]
+        way = rays.t_out[ray] - rays.t_in[ray]
+        last = np.ceil(way / self.step) - 1.0
+        t_last = rays.t_in[ray] + last * self.step + part * (way - last * self.step)
+        t = np.minimum(rays.t_in[ray] + (number + part) * self.step, t_last)
+        ijk, _ = rays.places(ray, t)
+        return (sample_field(rays.volume.voxels, ijk) - self.low) * self.scale + 0.5
+
+    def take_parts(
+        self, number: int, ray: NDArray[np.int64], t: Float64Array, length: Float64Array, values: Float64Array,
+        opacity: Float64Array,
+    ) -> tuple[Float64Array, Float64Array, Float64Array]:  # fmt: skip
+        """Return places, values and opacities of segments `number`, whose samples have `values` and `opacity`."""
+        here, after = (values - self.low) * self.scale + 0.5, self.sample(number + 1, ray)
+        before = self.sample(number - 1 if number else -np.minimum(self.part[ray], 0.5), ray)
+        if number == 0:
+            before = 2.0 * before - here
+        nothing = np.maximum(before, here) < self.first
+        nothing |= np.minimum(before, here) >= self.last
+        front, back = np.where(nothing, 0.0, 0.5 * (before - here)), 0.5 * (after - here)
+        least, most = np.minimum(np.minimum(front, back), 0.0), np.maximum(np.maximum(front, back), 0.0)
+        changes = self.steepness.changes
+        change = changes[self.nodes(here + most)] - changes[self.nodes(here + least)]
+        dense = 1.0 - self.clear[self.nodes(here)] > DENSE
+        steep = (here + most >= self.first) & (here + least < self.last)
+        steep &= ((most - least > self.steepness.narrow) & (change > STEEP)) | dense
+        clear, seen_at, seen_value = np.ones(len(ray)), np.zeros(len(ray)), np.zeros(len(ray))
+        for at in (np.arange(PARTS) + 0.5) / PARTS - 0.5:
+            end = (2.0 if number else 1.0) * front if at < 0.0 else 2.0 * back
+            rise = np.clip(at * (back - front + at * (back + front)), np.minimum(end, 0.0), np.maximum(end, 0.0))
+            behind = clear * self.clear[self.nodes(here + rise)] ** (1.0 / PARTS)
+            seen_at += (clear - behind) * at
+            seen_value += (clear - behind) * (here + rise)
+            clear = behind
+        whole = np.maximum(1.0 - clear, 1e-6)
+        in_parts = (seen_value / whole - 0.5) / self.scale + self.low
+        over_unit = 1.0 - clear ** (self.function.unit_distance / self.step)
+        return (
+            np.where(steep, t + seen_at / whole * length, t),
+            np.where(steep, in_parts, values),
+            np.where(steep, over_unit, opacity),
+        )
+
+
+def _segments(
+    rays: _Rays, step: float, part: Float64Array, opacity: Float64Array
+) -> Iterator[tuple[NDArray[np.int64], Float64Array, Float64Array]]:
+    """Yield segment by segment (ray numbers, t of the sample, length) of the rays that are not opaque yet."""
+    way = rays.t_out - rays.t_in
+    segments = np.where(way > 0.0, np.ceil(way / step), 0.0)
+    for number in range(int(segments.max(initial=0.0))):
+        ray = np.flatnonzero((number < segments) & (opacity < OPAQUE))
+        if len(ray) == 0:
+            return
+        start = rays.t_in[ray] + number * step
+        length = np.clip(rays.t_out[ray] - start, 0.0, step)
+        yield ray, start + part[ray] * length, length
+
+
+def _integrate(rays: _Rays, step: float, as_water: bool) -> Found:
+    voxels = rays.volume.voxels
+    if as_water:
+        voxels = np.maximum(voxels.astype(np.float64), AIR_HU) / -AIR_HU + 1.0
+    total, way = np.zeros(rays.count), np.zeros(rays.count)
+    for ray, t, length in _segments(rays, step, np.full(rays.count, 0.5), np.zeros(rays.count)):
+        ijk, there = rays.places(ray, t)
+        total[ray] += np.where(there, length * sample_field(voxels, ijk), 0.0)
+        way[ray] += np.where(there, length, 0.0)
+    mean = np.divide(total, way, out=np.full(rays.count, np.nan), where=way > 0.0)
+    nowhere = np.full(rays.count, np.nan)
+    return np.zeros((rays.count, 4)), nowhere, nowhere.copy(), total if as_water else mean
+
+
+def _find_extreme(rays: _Rays, step: float, sign: float) -> Found:
+    best, depth = np.full(rays.count, -np.inf), np.full(rays.count, np.nan)
+    for ray, t in _plane_samples(rays, step):
+        ijk, there = rays.places(ray, t)
+        values = sign * sample_field(rays.volume.voxels, ijk)
+        better = there & (values > best[ray])
+        best[ray[better]] = values[better]
+        depth[ray[better]] = t[better]
+    values = np.where(np.isnan(depth), np.nan, sign * best)
+    return np.zeros((rays.count, 4)), depth, depth.copy(), values
+
+
+def _plane_samples(rays: _Rays, step: float) -> Iterator[tuple[NDArray[np.int64], Float64Array]]:
+    """Yield sample by sample (ray numbers, t), on all slice planes of the index axis that the ray crosses fastest.
+
+    Between two planes there are additional samples as `step` requires.  Where no sample falls into the way through the
+    volume (a thin space between clip planes), there is one in the middle.  Uneven stacks have samples in the middles of
+    segments, as in other modes.
+    """
+    if rays.volume.uneven:
+        yield from ((ray, t) for ray, t, _ in _segments(rays, step, np.full(rays.count, 0.5), np.zeros(rays.count)))
+        return
+    inverse = np.linalg.inv(rays.volume.affine)
+    rates = rays.directions @ inverse[:3, :3].T
+    axis = np.abs(rates).argmax(axis=1)[:, None]
+    rate = np.take_along_axis(rates, axis, axis=1)[:, 0]
+    start = np.take_along_axis(rays.origins @ inverse[:3, :3].T + inverse[:3, 3], axis, axis=1)[:, 0]
+    parts = np.maximum(np.ceil(1.0 / (np.abs(rate) * step) - PART_SLACK), 1.0)
+    spacing = 1.0 / (np.abs(rate) * parts)
+    t_of_plane_0 = -start / rate
+    valid = rays.t_out > rays.t_in
+    t_in, t_out = np.where(valid, rays.t_in, 0.0), np.where(valid, rays.t_out, -1.0)
+    first = np.ceil((t_in - t_of_plane_0) / spacing - PLANE_SLACK)
+    last = np.floor((t_out - t_of_plane_0) / spacing + PLANE_SLACK)
+    missed = np.flatnonzero(valid & (last < first))
+    yield missed, 0.5 * (t_in + t_out)[missed]
+    for number in range(int((last - first).max(initial=-1.0)) + 1):
+        ray = np.flatnonzero(valid & (first + number <= last))
+        yield ray, t_of_plane_0[ray] + (first[ray] + number) * spacing[ray]

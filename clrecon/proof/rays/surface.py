@@ -1,0 +1,191 @@
+"""Twins of mode surface, the first place of each ray where the closed field reaches an iso value, shaded, and of mode
+slices, slices of a volume in space, blended along the ray of each pixel; in float64.
+
+The closed field is the one that `clrecon.operators.surface.extract` takes its closed mesh from: surrounded by a layer
+of outside, its surface at the level of `clrecon.geometry.iso_rule.IsoRule`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry import Volume
+from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.iso_rule import choose_iso_rule, slice_normal_matrices
+from clrecon.proof.rays.rays import Planes, box_of, find_interval, sample_field, voxel_gradients
+from clrecon.proof.rays.render import RayPicture, shade
+from clrecon.rendering import Lighting
+from clrecon.rendering.views.camera import Camera
+
+HALVINGS = 10
+"""Number of halvings of a step: the hit is then known to 1e-3 of it."""
+
+
+class _ClosedField:
+    """The field surrounded by a layer of outside, at places in LPS."""
+
+    def __init__(self, volume: Volume, iso_value: float):
+        rule = choose_iso_rule(volume, iso_value)
+        voxels = volume.voxels.astype(np.float64)
+        self.volume, self.level, self.outside = volume, rule.iso_level, rule.outside
+        self.closed = np.pad(voxels, 1, constant_values=rule.outside)
+        wider = np.pad(voxels, 2, constant_values=rule.outside)
+        matrices = slice_normal_matrices(volume, 2)
+        self.gradients = voxel_gradients(wider, matrices)[1:-1, 1:-1, 1:-1]
+        self.last = np.array(volume.shape_ijk) - 1.0
+
+    def inside(self, points: Float64Array) -> NDArray[np.bool_]:
+        """Return which LPS points (n, 3) are inside; nothing beyond the layer of outside is."""
+        ijk = self.volume.lps_to_ijk(points)
+        there = ((ijk >= -1.0) & (ijk <= self.last + 1.0)).all(axis=1)
+        return there & (sample_field(self.closed, ijk + 1.0) >= self.level)
+
+    def gradient(self, points: Float64Array) -> Float64Array:
+        return sample_field(self.gradients, self.volume.lps_to_ijk(points) + 1.0)
+
+
+def cast_surface(
+    volume: Volume,
+    iso_value: float,
+    camera: Camera,
+    size: Sequence[int],
+    ray_step: float | None = None,
+    lighting: Lighting | None = None,
+    clip: Planes | None = None,
+    colour: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    shadows: bool = False,
+) -> RayPicture:
+    """Find the surface along the ray of each pixel.
+
+    Samples lie `ray_step` apart from where the ray enters the closed volume, the last where it leaves; between the
+    first inside and the one before it the surface is found by bisection.  A ray that begins inside, behind a clip plane
+    or at a camera inside, has its hit at once: on the clip plane the cap's normal is the plane's, at a camera it is the
+    ray's own direction.
+
+    iso_value: HU.
+    size: Width and height of the picture.
+    ray_step: Mm; default half the smallest spacing.
+    lighting: None: no shading.
+    colour: Red, green, blue of the surface, 0 to 1.
+    shadows: A hit has only ambient light if a ray from it towards a fixed light meets something inside, from one step
+        on and within the clip planes.
+
+    Returns: Both depths are that of the hit; there are no values.
+    """
+    step = 0.5 * min(volume.spacing) if ray_step is None else float(ray_step)
+    field, box = _ClosedField(volume, iso_value), box_of(volume, border=1.0)
+    origins, directions = (rays.reshape(-1, 3) for rays in camera.rays(size))
+    nearest = -np.inf if camera.is_parallel else 0.0
+    t_in, t_out, entered_by = find_interval(origins, directions, box, clip, nearest)
+    hit, at_once = _first_inside(field, origins, directions, t_in, t_out, step)
+    found = np.flatnonzero(~np.isnan(hit))
+    points = origins[found] + hit[found, None] * directions[found]
+    normals = field.gradient(points)
+    for n in np.flatnonzero(at_once[found]):
+        plane = entered_by[found[n]]
+        normals[n] = directions[found[n]] if plane < 0 else clip.planes[plane, :3]  # type: ignore[union-attr]
+    colours = np.broadcast_to(np.array(colour, dtype=np.float64), points.shape)
+    if lighting is not None:
+        lit = np.ones(len(found))
+        if shadows and lighting.direction is not None:
+            light = np.array(lighting.direction, dtype=np.float64)
+            towards = np.broadcast_to(light / np.linalg.norm(light), points.shape)
+            _, far, _ = find_interval(points, towards, box, clip)
+            blocked, _ = _first_inside(field, points, towards, np.full(len(found), step), far, step)
+            lit = np.where(np.isnan(blocked), 1.0, 0.0)
+        colours = shade(colours, normals, directions[found], lighting, lit)
+    rgba = np.zeros((len(origins), 4))
+    rgba[found] = np.column_stack([colours, np.ones(len(found))])
+    width, height = size
+    depth = hit.reshape(height, width)
+    return RayPicture(rgba.reshape(height, width, 4), depth, depth.copy(), np.full((height, width), np.nan))
+
+
+def _first_inside(
+    field: _ClosedField,
+    origins: Float64Array,
+    directions: Float64Array,
+    t_in: Float64Array,
+    t_out: Float64Array,
+    step: float,
+) -> tuple[Float64Array, NDArray[np.bool_]]:
+    """Return where rays are first inside, mm or NaN, and which of them begin inside."""
+    hit = np.full(len(origins), np.nan)
+    at_once = np.zeros(len(origins), dtype=bool)
+    steps = np.where(t_out > t_in, np.ceil((t_out - t_in) / step), -1.0)
+    for number in range(int(steps.max(initial=-1.0)) + 1):
+        ray = np.flatnonzero((number <= steps) & np.isnan(hit))
+        t = np.minimum(t_in[ray] + number * step, t_out[ray])
+        inside = field.inside(origins[ray] + t[:, None] * directions[ray])
+        ray, high = ray[inside], t[inside]
+        low = high if number == 0 else t_in[ray] + (number - 1) * step
+        at_once[ray] = number == 0
+        for _ in range(HALVINGS if number else 0):
+            middle = 0.5 * (low + high)
+            inside = field.inside(origins[ray] + middle[:, None] * directions[ray])
+            low, high = np.where(inside, low, middle), np.where(inside, middle, high)
+        hit[ray] = high
+    return hit, at_once
+
+
+def overlay_slices(
+    volume: Volume,
+    camera: Camera,
+    size: Sequence[int],
+    slices: Sequence[int],
+    opacity: float,
+    lowest_hu: float,
+    colors: Callable[[Float64Array], Float64Array],
+    clip: Float64Array | None = None,
+) -> tuple[Float64Array, Float64Array]:
+    """Find where each ray crosses the planes of slices, from front to back, and blend them.
+
+    size: (width, height)
+    opacity: Opacity of a slice where its value is `lowest_hu` or more; elsewhere it is transparent.
+    colors: Function from HU (n,) to red, green and blue (n, 3).
+    clip: ndarray, shape (n, 4). Half-spaces that are kept: ``normal . p >= offset``.
+
+    Returns:
+    rgba: ndarray, shape (h, w, 4), float64. Premultiplied.
+    depth: ndarray, shape (h, w), float64. Mm to the first visible slice; NaN without one.
+    """
+    width, height = size
+    origins, directions = (rays.reshape(-1, 3) for rays in camera.rays(size))
+    normal = np.cross(volume.affine[:3, 0], volume.affine[:3, 1])
+    starts = volume.slice_origins()[list(slices)]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossings = ((starts[:, None] - origins) @ normal) / (directions @ normal)
+    rgba, depth = np.zeros((len(origins), 4)), np.full(len(origins), np.nan)
+    for order in np.argsort(crossings, axis=0):
+        t = np.take_along_axis(crossings, order[None], axis=0)[0]
+        k = np.asarray(slices)[order]
+        there = np.isfinite(t) & (camera.is_parallel | (t >= 0.0))
+        points = origins + np.where(there, t, 0.0)[:, None] * directions
+        if clip is not None:
+            there &= (points @ clip[:, :3].T >= clip[:, 3]).all(axis=1)
+        value, inside = _read_slices(volume, points, k)
+        there &= inside & (value >= lowest_hu)
+        weight = np.where(there, (1.0 - rgba[:, 3]) * opacity, 0.0)
+        rgba[:, :3] += weight[:, None] * colors(value)
+        rgba[:, 3] += weight
+        depth = np.where(there & np.isnan(depth), t, depth)
+    return rgba.reshape(height, width, 4), depth.reshape(height, width)
+
+
+def _read_slices(volume: Volume, points: Float64Array, k: NDArray[np.int64]) -> tuple[Float64Array, NDArray[np.bool_]]:
+    """Read bilinear values (n,) at points of slices k, and which points are in the slice or half a voxel around it."""
+    ij = (points - volume.slice_origins()[k]) @ np.linalg.pinv(volume.affine[:3, :2]).T
+    last = np.array(volume.shape_ijk[:2]) - 1
+    inside = ((ij >= -0.5) & (ij <= last + 0.5)).all(axis=1)
+    ij = np.clip(ij, 0, last)
+    low = np.minimum(ij.astype(int), np.maximum(last - 1, 0))
+    high = np.minimum(low + 1, last)
+    part_i, part_j = (ij - low).T
+    rows = [
+        volume.voxels[k, j, low[:, 0]] * (1.0 - part_i) + volume.voxels[k, j, high[:, 0]] * part_i
+        for j in (low[:, 1], high[:, 1])
+    ]
+    return rows[0] * (1.0 - part_j) + rows[1] * part_j, inside

@@ -1,0 +1,311 @@
+"""The self-test as a whole: its checks run in processes of their own, so that a driver that crashes or hangs becomes
+words.
+
+The process runs this module.  It writes a line of JSON for each thing that it does: ``{"check": name}`` before a check,
+``{"doing": words}`` before a kernel is built or launched, ``{"warnings": texts}`` of the device after a check, and the
+result of the check as `run_check` returns it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
+from typing import IO, Any
+
+from clrecon.errors import ClreconError, DeviceError
+from clrecon.opencl import Device, list_devices
+from clrecon.proof.checking.check import Check
+from clrecon.proof.filters import filter_checks
+from clrecon.proof.masks import mask_checks
+from clrecon.proof.points import cloud_checks, voxel_checks
+from clrecon.proof.primitives import primitive_checks
+from clrecon.proof.rays import layer_checks, ray_checks
+from clrecon.proof.reformat import sheet_checks
+from clrecon.proof.resident import brick_checks
+from clrecon.proof.surface import decimation_checks, surface_checks
+from clrecon.system.progress import Progress, device_seconds, ignore_progress
+
+CHECKS: tuple[Check, ...] = (
+    *primitive_checks.CHECKS,
+    *brick_checks.CHECKS,
+    *surface_checks.SURFACE_CHECKS,
+    *decimation_checks.CROSSING_CHECKS,
+    *surface_checks.LABEL_CHECKS,
+    *decimation_checks.DISTANCE_CHECKS,
+    *ray_checks.LEAP_CHECKS,
+    *ray_checks.PICTURE_CHECKS,
+    *layer_checks.CHECKS,
+    *sheet_checks.CHECKS,
+    *filter_checks.CHECKS,
+    *cloud_checks.GRID_CHECKS,
+    *voxel_checks.BAND_CHECKS,
+    *mask_checks.CHECKS,
+    *cloud_checks.FIELD_CHECKS,
+    *cloud_checks.FILTER_CHECKS,
+    *cloud_checks.CLUSTER_CHECKS,
+    *voxel_checks.POINT_CHECKS,
+)
+
+
+COMMAND = ("-m", "clrecon.proof.run")
+
+MOST_PROCESSES = 4
+"""Each of them takes a second to begin, and has the twins on a core of its own."""
+
+
+def run_selftest(
+    device: Device, checks: Sequence[Check], *, silent_seconds: float, processes: int | None = None
+) -> Generator[dict[str, Any], None, None]:
+    """Run checks on `device` in processes of their own, side by side, and yield each result at once.
+
+    After a crash the checks that are left to a process run in a new one.  After a hang they count as failed: each of
+    them would take as long.
+
+    silent_seconds: Time without a line after which a process counts as hanging.
+    processes: Default: one for each core of this computer, up to four.
+
+    Yields: As `clrecon.proof.run.run_check`.
+    """
+    many = min(processes or _count_cores(), MOST_PROCESSES, len(checks))
+    if many <= 1:
+        yield from _run_part(device, checks, silent_seconds, [], threading.Event())
+        return
+    told: queue.Queue[dict[str, Any] | BaseException | None] = queue.Queue()
+    children: list[_Child] = []
+    is_over = threading.Event()
+
+    def run(part: Sequence[Check]) -> None:
+        try:
+            for result in _run_part(device, part, silent_seconds, children, is_over):
+                told.put(result)
+        except BaseException as error:  # raised again by the thread that waits
+            told.put(error)
+        told.put(None)
+
+    threads = [threading.Thread(target=run, args=(checks[n::many],), daemon=True) for n in range(many)]
+    try:
+        for thread in threads:
+            thread.start()
+        running = many
+        while running:
+            line = told.get()
+            if isinstance(line, BaseException):
+                raise line
+            if line is None:
+                running -= 1
+            else:
+                yield line
+    finally:
+        is_over.set()
+        for child in children:
+            child.end()
+        for thread in threads:
+            thread.join()
+
+
+def _count_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _run_part(
+    device: Device, checks: Sequence[Check], silent_seconds: float, children: list[_Child], is_over: threading.Event
+) -> Iterator[dict[str, Any]]:
+    """Run checks one after the other; `children` gets each process that is started, until `is_over`."""
+    left = list(checks)
+    while left and not is_over.is_set():
+        with _Child(device, left) as child:
+            children.append(child)
+            if is_over.is_set():  # since it was started
+                return
+            for result in child.results(silent_seconds):
+                left = left[1:]
+                yield result
+            if not left or is_over.is_set():
+                return
+            words = child.describe_end()
+            yield _failed(left[0], words, child.seconds)
+            left = left[1:]
+            if child.hangs:
+                for check in left:
+                    yield _failed(check, "not run: the driver hangs", 0.0)
+                return
+
+
+def _failed(check: Check, detail: str, seconds: float) -> dict[str, Any]:
+    return {"operator": check.name, "passed": False, "detail": detail, "seconds": round(seconds, 3)}
+
+
+class _Child:
+    """The process, and what it said last."""
+
+    def __init__(self, device: Device, checks: Sequence[Check]):
+        self.hangs = False
+        self._device = device
+        self._doing = "its start"
+        self._since = time.perf_counter()
+        self._silent = 0.0
+        if getattr(sys, "frozen", False) or not sys.executable:
+            raise DeviceError("the self-test needs a Python interpreter to start, and this program has none")
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, *COMMAND],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+            )
+        except OSError as error:
+            raise DeviceError(f"no process can be started for the self-test: {error.strerror or error}") from error
+        assert self._process.stdin is not None and self._process.stdout is not None
+        request = {"device": device.index, "checks": [check.name for check in checks]}
+        try:
+            self._process.stdin.write(json.dumps(request).encode())
+            self._process.stdin.close()
+        except OSError:  # it has ended already: `results` tells
+            pass
+        self._lines: queue.Queue[bytes] = queue.Queue()
+        threading.Thread(target=self._read, args=(self._process.stdout,), daemon=True).start()
+
+    def __enter__(self) -> _Child:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def end(self) -> None:
+        """End the process, whatever it does."""
+        self._process.kill()
+        self._process.wait()
+
+    def _read(self, stream: IO[bytes]) -> None:
+        for line in stream:
+            self._lines.put(line)
+        self._lines.put(b"")
+
+    def results(self, silent_seconds: float) -> Iterator[dict[str, Any]]:
+        """Yield results until the process ends or hangs."""
+        while True:
+            try:
+                line = self._lines.get(timeout=silent_seconds)
+            except queue.Empty:
+                self.hangs, self._silent = True, silent_seconds
+                return
+            if not line:
+                self._process.wait()
+                return
+            told = json.loads(line)
+            if "operator" in told:
+                yield told
+            elif "warnings" in told:
+                for text in told["warnings"]:
+                    if text not in self._device.warnings:
+                        self._device.remark(text)
+            elif "check" in told:
+                self._doing, self._since = "the preparation of its data", time.perf_counter()
+            else:
+                self._doing = told["doing"]
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the last check began."""
+        return time.perf_counter() - self._since
+
+    def describe_end(self) -> str:
+        """Describe how the process ended, and in what."""
+        if self.hangs:
+            return f"the driver hangs: nothing for {self._silent:g} s in {self._doing}"
+        code = self._process.returncode
+        if code < 0:
+            name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+            return f"the driver crashed with {name} in {self._doing}"
+        return f"the process of the test ended with exit code {code} in {self._doing}"
+
+
+def run_check(device: Device, check: Check) -> dict[str, Any]:
+    """Run one check.
+
+    Returns: ``operator`` (str: name of the check), ``passed`` (bool), ``detail`` (str: what was compared, or what is
+        wrong) and ``seconds`` (float, kernel builds included).
+    """
+    start = time.perf_counter()
+    try:
+        passed, detail = True, check.run(device)
+    except (ClreconError, ArithmeticError, LookupError, ValueError, MemoryError) as error:
+        # A device that computes wrongly hands sizes and places to the host that lead to any of these.
+        words = str(error) if isinstance(error, ClreconError) else f"{type(error).__name__}: {error}"
+        passed, detail = False, words
+    return {
+        "operator": check.name,
+        "passed": passed,
+        "detail": detail,
+        "seconds": round(time.perf_counter() - start, 3),
+    }
+
+
+def main() -> None:
+    """Run the checks that are named in the JSON object on stdin, on the device that it names by its index."""
+    lines = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
+    os.dup2(2, 1)  # a driver may print
+
+    def tell(**line: Any) -> None:
+        lines.write(json.dumps(line) + "\n")
+
+    request = json.load(sys.stdin)
+    device = list_devices()[request["device"]]
+    device.trace = lambda doing: tell(doing=doing)
+    for check in CHECKS:
+        if check.name in request["checks"]:
+            tell(check=check.name)
+            result = run_check(device, check)
+            if device.known_good is not None:  # after its last result the process may be ended
+                device.known_good.record()
+            tell(warnings=device.warnings)
+            tell(**result)
+
+
+def run_device_selftest(
+    name: str | None = None,
+    *,
+    progress: Progress | None = None,
+    tell: Callable[[dict[str, Any], dict[str, Any]], None] | None = None,
+) -> dict[str, Any]:
+    """Compare every kernel with its twin, in a process of its own.
+
+    name: Device name or index.
+    progress: Called as ``progress("selftest", checks done, all checks)``.
+    tell: Called with the device and each result, as they are returned, as soon as it is there.
+
+    Returns: ``{"device": {...}, "passed": bool, "operators": [{"operator", "passed", "detail", "seconds"}], "warnings":
+        [text]}``.
+    """
+    from clrecon.opencl import choose_unchecked
+
+    progress = progress or ignore_progress
+    device = choose_unchecked(name)
+    results: list[dict[str, Any]] = []
+    progress("selftest", 0, len(CHECKS))
+    for result in run_selftest(device, CHECKS, silent_seconds=min(device_seconds(), threading.TIMEOUT_MAX)):
+        results.append(result)
+        if tell is not None:
+            tell(device.describe(), result)
+        progress("selftest", len(results), len(CHECKS))
+    place = {check.name: n for n, check in enumerate(CHECKS)}
+    results.sort(key=lambda result: place.get(result["operator"], len(place)))  # processes run side by side
+    passed = bool(results) and all(result["passed"] for result in results)
+    return {
+        "device": device.describe(),
+        "passed": passed,
+        "operators": results,
+        "warnings": device.warnings,
+    }
+
+
+if __name__ == "__main__":
+    main()

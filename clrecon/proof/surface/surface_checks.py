@@ -1,0 +1,324 @@
+"""Checks of iso surfaces: every way to mark samples, uneven slices, ranges, the topology of the trilinear field,
+labels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import DeviceError
+from clrecon.geometry import Volume
+from clrecon.geometry.iso_rule import Level
+from clrecon.labels import LabelMap, resample_labels
+from clrecon.labels.enclosed import count_faces
+from clrecon.labels.occupancy import FULL
+from clrecon.labels.solid import find_boxes
+from clrecon.mesh import Mesh
+from clrecon.opencl import Device, Stopwatch, allocate, download, launch, upload
+from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
+from clrecon.operators.surface.label_masks import extract_label_masks, prepare_label_masks, survey_labels
+from clrecon.operators.surface.labels import extract_labels
+from clrecon.operators.surface.seeds import AUTO, AUTO_SHARE
+from clrecon.proof.checking.check import Check, require_close, require_equal, require_whole
+from clrecon.proof.checking.scenes import MIRRORED, OBLIQUE, WIDE, noise, random_integers, stack, waves
+from clrecon.proof.surface import growing as growing_twin
+from clrecon.proof.surface import labels as label_twin
+from clrecon.proof.surface import labels as mask_twin
+from clrecon.proof.surface.extract import Surface
+from clrecon.proof.surface.extract import extract_isosurface as extract_twin
+
+VERTEX_TOLERANCE_VOXEL = 1e-4
+"""Largest difference of device (float32) and twin (float64), in units of the smallest voxel edge."""
+
+NORMAL_TOLERANCE = 2e-4
+"""Largest difference of unit vectors: near a saddle a gradient is a small difference of float32."""
+
+MARCHING = ("count_rows", "total_counts", "list_words", "emit_vertices", "emit_triangles")
+"""Kernels that every surface launches."""
+
+LONG = (532, 2, 6)
+"""Voxels (k, j, i) of more than 500 slices: one of the kernels works slice by slice."""
+
+LONG_THIN = (520, 7, 34)
+"""Voxels (k, j, i) of an open volume of many thin slices, whose ends are a large part of it."""
+
+
+def compare_mesh(volume: Volume, mesh: Mesh, expected: Surface, what: str) -> float:
+    """Refuse a mesh that is not its twin; return the largest distance of a vertex, in voxel edges."""
+    vertices, normals, triangles = expected
+    require_whole(mesh.report)
+    require_equal(mesh.triangles, triangles, f"triangles of {what}")
+    scale = 1.0 / min(volume.spacing)
+    allowed = VERTEX_TOLERANCE_VOXEL
+    away = require_close(scale * mesh.vertices, scale * vertices, allowed, f"vertices of {what}, in voxels")
+    assert mesh.normals is not None
+    require_close(mesh.normals, normals, NORMAL_TOLERANCE, f"normals of {what}")
+    return away
+
+
+def _compare(device: Device, volume: Volume, levels: tuple[Level, ...], what: str, **options: Any) -> float:
+    """Compare surfaces of a volume one after the other: from the second on, bricks of the volume are known."""
+    worst = 0.0
+    with SurfaceExtractor(volume, device=device) as extractor:
+        for number, level in enumerate(levels):
+            mesh = extractor.extract(level, **options)
+            words = f"{what}, surface {number + 1}" if len(levels) > 1 else what
+            worst = max(worst, compare_mesh(volume, mesh, extract_twin(volume, level, **options), words))
+    return worst
+
+
+def _check_first_and_second(device: Device) -> str:
+    worst = 0.0
+    for dtype, affine, closed in (("int16", OBLIQUE, True), ("float32", MIRRORED, False)):
+        volume = stack(waves(WIDE, dtype, -500.0, 500.0), affine)
+        worst = max(worst, _compare(device, volume, (30.5, -80.0), f"{dtype} voxels", closed=closed))
+    return f"4 surfaces: triangles equal, vertices within {worst:.1e} voxel"
+
+
+def _check_types(device: Device) -> str:
+    worst = 0.0
+    for dtype in ("int8", "uint8", "uint16", "int32"):
+        volume = stack(waves((130, 44, 7), dtype), OBLIQUE)
+        worst = max(worst, _compare(device, volume, (40.5, 61.0), f"{dtype} voxels"))
+    return f"8 surfaces of 4 types: triangles equal, vertices within {worst:.1e} voxel"
+
+
+def _check_variant(
+    device: Device, make: Callable[[tuple[int, int, int], str], NDArray[Any]], shape: tuple[int, int, int],
+    level: Level, uneven: bool = False, types: tuple[str, ...] = ("int16", "float32"), **options: Any,
+) -> str:  # fmt: skip
+    worst = 0.0
+    for dtype in types:
+        volume = stack(make(shape, dtype), OBLIQUE, uneven)
+        worst = max(worst, _compare(device, volume, (level,), f"{dtype} voxels", **options))
+    return f"{len(types)} surfaces: triangles equal, vertices within {worst:.1e} voxel"
+
+
+GROWING = (
+    "find_cell_runs",
+    "begin_cell_runs",
+    "join_cell_runs",
+    "find_run_roots",
+    "sum_components",
+    "mark_grown",
+    "count_visited",
+)
+"""Kernels that every grown surface launches, beside those that choose components."""
+
+
+class _GrownTwin:
+    """Cells of components that the twin takes, and what it counts."""
+
+    def __init__(self, marked: NDArray[Any] | None):
+        self.marked = marked
+        self.counts: dict[str, int] = {}
+        self.components = 0
+
+    def __call__(self, inside: NDArray[Any]) -> NDArray[Any]:
+        count, numbers = growing_twin.label_cells(inside)
+        self.components = count
+        if self.marked is None:
+            chosen = growing_twin.choose_largest(np.bincount(numbers[numbers >= 0], minlength=count), AUTO_SHARE)
+        else:
+            chosen = growing_twin.find_seeded(inside, self.marked, numbers, count)
+        cells = chosen[numbers] & (numbers >= 0)
+        active, visited = int((numbers >= 0).sum()), growing_twin.count_visited(cells)
+        self.counts = {"active": active, "all": cells.size, "grown": int(cells.sum()), "visited": visited}
+        return np.asarray(cells)
+
+
+def _grains() -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return grains of one voxel, many before the only large one, and a mark in the one at an edge of the volume.
+
+    Each grain has four runs of cells, that at the edge one, in row 10: the large grain begins with run 521.
+    """
+    voxels, marked = np.zeros((24, 12, 40), np.int16), np.zeros((24, 12, 40), bool)
+    places = [(k, j, i) for k in (2, 5, 8, 11) for j in (2, 5, 8) for i in range(2, 38, 3)]
+    for place in places[:130]:
+        voxels[place] = 100
+    voxels[14:20, 3:9, 10:16] = 100
+    voxels[0, 11, 5] = 100
+    marked[0, 11, 5] = True
+    return voxels, marked
+
+
+def _check_growing(device: Device) -> str:
+    """Compare parts of surfaces that grow from the largest components, and from the voxels of a label."""
+    worst = 0.0
+    grains, at_edge = _grains()
+    many = np.zeros((14, 12, 160), np.int16)
+    many[2::3, 2:9:3, 2:156:3] = 100
+    most = many > 0
+    most.reshape(-1)[np.flatnonzero(most)[::10]] = False
+    for voxels, closed, marked, by_point in (
+        (noise(WIDE, "int16", 8), True, None, False),
+        (noise(LONG_THIN, "float32", 8), False, noise(LONG_THIN, "uint8", 40) == 38, False),  # whose HU are 7
+        (grains, False, None, False),
+        (grains, False, at_edge, False),
+        (many, False, most, True),
+    ):
+        volume = stack(voxels, OBLIQUE)
+        twin = _GrownTwin(marked)
+        expected = extract_twin(volume, 6.5, closed=closed, grown=twin)
+        seeds: Any = AUTO
+        if marked is not None:
+            seeds = LabelMap(marked.astype(np.uint8), volume.affine), 1
+        if by_point:
+            seeds = volume.ijk_to_lps(np.argwhere(most)[:, ::-1])
+        mesh = extract_isosurface(volume, 6.5, device=device, closed=closed, grow_from=seeds)
+        worst = max(worst, compare_mesh(volume, mesh, expected, f"a part in {voxels.dtype} voxels"))
+        require_equal([mesh.report["cells"][name] for name in twin.counts], list(twin.counts.values()), "cells")
+        require_equal(mesh.report["growing"]["components"], twin.components, "components")
+    return f"5 parts of surfaces: triangles and counts of cells equal, vertices within {worst:.1e} voxel"
+
+
+TRILINEAR = ("count_cells", "make_room", "emit_cell_triangles", "emit_cell_vertices")
+
+SURFACE_CHECKS = (
+    Check(
+        "extract_isosurface",
+        ("classify_samples", "classify_bricks", *MARCHING),
+        _check_first_and_second,
+    ),
+    Check("types of voxels", ("classify_samples", "classify_bricks", *MARCHING), _check_types),
+    Check(
+        "uneven slices",
+        ("classify_samples", *MARCHING),
+        partial(_check_variant, make=waves, shape=WIDE, level=30.0, uneven=True),
+        {"surface/marching_cubes.cl": ("UNEVEN",)},
+    ),
+    Check(
+        "ranges",
+        ("classify_samples", *MARCHING),
+        partial(_check_variant, make=waves, shape=WIDE, level=(30.0, 60.0)),
+        {"masks/classify.cl": ("RANGE",), "surface/marching_cubes.cl": ("RANGE",)},
+    ),
+    Check(
+        "below a level",
+        ("classify_samples", *MARCHING),
+        partial(_check_variant, make=waves, shape=WIDE, level=30.0, below=True),
+        {"masks/classify.cl": ("BORDER_INSIDE",)},
+    ),
+    Check(
+        "growing",
+        (*MARCHING, *GROWING, "find_largest", "choose_largest", "choose_cells", "choose_seeded"),
+        _check_growing,
+        {"surface/cells.cl": ("GROWN",), "surface/marching_cubes.cl": ("GROWN",)},
+    ),
+    Check(
+        "golden sections",
+        MARCHING,
+        partial(_check_variant, make=waves, shape=WIDE, level=30.0, types=("int16",), vertex_rule="golden"),
+        {"surface/marching_cubes.cl": ("GOLDEN",)},
+    ),
+    Check(
+        "search by golden sections",
+        MARCHING,
+        partial(_check_variant, make=waves, shape=WIDE, level=30.0, types=("int16",), vertex_rule="golden-search"),
+        {"surface/marching_cubes.cl": ("GOLDEN_SEARCH",)},
+    ),
+    Check(
+        "trilinear topology",
+        ("classify_samples", *(kernel for kernel in MARCHING if kernel != "emit_triangles"), *TRILINEAR),
+        partial(_check_variant, make=noise, shape=LONG, level=2.5, topology="trilinear"),
+    ),
+)  # fmt: skip
+
+
+SUMS = 700
+"""Sums of volumes that are compared, with 16 triangles each."""
+
+
+def _blocks(dtype: str, numbers: tuple[int, ...]) -> NDArray[Any]:
+    """Return a map of blocks of labels in every word of a row, with voxels of none between them."""
+    coarse = np.random.default_rng(22).choice(np.array(numbers), [-(-n // 5) for n in WIDE])
+    blocks = coarse.repeat(5, 0).repeat(5, 1).repeat(5, 2)[: WIDE[0], : WIDE[1], : WIDE[2]]
+    return np.asarray(blocks.astype(dtype))
+
+
+def _check_labels(device: Device) -> str:
+    """Compare one label that fills most of the volume, and one that grows into what has none."""
+    worst = 0.0
+    for dtype, label_dtype, uneven, closed, solid in (
+        ("int16", "uint8", False, True, True),
+        ("float32", "uint16", True, False, False),
+    ):
+        volume = stack(waves(WIDE, dtype), OBLIQUE, uneven)
+        big = 2 if label_dtype == "uint8" else 300
+        numbers = _blocks(label_dtype, (big, big, big, big, big, big, 0))
+        label_map = LabelMap(numbers, volume.affine)
+        taken = resample_labels(label_map, volume).voxels
+        inside = label_twin.find_solid(volume, taken, 30.0, closed=closed, solid=(big,) if solid else ())
+        made = extract_labels(volume, label_map, 30.0, device=device, closed=closed, solid=solid)
+        if list(made) != [big]:
+            raise DeviceError(f"labels {list(made)} have a surface in place of [{big}]")
+        expected = label_twin.extract_label(volume, inside, big, 30.0, closed=closed)
+        worst = max(worst, compare_mesh(volume, made[big], expected, f"label {big} in {dtype} voxels"))
+    return f"2 labels: triangles equal, vertices within {worst:.1e} voxel"
+
+
+def _check_survey(device: Device) -> str:
+    for dtype, high in (("uint8", 256), ("uint16", 720)):
+        numbers = np.pad(random_integers((25, 28, 33), dtype, high).repeat(2, axis=2), 3)  # no box begins at 0
+        boxes, faces = survey_labels(LabelMap(numbers, np.eye(4)), device, None, Stopwatch())
+        present = tuple(int(number) for number in np.unique(numbers) if number)
+        expected = find_boxes(numbers, present, (0, 0, 0))
+        wrong = [number for number in present if boxes.get(number) != expected[number]]
+        if wrong or len(boxes) != len(present):
+            raise DeviceError(f"boxes of labels: {len(wrong)} of {len(present)} differ, label {wrong[0]} first")
+        require_equal(faces, count_faces(numbers), f"faces of labels of type {dtype}")
+    return "boxes and faces of 974 labels equal"
+
+
+def _check_masks(device: Device) -> str:
+    """Compare the surface of a label's own mask at one level: open, so that the level is not sought."""
+    worst = 0.0
+    for dtype in ("uint8", "uint16"):
+        wave = waves(WIDE, "float32") > 40.0
+        numbers = np.where(wave, 3, np.where(noise(WIDE, "uint8", 9) == 0, 5, 0)).astype(dtype)
+        mesh = extract_label_masks(LabelMap(numbers, OBLIQUE), device=device, numbers=[3], closed=False)[3]
+        level = round(mesh.report["mask_level"] * FULL)
+        expected = mask_twin.extract_label_mask(numbers, OBLIQUE, 3, level, closed=False)
+        worst = max(worst, compare_mesh(stack(numbers, OBLIQUE), mesh, expected, f"a mask of type {dtype}"))
+    return f"2 masks: triangles equal, vertices within {worst:.1e} voxel"
+
+
+def _check_volumes(device: Device) -> str:
+    rng = np.random.default_rng(23)
+    positions = rng.uniform(-20.0, 20.0, (900, 3)).astype(np.float32)
+    triangles = rng.integers(0, 900, (16 * SUMS - 5, 3)).astype(np.uint32)
+    sums_d, centre = allocate(device, 4 * SUMS), np.array([1.0, -2.0, 3.0, 0.0], np.float32)
+    launch(
+        device, prepare_label_masks(device)[0]["sum_volumes"], SUMS,
+        positions=upload(device, positions), triangles=upload(device, triangles), sums=sums_d, centre=centre,
+        triangle_count=len(triangles), triangles_per_sum=16,
+    )  # fmt: skip
+    corners = (positions.astype(np.float64) - centre[:3])[triangles]
+    each = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    expected = np.add.reduceat(each, np.arange(0, len(each), 16))
+    found = download(device, np.empty(SUMS, np.float32), sums_d)
+    away = require_close(found, expected, 0.1, "volumes below triangles, in mm3")
+    return f"{SUMS} sums within {away:.1g} of {np.abs(expected).max():,.0f} mm3"
+
+
+LABEL_CHECKS = (
+    Check(
+        "extract_labels",
+        ("own_samples", "classify_label", *MARCHING),
+        _check_labels,
+        {"surface/marching_cubes.cl": ("LABELS", "UNEVEN")},
+    ),
+    Check("survey of labels", ("clear_survey", "find_boxes", "count_faces"), _check_survey),
+    Check(
+        "extract_label_masks",
+        ("clear_survey", "find_boxes", "count_faces", "smooth_rows", "smooth_across", "classify_mask", *MARCHING),
+        _check_masks,
+        {"surface/marching_cubes.cl": ("MASKS",)},
+    ),
+    Check("volumes of masks", ("sum_volumes",), _check_volumes),
+)  # fmt: skip

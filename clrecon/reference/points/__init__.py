@@ -1,1 +1,0 @@
-"""Twins of `clrecon.operators.points`."""

@@ -1,1 +1,0 @@
-"""Twins of `clrecon.operators.surface`, and the derivation of their tables."""

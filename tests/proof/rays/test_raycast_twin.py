@@ -1,0 +1,209 @@
+"""The numpy twin of the raycaster, piece by piece against scipy, analysis and sums written out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tolerances
+from raycast_scenes import STEPS, centre_of, even_volume, look, uneven_volume
+from scipy.ndimage import map_coordinates
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.iso_rule import slice_normal_matrices
+from clrecon.proof.rays.rays import box_of, find_interval, hash_pixels, jitter_pixels, sample_field, voxel_gradients
+from clrecon.proof.rays.render import TABLE_NODES, cast_rays, look_up, shade
+from clrecon.rendering import Lighting, TransferFunction
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
+
+SLOPE = np.array([3.0, -2.0, 5.0])
+
+
+@pytest.mark.parametrize("shape", [(5, 6, 7), (1, 4, 3), (1, 1, 1), (2, 1, 5)])
+def test_the_field_is_that_of_scipy(shape):
+    rng = np.random.default_rng(3)
+    voxels = rng.integers(-1000, 2000, shape).astype(np.int16)
+    ijk = rng.uniform(-1.5, np.array(shape[::-1]) + 0.5, (500, 3))
+    expected = map_coordinates(voxels.astype(np.float64), ijk.T[::-1], order=1, mode="nearest")
+    assert np.abs(sample_field(voxels, ijk) - expected).max() <= tolerances.TRILINEAR * 1000
+    assert np.array_equal(sample_field(voxels, np.argwhere(voxels > -9999)[:, ::-1].astype(float)), voxels.ravel())
+
+
+@pytest.mark.parametrize("steps", [*STEPS, "uneven"])
+def test_gradients_of_linear_fields_are_exact(steps):
+    field = lambda p: p @ SLOPE  # noqa: E731
+    volume = uneven_volume(field, (9, 8), (1.0, 0.4, 1.9, 1.0)) if steps == "uneven" else even_volume(field, steps, 9.0)
+    volume = volume.with_voxels(volume.voxels.astype(np.float32))
+    gradients = voxel_gradients(volume.voxels, slice_normal_matrices(volume, 0))
+    assert np.abs(gradients[1:-1, 1:-1, 1:-1] - SLOPE).max() <= 1e-4
+    flat = voxel_gradients(volume.voxels[:, :, :1], slice_normal_matrices(volume, 0))
+    assert np.isfinite(flat).all()
+
+
+def test_gradients_at_the_border_are_half_a_step_to_the_inside():
+    voxels = np.array([[[1.0, 4.0, 9.0]]])
+    gradients = voxel_gradients(voxels, np.eye(3)[None])
+    assert np.array_equal(gradients[0, 0, :, 0], [1.5, 4.0, 2.5])
+    assert not gradients[..., 1:].any()
+
+
+@pytest.mark.parametrize("steps", [*STEPS, "uneven"])
+def test_intervals_end_where_the_indices_do(steps):
+    field = lambda p: p[:, 0]  # noqa: E731
+    volume = uneven_volume(field, (20, 18), noise=0.0) if steps == "uneven" else even_volume(field, steps, 12.0)
+    rng = np.random.default_rng(4)
+    origins = centre_of(volume) + rng.uniform(-10.0, 10.0, (200, 3))
+    directions = rng.normal(size=(200, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    t_in, t_out, _ = find_interval(origins, directions, box_of(volume))
+    t = np.linspace(-60.0, 60.0, 1001)
+    points = origins[:, None] + t[:, None] * directions[:, None]
+    ijk = volume.lps_to_ijk(points.reshape(-1, 3)).reshape(*points.shape)
+    there = np.asarray(((ijk >= -0.5) & (ijk <= np.array(volume.shape_ijk) - 0.5)).all(axis=-1))
+    within = (t >= t_in[:, None]) & (t <= t_out[:, None])
+    assert 0.01 < there.mean() and there.any(axis=1).mean() < 0.9
+    if steps == "uneven":  # its box is the smallest around all slices
+        assert within[there].all() and there.sum() > 0.3 * within.sum()
+    else:
+        assert np.array_equal(within, there)
+
+
+def test_a_ray_that_enters_through_a_clip_plane_says_so():
+    volume = even_volume(lambda p: p[:, 0], "even", 12.0)
+    centre = centre_of(volume)
+    clip = Clip.plane(centre, (0, 0, 1.0)) & Clip.plane(centre, (0, 1.0, 0))
+    origins = centre + np.array([(0.0, -50.0, 3.0), (0.0, 50.0, 3.0), (0.0, -50.0, -3.0)])
+    directions = np.array([(0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)])
+    t_in, t_out, entered_by = find_interval(origins, directions, box_of(volume), clip)
+    assert entered_by.tolist()[:2] == [1, -1]
+    assert np.abs(t_in[:2] - (50.0, 50.0 - 6.3)).max() < 1e-9 and t_out[2] < t_in[2]
+
+
+def test_the_table_has_the_values_of_its_nodes_and_exact_ends():
+    ramp = TransferFunction([(-1000, 0, 0.5, 1, 0.0), (3000, 1, 0.5, 0, 0.8)])
+    width = 4000 / (TABLE_NODES - 1)
+    hu = np.array([-2000.0, -1000.0, -1000 + 0.4 * width, -1000 + 1.7 * width, 3000 - 0.6 * width, 3000.0, 9000.0])
+    opacity = look_up(ramp, hu)[:, 3] * (TABLE_NODES - 1) / 0.8
+    last = TABLE_NODES - 1
+    assert np.abs(opacity - (0.0, 0.0, 0.0, 2.0, last - 1.0, last, last)).max() < 1e-3
+    step = TransferFunction([(300, 1, 1, 1, 0.0), (300, 1, 1, 1, 0.7), (400, 1, 1, 1, 0.7), (400, 1, 1, 1, 0.1)])
+    assert np.allclose(look_up(step, np.array([-1000.0, 301.0, 399.0, 5000.0]))[:, 3], [0.0, 0.7, 0.7, 0.1])
+
+
+@pytest.mark.parametrize("direction", [None, (0.3, -2.0, 1.0)])
+def test_shading_is_phongs(direction):
+    lighting = Lighting(0.1, 0.6, 0.3, 9.0, direction)
+    rng = np.random.default_rng(8)
+    gradients, directions = rng.normal(size=(2, 20, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    gradients[3] = 0.0
+    colours = rng.uniform(size=(20, 3))
+    shaded = shade(colours, gradients, directions, lighting)
+    for n in range(20):
+        if n == 3:
+            assert np.allclose(shaded[n], colours[n] * 0.7)
+            continue
+        normal = gradients[n] / np.linalg.norm(gradients[n])
+        light = -directions[n] if direction is None else np.array(direction) / np.linalg.norm(direction)
+        half_way = (light - directions[n]) / np.linalg.norm(light - directions[n])
+        normal = normal if normal @ directions[n] < 0.0 else -normal
+        lit = normal @ light > 0.0
+        assert direction is not None or lit
+        expected = colours[n] * (0.1 + 0.6 * lit * (normal @ light)) + 0.3 * lit * abs(normal @ half_way) ** 9
+        assert np.allclose(shaded[n], np.minimum(expected, 1.0))
+
+
+def test_one_ray_is_the_sum_written_out():
+    """Compositing, opacity over a part of a step, gradient opacity, shading and both depths, along a single ray."""
+    rng = np.random.default_rng(9)
+    volume = even_volume(lambda p: rng.uniform(-200.0, 900.0, len(p)), "oblique", 11.0)
+    function = TransferFunction(
+        [(-100, 0.2, 0.4, 0.9, 0.0), (300, 1, 0.6, 0.3, 0.1), (800, 1, 1, 1, 0.5)],
+        unit_distance=1.3,
+        gradient_opacity=[(50.0, 0.2), (600.0, 1.0)],
+    )
+    lighting, step = Lighting(direction=(0.2, -1.0, 0.4)), 0.37
+    camera = look(volume, (0.4, 1.0, 0.2), 4.0, perspective=True)
+    picture = cast_rays(volume, function, camera, (3, 3), step, lighting)
+    origin, direction = (rays[1, 2] for rays in camera.rays((3, 3)))
+    (t_in,), (t_out,), _ = find_interval(origin[None], direction[None], box_of(volume))
+    matrices = slice_normal_matrices(volume, 0)
+    colour, opacity, weighted, depth, start = np.zeros(3), 0.0, 0.0, np.nan, t_in
+    while start < t_out and opacity < 0.99:
+        length = min(step, t_out - start)
+        t = start + 0.5 * length
+        ijk = volume.lps_to_ijk([origin + t * direction])
+        hu = sample_field(volume.voxels, ijk)
+        slope = sample_field(voxel_gradients(volume.voxels, matrices), ijk)
+        *rgb, alpha = look_up(function, hu)[0]
+        alpha *= np.interp(np.linalg.norm(slope), [50.0, 600.0], [0.2, 1.0])
+        alpha = 1.0 - (1.0 - alpha) ** (length / 1.3)
+        weight = (1.0 - opacity) * alpha
+        colour = colour + weight * shade(np.array([rgb]), slope, direction[None], lighting)[0]
+        opacity += weight
+        weighted += weight * t
+        depth = t if np.isnan(depth) and opacity > 1 / 255 else depth
+        start += step
+    assert 0.3 < opacity < 0.99
+    assert np.allclose(picture.rgba[1, 2], [*colour, opacity])
+    assert np.isclose(picture.depth[1, 2], depth) and np.isclose(picture.expected_depth[1, 2], weighted / opacity)
+
+
+def test_a_ray_ends_when_it_is_opaque():
+    volume = even_volume(lambda p: np.where(p[:, 1] < 0.0, 100.0, 900.0), "even", 30.0)
+    wall = TransferFunction([(0, 1, 0, 0, 0.4), (400, 1, 0, 0, 0.4), (400, 0, 1, 0, 1), (1000, 0, 1, 0, 1)])
+    picture = cast_rays(volume, wall, look(volume, (0, 1, 0), 5.0), (4, 4), 0.5)
+    assert (picture.rgba[..., 3] >= 0.99).all() and (picture.rgba[..., 3] < 1.0).all()
+    assert not picture.rgba[..., 1].any()  # nothing of the green wall behind
+
+
+def test_the_default_step_is_half_the_smallest_spacing():
+    volume = even_volume(lambda p: 50.0 * p[:, 1], "anisotropic", 12.0)
+    camera = look(volume, (0.3, 1.0, 0.2), 5.0)
+    default, given = (cast_rays(volume, None, camera, (6, 6), step, mode="mean").values for step in (None, 0.225))
+    assert np.array_equal(default, given)
+
+
+def test_jitter_is_a_hash_of_the_pixel():
+    def mix(bits):  # lowbias32 in whole numbers without end
+        bits = (bits ^ bits >> 16) * 0x7FEB352D % 2**32
+        bits = (bits ^ bits >> 15) * 0x846CA68B % 2**32
+        return bits ^ bits >> 16
+
+    pixels = [(0, 0), (1, 7), (1023, 4095), (65535, 3)]
+    x, y = np.array(pixels).T
+    assert hash_pixels(x, y).tolist() == [mix((a + mix((b + 0x9E3779B9) % 2**32)) % 2**32) for a, b in pixels]
+    part = jitter_pixels(256, 256)
+    assert 0.0 <= part.min() < 1e-3 and 0.999 < part.max() < 1.0
+    assert np.array_equal(part.astype(np.float32), part)
+    assert abs(part.mean() - 0.5) < 4.0 / np.sqrt(12.0) / 256.0
+    centred = part - 0.5
+    for shift in ((0, 1), (1, 0), (1, 1), (0, 2), (16, 0)):  # neighbours know nothing of each other
+        assert abs((centred * np.roll(centred, shift, (0, 1))).mean()) < 4.0 / 12.0 / 256.0
+    assert np.array_equal(part[:50, :60], jitter_pixels(60, 50))
+
+
+def test_jitter_lies_within_each_segment_the_last_one_too():
+    """Thin fog on a ramp along the ray, all samples at part u of their segments: the sum is known."""
+    volume = even_volume(lambda p: p[:, 1], "even", 20.0)
+    camera = look(volume, (0.0, 1.0, 0.0), 4.0)
+    thin = TransferFunction([(-12, 1, 1, 1, 0.0), (12, 1, 1, 1, 0.001)])
+    step, part = 1.7, jitter_pixels(8, 8)
+    opacity = cast_rays(volume, thin, camera, (8, 8), step, jitter=True).rgba[..., 3]
+    way, inner = 0.9 * volume.shape_ijk[1], 0.5 * 0.9 * (volume.shape_ijk[1] - 1)
+    starts = np.arange(0.0, way, step)
+    lengths = np.minimum(step, way - starts)
+    places = np.clip(starts + part[..., None] * lengths - 0.5 * way, -inner, inner)
+    node = np.floor((places + 12.0) / 24.0 * (TABLE_NODES - 1) + 0.5) / (TABLE_NODES - 1)
+    through = ((1.0 - 0.001 * node) ** lengths).prod(axis=-1)
+    assert np.abs(opacity - (1.0 - through)).max() < 1e-7
+
+
+def test_nothing_is_cast_in_a_mode_that_is_not_there():
+    volume = Volume(np.zeros((2, 2, 2), np.int16), np.eye(4))
+    camera = Camera.fit(volume)
+    with pytest.raises(UsageError, match="dvr, mip, minip, mean"):
+        cast_rays(volume, None, camera, (4, 4), mode="xray")
+    with pytest.raises(UsageError, match="transfer function"):
+        cast_rays(volume, None, camera, (4, 4))

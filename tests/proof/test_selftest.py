@@ -1,0 +1,173 @@
+"""The self-test: every check passes and launches what it declares, and a driver that ends badly becomes words."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import re
+import time
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clrecon.errors import DeviceError
+from clrecon.opencl import Device
+from clrecon.opencl.sources import definitions_of
+from clrecon.proof import run
+from clrecon.proof.checking.check import LEAST_ITEMS, Check, require_close, require_equal, require_share
+from clrecon.proof.rays import ray_checks
+from clrecon.proof.run import CHECKS, run_check, run_selftest
+from clrecon.proof.surface import surface_checks
+
+FEW = {"scan_block_sums": 64, "total_counts": 64}
+"""Kernels that are launched over one work-group, whatever the data."""
+
+OF_TYPES = {"VOXEL", "VALUE", "LABEL", "VOXEL_IS_SHORT"}
+OF_DEVICES = {"LANES", "WORDS_PER_ITEM", "HAS_BUILTIN_PREFETCH", "SCAN_GROUP", "CPU_NAME", "ATOMIC_LOADS"}
+
+
+def macros_of(device: Device) -> dict[str, set[str]]:
+    """What programs were built with, beside types and what the device needs."""
+    found: dict[str, set[str]] = {}
+    for file, options in device.programs:
+        switched = {macro for macro, value in definitions_of(options).items() if value != "0"}
+        found.setdefault(file, set()).update(switched - OF_TYPES - OF_DEVICES)
+    return found
+
+
+REMEMBERED: dict[bytes, bytes] = {}
+"""What twins have said, by what they were asked."""
+
+
+def remember(monkeypatch: pytest.MonkeyPatch, module: ModuleType, name: str) -> None:
+    """Ask a slow twin once for all devices: it knows nothing of them.
+
+    One that grows is asked each time: it counts as it takes cells, and that is compared too.
+    """
+    twin = getattr(module, name)
+
+    def ask(*given: Any, **named: Any) -> Any:
+        if named.get("grown") is not None:
+            return twin(*given, **named)
+        question = hashlib.sha256(pickle.dumps((twin.__module__, twin.__qualname__, given, named))).digest()
+        if question not in REMEMBERED:
+            REMEMBERED[question] = pickle.dumps(twin(*given, **named))
+        return pickle.loads(REMEMBERED[question])
+
+    monkeypatch.setattr(module, name, ask)
+
+
+@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.every_device
+def test_row_57_every_check_passes_and_launches_what_it_declares(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So each kernel and each of its variants is compared with its twin on every device, whatever other tests do."""
+    launched: dict[str, int] = {}
+
+    def note(doing: str) -> None:
+        match = re.fullmatch(r"kernel (\w+) \(([\d,]+) items\)", doing)
+        if match is not None:
+            launched[match[1]] = max(launched.get(match[1], 0), int(match[2].replace(",", "")))
+
+    for module, name in ((ray_checks, "cast_rays"), (ray_checks, "surface_twin"), (surface_checks, "extract_twin")):
+        remember(monkeypatch, module, name)
+    monkeypatch.setattr(device, "trace", note)
+    most: dict[str, int] = {}
+    for check in CHECKS:
+        launched.clear()
+        monkeypatch.setattr(device, "programs", {})
+        outcome = run_check(device, check)
+        assert outcome["passed"], outcome
+        assert set(check.kernels) <= set(launched), check.name
+        built = macros_of(device)
+        for file, macros in check.variants.items():
+            assert set(macros) <= built.get(file, set()), (check.name, file)
+        for kernel in check.kernels:
+            most[kernel] = max(most.get(kernel, 0), launched[kernel])
+    assert {kernel for kernel, items in most.items() if items <= LEAST_ITEMS} == set(FEW)
+
+
+def test_row_57_mismatches_are_told() -> None:
+    require_equal([1, 2], [1, 2], "numbers")
+    with pytest.raises(DeviceError, match=r"^numbers: 1 of 2 differ$"):
+        require_equal([1, 3], [1, 2], "numbers")
+    with pytest.raises(DeviceError, match=r"^numbers: 3 elements in place of 2 elements$"):
+        require_equal([1, 3, 4], [1, 2], "numbers")
+    assert require_close([1.0, np.nan], [1.25, np.nan], 0.5, "numbers") == 0.25
+    for found in ([1.0, 2.0], [1.6, np.nan], [np.inf, np.nan]):
+        with pytest.raises(DeviceError, match=r"^numbers: 1 of 2 are off, by up to (inf|0.6) \(0.5 is allowed\)$"):
+            require_close(found, [1.0, np.nan], 0.5, "numbers")
+    assert require_share([0.0] * 99 + [9.0], [0.0] * 100, 1.0, 0.01, "numbers") == 0.0
+    with pytest.raises(DeviceError, match="2 of 100 are off, by up to 9"):
+        require_share([0.0] * 98 + [9.0, 2.0], [0.0] * 100, 1.0, 0.01, "numbers")
+
+
+def check_named(name: str) -> Check:
+    return Check(name, (), lambda device: "")
+
+
+STORY = """
+import json, os, signal, sys, time
+checks = json.load(sys.stdin)["checks"]
+for check in checks:
+    print(json.dumps({"check": check}), flush=True)
+    print(json.dumps({"doing": f"kernel of_{check} (64 items)"}), flush=True)
+    if check == "crash":
+        os.kill(os.getpid(), signal.SIGSEGV)
+    if check == "hang":
+        time.sleep(60)
+    if check == "exit":
+        os._exit(7)
+    print(json.dumps({"warnings": ["a remark of the process"]}), flush=True)
+    print(json.dumps({"operator": check, "passed": True, "detail": "", "seconds": 0.0}), flush=True)
+"""
+
+
+@pytest.fixture
+def storied(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Device:
+    """The device, whose self-test runs `STORY` in the place of checks."""
+    story = tmp_path / "story.py"
+    story.write_text(STORY)
+    monkeypatch.setattr(run, "COMMAND", (str(story),))
+    monkeypatch.setattr(device, "_remarks", [])
+    return device
+
+
+def test_row_57_a_driver_that_crashes_or_hangs_becomes_words(storied: Device) -> None:
+    names = ["first", "crash", "second", "exit", "third", "hang", "last"]
+    outcomes = list(run_selftest(storied, [check_named(name) for name in names], silent_seconds=1.5, processes=1))
+    assert [outcome["operator"] for outcome in outcomes] == names
+    assert [outcome["passed"] for outcome in outcomes] == [True, False, True, False, True, False, False]
+    words = {outcome["operator"]: outcome["detail"] for outcome in outcomes}
+    assert words["crash"] == "the driver crashed with SIGSEGV in kernel of_crash (64 items)"
+    assert words["exit"] == "the process of the test ended with exit code 7 in kernel of_exit (64 items)"
+    assert words["hang"] == "the driver hangs: nothing for 1.5 s in kernel of_hang (64 items)"
+    assert storied.warnings == ["a remark of the process"]
+    assert words["last"] == "not run: the driver hangs"
+
+
+def test_processes_run_side_by_side_and_one_that_hangs_holds_no_other(storied: Device) -> None:
+    names = ["hang", "first", "left", "second", "last", "crash", "fourth", "third"]
+    outcomes = list(run_selftest(storied, [check_named(name) for name in names], silent_seconds=1.5, processes=2))
+    assert {outcome["operator"]: outcome["passed"] for outcome in outcomes} == {
+        "hang": False, "left": False, "last": False, "fourth": False,
+        "first": True, "second": True, "crash": False, "third": True,
+    }  # fmt: skip
+    assert [outcome["operator"] for outcome in outcomes][0] == "first"  # it does not wait for the other process
+    assert sorted(outcome["detail"] for outcome in outcomes if "not run" in outcome["detail"]) == (
+        ["not run: the driver hangs"] * 3
+    )
+
+
+def test_a_caller_that_leaves_ends_all_processes(storied: Device) -> None:
+    names = ["hang", "first", "left", "second"]
+    outcomes = run_selftest(storied, [check_named(name) for name in names], silent_seconds=600.0, processes=2)
+    assert next(outcomes)["operator"] == "first"
+    began = time.perf_counter()
+    outcomes.close()
+    assert time.perf_counter() - began < 20.0
