@@ -65,14 +65,14 @@ from clrecon.operators.surface.methods import extract_by_method as extract_by_me
 from clrecon.operators.vertebrae.inside import VertebraInside as VertebraInside
 from clrecon.operators.vertebrae.inside import vertebra_inside as vertebra_inside
 from clrecon.operators.vertebrae.solid import vertebra_solid as vertebra_solid
-from clrecon.phantom.truth import PhantomTruth as PhantomTruth
-from clrecon.phantom.truth import phantom_truth as phantom_truth
 from clrecon.points import PointCloud as PointCloud
 from clrecon.points import PointStep as PointStep
 from clrecon.points import drop_ghost_slices as drop_ghost_slices
 from clrecon.points import fill_ghost_slices as fill_ghost_slices
 from clrecon.points import keep_clusters as keep_clusters
 from clrecon.points.cloud_reader import read_points as read_points
+from clrecon.proof.phantom.truth import PhantomTruth as PhantomTruth
+from clrecon.proof.phantom.truth import phantom_truth as phantom_truth
 from clrecon.reading import list_series as list_series
 from clrecon.reading import read_volume as read_volume
 from clrecon.reading.grids.write_volume import write_volume as write_volume

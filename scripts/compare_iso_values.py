@@ -162,15 +162,15 @@ def _sphere_distance(kji: Array) -> Array:
 
 def make_spine(settings: dict[str, Any], hu: dict[str, float]) -> tuple[Volume, Array]:
     """Make a spine phantom and, in an array of its shape, the signed distance to the bone of its vertebrae in mm."""
-    from clrecon.phantom import PhantomSettings, add_noise, apply_point_spread, tissue
-    from clrecon.phantom.placement import place_slices
-    from clrecon.phantom.settings import CENTRE_LPS_MM
-    from clrecon.phantom.spine import draw_spine
-    from clrecon.phantom.vertebra import vertebra_distance
+    from clrecon.proof.phantom import PhantomSettings, add_noise, apply_point_spread, spine
+    from clrecon.proof.phantom.series import place_slices
+    from clrecon.proof.phantom.settings import CENTRE_LPS_MM
+    from clrecon.proof.phantom.spine import draw_spine
+    from clrecon.proof.phantom.vertebra import vertebra_distance
 
     chosen = PhantomSettings(**settings)
     affine = place_slices(chosen).affine
-    with mock.patch.dict(vars(tissue), hu):
+    with mock.patch.dict(vars(spine), hu):
         field, anatomy = draw_spine(chosen, affine)
     add_noise(apply_point_spread(field, affine, chosen.point_spread_mm), chosen.noise, 0)
     distance = np.full(field.shape, -50.0, dtype=np.float32)

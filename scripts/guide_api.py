@@ -16,7 +16,7 @@ SUBJECTS = {
     ),
     "surfaces": ("Surfaces", "clrecon.operators.surface clrecon.anatomy.iso_choice"),
     "meshes": ("Meshes: files, smoothing, decimation", "clrecon.mesh"),
-    "measures": ("Measures of meshes", "clrecon.mesh.compare clrecon.phantom"),
+    "measures": ("Measures of meshes", "clrecon.mesh.compare clrecon.proof.phantom"),
     "anatomy": ("Body, table, noise, spine", "clrecon.anatomy"),
     "labels": ("Label maps", "clrecon.labels"),
     "vertebrae": ("Vertebrae", "clrecon.spine clrecon.operators.vertebrae clrecon.spine"),

@@ -16,14 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
-from clrecon.phantom import MATERIALS, PhantomSettings, add_noise, apply_point_spread, label_materials, make_phantom
-from clrecon.phantom import spine as spine_hu
-from clrecon.phantom import tissue as tissue_hu
-from clrecon.phantom.placement import place_slices
-from clrecon.phantom.scene_plans import plan_scene
-from clrecon.phantom.settings import CENTRE_LPS_MM, KINDS
-from clrecon.phantom.spine import label_levels, plan_spine
-from clrecon.phantom.vertebra import local_bounds, vertebra_distance
+from clrecon.proof.phantom import (
+    MATERIALS,
+    PhantomSettings,
+    add_noise,
+    apply_point_spread,
+    label_materials,
+    make_phantom,
+)
+from clrecon.proof.phantom import spine as spine_hu
+from clrecon.proof.phantom import spine as tissue_hu
+from clrecon.proof.phantom.scene_plans import plan_scene
+from clrecon.proof.phantom.series import place_slices
+from clrecon.proof.phantom.settings import CENTRE_LPS_MM, KINDS
+from clrecon.proof.phantom.spine import label_levels, plan_spine
+from clrecon.proof.phantom.vertebra import local_bounds, vertebra_distance
 
 __all__ = [
     "BODIES",

@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.bench.job import run_bench
+    from clrecon.proof.bench import run_bench
 
     result = run_bench(
         options.input,

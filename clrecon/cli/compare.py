@@ -13,8 +13,8 @@ from clrecon.cli.levels import parse_hu
 from clrecon.cli.masking import add_masking
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.reading import add_reading
-from clrecon.jobs.compare.methods import COMPARED
 from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
+from clrecon.proof.compare.methods import COMPARED
 
 PARTLY_DONE = 8
 
@@ -109,8 +109,8 @@ def _parse_names(text: str) -> tuple[str, ...]:
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
     from clrecon.errors import UsageError
-    from clrecon.jobs.compare.job import make_comparison
-    from clrecon.jobs.compare.settings import CompareSettings
+    from clrecon.proof.compare.job import make_comparison
+    from clrecon.proof.compare.methods import CompareSettings
 
     given = {**pick(options, {own.name for own in fields(CompareSettings)}), **options.hu}
     levels = given.get("iso_value")

@@ -96,6 +96,10 @@ def _find_words(command: str, action: argparse.Action) -> list[str]:
         return []
     if isinstance(action.metavar, str) and _WORDS.fullmatch(action.metavar):
         return action.metavar.split("|")
+    if command == "phantom":
+        from clrecon.proof.phantom.settings import KINDS, TABLE_NAMES
+
+        return {"kind": list(KINDS), "table": list(TABLE_NAMES)}.get(action.dest, [])
     return list_words(command, action.dest)
 
 

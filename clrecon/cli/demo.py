@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.demo import DEMO_FOLDER, make_demo
+    from clrecon.proof.demo import DEMO_FOLDER, make_demo
 
     outcome = make_demo(
         options.output or DEMO_FOLDER, options.device, no_clobber=options.no_clobber, progress=console.progress

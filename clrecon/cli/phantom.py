@@ -94,14 +94,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _list_kinds() -> str:
-    from clrecon.jobs.phantom import describe_kinds
+    from clrecon.proof.phantom.job import describe_kinds
 
     return "\n".join(f"  {name:<9} {said}" for name, said in describe_kinds().items())
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.phantom import make_phantom
+    from clrecon.proof.phantom.job import make_phantom
 
     given: dict[str, Any] = {name: getattr(options, name) for name in _SETTINGS}
     truth = make_phantom(options.output, no_clobber=options.no_clobber, progress=console.progress, **given)

@@ -109,7 +109,6 @@ def list_words(command: str, setting: str) -> list[str]:
     command: Name of a command: a preset of pictures is not one of meshes.
     setting: Name of the option's value, such as ``preset``.
     """
-    from clrecon.phantom.settings import KINDS, TABLE_NAMES
     from clrecon.rendering.looks.colors import COLORS
     from clrecon.rendering.looks.presets import PRESETS as LOOKS
     from clrecon.rendering.pictures.modes import MODES
@@ -130,8 +129,6 @@ def list_words(command: str, setting: str) -> list[str]:
         ("compare", "preset"): PRESETS,
         ("mesh", "purpose"): PURPOSES,
         ("mesh", "topology"): ("separated", "trilinear"),
-        ("phantom", "kind"): KINDS,
-        ("phantom", "table"): TABLE_NAMES,
     }
     if setting == "device":
         return ["cpu", "gpu"]

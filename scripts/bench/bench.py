@@ -31,7 +31,7 @@ from results import SCHEMA, load_results, pick, result_key, result_path  # noqa:
 from tables import format_results, markdown, seconds  # noqa: E402
 
 from clrecon.errors import ClreconError, UsageError  # noqa: E402
-from clrecon.jobs.bench.machine import usable_cores  # noqa: E402
+from clrecon.proof.timing import usable_cores  # noqa: E402
 
 QUIET_SHARE = 0.85
 """Smallest share of free cores without a warning that the machine is busy."""

@@ -48,7 +48,7 @@ def first_own(volume: Any, hu: float, device: str, threads: int) -> dict[str, An
 def first_peer(volume: Any, hu: float, device: str, threads: int) -> dict[str, Any]:
     """Seconds of the first ``Update()``, after the imports."""
     from clrecon.geometry.iso_rule import choose_iso_rule
-    from clrecon.jobs.bench.peer import FlyingEdges
+    from clrecon.proof.bench import FlyingEdges
 
     peer = FlyingEdges(volume, threads)
     level = choose_iso_rule(volume, hu, closed=False).iso_level
@@ -117,7 +117,7 @@ def memory_own(volume: Any, hu: float, device: str, threads: int) -> dict[str, A
 def memory_peer(volume: Any, hu: float, device: str, threads: int) -> dict[str, Any]:
     """Measure the resident memory of one run of flying edges; its output is counted as VTK stores it."""
     from clrecon.geometry.iso_rule import choose_iso_rule
-    from clrecon.jobs.bench.peer import FlyingEdges
+    from clrecon.proof.bench import FlyingEdges
 
     FlyingEdges(small_volume(volume), threads).run(49.5)
     peer = FlyingEdges(volume, threads)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.jobs.bench.machine import usable_cores
+from clrecon.proof.timing import usable_cores
 
 __all__ = [
     "active_brick_share",

@@ -64,7 +64,7 @@ class BenchInput:
             return None
         kept = self.work / f"{self.name}-vertebrae.npy"
         if not kept.is_file():
-            from clrecon.phantom import make_phantom
+            from clrecon.proof.phantom import make_phantom
 
             self.work.mkdir(mode=0o700, parents=True, exist_ok=True)
             known = make_phantom(settings)[2]["spine"]["vertebrae"]
@@ -88,7 +88,7 @@ class BenchInput:
             raise UsageError(f"input {self.name} is no CT series: use spineN or a CT folder for this case")
         folder = self.work / f"{self.name}-ct"
         if not (folder / "truth.json").is_file():
-            from clrecon.phantom import write_phantom
+            from clrecon.proof.phantom import write_phantom
 
             print(f"making {self.name} as CT series ...", file=sys.stderr)
             self.work.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -106,7 +106,7 @@ class BenchInput:
         kind, number = _split(self.name)
         settings = _phantom_settings(self.name)
         if settings is not None:
-            from clrecon.phantom import make_phantom
+            from clrecon.proof.phantom import make_phantom
 
             voxels, affine, _ = make_phantom(settings)
             return Volume(voxels // 32 * 32 + 2 if kind == "ties" else voxels, affine)
@@ -134,7 +134,7 @@ def _split(name: str) -> tuple[str, int]:
 
 def _phantom_settings(name: str) -> Any:
     """Return the settings of the spine phantom of a name; None for other inputs."""
-    from clrecon.phantom import PhantomSettings
+    from clrecon.proof.phantom import PhantomSettings
 
     kind, slices = _split(name)
     if kind not in ("spine", "clean", "ties", "thick"):

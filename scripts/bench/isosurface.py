@@ -70,7 +70,7 @@ class PeerSide:
     """Runs of vtkFlyingEdges3D."""
 
     def __init__(self, volume: Any, threads: int):
-        from clrecon.jobs.bench.peer import FlyingEdges
+        from clrecon.proof.bench import FlyingEdges
 
         self._peer = FlyingEdges(volume, threads)
         self._volume = volume

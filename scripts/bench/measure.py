@@ -13,8 +13,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from clrecon.jobs.bench.machine import free_cores, processor_name, usable_cores
-from clrecon.jobs.bench.pairs import alternate, spread, summarise
+from clrecon.proof.timing import alternate, free_cores, processor_name, spread, summarise, usable_cores
 from clrecon.version import package_version
 
 __all__ = [

@@ -37,7 +37,7 @@ class Job:
     peer_threads : int
         Threads of VTK's flying edges.
     limit_s : float
-        Start no further pair after so many seconds; for `clrecon.jobs.bench.pairs.alternate`.
+        Start no further pair after so many seconds; for `clrecon.proof.timing.alternate`.
     pictures : Path or None
         Folder where cases that draw keep what both sides drew.
     """

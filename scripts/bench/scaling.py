@@ -13,7 +13,7 @@ from measure import alternate, spread, summarise
 from numpy.typing import NDArray
 from registry import Job, case
 
-from clrecon.jobs.bench.pairs import FEWEST_PAIRS
+from clrecon.proof.timing import FEWEST_PAIRS
 
 __all__ = ["choose_levels", "choose_slices", "estimate_triangles", "fit_line", "measure_scaling"]
 

@@ -10,7 +10,7 @@ from paper_claims import judge_claims
 from paper_functions import PaperFunction, table_of_functions
 from paper_sets import SETS
 
-from clrecon.jobs.compare.paper import CONTROLS, PAPER
+from clrecon.proof.compare.figures import CONTROLS, PAPER
 
 __all__ = ["make_page"]
 

@@ -11,7 +11,7 @@ from odd_bodies import BODIES, OddBodies
 from clrecon.anatomy.body import mask_field_of_view, remove_table
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
-from clrecon.phantom import MATERIALS, PhantomSettings, label_materials, make_phantom
+from clrecon.proof.phantom import MATERIALS, PhantomSettings, label_materials, make_phantom
 
 SPECIMENS = {"skull", "skull-prone", "bones"}
 

@@ -16,7 +16,7 @@ from clrecon.anatomy.head import find_head, measure_skin, shows_face, warn_of_fa
 from clrecon.cli.main import main
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
-from clrecon.phantom import MATERIALS, PhantomSettings, label_materials, make_phantom, write_phantom
+from clrecon.proof.phantom import MATERIALS, PhantomSettings, label_materials, make_phantom, write_phantom
 
 COARSE: dict[str, Any] = {"size": (96, 96), "slices": 48, "spacing": (2.4, 2.4, 3.5)}
 SAID = "a surface of the skin can show a face: treat the file as one that identifies the patient"

@@ -20,7 +20,7 @@ from clrecon.anatomy import iso_choice
 from clrecon.anatomy.iso_choice import choose_iso_value, half_iso_value
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.phantom import PhantomSettings, make_phantom
+from clrecon.proof.phantom import PhantomSettings, make_phantom
 
 SPINE = {"size": (192, 192), "slices": 40, "spacing": (1.0, 1.0, 1.25)}
 
@@ -168,7 +168,8 @@ def test_lone_voxels_do_not_move_it() -> None:
 
 
 def test_contrast_medium_does_not_move_it(spine_level) -> None:
-    from clrecon.phantom import build, tissue
+    from clrecon.proof.phantom import build
+    from clrecon.proof.phantom import spine as tissue
 
     with mock.patch.object(build, "BLOOD_HU", 300.0), mock.patch.object(tissue, "KIDNEY_HU", 180.0):
         voxels = make_phantom(PhantomSettings(kind="spine", **SPINE))[0]

@@ -9,7 +9,7 @@ from tolerances import NOISE_SHARE
 from clrecon.anatomy.noise import measure_noise
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.phantom import PhantomSettings, make_phantom
+from clrecon.proof.phantom import PhantomSettings, make_phantom
 
 pytestmark = pytest.mark.unit
 

@@ -13,8 +13,8 @@ from clrecon import read_labels, read_volume
 from clrecon.anatomy.spine_line import _best_path, find_spine_line
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
-from clrecon.phantom import PhantomSettings, make_phantom
-from clrecon.phantom.plan import plan_anatomy
+from clrecon.proof.phantom import PhantomSettings, make_phantom
+from clrecon.proof.phantom.spine_plan import plan_anatomy
 from clrecon.rendering.views.centre_line import Curve
 
 SETTINGS = PhantomSettings(size=(160, 144), slices=60, spacing=(1.9, 1.8, 2.5))

@@ -56,7 +56,7 @@ def test_a_failed_device_is_partly_done(
     device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from clrecon.errors import DeviceError
-    from clrecon.jobs.bench import job as bench
+    from clrecon.proof import bench
 
     real = bench._measure_device
     seen: list[Any] = []
@@ -101,6 +101,6 @@ def test_an_input_that_is_not_there(device: Any, tmp_path: Path, capsys: pytest.
 
 
 def test_the_default_of_the_command_is_that_of_the_job() -> None:
-    from clrecon.jobs.bench.job import DEFAULT_RUNS
+    from clrecon.proof.bench import DEFAULT_RUNS
 
     assert command._RUNS == DEFAULT_RUNS

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from volume_files import make_ct, write_metaimage
 
-from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.proof.phantom import PhantomSettings, write_phantom
 from clrecon.system.log import hush, own_streams
 
 CLRECON = [sys.executable, "-m", "clrecon"]

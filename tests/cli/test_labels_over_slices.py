@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from clrecon.cli.main import main
-from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 
 @pytest.fixture(scope="module")

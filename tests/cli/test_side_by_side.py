@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 UNEQUAL = {"seconds", "peak_memory_bytes"}
 

@@ -11,7 +11,7 @@ import pytest
 
 from clrecon.cli import standard_output
 from clrecon.cli.main import main
-from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 
 @pytest.fixture(scope="module")

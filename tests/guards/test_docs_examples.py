@@ -12,7 +12,7 @@ import pytest
 from house import ROOT
 
 import clrecon
-from clrecon.jobs.phantom import make_phantom
+from clrecon.proof.phantom.job import make_phantom
 
 FENCED = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?:^ {4}\S.*\n(?:\n? {4,}\S.*\n)*)", re.MULTILINE)

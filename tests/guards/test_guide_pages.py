@@ -12,7 +12,7 @@ import pytest
 from house import ROOT
 
 from clrecon.cli.main import COMMANDS, main
-from clrecon.jobs.phantom import make_phantom
+from clrecon.proof.phantom.job import make_phantom
 
 GUIDE = ROOT / "docs" / "guide"
 PAGES = [path.relative_to(GUIDE).as_posix() for path in sorted(GUIDE.rglob("*.md"))]

@@ -52,7 +52,7 @@ def test_no_layer_imports_one_that_imports_it() -> None:
         ),
         ("clrecon.geometry.volume", "def f():\n    import clrecon.opencl.select", "may not import clrecon.opencl"),
         ("clrecon.exchange.stl", "from ..reading.dicom import read_volume", "may not import clrecon.reading.dicom"),
-        ("clrecon.phantom.shapes", "from clrecon.mesh import Mesh", "may not import clrecon.mesh"),
+        ("clrecon.mesh.mesh", "from clrecon.proof.phantom import MATERIALS", "may not import clrecon.proof"),
         ("clrecon.operators.surface.extract", "from clrecon import proof", "may not import clrecon.proof"),
         ("clrecon.cli.main", "from clrecon.geometry import Volume", "may not import clrecon.geometry"),
         ("clrecon.mesh.quality", "import scipy.spatial", "scipy at module level"),
@@ -110,8 +110,8 @@ def test_no_module_calls_further_right_but_by_this_list() -> None:
 
 VTK_ELSEWHERE = {
     "clrecon/exchange/vtp.py",  # VTK's own format, written by VTK
-    "clrecon/jobs/bench/peer.py",  # VTK as the peer that is timed
-    "clrecon/jobs/compare/peers.py",  # the same, as peers that are compared
+    "clrecon/proof/bench.py",  # VTK as the peer that is timed
+    "clrecon/proof/compare/makers.py",  # the same, as peers that are compared
 }
 
 

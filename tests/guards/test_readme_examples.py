@@ -14,7 +14,7 @@ from label_files import write_nrrd
 
 import clrecon
 from clrecon.cli.main import main
-from clrecon.jobs.phantom import make_phantom
+from clrecon.proof.phantom.job import make_phantom
 
 SMALLER = {
     '"CT_FOLDER"': '"ct"',

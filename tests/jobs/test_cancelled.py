@@ -20,7 +20,7 @@ from clrecon.jobs.render.job import PictureFiles, make_pictures
 from clrecon.jobs.render.settings import RenderSettings, Turntable
 from clrecon.jobs.run import DeviceOpening
 from clrecon.labels import LabelMap
-from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.proof.phantom import PhantomSettings, write_phantom
 from clrecon.system.progress import Progress
 
 Calls = list[tuple[str, int, int]]

@@ -17,7 +17,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.jobs.corridor import parse_screw, read_screws
 from clrecon.jobs.corridor_results import GIVEN, cylinder_mesh, draw_corridors
-from clrecon.phantom import PhantomSettings, phantom_truth, write_phantom
+from clrecon.proof.phantom import PhantomSettings, phantom_truth, write_phantom
 from clrecon.spine.corridors import Corridor
 from clrecon.spine.frame import VertebraFrame
 from clrecon.spine.measures import Screw

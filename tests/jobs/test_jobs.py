@@ -12,11 +12,11 @@ import tolerances
 from PIL import Image
 
 from clrecon.errors import DeviceError, NoSurfaceError, OutputError, UsageError
-from clrecon.jobs.demo import make_demo
 from clrecon.jobs.devices import survey_devices
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.proof.demo import make_demo
+from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +142,7 @@ def test_demo_without_a_device_or_room_leaves_nothing(
         folder.mkdir()
     with pytest.raises(DeviceError):
         make_demo(folder, "no such device")
-    monkeypatch.setattr("clrecon.jobs.demo._fill", fill_the_disk)
+    monkeypatch.setattr("clrecon.proof.demo._fill", fill_the_disk)
     with pytest.raises(OutputError) as caught:
         make_demo(folder, str(device.index))
     assert str(caught.value) == f"cannot write {folder / 'bone.stl'}: the disk is full"

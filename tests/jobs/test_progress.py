@@ -13,7 +13,7 @@ from sample_meshes import torus
 import clrecon
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
-from clrecon.phantom import PhantomSettings, make_phantom
+from clrecon.proof.phantom import PhantomSettings, make_phantom
 from clrecon.system.progress import Progress
 
 Work = Callable[..., Any]

@@ -12,10 +12,10 @@ from dicom_series import Plan, write_series
 
 from clrecon.cli.main import main
 from clrecon.errors import ClreconError, OutputError, UsageError
-from clrecon.jobs.bench.job import run_bench
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.render.job import PictureFiles, make_pictures
 from clrecon.jobs.render.settings import RenderSettings, Turntable
+from clrecon.proof.bench import run_bench
 from clrecon.system.files import replace_file
 
 DICOM_THERE = "a DICOM file is there, which is never replaced"

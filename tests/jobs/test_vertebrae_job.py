@@ -11,8 +11,8 @@ import pydicom
 import pytest
 
 from clrecon.cli.main import main
-from clrecon.jobs.phantom import make_phantom
 from clrecon.labels import read_labels, resample_labels
+from clrecon.proof.phantom.job import make_phantom
 from clrecon.reading.dicom import read_volume
 
 pytest.importorskip("nibabel")

@@ -80,8 +80,8 @@ def test_row_59_every_command_with_a_device_warns_once(command, device, tmp_path
 def test_row_59_reports_of_other_commands_and_pictures_have_the_warnings(device, monkeypatch):
     from clrecon.geometry import Volume
     from clrecon.jobs import devices
-    from clrecon.jobs.bench import job as bench_job
     from clrecon.operators.reformat.cut import cut_slice
+    from clrecon.proof import bench as bench_job
     from clrecon.proof import run
 
     monkeypatch.setattr(run, "CHECKS", ())
@@ -96,7 +96,7 @@ def test_row_59_reports_of_other_commands_and_pictures_have_the_warnings(device,
 
 @pytest.fixture(scope="module")
 def phantom_folder(shared_folder):
-    from clrecon.jobs.phantom import make_phantom
+    from clrecon.proof.phantom.job import make_phantom
 
     def make(folder):
         make_phantom(folder, kind="sphere", size=(24, 24), slices=24)

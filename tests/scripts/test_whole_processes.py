@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import clrecon
-from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 import marked_tables  # isort: skip
 import whole_processes  # isort: skip

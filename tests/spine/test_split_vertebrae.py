@@ -11,8 +11,8 @@ import pytest
 import clrecon
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import Volume
-from clrecon.phantom import PhantomSettings, make_phantom, phantom_truth
-from clrecon.phantom.spine import label_levels
+from clrecon.proof.phantom import PhantomSettings, make_phantom, phantom_truth
+from clrecon.proof.phantom.spine import label_levels
 from clrecon.spine.regions import CONFIDENT
 
 COARSE: dict[str, Any] = {"size": (112, 112), "spacing": (2.0, 2.0, 2.5)}

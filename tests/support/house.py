@@ -31,7 +31,6 @@ _layer("spine", "errors", "system", "geometry", "anatomy", "labels")
 _layer("mesh", "errors", "system", "geometry", "anatomy", "exchange")
 _layer("points", "errors", "system", "geometry", "exchange")
 _layer("rendering", "errors", "version", "system", "geometry", "labels")
-_layer("phantom", "errors", "version", "system", "geometry")
 _layer("operators", "errors", "system", "opencl", "geometry", "anatomy", "labels", "mesh", "points", "rendering")
 _layer(
     "jobs",
@@ -48,9 +47,7 @@ _layer(
     "mesh",
     "points",
     "rendering",
-    "phantom",
     "operators",
-    "proof",
 )
 _layer(
     "viewer",
@@ -68,7 +65,21 @@ _layer(
     "operators",
     "jobs",
 )
-_layer("proof", "errors", "system", "opencl", "geometry", "labels", "mesh", "points", "rendering", "operators")
+_layer(
+    "proof",
+    "errors",
+    "version",
+    "system",
+    "opencl",
+    "geometry",
+    "reading",
+    "labels",
+    "mesh",
+    "points",
+    "rendering",
+    "operators",
+    "jobs",
+)
 _layer("cli", "errors", "version", "system", "jobs", "viewer", "proof")
 _layer("__main__", "cli")
 _layer(
@@ -85,9 +96,9 @@ _layer(
     "mesh",
     "points",
     "rendering",
-    "phantom",
     "operators",
     "viewer",
+    "proof",
 )
 
 # Third-party packages: at module level (paid by whoever imports the layer), or only inside functions.
@@ -101,12 +112,11 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "points": frozenset({"numpy"}),
     "exchange": frozenset({"numpy"}),
     "rendering": frozenset({"numpy"}),
-    "phantom": frozenset({"numpy", "pydicom"}),
     "opencl": frozenset({"numpy"}),
     "operators": frozenset({"numpy"}),
     "jobs": frozenset({"numpy"}),
     "viewer": frozenset({"numpy"}),
-    "proof": frozenset({"numpy"}),
+    "proof": frozenset({"numpy", "pydicom"}),
     "spine": frozenset({"numpy"}),
 }
 INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
@@ -118,13 +128,12 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification", "trimesh"}),
     "points": frozenset({"pyvista", "open3d"}),
     "rendering": frozenset({"scipy", "PIL", "skimage", "imageio_ffmpeg", "pyvista", "vtk", "vtkmodules"}),
-    "phantom": frozenset({"scipy"}),
     "opencl": frozenset({"pyopencl"}),
     "operators": frozenset({"pyopencl", "SimpleITK", "skimage"}),
-    # vtkmodules: peers of the bench and of the comparison, whose page has plots and pictures.
-    "jobs": frozenset({"pyvista", "skimage", "vtkmodules", "matplotlib", "PIL"}),
+    "jobs": frozenset({"PIL"}),
     "viewer": frozenset({"aiohttp", "PIL", "pyvista", "vtk", "vtkmodules"}),
-    "proof": frozenset({"scipy"}),
+    # vtkmodules: peers of the bench and of the comparison, whose page has plots and pictures.
+    "proof": frozenset({"scipy", "pyvista", "skimage", "vtkmodules", "matplotlib", "PIL"}),
     "cli": frozenset({"rich"}),
     "spine": frozenset({"scipy", "skimage"}),
 }

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.labels import read_labels
-from clrecon.phantom import KINDS, MATERIALS, PhantomSettings, write_phantom
+from clrecon.proof.phantom import KINDS, MATERIALS, PhantomSettings, write_phantom
 from clrecon.reading import read_volume
 
 COARSE = 2.8

@@ -15,7 +15,6 @@ from clrecon.anatomy.iso_choice import half_iso_value
 from clrecon.anatomy.noise import Noise
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
-from clrecon.jobs.compare.settings import CompareSettings
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.labels import LabelMap
@@ -23,8 +22,9 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.compare.cells import GridCells
 from clrecon.operators.points.clusters import Clustering
 from clrecon.operators.points.neighbours import Neighbours
-from clrecon.phantom import PhantomSettings, phantom_truth
 from clrecon.points import PointCloud, PointStep
+from clrecon.proof.compare.methods import CompareSettings
+from clrecon.proof.phantom import PhantomSettings, phantom_truth
 from clrecon.reading.common.source_facts import SeriesEntry, SeriesListing
 from clrecon.rendering import Lighting, Rendering, TransferFunction
 from clrecon.rendering.looks.label_style import LabelStyle

@@ -13,7 +13,7 @@ from house import ROOT
 
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
 from clrecon.labels import read_labels
-from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.proof.phantom import PhantomSettings, write_phantom
 from clrecon.reading import list_series, read_volume
 from clrecon.rendering import load_transfer_function
 from clrecon.rendering.views.centre_line_files import LARGEST_BYTES, read_curve_points
@@ -112,9 +112,9 @@ OWN = {
     "exchange/vtp.py": "what it has just written",
     "__init__.py": "its own list of names",
     "reading/grids/metaimage.py": "what it has just written",
-    "jobs/bench/machine.py": "the system",
-    "jobs/compare/folder.py": "what it has just written",
-    "jobs/compare/template.py": "its own style",
+    "proof/timing.py": "the system",
+    "proof/compare/job.py": "what it has just written",
+    "proof/compare/page.py": "its own style",
     "jobs/run.py": "the system",
     "rendering/movies/frame_folder.py": "new frames",
     "rendering/movies/video.py": "its own temporary files",

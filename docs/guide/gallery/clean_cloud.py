@@ -5,7 +5,7 @@ other and from what lies beside them; the largest is kept, and of it one point i
 """
 
 import clrecon
-from clrecon.phantom import PhantomSettings, make_phantom
+from clrecon.proof.phantom import PhantomSettings, make_phantom
 
 voxels, affine, _ = make_phantom(PhantomSettings(levels="L1-L3", size=(160, 160), spacing=(1.2, 1.2, 1.2)))
 cloud = clrecon.extract_points(clrecon.Volume(voxels, affine), hu=(200, None), kind="shell")

@@ -5,7 +5,7 @@ the phantom; a map of another program is read in the same way.
 """
 
 import clrecon
-from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 write_phantom("spine", PhantomSettings(levels="L1-L3", size=(160, 160), spacing=(1.2, 1.2, 1.2)))
 volume = clrecon.read_volume("spine")

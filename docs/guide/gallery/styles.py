@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 import clrecon
-from clrecon.phantom import PhantomSettings, make_phantom
+from clrecon.proof.phantom import PhantomSettings, make_phantom
 
 voxels, affine, _ = make_phantom(PhantomSettings(levels="L1-L3", size=(160, 160), spacing=(1.2, 1.2, 1.2)))
 size = (320, 240)

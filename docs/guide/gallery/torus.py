@@ -5,7 +5,7 @@ and measured; its true volume is known.
 """
 
 import clrecon
-from clrecon.phantom import PhantomSettings, make_phantom
+from clrecon.proof.phantom import PhantomSettings, make_phantom
 
 settings = PhantomSettings(kind="torus", size=(128, 96), slices=40, spacing=(0.7, 0.5, 1.5), tilt=12.0)
 voxels, affine, truth = make_phantom(settings)

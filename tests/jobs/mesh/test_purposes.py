@@ -15,7 +15,7 @@ from clrecon.cli.main import main
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.refinement import warn_of_print
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings, settings_for
-from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 
 def test_what_is_given_wins() -> None:

@@ -14,7 +14,7 @@ from clrecon.cli.main import main
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 SPACING = (0.5, 0.7, 1.0)
 

@@ -18,7 +18,7 @@ from clrecon.errors import DeviceError, OutputError, RefusedInputError, UsageErr
 from clrecon.jobs.render.job import PictureFiles, make_pictures, name_view, path_of
 from clrecon.jobs.render.picture_taker import read_function
 from clrecon.jobs.render.settings import LabelLook, RenderSettings, Turntable
-from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.proof.phantom import PhantomSettings, write_phantom
 from clrecon.rendering.pictures.styles import Projection, VolumeLook
 
 SIZE = (48, 40)

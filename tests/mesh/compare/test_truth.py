@@ -14,7 +14,7 @@ from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.cells import find_mesh_cells, measure_cells
 from clrecon.mesh.compare.truth import find_cut_cells, measure_truth
-from clrecon.phantom import PhantomSettings, phantom_truth
+from clrecon.proof.phantom import PhantomSettings, phantom_truth
 
 pytestmark = pytest.mark.unit
 

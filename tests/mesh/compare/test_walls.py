@@ -20,7 +20,7 @@ from clrecon.mesh.compare.walls import (
     sample_walls,
 )
 from clrecon.mesh.connectivity import label_components
-from clrecon.phantom import KINDS, PhantomSettings, make_phantom
+from clrecon.proof.phantom import KINDS, PhantomSettings, make_phantom
 from clrecon.proof.surface.extract import extract_isosurface
 
 AFFINE = np.diag((1.0, 1.0, 1.5, 1.0))

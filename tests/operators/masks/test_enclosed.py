@@ -13,7 +13,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.labels.volumes import slice_voxel_ml
 from clrecon.operators.masks import enclosed
-from clrecon.phantom import PhantomSettings, make_phantom
+from clrecon.proof.phantom import PhantomSettings, make_phantom
 
 TILTED = np.array([[0.6, 0.0, 0.0, -20.0], [0.0, 0.6, 0.4, 5.0], [0.0, 0.0, 1.4, 100.0], [0, 0, 0, 1.0]])
 

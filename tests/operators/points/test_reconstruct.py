@@ -9,7 +9,7 @@ from tolerances import FAR_FIELD_MM, MEAN_SPACING
 
 from clrecon import PointCloud, Volume, extract_isosurface, reconstruct_surface
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.phantom import PhantomSettings, make_phantom
+from clrecon.proof.phantom import PhantomSettings, make_phantom
 
 BALL_ML = 4.0 / 3.0 * np.pi * 8.0  # radius 20 mm
 

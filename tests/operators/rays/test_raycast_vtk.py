@@ -49,7 +49,7 @@ def blobs(axes: str) -> Volume:
 
 
 def spine() -> Volume:
-    from clrecon.phantom import PhantomSettings, make_phantom
+    from clrecon.proof.phantom import PhantomSettings, make_phantom
 
     settings = PhantomSettings(kind="spine", size=(160, 160), slices=60, spacing=(0.8, 0.8, 1.2))
     voxels, affine, _ = make_phantom(settings)

@@ -20,7 +20,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
 from clrecon.operators.surface.seeds import AUTO_SHARE
 from clrecon.operators.surface.slabs import SampleGrid
-from clrecon.phantom import PhantomSettings, make_phantom
+from clrecon.proof.phantom import PhantomSettings, make_phantom
 from clrecon.proof.surface.extract import extract_isosurface as extract_twin
 from clrecon.proof.surface.growing import choose_largest, count_visited, grow_cells, label_cells
 

@@ -18,7 +18,7 @@ from clrecon.mesh.compare.mesh_slices import measure_slices
 from clrecon.mesh.compare.truth import measure_truth
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.methods import extract_by_method
-from clrecon.phantom import PhantomSettings, phantom_truth
+from clrecon.proof.phantom import PhantomSettings, phantom_truth
 from clrecon.reading import read_volume
 
 TILTED = np.eye(4)

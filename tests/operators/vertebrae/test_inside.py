@@ -13,11 +13,11 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.operators.vertebrae.inside import PARTS, measure_thickness, name_band
-from clrecon.phantom import PhantomSettings, make_phantom
-from clrecon.phantom.fields import coverage
-from clrecon.phantom.settings import CENTRE_LPS_MM
-from clrecon.phantom.spine import plan_spine
-from clrecon.phantom.vertebra import canal_distance, vertebra_distance
+from clrecon.proof.phantom import PhantomSettings, make_phantom
+from clrecon.proof.phantom.fields import coverage
+from clrecon.proof.phantom.settings import CENTRE_LPS_MM
+from clrecon.proof.phantom.spine import plan_spine
+from clrecon.proof.phantom.vertebra import canal_distance, vertebra_distance
 
 pytestmark = pytest.mark.first_device
 
@@ -38,7 +38,7 @@ def truth_of(volume, affine, name):
     local = (volume.ijk_to_lps(np.stack([i, j, k], axis=1)) - CENTRE_LPS_MM - vertebra.center) @ vertebra.axes.T
     bone = vertebra_distance(vertebra, *local.T)
     arch = coverage(local[:, 1] - (vertebra.depth / 2.0 + 1.0), 6.0)
-    cortex = (bone >= 0) & (bone < 0.75 + 0.65 * arch)  # as clrecon/phantom/spine.py draws it
+    cortex = (bone >= 0) & (bone < 0.75 + 0.65 * arch)  # as clrecon/proof/phantom/spine.py draws it
     canal = canal_distance(vertebra, local[:, 0], local[:, 1]) >= 0
     return cortex.reshape(volume.voxels.shape), canal.reshape(volume.voxels.shape)
 

@@ -10,7 +10,7 @@ from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.operators.vertebrae.solid import vertebra_solid
-from clrecon.phantom import PhantomSettings, make_phantom
+from clrecon.proof.phantom import PhantomSettings, make_phantom
 
 pytestmark = pytest.mark.first_device
 

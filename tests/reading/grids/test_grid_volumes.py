@@ -239,7 +239,7 @@ def test_no_more_than_two_volumes_of_memory(tmp_path, name, kind):
 def test_a_surface_is_the_same_from_every_kind_of_file(tmp_path, device):
     from scipy.spatial import cKDTree
 
-    from clrecon.phantom import PhantomSettings, write_phantom
+    from clrecon.proof.phantom import PhantomSettings, write_phantom
 
     settings = PhantomSettings(kind="torus", size=(48, 44), slices=20, spacing=(0.7, 0.5, 2.5), tilt=12.0)
     write_phantom(tmp_path / "ct", settings)

@@ -1,1 +1,0 @@
-"""The bench job: times of the stages from scan to mesh, beside those of a peer."""

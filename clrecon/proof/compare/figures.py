@@ -1,0 +1,455 @@
+"""Pictures of a comparison: from one camera, slices with the contours of all methods, and those of a paper's table.
+
+Pictures of each method are compared with a slice, by MSE and SSIM, beside pictures of nothing.  Reference: "CPU-GPU
+Rendering of CT Scan Images for Vertebra Reconstruction from CT Scan Images with a Calibration Policy", Table 1 and
+Figures 10 and 11."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import ClreconError
+from clrecon.geometry import Volume
+from clrecon.mesh import Mesh
+from clrecon.operators.rays.mesh_pictures import box_around
+from clrecon.proof.compare.findings import SAME_MM, MethodRecord
+from clrecon.proof.compare.methods import COMPARED
+from clrecon.proof.compare.processes import load_array, load_mesh
+from clrecon.rendering.pictures.likeness import make_control_pictures, measure_pictures
+from clrecon.rendering.views.camera import Camera
+
+WINDOW_HU = (-200.0, 800.0)
+BETWEEN = 0.487
+"""Place of a plane between two slices: on a slice, vertices lie in the plane."""
+
+PIXELS, DETAIL_MM = 560, 24.0
+MARGIN_MM = 8.0
+OVERSAMPLING = 2
+WIDEST, THINNEST = {"whole": 3.4, "detail": 7.0}, {"whole": 1.1, "detail": 1.6}
+"""Pixels of the first line, which lies below, and of the last one: lines at one place are seen as bands."""
+
+Segments = NDArray[np.float64]
+"""Ends of lines in index coordinates across and down the picture, shape (n, 2, 2)."""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane across an axis of the volume.
+
+    axis: Of (i, j, k).
+    at: Index coordinate along it.
+    across, down: The axes that run to the right and down in the picture.
+    flip: The axis `down` runs upward instead.
+    """
+
+    name: str
+    axis: int
+    at: float
+    across: int
+    down: int
+    flip: bool
+
+
+def find_planes(volume: Volume, iso_value: float) -> tuple[list[Plane], NDArray[np.float64]]:
+    """Choose two planes through the middle of what is inside.
+
+    Returns:
+    box: ndarray, shape (2, 3). Lowest and highest index (i, j, k) of the voxels that are inside.
+    """
+    box = inside_box(volume, iso_value)
+    middle = np.floor(box.mean(axis=0))
+    wanted = (("across the body", 2, 0, 1, False), ("from the side", 0, 1, 2, bool(volume.affine[2, 2] > 0)))
+    planes = [
+        Plane(name, axis, float(min(middle[axis], volume.shape_ijk[axis] - 2)) + BETWEEN, across, down, flip)
+        for name, axis, across, down, flip in wanted
+        if volume.shape_ijk[axis] > 1
+    ]
+    return planes, box
+
+
+def inside_box(volume: Volume, iso_value: float) -> NDArray[np.float64]:
+    """Return the lowest and the highest index (i, j, k) of voxels at the level and above, shape (2, 3)."""
+    marks = [np.zeros(n, bool) for n in volume.shape_ijk]
+    for k, layer in enumerate(volume.voxels):
+        inside = layer >= iso_value
+        if inside.any():
+            marks[0] |= inside.any(axis=0)
+            marks[1] |= inside.any(axis=1)
+            marks[2][k] = True
+    places = [np.flatnonzero(mark) for mark in marks]
+    return np.array([[float(each[0]) for each in places], [float(each[-1]) for each in places]])
+
+
+def cut_mesh(mesh: Mesh, volume: Volume, plane: Plane) -> Segments:
+    """Return the lines in which a mesh cuts a plane."""
+    ijk = volume.lps_to_ijk(mesh.vertices)
+    height = ijk[:, plane.axis] - plane.at
+    above = height[mesh.triangles] > 0.0
+    crossing = above.any(axis=1) & ~above.all(axis=1)
+    corners, above = mesh.triangles[crossing], above[crossing]
+    # The lone corner of each triangle is the one whose two edges are cut.
+    lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
+    rows = np.arange(len(corners))
+    own = corners[rows, lone]
+    ends = []
+    for step in (1, 2):
+        other = corners[rows, (lone + step) % 3]
+        share = (height[own] / (height[own] - height[other]))[:, None]
+        ends.append((ijk[own] + share * (ijk[other] - ijk[own]))[:, [plane.across, plane.down]])
+    return np.stack(ends, axis=1)
+
+
+def read_plane(volume: Volume, plane: Plane) -> NDArray[np.uint8]:
+    """Return the HU in a plane as grey values, shape (down, across)."""
+    first = int(plane.at)
+    take: list[Any] = [slice(None)] * 3
+    layers = []
+    for index in (first, first + 1):
+        take[2 - plane.axis] = index
+        layers.append(volume.voxels[tuple(take)].astype(np.float64))
+    share = plane.at - first
+    values = (1.0 - share) * layers[0] + share * layers[1]
+    if plane.across > plane.down:  # voxels are [k, j, i]: the later axis comes first
+        values = values.T
+    return to_grey(values)
+
+
+def to_grey(values: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return HU as grey values of the window."""
+    low, high = WINDOW_HU
+    return np.rint(255.0 * np.clip((values - low) / (high - low), 0.0, 1.0)).astype(np.uint8)
+
+
+def draw_plane(
+    volume: Volume,
+    plane: Plane,
+    box: NDArray[np.float64],
+    contours: Mapping[str, Segments],
+    colors: Mapping[str, str],
+    reference: str,
+) -> tuple[Any, Any]:
+    """Draw a plane with the contours of all methods, as a whole and the detail where there is most to see."""
+    grey = read_plane(volume, plane)
+    steps = np.array([volume.spacing[plane.across], volume.spacing[plane.down]])
+    axes = [plane.across, plane.down]
+    low, high = box[0, axes] - MARGIN_MM / steps, box[1, axes] + MARGIN_MM / steps
+    shape = np.array([grey.shape[1], grey.shape[0]])
+    low, high = np.maximum(low, -0.5), np.minimum(high, shape - 0.5)
+    whole = _draw(grey, plane, steps, low, high, "whole", contours, colors)
+    middle = _find_detail(contours.get(reference, np.empty((0, 2, 2))), steps, 0.5 * (low + high))
+    half = 0.5 * DETAIL_MM / steps
+    detail = _draw(grey, plane, steps, middle - half, middle + half, "detail", contours, colors)
+    return whole, detail
+
+
+def _find_detail(segments: Segments, steps: NDArray[np.float64], default: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the middle of the square with the most lines."""
+    if not len(segments):
+        return default
+    middles = segments.mean(axis=1)
+    squares = np.floor(middles * steps / (0.5 * DETAIL_MM)).astype(np.int64)
+    found, counts = np.unique(squares, axis=0, return_counts=True)
+    best = found[int(np.argmax(counts))]
+    return np.asarray(middles[(squares == best).all(axis=1)].mean(axis=0))
+
+
+def _draw(
+    grey: NDArray[np.uint8],
+    plane: Plane,
+    steps: NDArray[np.float64],
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    which: str,
+    contours: Mapping[str, Segments],
+    colors: Mapping[str, str],
+) -> Any:
+    from clrecon.rendering.pictures.pillow import load_pillow
+
+    load_pillow()
+    from PIL import Image, ImageDraw
+
+    extent = (high - low) * steps
+    scale = OVERSAMPLING * PIXELS / float(extent.max())  # pixels a mm
+    width, height = (max(1, int(round(scale * side))) for side in extent)
+    whole = Image.fromarray(grey)
+    # Index coordinates count from the centres of pixels, Pillow's from their corners.
+    part = whole.transform(
+        (width, height), Image.Transform.EXTENT,
+        (low[0] + 0.5, low[1] + 0.5, high[0] + 0.5, high[1] + 0.5), Image.Resampling.BILINEAR,
+    ).convert("RGB")  # fmt: skip
+    canvas = ImageDraw.Draw(part)
+    lines = np.linspace(WIDEST[which], THINNEST[which], max(len(contours), 2))
+    for (name, segments), line in zip(contours.items(), lines.tolist(), strict=False):
+        thick = max(1, round(OVERSAMPLING * line))
+        ends = (segments - low) * steps * scale
+        seen = ((ends > -50) & (ends < [width + 50, height + 50])).all(axis=(1, 2))
+        for (x, y), (to_x, to_y) in ends[seen].tolist():
+            canvas.line((x, y, to_x, to_y), fill=colors[name], width=thick)
+    if plane.flip:
+        part = part.transpose(Image.Transpose.FLIP_TOP_BOTTOM)
+    return part.resize((width // OVERSAMPLING or 1, height // OVERSAMPLING or 1), Image.Resampling.LANCZOS)
+
+
+MOST_PIXELS = 512
+
+PAPER = {
+    "skimage": {"method": "marching cubes, CPU", "seconds": 300.0},
+    "vtk-mc": {"method": "marching cubes, GPU", "seconds": 2.0},
+    "cloud": {"method": "affine point cloud", "seconds": 3.0},
+    "rays": {"method": "ray casting, GPU", "seconds": 10.0, "later_s": 2.0},
+    "rays-cpu": {"method": "ray casting, CPU", "seconds": 300.0},
+}
+"""What the paper says of its own methods, on its own machine and scan."""
+
+CONTROLS = {
+    "black": "all black",
+    "white": "all white",
+    "noise": "noise",
+    "next": "the next slice",
+    "shifted": "the slice, moved by 5 pixels",
+}
+
+
+def along_slices(volume: Volume) -> dict[str, Any]:
+    """Return camera and size of a picture that looks along the slices, pixel for pixel with the middle one.
+
+    The camera stands before the first slice; what runs along a row is to the right, as in the slice.
+    """
+    ni, nj, nk = volume.shape_ijk
+    di, dj, _ = volume.spacing
+    width = min(ni, MOST_PIXELS)
+    height = max(7, round(nj * dj / (ni * di) * width))
+    middle = volume.ijk_to_lps([[(ni - 1) / 2, (nj - 1) / 2, nk // 2]])[0]
+    right, down = volume.affine[:3, 0] / di, volume.affine[:3, 1] / dj
+    forward = np.cross(right, down)
+    corners = [(i, j, k) for i in (0, ni - 1) for j in (0, nj - 1) for k in (0, nk - 1)]
+    away = 1.5 * float(np.linalg.norm(volume.ijk_to_lps(corners) - middle, axis=1).max()) + 10.0
+    camera = {
+        "position": [float(x) for x in middle - away * forward],
+        "focal_point": [float(x) for x in middle],
+        "up": [float(x) for x in -down],
+        "parallel_scale": 0.5 * nj * dj,
+    }
+    return {"camera": camera, "size": [width, height]}
+
+
+def middle_slice(volume: Volume, size: tuple[int, int], offset: int = 0) -> NDArray[np.uint8]:
+    """Return the middle slice, or one beside it, as grey values of the size of the pictures."""
+    from clrecon.rendering.pictures.pillow import load_pillow
+
+    load_pillow()
+    from PIL import Image
+
+    nk = volume.shape_ijk[2]
+    grey = to_grey(volume.voxels[min(nk // 2 + offset, nk - 1)].astype(np.float64))
+    return np.asarray(Image.fromarray(grey).resize(size, Image.Resampling.BILINEAR))
+
+
+def measure_against_slice(
+    volume: Volume, pictures: Mapping[str, NDArray[np.uint8]], size: tuple[int, int]
+) -> dict[str, Any]:
+    """Compare pictures of methods with the middle slice, and pictures that show what that is worth.
+
+    pictures: mapping of str to ndarray, shape (height, width, 3), uint8
+    size: (width, height)
+
+    Returns: ``window_hu``, ``slice``; ``methods`` and ``controls``: ``ssim`` and ``mse`` by name.
+    """
+    wanted = middle_slice(volume, size)
+    controls = make_control_pictures(wanted, middle_slice(volume, size, 1))
+
+    def like(picture: NDArray[np.uint8]) -> dict[str, float]:
+        grey = np.rint(picture.mean(axis=2)).astype(np.uint8) if picture.ndim == 3 else picture
+        found = measure_pictures(grey, wanted, whole=True)
+        return {"ssim": found.ssim, "mse": found.mse}
+
+    return {
+        "window_hu": [-200.0, 800.0],
+        "slice": volume.shape_ijk[2] // 2,
+        "methods": {name: like(picture) for name, picture in pictures.items()},
+        "controls": {name: like(controls[name]) for name in CONTROLS if name in controls},
+    }
+
+
+VIEW = "anterior"
+SIZE = (480, 480)
+QUALITY = 80
+"""Of WebP; PNG beside the page is exact."""
+
+Image = NDArray[np.uint8]
+
+
+def choose_camera(volume: Volume, box: NDArray[np.float64]) -> dict[str, Any]:
+    """Return the parameters of the camera that looks at what is inside.
+
+    box: ndarray, shape (2, 3). Lowest and highest index (i, j, k), see `clrecon.proof.compare.figures.find_planes`.
+    """
+    low, high = box
+    ends = np.stack([low - 1.0, high + 1.0])
+    places = volume.ijk_to_lps([[ends[bit >> axis & 1, axis] for axis in range(3)] for bit in range(8)])
+    camera = Camera.fit(box_around([places]), VIEW, size=SIZE)
+    return {
+        "position": list(camera.position),
+        "focal_point": list(camera.focal_point),
+        "up": list(camera.up),
+        "parallel_scale": camera.parallel_scale,
+    }
+
+
+def compare_pictures(pictures: Mapping[str, Image], reference: str) -> dict[str, dict[str, float]]:
+    """Return ``mse`` and ``ssim`` of each picture to that of the reference; without one, nothing."""
+    if reference not in pictures:
+        return {}
+    found = {}
+    for name, picture in pictures.items():
+        try:
+            like = measure_pictures(picture, pictures[reference])
+        except ClreconError:  # nothing is drawn in either
+            continue
+        found[name] = {"mse": like.mse, "ssim": like.ssim}
+    return found
+
+
+def difference_of(picture: Image, reference: Image) -> Image:
+    """Return where two pictures differ, shape (h, w): black where they do not, white from a quarter of the range on."""
+    apart = np.abs(picture.astype(np.int16) - reference).max(axis=2)
+    return np.asarray(np.minimum(4 * apart, 255), dtype=np.uint8)
+
+
+def save_png(image: Any, path: Path) -> None:
+    """Write a picture, an array or Pillow's, as PNG."""
+    _as_pillow(image).save(path, "PNG", optimize=True)
+
+
+def embed(image: Any) -> str:
+    """Return a picture as the address of a WebP inside the page."""
+    stream = io.BytesIO()
+    _as_pillow(image).save(stream, "WEBP", quality=QUALITY, method=4)
+    return "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
+
+
+def _as_pillow(image: Any) -> Any:
+    from clrecon.rendering.pictures.pillow import load_pillow
+
+    load_pillow()
+    from PIL import Image as Pillow
+
+    return Pillow.fromarray(image) if isinstance(image, np.ndarray) else image
+
+
+COLORS = dict(
+    zip(
+        COMPARED,
+        ("#ff3b30", "#9a9a9a", "#ffd60a", "#ff9f0a", "#c46a3a", "#0a84ff", "#bf5af2", "#30d158", "#64d2ff", "#a2845e",
+         "#ff7ac6", "#8e8cff", "#b8b04a"),
+        strict=True,
+    )
+)  # fmt: skip
+"""Of each method, in plots and contours."""
+
+
+@dataclass
+class Figures:
+    """The pictures of a comparison.
+
+    work: Folder with the arrays of the methods.
+    box: ndarray, shape (2, 3)
+    views: The picture of each method from the one camera.
+    contours: For each plane the lines of each method.
+    images: What is written as PNG, by file name without extension.
+    same: Methods whose surface is that of the reference.
+    """
+
+    work: Path
+    volume: Volume
+    level: float
+    reference: str
+    planes: list[Plane] = field(default_factory=list)
+    box: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 3)))
+    views: dict[str, NDArray[np.uint8]] = field(default_factory=dict)
+    contours: list[dict[str, NDArray[np.float64]]] = field(default_factory=list)
+    images: dict[str, Any] = field(default_factory=dict)
+    same: set[str] = field(default_factory=set)
+    paper: dict[str, Any] | None = None
+
+    def complete(self, records: Sequence[MethodRecord]) -> list[MethodRecord]:
+        """Return the records with what pictures say, and the files of pictures."""
+        likeness = compare_pictures(
+            {name: view for name, view in self.views.items() if self._is_like(name)}, self.reference
+        )
+        return [
+            record.changed(
+                pictures=likeness.get(record.name),
+                picture=f"{record.name}.png" if record.name in self.images else None,
+                difference=f"{record.name}-difference.png" if f"{record.name}-difference" in self.images else None,
+            )
+            for record in records
+        ]
+
+    def _is_like(self, name: str) -> bool:
+        """True where the picture has the size of the reference's."""
+        return self.reference in self.views and self.views[name].shape == self.views[self.reference].shape
+
+    def slice_entries(self) -> list[dict[str, Any]]:
+        """Return the entries of the report on slices."""
+        return [
+            {
+                "name": plane.name,
+                "axis": "ijk"[plane.axis],
+                "index": plane.at,
+                "file": f"slice-{'ijk'[plane.axis]}.png",
+                "detail": f"slice-{'ijk'[plane.axis]}-detail.png",
+                "lines": {name: len(lines) for name, lines in own.items()},
+            }
+            for plane, own in zip(self.planes, self.contours, strict=True)
+        ]
+
+    def compare_with_slice(self) -> None:
+        """Compare the pictures that look along the slices with the middle one."""
+        found = {name: load_array(self.work, name, "along") for name in self.views}
+        pictures = {name: picture for name, picture in found.items() if picture is not None}
+        width, height = along_slices(self.volume)["size"]
+        self.paper = measure_against_slice(self.volume, pictures, (width, height))
+
+
+def collect_figures(figures: Figures, records: Sequence[MethodRecord]) -> None:
+    """Load the pictures of methods, and cut their meshes with the planes."""
+    names = [record.name for record in records if record.is_done]
+    figures.same = {
+        record.name
+        for record in records
+        if record.name != figures.reference and record.surfaces and record.surfaces["hd95_mm"] < SAME_MM
+    }
+    figures.contours = [{} for _ in figures.planes]
+    for name in names:
+        view = load_array(figures.work, name, "view")
+        if view is not None:
+            figures.views[name] = figures.images[name] = view
+        mesh = load_mesh(figures.work, name)
+        if mesh is not None:
+            for plane, own in zip(figures.planes, figures.contours, strict=True):
+                own[name] = cut_mesh(mesh, figures.volume, plane)
+    reference = figures.views.get(figures.reference)
+    for name, view in figures.views.items():
+        if reference is not None and name != figures.reference and view.shape == reference.shape:
+            figures.images[f"{name}-difference"] = difference_of(view, reference)
+    for plane, own in zip(figures.planes, figures.contours, strict=True):
+        order = sorted(own, key=lambda name: name != figures.reference)  # which lies below all others
+        lines = {name: own[name] for name in order if name not in figures.same}
+        whole, detail = draw_plane(figures.volume, plane, figures.box, lines, COLORS, figures.reference)
+        figures.images[f"slice-{'ijk'[plane.axis]}"] = whole
+        figures.images[f"slice-{'ijk'[plane.axis]}-detail"] = detail
+
+
+def draw_figures(figures: Figures, folder: Path) -> None:
+    """Write all pictures as PNG."""
+    for name, image in figures.images.items():
+        save_png(image, folder / f"{name}.png")

@@ -1,0 +1,278 @@
+"""The compare job: a scan in; the methods one after another, measured, as a page, as JSON and as pictures.
+
+The folder of a comparison appears as a whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+from clrecon.errors import ClreconError, DeviceError, NoSurfaceError, UsageError
+from clrecon.jobs.mesh.make import mask_and_preprocess, mask_parts
+from clrecon.jobs.mesh.mesh_parts import check_levels
+from clrecon.jobs.mesh.surfaces import choose_level, describe_level, plan_surfaces
+from clrecon.jobs.outputs import check_kept
+from clrecon.jobs.run import DeviceOpening, Laps, to_json
+from clrecon.proof.compare.figures import (
+    SIZE,
+    Figures,
+    along_slices,
+    choose_camera,
+    collect_figures,
+    draw_figures,
+    find_planes,
+)
+from clrecon.proof.compare.findings import CompareReport
+from clrecon.proof.compare.methods import COMPARED, CompareSettings
+from clrecon.proof.compare.page import make_page
+from clrecon.proof.compare.processes import Request, measure_in_processes, run_in_process, save_volume
+from clrecon.proof.compare.records import compose_report, make_record
+from clrecon.reading import read_selected
+from clrecon.system.files import StagedFolder, check_folder, temporary_folder
+from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.paths import final_mode, keep_existing, system_errors
+from clrecon.system.progress import Progress, device_seconds, ignore_progress
+from clrecon.system.text import format_hu
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+    from clrecon.opencl import Device
+
+
+PAGE, REPORT = "index.html", "report.json"
+
+_NAMES = "|".join(map(re.escape, COMPARED))
+_OWN = re.compile(rf"index\.html|report\.json|(?:{_NAMES})(?:-difference|-along)?\.png|slice-[a-z]+(?:-detail)?\.png")
+
+
+def check_report_folder(path: str | os.PathLike[str]) -> Path:
+    """Return the folder that will be made, or that of an earlier comparison, which will be replaced."""
+    folder = check_folder(path, _OWN, "report")
+    names = set(os.listdir(folder)) if folder.is_dir() else set()
+    if names and not {PAGE, REPORT} <= names:
+        raise UsageError(
+            f"the folder {path} holds pictures without the page of a comparison: name a new or empty one for the report"
+        )
+    return folder
+
+
+class MadeFolder(StagedFolder):
+    """The folder while it is filled.
+
+    path: Its temporary place.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], made: Path, folder: Path):
+        super().__init__(path, made, folder, 0)
+        self._shown, self.path = path, made
+
+    def write(self, name: str, text: str) -> None:
+        """Write a file of text."""
+        with system_errors(self._shown), open(self.path / name, "x", encoding="utf-8", newline="\n") as stream:
+            stream.write(text)
+
+    def write_report(self, report: Mapping[str, Any]) -> None:
+        """Write the report as JSON."""
+        self.write(REPORT, to_json(report) + "\n")
+
+    def commit(self) -> None:
+        """Bring all files to the disk, and the folder to its place."""
+        with system_errors(self._shown):
+            for entry in os.scandir(self.path):
+                with open(entry.path, "rb") as stream:
+                    os.fsync(stream.fileno())
+                    self.size += os.fstat(stream.fileno()).st_size
+        super().commit()
+
+
+@contextlib.contextmanager
+def stage_report_folder(path: str | os.PathLike[str]) -> Iterator[MadeFolder]:
+    """Make a folder under a temporary name; one that is not committed is removed at the end of the block."""
+    folder = check_report_folder(path)
+    with contextlib.ExitStack() as stack:
+        with system_errors(path):
+            made = stack.enter_context(temporary_folder(folder.parent))
+            made.chmod(final_mode(folder, 0o777))
+        yield MadeFolder(path, made, folder)
+
+
+log = get_logger(__name__)
+
+
+def make_comparison(
+    source: str | Path,
+    output: str | Path,
+    settings: CompareSettings | None = None,
+    *,
+    no_clobber: bool = False,
+    progress: Progress | None = None,
+) -> CompareReport:
+    """Run all methods on one scan at one level, measure what they make, and write the page.
+
+    Each method runs in a process of its own, one after another: the first run in a new process, then warm ones.  A
+    method that fails, or whose library is not installed, is a row that says so.
+
+    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
+    output: Folder for ``index.html``, ``report.json`` and pictures: a new or empty one, or that of an earlier
+        comparison, which is replaced.
+    no_clobber: A folder that holds anything stays and is an `OutputError`.
+    progress: ``progress(stage, done, total)``.
+    """
+    settings = settings or CompareSettings()
+    progress = progress or ignore_progress
+    watch = Laps()
+    truth = None if settings.truth is None else _check_truth(Path(settings.truth))
+    with keep_existing(no_clobber):
+        folder = check_report_folder(output)
+    check_kept([("the report", output)], source, settings.truth)
+    volume, device, read_s = _open(source, settings, progress, watch)
+    volume, level, reason, warnings = _prepare(volume, settings, device, progress)
+    watch.lap("mask")
+    with ExitStack() as stack:
+        with system_errors(output):
+            work = stack.enter_context(temporary_folder(folder.parent))
+            save_volume(work, volume)
+        figures = Figures(work, volume, level, settings.reference)
+        figures.planes, figures.box = find_planes(volume, level)
+        told = _run_methods(figures, settings, device, progress)
+        watch.lap("methods")
+        measured = _measure(told, figures, settings, truth, progress)
+        watch.lap("measure")
+        progress("report", 0, 0)
+        records = [make_record(COMPARED[name], each, measured.get(name, {}), read_s) for name, each in told.items()]
+        collect_figures(figures, records)
+        records = figures.complete(records)
+        if settings.paper:
+            figures.compare_with_slice()
+        report = compose_report(
+            volume, settings, device, records, figures, level=level, reason=reason, read_s=read_s,
+            warnings=[*warnings, *device.warnings], watch=watch,
+        )  # fmt: skip
+        with keep_existing(no_clobber):
+            made = stack.enter_context(stage_report_folder(output))
+            with system_errors(output):
+                draw_figures(figures, made.path)
+                made.write("index.html", make_page(report, figures))
+            made.write_report(report)
+            made.commit()
+    log_warnings(log, report.warnings, volume.report.get("warnings", ()))
+    log.info("%d methods compared on %s in %.3f s", len(records), report.device, watch.total())
+    return report
+
+
+def _check_truth(path: Path) -> str:
+    """Return the folder of a phantom's truth, which can be read."""
+    from clrecon.proof.phantom import phantom_truth
+
+    folder = path.parent if path.name == "truth.json" and not path.is_dir() else path
+    phantom_truth(folder)
+    return str(folder.resolve())
+
+
+def _open(
+    source: str | Path, settings: CompareSettings, progress: Progress, watch: Laps
+) -> tuple[Volume, Device, dict[str, float]]:
+    """Read the input twice, while the device opens; also return the seconds of both times."""
+    progress("device", 0, 0)
+    read_s: dict[str, float] = {}
+    with DeviceOpening(settings.device, lambda device: None) as opening:
+        device = opening.wait()
+        watch.lap("device")
+        read = partial(read_selected, source, settings, progress=progress)
+        for name in ("first", "warm"):
+            start = perf_counter()
+            volume = read()
+            read_s[name] = perf_counter() - start
+        watch.lap("read")
+    return volume, device, read_s
+
+
+def _prepare(
+    volume: Volume, settings: CompareSettings, device: Device, progress: Progress
+) -> tuple[Volume, float, str, list[str]]:
+    """Return the volume that all methods get, the level, why it is that, and warnings."""
+    wanted = settings.as_mesh()
+    surfaces = plan_surfaces(wanted.levels)
+    volume = mask_parts(volume, surfaces, wanted, device, progress)
+    choice = choose_level(volume, wanted, progress)
+    if choice is not None:
+        surfaces = plan_surfaces([choice.iso_value])
+    check_levels(volume, surfaces)
+    volume = mask_and_preprocess(volume, surfaces, wanted, device, progress)
+    facts, warnings = describe_level(volume, wanted, choice)
+    level = surfaces[0].iso_value
+    assert isinstance(level, float | int)
+    low, high = volume.hu_range or (math.nan, math.nan)
+    if not level <= high:
+        raise NoSurfaceError(
+            f"no surface at {level:g} HU: the volume runs from {format_hu(low)} to {format_hu(high)} HU"
+        )
+    return volume, float(level), str(facts["iso_value_reason"]), warnings
+
+
+def _run_methods(
+    figures: Figures, settings: CompareSettings, device: Device, progress: Progress
+) -> dict[str, dict[str, Any]]:
+    """Run the methods one after another; those on a device that hangs are not tried any more."""
+    volume, chosen = figures.volume, settings.chosen
+    camera = choose_camera(volume, figures.box)
+    along = along_slices(volume) if settings.paper else None
+    told: dict[str, dict[str, Any]] = {}
+    hung = False
+    for done, method in enumerate(chosen):
+        progress("compare methods", done, len(chosen))
+        if hung and method.on_device:
+            told[method.name] = {"state": "failed", "kind": "DeviceError", "error": "not run: the device hangs"}
+            continue
+        request = Request(
+            method=method.name, folder=str(figures.work), iso_value=figures.level, closed=settings.closed,
+            device=device.index, memory=settings.memory, repeat=settings.repeat, timeout=device_seconds(),
+            camera=camera, size=SIZE, along=along,
+        )  # fmt: skip
+        told[method.name] = run_in_process(request)
+        hung = hung or bool(told[method.name].get("hung"))
+    progress("compare methods", len(chosen), len(chosen))
+    _refuse_nothing(told)
+    return told
+
+
+def _refuse_nothing(told: dict[str, dict[str, Any]]) -> None:
+    """Raise the first error where no method works: NoSurfaceError where they found none, else that of a device."""
+    if any(each["state"] == "done" for each in told.values()):
+        return
+    errors: Sequence[dict[str, Any]] = list(told.values())
+    empty = [each for each in errors if each["kind"] == "NoSurfaceError"]
+    kind: type[ClreconError] = NoSurfaceError if empty else DeviceError
+    first = (empty or errors)[0]["error"]
+    raise kind(str(first) if empty else f"none of {len(errors)} methods works; the first says: {first}")
+
+
+def _measure(
+    told: dict[str, dict[str, Any]], figures: Figures, settings: CompareSettings, truth: str | None, progress: Progress
+) -> dict[str, dict[str, Any]]:
+    """Measure what the methods made."""
+    sizes = {
+        name: int(each["triangles"] or each["points"] or 0) for name, each in told.items() if each["state"] == "done"
+    }
+    sizes = {name: size for name, size in sizes.items() if size}
+    asked = {
+        "folder": str(figures.work),
+        "reference": settings.reference if settings.reference in sizes else None,
+        "iso_value": figures.level,
+        "closed": settings.closed,
+        "truth": truth,
+    }
+    found: dict[str, dict[str, Any]] = {}
+    progress("measure methods", 0, len(sizes))
+    for name, measures in measure_in_processes(asked, sizes):
+        found[name] = measures
+        progress("measure methods", len(found), len(sizes))
+    return found

@@ -1,0 +1,124 @@
+"""The process that measures what methods made: against a reference, the HU of the scan, and a phantom's truth."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clrecon.errors import ClreconError
+from clrecon.jobs.run import to_json
+from clrecon.mesh import Mesh
+from clrecon.mesh.compare.cells import GridCells, find_mesh_cells, measure_cells
+from clrecon.mesh.compare.distances import SAMPLES, SurfaceDistance, compare_meshes, summarise_distances
+from clrecon.mesh.compare.mesh_slices import measure_slices
+from clrecon.mesh.compare.truth import REACH_MM, measure_truth
+from clrecon.proof.compare.processes import load_array, load_mesh, load_volume
+
+MEASURES = ("quality", "cells", "slices", "surfaces", "truth", "points")
+
+
+class Judge:
+    """Measures of one scan, one level and one reference.
+
+    told: ``folder`` with the arrays; ``reference``, name of a method, None where it failed; ``iso_value``; ``closed``;
+        ``truth``, the folder of a phantom, or None.
+    """
+
+    def __init__(self, told: Mapping[str, Any]):
+        self._folder = Path(told["folder"])
+        self._reference: str | None = told["reference"]
+        self._level, self._closed, self._truth = float(told["iso_value"]), bool(told["closed"]), told["truth"]
+        self._volume = load_volume(self._folder)
+
+    @cached_property
+    def truth(self) -> Any:
+        """The true surface of the phantom."""
+        from clrecon.proof.phantom import phantom_truth
+
+        return phantom_truth(self._truth)
+
+    @cached_property
+    def reference(self) -> Mesh | None:
+        """The mesh that others are compared with."""
+        return None if self._reference is None else load_mesh(self._folder, self._reference)
+
+    @cached_property
+    def cells(self) -> GridCells:
+        """The cells of that mesh."""
+        assert self.reference is not None
+        return find_mesh_cells(self.reference, self._volume, name=self._reference or "")
+
+    def measure(self, method: str) -> dict[str, Any]:
+        """Measure what a method made.
+
+        Returns: An entry for each of `MEASURES`, None where it does not apply; and ``reasons``, why a measure failed.
+        """
+        mesh, points = load_mesh(self._folder, method), load_array(self._folder, method, "points")
+        found: dict[str, Any] = dict.fromkeys(MEASURES)
+        reasons: dict[str, str] = {}
+        for name, take in self._measures(method, mesh, points).items():
+            try:
+                found[name] = take()
+            except (ClreconError, MemoryError) as error:
+                reasons[name] = str(error) or "out of memory"
+        return {**found, "reasons": reasons}
+
+    def _measures(self, method: str, mesh: Mesh | None, points: Any) -> dict[str, Callable[[], Any]]:
+        """Return the measures that apply."""
+        if points is not None:
+            return {"points": lambda: self._measure_points(points)}
+        if mesh is None:
+            return {}
+        reference, volume = self.reference, self._volume
+        takers: dict[str, Callable[[], Any]] = {
+            "quality": lambda: _describe_quality(mesh),
+            "slices": lambda: measure_slices(mesh, volume, self._level, closed=self._closed),
+        }
+        if reference is not None:
+            takers["cells"] = lambda: measure_cells(mesh, self.cells, volume, reference_name=self._reference)
+            takers["surfaces"] = lambda: compare_meshes(mesh, reference)
+        if self._truth is not None:
+            takers["truth"] = lambda: measure_truth(mesh, self.truth, grid=volume)
+        return takers
+
+    def _measure_points(self, points: Any) -> dict[str, Any]:
+        """Measure points of a cloud: distances from the reference, and signed ones from the true surface."""
+        step = max(1, len(points) // SAMPLES)
+        sample = np.asarray(points[::step], dtype=np.float64)
+        found: dict[str, Any] = {"samples": len(sample), "to_reference_mm": None, "bias_mm": None, "scatter_mm": None}
+        if self.reference is not None:
+            distance = SurfaceDistance(self.reference.vertices, self.reference.triangles)
+            found["to_reference_mm"] = summarise_distances(distance(sample))
+        if self._truth is not None:
+            signed = self.truth.signed_distance(sample)
+            signed = signed[np.abs(signed) <= REACH_MM]
+            if len(signed):
+                found["bias_mm"], found["scatter_mm"] = float(signed.mean()), float(signed.std())
+        return found
+
+
+def _describe_quality(mesh: Mesh) -> dict[str, Any]:
+    quality = mesh.quality()
+    names = ("closed", "manifold", "components", "euler_number", "area_mm2", "volume_ml", "outward")
+    return {name: getattr(quality, name) for name in names}
+
+
+def main() -> None:
+    """Measure the methods that the JSON object on stdin names, and write a line of JSON for each."""
+    lines = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
+    os.dup2(2, 1)
+    told = json.load(sys.stdin)
+    judge = Judge(told)
+    for method in told["methods"]:
+        lines.write(to_json({"method": method, **judge.measure(method)}, indent=None) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,123 @@
+"""The methods that are compared, one table in the order of the page, and the settings of the comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from clrecon.errors import UsageError
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.options import InputSettings
+from clrecon.system.arguments import name_parameter
+
+MESH, CLOUD, PICTURE = "mesh", "cloud", "picture"
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A method that is compared.
+
+    name: As the user names it.
+    title: In tables and plots.
+    what: In words.
+    makes: {"mesh", "cloud", "picture"}
+    on_device: True: its kernels run on the OpenCL device; False: on the CPU alone.
+    peer: The library of somebody else that does the work; empty for clrecon's own.
+    """
+
+    name: str
+    title: str
+    what: str
+    makes: str = MESH
+    on_device: bool = True
+    peer: str = ""
+
+
+COMPARED = {
+    method.name: method
+    for method in (
+        Compared("t-mc", "T-MC", "marching cubes, every cell, shared vertices"),
+        Compared("t-mc-soup", "T-MC, soup", "every cell, triangles welded afterwards (numpy)", on_device=False),
+        Compared("skimage", "scikit-image", "marching cubes of scikit-image", on_device=False, peer="scikit-image"),
+        Compared("vtk-mc", "VTK MC", "vtkMarchingCubes", on_device=False, peer="vtk"),
+        Compared("vtk-fe", "VTK FE", "vtkFlyingEdges3D", on_device=False, peer="vtk"),
+        Compared("i-mc", "I-MC", "cells grown from the large parts, linear vertices"),
+        Compared("i-mc-golden", "I-MC, golden", "the same, vertices at the golden section of their edge"),
+        Compared("g-mc", "G-MC", "T-MC, then quadric collapse without a bound"),
+        Compared("s-mc", "S-MC", "T-MC, then decimation within a bound, topology kept"),
+        Compared("cloud-surface", "Cloud surface", "closed surface around the points of the cloud"),
+        Compared("cloud", "Cloud", "voxels at the border of what is at the level and above, by the affine", CLOUD),
+        Compared("rays", "Ray casting", "samples along rays, preset bone, with light", PICTURE),
+        Compared("rays-cpu", "Ray casting, CPU", "the same in plain numpy", PICTURE, on_device=False),
+    )
+}
+
+
+def choose_methods(names: Sequence[str], reference: str) -> tuple[Compared, ...]:
+    """Return the methods that run, in the order of the table, the reference among them.
+
+    names: Empty: all.
+    """
+    for name in (*names, reference):
+        if name not in COMPARED:
+            raise UsageError(f"there is no method {name!r:.60} to compare: they are {', '.join(COMPARED)}")
+    doubled = sorted({name for name in names if names.count(name) > 1})
+    if doubled:
+        raise UsageError(f"a method is named twice: {', '.join(doubled)}")
+    if COMPARED[reference].makes != MESH:
+        meshes = ", ".join(name for name, method in COMPARED.items() if method.makes == MESH)
+        raise UsageError(
+            f"{name_parameter('reference', reference)} makes no mesh to compare with: take one of {meshes}"
+        )
+    wanted = {*(names or COMPARED), reference}
+    return tuple(method for name, method in COMPARED.items() if name in wanted)
+
+
+MOST_REPEATS = 100
+
+
+@dataclass(frozen=True)
+class CompareSettings(InputSettings):
+    """Settings of the compare job.
+
+    methods: Names of `clrecon.proof.compare.methods.COMPARED`; empty: all of them.
+    reference: The method whose mesh the others are compared with; it always runs.
+    truth: ``truth.json`` of a phantom: what is made is compared with the true surface too.
+    paper: Also compare a picture of each method with the middle slice, as a paper does, beside controls.
+    repeat: Warm runs of each method, of which the median counts.
+    iso_value, preset, half_way, closed: See `MeshSettings`; one level, above which is inside.
+    **shared: See `clrecon.jobs.options.InputSettings`.
+    """
+
+    methods: Sequence[str] = ()
+    reference: str = "t-mc"
+    truth: str | Path | None = None
+    paper: bool = False
+    repeat: int = 3
+    iso_value: float | None = None
+    preset: str | None = None
+    half_way: str | Sequence[float] | None = None
+    closed: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        choose_methods(self.methods, self.reference)
+        if not 1 <= self.repeat <= MOST_REPEATS:
+            raise UsageError(f"the number of warm runs lies between 1 and {MOST_REPEATS}, not at {self.repeat}")
+        if isinstance(self.iso_value, Sequence):
+            raise UsageError("methods are compared at one iso value: give one number of HU, and no range")
+        if len(self.as_mesh().levels) != 1:
+            raise UsageError("methods are compared at one iso value")
+
+    @property
+    def chosen(self) -> tuple[Compared, ...]:
+        """The methods that run, in the order of the page."""
+        return choose_methods(self.methods, self.reference)
+
+    def as_mesh(self) -> MeshSettings:
+        """Return the settings of a mesh job with the same input and level."""
+        shared = {field.name: getattr(self, field.name) for field in fields(InputSettings)}
+        return MeshSettings(
+            **shared, iso_value=self.iso_value, preset=self.preset, half_way=self.half_way, closed=self.closed
+        )

@@ -1,0 +1,221 @@
+"""The processes of a comparison: one after another for methods, whose memory is their own; side by side for measures.
+
+They are told and tell plain values, and arrays in files of a folder.
+
+A crash of one becomes words."""
+
+from __future__ import annotations
+
+import json
+import queue
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import DeviceError
+from clrecon.geometry import Volume
+from clrecon.mesh import Mesh
+from clrecon.proof.timing import usable_cores
+from clrecon.rendering.views.camera import Camera
+
+_VOXELS, _PLACE = "voxels.npy", "place.npz"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What one process does.
+
+    method: Name in `COMPARED`.
+    folder: Has the volume; gets the results.
+    device: Index of the OpenCL device.
+    repeat: Warm runs.
+    timeout: Seconds after which a device that finishes nothing hangs.
+    camera: Parameters of the `Camera` of the picture.
+    size: [int, int]. Width and height of the picture.
+    along: Camera and size of a picture along the slices, for the table of the paper.
+    """
+
+    method: str
+    folder: str
+    iso_value: float
+    closed: bool
+    device: int
+    memory: int | None
+    repeat: int
+    timeout: float
+    camera: dict[str, Any]
+    size: tuple[int, int]
+    along: dict[str, Any] | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the request for JSON."""
+        return asdict(self)
+
+    def views(self) -> dict[str, tuple[Camera, tuple[int, int]]]:
+        """Return the pictures that are drawn: the name of each, its camera, and its size."""
+        views = {"view": (Camera(**self.camera), (self.size[0], self.size[1]))}
+        if self.along is not None:
+            width, height = self.along["size"]
+            views["along"] = Camera(**self.along["camera"]), (width, height)
+        return views
+
+
+def save_volume(folder: Path, volume: Volume) -> None:
+    """Write voxels and place of a volume, and nothing of its report."""
+    np.save(folder / _VOXELS, volume.voxels, allow_pickle=False)
+    place = {"affine": volume.affine}
+    if volume.uneven:
+        place["positions"] = volume.slice_origins()
+    np.savez(folder / _PLACE, **place)  # type: ignore[arg-type]
+
+
+def load_volume(folder: Path) -> Volume:
+    """Read what `save_volume` wrote, into memory."""
+    voxels = np.load(folder / _VOXELS, allow_pickle=False)
+    with np.load(folder / _PLACE, allow_pickle=False) as place:
+        return Volume(voxels, place["affine"], None, place["positions"] if "positions" in place else None)
+
+
+def save_arrays(folder: Path, name: str, **arrays: NDArray[Any] | None) -> None:
+    """Write the arrays of a method; those that are None are left out."""
+    for what, array in arrays.items():
+        if array is not None:
+            np.save(folder / f"{name}-{what}.npy", array, allow_pickle=False)
+
+
+def load_array(folder: Path, name: str, what: str) -> NDArray[Any] | None:
+    """Read one of them; None if it was left out."""
+    path = folder / f"{name}-{what}.npy"
+    return np.load(path, allow_pickle=False) if path.exists() else None
+
+
+def save_mesh(folder: Path, name: str, mesh: Mesh) -> None:
+    """Write the arrays of a mesh."""
+    save_arrays(folder, name, vertices=mesh.vertices, triangles=mesh.triangles, normals=mesh.normals)
+
+
+def load_mesh(folder: Path, name: str) -> Mesh | None:
+    """Read the mesh of a method; None if it made none."""
+    vertices, triangles = (load_array(folder, name, what) for what in ("vertices", "triangles"))
+    if vertices is None or triangles is None:
+        return None
+    return Mesh(vertices, triangles, load_array(folder, name, "normals"))
+
+
+METHOD = ("-m", "clrecon.proof.compare.child")
+JUDGE = ("-m", "clrecon.proof.compare.judge")
+
+MOST_JUDGES = 4
+
+
+def _start(command: Sequence[str], told: Mapping[str, Any]) -> subprocess.Popen[bytes]:
+    """Start a process of this interpreter, and tell it what to do."""
+    if getattr(sys, "frozen", False) or not sys.executable:
+        raise DeviceError("methods are compared in processes of a Python interpreter, and this program has none")
+    try:
+        process = subprocess.Popen(
+            [sys.executable, *command],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+        )
+    except OSError as error:
+        raise DeviceError(f"no process can be started to compare methods: {error.strerror or error}") from error
+    assert process.stdin is not None
+    try:
+        process.stdin.write(json.dumps(told).encode())
+        process.stdin.close()
+    except OSError:  # it has ended already: its answer is missing
+        pass
+    return process
+
+
+def run_in_process(request: Request) -> dict[str, Any]:
+    """Run a method in a process of its own, and return what `clrecon.proof.compare.child.run_method` tells."""
+    process = _start(METHOD, request.as_dict())
+    assert process.stdout is not None
+    try:
+        answer = process.stdout.read()
+        process.wait()
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+    try:
+        told: dict[str, Any] = json.loads(answer)
+    except ValueError:
+        return {"state": "failed", "kind": "Crash", "error": _describe_end(process.returncode), "hung": False}
+    return told
+
+
+def _describe_end(code: int) -> str:
+    """Describe how a process ended that said nothing."""
+    if code >= 0:
+        return f"its process ended with exit code {code}"
+    name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+    more = ": out of memory, or ended by somebody" if name == "SIGKILL" else ""
+    return f"its process crashed with {name}{more}"
+
+
+def measure_in_processes(told: Mapping[str, Any], methods: Mapping[str, int]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Measure what methods made in a process a core, and yield the figures of each method.
+
+    told: See `clrecon.proof.compare.judge.Judge`.
+    methods: Names, and how much there is to measure of each.
+
+    Yields:
+    figures: See `Judge.measure`; only ``reasons`` where the process ended before.
+    """
+    parts = _share(methods, min(usable_cores(), MOST_JUDGES))
+    lines: queue.Queue[tuple[int, bytes]] = queue.Queue()
+    processes: list[subprocess.Popen[bytes]] = []
+    try:
+        for number, part in enumerate(parts):
+            process = _start(JUDGE, {**told, "methods": part})
+            processes.append(process)
+            threading.Thread(target=_forward, args=(number, process.stdout, lines), daemon=True).start()
+        running = len(processes)
+        while running:
+            number, line = lines.get()
+            if line:
+                figures = json.loads(line)
+                parts[number].remove(figures["method"])
+                yield figures.pop("method"), figures
+                continue
+            running -= 1
+            processes[number].wait()
+            for name in parts[number]:
+                yield name, {"reasons": {"all": _describe_end(processes[number].returncode)}}
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def _forward(number: int, stream: IO[bytes] | None, lines: queue.Queue[tuple[int, bytes]]) -> None:
+    """Put the lines of a process into a queue, and an empty one at its end."""
+    assert stream is not None
+    with stream:
+        for line in stream:
+            lines.put((number, line))
+    lines.put((number, b""))
+
+
+def _share(methods: Mapping[str, int], most: int) -> list[list[str]]:
+    """Share methods out to at most so many processes, the largest first, each to the one with the least to do."""
+    parts: list[list[str]] = [[] for _ in range(max(1, min(most, len(methods))))]
+    loads = [0] * len(parts)
+    for name, load in sorted(methods.items(), key=lambda each: -each[1]):
+        least = loads.index(min(loads))
+        parts[least].append(name)
+        loads[least] += load + 1
+    return parts

@@ -1,0 +1,178 @@
+"""Records of methods and the report, composed from what the processes tell."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import platform
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from clrecon.geometry.certificate import without_ids
+from clrecon.geometry.iso_rule import choose_iso_rule
+from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name
+from clrecon.proof.compare.figures import SIZE, VIEW
+from clrecon.proof.compare.findings import CompareReport, MethodRecord, find_findings
+from clrecon.proof.compare.makers import PARTS, TWIN_SIZE
+from clrecon.proof.compare.methods import Compared, CompareSettings
+from clrecon.proof.timing import free_cores, processor_name, usable_cores
+from clrecon.version import package_version
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+    from clrecon.opencl import Device
+    from clrecon.proof.compare.figures import Figures
+
+ALL_PARTS = ("read", *PARTS)
+
+LIBRARIES = {
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "scikit-image": "scikit-image",
+    "VTK": "vtk",
+    "fast-simplification": "fast-simplification",
+    "pyopencl": "pyopencl",
+}
+
+BUSY_SHARE = 0.5
+"""Smallest share of free cores without a warning, as of the bench."""
+
+
+def make_record(
+    method: Compared, told: Mapping[str, Any], measured: Mapping[str, Any], read_s: Mapping[str, float]
+) -> MethodRecord:
+    """Compose the row of a method.
+
+    told: See `clrecon.proof.compare.child.run_method`.
+    measured: See `clrecon.proof.compare.judge.Judge.measure`.
+    read_s: ``first`` and ``warm`` seconds of reading.
+    """
+    done = told["state"] == "done"
+    first, runs = (told["first"], told["warm"]) if done else ({}, [])
+    warm = {part: statistics.median(run[part] for run in runs) for part in PARTS} if done else {}
+    cells = told.get("cells") or {}
+    peak, before = told.get("memory_bytes"), told.get("memory_before_bytes")
+    kernels = told.get("kernel_seconds") or {}
+    return MethodRecord(
+        name=method.name,
+        title=method.title,
+        what=method.what,
+        makes=method.makes,
+        peer=method.peer,
+        state=told["state"],
+        error=told["error"],
+        triangles=told.get("triangles"),
+        vertices=told.get("vertices"),
+        points=told.get("points"),
+        first_s=_work(first) if done else None,
+        warm_s=statistics.median(map(_work, runs)) if done else None,
+        warm_runs=len(runs),
+        first_parts_s={"read": read_s["first"], **first} if done else {},
+        warm_parts_s={"read": read_s["warm"], **warm} if done else {},
+        kernels_ms=1e3 * sum(kernels.values()) if kernels else None,
+        memory_bytes=peak,
+        memory_own_bytes=None if peak is None or before is None else max(0, peak - before),
+        cells_visited=cells.get("visited"),
+        cells_all=cells.get("all"),
+        growing=told.get("growing"),
+        quality=measured.get("quality"),
+        cells=measured.get("cells"),
+        slices=measured.get("slices"),
+        surfaces=measured.get("surfaces"),
+        truth=measured.get("truth"),
+        points_mm=measured.get("points"),
+        reasons=measured.get("reasons", {}),
+        small=_describe_small(method, told),
+    )
+
+
+def _work(parts: Mapping[str, float]) -> float:
+    """Return the seconds of a run without drawing."""
+    return sum(parts.values()) - parts.get("draw", 0.0)
+
+
+def _describe_small(method: Compared, told: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Describe ray casting at the size of the twin; its time at the full size is reckoned from the pixels."""
+    small = told.get("small")
+    if not small:
+        return None
+    pixels = SIZE[0] * SIZE[1] / (TWIN_SIZE[0] * TWIN_SIZE[1])
+    return {
+        "size": list(TWIN_SIZE),
+        "first_s": small[0],
+        "warm_s": small[1],
+        "scaled_s": None if method.on_device else pixels * small[1],
+    }
+
+
+def compose_report(
+    volume: Volume,
+    settings: CompareSettings,
+    device: Device,
+    records: Sequence[MethodRecord],
+    figures: Figures,
+    *,
+    level: float,
+    reason: str,
+    read_s: Mapping[str, float],
+    warnings: Sequence[str],
+    watch: Laps,
+) -> CompareReport:
+    """Compose the report.
+
+    volume: What the methods got.
+    level: HU.
+    reason: Why it is that level.
+    warnings: Those of the volume come before them.
+    """
+    certificate = dict(volume.report) if settings.keep_ids else dict(without_ids(volume.report))
+    said = [str(text) for text in certificate.pop("warnings", [])]
+    cores, free = usable_cores(), free_cores()
+    if free < BUSY_SHARE * cores:
+        said.append(f"only {free:.1f} of {cores} cores are free: times are of a busy computer, their ratios count")
+    watch.lap("report")
+    return CompareReport(
+        affine_ijk_to_lps_mm=volume.affine.tolist(),
+        date=datetime.date.today().isoformat(),
+        shape_ijk=list(volume.shape_ijk),
+        spacing_mm=[float(step) for step in volume.spacing],
+        iso_value_hu=level,
+        iso_level_hu=float(choose_iso_rule(volume, level, settings.closed).iso_level),
+        iso_value_reason=reason,
+        closed_at_border=settings.closed,
+        reference=settings.reference,
+        repeat=settings.repeat,
+        with_truth=settings.truth is not None,
+        processor=processor_name(),
+        cores=cores,
+        free_cores=round(free, 2),
+        versions=_find_versions(),
+        read_s=dict(read_s),
+        findings=find_findings(records, settings.reference, with_truth=settings.truth is not None),
+        methods=list(records),
+        view=VIEW,
+        size=list(SIZE),
+        slices=figures.slice_entries(),
+        paper=figures.paper,
+        device=device.label,
+        driver=device.driver,
+        memory_allowed_bytes=settings.memory,
+        version=package_version(),
+        platform=platform_name(),
+        warnings=list(dict.fromkeys([*said, *warnings])),
+        volume=certificate,
+        seconds={part: round(spent, 4) for part, spent in {**watch.seconds, "total": watch.total()}.items()},
+        peak_memory_bytes=peak_memory_bytes(),
+    )
+
+
+def _find_versions() -> dict[str, str]:
+    """Return the versions of Python and of the libraries that are installed."""
+    versions = {"Python": platform.python_version(), "clrecon": package_version()}
+    for title, name in LIBRARIES.items():
+        try:
+            versions[title] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return versions

@@ -1,0 +1,177 @@
+"""The demonstration: phantom, mesh, picture and report in one folder, and one surface whose size is known exactly."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clrecon.errors import OutputError, UsageError
+from clrecon.jobs.mesh.job import make_mesh
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.render.job import PictureFiles, make_pictures
+from clrecon.jobs.render.settings import RenderSettings
+from clrecon.jobs.run import Laps
+from clrecon.system.files import hold_interrupts, temporary_folder
+from clrecon.system.paths import (
+    existing_stay,
+    final_mode,
+    keep_existing,
+    place_file,
+    place_folder,
+    refuse_existing,
+    resolve_target,
+    system_errors,
+)
+from clrecon.system.progress import Progress
+
+if TYPE_CHECKING:
+    from clrecon.opencl import Device
+
+DEMO_FOLDER = "clrecon-demo"
+DEMO_FILES = ("ct", "bone.stl", "bone.png", "report.json")
+
+_TILT_DEG, _OBLIQUE_DEG = 12.0, (10.0, -5.0, 30.0)
+
+
+def make_demo(
+    output: str | Path = DEMO_FOLDER,
+    device: str | None = None,
+    *,
+    no_clobber: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Write a phantom CT series, a picture of it, its bone mesh and the report; check a sphere of known volume.
+
+    output: A new or empty folder, or one of an earlier demonstration, which is replaced.
+    device: Name or index of an OpenCL device.
+    no_clobber: A folder that holds anything stays and is an `OutputError`.
+
+    Returns: ``folder``, ``files``, ``affine_error_mm`` (largest difference between the affine of the report and that of
+        the truth), ``check`` (see `check_sphere`), ``seconds``, ``mesh`` and ``picture`` (the reports of both).
+    """
+    from clrecon.operators import choose_device
+
+    folder = resolve_target(output)
+    with keep_existing(no_clobber):
+        _check_replaceable(folder, output)
+        chosen = choose_device(device)
+        with ExitStack() as stack:
+            with system_errors(output):
+                made = stack.enter_context(temporary_folder(folder if folder.exists() else folder.parent))
+            try:
+                outcome = _fill(made, chosen, progress)
+            except OutputError as error:
+                raise OutputError(str(error).replace(str(made), str(output))) from error
+            with hold_interrupts():
+                _put_in_place(made, folder, output)
+    return {"folder": str(output), **outcome}
+
+
+def _fill(folder: Path, chosen: Device, progress: Progress | None) -> dict[str, Any]:
+    """Write everything into a folder; returns the outcome."""
+    from clrecon.proof.phantom import PhantomSettings, write_phantom
+
+    watch = Laps()
+    settings = PhantomSettings(kind="spine", size=(256, 192), slices=110, spacing=(1.0, 1.0, 1.25))
+    truth = write_phantom(folder / "ct", settings, progress=progress)
+    watch.lap("phantom")
+    picture = make_pictures(
+        folder / "ct", PictureFiles(folder / "bone.png"), _look(str(chosen.index)), progress=progress
+    )
+    watch.lap("picture")
+    report = make_mesh(
+        folder / "ct",
+        folder / "bone.stl",
+        MeshSettings(device=str(chosen.index)),
+        report_path=folder / "report.json",
+        progress=progress,
+    )
+    watch.lap("mesh")
+    check = check_sphere(chosen)
+    watch.lap("check")
+    errors = [
+        abs(found - true)
+        for row, true_row in zip(report["affine_ijk_to_lps_mm"], truth["affine_ijk_to_lps_mm"], strict=True)
+        for found, true in zip(row, true_row, strict=True)
+    ]
+    seconds = {**watch.seconds, "total": watch.total()}
+    return {
+        "files": list(DEMO_FILES),
+        "affine_error_mm": max(errors),
+        "check": check,
+        "seconds": {part: round(value, 4) for part, value in seconds.items()},
+        "mesh": report,
+        "picture": picture,
+    }
+
+
+def _look(device: str) -> RenderSettings:
+    return RenderSettings.of(preset="bone", views=["25,10"], ray_step=0.25, letters=True, scale_bar=True, device=device)
+
+
+def check_sphere(device: Device) -> dict[str, Any]:
+    """Mesh a sphere in anisotropic voxels, tilted gantry and oblique frame, and compare with geometry.
+
+    Returns: ``volume_ml``, ``true_volume_ml``, ``area_mm2``, ``true_area_mm2``, ``radius_error_max_mm`` (largest
+        distance of a vertex from the sphere), ``spacing_mm``, ``tilt_deg``.
+    """
+    import numpy as np
+
+    from clrecon.geometry import Volume
+    from clrecon.operators.surface.extract import extract_isosurface
+    from clrecon.proof.phantom import PhantomSettings, make_phantom
+
+    settings = PhantomSettings(
+        kind="sphere",
+        size=(72, 56),
+        slices=40,
+        spacing=(0.7, 0.5, 1.0),
+        tilt=_TILT_DEG,
+        oblique=_OBLIQUE_DEG,
+        noise=0.0,
+        point_spread_mm=0.0,
+    )
+    voxels, affine, truth = make_phantom(settings)
+    mesh = extract_isosurface(Volume(voxels, affine), truth["iso_value_hu"], device=device)
+    quality = mesh.quality()
+    surface = truth["surface"]
+    distance = np.linalg.norm(mesh.vertices - np.array(surface["center_lps_mm"]), axis=1)
+    return {
+        "volume_ml": quality.volume_ml,
+        "true_volume_ml": surface["volume_ml"],
+        "area_mm2": quality.area_mm2,
+        "true_area_mm2": surface["area_mm2"],
+        "radius_error_max_mm": float(np.abs(distance - surface["radius_mm"]).max()),
+        "spacing_mm": truth["spacing_mm"],
+        "tilt_deg": truth["tilt_deg"],
+    }
+
+
+def _check_replaceable(folder: Path, output: str | Path) -> None:
+    """Accept a folder that is absent, empty, or that of an earlier demonstration, unless existing files are kept."""
+    try:
+        if not folder.parent.is_dir():
+            raise OutputError(f"cannot make {output}: the folder around it does not exist; make it first")
+        names = {entry.name for entry in folder.iterdir() if not entry.name.startswith(".clrecon-")}
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise OutputError(f"cannot make the folder {output}: {error.strerror or error}") from error
+    refuse_existing(output, folder)
+    foreign = sorted(names - set(DEMO_FILES))
+    if foreign or (names and not (folder / "ct" / "truth.json").is_file()):
+        example = (foreign or sorted(names))[0]
+        raise UsageError(f"{output} holds something that is not of a demo ({example}): name a new or empty folder")
+
+
+def _put_in_place(made: Path, folder: Path, output: str | Path) -> None:
+    """Move a finished demonstration to its place: as a folder, or file by file into a folder that is there."""
+    keep = existing_stay()
+    if not folder.exists():
+        made.chmod(final_mode(folder, 0o777))
+        place_folder(made, folder, output, keep=keep)
+        return
+    for name in DEMO_FILES:
+        place = place_folder if (made / name).is_dir() else place_file
+        place(made / name, folder / name, Path(output) / name, keep=keep)

@@ -1,0 +1,216 @@
+"""Voxels of a body under any affine, sheared ones included: partial volume, point spread, noise."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry import apply_affine, column_spacing
+from clrecon.geometry.affine import checked_affine
+from clrecon.proof.phantom.shapes import Body
+from clrecon.system.progress import Progress
+
+Float32Array = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+
+_CHUNK = 1 << 21
+"""Points evaluated at once: bounds the scratch memory to some hundred MB."""
+
+
+def map_slices(
+    work: Callable[[int], None], count: int, stage: str = "slices", progress: Progress | None = None
+) -> None:
+    """Call ``work(k)`` for every slice on a thread pool; each call may write only to its own slice.
+
+    `progress` is called as ``progress(stage, done, count)`` from the calling thread.
+    """
+    workers = max(1, min(os.cpu_count() or 1, 8, count))
+    with ThreadPoolExecutor(workers) as pool:
+        for done, _ in enumerate(pool.map(work, range(count)), start=1):
+            if progress is not None:
+                progress(stage, done, count)
+
+
+def _checked_shape(shape_kji: tuple[int, int, int]) -> tuple[int, int, int]:
+    shape = tuple(int(extent) for extent in shape_kji)
+    if len(shape) != 3 or min(shape) < 1:
+        raise UsageError(f"a volume has three extents (nk, nj, ni) of at least 1, got {tuple(shape_kji)}")
+    return shape[0], shape[1], shape[2]
+
+
+def _index_box(
+    bounds_mm: Float64Array, affine: Float64Array, shape: tuple[int, int, int], margin_mm: float
+) -> tuple[slice, slice, slice]:
+    """Return slices (k, j, i) that hold all voxels whose centre may lie within `margin_mm` of the box `bounds_mm`."""
+    if not np.isfinite(bounds_mm).all():
+        return slice(0, shape[0]), slice(0, shape[1]), slice(0, shape[2])
+    corners = np.array(list(itertools.product(*(bounds_mm + np.array(((-margin_mm,), (margin_mm,)))).T)))
+    ijk = apply_affine(np.asarray(np.linalg.inv(affine), dtype=np.float64), corners)
+    low = np.floor(ijk.min(axis=0)).astype(int)
+    high = np.ceil(ijk.max(axis=0)).astype(int) + 1
+    ranges = [slice(min(max(a, 0), n), max(min(b, n), 0)) for a, b, n in zip(low, high, shape[::-1], strict=True)]
+    return ranges[2], ranges[1], ranges[0]
+
+
+def _slab_thickness(k: slice, j: slice, i: slice) -> int:
+    return max(1, _CHUNK // max(1, (j.stop - j.start) * (i.stop - i.start)))
+
+
+def _centres(affine: Float64Array, k: slice, j: slice, i: slice) -> Float64Array:
+    """Return LPS mm of the voxel centres in a box of indices, shape (nk * nj * ni, 3), i fastest."""
+    grid = np.meshgrid(*(np.arange(axis.start, axis.stop) for axis in (k, j, i)), indexing="ij")
+    return apply_affine(affine, np.stack([axis.ravel() for axis in reversed(grid)], axis=1))
+
+
+def _boundary_coverage(body: Body, points: Float64Array, steps: Float64Array, subsamples: int) -> Float64Array:
+    """Return the share of each voxel's parallelepiped inside `body`, computed from subsamples**3 cells in a voxel.
+
+    Each cell contributes by a linear ramp as wide as the cell is along the gradient of the distance.  So the share is
+    continuous in the position of the surface, and a plane gives no steps of 1/subsamples.
+    """
+    delta = 0.25 * float(np.linalg.norm(steps, axis=0).min())
+    gradient = np.stack(
+        [
+            (body.signed_distance(points + shift) - body.signed_distance(points - shift)) / (2.0 * delta)
+            for shift in delta * np.eye(3)
+        ],
+        axis=1,
+    )
+    cell = np.abs(gradient @ steps) / subsamples
+    # Averaging a plane over a box has the variance of three uniform distributions; the ramp gets the same variance.
+    ramp = np.maximum(np.sqrt((cell**2).sum(axis=1)), 1e-9)
+    centred = (np.arange(subsamples) + 0.5) / subsamples - 0.5
+    total = np.zeros(len(points))
+    for fractions in itertools.product(centred, repeat=3):
+        distance = body.signed_distance(points + steps @ np.array(fractions))
+        total += np.clip(0.5 + distance / ramp, 0.0, 1.0)
+    return total / subsamples**3
+
+
+def sample_occupancy(
+    body: Body, affine: ArrayLike, shape_kji: tuple[int, int, int], subsamples: int = 6
+) -> Float32Array:
+    """Partial volume: the share of every voxel's parallelepiped that lies inside `body`.
+
+    Exactly 0 or 1 away from the surface; near it the average over ``subsamples**3`` cells of the voxel.
+
+    affine: array_like, shape (4, 4). Index (i, j, k) to LPS mm; any invertible affine, shear included.
+    shape_kji: (nk, nj, ni)
+    subsamples: Cells along each of the voxel's three edges.
+
+    Returns: ndarray, shape (nk, nj, ni), float32. 0 to 1; its iso value is 0.5.
+    """
+    matrix, shape = checked_affine(affine), _checked_shape(shape_kji)
+    if subsamples < 1:
+        raise UsageError(f"subsamples must be at least 1, got {subsamples}")
+    steps = matrix[:3, :3]
+    # Half the longest diagonal: a surface farther from the centre cannot cut the voxel.
+    reach = max(float(np.linalg.norm(steps @ np.array(signs))) for signs in itertools.product((-0.5, 0.5), repeat=3))
+    share = np.zeros(shape, dtype=np.float32)
+    box_k, j, i = _index_box(body.bounds_mm, matrix, shape, reach)
+    step = _slab_thickness(box_k, j, i)
+    for start in range(box_k.start, box_k.stop, step):
+        k = slice(start, min(start + step, box_k.stop))
+        centres = _centres(matrix, k, j, i)
+        distance = body.signed_distance(centres)
+        coverage = (distance >= 0.0).astype(np.float32)
+        near = np.flatnonzero(np.abs(distance) < reach)
+        for first in range(0, len(near), _CHUNK // 8):
+            chosen = near[first : first + _CHUNK // 8]
+            coverage[chosen] = _boundary_coverage(body, centres[chosen], steps, subsamples)
+        share[k, j, i] = coverage.reshape(share[k, j, i].shape)
+    return share
+
+
+def _gaussian_weights(sigma: float) -> Float64Array:
+    """Return half of a normalised Gaussian, from the centre outwards, cut off at four sigma."""
+    weights = np.exp(-0.5 * (np.arange(int(4.0 * sigma + 0.5) + 1) / max(sigma, 1e-9)) ** 2)
+    return weights / (weights[0] + 2.0 * weights[1:].sum())
+
+
+def _blur_axis(field: Float32Array, sigma: float, axis: int) -> Float32Array:
+    """Blur along one axis with a Gaussian, sigma in steps; the edge value is continued outside."""
+    weights = _gaussian_weights(sigma)
+    radius, extent = len(weights) - 1, field.shape[axis]
+    if radius == 0:
+        return field
+    widths = [(0, 0)] * field.ndim
+    widths[axis] = (radius, radius)
+    padded = np.moveaxis(np.pad(field, widths, mode="edge"), axis, 0)
+    blurred = padded[radius : radius + extent] * np.float32(weights[0])
+    for offset in range(1, radius + 1):
+        pair = padded[radius - offset : radius - offset + extent] + padded[radius + offset : radius + offset + extent]
+        pair *= np.float32(weights[offset])
+        blurred += pair
+    return np.moveaxis(blurred, 0, axis)
+
+
+def _uneven_weights(at_mm: Float64Array, sigma_mm: float) -> Float32Array:
+    """Return the matrix (n, n) of Gaussian means over samples at uneven places."""
+    weights = np.exp(-0.5 * ((at_mm[:, None] - at_mm) / sigma_mm) ** 2)
+    weights *= np.gradient(at_mm)  # each sample stands for the space between its neighbours
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True), dtype=np.float32)
+
+
+def apply_point_spread(
+    voxels: Float32Array,
+    affine: ArrayLike,
+    sigma_mm: float,
+    progress: Progress | None = None,
+    places: Float64Array | None = None,
+) -> Float32Array:
+    """Blur `voxels` in place by a Gaussian of `sigma_mm` along each of the affine's three steps.
+
+    On a perpendicular stack this is the isotropic point spread; on a sheared one the blur between slices follows
+    the slice step, as the averaging of a moving table does.
+
+    voxels: ndarray, shape (nk, nj, ni), float32. Changed in place.
+    affine: array_like, shape (4, 4)
+    sigma_mm: Standard deviation; 0 does nothing.
+    places: ndarray, shape (nk,). k of each slice in the affine; default: 0, 1, 2 and so on.
+
+    Returns: `voxels`.
+    """
+    if not (math.isfinite(sigma_mm) and sigma_mm >= 0.0):
+        raise UsageError(f"the point spread must be 0 mm or more, got {sigma_mm}")
+    if sigma_mm == 0.0:
+        return voxels
+    di, dj, dk = column_spacing(checked_affine(affine))
+
+    def blur_slice(k: int) -> None:
+        voxels[k] = _blur_axis(_blur_axis(voxels[k], sigma_mm / di, 1), sigma_mm / dj, 0)
+
+    weights = None if places is None else _uneven_weights(places * dk, sigma_mm)
+
+    def blur_row(j: int) -> None:
+        row = np.ascontiguousarray(voxels[:, j])
+        voxels[:, j] = _blur_axis(row, sigma_mm / dk, 0) if weights is None else weights @ row
+
+    map_slices(blur_slice, voxels.shape[0], "blur", progress)
+    map_slices(blur_row, voxels.shape[1])
+    return voxels
+
+
+def add_noise(voxels: Float32Array, sigma_hu: float, seed: int) -> Float32Array:
+    """Add white Gaussian noise in place; every slice has its own stream, so threads do not change the result.
+
+    voxels: ndarray, shape (nk, nj, ni), float32. HU, changed in place.
+    sigma_hu: Standard deviation in HU.
+
+    Returns: `voxels`.
+    """
+    if sigma_hu > 0.0:
+
+        def disturb(k: int) -> None:
+            generator = np.random.default_rng((seed, k))
+            voxels[k] += np.float32(sigma_hu) * generator.standard_normal(voxels.shape[1:], dtype=np.float32)
+
+        map_slices(disturb, voxels.shape[0])
+    return voxels

@@ -1,0 +1,403 @@
+"""`PhantomSettings` and its validation; ghosts.
+
+Ghosts are foreign slices in the stack of a phantom and a localizer in its folder, as they come from real archives."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry import column_spacing, slice_normal
+from clrecon.geometry.affine import Float64Array
+from clrecon.proof.phantom.spine_parts import THORACOLUMBAR, SpineChoice, format_levels, parse_levels
+from clrecon.proof.phantom.spine_plan import fit_slices, spine_choice
+from clrecon.proof.phantom.vertebra import LARGEST_GAP_MM
+from clrecon.system.text import unknown_name
+
+if TYPE_CHECKING:
+    from pydicom.dataset import FileDataset
+
+
+FEWEST_SLICES = 12
+"""Fewest slices of a phantom with ghosts: two foreign ones with real ones between, before and behind them."""
+
+PLACES = (0.35, 0.65)
+"""Foreign slices as shares of the stack."""
+
+BACKGROUND_HU, TEXT_HU = -1000, 2000
+
+
+def ghost_places(slices: int) -> tuple[int, int]:
+    """Return the numbers of the two foreign slices of a stack."""
+    if slices < FEWEST_SLICES:
+        raise UsageError(f"{slices} slices have no room for ghosts: at least {FEWEST_SLICES} are needed")
+    first, second = (round(share * slices) for share in PLACES)
+    return first, second
+
+
+def draw_ghosts(voxels: NDArray[np.int16], seed: int) -> dict[str, Any]:
+    """Replace two slices of a stack: by a screen capture, and by a sagittal view of the stack itself.
+
+    voxels: ndarray, shape (nk, nj, ni), int16. HU, changed in place.
+
+    Returns: What the truth says of them.
+    """
+    capture, sagittal = ghost_places(len(voxels))
+    view = _sagittal(voxels)
+    rows = np.arange(voxels.shape[1]) * view.shape[0] // voxels.shape[1]
+    columns = np.arange(voxels.shape[2]) * view.shape[1] // voxels.shape[2]
+    voxels[sagittal] = view[rows][:, columns]
+    voxels[capture] = _screen_capture(voxels.shape[1:], seed)
+    return {
+        "slices": [
+            {"slice": capture, "shows": "a screen capture"},
+            {"slice": sagittal, "shows": "a sagittal view of the stack"},
+        ]
+    }
+
+
+def _sagittal(voxels: NDArray[np.int16]) -> NDArray[np.int16]:
+    """Return the highest value along each row of the volume: columns run along j, rows from the last slice down."""
+    return voxels.max(axis=2)[::-1]
+
+
+def _screen_capture(shape: tuple[int, ...], seed: int) -> NDArray[np.int16]:
+    """Draw a frame, and lines of letters that are filled rectangles."""
+    rows, columns = shape
+    page = np.full(shape, BACKGROUND_HU, np.int16)
+    edge = max(1, min(rows, columns) // 64)
+    page[edge : 2 * edge] = page[-2 * edge : -edge] = TEXT_HU
+    page[:, edge : 2 * edge] = page[:, -2 * edge : -edge] = TEXT_HU
+    rng = np.random.default_rng([seed, 7])
+    height = max(2, rows // 24)
+    for top in range(3 * height, rows - 2 * height, 2 * height):
+        left = 4 * edge
+        while left < columns - 8 * edge:
+            width = int(rng.integers(1, 4)) * edge
+            if rng.random() < 0.7:
+                page[top : top + height, left : left + width] = TEXT_HU
+            left += width + edge
+    return page
+
+
+def make_localizer(
+    slice_header: FileDataset, voxels: NDArray[np.int16], affine: Float64Array, number: int, instance: str
+) -> tuple[FileDataset, NDArray[np.int16]]:
+    """Return header and HU of a sagittal localizer of the stack, in the series of its slices.
+
+    voxels: ndarray, shape (nk, nj, ni), int16
+    affine: ndarray, shape (4, 4)
+    number: InstanceNumber.
+    instance: SOPInstanceUID.
+    """
+    from pydicom.uid import UID
+
+    header = deepcopy(slice_header)
+    view = np.ascontiguousarray(_sagittal(voxels))
+    _, dj, dk = column_spacing(affine)
+    along = affine[:3, 1] / np.linalg.norm(affine[:3, 1])
+    down = slice_normal(affine)
+    if down @ affine[:3, 2] > 0.0:
+        down = -down
+    middle = ((voxels.shape[2] - 1) / 2.0, 0.0, len(voxels) - 1.0)
+    header.file_meta.MediaStorageSOPInstanceUID = header.SOPInstanceUID = UID(instance)
+    header.ImageType = ["ORIGINAL", "PRIMARY", "LOCALIZER"]
+    header.InstanceNumber = str(number)
+    header.ImagePositionPatient = [f"{value:.8g}" for value in affine[:3, :3] @ middle + affine[:3, 3]]
+    header.ImageOrientationPatient = [f"{value + 0.0:.8g}" for value in (*along, *down)]
+    header.Rows, header.Columns = view.shape
+    header.PixelSpacing = [f"{dk:.8g}", f"{dj:.8g}"]
+    return header, view
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of phantom: its description, and its default settings."""
+
+    said: str
+    spacing: tuple[float, float, float] = (1.0, 1.0, 1.25)
+    noise: float = 0.0
+    point_spread_mm: float = 0.0
+    table: str | None = None
+    """Table under bodies of this kind; None for an analytic shape, which lies on nothing."""
+    is_scene: bool = False
+
+
+def _scene(said: str, spacing: tuple[float, float, float], table: str = "none") -> Kind:
+    return Kind(said, spacing, noise=12.0, point_spread_mm=0.5, table=table, is_scene=True)
+
+
+KINDS = {
+    "spine": Kind("thoracic and lumbar spine in a trunk", noise=12.0, point_spread_mm=0.5, table="own"),
+    "sphere": Kind("ball"),
+    "torus": Kind("ring"),
+    "cylinder": Kind("cylinder with flat ends"),
+    "plane": Kind("oblique slab"),
+    "skull": _scene("dry skull, a specimen without soft tissue", (0.9, 0.9, 1.5)),
+    "head": _scene("the skull in soft tissue, with air in sinuses and throat", (0.9, 0.9, 1.5)),
+    "bones": _scene("dry bones that lie apart", (0.9, 0.9, 1.5)),
+    "limb": _scene("lower leg, off the centre", (0.9, 0.9, 1.5)),
+    "pair": _scene("two legs of two sizes, air between them", (0.9, 0.9, 1.5)),
+    "pelvis": _scene("pelvis with a hip prosthesis and a screw at the ceiling of 12 bits", (1.5, 1.5, 1.5)),
+    "contrast": _scene("trunk with heart and vessels brighter and larger than the spine", (1.4, 1.4, 2.0)),
+    "water": _scene("cylinder of water in an acrylic shell", (1.0, 1.0, 1.5)),
+    "empty": _scene("a table with nothing on it", (1.7, 1.7, 2.0), "curved"),
+}
+"""Every kind with its description and defaults."""
+
+TABLE_NAMES = ("none", "flat", "curved", "headrest")
+"""Tables that a body may lie on.  If none is named, a spine lies on a curved couch of its own."""
+
+CENTRE_LPS_MM = (-3.5, -142.25, -418.75)
+"""Centre of the volume, away from zero as on a real couch, so that an origin lost by a program shows."""
+
+MOST_BEND = 60.0
+"""Largest kyphosis and scoliosis that is added, degrees."""
+
+_CHOOSING = ("levels", "facet_gap_mm", "kyphosis_deg", "scoliosis_deg")
+_SPINE_ONLY: dict[str, Any] = {
+    "levels": None,
+    "facet_gap_mm": None,
+    "kyphosis_deg": 0.0,
+    "scoliosis_deg": 0.0,
+    "uneven_mm": 0.0,
+    "phases": 1,
+}
+"""Settings of a spine alone, with their defaults."""
+_SAID = {"uneven_mm": "uneven slices", "facet_gap_mm": "facet joints"}
+_SAID_PLURAL = dict.fromkeys(("levels", "phases", "ghosts", "uneven_mm", "facet_gap_mm"), "they are")
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Read ``"256"`` or ``"256x192"`` as (columns, rows)."""
+    parts = text.lower().split("x")
+    if len(parts) > 2 or not all(re.fullmatch(r" *[0-9]{1,9} *", part) for part in parts):
+        raise UsageError(f"size {text!r} is not understood: use columns or columns x rows, like 256 or 256x192")
+    return int(parts[0]), int(parts[-1])
+
+
+def parse_missing(text: str) -> tuple[int, ...]:
+    """Read numbers of slices such as ``"20-22,40"``."""
+    numbers: list[int] = []
+    for part in text.split(","):
+        found = re.fullmatch(r" *([0-9]{1,4})(?: *- *([0-9]{1,4}))? *", part, re.ASCII)
+        if found is None or int(found[2] or found[1]) < int(found[1]):
+            raise UsageError(f"missing slices {text[:40]!r} are not understood: use numbers from 1, like 20-22,40")
+        numbers += range(int(found[1]), int(found[2] or found[1]) + 1)
+    return tuple(numbers)
+
+
+@dataclass(frozen=True)
+class PhantomSettings:
+    """What a phantom shows and how it is sampled.
+
+    kind: One of `KINDS`.  ``plane`` is an oblique slab with finite faces, so that it has an area and a volume.
+    size: (columns, rows). Extents of a slice in pixels.
+    slices: Number of slices; default: as many as whole vertebrae of `levels` need, 120 without levels.
+    spacing: (dj, di, dk). mm, in DICOM's order: distance between rows, between columns, and between neighbouring slices
+        **along the slice normal**.  With a tilted gantry the slice step itself is longer: ``dk / cos(tilt)``.  Default:
+        that of the kind, so that 256 x 256 pixels hold it whole.
+    tilt: Gantry tilt in degrees: slices rotated about the patient's x axis while the table still moves along z, so the
+        slice step is not parallel to the slice normal (a shear).  At most 45 either way.
+    oblique: (about_x, about_y, about_z). Degrees by which the whole frame (slices and slice step) is then rotated
+        rigidly about the patient's x, then y, then z axis.
+    noise: Standard deviation of white Gaussian noise in HU; default 12, 0 for an analytic shape.
+    point_spread_mm: Standard deviation of the Gaussian point spread in mm; default 0.5, 0 for an analytic shape.
+    seed: Same settings and seed give the same bytes; another seed moves the shape by part of a voxel, and gives other
+        noise and texture.
+    inside_hu, outside_hu: HU of an analytic shape and of its surroundings (not used by other kinds).
+    radius_mm: Sphere radius, torus centre-line radius, cylinder radius, or half the thickness of the plane's slab.
+        Default: a part of the field of view.
+    table: {"none", "flat", "curved", "headrest"}. Table that the body lies on; default: nothing, the spine's own couch,
+        a curved table for the kind ``empty``. Not for analytic shapes.
+    table_gap_mm: Gap between body and table: at 0 they touch, below 0 the body sinks in.  The spine's own couch ignores
+        it.
+    prone: The patient lies on the face: the table is at the front, and the image's rows and columns are turned by half
+        a turn about z, as a scanner does it (PatientPosition HFP).
+    ghosts: Of a spine: two slices of the stack are foreign, a screen capture and a sagittal view, the folder has a
+        sagittal localizer, and the table is the curved one unless another is named.
+    levels: Of a spine: the vertebrae that it shows, from C1 to L5, like ``"C1-L5"``, ``"L4-L5"`` or ``"C3-C7,T1-T5"``,
+        in the middle of the stack.  Their joints are 2 mm wide or more.  Default: T1 to L5 with T12 in the middle, as
+        far as the slices show them.
+    facet_gap_mm: Of a spine: distance of neighbouring vertebrae in their facet joints, at most 1.5 mm.
+    kyphosis_deg, scoliosis_deg: Of a spine: angle between the first and the last of its levels that is added to the
+        natural curve, from -60 to 60; vertebrae stay rigid.  Positive: the back is round, the middle lies to the left.
+    uneven_mm: Of a spine: the gaps of the slices differ by up to this much from their mean, at most 0.4 of it.
+    missing: Numbers of slices, from 1 as in file names, that are not written; not the first and not the last.
+    phases: Of a spine: this many series of slices at the same places, with ever more contrast medium in the vessels.
+    transfer_syntax: {"explicit", "implicit"}. Value representations in the files, both little endian and uncompressed.
+    """
+
+    kind: str = "spine"
+    size: tuple[int, int] = (256, 256)
+    slices: int = None  # type: ignore[assignment]  # a number once constructed
+    spacing: tuple[float, float, float] = None  # type: ignore[assignment]  # three numbers once constructed
+    tilt: float = 0.0
+    oblique: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    noise: float = None  # type: ignore[assignment]  # a number once constructed
+    point_spread_mm: float = None  # type: ignore[assignment]  # a number once constructed
+    seed: int = 0
+    inside_hu: float = 1000.0
+    outside_hu: float = -1000.0
+    radius_mm: float | None = None
+    table: str | None = None
+    table_gap_mm: float = 0.0
+    prone: bool = False
+    ghosts: bool = False
+    levels: str | None = None
+    facet_gap_mm: float | None = None
+    kyphosis_deg: float = 0.0
+    scoliosis_deg: float = 0.0
+    uneven_mm: float = 0.0
+    missing: tuple[int, ...] = ()
+    phases: int = 1
+    transfer_syntax: str = "explicit"
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise UsageError(unknown_name("phantom kind", self.kind, KINDS))
+        if self.transfer_syntax not in ("explicit", "implicit"):
+            raise UsageError(f"unknown transfer syntax {self.transfer_syntax!r}: use explicit or implicit")
+        for name in ("spacing", "noise", "point_spread_mm"):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, getattr(KINDS[self.kind], name))
+        # Lists (from a command line) become tuples, so that equal settings compare and describe equal.
+        for name, length in (("size", 2), ("spacing", 3), ("oblique", 3)):
+            value = tuple(getattr(self, name))
+            if len(value) != length:
+                raise UsageError(f"{name} needs {length} values, got {len(value)}: {value}")
+            object.__setattr__(self, name, value)
+        for name, extent in (("columns", self.size[0]), ("rows", self.size[1])):
+            _check_integer(name, extent, 8, 4096)
+        if self.slices is not None:
+            _check_integer("slices", self.slices, 1, 9999)
+        _check_integer("seed", self.seed, 0, 2**31 - 1)
+        for name, step in zip(("row spacing dj", "column spacing di", "slice gap dk"), self.spacing, strict=True):
+            _check_number(name, step, 0.05, 50.0, "mm")
+        _check_number("tilt", self.tilt, -45.0, 45.0, "degrees")
+        for name, angle in zip(("oblique about x", "oblique about y", "oblique about z"), self.oblique, strict=True):
+            _check_number(name, angle, -360.0, 360.0, "degrees")
+        _check_number("noise", self.noise, 0.0, 1000.0, "HU")
+        _check_number("point spread", self.point_spread_mm, 0.0, 20.0, "mm")
+        _check_number("inside HU", self.inside_hu, -1024.0, 30000.0, "HU")
+        _check_number("outside HU", self.outside_hu, -1024.0, 30000.0, "HU")
+        if abs(self.inside_hu - self.outside_hu) < 1.0:
+            raise UsageError(f"inside ({self.inside_hu:g}) and outside ({self.outside_hu:g}) differ by less than 1 HU")
+        if self.radius_mm is not None:
+            _check_number("radius", self.radius_mm, 1e-3, 1e4, "mm")
+            if KINDS[self.kind].table is not None:
+                raise UsageError(f"a {self.kind} has no radius: it is for sphere, torus, cylinder and plane")
+        _check_number("gap between body and table", self.table_gap_mm, -100.0, 500.0, "mm")
+        self._check_lying()
+        self._check_spine()
+        self._check_series()
+
+    def _check_spine(self) -> None:
+        _check_number("kyphosis", self.kyphosis_deg, -MOST_BEND, MOST_BEND, "degrees")
+        _check_number("scoliosis", self.scoliosis_deg, -MOST_BEND, MOST_BEND, "degrees")
+        if self.facet_gap_mm is not None:
+            _check_number("gap of the facet joints", self.facet_gap_mm, 0.0, LARGEST_GAP_MM, "mm")
+        _check_number("unevenness", self.uneven_mm, 0.0, 0.4 * self.spacing[2], "mm (0.4 of the mean gap)")
+        _check_integer("phases", self.phases, 1, 20)
+        if self.levels is not None:
+            object.__setattr__(self, "levels", format_levels(parse_levels(self.levels)))
+        if self.kind != "spine":
+            for name, default in (*_SPINE_ONLY.items(), ("ghosts", False)):
+                if getattr(self, name) != default:
+                    said = _SAID.get(name) or name.removesuffix("_deg").removesuffix("_mm").replace("_", " ")
+                    raise UsageError(f"a {self.kind} has no {said}: {_SAID_PLURAL.get(name, 'it is')} for the spine")
+        if self.slices is None or self.levels is not None:
+            choice, slices = self.spine_choice, self.slices
+            if choice is not None and self.levels is not None:
+                slices = fit_slices(choice, self.size, self.spacing, self.seed, self._directions, self.slices)
+            object.__setattr__(self, "slices", slices or 120)
+
+    def _check_series(self) -> None:
+        missing = tuple(self.missing)
+        object.__setattr__(self, "missing", tuple(sorted(missing, key=int)) if _are_integers(missing) else missing)
+        for number in missing:
+            _check_integer("the number of a missing slice", number, 2, self.slices - 1)
+        if len(set(missing)) < len(missing):
+            raise UsageError("a slice is named more than once among those that are missing")
+        if self.phases * self.slices > 9999:
+            raise UsageError(f"{self.phases} phases of {self.slices} slices are more than 9999 files")
+        if self.ghosts:
+            if self.uneven_mm or self.missing or self.phases > 1:
+                raise UsageError("ghosts are for an even series of one phase without missing slices")
+            ghost_places(self.slices)
+
+    @property
+    def _directions(self) -> tuple[float, tuple[float, float, float], bool]:
+        return self.tilt, self.oblique, self.prone
+
+    @property
+    def spine_choice(self) -> SpineChoice | None:
+        """What is chosen of a spine; None without levels, bend and facets."""
+        if self.kind != "spine" or all(getattr(self, name) == _SPINE_ONLY[name] for name in _CHOOSING):
+            return None
+        return spine_choice(
+            parse_levels(self.levels) if self.levels is not None else THORACOLUMBAR,
+            (self.kyphosis_deg, self.scoliosis_deg),
+            self.facet_gap_mm,
+            centred=self.levels is not None,
+            directions=self._directions,
+            length_mm=None if self.slices is None else self.slices * self.spacing[2],
+        )
+
+    def _check_lying(self) -> None:
+        if self.table is not None and self.table not in TABLE_NAMES:
+            raise UsageError(unknown_name("table", self.table, TABLE_NAMES))
+        lies = self.table is not None or self.table_gap_mm != 0.0 or self.prone
+        if lies and KINDS[self.kind].table is None:
+            raise UsageError(f"a {self.kind} lies on nothing: table, gap and prone are for spine and the other bodies")
+        if self.table_gap_mm != 0.0 and self.table_used in ("none", "own"):
+            names = ", ".join(TABLE_NAMES[1:])
+            raise UsageError(f"a gap of {self.table_gap_mm:g} mm needs a table: name one of {names}")
+
+    @property
+    def table_used(self) -> str:
+        """Name of the table: the given one, else that of the kind; ``own`` for the spine's own couch, which is too thin
+        to be a ghost.
+        """
+        return self.table or ("curved" if self.ghosts else KINDS[self.kind].table) or "none"
+
+    @property
+    def shape_kji(self) -> tuple[int, int, int]:
+        """(slices, rows, columns), the shape of the voxels."""
+        return self.slices, self.size[1], self.size[0]
+
+    def as_dict(self) -> dict[str, Any]:
+        """All settings as plain JSON types; those of table, spine and series where they are not the default.
+
+        UIDs are derived from these texts, so the defaults are left out: phantoms of earlier versions keep their UIDs.
+        """
+        plain = {
+            name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self).items()
+        }
+        plain["missing"] = list(self.missing)
+        lying = {"table": None, "table_gap_mm": 0.0, "prone": False, "ghosts": False}
+        for name, default in {**lying, **_SPINE_ONLY, "missing": []}.items():
+            if plain[name] == default:
+                del plain[name]
+        return plain
+
+
+def _are_integers(values: tuple[Any, ...]) -> bool:
+    return all(isinstance(value, (int, np.integer)) for value in values)
+
+
+def _check_integer(name: str, value: Any, low: int, high: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not low <= value <= high:
+        raise UsageError(f"{name} must be a whole number from {low} to {high}, got {value}")
+
+
+def _check_number(name: str, value: Any, low: float, high: float, unit: str) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not low <= value <= high:
+        raise UsageError(f"{name} must be a number from {low:g} to {high:g} {unit}, got {value}")

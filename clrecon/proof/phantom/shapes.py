@@ -1,0 +1,365 @@
+"""Analytic bodies in LPS mm: exact signed distance, area and volume; and the body of a phantom.
+
+Signed distances are in mm, **positive inside** and zero on the surface, so that a distance field behaves like bone
+in a CT volume: inside is ``>= 0``.  Source: exact Euclidean distances after J. C. Hart, "Sphere tracing", The
+Visual Computer 12 (1996), with the sign turned round.
+
+The body of a phantom is sized for its field of view, with its centre a part of a voxel off the middle."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry import apply_affine
+from clrecon.proof.phantom.settings import PhantomSettings
+
+Float64Array = NDArray[np.float64]
+
+
+class Body(Protocol):
+    """A solid with an exact signed distance."""
+
+    def signed_distance(self, points_mm: ArrayLike) -> Float64Array:
+        """Distance in mm to the surface, positive inside; points (n, 3) LPS mm, result (n,) float64."""
+        ...
+
+    @property
+    def area_mm2(self) -> float:
+        """Area of the surface in mm2, infinite for an unbounded body."""
+        ...
+
+    @property
+    def volume_ml(self) -> float:
+        """Volume in ml (1000 mm3), infinite for an unbounded body."""
+        ...
+
+    @property
+    def bounds_mm(self) -> Float64Array:
+        """Axis-parallel box, shape (2, 3): lowest and highest corner in LPS mm."""
+        ...
+
+    def describe(self) -> dict[str, Any]:
+        """Kind, parameters, area and volume as plain JSON types (null where infinite)."""
+        ...
+
+
+def _vector(name: str, value: ArrayLike) -> Float64Array:
+    vector = np.array(value, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise UsageError(f"{name} must be three finite numbers, got {np.asarray(value).tolist()}")
+    return vector
+
+
+def _unit(name: str, value: ArrayLike) -> Float64Array:
+    vector = _vector(name, value)
+    length = float(np.linalg.norm(vector))
+    if length == 0.0:
+        raise UsageError(f"{name} must not be the zero vector")
+    return vector / length
+
+
+def _positive(name: str, value: float) -> float:
+    number = float(value)
+    if not (math.isfinite(number) and number > 0.0):
+        raise UsageError(f"{name} must be a positive number of mm, got {value}")
+    return number
+
+
+def _points(points_mm: ArrayLike) -> Float64Array:
+    points = np.asarray(points_mm, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise UsageError(f"points have shape (n, 3), these have {points.shape}")
+    return points
+
+
+def _box_distance(excess: Float64Array) -> Float64Array:
+    """Return the signed distance, positive inside, from (n, m) signed excesses over m orthogonal limits."""
+    outside = np.linalg.norm(np.maximum(excess, 0.0), axis=1)
+    return -(outside + np.minimum(excess.max(axis=1), 0.0))
+
+
+def _listed(vector: Float64Array) -> list[float]:
+    return [float(value) for value in vector]
+
+
+class Sphere:
+    """Ball.
+
+    center: array_like, shape (3,). LPS mm.
+    radius: mm.
+    """
+
+    def __init__(self, center: ArrayLike, radius: float):
+        self.center = _vector("center", center)
+        self.radius = _positive("radius", radius)
+
+    def signed_distance(self, points_mm: ArrayLike) -> Float64Array:
+        """Distance in mm to the surface, positive inside, (n,) float64 for points (n, 3)."""
+        offset = _points(points_mm) - self.center
+        return self.radius - np.sqrt(np.einsum("ij,ij->i", offset, offset))
+
+    @property
+    def area_mm2(self) -> float:
+        """Area in mm2."""
+        return 4.0 * math.pi * self.radius**2
+
+    @property
+    def volume_ml(self) -> float:
+        """Volume in ml."""
+        return 4.0 / 3.0 * math.pi * self.radius**3 / 1000.0
+
+    @property
+    def bounds_mm(self) -> Float64Array:
+        """Lowest and highest corner, shape (2, 3)."""
+        return np.array((self.center - self.radius, self.center + self.radius))
+
+    def describe(self) -> dict[str, Any]:
+        """Parameters, area and volume as plain JSON types."""
+        return {
+            "kind": "sphere",
+            "center_lps_mm": _listed(self.center),
+            "radius_mm": self.radius,
+            "area_mm2": self.area_mm2,
+            "volume_ml": self.volume_ml,
+        }
+
+
+class Torus:
+    """Ring torus.
+
+    center: array_like, shape (3,). LPS mm.
+    axis: array_like, shape (3,). Axis of revolution, any length.
+    major, minor: Radius of the ring's centre line and of the tube in mm, ``minor < major``.
+    """
+
+    def __init__(self, center: ArrayLike, axis: ArrayLike, major: float, minor: float):
+        self.center = _vector("center", center)
+        self.axis = _unit("axis", axis)
+        self.major = _positive("major", major)
+        self.minor = _positive("minor", minor)
+        if self.minor >= self.major:
+            raise UsageError(f"a torus needs minor < major, got minor {self.minor:g} and major {self.major:g} mm")
+
+    def signed_distance(self, points_mm: ArrayLike) -> Float64Array:
+        """Distance in mm to the surface, positive inside, (n,) float64 for points (n, 3)."""
+        offset = _points(points_mm) - self.center
+        along = offset @ self.axis
+        radial = np.linalg.norm(offset - along[:, None] * self.axis, axis=1)
+        return self.minor - np.hypot(radial - self.major, along)
+
+    @property
+    def area_mm2(self) -> float:
+        """Area in mm2 (Pappus)."""
+        return 4.0 * math.pi**2 * self.major * self.minor
+
+    @property
+    def volume_ml(self) -> float:
+        """Volume in ml (Pappus)."""
+        return 2.0 * math.pi**2 * self.major * self.minor**2 / 1000.0
+
+    @property
+    def bounds_mm(self) -> Float64Array:
+        """Lowest and highest corner, shape (2, 3)."""
+        reach = self.major * np.sqrt(np.maximum(1.0 - self.axis**2, 0.0)) + self.minor
+        return np.array((self.center - reach, self.center + reach))
+
+    def describe(self) -> dict[str, Any]:
+        """Parameters, area and volume as plain JSON types."""
+        return {
+            "kind": "torus",
+            "center_lps_mm": _listed(self.center),
+            "axis_lps": _listed(self.axis),
+            "major_radius_mm": self.major,
+            "minor_radius_mm": self.minor,
+            "area_mm2": self.area_mm2,
+            "volume_ml": self.volume_ml,
+        }
+
+
+class Cylinder:
+    """Circular cylinder with flat caps.
+
+    center: array_like, shape (3,). Middle of the axis, LPS mm.
+    axis: array_like, shape (3,). Direction of the axis, any length.
+    radius, length: mm.
+    """
+
+    def __init__(self, center: ArrayLike, axis: ArrayLike, radius: float, length: float):
+        self.center = _vector("center", center)
+        self.axis = _unit("axis", axis)
+        self.radius = _positive("radius", radius)
+        self.length = _positive("length", length)
+
+    def signed_distance(self, points_mm: ArrayLike) -> Float64Array:
+        """Distance in mm to the surface, positive inside, (n,) float64 for points (n, 3)."""
+        offset = _points(points_mm) - self.center
+        along = offset @ self.axis
+        radial = np.linalg.norm(offset - along[:, None] * self.axis, axis=1)
+        return _box_distance(np.stack((radial - self.radius, np.abs(along) - self.length / 2.0), axis=1))
+
+    @property
+    def area_mm2(self) -> float:
+        """Area in mm2, caps included."""
+        return 2.0 * math.pi * self.radius * (self.length + self.radius)
+
+    @property
+    def volume_ml(self) -> float:
+        """Volume in ml."""
+        return math.pi * self.radius**2 * self.length / 1000.0
+
+    @property
+    def bounds_mm(self) -> Float64Array:
+        """Lowest and highest corner, shape (2, 3)."""
+        reach = np.abs(self.axis) * self.length / 2.0 + self.radius * np.sqrt(np.maximum(1.0 - self.axis**2, 0.0))
+        return np.array((self.center - reach, self.center + reach))
+
+    def describe(self) -> dict[str, Any]:
+        """Parameters, area and volume as plain JSON types."""
+        return {
+            "kind": "cylinder",
+            "center_lps_mm": _listed(self.center),
+            "axis_lps": _listed(self.axis),
+            "radius_mm": self.radius,
+            "length_mm": self.length,
+            "area_mm2": self.area_mm2,
+            "volume_ml": self.volume_ml,
+        }
+
+
+class Box:
+    """Oblique box: a slab with two large faces square to `normal`.
+
+    center: array_like, shape (3,). LPS mm.
+    normal: array_like, shape (3,). Direction of the thickness, any length.
+    thickness: Extent along `normal`, mm.
+    width, height: Extents along the two other edges, mm.
+    edge: array_like, shape (3,). Direction of the width; its part along `normal` is taken out.  Default: some direction
+        square to `normal`.
+    """
+
+    def __init__(
+        self,
+        center: ArrayLike,
+        normal: ArrayLike,
+        thickness: float,
+        width: float,
+        height: float,
+        edge: ArrayLike | None = None,
+    ):
+        self.center = _vector("center", center)
+        self.normal = _unit("normal", normal)
+        if edge is None:
+            edge = np.eye(3)[int(np.argmin(np.abs(self.normal)))]
+        across = _unit("edge", edge)
+        across = across - (across @ self.normal) * self.normal
+        if np.linalg.norm(across) < 1e-6:
+            raise UsageError("edge must not be parallel to normal")
+        self.edge = _unit("edge", across)
+        self.size = np.array(
+            (_positive("width", width), _positive("height", height), _positive("thickness", thickness))
+        )
+        # rows: width, height and thickness directions
+        self._axes = np.array((self.edge, np.cross(self.normal, self.edge), self.normal))
+
+    def signed_distance(self, points_mm: ArrayLike) -> Float64Array:
+        """Distance in mm to the surface, positive inside, (n,) float64 for points (n, 3)."""
+        local = (_points(points_mm) - self.center) @ self._axes.T
+        return _box_distance(np.abs(local) - self.size / 2.0)
+
+    @property
+    def area_mm2(self) -> float:
+        """Area in mm2."""
+        width, height, thickness = self.size
+        return float(2.0 * (width * height + height * thickness + thickness * width))
+
+    @property
+    def volume_ml(self) -> float:
+        """Volume in ml."""
+        return float(np.prod(self.size)) / 1000.0
+
+    @property
+    def bounds_mm(self) -> Float64Array:
+        """Lowest and highest corner, shape (2, 3)."""
+        reach = (self.size / 2.0) @ np.abs(self._axes)
+        return np.array((self.center - reach, self.center + reach))
+
+    def describe(self) -> dict[str, Any]:
+        """Parameters, area and volume as plain JSON types."""
+        width, height, thickness = _listed(self.size)
+        return {
+            "kind": "plane",
+            "center_lps_mm": _listed(self.center),
+            "normal_lps": _listed(self.normal),
+            "edge_lps": _listed(self.edge),
+            "thickness_mm": thickness,
+            "width_mm": width,
+            "height_mm": height,
+            "area_mm2": self.area_mm2,
+            "volume_ml": self.volume_ml,
+        }
+
+
+AXIS_LPS = (0.36, -0.48, 0.8)
+"""Axis of torus, cylinder and slab: unit length, parallel to no axis of the patient or of usual slices."""
+
+_MARGIN_STEPS = 1.5
+"""Steps of background kept between the body and the faces of the volume."""
+
+
+def _sub_voxel_centre(affine: NDArray[np.float64], settings: PhantomSettings) -> NDArray[np.float64]:
+    offset = np.random.default_rng((settings.seed, 7)).uniform(-0.5, 0.5, 3)
+    middle = (np.array(settings.shape_kji[::-1], dtype=np.float64) - 1.0) / 2.0
+    return apply_affine(affine, (middle + offset)[None])[0]
+
+
+def choose_body(affine: NDArray[np.float64], settings: PhantomSettings) -> Body:
+    """Make the analytic body of `settings` for a volume with this affine.
+
+    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
+    settings: Of an analytic kind.
+
+    Returns: Wholly inside the volume, with at least one voxel of background on every side.
+    """
+    centre = _sub_voxel_centre(affine, settings)
+    # distances between opposite faces of the volume, halved: rows of the inverse are the faces' normals per step
+    per_step = 1.0 / np.linalg.norm(np.linalg.inv(affine)[:3, :3], axis=1)
+    reach = float(((np.array(settings.shape_kji[::-1]) / 2.0 - _MARGIN_STEPS) * per_step).min())
+    if reach <= 0.0:
+        raise UsageError(
+            f"a {settings.kind} needs at least 4 voxels along every axis, this volume has {settings.shape_kji[::-1]}"
+        )
+    given = settings.radius_mm
+    body: Body
+    if settings.kind == "sphere":
+        radius = given if given is not None else 0.7 * reach
+        body, extent, thinnest = Sphere(centre, radius), radius, 2.0 * radius
+    elif settings.kind == "torus":
+        radius = given if given is not None else 0.6 * reach
+        body, extent, thinnest = Torus(centre, AXIS_LPS, radius, 0.4 * radius), 1.4 * radius, 0.8 * radius
+    elif settings.kind == "cylinder":
+        radius = given if given is not None else 0.4 * reach
+        body = Cylinder(centre, AXIS_LPS, radius, 3.0 * radius)
+        extent, thinnest = float(np.hypot(1.0, 1.5)) * radius, 2.0 * radius
+    elif settings.kind == "plane":
+        radius = given if given is not None else 0.2 * reach
+        body = Box(centre, AXIS_LPS, 2.0 * radius, 0.9 * reach, 0.7 * reach)
+        extent, thinnest = float(np.linalg.norm(body.size)) / 2.0, 2.0 * radius
+    else:
+        raise UsageError(f"a {settings.kind} phantom has no analytic body")
+    largest_step = float(np.linalg.norm(affine[:3, :3], axis=0).max())
+    if thinnest < 2.0 * largest_step:
+        raise UsageError(
+            f"a {settings.kind} with radius {radius:.4g} mm is {thinnest:.4g} mm thick: too thin for voxels of "
+            f"{largest_step:.4g} mm (two voxels are needed); use more or finer voxels, or a larger radius"
+        )
+    if extent > reach:
+        raise UsageError(
+            f"a {settings.kind} with radius {radius:.4g} mm reaches {extent:.4g} mm from the centre: the volume "
+            f"leaves {reach:.4g} mm; use a smaller radius or a larger volume"
+        )
+    return body

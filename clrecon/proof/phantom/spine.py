@@ -1,0 +1,424 @@
+"""Draw the spine phantom in HU, slice by slice: soft tissue, lungs, vessels, discs, ribs, vertebrae, marker and table.
+
+Every interface is a linear ramp of about one voxel (partial volume), not a threshold.  Bone is drawn on thin
+sub-slices and averaged, so that thick slices blur endplates as a scanner does."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry import column_spacing
+from clrecon.proof.phantom.fields import Field, capsule, coverage, ellipse, ellipsoid, waves_at
+from clrecon.proof.phantom.scenes import Part, Piece, PlacedPiece, Plan, Window, lay_under, paint
+from clrecon.proof.phantom.settings import CENTRE_LPS_MM, PhantomSettings
+from clrecon.proof.phantom.spine_parts import Anatomy, Vertebra, level_number
+from clrecon.proof.phantom.spine_plan import plan_anatomy
+from clrecon.proof.phantom.vertebra import local_bounds, vertebra_distance
+from clrecon.system.progress import Progress
+
+AIR_HU = -1000.0
+SKIN_HU = 25.0
+FAT_HU = -105.0
+MUSCLE_HU = 54.0
+LUNG_HU = -860.0
+LIVER_HU = 62.0
+SPLEEN_HU = 52.0
+KIDNEY_HU = 36.0
+BLOOD_HU = 44.0
+CALCIUM_HU = 520.0
+BOWEL_HU = 22.0
+GAS_HU = -850.0
+FLUID_HU = 14.0
+CORD_HU = 38.0
+TABLE_SHELL_HU = 130.0
+TABLE_CORE_HU = -930.0
+
+
+def _blend(canvas: Field, share: Field, hu: float) -> None:
+    canvas += share * (np.float32(hu) - canvas)
+
+
+def _draw_couch(canvas: Field, anatomy: Anatomy, x: Field, y: Field, ramp: float) -> None:
+    """Draw a curved carbon couch under the back: a thin shell around foam, endless along z; `y` runs downwards."""
+    top = y - np.float32(anatomy.half_depth + 2.0)
+    bowed = top + np.float32(0.16 / anatomy.half_width) * x * x
+    shell = np.minimum(np.minimum(bowed, 32.0 - top), np.float32(0.95 * anatomy.half_width) - np.abs(x))
+    _blend(canvas, coverage(shell, ramp), TABLE_SHELL_HU)
+    _blend(canvas, coverage(shell - np.float32(1.6), ramp), TABLE_CORE_HU)
+
+
+def _draw_wall(
+    canvas: Field, half_width: float | Field, half_depth: float | Field, x: Field, y: Field, ramp: float
+) -> Field:
+    """Draw skin, fat and muscle; return the distance into the body cavity."""
+    skin = ellipse(x, y, half_width, half_depth)
+    _blend(canvas, coverage(skin, ramp), SKIN_HU)
+    _blend(canvas, coverage(skin - np.float32(1.8), ramp), FAT_HU)
+    # The flanks and the belly have more fat than the ribs of the back.
+    fat = np.float32(11.0) - np.float32(3.0) * np.clip(y / np.asarray(half_depth, dtype=np.float32), -1.0, 1.0)
+    muscle = skin - fat
+    _blend(canvas, coverage(muscle, ramp), MUSCLE_HU)
+    return muscle - np.float32(13.0)
+
+
+def _draw_organs(
+    canvas: Field,
+    anatomy: Anatomy,
+    cavity: Field,
+    x: Field,
+    y: Field,
+    z: Field,
+    ramp: float,
+    seed: int,
+    blood_hu: float,
+) -> Field:
+    """Draw abdominal organs in fat and, above the diaphragm, lungs; return the distance into the lungs.
+
+    `x` and `y` count from the middle of the trunk.
+    """
+    wide, deep = anatomy.half_width - 28.0, anatomy.half_depth - 28.0
+    low = np.float32(anatomy.level_z("L1"))
+    _blend(canvas, coverage(cavity, ramp), FAT_HU + 8.0)
+    # The domes of the diaphragm are highest over the middle of each half of the chest.
+    half = np.abs(x) - np.float32(0.5 * wide)
+    dome = low + np.float32(62.0) * np.maximum(
+        1.0 - (half / np.float32(0.62 * wide)) ** 2 - (y / np.float32(1.05 * deep)) ** 2, -0.2
+    )
+    above = (z - dome) * np.float32(0.75)
+    abdomen = np.minimum(cavity, -above)
+
+    lowest, highest = float(z.min()), float(z.max())
+
+    def organ(center: tuple[float, float, float], half_axes: tuple[float, float, float], hu: float) -> None:
+        if lowest > center[2] + half_axes[2] + 2.0 * ramp or highest < center[2] - half_axes[2] - 2.0 * ramp:
+            return
+        shape = ellipsoid(x - np.float32(center[0]), y - np.float32(center[1]), z - np.float32(center[2]), half_axes)
+        _blend(canvas, coverage(np.minimum(shape, abdomen), ramp), hu)
+
+    mid, kidney = anatomy.level_z("T12"), anatomy.level_z("L2")
+    generator = np.random.default_rng((seed, 13))
+    for n in range(9):
+        spot = (generator.uniform(-0.6, 0.7) * wide, generator.uniform(-0.75, -0.1) * deep, kidney - 22.0 * n + 25.0)
+        size = tuple(generator.uniform(14.0, 26.0, 3))
+        organ(spot, (size[0], size[1], size[2]), BOWEL_HU)
+        if n % 3 == 0:
+            organ((spot[0], spot[1] - 0.35 * size[1], spot[2]), (0.6 * size[0], 0.5 * size[1], 0.6 * size[2]), GAS_HU)
+    organ((-0.48 * wide, -0.10 * deep, mid - 8.0), (0.62 * wide, 0.80 * deep, 74.0), LIVER_HU)
+    organ((0.20 * wide, -0.45 * deep, mid), (0.34 * wide, 0.36 * deep, 34.0), BOWEL_HU + 8.0)
+    organ((0.70 * wide, 0.22 * deep, mid - 4.0), (0.24 * wide, 0.42 * deep, 44.0), SPLEEN_HU)
+    spine_y = anatomy.centres["L2"][1]
+    if anatomy.outline is not None:
+        spine_y = spine_y - float(anatomy.outline.at(np.array([kidney]))[1][0])
+    for side in (1.0, -1.0):
+        # The right kidney lies lower, under the liver.
+        organ((side * 56.0, spine_y + 8.0, kidney + 8.0 * side), (23.0, 19.0, 50.0), KIDNEY_HU)
+
+    mediastinum = ellipse(x - np.float32(6.0), y + np.float32(0.25 * deep), 0.34 * wide + 6.0, 0.85 * deep)
+    # Heart and great vessels are one piece, in a rim of fat.
+    _blend(canvas, coverage(np.minimum(np.minimum(mediastinum - np.float32(4.0), above), cavity), ramp), blood_hu)
+    lung = np.minimum(np.minimum(cavity + np.float32(9.0), above), -mediastinum)
+    return lung
+
+
+_BAND = 24000
+"""Pixels drawn at once: temporaries stay in the cache, and below the size at which the system maps memory anew."""
+
+
+def draw_tissue(
+    anatomy: Anatomy,
+    x: Field,
+    y: Field,
+    z: Field,
+    ramp: float,
+    seed: int,
+    table: Sequence[Part] | None,
+    prone: bool,
+    *,
+    blood_hu: float = BLOOD_HU,
+) -> Field:
+    """Draw one slice without bone, in bands of rows.
+
+    x, y, z: ndarray, shape (nj, ni), float32. mm of the plan.
+    ramp: Width of an interface, mm.
+    table: Table that the body lies on; None: a couch of its own.
+    prone: That couch is under the front.
+    blood_hu: HU of heart and vessels.
+
+    Returns: ndarray, shape (nj, ni), float32. HU.
+    """
+    canvas = np.full(x.shape, AIR_HU, dtype=np.float32)
+    rows = max(1, _BAND // x.shape[1])
+    for start in range(0, x.shape[0], rows):
+        band = slice(start, start + rows)
+        if table is None:
+            _draw_couch(canvas[band], anatomy, x[band], -y[band] if prone else y[band], ramp)
+        for part in table or ():
+            _blend(canvas[band], coverage(part.distance_at(x[band], y[band], z[band]), ramp), part.hu)
+        _draw_band(canvas[band], anatomy, x[band], y[band], z[band], ramp, seed, blood_hu)
+    return canvas
+
+
+def _draw_band(
+    canvas: Field, anatomy: Anatomy, x: Field, y: Field, z: Field, ramp: float, seed: int, blood_hu: float
+) -> None:
+    """Draw onto `canvas`, which already holds air and the couch."""
+    neck: float | Field = 0.0
+    if anatomy.outline is None:
+        cavity = _draw_wall(canvas, anatomy.half_width, anatomy.half_depth, x, y, ramp)
+        lung = _draw_organs(canvas, anatomy, cavity, x, y, z, ramp, seed, blood_hu)
+    else:
+        middle_x, middle_y, half_width, half_depth, neck = anatomy.outline.at(z)
+        body_x, body_y = x - middle_x, y - middle_y
+        cavity = _draw_wall(canvas, half_width, half_depth, body_x, body_y, ramp)
+        lung = _draw_organs(canvas, anatomy, cavity, body_x, body_y, z, ramp, seed, blood_hu)
+        lung = np.minimum(lung, np.float32(60.0) * (np.float32(0.2) - neck))  # no lungs in the neck
+
+    height = np.clip(z, *anatomy.curve_z) * np.float32(0.01)
+    spine_x, spine_y = (
+        np.asarray(np.polyval(curve.astype(np.float32), height), dtype=np.float32)
+        for curve in (anatomy.curve_x, anatomy.curve_y)
+    )
+    from_x, from_y = x - spine_x, y - spine_y
+    # muscle round the column, before the lungs, so that they do not reach into it
+    column = ellipse(from_x, from_y - np.float32(34.0), 66.0, 37.0)
+    front = ellipse(from_x, from_y, 29.0, 27.0)
+    lung = np.minimum(lung, -np.maximum(column, front))
+    _blend(canvas, coverage(np.minimum(column, cavity + np.float32(13.0)), ramp), MUSCLE_HU)
+    _blend(canvas, coverage(lung, ramp), LUNG_HU)
+    # Planes of fat: under the skin between the muscle bellies, and beside the transverse processes.
+    cleft = np.minimum(3.0 - np.abs(from_x), from_y - 56.0)
+    _blend(canvas, coverage(np.minimum(cleft, cavity + np.float32(13.0)), ramp), FAT_HU)
+    belly = np.abs(ellipse(np.abs(from_x) - np.float32(27.0), from_y - np.float32(42.0), 25.0, 17.0))
+    _blend(canvas, np.float32(0.6) * coverage(np.float32(0.7) - belly, ramp), FAT_HU)
+
+    top, bottom = anatomy.level_z("T12"), anatomy.level_z("L5")
+    lean = float(np.polyval(anatomy.curve_y, bottom / 100.0))
+    start = float(np.polyval(anatomy.curve_y, top / 100.0))
+    psoas = capsule(np.abs(from_x), y, z, (24.0, start + 6.0, top - 12.0), (44.0, lean - 6.0, bottom), 3.0, 21.0)
+    _blend(canvas, coverage(psoas, ramp), MUSCLE_HU + 4.0)
+    fat_round = ellipse(from_x - np.float32(2.0), from_y + np.float32(29.0), 34.0, 14.0)
+    _blend(canvas, coverage(np.minimum(fat_round, -lung), ramp), FAT_HU + 20.0)
+    _draw_vessels(canvas, from_x, from_y, z, neck, ramp, seed, blood_hu)
+    # The canal lies nearer to the middle of the small bodies of the neck.
+    behind = np.float32(9.5) * neck
+    canal = ellipse(from_x, from_y - np.float32(24.3) + behind, 11.5, 8.3)
+    _blend(canvas, coverage(canal, ramp), FAT_HU + 40.0)
+    sac = ellipse(from_x, from_y - np.float32(24.0) + behind, 8.5, 6.6)
+    _blend(canvas, coverage(sac, ramp), FLUID_HU)
+    _blend(canvas, coverage(np.minimum(sac - np.float32(3.0), z - np.float32(anatomy.level_z("L1"))), ramp), CORD_HU)
+
+
+def _draw_vessels(
+    canvas: Field, from_x: Field, from_y: Field, z: Field, neck: float | Field, ramp: float, seed: int, blood_hu: float
+) -> None:
+    """Draw aorta and vena cava in front of the spine, and in the neck the windpipe."""
+    trunk = np.float32(1.0) - neck
+    aorta = ellipse(from_x - np.float32(13.0), from_y + np.float32(29.0), 10.0, 10.0)
+    # Plaques: spots of the left and rear wall, at intervals along the vessel.
+    plaque = (
+        1.1
+        - np.abs(aorta - np.float32(1.0))
+        - np.float32(3.0)
+        * np.maximum(
+            0.84 - np.cos(z * np.float32(0.23) + np.float32(seed % 7)) * np.cos((from_x - from_y) * np.float32(0.25)),
+            0.0,
+        )
+    )
+    _blend(canvas, trunk * coverage(aorta, ramp), blood_hu)
+    _blend(canvas, trunk * coverage(np.minimum(plaque, from_x - np.float32(13.0)), ramp), CALCIUM_HU)
+    vein = ellipse(from_x + np.float32(16.0), from_y + np.float32(27.0), 12.5, 8.5)
+    _blend(canvas, trunk * coverage(vein, ramp), blood_hu)
+    if not isinstance(neck, float):
+        windpipe = ellipse(from_x, from_y + np.float32(27.0), 8.0, 8.0)
+        _blend(canvas, coverage(np.minimum(windpipe, np.float32(60.0) * (neck - np.float32(0.5))), ramp), AIR_HU)
+
+
+Float64Array = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+
+CORTEX_HU = 1050.0
+BODY_CORTEX_HU = 850.0
+TRABECULAR_HU = 190.0
+TRABECULAR_TEXTURE_HU = 45.0
+ARCH_MARROW_HU = 330.0
+RIB_MARROW_HU = 140.0
+DISC_HU = 92.0
+VEIN_HU = 60.0
+MARKER_HU = 2200.0
+
+
+class _Scene:
+    """All bone parts of a spine plan, placed on one grid."""
+
+    def __init__(self, anatomy: Anatomy, affine: Float64Array, shape_kji: tuple[int, int, int], ramp_mm: float):
+        self.anatomy, self.ramp = anatomy, ramp_mm
+        margin = np.full(3, 2.0 * ramp_mm + float(np.linalg.norm(affine[:3, :3], axis=0).max()))
+
+        def place(center: Float64Array, axes: Float64Array, low: Float64Array, high: Float64Array) -> PlacedPiece:
+            return PlacedPiece(Piece(center, axes, low - margin, high + margin), affine, shape_kji)
+
+        self.discs = []
+        for disc in anatomy.discs:
+            half = np.array((disc.half_width, disc.half_depth, disc.half_length))
+            self.discs.append((disc, place(disc.center, disc.axes, -half, half)))
+        self.vertebrae = []
+        for vertebra in anatomy.vertebrae:
+            low, high = (np.array(corner) for corner in local_bounds(vertebra))
+            self.vertebrae.append((vertebra, place(vertebra.center, vertebra.axes, low, high)))
+        self.rib_rods = []
+        for rib in anatomy.ribs:
+            for a, b in itertools.pairwise(rib.points):
+                reach = np.array((4.5, 4.5, 8.0))
+                low, high = np.minimum(a, b) - reach, np.maximum(a, b) + reach
+                self.rib_rods.append((a, b, place(np.zeros(3), np.eye(3), low, high)))
+        reach = np.full(3, anatomy.marker_radius)
+        self.marker = place(anatomy.marker, np.eye(3), -reach, reach)
+
+    def draw(self, canvas: Field, scratch: Field, slice_k: int, k: float) -> None:
+        """Draw all bone of (sub-)slice `k`, which belongs to slice `slice_k`, onto `canvas`."""
+        for disc, placed in self.discs:
+            if placed.meets(slice_k):
+                at = placed.window(k)
+                wall = ellipse(at.x, at.y, disc.half_width, disc.half_depth)
+                inside = np.minimum(wall, np.float32(disc.half_length) - np.abs(at.z))
+                # The fibrous ring is a little denser than the nucleus.
+                ring = np.float32(DISC_HU) + np.float32(14.0) * coverage(8.0 - wall, 8.0)
+                paint(canvas, placed.region, coverage(inside, self.ramp), ring)
+        self._draw_ribs(canvas, scratch, slice_k, k)
+        for vertebra, placed in self.vertebrae:
+            if placed.meets(slice_k):
+                self._draw_vertebra(canvas, vertebra, placed.window(k))
+        if self.marker.meets(slice_k):
+            at = self.marker.window(k)
+            ball = np.float32(self.anatomy.marker_radius) - np.sqrt(at.x * at.x + at.y * at.y + at.z * at.z)
+            paint(canvas, at.region, coverage(ball, self.ramp), MARKER_HU)
+
+    def _draw_ribs(self, canvas: Field, scratch: Field, slice_k: int, k: float) -> None:
+        """Draw all ribs as one union, so that the joints of the rods do not show."""
+        active = [(a, b, placed) for a, b, placed in self.rib_rods if placed.meets(slice_k)]
+        if not active:
+            return
+        for _, _, placed in active:
+            scratch[placed.region] = -1e3
+        for a, b, placed in active:
+            at = placed.window(k)
+            rod = capsule(at.x, at.y, at.z, tuple(a), tuple(b), 3.5, 3.5, 0.55)
+            view = scratch[placed.region]
+            np.maximum(view, rod, out=view)
+        rows = slice(min(p.region[0].start for *_, p in active), max(p.region[0].stop for *_, p in active))
+        columns = slice(min(p.region[1].start for *_, p in active), max(p.region[1].stop for *_, p in active))
+        rib = scratch[rows, columns]
+        paint(canvas, (rows, columns), coverage(rib, self.ramp), CORTEX_HU)
+        paint(canvas, (rows, columns), coverage(rib - np.float32(1.0), self.ramp), RIB_MARROW_HU)
+        rib[...] = -1e3
+
+    def _draw_vertebra(self, canvas: Field, vertebra: Vertebra, at: Window) -> None:
+        bone = vertebra_distance(vertebra, at.x, at.y, at.z)
+        if bone.max() <= -self.ramp:
+            return
+        # 0 in the body, 1 in the arch: thicker cortex and denser marrow behind the body
+        arch = coverage(at.y - np.float32(vertebra.depth / 2.0 + 1.0), 6.0)
+        cortex = np.float32(0.75) + np.float32(0.65) * arch
+        marrow = waves_at(at.x, at.y, at.z, vertebra.waves) * np.float32(TRABECULAR_TEXTURE_HU)
+        marrow += np.float32(TRABECULAR_HU) + np.float32(ARCH_MARROW_HU - TRABECULAR_HU) * arch
+        # basivertebral vein, from the middle of the back wall into the body
+        vein = capsule(at.x, at.y, at.z, (0.0, vertebra.depth / 2.0, 0.0), (0.0, 2.0, 0.0), 2.4, 1.0, 1.0)
+        marrow += coverage(vein, 1.5) * (np.float32(VEIN_HU) - marrow)
+        shell = np.float32(BODY_CORTEX_HU) + np.float32(CORTEX_HU - BODY_CORTEX_HU) * arch
+        paint(canvas, at.region, coverage(bone, self.ramp), shell)
+        paint(canvas, at.region, coverage(bone - cortex, self.ramp), marrow)
+
+
+def plan_spine(settings: PhantomSettings, affine: Float64Array) -> tuple[Anatomy, Float64Array]:
+    """Plan the spine of a phantom.
+
+    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
+
+    Returns:
+    anatomy: In mm about `CENTRE_LPS_MM`.
+    grid: ndarray, shape (4, 4). Index to mm of the plan.
+    """
+    # The plan's origin is the centre of the volume.
+    grid = affine.copy()
+    grid[:3, 3] -= CENTRE_LPS_MM
+    extents = np.array(settings.shape_kji[::-1]) * column_spacing(affine)
+    width, depth, length = (float(extent) for extent in extents)
+    return plan_anatomy((width, depth, length), grid[:3, :3], settings.seed, settings.spine_choice), grid
+
+
+def label_levels(settings: PhantomSettings, affine: Float64Array) -> NDArray[np.uint8]:
+    """Label each voxel of a spine phantom with the number of the vertebra that holds its centre.
+
+    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
+
+    Returns: ndarray, shape (nk, nj, ni), uint8. 0 where no vertebra is, else
+        `clrecon.proof.phantom.spine_parts.level_number`.
+    """
+    anatomy, grid = plan_spine(settings, affine)
+    labels = np.zeros(settings.shape_kji, dtype=np.uint8)
+    for vertebra in anatomy.vertebrae:
+        low, high = (np.array(corner) for corner in local_bounds(vertebra))
+        placed = PlacedPiece(Piece(vertebra.center, vertebra.axes, low, high), grid, settings.shape_kji)
+        for k in range(settings.slices):
+            if placed.meets(k):
+                at = placed.window(float(k))
+                labels[k][at.region][vertebra_distance(vertebra, at.x, at.y, at.z) >= 0.0] = level_number(vertebra.name)
+    return labels
+
+
+def draw_spine(
+    settings: PhantomSettings,
+    affine: Float64Array,
+    progress: Progress | None = None,
+    *,
+    places: Float64Array | None = None,
+    blood_hu: float = BLOOD_HU,
+) -> tuple[Float32Array, Anatomy]:
+    """Draw the spine phantom without point spread and noise.
+
+    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
+    progress: Called as ``progress("draw", done, slices)``.
+    places: ndarray, shape (nk,). k of each slice in the affine; default: 0, 1, 2 and so on.
+    blood_hu: HU of heart and vessels.
+
+    Returns:
+    voxels: ndarray, shape (nk, nj, ni), float32. HU.
+    anatomy: The plan, in mm about `CENTRE_LPS_MM`.
+    """
+    shape = settings.shape_kji
+    di, dj, dk = column_spacing(affine)
+    subslices = int(np.clip(round(dk / math.sqrt(di * dj)), 1, 4))
+    ramp = (di * dj * dk / subslices) ** (1.0 / 3.0)
+    anatomy, grid = plan_spine(settings, affine)
+    scene = _Scene(anatomy, grid, shape, ramp)
+    body = Plan([], front=-anatomy.half_depth, back=anatomy.half_depth)
+    own = settings.table_used == "own"
+    table = None if own else lay_under(body, settings.table_used, settings.table_gap_mm, settings.prone)
+    voxels = np.empty(shape, dtype=np.float32)
+    offsets = (np.arange(subslices) + 0.5) / subslices - 0.5
+
+    def draw(k: int, place: float) -> None:
+        full = Window((slice(0, shape[1]), slice(0, shape[2])), grid, place)
+        tissue = draw_tissue(
+            anatomy, full.x, full.y, full.z, ramp, settings.seed, table, settings.prone, blood_hu=blood_hu
+        )
+        scratch = np.full(shape[1:], -1e3, dtype=np.float32)
+        voxels[k] = 0.0
+        for offset in offsets:
+            canvas = tissue.copy() if subslices > 1 else tissue
+            scene.draw(canvas, scratch, k, place + offset)
+            voxels[k] += canvas
+        if subslices > 1:
+            voxels[k] /= np.float32(subslices)
+
+    # One thread: the pieces are small, and threads lose more time to the interpreter lock than they gain.
+    for k in range(shape[0]):
+        draw(k, float(k if places is None else places[k]))
+        if progress is not None:
+            progress("draw", k + 1, shape[0])
+    return voxels, anatomy

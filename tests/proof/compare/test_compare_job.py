@@ -1,0 +1,312 @@
+"""`clrecon compare`: all methods on a small phantom, the page, the folder, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from html_check import PageCheck, find_faults
+from made_once import make_once
+
+from clrecon.cli.compare import _is_missed
+from clrecon.cli.main import main
+from clrecon.errors import DeviceError, NoSurfaceError, OutputError, UsageError
+from clrecon.proof.compare import child, processes
+from clrecon.proof.compare.findings import CompareReport, MethodRecord
+from clrecon.proof.compare.job import make_comparison
+from clrecon.proof.compare.methods import COMPARED, CompareSettings
+from clrecon.proof.compare.table import COLUMNS
+from clrecon.proof.phantom import PhantomSettings, write_phantom
+
+pytestmark = pytest.mark.first_device
+
+MOST_BYTES = 2_000_000
+OF_TIME = re.compile(r"_s$|_ms$|seconds|_bytes$|^date$|free_cores|findings|warnings")
+NOBODY_TELLS = "import os; os.abort()"
+ONE_CRASHES = """
+import io, json, os, sys
+told = sys.stdin.read()
+method = json.loads(told)["method"]
+if method == "skimage":
+    os.abort()
+if method == "vtk-mc":
+    sys.modules["vtkmodules"] = None
+sys.stdin = io.StringIO(told)
+from clrecon.proof.compare.child import main
+main()
+"""
+
+
+def _write_ball(folder: Path) -> None:
+    settings = PhantomSettings(
+        kind="sphere", size=(44, 40), slices=30, spacing=(0.9, 0.8, 1.1), tilt=6.0, oblique=(4.0, -3.0, 10.0)
+    )
+    write_phantom(folder, settings)
+
+
+@pytest.fixture(scope="module")
+def ball(shared_folder: Path) -> Path:
+    return make_once(shared_folder, "compare-ball", _write_ball)
+
+
+def read_report(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "report.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def whole(ball: Path, shared_folder: Path) -> Path:
+    """The comparison of all methods, with truth and the table of the paper."""
+
+    def make(folder: Path) -> None:
+        settings = CompareSettings(truth=ball / "truth.json", paper=True, repeat=1, device=_first_device())
+        make_comparison(ball, folder, settings)
+
+    return make_once(shared_folder, "compare-whole", make)
+
+
+def _first_device() -> str | None:
+    wanted = os.environ.get("CLRECON_TEST_DEVICE", "")
+    return wanted or None
+
+
+@pytest.mark.long
+def test_every_method_has_its_row_and_its_picture(device: Any, whole: Path) -> None:
+    report = read_report(whole)
+    assert {m["name"]: m["error"] for m in report["methods"]} == dict.fromkeys(COMPARED)
+    truth = {m["name"]: m["truth"]["scatter_mm"] for m in report["methods"] if m["makes"] == "mesh"}
+    assert truth["t-mc"] < 0.05 < truth["i-mc-golden"]
+    rows = {m["name"]: m for m in report["methods"]}
+    assert rows["t-mc"]["triangles"] == rows["vtk-fe"]["triangles"] == rows["t-mc-soup"]["triangles"]
+    assert rows["g-mc"]["triangles"] < 0.2 * rows["t-mc"]["triangles"]
+    assert rows["t-mc-soup"]["surfaces"]["max_mm"] < 1e-4
+    assert rows["t-mc"]["cells"]["dice"] == rows["vtk-mc"]["cells"]["dice"] == 1.0
+    assert rows["i-mc"]["cells_visited"] < rows["i-mc"]["cells_all"] == rows["t-mc"]["cells_visited"]
+    assert rows["i-mc-golden"]["slices"]["dice"] < rows["i-mc"]["slices"]["dice"] - 0.01
+    assert rows["t-mc-soup"]["pictures"]["mse"] < 1e-3 and rows["t-mc-soup"]["pictures"]["ssim"] > 0.9999
+    assert rows["cloud"]["points"] and rows["cloud"]["points_mm"]["to_reference_mm"]["mean"] > 0.0
+    assert all(m["memory_bytes"] > 3e7 and m["first_s"] > 0 and m["warm_s"] > 0 for m in report["methods"])
+    for method in report["methods"]:
+        assert (whole / method["picture"]).read_bytes()[:4] == b"\x89PNG"
+    assert {path.name for path in whole.iterdir()} >= {"slice-k.png", "slice-k-detail.png", "slice-i.png"}
+
+
+@pytest.mark.long
+def test_parts_of_time_add_up(device: Any, whole: Path) -> None:
+    for method in read_report(whole)["methods"]:
+        parts = method["first_parts_s"]
+        assert set(parts) == {"read", "build", "upload", "kernels", "host", "download", "draw"}
+        assert sum(parts.values()) - parts["read"] - parts["draw"] == pytest.approx(method["first_s"])
+        assert (method["kernels_ms"] is not None) == COMPARED[method["name"]].on_device
+
+
+@pytest.mark.long
+def test_the_page_stands_alone(device: Any, whole: Path) -> None:
+    page = (whole / "index.html").read_text(encoding="utf-8")
+    assert find_faults(page) == []
+    assert len(page.encode()) < MOST_BYTES
+    check = PageCheck(page)
+    assert len(check.pictures) == 13 + 11 + 4
+    assert all(picture["src"].startswith("data:image/webp;base64,") for picture in check.pictures)
+    assert page.count("<svg") == 3 and "<text" in page and page.count("<style") == 1
+    assert "prefers-color-scheme: dark" in page and "@media print" in page
+
+
+@pytest.mark.long
+def test_numbers_of_the_page_are_those_of_the_report(device: Any, whole: Path) -> None:
+    report = read_report(whole)
+    check = PageCheck((whole / "index.html").read_text(encoding="utf-8"))
+    table = {row[0]: row[1:] for row in check.tables[0] if len(row) > 2}
+    for method in report["methods"]:
+        record = MethodRecord(**method)
+        expected = [(value, column) for column in COLUMNS for value in [column.take(record)]]
+        texts = ["\N{EN DASH}" if value is None else column.write(value) for value, column in expected]
+        assert table[method["title"]][: len(COLUMNS)] == texts
+    page = (whole / "index.html").read_text(encoding="utf-8")
+    assert all(finding.replace("'", "&#x27;") in page for finding in report["findings"])
+    paper = {row[0]: row for row in check.tables[2] if len(row) > 2}
+    assert paper["all black"][3] == f"{report['paper']['controls']['black']['ssim']:.3f}"
+
+
+@pytest.mark.long
+def test_the_paper_is_compared_with_controls(device: Any, whole: Path) -> None:
+    paper = read_report(whole)["paper"]
+    assert list(paper["controls"]) == ["black", "white", "noise", "next", "shifted"]
+    assert set(paper["methods"]) == {name for name in COMPARED if name != "rays-cpu"}
+    assert paper["controls"]["next"]["ssim"] > paper["controls"]["shifted"]["ssim"] > paper["controls"]["noise"]["ssim"]
+
+
+@pytest.mark.long
+def test_the_report_is_read_again_as_records(device: Any, whole: Path) -> None:
+    told = read_report(whole)
+    told["methods"] = [MethodRecord(**method) for method in told["methods"]]
+    report = CompareReport(**told)
+    assert report.as_dict() == read_report(whole)
+
+
+def without_time(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: without_time(own) for name, own in value.items() if not OF_TIME.search(name)}
+    return [without_time(own) for own in value] if isinstance(value, list) else value
+
+
+@pytest.mark.long
+def test_only_times_and_memory_differ_between_runs(device: Any, ball: Path, tmp_path: Path) -> None:
+    settings = CompareSettings(methods=("t-mc", "vtk-fe", "cloud"), repeat=1, device=str(device.index))
+    for name in ("one", "other"):
+        make_comparison(ball, tmp_path / name, settings)
+    one, other = (read_report(tmp_path / name) for name in ("one", "other"))
+    assert without_time(one) == without_time(other)
+    pictures = sorted(path.name for path in (tmp_path / "one").glob("*.png"))
+    assert len(pictures) == 3 + 2 + 4
+    for name in pictures:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("state", "asked", "code"),
+    [
+        ("done", (), 0), ("declined", (), 0), ("missing", (), 0), ("failed", (), 8),
+        ("declined", ("vtk-mc",), 8), ("missing", ("vtk-mc",), 8), ("declined", ("skimage",), 0),
+    ],
+)  # fmt: skip
+def test_a_method_that_nobody_named_may_decline(state: str, asked: tuple[str, ...], code: int) -> None:
+    assert 8 * _is_missed({"name": "vtk-mc", "state": state}, asked) == code
+
+
+@pytest.mark.parametrize(("error", "state"), [(UsageError("no"), "declined"), (DeviceError("no"), "failed")])
+def test_a_refusal_is_no_failure(error: Exception, state: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(request: Any) -> dict[str, Any]:
+        raise error
+
+    monkeypatch.setattr(child, "_measure", refuse)
+    assert child.run_method(SimpleNamespace(timeout=10.0, method="t-mc"))["state"] == state  # type: ignore[arg-type]
+
+
+def test_a_crash_and_a_missing_library_are_rows(
+    device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(processes, "METHOD", ("-c", ONE_CRASHES))
+    arguments = ["compare", str(ball), "-o", str(tmp_path / "r"), "--device", str(device.index), "--repeat", "1"]
+    assert main([*arguments, "--methods", "skimage,vtk-mc,t-mc"]) == 8
+    rows = {m["name"]: m for m in read_report(tmp_path / "r")["methods"]}
+    assert [rows[name]["state"] for name in ("t-mc", "skimage", "vtk-mc")] == ["done", "failed", "missing"]
+    assert "crashed with SIGABRT" in rows["skimage"]["error"]
+    assert rows["vtk-mc"]["error"] == "vtkmodules is not installed"
+    page = (tmp_path / "r" / "index.html").read_text()
+    assert find_faults(page) == []
+    assert "failed: its process crashed with SIGABRT" in page and "not installed: vtkmodules" in page
+    assert "scikit-image and VTK MC did not run" in capsys.readouterr().out
+
+
+def test_without_its_reference_the_page_says_what_is_left(
+    device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "METHOD", ("-c", ONE_CRASHES))
+    settings = CompareSettings(methods=("t-mc",), reference="skimage", repeat=1, device=str(device.index))
+    report = make_comparison(ball, tmp_path / "r", settings)
+    rows = {m.name: m for m in report.methods}
+    assert rows["skimage"].state == "failed" and rows["t-mc"].surfaces is None and rows["t-mc"].slices is not None
+    assert find_faults((tmp_path / "r" / "index.html").read_text()) == []
+
+
+def test_where_no_method_works_there_is_no_folder(
+    device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "METHOD", ("-c", NOBODY_TELLS))
+    settings = CompareSettings(methods=("t-mc",), device=str(device.index))
+    with pytest.raises(DeviceError, match="none of 1 methods works; the first says: its process crashed with SIGABRT"):
+        make_comparison(ball, tmp_path / "r", settings)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_measures_of_a_crashed_process_are_missing_with_a_reason(
+    device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "JUDGE", ("-c", NOBODY_TELLS))
+    settings = CompareSettings(methods=("t-mc",), repeat=1, device=str(device.index))
+    (record,) = make_comparison(ball, tmp_path / "r", settings).methods
+    assert record.is_done and record.slices is None and "SIGABRT" in record.reasons["all"]
+    assert "SIGABRT" in (tmp_path / "r" / "index.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("hu", "words"),
+    [(5000.0, "no surface at 5000 HU: the volume runs from"), (-3000.0, "every voxel is inside")],
+)
+def test_no_surface_is_said_before_any_method_runs(
+    hu: float, words: str, device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "METHOD", ("-c", NOBODY_TELLS))
+    settings = CompareSettings(iso_value=hu, device=str(device.index))
+    with pytest.raises(NoSurfaceError, match=words):
+        make_comparison(ball, tmp_path / "r", settings)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--methods t-mc,x-mc", "there is no method 'x-mc' to compare: they are t-mc, t-mc-soup"),
+        ("--methods t-mc,t-mc", "a method is named twice: t-mc"),
+        ("--methods t-mc,,i-mc", "has an empty name"),
+        ("--reference rays", "--reference rays makes no mesh to compare with"),
+        ("--repeat 0", "between 1 and 100, not at 0"),
+        ("--hu 100:300", "compared at one iso value"),
+        ("--hu 100,300", "compared at one iso value"),
+        ("--hu 100 --preset bone", "not allowed with"),
+        ("--truth nowhere/truth.json", "truth.json cannot be read"),
+    ],
+)
+def test_wrong_arguments_are_one_line(
+    options: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither input nor device is looked for: there is none of either."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CLRECON_DEVICE", "no such device")
+    assert main(["compare", "scan", "-o", "r", *options.split()]) == 3
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_with_other_things_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CLRECON_DEVICE", "no such device")
+    (tmp_path / "r").mkdir()
+    (tmp_path / "r" / "notes.txt").write_text("mine")
+    with pytest.raises(UsageError, match="holds other things"):
+        make_comparison(tmp_path, tmp_path / "r")
+    (tmp_path / "r" / "notes.txt").rename(tmp_path / "r" / "t-mc.png")
+    with pytest.raises(UsageError, match="pictures without the page"):
+        make_comparison(tmp_path, tmp_path / "r")
+    with pytest.raises(OutputError, match="it is a file"):
+        make_comparison(tmp_path, tmp_path / "r" / "t-mc.png")
+    with pytest.raises(OutputError, match="does not exist, make it first"):
+        make_comparison(tmp_path, tmp_path / "none" / "r")
+    assert (tmp_path / "r" / "t-mc.png").read_text() == "mine"
+
+
+def test_an_earlier_comparison_is_replaced_as_a_whole(device: Any, ball: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "r"
+    folder.mkdir()
+    for name in ("index.html", "report.json", "s-mc.png"):
+        (folder / name).write_text("old")
+    settings = CompareSettings(methods=("t-mc",), repeat=1, device=str(device.index), keep_ids=True)
+    with pytest.raises(OutputError, match="exists already and stays"):
+        make_comparison(ball, folder, settings, no_clobber=True)
+    stages: list[str] = []
+    report = make_comparison(ball, folder, settings, progress=lambda stage, done, total: stages.append(stage))
+    assert not (folder / "s-mc.png").exists() and read_report(folder)["methods"][0]["name"] == "t-mc"
+    assert report.volume["series"]["uid_hash"] and [entry.name for entry in tmp_path.iterdir()] == ["r"]
+    assert {"read", "compare methods", "measure methods", "report"} <= set(stages)
+    assert oct(folder.stat().st_mode & 0o777) == oct(0o777 & ~_umask())
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

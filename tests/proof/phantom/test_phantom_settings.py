@@ -1,0 +1,78 @@
+"""Phantom settings: what is refused, with which numbers."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from clrecon.errors import UsageError
+from clrecon.proof.phantom import PhantomSettings, make_phantom, parse_size
+from clrecon.proof.phantom.series import format_decimal
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"kind": "cube"}, "'cube'.*spine, sphere"),
+        ({"size": (4, 64)}, "columns.*from 8 to 4096, got 4"),
+        ({"size": (64,)}, "size needs 2 values, got 1"),
+        ({"size": (64.5, 64)}, "whole number.*64.5"),
+        ({"slices": 0}, "slices.*got 0"),
+        ({"slices": True}, "slices.*got True"),
+        ({"spacing": (0.5, 0.7)}, "spacing needs 3 values, got 2"),
+        ({"spacing": (0.5, -0.7, 1.0)}, "column spacing di.*got -0.7"),
+        ({"spacing": (0.5, 0.7, math.nan)}, "slice gap dk.*got nan"),
+        ({"tilt": 60.0}, "tilt.*-45 to 45 degrees, got 60"),
+        ({"oblique": (0.0, math.inf, 0.0)}, "oblique about y.*got inf"),
+        ({"noise": -1.0}, "noise.*got -1"),
+        ({"point_spread_mm": 21.0}, "point spread.*got 21"),
+        ({"seed": -3}, "seed.*got -3"),
+        ({"inside_hu": 40000.0}, "inside HU.*got 40000"),
+        ({"inside_hu": 100.0, "outside_hu": 100.2}, "differ by less than 1 HU"),
+        ({"radius_mm": 0.0}, "radius.*got 0"),
+        ({"transfer_syntax": "jpeg"}, "'jpeg'"),
+    ],
+)
+def test_bad_settings_are_refused_with_their_numbers(given: dict, says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        PhantomSettings(**given)
+
+
+@pytest.mark.parametrize("kind", ["sphere", "torus", "cylinder", "plane"])
+def test_bodies_that_do_not_fit_are_refused_with_their_numbers(kind: str) -> None:
+    small = {"kind": kind, "size": (40, 40), "slices": 40, "spacing": (1.0, 1.0, 1.0)}
+    with pytest.raises(UsageError, match=r"radius 30 mm reaches .* leaves 18\.5 mm"):
+        make_phantom(PhantomSettings(**small, radius_mm=30.0))
+    with pytest.raises(UsageError, match="too thin for voxels of 1 mm"):
+        make_phantom(PhantomSettings(**small, radius_mm=0.9))
+    with pytest.raises(UsageError, match="at least 4 voxels"):
+        make_phantom(PhantomSettings(**{**small, "slices": 3}))
+
+
+def test_defaults_depend_on_the_kind() -> None:
+    spine, sphere = PhantomSettings(), PhantomSettings(kind="sphere")
+    assert (spine.noise, spine.point_spread_mm) == (12.0, 0.5)
+    assert (sphere.noise, sphere.point_spread_mm) == (0.0, 0.0)
+    assert PhantomSettings(kind="sphere", size=[20, 30]).shape_kji == (120, 30, 20)
+
+
+@pytest.mark.parametrize(("text", "size"), [("256", (256, 256)), ("256x192", (256, 192)), ("64 X 32", (64, 32))])
+def test_sizes_are_columns_then_rows(text: str, size: tuple[int, int]) -> None:
+    assert parse_size(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "a", "1x2x3", "256x", "-5", "2.5"])
+def test_other_sizes_are_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="columns x rows"):
+        parse_size(text)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [0.0, -0.0, 1.0, -1 / 3, 1e-17, -123.456789012345678, -1234.56789012345678, 0.1 + 0.2, -6.123233995736766e-17],
+)
+def test_decimal_strings_are_short_and_close(value: float) -> None:
+    text = format_decimal(value)
+    assert len(text) <= 16 and float(text) == pytest.approx(value, rel=1e-8, abs=1e-30)
+    assert format_decimal(float(text)) == text

@@ -1,0 +1,122 @@
+"""Analytic bodies: distances against brute force, area and volume against other formulas."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import tolerances
+
+from clrecon.errors import UsageError
+from clrecon.proof.phantom.shapes import Box, Cylinder, Sphere, Torus
+
+AXIS = np.array((0.36, -0.48, 0.8))
+CENTRE = np.array((3.0, -14.0, 25.0))
+ACROSS = np.array((0.8, 0.6, 0.0))
+THIRD = np.cross(AXIS, ACROSS)
+
+SPHERE = Sphere(CENTRE, 9.0)
+TORUS = Torus(CENTRE, 2.0 * AXIS, 11.0, 4.0)
+CYLINDER = Cylinder(CENTRE, -3.0 * AXIS, 6.0, 17.0)
+BOX = Box(CENTRE, AXIS, 5.0, 12.0, 16.0, edge=ACROSS + 0.5 * AXIS)
+BODIES = [SPHERE, TORUS, CYLINDER, BOX]
+IDS = ["sphere", "torus", "cylinder", "box"]
+
+
+def place(u, v, w) -> np.ndarray:
+    """Points from coordinates along the two directions across the axis and the axis itself."""
+    u, v, w = np.broadcast_arrays(u, v, w)
+    return CENTRE + u.ravel()[:, None] * ACROSS + v.ravel()[:, None] * THIRD + w.ravel()[:, None] * AXIS
+
+
+def surface_points(body) -> np.ndarray:
+    turn = np.linspace(0.0, 2.0 * np.pi, 361)[:-1]
+    if isinstance(body, Sphere):
+        polar = np.linspace(0.0, np.pi, 181)[:, None]
+        return place(*(9.0 * f for f in (np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar))))
+    if isinstance(body, Torus):
+        tube = turn[::3, None]
+        ring = 11.0 + 4.0 * np.cos(tube)
+        return place(ring * np.cos(turn), ring * np.sin(turn), 4.0 * np.sin(tube))
+    if isinstance(body, Cylinder):
+        wall = place(6.0 * np.cos(turn), 6.0 * np.sin(turn), np.linspace(-8.5, 8.5, 120)[:, None])
+        radius = np.linspace(0.0, 6.0, 60)[:, None]
+        caps = [place(radius * np.cos(turn), radius * np.sin(turn), height) for height in (-8.5, 8.5)]
+        return np.vstack((wall, *caps))
+    faces = []
+    half = np.array((6.0, 8.0, 2.5))
+    for axis in range(3):
+        a, b = (other for other in range(3) if other != axis)
+        grid = np.meshgrid(np.linspace(-half[a], half[a], 101), np.linspace(-half[b], half[b], 101))
+        for sign in (-1.0, 1.0):
+            coordinates = [np.zeros_like(grid[0])] * 3
+            coordinates[axis] = np.full_like(grid[0], sign * half[axis])
+            coordinates[a], coordinates[b] = grid
+            faces.append(place(*coordinates))
+    return np.vstack(faces)
+
+
+def is_inside(body, points: np.ndarray) -> np.ndarray:
+    offset = points - CENTRE
+    u, v, w = offset @ ACROSS, offset @ THIRD, offset @ AXIS
+    if isinstance(body, Sphere):
+        return u**2 + v**2 + w**2 < 81.0
+    if isinstance(body, Torus):
+        return (np.sqrt(u**2 + v**2) - 11.0) ** 2 + w**2 < 16.0
+    if isinstance(body, Cylinder):
+        return (u**2 + v**2 < 36.0) & (np.abs(w) < 8.5)
+    return (np.abs(u) < 6.0) & (np.abs(v) < 8.0) & (np.abs(w) < 2.5)
+
+
+@pytest.mark.parametrize("body", BODIES, ids=IDS)
+def test_distance_equals_nearest_surface_point(body) -> None:
+    points = CENTRE + np.random.default_rng(3).uniform(-14.0, 14.0, (500, 3))
+    surface = surface_points(body)
+    nearest = np.array([np.sqrt(((surface - point) ** 2).sum(axis=1).min()) for point in points])
+    distance = body.signed_distance(points)
+    assert np.array_equal(distance > 0.0, is_inside(body, points))
+    assert 15 < (distance > 0.0).sum() < 480
+    # a cloud of samples is never nearer than the surface, and farther by little where the surface is not touched
+    assert (nearest - np.abs(distance)).min() > -1e-9
+    far = np.abs(distance) > 1.0
+    assert (nearest - np.abs(distance))[far].max() < tolerances.PHANTOM_DISTANCE_MM
+
+
+@pytest.mark.parametrize("body", BODIES, ids=IDS)
+def test_area_is_derivative_of_volume_and_bounds_are_tight(body) -> None:
+    low, high = body.bounds_mm
+    points = np.random.default_rng(4).uniform(low, high, (400_000, 3))
+    distance = body.signed_distance(points)
+    box_ml = float(np.prod(high - low)) / 1000.0
+    assert (distance >= 0.0).mean() * box_ml == pytest.approx(body.volume_ml, rel=0.01)
+    shell = (np.abs(distance) < 0.2).mean() * box_ml * 1000.0 / 0.4
+    assert shell == pytest.approx(body.area_mm2, rel=0.03)
+    surface = surface_points(body)
+    assert surface.min(axis=0) == pytest.approx(low, abs=0.02)
+    assert surface.max(axis=0) == pytest.approx(high, abs=0.02)
+
+
+def test_descriptions_hold_plain_numbers() -> None:
+    described = TORUS.describe()
+    assert described["major_radius_mm"] == 11.0 and described["minor_radius_mm"] == 4.0
+    assert described["axis_lps"] == pytest.approx(AXIS.tolist())
+    assert described["volume_ml"] == pytest.approx(2.0 * math.pi**2 * 11.0 * 16.0 / 1000.0)
+    assert BOX.describe()["thickness_mm"] == 5.0 and BOX.describe()["edge_lps"] == pytest.approx(ACROSS.tolist())
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: Sphere((0, 0, 0), 0.0), "radius"),
+        (lambda: Sphere((0, 0), 1.0), "three finite numbers"),
+        (lambda: Torus((0, 0, 0), (0, 0, 0), 3.0, 1.0), "zero vector"),
+        (lambda: Torus((0, 0, 0), (0, 0, 1), 3.0, 3.0), "minor 3 and major 3"),
+        (lambda: Cylinder((0, 0, 0), (0, 0, 1), 3.0, math.nan), "length"),
+        (lambda: Box((0, 0, 0), (0, 0, 1), 1.0, 1.0, 1.0, edge=(0, 0, 2)), "parallel"),
+        (lambda: SPHERE.signed_distance(np.zeros((3, 2))), r"\(3, 2\)"),
+    ],
+)
+def test_bad_bodies_are_refused(make, says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        make()
