@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,8 @@ files, depth = set(), []
 package = sys.argv[1]
 
 def watch(frame, event, argument):
-    if event != "call" or not (name := frame.f_code.co_filename).startswith(package) or frame.f_code.co_name == "<module>":
+    name = frame.f_code.co_filename
+    if event != "call" or not name.startswith(package) or frame.f_code.co_name == "<module>":
         return
     files.add(name)
     if frame.f_code.co_name == "launch" and frame.f_locals["kernel"].name == "emit_vertices":
@@ -49,7 +51,8 @@ sys.setprofile(watch)
 main([*sys.argv[3:5], "-o", sys.argv[2] + "/bone.stl"])
 sys.setprofile(None)
 modules = [name for name in sys.modules if name.split(".")[0] == "clrecon"]
-print(json.dumps({"imported": len(modules), "visited": len(files), "frames": max(depth)[0], "frame_files": max(depth)[1]}))
+frames, frame_files = max(depth)
+print(json.dumps({"imported": len(modules), "visited": len(files), "frames": frames, "frame_files": frame_files}))
 """
 
 
@@ -92,6 +95,7 @@ def _option_places(modules: dict[str, tuple[str, ast.Module]]) -> Counter[str]:
     return Counter(flag for flag, _ in places)
 
 
+@cache
 def count_grain() -> dict[str, int]:
     """Return what can be counted without running anything."""
     modules = _modules()
