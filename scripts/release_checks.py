@@ -39,11 +39,11 @@ CHECKS = {
     ),
     "kernels": ReleaseCheck(
         "every mutation of every kernel is caught by the self-test, where .ci/run draws a few; on PoCL 3.1",
-        ("scripts/mutate_kernels.py", "--device", "0", "--results", str(KEPT / "kernels.json")),
+        ("scripts/proof/mutate_kernels.py", "--device", "0", "--results", str(KEPT / "kernels.json")),
     ),
     "python": ReleaseCheck(
         "at most 5 % of the changes of a room survive its tests; needs the extra mutation",
-        ("scripts/mutate_python.py", "--json", str(KEPT / "changes.json"), "--resume"),
+        ("scripts/proof/mutate_python.py", "--json", str(KEPT / "changes.json"), "--resume"),
         {"CLRECON_TEST_DEVICE": "0"},
     ),
     "fuzz": ReleaseCheck(

@@ -76,7 +76,7 @@ def main() -> int:
     python = program_path(folder, "python")
     steps = {**quick_checks(folder), "mypy": [program_path(folder, "mypy")]}
     if not fast and (shutil.which("oclgrind") or os.environ.get("CLRECON_REQUIRE_OCLGRIND")):
-        steps["oclgrind"] = [python, os.path.join("scripts", "check_oclgrind.py")]
+        steps["oclgrind"] = [python, os.path.join("scripts", "proof", "check_oclgrind.py")]
     # Much of the suite's time is the building of kernels, on one core.  Each process gets a part of the tests in order.
     # A process that is done takes half of the rest of another, so that none waits for the longest file.  A process that
     # crashes ends the run: pytest-xdist 3.8 would wait for ever for a process in its place.

@@ -33,7 +33,7 @@ _PARTS = (
 _SHOWN_PARTS = 12
 
 WHAT_BONE_COSTS = "in soft tissue 0.4 to 1.1 mm outside of the bone; --hu auto lies closer"
-"""What the default level costs, measured by scripts/measure_levels.py."""
+"""What the default level costs, measured by scripts/proof/measure_levels.py."""
 
 
 def _epilog() -> str:

@@ -1,4 +1,4 @@
-"""Sphinx: how the Guide is built.  `scripts/build_guide.py` gathers the pages and calls this."""
+"""Sphinx: how the Guide is built.  `scripts/guide/build_guide.py` gathers the pages and calls this."""
 
 from clrecon.version import package_version
 

@@ -29,7 +29,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(ROOT), str(HERE), str(HERE.parent)]
+sys.path[:0] = [str(ROOT), str(HERE), str(HERE.parent), str(HERE.parent / "guide")]
 
 from marked_tables import markdown_table, put_table  # noqa: E402
 from measure import describe_machine, spread, write_json  # noqa: E402

@@ -49,7 +49,7 @@ def spine_level(spine) -> float:
 
 @pytest.fixture(scope="module")
 def comparison(project_root):
-    path = project_root / "scripts" / "compare_iso_values.py"
+    path = project_root / "scripts" / "proof" / "compare_iso_values.py"
     specification = importlib.util.spec_from_file_location("compare_iso_values", path)
     module = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(module)

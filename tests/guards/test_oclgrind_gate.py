@@ -29,7 +29,7 @@ queue.finish()
 
 
 def check(statement: str, *options: str) -> subprocess.CompletedProcess[str]:
-    script = ROOT / "scripts" / "check_oclgrind.py"
+    script = ROOT / "scripts" / "proof" / "check_oclgrind.py"
     code = PROGRAM.replace("STATEMENT)", f"{statement!r})")
     return subprocess.run(
         [sys.executable, str(script), *options, sys.executable, "-c", code], capture_output=True, text=True
@@ -74,7 +74,7 @@ def test_a_sound_kernel_is_green(oclgrind: str) -> None:
 
 @pytest.mark.parametrize(("code", "said"), [("raise SystemExit(3)", "exit status 3"), ("pass", "no log")])
 def test_a_failing_or_idle_command_is_red(oclgrind: str, code: str, said: str) -> None:
-    script = str(ROOT / "scripts" / "check_oclgrind.py")
+    script = str(ROOT / "scripts" / "proof" / "check_oclgrind.py")
     done = subprocess.run([sys.executable, script, sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 1
     assert said in done.stderr

@@ -13,7 +13,7 @@ from clrecon.proof.checking.check import Check
 from clrecon.proof.run import CHECKS
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "scripts"))
+sys.path.insert(0, str(ROOT / "scripts" / "proof"))
 
 from kernel_mutations import EQUIVALENT, INVERSIONS, all_mutations, find_kernels  # noqa: E402
 

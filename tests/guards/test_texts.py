@@ -140,7 +140,7 @@ def test_functions_are_short() -> None:
 
 
 def run_check(root: Path) -> subprocess.CompletedProcess[str]:
-    script = root / "scripts" / "derive_mc_tables.py"
+    script = root / "scripts" / "proof" / "derive_mc_tables.py"
     return subprocess.run([sys.executable, str(script), "--check"], capture_output=True, text=True)
 
 
@@ -151,7 +151,7 @@ def test_generated_files_are_up_to_date() -> None:
 
 def test_a_changed_generated_file_is_found(tmp_path: Path) -> None:
     headers = ("mc_tables.h", "trilinear_tables.h")
-    for name in ("scripts/derive_mc_tables.py", *(f"cl/surface/{header}" for header in headers)):
+    for name in ("scripts/proof/derive_mc_tables.py", *(f"cl/surface/{header}" for header in headers)):
         target = tmp_path / name
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text((ROOT / name).read_text())

@@ -20,7 +20,7 @@ from clrecon.opencl import Device, program, select
 from clrecon.operators.first_use import check_ball
 from clrecon.operators.surface.extract import extract_isosurface
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts" / "proof"))
 
 from kernel_mutations import Mutation  # noqa: E402
 

@@ -1,4 +1,4 @@
-"""scripts/compare_versions.py finds what differs between two versions, and nothing else."""
+"""scripts/proof/compare_versions.py finds what differs between two versions, and nothing else."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ import pytest
 from clrecon.opencl import Device, kernel_files, read_kernel_source
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "scripts"))
+sys.path.insert(0, str(ROOT / "scripts" / "proof"))
 
 from kernel_mutations import EQUIVALENT, all_mutations  # noqa: E402
 from mutate_kernels import judge, key_of, report, run_mutations  # noqa: E402

@@ -1,4 +1,4 @@
-"""scripts/mutate_python.py counts changes of a small package by what its tests notice, and harms nothing.
+"""scripts/proof/mutate_python.py counts changes of a small package by what its tests notice, and harms nothing.
 
 The changes are written here: cosmic-ray, which finds them in clrecon, is not part of the extra ``test``.
 """

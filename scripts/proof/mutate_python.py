@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Change the Python code in one place at a time, and count the changes that the tests of the same room notice.
 
-    python scripts/mutate_python.py [--rooms mesh,geometry] [--changes 200] [--seed 1] [--seconds S]
+    python scripts/proof/mutate_python.py [--rooms mesh,geometry] [--changes 200] [--seed 1] [--seconds S]
                                     [--json FILE [--resume]]
 
 It needs the extras `test` and `mutation`.  A room is a folder of clrecon/ with its tests in the folder of that name in
@@ -39,7 +39,7 @@ from python_changes import Change, Equivalent, choose_changes, read_equivalents,
 from room_traces import Digests, Imports, KeptTrace, Trace, digest  # noqa: E402
 from warm_tests import PYTEST_OPTIONS, Run, WarmTests  # noqa: E402
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("mesh", "geometry", "labels", "reading", "operators")
 EQUIVALENTS = Path(__file__).with_name("equivalent_changes.json")
 ROOM_TESTS = {

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Make the pictures of the Guide again, from a phantom: those of the commands, and those of its gallery.
 
-    python scripts/make_guide_pictures.py [NAME...]
+    python scripts/guide/make_guide_pictures.py [NAME...]
 
 NAME: only those; default: all.  The commands stand in `PICTURES`; the gallery's are what its scripts write.
 command-view.png is a screenshot, in a browser of 1000 x 640, of `clrecon view ct --html page.html --labels
@@ -17,7 +17,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 IMAGES = ROOT / "docs" / "images"
 GALLERY = ROOT / "docs" / "guide" / "gallery"
 

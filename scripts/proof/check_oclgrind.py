@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Run the tests marked ``oclgrind`` under the Oclgrind simulator and fail on anything that it reports.
 
-    python scripts/check_oclgrind.py [--uninitialized] [COMMAND ...]
+    python scripts/proof/check_oclgrind.py [--uninitialized] [COMMAND ...]
 
 Oclgrind checks every memory access of every kernel and data races.  It always exits with 0, so this script checks that
 its log exists and is empty.  COMMAND replaces the tests (the guard of this script uses that).  Run it with the Python
@@ -22,7 +22,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 SHOWN_LINES = 60
 
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The matrix of meshes: where clrecon and other readers put the corners of meshes in files with known places.
 
-    python scripts/compare_mesh_readers.py [--write]
+    python scripts/proof/compare_mesh_readers.py [--write]
 
 Prints the table; with --write it goes into docs/calibration.md.  The files are those of tests/support/mesh_matrix.py.
 Readers that are not installed are left out: pip install trimesh lxml networkx pyvista open3d-cpu meshio.
@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support"), str(ROOT / "scripts")]
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support"), str(ROOT / "scripts"), str(ROOT / "scripts" / "guide")]
 
 from marked_tables import markdown_table, put_table  # noqa: E402
 from mesh_matrix import CASES, MeshCase, Read, judge, read_with_clrecon  # type: ignore[import-not-found]  # noqa: E402

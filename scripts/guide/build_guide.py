@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Build the Guide: the pages of docs/, one page a command, the Python names by subject, as a site.
 
-    python3 scripts/build_guide.py [FOLDER]
+    python3 scripts/guide/build_guide.py [FOLDER]
 
 FOLDER (default: build/guide) gets index.html and what it needs; nothing is fetched when it is opened.  Needs the extra
 `docs`.  A warning of Sphinx, a link without a target for one, fails the build.
@@ -17,7 +17,7 @@ from pathlib import Path
 
 from guide_sources import gather_sources
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 NEEDED = ("sphinx", "pydata_sphinx_theme", "numpydoc", "myst_parser", "sphinx_copybutton")
 
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Comparison of two checkouts of clrecon: the same commands are run with both, and all outputs compared byte for byte.
 
-    python scripts/compare_versions.py OLD NEW [CT_FOLDER ...] [--labels FILE] [--device D] [--only TEXT] [--quick]
+    python scripts/proof/compare_versions.py OLD NEW [CT ...] [--labels FILE] [--device D] [--only TEXT] [--quick]
 
 OLD and NEW are folders of the project: `git worktree add ../old COMMIT` makes such a folder.  Each runs with the
 environment in its own `.venv-test` or `.venv`; a missing environment is made.  Two phantoms are always compared (a
@@ -24,7 +24,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from _environment import find_python
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from _environment import find_python  # noqa: E402
 
 VOLATILE = frozenset({"seconds", "seconds_a_frame", "peak_memory_bytes", "version"})
 """Names in reports whose values differ between runs, or always differ between versions."""

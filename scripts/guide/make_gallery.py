@@ -3,7 +3,7 @@
 
     clrecon phantom SPINE --kind spine --size 512x512 --slices 149 --spacing 0.7 0.7 1.0
     clrecon phantom CHEST --levels T4-L5 --size 512 --spacing 0.7 0.7 1.0 --scoliosis 12 --seed 3
-    python scripts/make_gallery.py SPINE CHEST docs/images
+    python scripts/guide/make_gallery.py SPINE CHEST docs/images
 
 The picture beside VTK's also needs scikit-image; the likeness of the two is printed.
 """
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "scripts" / "bench")]
 
 import clrecon  # noqa: E402

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The trap matrix: where clrecon and other readers place the voxels of difficult CT series.
 
-    python scripts/compare_readers.py [--table NAME] [--only TEXT] [--readers NAMES] [--json FILE] [--markdown]
+    python scripts/proof/compare_readers.py [--table NAME] [--only TEXT] [--readers NAMES] [--json FILE] [--markdown]
 
 The table "places" has series whose voxels are easily placed wrongly.  The table "doubts" has series that look right but
 are not: a volume of them is wrong.  Each cell has the largest distance in mm of a corner voxel of any slice from its
@@ -31,8 +31,8 @@ from typing import Any
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support"), str(ROOT / "scripts")]
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support"), str(ROOT / "scripts"), str(ROOT / "scripts" / "guide")]
 
 from reader_peers import READERS  # noqa: E402
 from trap_cases import CASES, FIELD_SIZE, Case, Marks, Size  # type: ignore[import-not-found]  # noqa: E402

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Measure the error of the default ray step: SSIM of each preset's pictures against pictures with a tenth of the step.
 
-    python scripts/measure_ray_steps.py CT_FOLDER [DEVICE]
+    python scripts/proof/measure_ray_steps.py CT_FOLDER [DEVICE]
 
 Prints a line per preset, for the view from the front and for an oblique view.  Each view has two figures: the SSIM of
 the whole picture (grey values of 8 bits), and that of its pixels without the background.  It needs scikit-image.
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 import clrecon  # noqa: E402

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """What the default level of `clrecon mesh` costs and saves beside `--hu auto`, on phantoms and on scans of your own.
 
-    python scripts/measure_levels.py phantoms
-    python scripts/measure_levels.py scans thorax=CT_FOLDER head=OTHER_FOLDER
-    python scripts/measure_levels.py page
+    python scripts/proof/measure_levels.py phantoms
+    python scripts/proof/measure_levels.py scans thorax=CT_FOLDER head=OTHER_FOLDER
+    python scripts/proof/measure_levels.py page
 
 `phantoms` measures every phantom of `level_phantoms.py` (about five minutes on one core) at the preset bone, at
 `--hu auto`, at `--hu half:BONE,TISSUE` with the phantom's own materials, and at the best of the levels from 100 to
@@ -25,8 +25,8 @@ from typing import Any
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent), str(ROOT / "scripts" / "guide")]
 
 from level_phantoms import NOTHING, PHANTOMS, SCANNING, Phantom, Profiles, draw_phantom, sample_profiles  # noqa: E402
 from marked_tables import markdown_table, put_table  # noqa: E402

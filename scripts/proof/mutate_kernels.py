@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Break every kernel in turn and see that the self-test notices.
 
-    python scripts/mutate_kernels.py [--device D] [--only TEXT] [--results FILE] [--seconds N] [--draw N --seed TEXT]
+    python scripts/proof/mutate_kernels.py [--device D] [--only TEXT] [--results FILE] [--seconds N] [--draw N]
 
 Each mutation of `kernel_mutations` is built into the kernel, and the checks of the self-test that cover this kernel
 run until one fails.  Exit code 1 if a mutation is not noticed that should be.  What a driver does with a broken kernel
@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from kernel_mutations import Mutation, all_mutations
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 HANGS_SECONDS = 120.0
 """Seconds without an answer after which a broken kernel counts as hanging, which is noticed too."""

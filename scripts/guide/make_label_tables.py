@@ -1,6 +1,6 @@
 """Write the tables of label maps and volumes in docs/calibration.md, from the rows of tests/support/label_matrix.py.
 
-python scripts/make_label_tables.py
+python scripts/guide/make_label_tables.py
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "support"))
 
 from label_matrix import table_of_places, table_of_rows  # type: ignore[import-not-found]  # noqa: E402
