@@ -80,12 +80,12 @@ from clrecon.rendering import Lighting as Lighting
 from clrecon.rendering import Rendering as Rendering
 from clrecon.rendering import TransferFunction as TransferFunction
 from clrecon.rendering import load_transfer_function as load_transfer_function
-from clrecon.rendering.movies.movie import turntable_cameras as turntable_cameras
-from clrecon.rendering.movies.movie import write_animation as write_animation
+from clrecon.rendering.movies import turntable_cameras as turntable_cameras
+from clrecon.rendering.movies import write_animation as write_animation
 from clrecon.rendering.pictures.likeness import make_control_pictures as make_control_pictures
 from clrecon.rendering.pictures.likeness import measure_pictures as measure_pictures
-from clrecon.rendering.pictures.mesh_look import MeshLook as MeshLook
-from clrecon.rendering.pictures.point_look import PointLook as PointLook
+from clrecon.rendering.pictures.object_looks import MeshLook as MeshLook
+from clrecon.rendering.pictures.object_looks import PointLook as PointLook
 from clrecon.rendering.pictures.styles import CurveCut as CurveCut
 from clrecon.rendering.pictures.styles import PlaneCut as PlaneCut
 from clrecon.rendering.pictures.styles import Projection as Projection
@@ -94,7 +94,7 @@ from clrecon.rendering.pictures.styles import Style as Style
 from clrecon.rendering.pictures.styles import SurfaceLook as SurfaceLook
 from clrecon.rendering.pictures.styles import VolumeLook as VolumeLook
 from clrecon.rendering.views.camera import Camera as Camera
-from clrecon.rendering.views.centre_line_files import read_curve_points as read_curve_points
+from clrecon.rendering.views.centre_line import read_curve_points as read_curve_points
 from clrecon.rendering.views.clip import Clip as Clip
 from clrecon.spine.corridors import find_corridors as find_corridors
 from clrecon.spine.split import MiddlePlane as MiddlePlane

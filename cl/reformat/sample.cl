@@ -1,6 +1,6 @@
 /* Slices through a volume: oblique planes and curved reformations, with thickness.
  *
- * A row of the picture is a straight line with a slab direction of its own (clrecon/rendering/views/plane.py), so that one
+ * A row of the picture is a straight line with a slab direction of its own (clrecon/rendering/views/reformation.py), so that one
  * kernel makes planes, stretched and straightened reformations (Kanitsar et al. 2002, "CPR - Curved Planar
  * Reformation").  Places are in fixed point, see reformat/trilinear_sample.h.
  *

@@ -241,7 +241,7 @@ def make_corridors(
 def _check_files(source: str | Path, settings: CorridorSettings, files: CorridorFiles) -> None:
     """Refuse outputs that cannot be written or would replace an input, as far as their names are known."""
     from clrecon.exchange.formats import check_format
-    from clrecon.rendering.pictures.image_files import check_image_path
+    from clrecon.rendering.pictures.picture import check_image_path
     from clrecon.system.files import check_writable
 
     if files.output is not None:
@@ -390,7 +390,7 @@ def _stage_picture(
     settings: CorridorSettings,
 ) -> Any:
     from clrecon.jobs.corridor_results import draw_corridors
-    from clrecon.rendering.pictures.image_files import check_image_path, encode_image
+    from clrecon.rendering.pictures.picture import check_image_path, encode_image
     from clrecon.system.files import stage_file
 
     footer = [f"surface at {level:g} HU; green: corridor, yellow: largest screw, red: given screw", NOT_FOR_PLANNING]

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume, frame_from_lps
 from clrecon.mesh import Mesh
-from clrecon.rendering.pictures.annotations import orientation_letters
-from clrecon.rendering.pictures.picture_data import PictureData
+from clrecon.rendering.pictures.annotations import PictureData, orientation_letters
 from clrecon.rendering.pictures.sheets import Panel, Stroke, draw_sheet
 from clrecon.spine.corridors import SIDES, Corridor, VertebraCorridors, screw_diameter
 from clrecon.spine.measures import SCALE, Bias, Screw, ScrewGrade

@@ -36,7 +36,7 @@ from clrecon.version import package_version
 if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.rendering import Rendering
-    from clrecon.rendering.looks.color_scale import ColorScale
+    from clrecon.rendering.looks.colors import ColorScale
 
 
 MOST_SAMPLES = 10_000_000
@@ -152,7 +152,7 @@ def measure_meshes(
 
 
 def _check_files(files: DistanceFiles, sources: tuple[str | Path, str | Path]) -> None:
-    from clrecon.rendering.pictures.image_files import check_image_path
+    from clrecon.rendering.pictures.picture import check_image_path
     from clrecon.rendering.pictures.pillow import load_pillow
 
     if files.output is not None and not os.fspath(files.output).lower().endswith(".ply"):
@@ -191,7 +191,7 @@ class _Colored:
 def _color_mesh(
     mesh: Mesh, reference: Mesh, found: MeshDeviation, settings: DistanceSettings, progress: Progress
 ) -> _Colored:
-    from clrecon.rendering.looks.color_scale import ColorScale, round_up
+    from clrecon.rendering.looks.colors import ColorScale, round_up
 
     distances, signed = measure_vertex_distances(mesh, reference, progress=progress)
     limit = settings.range_mm or round_up(max(found.to_reference_mm.p95, _LEAST_RANGE_MM))
@@ -201,8 +201,8 @@ def _color_mesh(
 def _draw_mesh(mesh: Mesh, colored: _Colored, other: str, settings: DistanceSettings, device: Device) -> Rendering:
     from clrecon.operators.rays.mesh_pictures import box_around, mesh_corners
     from clrecon.operators.rays.scene import ScenePictures
-    from clrecon.rendering.pictures.mesh_look import MeshLook
-    from clrecon.rendering.pictures.scale_strip import add_scale
+    from clrecon.rendering.pictures.object_looks import MeshLook
+    from clrecon.rendering.pictures.sheets import add_scale
     from clrecon.rendering.views.camera import Camera
     from clrecon.rendering.views.directions import DEFAULT_SIZE
 

@@ -61,7 +61,7 @@ FADED_OPACITY = 0.15
 
 def check_pictures(picture: str | Path, view: str) -> None:
     """Refuse pictures that cannot be made, before any work is done."""
-    from clrecon.rendering.pictures.image_files import check_image_path
+    from clrecon.rendering.pictures.picture import check_image_path
     from clrecon.rendering.pictures.pillow import load_pillow
     from clrecon.rendering.views.directions import find_view
 
@@ -81,7 +81,7 @@ def draw_parts(
     """
     from clrecon.operators.rays.mesh_pictures import box_around, mesh_corners
     from clrecon.operators.rays.scene import ScenePictures
-    from clrecon.rendering.pictures.mesh_look import MeshLook
+    from clrecon.rendering.pictures.object_looks import MeshLook
     from clrecon.rendering.views.camera import Camera
     from clrecon.rendering.views.directions import DEFAULT_SIZE
 

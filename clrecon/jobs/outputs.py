@@ -217,7 +217,7 @@ def commit_all(files: Sequence[Staged]) -> None:
 
 def stage_picture(stack: ExitStack, picture: Rendering, path: str | Path) -> StagedFile:
     """Write a picture under a temporary name that `stack` removes unless it is committed."""
-    from clrecon.rendering.pictures.image_files import encode_image
+    from clrecon.rendering.pictures.picture import encode_image
     from clrecon.system.files import stage_file
 
     content = encode_image(picture, os.path.splitext(os.fspath(path))[1].lower())

@@ -225,7 +225,7 @@ def _mask_of(resident: DeviceVolume, rule: RegionRule, space: str, facts: dict[s
 def _line_of(volume: Volume, rule: RegionRule, facts: dict[str, Any]) -> Any:
     """Return the centre line of a tube, LPS mm."""
     if rule.path is not None:
-        from clrecon.rendering.views.centre_line_files import read_curve_points
+        from clrecon.rendering.views.centre_line import read_curve_points
 
         return read_curve_points(rule.path)
     from clrecon.anatomy.spine_line import find_spine_line

@@ -114,7 +114,7 @@ def list_words(command: str, setting: str) -> list[str]:
     from clrecon.rendering.pictures.modes import MODES
     from clrecon.rendering.pictures.styles import CURVED_KINDS
     from clrecon.rendering.views.directions import DIRECTIONS
-    from clrecon.rendering.views.plane import PLANES
+    from clrecon.rendering.views.reformation import PLANES
 
     tables: dict[tuple[str, str], Iterable[str]] = {
         ("render", "preset"): LOOKS,

@@ -23,7 +23,7 @@ from clrecon.geometry.certificate import without_ids
 from clrecon.jobs.outputs import check_distinct, check_kept, commit_all
 from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name, stage_report
 from clrecon.reading import Selection, read_selected
-from clrecon.rendering.looks.label_style import distinct_colors
+from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.pictures.pillow import load_font, load_pillow
 from clrecon.system.files import Staged, StagedFile, stage_file
 from clrecon.system.log import get_logger, log_warnings

@@ -114,7 +114,7 @@ def _show_volume(volume: Volume) -> str:
 
 
 def _show_labels(labels: LabelMap) -> str:
-    from clrecon.rendering.looks.label_style import distinct_colors
+    from clrecon.rendering.pictures.label_style import distinct_colors
 
     voxel_ml = abs(float(np.linalg.det(labels.affine[:3, :3]))) / 1000.0
     colors = [

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.rendering import Rendering
-from clrecon.rendering.pictures.layers import merge_layers
+from clrecon.rendering.pictures.picture import merge_layers
 from clrecon.rendering.pictures.vtk import rendering_to_pyvista
 
 if TYPE_CHECKING:

@@ -40,13 +40,13 @@ def test_what_may_be_given_again_makes_a_list(name: str, parser: argparse.Argume
 def test_no_encoder_is_said_before_anything_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from clrecon.rendering.movies import video
+    from clrecon.rendering import movies
 
-    video.find_encoder.cache_clear()
-    monkeypatch.setattr(video, "_find_ffmpeg", lambda: None)
+    movies.find_encoder.cache_clear()
+    monkeypatch.setattr(movies, "_find_ffmpeg", lambda: None)
     assert main(["render", str(tmp_path / "no CT"), "--turntable", str(tmp_path / "a.mp4")]) == 3
     assert "no encoder for MP4" in capsys.readouterr().err
-    video.find_encoder.cache_clear()
+    movies.find_encoder.cache_clear()
     assert list(tmp_path.iterdir()) == []
 
 

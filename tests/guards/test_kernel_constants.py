@@ -19,9 +19,9 @@ from clrecon.operators.reformat.sheets import COMBINATIONS
 
 PAIRS = [
     ("clrecon.labels.occupancy.REACH", "surface/label_masks.h", "REACH"),
-    ("clrecon.rendering.looks.steepness.DENSE", "rays/steep_segments.h", "DENSE"),
-    ("clrecon.rendering.looks.steepness.PARTS", "rays/steep_segments.h", "PARTS"),
-    ("clrecon.rendering.looks.steepness.STEEP", "rays/steep_segments.h", "STEEP"),
+    ("clrecon.rendering.looks.piecewise.DENSE", "rays/steep_segments.h", "DENSE"),
+    ("clrecon.rendering.looks.piecewise.PARTS", "rays/steep_segments.h", "PARTS"),
+    ("clrecon.rendering.looks.piecewise.STEEP", "rays/steep_segments.h", "STEEP"),
 ]
 """Name in Python, kernel file below cl/, name there: of rooms without OpenCL."""
 

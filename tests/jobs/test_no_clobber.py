@@ -14,7 +14,7 @@ import clrecon
 from clrecon.cli.main import main
 from clrecon.errors import OutputError
 from clrecon.jobs.outputs import refuse_numbered
-from clrecon.rendering.movies.movie import stage_animation, write_animation
+from clrecon.rendering.movies import stage_animation, write_animation
 from clrecon.system.files import replace_file, stage_file
 from clrecon.system.paths import keep_existing
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clrecon.errors import UsageError
-from clrecon.rendering.pictures.image_files import encode_image
+from clrecon.rendering.pictures.picture import encode_image
 from clrecon.rendering.pictures.sheets import GAP_PIXELS, Panel, Stroke, draw_sheet
 
 pytest.importorskip("PIL")

@@ -27,9 +27,8 @@ from clrecon.proof.compare.methods import CompareSettings
 from clrecon.proof.phantom import PhantomSettings, phantom_truth
 from clrecon.reading.common.source_facts import SeriesEntry, SeriesListing
 from clrecon.rendering import Lighting, Rendering, TransferFunction
-from clrecon.rendering.looks.label_style import LabelStyle
-from clrecon.rendering.pictures.mesh_look import MeshLook
-from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.label_style import LabelStyle
+from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import (
     CurveCut,
     PlaneCut,

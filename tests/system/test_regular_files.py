@@ -16,7 +16,7 @@ from clrecon.labels import read_labels
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 from clrecon.reading import list_series, read_volume
 from clrecon.rendering import load_transfer_function
-from clrecon.rendering.views.centre_line_files import LARGEST_BYTES, read_curve_points
+from clrecon.rendering.views.centre_line import LARGEST_BYTES, read_curve_points
 from clrecon.system.paths import open_regular, read_regular
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="FIFOs and devices of POSIX")
@@ -116,8 +116,7 @@ OWN = {
     "proof/compare/job.py": "what it has just written",
     "proof/compare/page.py": "its own style",
     "jobs/run.py": "the system",
-    "rendering/movies/frame_folder.py": "new frames",
-    "rendering/movies/video.py": "its own temporary files",
+    "rendering/movies.py": "new frames, its own temporary files",
 }
 """Modules that open files by themselves, and what they are."""
 

@@ -181,7 +181,7 @@ def _write_meshes(
 
 def _name_objects(parts: Sequence[Part]) -> None:
     """Give each mesh the name and the colour that it has as an object of a file; those of labels stay."""
-    from clrecon.rendering.looks.label_style import distinct_colors
+    from clrecon.rendering.pictures.label_style import distinct_colors
 
     for part, color in zip(parts, distinct_colors(len(parts)), strict=True):
         given = part.mesh.report

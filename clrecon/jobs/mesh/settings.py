@@ -391,7 +391,7 @@ class LabelChoice:
     ) -> dict[int, tuple[float, float, float]]:
         """Return the colours of labels: those given, and where wanted distinct ones for all others."""
         from clrecon.rendering.looks.colors import find_color
-        from clrecon.rendering.looks.label_style import distinct_colors
+        from clrecon.rendering.pictures.label_style import distinct_colors
 
         given = {}
         for label, color in self.colors:

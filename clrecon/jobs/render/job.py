@@ -239,7 +239,7 @@ def _take_turntable(
     turn = settings.turntable
     if files.turntable is None or turn is None:
         return None, []
-    from clrecon.rendering.movies.movie import animation_kind, stage_animation, turntable_cameras
+    from clrecon.rendering.movies import animation_kind, stage_animation, turntable_cameras
 
     first = settings.camera(taker.box, taker.views[0], turning=True)
     cameras = turntable_cameras(first, turn.frames, turn.degrees)
@@ -287,7 +287,7 @@ class PictureFiles:
 
     picture: .png, .jpg or .tif.
     depth, values: .npy or .tif, with the distances to the first hit in mm, and with HU.
-    turntable: See `clrecon.rendering.movies.movie.check_animation`.
+    turntable: See `clrecon.rendering.movies.check_animation`.
     report: JSON.
     """
 
@@ -336,9 +336,9 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[
 
     Returns: list of (str, path). A description of each output, and its path.
     """
-    from clrecon.rendering.movies.movie import animation_kind, check_animation
+    from clrecon.rendering.movies import animation_kind, check_animation
     from clrecon.rendering.pictures.annotations import check_caption
-    from clrecon.rendering.pictures.image_files import check_float_path, check_image_path
+    from clrecon.rendering.pictures.picture import check_float_path, check_image_path
     from clrecon.rendering.pictures.pillow import load_pillow
     from clrecon.system.files import check_writable
 
@@ -391,7 +391,7 @@ def stage_picture(
     Returns: ``output`` and, if asked for, ``depth_output`` and ``values_output``: each with its path and its staged
         file.
     """
-    from clrecon.rendering.pictures.image_files import encode_floats, encode_image
+    from clrecon.rendering.pictures.picture import encode_floats, encode_image
     from clrecon.system.files import stage_file
 
     def stage(path: str | Path, content: bytes) -> tuple[str | Path, StagedFile]:

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 from clrecon.jobs.render.settings import SPINES, LabelLook, RenderSettings
 from clrecon.rendering.looks.colors import is_transparent
-from clrecon.rendering.looks.label_style import NO_LABEL
 from clrecon.rendering.looks.presets import find_preset
-from clrecon.rendering.pictures.mesh_look import MeshLook
-from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.label_style import NO_LABEL
+from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import (
     SPINE,
     CurveCut,
@@ -21,8 +20,8 @@ from clrecon.rendering.pictures.styles import (
     SurfaceLook,
     VolumeLook,
 )
-from clrecon.rendering.views.default_view import default_view
-from clrecon.rendering.views.seen import check_center
+from clrecon.rendering.views.clip import check_center
+from clrecon.rendering.views.directions import default_view
 from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress
 
@@ -54,7 +53,7 @@ def read_curve(named: str | None) -> Float64Array | None:
     """Read the points (n, 3) in LPS mm of a centre line; None if no file is given or the spinal canal is meant."""
     if named is None or named in SPINES:
         return None
-    from clrecon.rendering.views.centre_line_files import read_curve_points
+    from clrecon.rendering.views.centre_line import read_curve_points
 
     return read_curve_points(named)
 

@@ -11,10 +11,9 @@ from clrecon.geometry.certificate import without_ids
 from clrecon.jobs.inputs import describe_cloud
 from clrecon.jobs.render.settings import LabelLook, RenderSettings
 from clrecon.jobs.run import RunReport, peak_memory_bytes, platform_name
-from clrecon.rendering.looks.label_style import NO_LABEL, find_shown
 from clrecon.rendering.pictures.annotations import edge_letters
-from clrecon.rendering.pictures.mesh_look import MeshLook
-from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.label_style import NO_LABEL, find_shown
+from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, Style, SurfaceLook, VolumeLook
 from clrecon.system.arguments import name_parameter
 from clrecon.version import package_version

@@ -16,18 +16,17 @@ from clrecon.geometry.grid import Grid
 from clrecon.jobs.options import InputSettings
 from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import find_color
-from clrecon.rendering.looks.label_style import NO_LABEL, distinct_colors
 from clrecon.rendering.looks.lighting import UNSHADED, Lighting
 from clrecon.rendering.looks.presets import DEFAULT_PRESET, PRESETS, find_preset
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.looks.window import WINDOWS as WINDOWS
-from clrecon.rendering.movies.movie import turntable_cameras
+from clrecon.rendering.movies import turntable_cameras
 from clrecon.rendering.pictures.annotations import SMALLEST_SIDE
-from clrecon.rendering.pictures.contact_sheet import SHEET_SIZE
-from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.rendering.pictures.label_style import NO_LABEL, distinct_colors
 from clrecon.rendering.pictures.modes import MODES, check_known, choose_mode, keywords_of, make_style
-from clrecon.rendering.pictures.point_look import POINT_COLORS as POINT_COLORS
-from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.object_looks import POINT_COLORS as POINT_COLORS
+from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
+from clrecon.rendering.pictures.sheets import SHEET_SIZE
 from clrecon.rendering.pictures.style_checks import SHEET_SLICES as SHEET_SLICES
 from clrecon.rendering.pictures.styles import (
     SPINE,
@@ -40,9 +39,8 @@ from clrecon.rendering.pictures.styles import (
 )
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
-from clrecon.rendering.views.default_view import ANTERIOR, SLICES_VIEWS
-from clrecon.rendering.views.directions import DEFAULT_SIZE, DIRECTIONS, checked_size
-from clrecon.rendering.views.plane import find_plane
+from clrecon.rendering.views.directions import ANTERIOR, DEFAULT_SIZE, DIRECTIONS, SLICES_VIEWS, checked_size
+from clrecon.rendering.views.reformation import find_plane
 from clrecon.system.arguments import name_parameter
 from clrecon.system.text import unknown_name
 

@@ -21,7 +21,7 @@ from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name
 from clrecon.jobs.view.inputs import ViewSettings
 from clrecon.mesh import Mesh
 from clrecon.mesh.mesh_reader import MESH_INPUTS
-from clrecon.rendering.looks.label_style import distinct_colors
+from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.system.arguments import name_parameter
 from clrecon.system.files import check_writable
 from clrecon.system.log import get_logger, log_warnings

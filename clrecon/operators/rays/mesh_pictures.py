@@ -19,7 +19,7 @@ from clrecon.operators.primitives.scan import exclusive_scan
 from clrecon.operators.rays.picture_buffers import highlight_table
 from clrecon.operators.rays.point_pictures import eye_table
 from clrecon.rendering import Lighting
-from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.text import format_digits
 

@@ -35,9 +35,9 @@ from clrecon.points import PointCloud
 from clrecon.points.spacing import mean_spacing
 from clrecon.rendering import Lighting, Rendering
 from clrecon.rendering.looks.colors import find_color
-from clrecon.rendering.looks.label_style import distinct_colors
 from clrecon.rendering.looks.window import checked_window, choose_window
-from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.label_style import distinct_colors
+from clrecon.rendering.pictures.object_looks import PointLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.arguments import name_parameter
 from clrecon.system.base_classes import Closing

@@ -40,8 +40,7 @@ from clrecon.operators.rays.ray_slabs import (
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import FieldFrame, label_variants, volume_box
 from clrecon.rendering import Lighting, Rendering, TransferFunction
-from clrecon.rendering.looks.label_style import LabelStyle
-from clrecon.rendering.looks.steepness import PARTS, Steepness
+from clrecon.rendering.looks.piecewise import PARTS, Steepness
 from clrecon.rendering.looks.window import (
     checked_window,
     choose_mip_window,
@@ -49,6 +48,7 @@ from clrecon.rendering.looks.window import (
     choose_window,
     grey_image,
 )
+from clrecon.rendering.pictures.label_style import LabelStyle
 from clrecon.rendering.pictures.styles import Projection, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.progress import Progress, ignore_progress

@@ -16,13 +16,11 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
-from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.modes import find_style
-from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import SlicesInSpace, Style, VolumeLook
 from clrecon.rendering.views.camera import Camera
-from clrecon.rendering.views.default_view import default_view
-from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size
+from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size, default_view
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress
 

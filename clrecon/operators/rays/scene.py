@@ -49,8 +49,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
 from clrecon.rendering import Lighting, Rendering
 from clrecon.rendering.looks.colors import find_color
-from clrecon.rendering.pictures.mesh_look import MeshLook
-from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import SlicesInSpace, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.system.base_classes import Closing

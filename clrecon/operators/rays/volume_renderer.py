@@ -25,12 +25,11 @@ from clrecon.operators.reformat.cut import take_contact_sheet, take_curve, take_
 from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
-from clrecon.rendering.looks.label_style import LabelStyle
 from clrecon.rendering.looks.transfer_function import TransferFunction
-from clrecon.rendering.pictures.contact_sheet import SHEET_SIZE
-from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.rendering.pictures.label_style import LabelStyle
 from clrecon.rendering.pictures.modes import check_known, find_style
-from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
+from clrecon.rendering.pictures.sheets import SHEET_SIZE
 from clrecon.rendering.pictures.styles import (
     CurveCut,
     PlaneCut,
@@ -41,10 +40,9 @@ from clrecon.rendering.pictures.styles import (
     VolumeLook,
 )
 from clrecon.rendering.views.camera import Camera, box_corners
-from clrecon.rendering.views.default_view import ANTERIOR, default_view
-from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size
-from clrecon.rendering.views.plane import find_plane
-from clrecon.rendering.views.seen import ShownLabels, check_center, find_seen_box
+from clrecon.rendering.views.clip import ShownLabels, check_center, find_seen_box
+from clrecon.rendering.views.directions import ANTERIOR, DEFAULT_SIZE, checked_size, default_view
+from clrecon.rendering.views.reformation import find_plane
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress

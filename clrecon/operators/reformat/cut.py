@@ -21,13 +21,20 @@ from clrecon.operators.reformat.sheets import CutJob
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.rendering import Rendering
 from clrecon.rendering.pictures.annotations import edge_letters, sheet_letters
-from clrecon.rendering.pictures.contact_sheet import lay_out, write_on_tile
+from clrecon.rendering.pictures.sheets import lay_out, write_on_tile
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut
 from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.rendering.views.centre_line import Curve
-from clrecon.rendering.views.curved import CurvedSheet, straightened_sheet, stretched_length, stretched_sheet
 from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size, find_up, find_view
-from clrecon.rendering.views.plane import find_plane, finest_step, plane_sheet
+from clrecon.rendering.views.reformation import (
+    CurvedSheet,
+    find_plane,
+    finest_step,
+    plane_sheet,
+    straightened_sheet,
+    stretched_length,
+    stretched_sheet,
+)
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 
@@ -78,13 +85,13 @@ def cut_slice(
     device : Device, str or int, optional
         See `clrecon.device`.
     zoom, up, pixel_mm
-        Options for a plane by name, see ``clrecon.rendering.views.plane.find_plane``.
+        Options for a plane by name, see ``clrecon.rendering.views.reformation.find_plane``.
     offset_mm : float
         Moves the plane along the view, away from the camera.
     thickness : float
         Thickness in mm of a thick slice, half of it on either side of the plane; its samples are combined.  0 is the
         plane alone.  Samples are at most half the smallest distance of voxels apart, see
-        ``clrecon.rendering.views.plane.SlabSamples``.
+        ``clrecon.rendering.views.reformation.SlabSamples``.
     combine : {"mean", "max", "min"}
         How the samples within the volume are combined.
     window : (low, high) or str, optional
@@ -194,7 +201,7 @@ def reformat_curve(
     kind : {"straightened", "stretched"}
         Straightened: the centre line is a straight line down the picture, and each row crosses it.  Stretched: all rows
         have one direction in the patient and form a surface, which the picture shows unrolled; all lengths within that
-        surface are kept.  See ``clrecon.rendering.views.curved``.
+        surface are kept.  See ``clrecon.rendering.views.reformation``.
     size : (int, int), optional
         Width and height of the picture; default: the whole curve, and ``width_mm``.
     device : Device, str or int, optional
@@ -384,7 +391,7 @@ def take_contact_sheet(
     Axial slices come from the head downwards, coronal ones from the front, sagittal ones from the right.
 
     style: With a `sheet`; thickness, window and labels are those of each slice.
-    plane: The plane in the middle, with zoom and centre, see `clrecon.rendering.views.plane.find_plane`.
+    plane: The plane in the middle, with zoom and centre, see `clrecon.rendering.views.reformation.find_plane`.
     shown: The volume, or the box of what is left of it: slices beside it are left out, and tiles fit it.
     size: Width and height of the picture.
     background, progress: As in `cut_slice`.

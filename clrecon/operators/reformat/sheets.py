@@ -33,10 +33,10 @@ from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.looks.window import BONE_WINDOW, checked_window, grey_image
 from clrecon.rendering.pictures import styles
-from clrecon.rendering.pictures.label_overlay import describe_overlay, draw_labels, labels_on_sheet
+from clrecon.rendering.pictures.label_style import draw_labels, facts_of_overlay, labels_on_sheet
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut
 from clrecon.rendering.views.camera import Camera
-from clrecon.rendering.views.plane import Sheet, SlabSamples, slab_samples
+from clrecon.rendering.views.reformation import Sheet, SlabSamples, slab_samples
 from clrecon.system.progress import Progress
 
 COMBINATIONS = {name: kernel_constant("reformat/sample.cl", f"COMBINE_{name.upper()}") for name in styles.COMBINATIONS}
@@ -283,7 +283,7 @@ class CutJob:
         if depth is None:
             depth = np.full(values.shape, np.nan, np.float32)
         if numbers is not None and self.look is not None:
-            report["labels"] = describe_overlay(numbers, self.look)
+            report["labels"] = facts_of_overlay(numbers, self.look)
         seen = Rendering(image, depth, depth.copy(), camera, values, mode=self.style.mode, report=report)
         return seen if is_transparent(background) else seen.with_background(background)
 

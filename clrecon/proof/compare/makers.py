@@ -33,7 +33,7 @@ def draw_mesh(mesh: Mesh, camera: Camera, size: tuple[int, int], *, device: Devi
     Returns: ndarray, shape (height, width, 3), uint8
     """
     from clrecon.operators.rays.render import render
-    from clrecon.rendering.pictures.mesh_look import MeshLook
+    from clrecon.rendering.pictures.object_looks import MeshLook
 
     bare = Mesh(mesh.vertices, mesh.triangles)
     picture = render(bare, MeshLook("bone"), camera=camera, size=size, background=BACKGROUND, device=device)
@@ -46,7 +46,7 @@ def draw_points(cloud: PointCloud, camera: Camera, size: tuple[int, int], *, dev
     Returns: ndarray, shape (height, width, 3), uint8
     """
     from clrecon.operators.rays.point_pictures import PointPictures
-    from clrecon.rendering.pictures.point_look import PointLook
+    from clrecon.rendering.pictures.object_looks import PointLook
 
     with PointPictures(cloud, device=device) as pictures:
         return flatten(pictures.take(PointLook(color="bone"), camera, size, BACKGROUND).image)

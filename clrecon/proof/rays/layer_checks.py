@@ -21,7 +21,7 @@ from clrecon.proof.rays.objects import Meetings, find_meetings, nth_layer, shade
 from clrecon.proof.rays.render import cast_rays
 from clrecon.proof.rays.surface import overlay_slices as overlay_twin
 from clrecon.rendering import UNSHADED, Lighting, TransferFunction
-from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.rendering.pictures.styles import SlicesInSpace, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip

@@ -19,7 +19,7 @@ from clrecon.geometry.iso_rule import slice_normal_matrices, takes_parts
 from clrecon.proof.rays.rays import Planes, box_of, find_interval, jitter_pixels, sample_field, voxel_gradients
 from clrecon.rendering import Lighting, TransferFunction
 from clrecon.rendering.looks.lighting import LEAST_SOFT_GRADIENT
-from clrecon.rendering.looks.steepness import DENSE, PARTS, STEEP, Steepness
+from clrecon.rendering.looks.piecewise import DENSE, PARTS, STEEP, Steepness
 from clrecon.rendering.views.camera import Camera
 
 MODES = ("dvr", "mip", "minip", "mean", "drr")

@@ -10,7 +10,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.proof.checking.check import Check, require_close, require_whole
 from clrecon.proof.checking.scenes import OBLIQUE, random_integers, stack
 from clrecon.proof.reformat.sheets import reformat_sheet
-from clrecon.rendering.views.plane import find_plane, plane_sheet, slab_samples
+from clrecon.rendering.views.reformation import find_plane, plane_sheet, slab_samples
 
 SIZE = (41, 37)
 """Pixels, a work-item each."""

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
-from clrecon.rendering.views.plane import Sheet, SlabSamples
+from clrecon.rendering.views.reformation import Sheet, SlabSamples
 
 EDGE = 2.0**-20
 """Index steps beyond the box of a volume that still count as inside: the rounding error of a pixel on a face."""

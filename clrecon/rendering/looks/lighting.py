@@ -14,7 +14,7 @@ LEAST_SOFT_GRADIENT = 0.01
 """Least gradient in HU per mm that is shaded; rounding errors of float32 in a flat field are a hundredth of it."""
 
 
-def _number(name: str, value: Any, low: float, high: float) -> float:
+def _checked_share(name: str, value: Any, low: float, high: float) -> float:
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
@@ -63,9 +63,9 @@ class Lighting:
 
     def __post_init__(self) -> None:
         for name in ("ambient", "diffuse", "specular"):
-            object.__setattr__(self, name, _number(name, getattr(self, name), 0.0, 1.0))
-        object.__setattr__(self, "specular_power", _number("specular power", self.specular_power, 1.0, 128.0))
-        object.__setattr__(self, "soft_gradient", _number("soft gradient", self.soft_gradient, 0.0, 10_000.0))
+            object.__setattr__(self, name, _checked_share(name, getattr(self, name), 0.0, 1.0))
+        object.__setattr__(self, "specular_power", _checked_share("specular power", self.specular_power, 1.0, 128.0))
+        object.__setattr__(self, "soft_gradient", _checked_share("soft gradient", self.soft_gradient, 0.0, 10_000.0))
         if self.direction is not None:
             object.__setattr__(self, "direction", self._unit(self.direction))
 

@@ -1,12 +1,16 @@
-"""Piecewise linear functions with steps, the parts of transfer functions.
+"""Piecewise linear functions with steps, the parts of transfer functions, and where they are steep.
 
 A curve is `positions` (n,), ascending, and `values` (n, k), both float64; two points at one position are a step, where
-the second counts from that position on.  Beyond its ends a curve is constant.
+the second counts from that position on.  Beyond its ends a curve is constant.  Where a transfer function is steep,
+volume rendering divides its segments into parts.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
@@ -96,3 +100,46 @@ def straighten_curve(
         out_positions += [positions[n] + way * (positions[n + 1] - positions[n]), positions[n + 1 : n + 2]]
         out_values += [values[n] + rise[:, np.newaxis] * (values[n + 1] - values[n]), values[n + 1 : n + 2]]
     return np.concatenate(out_positions), np.concatenate(out_values)
+
+
+# The kernels have these three numbers too, in cl/rays/steep_segments.h; a test compares them.
+PARTS = 4
+"""Number of parts of a segment where the transfer function is steep."""
+
+STEEP = 0.1
+"""Change of opacity within a ray step from which on it is steep."""
+
+DENSE = 0.7
+"""Opacity of a ray step from which on only its front is visible."""
+
+STEEP_HU = 50.0
+"""Widest range of HU for the change `STEEP`. Over wider ranges, parts are no better than the samples alone, and cost
+time."""
+
+
+@dataclass(frozen=True)
+class Steepness:
+    """The steepness of a table of opacities over one ray step.
+
+    changes: ndarray, shape (nodes,), float64. Sum of the changes of opacity, up and down, from the first node to each
+        node.
+    narrow: Number of nodes within which the opacity changes by at most `STEEP`.
+    has_dense: The opacity is above `DENSE` somewhere.
+    is_steep: The opacity changes by more than `STEEP` within `STEEP_HU` somewhere.
+    """
+
+    changes: NDArray[np.float64]
+    narrow: float
+    has_dense: bool
+    is_steep: bool
+
+    @classmethod
+    def of(cls, opacities: NDArray[np.float32], nodes_per_hu: float) -> Steepness:
+        """Compute the steepness of opacities (nodes,) over one ray step."""
+        changes = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(opacities.astype(np.float64))))])
+        ends = np.searchsorted(changes, changes + STEEP, side="right")
+        reached = ends < len(changes)
+        apart = (ends - np.arange(len(changes)))[reached]
+        # Values this far apart may be rounded to nodes that are one more apart.
+        narrow = float(max(apart.min() - 1, 0)) if len(apart) else float(len(changes))
+        return cls(changes, narrow, bool((opacities > DENSE).any()), narrow <= STEEP_HU * nodes_per_hu)

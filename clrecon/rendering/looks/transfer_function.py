@@ -1,9 +1,13 @@
-"""`TransferFunction`: the colour and opacity that each HU has in a picture."""
+"""`TransferFunction`: the colour and opacity that each HU has in a picture.
+
+docs/transfer_functions.md describes its text, JSON of clrecon's own form.
+"""
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -31,7 +35,7 @@ included."""
 COLUMNS = ("red", "green", "blue", "opacity")
 
 
-def _numbers(what: str, form: str, rows: ArrayLike, width: int) -> Float64Array:
+def _checked_rows(what: str, form: str, rows: ArrayLike, width: int) -> Float64Array:
     try:
         array = np.array(rows, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -106,7 +110,7 @@ class TransferFunction(Message):
     @staticmethod
     def _check_points(rows: ArrayLike) -> Float64Array:
         what = "the transfer function"
-        points = _numbers(what, "(hu, red, green, blue, opacity)", rows, 5)
+        points = _checked_rows(what, "(hu, red, green, blue, opacity)", rows, 5)
         hu = points[:, 0]
         if np.abs(hu).max() > HU_LIMIT:
             at = int(np.abs(hu).argmax())
@@ -120,7 +124,7 @@ class TransferFunction(Message):
     @staticmethod
     def _check_gradient(rows: ArrayLike) -> Float64Array:
         what = "the gradient opacity"
-        points = _numbers(what, "(HU per mm, factor)", rows, 2)
+        points = _checked_rows(what, "(HU per mm, factor)", rows, 2)
         if points[:, 0].min() < 0 or points[:, 0].max() > HU_LIMIT:
             raise UsageError(f"{what} goes from 0 to at most a million HU per mm")
         check_ascending(what, "HU per mm", points[:, 0])
@@ -189,7 +193,7 @@ class TransferFunction(Message):
         UsageError
             There are fewer than two nodes, or ``low`` and ``high`` are not finite or descend.
         """
-        return self(_nodes(low, high, nodes)).astype(np.float32)
+        return self(_table_nodes(low, high, nodes)).astype(np.float32)
 
     def gradient_factor(self, magnitude: ArrayLike) -> Float64Array:
         """Return the factor on the opacity (...,), float64, at magnitudes of the gradient (...,) in HU per mm; 1
@@ -209,7 +213,7 @@ class TransferFunction(Message):
         UsageError
             As in `table`.
         """
-        return self.gradient_factor(_nodes(0.0, high, nodes)).astype(np.float32)
+        return self.gradient_factor(_table_nodes(0.0, high, nodes)).astype(np.float32)
 
     def changed(self, **changes: Any) -> TransferFunction:
         """Return a copy with other parameters, named as in the constructor."""
@@ -339,7 +343,6 @@ class TransferFunction(Message):
         OutputError
             The file cannot be written; an older file of that name is intact.
         """
-        from clrecon.rendering.looks.transfer_text import transfer_text
         from clrecon.system.files import replace_file
         from clrecon.system.paths import keep_existing
 
@@ -370,9 +373,35 @@ class TransferFunction(Message):
         return f"TransferFunction({name}{len(self._points)} points from {low:g} to {high:g} HU)"
 
 
-def _nodes(low: float, high: float, nodes: int) -> Float64Array:
+def _table_nodes(low: float, high: float, nodes: int) -> Float64Array:
     if not (nodes >= 2 and np.isfinite([low, high]).all() and low <= high):
         raise UsageError(
             f"a table has two nodes or more from a lower to a higher value, not {nodes} of {low} to {high}"
         )
     return np.linspace(low, high, nodes, dtype=np.float64)
+
+
+FORMAT = "clrecon transfer function"
+VERSION = 1
+
+
+def transfer_text(
+    head: Mapping[str, Any], points: Sequence[Sequence[float]], gradient_opacity: Sequence[Sequence[float]] | None
+) -> str:
+    """Return a transfer function as text; reading it gives the same function, bit for bit.
+
+    head: Name, description, unit distance and lighting, by the names of the format.
+    points: sequence of (hu, red, green, blue, opacity)
+    gradient_opacity: sequence of (HU per mm, factor), or None
+    """
+    first = {"format": FORMAT, "version": VERSION, **head}
+    fields = [f'  "{key}": {json.dumps(value)}' for key, value in first.items()]
+    fields.append(_rows_text("points", [{"hu": row[0], "color": row[1:4], "opacity": row[4]} for row in points]))
+    if gradient_opacity is not None:
+        rows = [{"hu_per_mm": place, "factor": factor} for place, factor in gradient_opacity]
+        fields.append(_rows_text("gradient_opacity", rows))
+    return "{\n" + ",\n".join(fields) + "\n}\n"
+
+
+def _rows_text(name: str, rows: Sequence[Mapping[str, Any]]) -> str:
+    return f'  "{name}": [\n' + ",\n".join(f"    {json.dumps(row)}" for row in rows) + "\n  ]"

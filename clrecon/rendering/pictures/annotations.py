@@ -1,22 +1,58 @@
-"""Annotations of a picture: letters for the sides of the patient, a scale bar in mm, a line of text."""
+"""`PictureData`, the plain values of a picture, and what is written on it.
+
+Annotations are letters for the sides of the patient, a scale bar in mm, a line of text.
+"""
 
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.rendering.pictures.picture_data import PictureData
 from clrecon.rendering.pictures.pillow import load_font, load_pillow
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import DIRECTIONS
-from clrecon.rendering.views.plane import Sheet
+from clrecon.rendering.views.reformation import Sheet
+from clrecon.system.base_classes import Message
 
 if TYPE_CHECKING:
     from PIL import Image
+
+
+@dataclass
+class PictureData(Message):
+    """Pixels, depths and camera of a picture; see `clrecon.rendering.Rendering` for each attribute."""
+
+    image: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    expected_depth: NDArray[np.float32]
+    camera: Camera | None
+    values: NDArray[np.float32] | None = None
+    mode: str = "dvr"
+    report: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.image.shape[1], self.image.shape[0]
+
+    @property
+    def pixel_mm(self) -> float | None:
+        """Side of a pixel in mm; None if it varies within the picture (perspective)."""
+        if self.camera is not None:
+            return self.camera.pixel_mm(self.size) if self.camera.is_parallel else None
+        told = self.report.get("pixel_mm")
+        return None if told is None else float(told)
+
+    @property
+    def is_opaque(self) -> bool:
+        """True if no pixel is transparent, not even partly."""
+        return bool((self.image[..., 3] == 255).all())
+
 
 SMALLEST_SIDE = 64
 """Smallest width and height in pixels; letters in smaller pictures cannot be read."""

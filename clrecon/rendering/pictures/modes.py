@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 from clrecon.errors import UsageError
 from clrecon.rendering.looks.presets import find_preset
-from clrecon.rendering.pictures.mesh_look import MeshLook
-from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import (
     CurveCut,
     PlaneCut,
@@ -153,13 +152,15 @@ def find_style(style: Style | str | None, look: Mapping[str, object]) -> Style:
     """Return a given style unchanged, or make the one that a mode and keywords ask for."""
     if isinstance(style, Style):
         if look:
-            raise UsageError(f"a style says by itself what a picture shows: leave out {_join(look)}, or the style")
+            raise UsageError(
+                f"a style says by itself what a picture shows: leave out {_join_names(look)}, or the style"
+            )
         return style
     if style is not None and "mode" in look:
         raise UsageError(f"the mode is given twice, as {style!r:.60} and as {look['mode']!r:.60}")
     return make_style(**({} if style is None else {"mode": style}), **look)  # type: ignore[arg-type]
 
 
-def _join(names: Iterable[str]) -> str:
+def _join_names(names: Iterable[str]) -> str:
     *first, last = names
     return " and ".join(filter(None, (", ".join(first), last)))

@@ -1,18 +1,108 @@
-"""Sheets: grey slices side by side, with lines, circles and captions drawn over them."""
+"""Slices side by side in one picture, with lines, circles, captions and the scale of colours on them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
+from clrecon.rendering.looks.colors import ColorScale
 from clrecon.rendering.looks.window import BONE_WINDOW, grey_image
-from clrecon.rendering.pictures.picture_data import PictureData
+from clrecon.rendering.pictures.annotations import PictureData
+from clrecon.rendering.pictures.picture import Rendering
 from clrecon.rendering.pictures.pillow import load_font, load_pillow
+
+SHEET_SIZE = (1600, 1200)
+"""Default width and height of a contact sheet: twenty slices of about 300 pixels."""
+
+TILE_GAP_PIXELS = 2
+LEAST_TILE = 64
+"""Least pixels along the shorter side of a tile; what is written on smaller ones cannot be read."""
+
+LEAST_LETTERED = 96
+"""Least pixels along the shorter side of a tile with letters."""
+
+TEXT_SHARE, LEAST_TEXT, MOST_TEXT = 1 / 14, 9.0, 18.0
+
+
+@dataclass(frozen=True)
+class SheetLayout:
+    """Tiles of one size in rows.
+
+    tile: Width and height of a tile, pixels.
+    corners: sequence of (int, int). Left and top pixel of each tile.
+    """
+
+    tile: tuple[int, int]
+    pixel_mm: float
+    corners: tuple[tuple[int, int], ...]
+
+
+def lay_out(count: int, mm: tuple[float, float], size: tuple[int, int], zoom: float = 1.0) -> SheetLayout:
+    """Place tiles so that each is as large as possible.
+
+    mm: Width and height that a tile shows at zoom 1.
+    size: Width and height of the picture; it is not exceeded.
+    zoom: 2 shows everything twice as large, and half as much of it.
+    """
+    best: tuple[float, int, tuple[int, int]] | None = None
+    for columns in range(1, count + 1):
+        rows = -(-count // columns)
+        room = [
+            (whole - (many - 1) * TILE_GAP_PIXELS) // many for whole, many in zip(size, (columns, rows), strict=True)
+        ]
+        if min(room) < 1:
+            continue
+        pixel = max(mm[0] / room[0], mm[1] / room[1])
+        tile = tuple(min(most, max(1, round(length / pixel))) for most, length in zip(room, mm, strict=True))
+        if best is None or pixel < best[0] - 1e-12:
+            best = pixel, columns, (tile[0], tile[1])
+    if best is None or min(best[2]) < LEAST_TILE:
+        raise UsageError(
+            f"{count:,} slices are too many for a sheet of {size[0]} x {size[1]} pixels, in which each needs"
+            f" {LEAST_TILE}: show fewer, or make it larger"
+        )
+    pixel, columns, (width, height) = best
+    rows = -(-count // columns)
+    left = (size[0] - columns * (width + TILE_GAP_PIXELS) + TILE_GAP_PIXELS) // 2
+    top = (size[1] - rows * (height + TILE_GAP_PIXELS) + TILE_GAP_PIXELS) // 2
+    corners = tuple(
+        (left + n % columns * (width + TILE_GAP_PIXELS), top + n // columns * (height + TILE_GAP_PIXELS))
+        for n in range(count)
+    )
+    return SheetLayout((width, height), pixel / zoom, corners)
+
+
+def write_on_tile(image: NDArray[np.uint8], texts: tuple[str, ...], edges: Mapping[str, str]) -> NDArray[np.uint8]:
+    """Write on a copy of a tile.
+
+    image: ndarray, shape (h, w, 4), uint8
+    texts: The first that fits stands at the top left, else the last.
+    edges: Letters of the sides of the patient at the ``left`` and ``right`` edge; tiles under `LEAST_LETTERED` pixels
+        have none.
+    """
+    load_pillow()
+    from PIL import Image, ImageDraw
+
+    height, width = image.shape[:2]
+    font = load_font(float(np.clip(TEXT_SHARE * min(height, width), LEAST_TEXT, MOST_TEXT)))
+    fitting = [text for text in texts if font.getlength(text) <= width - 6]
+    picture: Any = Image.fromarray(np.ascontiguousarray(image))
+    pen = ImageDraw.Draw(picture)
+
+    def write(at: tuple[float, float], text: str, anchor: str) -> None:
+        pen.text(at, text, (255, 255, 255, 255), font, anchor, stroke_width=1, stroke_fill=(0, 0, 0, 255))
+
+    write((3, 2), fitting[0] if fitting else texts[-1], "la")
+    if min(height, width) >= LEAST_LETTERED:
+        for x, anchor, edge in ((3, "lm", "left"), (width - 3, "rm", "right")):
+            write((x, height / 2), edges[edge], anchor)
+    return np.array(picture)
+
 
 GAP_PIXELS = 6
 TEXT_PIXELS = 15
@@ -115,3 +205,39 @@ def _draw_panel(panel: Panel, window: tuple[float, float], font: Any) -> Any:
         if text:
             draw.text(place, text, anchor=anchor, **outline)
     return picture
+
+
+_TEXT_SHARE, _SMALLEST_TEXT = 1 / 36, 9.0
+
+
+def add_scale(picture: Rendering, scale: ColorScale, title: str) -> Rendering:
+    """Return a picture with a strip at its right that has the colours, their numbers and a title.
+
+    picture: With an opaque background.  Only its image grows: depth and camera stay those of the left part.
+    title: Lines over the scale, such as ``mm``.
+    """
+    load_pillow()
+    from PIL import Image, ImageDraw
+
+    height = picture.image.shape[0]
+    text = max(_SMALLEST_TEXT, _TEXT_SHARE * height)
+    font = load_font(text)
+    names = [f"{tick:+g}" if scale.signed and tick else f"{tick:g}" for tick in scale.ticks]
+    gap, bar = round(0.8 * text), round(1.4 * text)
+    lines = title.splitlines()
+    wide = max(gap + bar + gap // 2 + max(font.getlength(name) for name in names), *map(font.getlength, lines))
+    strip = Image.new("RGBA", (round(wide) + 2 * gap, height), "white")
+    pen = ImageDraw.Draw(strip)
+    top = gap + round(1.3 * text * len(lines)) + gap
+    bottom = height - 2 * gap
+    values = np.linspace(scale.limit, scale.low, bottom - top)
+    colors = np.full((bottom - top, bar, 4), 255, np.uint8)
+    colors[..., :3] = scale.colors(values)[:, None]
+    strip.paste(Image.fromarray(colors), (gap, top))
+    pen.rectangle((gap, top, gap + bar - 1, bottom - 1), outline="black", width=max(1, round(text / 14.0)))
+    for row, line in enumerate(lines):
+        pen.text((gap, gap + round(1.3 * text * row)), line, "black", font, "lt")
+    for tick, name in zip(scale.ticks, names, strict=True):
+        place = top + (scale.limit - tick) / (scale.limit - scale.low) * (bottom - 1 - top)
+        pen.text((gap + bar + gap // 2, place), name, "black", font, "lm")
+    return replace(picture, image=np.concatenate([picture.image, np.array(strip)], axis=1))

@@ -20,16 +20,16 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.iso_rule import checked_iso_value
 from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import find_color
-from clrecon.rendering.looks.label_style import LabelStyle
 from clrecon.rendering.looks.lighting import Lighting
 from clrecon.rendering.looks.presets import DEFAULT_PRESET, find_preset
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.looks.window import checked_window
 from clrecon.rendering.pictures import style_checks as checks
+from clrecon.rendering.pictures.label_style import LabelStyle
 from clrecon.rendering.pictures.style_checks import SPINE
 from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.clip import Clip
-from clrecon.rendering.views.plane import checked_offset, checked_thickness, positive_mm
+from clrecon.rendering.views.reformation import checked_offset, checked_thickness, positive_mm
 from clrecon.system.arguments import name_parameter
 
 _T = TypeVar("_T")
@@ -140,7 +140,8 @@ class VolumeLook(_Lit):
     labels : LabelMap, optional
         Labels that get a look of their own.
     label_colors : mapping of label to colour, optional
-        Labels by number or name, see ``clrecon.rendering.looks.label_style.LabelStyle.of``; default: a colour for each.
+        Labels by number or name, see ``clrecon.rendering.pictures.label_style.LabelStyle.of``; default: a colour for
+        each.
     label_opacity : mapping of label to float, optional
         Factors on the opacity, 0 to 1; label 0 is all that has no label.
     """
@@ -342,7 +343,7 @@ class PlaneCut(_Cut):
     slices : int or sequence of int, optional
         Of a contact sheet: every n-th plane of voxels, or a list of them.
     labels : LabelMap, optional
-        Labels that are drawn over the slice, see ``clrecon.rendering.pictures.label_overlay``.
+        Labels that are drawn over the slice, see ``clrecon.rendering.pictures.label_style``.
     label_colors : mapping of label to colour, optional
         Labels that are drawn, with their colours; default: all, each with one of its own.
     label_opacity : mapping of label to float, optional
@@ -374,7 +375,7 @@ class CurveCut(_Cut):
     curve : Curve, array_like of shape (n, 3), or "spine"
         Points of the centre line in LPS mm; "spine": the spinal canal, found in the volume.
     kind : {"straightened", "stretched"}
-        See ``clrecon.rendering.views.curved``.
+        See ``clrecon.rendering.views.reformation``.
     angle : float
         Rotation of the rows of a straightened picture about the centre line, in degrees.
     width_mm : float, optional

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.rendering.pictures.picture_data import PictureData
+from clrecon.rendering.pictures.annotations import PictureData
 from clrecon.rendering.views.camera import Camera
 
 FORMS = ("points", "plane")

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.grid import Grid
 from clrecon.system.arguments import name_parameter
 from clrecon.system.text import unknown_name
 
@@ -124,3 +125,27 @@ def _find_angles(view: str | Sequence[float]) -> tuple[float, float]:
             f" elevation from -90 to 90, such as 30,15{hint_at_sheet(view)}"
         )
     return azimuth, elevation
+
+
+ANTERIOR = "anterior"
+
+SLICES_VIEWS = ("30,30", "-60,30", "75,-30")
+"""Views of slices in space, the first of which shows slices across any axis of the patient.  No plane holds all three
+directions, so slices that are edge-on in one of them show in another."""
+
+LEAST_COSINE = 0.25
+"""Slices are shown by a view where its cosine to their normal is at least this: a quarter of their height is seen."""
+
+
+def default_view(mode: str, grid: Grid) -> str:
+    """Return the view of a mode in `render`: anterior, and for slices in space one from which they show.
+
+    That is the first of `SLICES_VIEWS` that shows the slices of the volume well, else the one that shows them best.
+    """
+    if mode != "slices":
+        return ANTERIOR
+    normal = np.cross(grid.affine[:3, 0], grid.affine[:3, 1])
+    normal = normal / np.linalg.norm(normal)
+    cosines = [abs(float(find_view(view)[0] @ normal)) for view in SLICES_VIEWS]
+    shown = [n for n, cosine in enumerate(cosines) if cosine >= LEAST_COSINE]
+    return SLICES_VIEWS[shown[0] if shown else int(np.argmax(cosines))]

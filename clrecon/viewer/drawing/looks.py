@@ -11,8 +11,7 @@ import numpy as np
 
 from clrecon.labels import LabelMap
 from clrecon.labels.resample import ResampledLabels
-from clrecon.rendering.pictures.mesh_look import MeshLook
-from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import PlaneCut, Projection, SlicesInSpace, Style, SurfaceLook, VolumeLook
 from clrecon.viewer.model.modes import ViewMode
 from clrecon.viewer.model.state import ShownPart, ViewState

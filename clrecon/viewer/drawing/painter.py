@@ -22,7 +22,7 @@ from clrecon.rendering import Rendering
 from clrecon.rendering.pictures.styles import CurveCut, Projection, SlicesInSpace, Style, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import checked_size
-from clrecon.rendering.views.plane import PLANES, find_plane
+from clrecon.rendering.views.reformation import PLANES, find_plane
 from clrecon.system.progress import Progress
 from clrecon.system.text import unknown_name
 from clrecon.viewer.drawing.coarse import coarsen_mesh

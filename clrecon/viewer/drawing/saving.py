@@ -17,7 +17,7 @@ from clrecon.mesh import Mesh
 from clrecon.operators.masks.mask import Mask
 from clrecon.points import PointCloud
 from clrecon.reading.grids.write_volume import FORMATS as VOLUME_FORMATS
-from clrecon.rendering.pictures.image_files import IMAGE_FORMATS
+from clrecon.rendering.pictures.picture import IMAGE_FORMATS
 from clrecon.system.files import check_writable
 from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress

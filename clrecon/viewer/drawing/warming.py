@@ -15,7 +15,7 @@ from clrecon.operators.rays.scene import ScenePictures
 from clrecon.operators.rays.volume_renderer import VolumeRenderer
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.extract import SurfaceExtractor
-from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.rendering.pictures.styles import PlaneCut, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.progress import Progress, ignore_progress

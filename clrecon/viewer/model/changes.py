@@ -12,7 +12,7 @@ import numpy as np
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
-from clrecon.rendering.looks.label_style import distinct_colors
+from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import checked_vector
 from clrecon.system.text import unknown_name

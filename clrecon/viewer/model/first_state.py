@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from clrecon.rendering.looks.label_style import distinct_colors
+from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.viewer.model.objects import ShownCloud, ShownLabels, ShownMesh, ShownObject, ShownScan
 from clrecon.viewer.model.state import ShownPart, as_point
 

@@ -10,7 +10,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.operators.rays.mesh_pictures import box_around
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import DIRECTIONS
-from clrecon.rendering.views.plane import PLANES
+from clrecon.rendering.views.reformation import PLANES
 from clrecon.viewer.model.objects import ShownScan
 
 FIT_PIXELS = 1000

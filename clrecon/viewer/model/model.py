@@ -16,7 +16,7 @@ from clrecon.rendering.pictures.annotations import edge_letters
 from clrecon.rendering.pictures.styles import DEFAULT_ISO_VALUE
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import checked_vector
-from clrecon.rendering.views.plane import PLANES
+from clrecon.rendering.views.reformation import PLANES
 from clrecon.system.text import format_hu, unknown_name
 from clrecon.viewer.model.changes import ChangingView, checked_numbers
 from clrecon.viewer.model.first_state import find_iso_range, first_parts

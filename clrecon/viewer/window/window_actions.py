@@ -11,7 +11,7 @@ import numpy as np
 
 from clrecon.errors import ClreconError
 from clrecon.geometry import frame_from_lps
-from clrecon.rendering.looks.label_style import distinct_colors
+from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.system.text import format_volume
 from clrecon.viewer.window.file_names import DEFAULT_MESH, DEFAULT_PICTURE, free_name
 from clrecon.viewer.window.layout import PLANES

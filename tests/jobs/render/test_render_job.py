@@ -135,9 +135,9 @@ def test_a_step_that_fails_leaves_the_old_files(
         )
     else:
         home = {
-            "encode_floats": "clrecon.rendering.pictures.image_files.encode_floats",
+            "encode_floats": "clrecon.rendering.pictures.picture.encode_floats",
             "stage_report": "clrecon.jobs.render.job.stage_report",
-            "stage_animation": "clrecon.rendering.movies.movie.stage_animation",
+            "stage_animation": "clrecon.rendering.movies.stage_animation",
             "commit": "clrecon.system.files.StagedFile.commit",
         }[fails]
         monkeypatch.setattr(home, fail)

@@ -11,7 +11,7 @@ import pytest
 from clrecon.operators.rays.point_pictures import LARGEST_DISC, PointPictures
 from clrecon.points import PointCloud
 from clrecon.points.spacing import mean_spacing
-from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.object_looks import PointLook
 from clrecon.rendering.views.camera import Camera
 
 ABOVE = Camera((3.5, 3.5, 50.0), (3.5, 3.5, 0.0), (0.0, 1.0, 0.0), parallel_scale=5.0)

@@ -15,7 +15,7 @@ from clrecon.operators.rays.point_pictures import MOST_NAMED, PointPictures, clo
 from clrecon.points import PointCloud
 from clrecon.proof.rays.objects import find_splats, shade_splats
 from clrecon.rendering import UNSHADED, Lighting
-from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.object_looks import PointLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 

@@ -11,8 +11,7 @@ from clrecon.geometry import Volume
 from clrecon.operators.reformat.cut import reformat_curve
 from clrecon.proof.reformat.sheets import reformat_sheet
 from clrecon.rendering.views.centre_line import Curve
-from clrecon.rendering.views.curved import straightened_sheet
-from clrecon.rendering.views.plane import slab_samples
+from clrecon.rendering.views.reformation import slab_samples, straightened_sheet
 
 BEND, TUBE = 40.0, 7.0
 """Radius of the torus and of its tube, mm."""

@@ -18,7 +18,7 @@ from clrecon.operators.reformat.sheets import prepare_reformat, sample_sheet
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.proof.reformat.sheets import reformat_sheet
 from clrecon.rendering.views.camera import Camera
-from clrecon.rendering.views.plane import find_plane, plane_sheet, slab_samples
+from clrecon.rendering.views.reformation import find_plane, plane_sheet, slab_samples
 
 SHEARED = np.eye(4)
 SHEARED[:3, :3] = rotation((15.0, -25.0, 40.0)) @ [[0.7, 0.0, 0.1], [0.0, 0.5, -0.9], [0.0, 0.0, 2.5]]

@@ -7,8 +7,8 @@ import pytest
 
 from clrecon.errors import UsageError
 from clrecon.rendering import Rendering
-from clrecon.rendering.looks.color_scale import ColorScale, round_up
-from clrecon.rendering.pictures.scale_strip import add_scale
+from clrecon.rendering.looks.colors import ColorScale, round_up
+from clrecon.rendering.pictures.sheets import add_scale
 
 
 def test_colours_about_zero_and_from_zero_on() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from clrecon.errors import UsageError
 from clrecon.labels import LabelMap
-from clrecon.rendering.looks.label_style import LabelStyle, distinct_colors
+from clrecon.rendering.pictures.label_style import LabelStyle, distinct_colors
 
 LABELS = LabelMap(
     np.array([0, 4, 9, 9, 2, 0, 0, 4]).reshape(2, 2, 2), np.eye(4), {4: "vertebrae_L2", 9: "rib_left_1", 7: "heart"}

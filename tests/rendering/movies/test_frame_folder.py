@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.rendering.movies.movie import check_animation, stage_animation, write_animation
+from clrecon.rendering.movies import check_animation, stage_animation, write_animation
 from clrecon.system.files import replace_file
 
 NAMES = ["frame_0000.png", "frame_0001.png"]

@@ -11,15 +11,15 @@ from picture_files import PARALLEL, make_picture
 from PIL import Image
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.rendering.movies import movie as motion
-from clrecon.rendering.movies import video
-from clrecon.rendering.movies.movie import check_animation, stage_animation, turntable_cameras, write_animation
+from clrecon.rendering import movies
+from clrecon.rendering import movies as motion
+from clrecon.rendering.movies import check_animation, stage_animation, turntable_cameras, write_animation
 
 
 @pytest.fixture
 def encoder() -> str:
     try:
-        return video.find_encoder()
+        return movies.find_encoder()
     except UsageError as error:
         pytest.skip(str(error))
 
@@ -234,10 +234,10 @@ def test_what_cannot_be_written_is_said_before_the_first_frame(tmp_path, name, f
 
 @pytest.fixture
 def no_encoder(monkeypatch):
-    video.find_encoder.cache_clear()
+    movies.find_encoder.cache_clear()
     monkeypatch.setitem(__import__("sys").modules, "imageio_ffmpeg", None)
     yield monkeypatch
-    video.find_encoder.cache_clear()
+    movies.find_encoder.cache_clear()
 
 
 def test_without_an_encoder_the_message_says_what_to_install(tmp_path, no_encoder):

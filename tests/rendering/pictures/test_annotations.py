@@ -19,7 +19,7 @@ from clrecon.rendering.pictures.annotations import (
 )
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.centre_line import Curve
-from clrecon.rendering.views.curved import straightened_sheet, stretched_sheet
+from clrecon.rendering.views.reformation import straightened_sheet, stretched_sheet
 
 BLACK, WHITE, CLEAR = (0, 0, 0, 255), (255, 255, 255, 255), (0, 0, 0, 0)
 

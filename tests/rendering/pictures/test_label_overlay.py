@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from clrecon.labels import LabelMap
-from clrecon.rendering.looks.label_style import LabelStyle
-from clrecon.rendering.pictures.label_overlay import FILL, describe_overlay, draw_labels, labels_on_sheet
+from clrecon.rendering.pictures.label_style import FILL, LabelStyle, draw_labels, facts_of_overlay, labels_on_sheet
 from clrecon.rendering.views.camera import Camera
-from clrecon.rendering.views.plane import plane_sheet
+from clrecon.rendering.views.reformation import plane_sheet
 
 pytestmark = pytest.mark.unit
 
@@ -62,10 +61,10 @@ def test_labels_without_a_colour_and_pixels_without_a_scan_stay() -> None:
 
 def test_what_is_drawn_is_named() -> None:
     look = LabelStyle.of(LABELS, {1: "#ff0000", 2: "#0000ff"}, {1: 0.0})
-    assert describe_overlay(NUMBERS, look) == [
+    assert facts_of_overlay(NUMBERS, look) == [
         {"label_number": 2, "label": "vertebrae_L2", "color": "#0000ff", "pixels": 30}
     ]
-    assert describe_overlay(np.zeros((3, 3), np.uint8), look) == []
+    assert facts_of_overlay(np.zeros((3, 3), np.uint8), look) == []
 
 
 def test_a_pixel_has_the_label_of_the_voxel_that_it_lies_in() -> None:

@@ -13,7 +13,7 @@ from PIL import Image
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.rendering.looks.colors import COLORS, find_color
-from clrecon.rendering.pictures import image_files
+from clrecon.rendering.pictures import picture as image_files
 
 CLEAR = (10, 20, 30, 0)
 

@@ -8,7 +8,7 @@ import tolerances
 
 from clrecon.errors import UsageError
 from clrecon.rendering import Rendering
-from clrecon.rendering.pictures.layers import merge_layers
+from clrecon.rendering.pictures.picture import merge_layers
 from clrecon.rendering.views.camera import Camera
 
 WIDTH, HEIGHT = 14, 9

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clrecon.errors import UsageError
-from clrecon.rendering.pictures.contact_sheet import LEAST_TILE, lay_out, write_on_tile
+from clrecon.rendering.pictures.sheets import LEAST_TILE, lay_out, write_on_tile
 
 pytestmark = pytest.mark.unit
 

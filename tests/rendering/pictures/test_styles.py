@@ -13,9 +13,8 @@ import pytest
 from clrecon.errors import UsageError
 from clrecon.labels import LabelMap
 from clrecon.rendering import Lighting, TransferFunction, find_preset
-from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.modes import MODES, check_known, find_style, keywords_of, make_style
-from clrecon.rendering.pictures.point_look import PointLook
+from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import (
     CurveCut,
     PlaneCut,

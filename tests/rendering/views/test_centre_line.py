@@ -10,7 +10,7 @@ from dicom_series import rotation
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.rendering.views.centre_line import Curve, rotation_minimising_normals
-from clrecon.rendering.views.curved import straightened_sheet, stretched_length, stretched_sheet
+from clrecon.rendering.views.reformation import straightened_sheet, stretched_length, stretched_sheet
 
 RADIUS = 80.0
 

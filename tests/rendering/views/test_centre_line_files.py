@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.rendering.views.centre_line_files import read_curve_points
+from clrecon.rendering.views.centre_line import read_curve_points
 
 POINTS = np.array([[1.5, -2.0, 30.0], [2.0, -1e1, 28.25], [0.0, 4.0, -7.0]])
 RAS = POINTS * (-1.0, -1.0, 1.0)

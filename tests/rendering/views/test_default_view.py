@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from clrecon.geometry.grid import Grid
-from clrecon.rendering.views.default_view import LEAST_COSINE, SLICES_VIEWS, default_view
-from clrecon.rendering.views.directions import find_view
+from clrecon.rendering.views.directions import LEAST_COSINE, SLICES_VIEWS, default_view, find_view
 
 
 def stack(normal: np.ndarray) -> Grid:

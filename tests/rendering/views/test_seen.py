@@ -10,8 +10,7 @@ import pytest
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.rendering.views.camera import Camera, box_corners
-from clrecon.rendering.views.clip import Clip
-from clrecon.rendering.views.seen import ShownLabels, check_center, find_seen_box
+from clrecon.rendering.views.clip import Clip, ShownLabels, check_center, find_seen_box
 
 AFFINE = np.array([[2.0, 0, 0, -30.0], [0, 3.0, 0, -40.0], [0, 0, 5.0, 100.0], [0, 0, 0, 1]])
 

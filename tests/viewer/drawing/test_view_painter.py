@@ -10,7 +10,7 @@ from open_views import find, open_painters, shown_pixels
 from clrecon.errors import Cancelled, NoSurfaceError, UsageError
 from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.operators.rays.render import render
-from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import show_objects

@@ -10,7 +10,7 @@ from open_views import find, open_painters, shown_pixels
 from clrecon.geometry import Volume
 from clrecon.operators.rays.render import render
 from clrecon.operators.surface.extract import extract_isosurface
-from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.viewer.model.parts import grow_labels
 
 pytestmark = pytest.mark.opencl

@@ -1,0 +1,470 @@
+"""Moving pictures: the cameras of a turntable, and the writing of frames to a file or a folder.
+
+Frames are taken from an iterator and written one by one, so that a thousand need the memory of one.  The name, the
+place and the encoder are checked before the first frame is computed.  Folders of frames appear as a whole.
+
+Pillow writes GIF and APNG, but holds all frames in memory until the end.  Here Pillow compresses each frame as a
+separate picture, whose compressed blocks are copied into the moving picture: the memory of one frame suffices.  MP4 is
+written by the program ffmpeg: it gets frames through a pipe, and writes the file to a temporary folder.  Every browser
+and every slide program plays H.264 in yuv420p.
+
+Sources: CompuServe, Graphics Interchange Format, version 89a; W3C, Portable Network Graphics, third edition.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import struct
+import subprocess
+import tempfile
+import zlib
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
+from io import BytesIO
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import OutputError, UsageError
+from clrecon.rendering.views.camera import Camera
+from clrecon.system.arguments import explains_arguments
+from clrecon.system.files import Staged, StagedFolder, check_folder, check_writable, stage_file, temporary_folder
+from clrecon.system.packages import install_command
+from clrecon.system.paths import final_mode, keep_existing, system_errors
+from clrecon.system.progress import Progress
+from clrecon.system.text import guess_word
+
+if TYPE_CHECKING:
+    from clrecon.rendering.pictures.picture import Rendering
+
+
+ANIMATIONS = (".mp4", ".gif", ".apng")
+"""Extensions of moving pictures; a name without extension is a folder of PNG files."""
+
+MOST_FRAMES = 10_000
+"""Most frames: five minutes at 30 frames per second.  More are a typing error."""
+
+FASTEST = {".mp4": 120.0, ".gif": 50.0, ".apng": 120.0, "": 120.0}
+"""Most frames per second.  GIF counts hundredths of a second; browsers slow down frames shorter than two."""
+
+SLOWEST = 0.1
+"""Fewest frames per second."""
+
+
+@explains_arguments
+def turntable_cameras(camera: Camera, frames: int, degrees: float = 360.0) -> list[Camera]:
+    """Return cameras around the focal point, turning about the axis of the body towards the patient's left.
+
+    Parameters
+    ----------
+    camera : Camera
+        The first camera.
+    frames : int
+        Number of cameras.
+    degrees : float
+        Total angle.  Whole turns end one step before the first camera, so that the movie can be repeated; other angles
+        end exactly there.
+
+    Raises
+    ------
+    UsageError
+        ``frames`` is not from 1 to 10000, or ``degrees`` is not finite.
+    """
+    if not isinstance(frames, (int, np.integer)) or not 1 <= frames <= MOST_FRAMES:
+        raise UsageError(f"a turntable has 1 to {MOST_FRAMES} frames, not {frames!r}")
+    if not np.isfinite(degrees):
+        raise UsageError(f"a turntable turns by a finite angle in degrees, not {degrees!r}")
+    whole = degrees % 360.0 == 0.0
+    step = degrees / max(1, frames if whole else frames - 1)
+    return [camera.orbit(step * frame) for frame in range(frames)]
+
+
+def animation_kind(path: str | os.PathLike[str]) -> str:
+    """Return the extension of a moving picture in lower case; empty for a folder: no extension, a final slash, or a
+    folder.
+    """
+    text = os.fspath(path)
+    is_folder = text.endswith(tuple(filter(None, (os.sep, os.altsep)))) or os.path.isdir(text)
+    return "" if is_folder else os.path.splitext(text)[1].lower()
+
+
+def check_animation(path: str | os.PathLike[str], fps: float = 25.0) -> str:
+    """Refuse a moving picture that cannot be written, before a frame is computed.
+
+    path: ``.mp4``, ``.gif``, ``.apng``, or a folder: a name without extension, a name that ends with a slash, or an
+        existing folder.
+    fps: Frames per second.
+
+    Returns: The extension, empty for a folder.
+    """
+    try:
+        text = os.fspath(path)
+    except TypeError as error:
+        raise UsageError(f"a moving picture is named by a string or a path, not {type(path).__name__}") from error
+    if not text:
+        raise UsageError("the name of the moving picture is empty")
+    extension = animation_kind(text)
+    if extension and extension not in ANIMATIONS:
+        raise UsageError(
+            f"a moving picture is not written as {extension!r}{guess_word(extension, ANIMATIONS)}: use one of"
+            f" {', '.join(ANIMATIONS)}, or a name without extension for a folder of PNG files"
+        )
+    if not isinstance(fps, (int, float)) or not SLOWEST <= fps <= FASTEST[extension]:
+        kind = extension[1:].upper() or "a folder of frames"
+        raise UsageError(f"{kind} takes {SLOWEST:g} to {FASTEST[extension]:g} frames a second, not {fps!r}")
+    if extension == ".mp4":
+        find_encoder()
+    if extension:
+        check_writable(text)
+    else:
+        check_frame_folder(text)
+    return extension
+
+
+@explains_arguments
+def write_animation(
+    frames: Iterable[Rendering | NDArray[np.uint8]],
+    path: str | os.PathLike[str],
+    fps: float = 25.0,
+    *,
+    no_clobber: bool = False,
+    total: int = 0,
+    progress: Progress | None = None,
+) -> int:
+    """Write frames as a moving picture, whole or not at all.
+
+    Parameters
+    ----------
+    frames : iterable of Rendering or of ndarray, shape (h, w, 3) or (h, w, 4), uint8
+        Frames of one size.  The next frame is requested after the one before has been written.
+    path : str or path
+        ``.mp4``, ``.gif``, ``.apng``, or a folder: a name without extension, a name that ends with a slash, or an
+        existing folder.  MP4 is H.264 (BT.709, quality 18), an odd side made even by repeating its last row or
+        column.  GIF has a palette for each frame, dithered after Floyd and Steinberg, and repeats.  APNG repeats too,
+        and keeps every colour and the opacity.  A folder gets frame_0000.png, frame_0001.png, ...
+    fps : float
+        Frames per second.
+    no_clobber : bool
+        True: what has that name stays and is an `OutputError`; an empty folder is filled.
+    total : int
+        Number of frames, for ``progress``.
+    progress : callable, optional
+        Called as ``progress("frames", done, total)``.
+
+    Returns
+    -------
+    int
+        Bytes written.
+
+    Raises
+    ------
+    UsageError
+        The extension is unknown, there is no encoder, the folder contains other files, or ``fps`` is out of range; or
+        there is no frame, frames differ in size, or have opacity that the format would
+        lose.
+    OutputError
+        The file cannot be written; an older one is intact.
+    """
+    with (
+        keep_existing(no_clobber),
+        stage_animation(frames, path, fps, total=total, progress=progress) as staged,
+    ):
+        staged.commit()
+    return staged.size
+
+
+@contextlib.contextmanager
+def stage_animation(
+    frames: Iterable[Rendering | NDArray[np.uint8]],
+    path: str | os.PathLike[str],
+    fps: float = 25.0,
+    *,
+    total: int = 0,
+    progress: Progress | None = None,
+) -> Iterator[Staged]:
+    """Write a moving picture under a temporary name; ``commit`` of the yielded object moves it to its place.
+
+    For files that belong together: stage all of them, then commit one after the other.  Files that are not committed
+    are removed at the end of the block.  Parameters and errors as in `write_animation`.
+    """
+    extension = check_animation(path, fps)
+    checked = _checked_frames(frames, extension, total, progress)
+    if extension == "":
+        with stage_frame_folder(checked, path) as folder:
+            yield folder
+        return
+    if extension == ".mp4":
+        pass
+    elif extension == ".gif":
+        pass
+    else:
+        pass
+
+    def write_all(stream: BinaryIO) -> None:
+        write_apng(stream, checked, fps)
+
+    with stage_file(path, write_all) as file:
+        yield file
+
+
+def _checked_frames(
+    frames: Iterable[Rendering | NDArray[np.uint8]], extension: str, total: int, progress: Progress | None
+) -> Iterator[NDArray[np.uint8]]:
+    """Yield frames as arrays (h, w, 3 or 4), with three channels for formats without opacity; report progress."""
+    shape: tuple[int, ...] | None = None
+    done = 0
+    for frame in frames:
+        image = np.asarray(getattr(frame, "image", frame))
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4) or image.size == 0:
+            raise UsageError(f"frame {done} is no picture of uint8 (h, w, 3 or 4): {image.dtype} {image.shape}")
+        if shape is None:
+            shape = image.shape
+        elif image.shape != shape:
+            raise UsageError(f"frame {done} has shape {image.shape}, the frames before it {shape}")
+        if extension in (".mp4", ".gif") and image.shape[2] == 4:
+            if (image[..., 3] != 255).any():
+                raise UsageError(
+                    f"{extension[1:].upper()} cannot hold a transparent background: choose a background colour,"
+                    " APNG or a folder of PNG files"
+                )
+            image = image[..., :3]
+        yield np.ascontiguousarray(image)
+        done += 1
+        if progress is not None:
+            progress("frames", done, total)
+    if done == 0:
+        raise UsageError("a moving picture needs at least one frame")
+
+
+_FRAME = re.compile(r"frame_[0-9]{4,}\.png")
+
+
+def check_frame_folder(path: str | os.PathLike[str]) -> Path:
+    """Return the folder that will be made or replaced, see `clrecon.system.files.check_folder`."""
+    return check_folder(path, _FRAME, "frames")
+
+
+@contextlib.contextmanager
+def stage_frame_folder(frames: Iterator[NDArray[np.uint8]], path: str | os.PathLike[str]) -> Iterator[StagedFolder]:
+    """Write frames (h, w, 3 or 4) as frame_0000.png, ... into a folder under a temporary name.
+
+    `StagedFolder.commit` in the ``with`` block moves it to its place; a folder that is not committed is removed at the
+    end of the block.
+    """
+    from clrecon.rendering.pictures.pillow import load_pillow
+
+    load_pillow()
+    from PIL import Image
+
+    folder = check_frame_folder(path)
+    size = 0
+    with contextlib.ExitStack() as stack:
+        with system_errors(path):
+            made = stack.enter_context(temporary_folder(folder.parent))
+            for number, frame in enumerate(frames):
+                with open(made / f"frame_{number:04d}.png", "xb") as stream:
+                    Image.fromarray(frame).save(stream, "PNG")
+                    stream.flush()
+                    os.fsync(stream.fileno())
+                    size += stream.tell()
+            made.chmod(final_mode(folder, 0o777))
+        yield StagedFolder(path, made, folder, size)
+
+
+_REPEAT_FOR_EVER = b"\x21\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00"
+
+
+def write_gif(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float) -> None:
+    """Write frames (h, w, 3), each with its own best 256 colours."""
+    from clrecon.rendering.pictures.pillow import load_pillow
+
+    load_pillow()
+    first = next(frames)
+    height, width = first.shape[:2]
+    stream.write(b"GIF89a" + struct.pack("<HHBBB", width, height, 0x70, 0, 0) + _REPEAT_FOR_EVER)
+    shown = 0
+    for number, frame in enumerate(chain([first], frames)):
+        # Durations in hundredths of a second, rounded so that the total is right.
+        delay = round(100.0 * (number + 1) / fps) - shown
+        shown += delay
+        palette, blocks = _gif_picture(frame)
+        bits = max(1, (len(palette) // 3 - 1).bit_length())
+        palette = palette.ljust(3 << bits, b"\0")
+        stream.write(b"\x21\xf9\x04" + struct.pack("<BHBB", 1 << 2, delay, 0, 0))
+        stream.write(b"\x2c" + struct.pack("<HHHHB", 0, 0, width, height, 0x80 | (bits - 1)))
+        stream.write(palette + blocks)
+    stream.write(b"\x3b")
+
+
+def _gif_picture(frame: NDArray[np.uint8]) -> tuple[bytes, bytes]:
+    """Return the palette and the compressed pixels: everything after the last image descriptor of a one-picture GIF."""
+    from PIL import Image
+
+    picture = Image.fromarray(frame)
+    best = picture.quantize(256, Image.Quantize.MEDIANCUT)
+    dithered = picture.quantize(palette=best, dither=Image.Dither.FLOYDSTEINBERG)
+    data = BytesIO()
+    dithered.save(data, "GIF", optimize=False, interlace=False)
+    content = data.getvalue()
+    flags = content[10]
+    at = 13
+    palette = b""
+    if flags & 0x80:
+        palette = content[at : at + (3 << ((flags & 7) + 1))]
+        at += len(palette)
+    while content[at] == 0x21:  # extensions: a label, then blocks with their length, up to an empty block
+        at += 2
+        while content[at]:
+            at += content[at] + 1
+        at += 1
+    assert content[at] == 0x2C and content[-1] == 0x3B
+    local = content[at + 9]
+    at += 10
+    if local & 0x80:
+        palette = content[at : at + (3 << ((local & 7) + 1))]
+        at += len(palette)
+    return palette, content[at:-1]
+
+
+def write_apng(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float) -> None:
+    """Write frames (h, w, 3 or 4) without loss; `stream` must be seekable, as the number of frames comes first."""
+    from clrecon.rendering.pictures.pillow import load_pillow
+
+    load_pillow()
+    first = next(frames)
+    height, width = first.shape[:2]
+    numerator, denominator = (1, round(fps)) if fps == round(fps) else (1000, round(1000 * fps))
+    if denominator > 0xFFFF:
+        numerator, denominator = 100, round(100 * fps)
+    written = sequence = 0
+    control_at = 0
+    for frame in chain([first], frames):
+        chunks = list(_png_chunks(frame))
+        if written == 0:
+            stream.write(b"\x89PNG\r\n\x1a\n")
+            _write_chunk(stream, *chunks[0])  # IHDR
+            control_at = stream.tell()
+            _write_chunk(stream, b"acTL", bytes(8))
+        control = struct.pack(">IIIIIHHBB", sequence, width, height, 0, 0, numerator, denominator, 0, 0)
+        _write_chunk(stream, b"fcTL", control)
+        sequence += 1
+        for kind, body in chunks:
+            if kind == b"IDAT" and written == 0:
+                _write_chunk(stream, kind, body)
+            elif kind == b"IDAT":
+                _write_chunk(stream, b"fdAT", struct.pack(">I", sequence) + body)
+                sequence += 1
+        written += 1
+    _write_chunk(stream, b"IEND", b"")
+    end = stream.tell()
+    stream.seek(control_at)
+    _write_chunk(stream, b"acTL", struct.pack(">II", written, 0))
+    stream.seek(end)
+
+
+def _png_chunks(frame: NDArray[np.uint8]) -> Iterator[tuple[bytes, bytes]]:
+    from PIL import Image
+
+    data = BytesIO()
+    Image.fromarray(frame).save(data, "PNG")
+    content = data.getvalue()
+    at = 8
+    while at < len(content):
+        length, kind = struct.unpack_from(">I4s", content, at)
+        yield kind, content[at + 8 : at + 8 + length]
+        at += 12 + length
+
+
+def _write_chunk(stream: BinaryIO, kind: bytes, body: bytes) -> None:
+    stream.write(struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)))
+
+
+QUALITY = 18
+"""x264's constant rate factor; at 18 the loss is not visible."""
+
+
+@lru_cache(maxsize=1)
+def find_encoder() -> str:
+    """Return the ffmpeg to call: that of imageio-ffmpeg, else the one on the PATH."""
+    program = _find_ffmpeg()
+    if program is None:
+        raise UsageError(f"no encoder for MP4: {_advise_encoder()}; GIF, APNG and a folder of PNG files need none")
+    try:
+        listed = subprocess.run([program, "-hide_banner", "-encoders"], capture_output=True, timeout=60).stdout
+    except (OSError, subprocess.SubprocessError) as error:
+        raise UsageError(f"{program} does not run ({error}): {_advise_encoder()}") from error
+    if b" libx264 " not in listed:
+        raise UsageError(f"{program} has no H.264 encoder (libx264): {_advise_encoder()}")
+    return program
+
+
+def _advise_encoder() -> str:
+    return f"{install_command('imageio-ffmpeg')}, or put an ffmpeg with libx264 on the PATH"
+
+
+def _find_ffmpeg() -> str | None:
+    try:
+        import imageio_ffmpeg
+
+        return str(imageio_ffmpeg.get_ffmpeg_exe())
+    except (ImportError, RuntimeError):  # not installed, or installed without a program for this system
+        return shutil.which("ffmpeg")
+
+
+def write_video(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float) -> None:
+    """Encode frames (h, w, 3) and copy the finished file to a stream."""
+    first = next(frames)
+    height, width = first.shape[:2]
+    with tempfile.TemporaryDirectory(prefix="clrecon-") as folder:
+        made = Path(folder) / "video.mp4"
+        errors = Path(folder) / "errors.txt"
+        command = _encoder_command(find_encoder(), (width + width % 2, height + height % 2), fps, made)
+        with open(errors, "wb") as log, _start_encoder(command, log) as encoder:
+            assert encoder.stdin is not None
+            try:
+                for frame in chain([first], frames):
+                    encoder.stdin.write(np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), "edge").data)
+                encoder.stdin.close()
+                code = encoder.wait()
+            except BrokenPipeError:
+                with contextlib.suppress(OSError):
+                    encoder.stdin.close()
+                code = encoder.wait() or 1
+            except BaseException:
+                encoder.kill()
+                with contextlib.suppress(OSError):
+                    encoder.stdin.close()
+                raise
+        if code != 0 or not made.exists():
+            lines = errors.read_text(errors="replace").split("\n")
+            said = next((line.strip() for line in reversed(lines) if line.strip()), f"exit code {code}")
+            raise OutputError(f"the encoder of MP4 failed: {said}")
+        with open(made, "rb") as finished:
+            shutil.copyfileobj(finished, stream, 1 << 20)
+
+
+def _start_encoder(command: list[str], log: BinaryIO) -> subprocess.Popen[bytes]:
+    # A session of its own: we handle Ctrl-C; otherwise the encoder would end first and we would see a broken pipe.
+    return subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log, start_new_session=os.name == "posix"
+    )
+
+
+def _encoder_command(program: str, size: tuple[int, int], fps: float, path: Path) -> list[str]:
+    width, height = size
+    # The colour matrix is both applied and named: ffmpeg's default is BT.601, but players assume BT.709 for large
+    # pictures.
+    colours = "scale=out_range=tv:out_color_matrix=bt709:flags=lanczos+accurate_rnd,format=yuv420p"
+    return [
+        *(program, "-hide_banner", "-loglevel", "error", "-nostdin", "-y"),
+        *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:.6g}", "-i", "pipe:0"),
+        *("-an", "-vf", colours, "-c:v", "libx264", "-preset", "medium", "-crf", str(QUALITY)),
+        *("-color_primaries", "bt709", "-color_trc", "bt709", "-colorspace", "bt709", "-color_range", "tv"),
+        *("-movflags", "+faststart", "-fflags", "+bitexact", "-map_metadata", "-1", os.fspath(path)),
+    ]

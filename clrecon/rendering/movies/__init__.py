@@ -1,1 +1,0 @@
-"""Movies: turning cameras, and files of moving pictures."""
