@@ -7,17 +7,47 @@ import math
 from dataclasses import fields
 from typing import Any
 
-from clrecon.cli.cloud_values import parse_clusters, parse_denoisers, parse_level
 from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes, pick
 from clrecon.cli.console import Console, printable
-from clrecon.cli.cropping import add_cropping
-from clrecon.cli.masking import add_masking
 from clrecon.cli.mesh import describe_volume
-from clrecon.cli.points import parse_point
-from clrecon.cli.reading import add_reading
+from clrecon.cli.options import add_cropping, add_masking, add_reading, parse_point
 from clrecon.jobs.cloud.settings import DENOISERS, GHOSTS, POINT_KINDS, STEPS, CloudSettings
 from clrecon.jobs.inputs import CLOUD_INPUTS
 from clrecon.system.text import count_of, format_band
+
+
+def parse_level(text: str) -> float | tuple[float, ...]:
+    """Read ``N`` as an iso value, and ``LO,HI`` or ``LO:HI`` as a band of HU."""
+    try:
+        numbers = tuple(float(part) for part in text.replace(":", ",").split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) not in (1, 2):
+        raise argparse.ArgumentTypeError(f"{text!r} is no iso value N and no band LO,HI of HU")
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+def parse_clusters(text: str) -> dict[str, Any]:
+    """Read ``eps=MM,min=N`` (either may be missing) as parameters of `clrecon.jobs.cloud.settings.Clustering`."""
+    known = {"eps": "eps", "min": "min_samples"}
+    found: dict[str, Any] = {}
+    for part in text.split(","):
+        name, equals, value = (word.strip() for word in part.partition("="))
+        if not equals or name not in known or known[name] in found:
+            raise argparse.ArgumentTypeError(f"{text!r} is not eps=MM,min=N, such as eps=1.2,min=6")
+        try:
+            found[known[name]] = (
+                value if value == "plane+1" and name == "min" else (float if name == "eps" else int)(value)
+            )
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r}: {name} is no number: {value!r}") from None
+    return found
+
+
+def parse_denoisers(text: str) -> tuple[str, ...]:
+    """Read names with commas between them; what is not known is refused with the settings."""
+    return tuple(part.strip().lower() for part in text.split(","))
+
 
 _PARTS = ("device", "read", "mask", "steps", "surface", "write", "other")
 _EXAMPLES = """\

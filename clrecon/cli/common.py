@@ -10,9 +10,7 @@ import traceback
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, NoReturn
 
-from clrecon.cli.console import Console
-from clrecon.cli.standard_output import STREAMED
-from clrecon.cli.wrapping import fit_help
+from clrecon.cli.console import STREAMED, Console, fit_help
 from clrecon.errors import ClreconError, OutputError, UsageError
 from clrecon.system.progress import DEFAULT_SECONDS, check_time_limit
 from clrecon.system.text import guess_word

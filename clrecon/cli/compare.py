@@ -9,10 +9,8 @@ from typing import Any
 
 from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, pick, table
 from clrecon.cli.console import Console, printable
-from clrecon.cli.levels import parse_hu
-from clrecon.cli.masking import add_masking
 from clrecon.cli.mesh import describe_volume
-from clrecon.cli.reading import add_reading
+from clrecon.cli.options import add_masking, add_reading, parse_hu
 from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 from clrecon.proof.compare.methods import COMPARED
 

@@ -1,14 +1,104 @@
-"""The output of a command: results on stdout, everything else on stderr."""
+"""The output of a command: results on stdout, everything else on stderr, in lines that fit the terminal."""
 
 from __future__ import annotations
 
+import argparse
 import os
+import re
+import shutil
 import sys
+import tempfile
+import textwrap
 import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
-from clrecon.cli.wrapping import fit, is_terminal
-from clrecon.errors import OutputError
+from clrecon.errors import OutputError, UsageError
+
+_LABEL = re.compile(r"\s*\S+(?: \S+){0,2}\s{2,}|exit codes: |\s*")
+_COMMAND = re.compile(r"\s*clrecon \S")
+
+FULL = 90
+"""A line of a help text that has no room for the next word within this length was broken for want of room."""
+
+
+def is_terminal(stream: Any) -> bool:
+    """True if `stream` is a terminal that can show moving lines and styles."""
+    return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
+
+
+def fit(text: str, stream: Any) -> str:
+    """Break the lines of a text for a terminal; for files and pipes it stays as it is, a line a fact."""
+    return _fit_lines(text, shutil.get_terminal_size().columns) if is_terminal(stream) else text
+
+
+def fit_help(text: str, stream: Any) -> str:
+    """Break the lines of a help text for a terminal, or for the width that COLUMNS says; its examples can be pasted."""
+    if not (is_terminal(stream) or os.environ.get("COLUMNS")):
+        return text
+    width = shutil.get_terminal_size().columns
+    return "\n".join(_fit_paragraph(lines, max(width, 20)) for lines in _find_paragraphs(text.split("\n")))
+
+
+def _find_paragraphs(lines: list[str]) -> list[list[str]]:
+    """Put lines together that are one text: broken because they were full, with the rest under the beginning."""
+    found: list[list[str]] = []
+    for line in lines:
+        if found and line.strip() and not _COMMAND.match(line) and not _has_label(line):
+            last, indent, hang = found[-1][-1], _indent_of(line), _hang_of(found[-1][0])
+            was_full = len(last) + 1 + len(line.split()[0]) > FULL
+            if indent == hang > _indent_of(found[-1][0]) or was_full and indent in (_indent_of(last), hang):
+                found[-1].append(line)
+                continue
+        found.append([line])
+    return found
+
+
+def _fit_paragraph(lines: list[str], width: int) -> str:
+    if _COMMAND.match(lines[0]) or max(map(len, lines)) <= width:
+        return "\n".join(part for line in lines for part in _fit_line(line, width))
+    text = " ".join([lines[0].rstrip(), *(line.strip() for line in lines[1:])])
+    hang = _hang_of(lines[0]) if _hang_of(lines[0]) <= width // 2 else _indent_of(lines[0])
+    return "\n".join(_wrap(text, width, hang))
+
+
+def _has_label(line: str) -> bool:
+    """True for a row of a list: a word or a few, and its text after a gap."""
+    return _hang_of(line) > _indent_of(line)
+
+
+def _indent_of(line: str) -> int:
+    return len(line) - len(line.lstrip())
+
+
+def _hang_of(line: str) -> int:
+    """Return where the text of a line begins, after its indentation or its label."""
+    label = _LABEL.match(line)
+    return len(label[0]) if label else 0
+
+
+def _fit_lines(text: str, width: int) -> str:
+    return "\n".join(part for line in text.split("\n") for part in _fit_line(line, max(width, 20)))
+
+
+def _fit_line(line: str, width: int) -> list[str]:
+    if len(line) <= width or "\x1b" in line:  # a table with styles has been laid out for the terminal
+        return [line]
+    hang = _hang_of(line)
+    is_command = _COMMAND.match(line) is not None
+    if is_command or hang > width // 2 or not line[:hang].strip():
+        hang = _indent_of(line) + 2
+    parts = _wrap(line, width - 2 * is_command, hang)
+    return [f"{part} \\" for part in parts[:-1]] + parts[-1:] if is_command else parts
+
+
+def _wrap(line: str, width: int, hang: int) -> list[str]:
+    return textwrap.wrap(
+        line, width, subsequent_indent=" " * hang, break_long_words=False, break_on_hyphens=False,
+        replace_whitespace=False, expand_tabs=False,
+    )  # fmt: skip
+
 
 _STAGES = {
     "device": "choosing a device",
@@ -228,3 +318,87 @@ def _columns() -> int:
         return os.get_terminal_size(2).columns
     except OSError:
         return 80
+
+
+DASH = "-"
+
+STREAMED = {
+    "cloud": ".ply",
+    "distance": ".ply",
+    "export": ".nii.gz",
+    "mesh": ".stl",
+    "render": ".png",
+    "vertebrae": ".nii.gz",
+}
+"""Commands whose ``-o`` is one file, with the format of ``-o -``; ``-o -.ply`` names another."""
+
+_NAME = "standard output"
+_FILES = {"output": "-o", "csv": "--csv"}
+_PIECE = 1 << 20
+
+
+def run_with_streams(command: str, run: Callable[[], int], options: argparse.Namespace, console: Console) -> int:
+    """Run a command; what it should write to ``-`` goes to standard output once the command is done.
+
+    A file is made as a whole first, checked as any other, and then copied: nothing of it appears if the command fails.
+    """
+    wanted = {name: str(getattr(options, name, None) or "") for name in _FILES}
+    wanted = {name: value for name, value in wanted.items() if value == DASH or value.startswith(f"{DASH}.")}
+    has_report = getattr(options, "report", None) == DASH
+    takers = [_FILES[name] for name in wanted] + ["--report"] * has_report
+    if not takers:
+        return run()
+    if len(takers) > 1 or (wanted and options.json):
+        both = " and ".join([*takers, *(["--json"] * bool(wanted and options.json))])
+        raise UsageError(f"{both} cannot share standard output: name a file for one of them")
+    if sys.stdout is None:
+        raise OutputError(f"{takers[0]} -: standard output is closed")
+    if has_report:
+        console.stream_result()
+        options.report, options.json = None, True  # measured and made as with --json
+        return run()
+    return _stream_file(command, run, options, console, *next(iter(wanted.items())))
+
+
+def _stream_file(
+    command: str, run: Callable[[], int], options: argparse.Namespace, console: Console, option: str, value: str
+) -> int:
+    """Run a command with one of its files in a folder of its own, and copy it to standard output."""
+    extension = ".csv" if option == "csv" else STREAMED.get(command)
+    if extension is None:
+        raise UsageError(f"{_FILES[option]} {value}: {command} writes several files, which one stream cannot hold")
+    if option != "csv" and sys.stdout.isatty():
+        raise UsageError(f"{_FILES[option]} {value}: standard output is a terminal: lead it into a file or a program")
+    if several := _find_several(command, options):
+        raise UsageError(f"{_FILES[option]} {value}: {several} make several files, and one stream holds one")
+    options.streams_output = option == "output"
+    folder = tempfile.mkdtemp(prefix="clrecon-")
+    try:
+        path = Path(folder) / f"stream{extension if value == DASH else value[1:]}"
+        setattr(options, option, str(path))
+        console.stream_file(str(path), _NAME)
+        code = run()
+        made = sorted(os.listdir(folder))
+        if made != [path.name]:
+            raise UsageError(f"{_FILES[option]} {value}: {len(made)} files were made, and one stream holds one")
+        with open(path, "rb") as stream:
+            while piece := stream.read(_PIECE):
+                console.send(piece)
+        return code
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _find_several(command: str, options: argparse.Namespace) -> str:
+    """Name the options that make several files of ``-o``; empty where it is one."""
+    if command == "render":
+        return "several views" if sum(map(len, options.view)) > 1 else ""
+    if command != "mesh" or options.one_file:
+        return ""
+    if options.split:
+        return "the components of --split"
+    levels = options.below or options.hu.get("iso_value", ())
+    if isinstance(levels, tuple) and len(levels) > 1:
+        return "several iso values"
+    picked = options.labels is not None and not any(str(seed).startswith("label:") for seed in options.grow_from)
+    return "labels (name one with --label)" if picked and len(options.label or ()) != 1 else ""

@@ -7,9 +7,8 @@ from typing import Any
 
 from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes
 from clrecon.cli.console import Console, printable
-from clrecon.cli.levels import parse_levels
 from clrecon.cli.mesh import describe_volume
-from clrecon.cli.reading import add_reading
+from clrecon.cli.options import add_reading, parse_levels
 from clrecon.errors import UsageError
 
 PARTLY_DONE = 8

@@ -8,10 +8,8 @@ from typing import Any
 
 from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes, pick
 from clrecon.cli.console import Console, printable
-from clrecon.cli.cropping import add_cropping
-from clrecon.cli.masking import add_masking
 from clrecon.cli.mesh import describe_volume
-from clrecon.cli.reading import add_reading
+from clrecon.cli.options import add_cropping, add_masking, add_reading
 
 _PARTS = ("read", "mask", "resample", "write")
 _EPILOG = """\

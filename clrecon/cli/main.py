@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import atexit
 import contextlib
 import os
@@ -14,13 +15,47 @@ from types import FrameType
 from typing import NamedTuple
 
 from clrecon.cli.common import EXIT_CODES, Parser, guard, has_hung_device
-from clrecon.cli.console import Console
-from clrecon.cli.standard_output import run_with_streams
-from clrecon.cli.wording import speaker_of
+from clrecon.cli.console import Console, run_with_streams
 from clrecon.errors import UsageError
-from clrecon.system.arguments import spoken_by
+from clrecon.system.arguments import Speaker, in_python, spoken_by
 from clrecon.system.log import own_streams
 from clrecon.system.progress import DEFAULT_SECONDS, time_limit
+
+_DESTINATIONS = {
+    "color_by": "color",
+    "direction": "light",
+    "eps": "clusters",
+    "grow_mm": "grow",
+    "half_way": "hu",
+    "iso_value": "hu",
+    "kind": "points",
+    "min_samples": "clusters",
+    "only": "label",
+    "picture": "output",
+}
+"""Options of parameters by another name; used if the command has no option of the parameter's own name."""
+
+_PARTS = {"eps": "eps=", "min_samples": "min="}
+"""Parameters that are a part of an option's value."""
+
+
+def speaker_of(parser: argparse.ArgumentParser) -> Speaker:
+    """Make a function that names parameters as options of a command; others keep their names in Python."""
+    options = {action.dest: action.option_strings[0] for action in parser._actions if action.option_strings}
+
+    def speak(parameter: str, value: object = None) -> str:
+        option = options.get(parameter) or options.get(_DESTINATIONS.get(parameter, ""))
+        if option is None:
+            return in_python(parameter, value)
+        part = _PARTS.get(parameter, "")
+        if part:
+            return f"{option} {part}{'MM' if value is None and parameter == 'eps' else 'N' if value is None else value}"
+        if value is None or value is True or (parameter == "closed" and value is False):
+            return option
+        words = str(value).strip("()").replace(", ", ",")
+        return f"{option} {'half:' if parameter == 'half_way' and value != 'auto' else ''}{words}"
+
+    return speak
 
 
 class _Command(NamedTuple):

@@ -8,21 +8,20 @@ from typing import Any
 
 from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, describe_space, megabytes, pick
 from clrecon.cli.console import Console, printable
-from clrecon.cli.cropping import add_cropping
-from clrecon.cli.growing import add_methods, describe_cells
-from clrecon.cli.labels import add_label_arguments, describe_labels, label_choice
-from clrecon.cli.levels import LEVELS_HELP, parse_hu, parse_levels
-from clrecon.cli.masking import add_masking
-from clrecon.cli.points import parse_point
-from clrecon.cli.reading import add_reading
-from clrecon.cli.refinement import (
+from clrecon.cli.mesh_options import (
+    add_label_arguments,
+    add_methods,
     add_purpose,
     add_refinement,
     add_strict,
+    describe_cells,
+    describe_labels,
     describe_purposes,
     describe_refinement,
     finish_with_gates,
+    label_choice,
 )
+from clrecon.cli.options import LEVELS_HELP, add_cropping, add_masking, add_reading, parse_hu, parse_levels, parse_point
 from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 from clrecon.system.text import count_of, format_digits, format_ml, format_volume
 

@@ -8,8 +8,7 @@ from typing import Any
 from clrecon.cli.common import add_keep_ids, add_no_clobber, megabytes, pick, table
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
-from clrecon.cli.points import parse_point
-from clrecon.cli.reading import add_reading
+from clrecon.cli.options import add_reading, parse_point
 from clrecon.system.text import count_of
 
 PARTLY = 8

@@ -5,7 +5,7 @@ A parameter is named by Python's word, or by that of the command line when it ru
 >>> name_parameter("keep_largest", "N")
 'keep_largest=N'
 
-On the command line the same call returns the option of the running command: see `clrecon.cli.wording`.
+On the command line the same call returns the option of the running command: see `clrecon.cli.main`.
 
 Where a function fails on an argument of a wrong kind, the error names the parameter.  What is wanted is read from the
 annotations, so that it stands once.  Only kinds are told apart (a number, a text, a `Volume`); what a function checks

@@ -17,9 +17,8 @@ from ct_files import PATIENT, SPACING, write_series
 from dicom_series import Plan, set_values
 from dicom_series import write_series as write_plan
 
-from clrecon.cli.certificate import describe_certificate
+from clrecon.cli.info import describe_certificate, render_listing
 from clrecon.cli.main import main
-from clrecon.cli.series_table import render_listing
 
 ANSI = re.compile(r"\x1b\[")
 

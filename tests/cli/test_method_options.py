@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clrecon.cli.growing import METHOD_NAMES
 from clrecon.cli.main import main
+from clrecon.cli.mesh_options import METHOD_NAMES
 from clrecon.operators.surface.methods import METHODS
 
 

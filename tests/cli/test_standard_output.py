@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from clrecon.cli import standard_output
+from clrecon.cli import console
 from clrecon.cli.main import main
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
@@ -176,4 +176,4 @@ def test_a_reader_that_closes_early_is_no_error(device, ct):
 def test_each_streamed_command_has_the_option():
     from clrecon.cli.main import COMMANDS
 
-    assert set(standard_output.STREAMED) <= set(COMMANDS)
+    assert set(console.STREAMED) <= set(COMMANDS)

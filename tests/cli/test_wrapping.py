@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from clrecon.cli import wrapping
+from clrecon.cli import console
 from clrecon.cli.main import COMMANDS, main
 
 
@@ -21,17 +21,17 @@ def narrow(monkeypatch):
 
 def test_lines_break_between_words_and_go_on_under_their_text(narrow):
     line = "surface  200 HU (as given), closed at the border of the volume, and more words that are too long for it"
-    parts = wrapping.fit(line, Terminal()).split("\n")
+    parts = console.fit(line, Terminal()).split("\n")
     assert max(map(len, parts)) <= 60 and len(parts) == 2
     assert parts[1].startswith(" " * 9) and parts[1][9] != " "
     assert " ".join(part.strip() for part in parts) == line
-    assert wrapping.fit(line, None) == line and wrapping.fit("short", Terminal()) == "short"
+    assert console.fit(line, None) == line and console.fit("short", Terminal()) == "short"
     styled = "\x1b[1m" + "table  " * 20
-    assert wrapping.fit(styled, Terminal()) == styled
+    assert console.fit(styled, Terminal()) == styled
     path = "wrote    /" + "x" * 80
-    assert wrapping.fit(path, Terminal()).replace("\n", " ").split() == path.split()  # a word stays whole
+    assert console.fit(path, Terminal()).replace("\n", " ").split() == path.split()  # a word stays whole
     warning = "clrecon: warning: " + "word " * 20
-    assert all(part.startswith("  word") for part in wrapping.fit(warning, Terminal()).split("\n")[1:])
+    assert all(part.startswith("  word") for part in console.fit(warning, Terminal()).split("\n")[1:])
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))

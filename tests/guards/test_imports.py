@@ -54,8 +54,8 @@ def test_help_of_clouds_names_the_kinds_of_points_without_numpy(tmp_path: Path) 
 
 def test_only_a_listing_that_is_shown_loads_rich(tmp_path: Path) -> None:
     listing: dict[str, object] = {"series": [], "chosen": None, "certificate": None}
-    show = f"from clrecon.cli import info, mesh, series_table; series_table.render_listing({listing}, [])"
-    assert "rich" not in loaded_after("from clrecon.cli import info, mesh, series_table", tmp_path)
+    show = f"from clrecon.cli import info, mesh; info.render_listing({listing}, [])"
+    assert "rich" not in loaded_after("from clrecon.cli import info, mesh", tmp_path)
     assert "rich" in loaded_after(show, tmp_path)
 
 

@@ -13,8 +13,7 @@ from house import PACKAGE, ROOT
 
 import clrecon
 from clrecon.cli.common import Parser, add_common
-from clrecon.cli.main import COMMANDS
-from clrecon.cli.wording import _DESTINATIONS, speaker_of
+from clrecon.cli.main import _DESTINATIONS, COMMANDS, speaker_of
 from clrecon.jobs.cloud.settings import CloudSettings
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.options import InputSettings

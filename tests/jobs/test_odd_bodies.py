@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from odd_bodies import BODIES, OddBodies, OddBody
 
-from clrecon.cli.refinement import describe_purposes
+from clrecon.cli.mesh_options import describe_purposes
 from clrecon.errors import ClreconError, NoSurfaceError, RefusedInputError
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.refinement import LEFT_SHARE
