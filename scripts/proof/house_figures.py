@@ -90,8 +90,8 @@ def _option_places(modules: dict[str, tuple[str, ast.Module]]) -> Counter[str]:
     for name, (_, tree) in modules.items():
         for node in ast.walk(tree):
             if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument":
-                flags = [word.value for word in node.args if isinstance(word, ast.Constant)]
-                places |= {(flag, name) for flag in flags if str(flag).startswith("--")}
+                flags = [str(word.value) for word in node.args if isinstance(word, ast.Constant)]
+                places |= {(flag, name) for flag in flags if flag.startswith("--")}
     return Counter(flag for flag, _ in places)
 
 
