@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import os
 import pickle
 import re
+import subprocess
+import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import is_set
+from house import ROOT
 
 from clrecon.errors import DeviceError
 from clrecon.opencl import Device
@@ -25,14 +32,32 @@ from clrecon.proof.surface import surface_checks
 FEW = {"scan_block_sums": 64, "total_counts": 64}
 """Kernels that are launched over one work-group, whatever the data."""
 
+ASKED_BY_OPERATORS = frozenset({
+    "exclusive_scan", "compact", "radix_sort", "label_components", "bricks", "extract_isosurface", "types of voxels",
+    "uneven slices", "ranges", "below a level", "trilinear topology", "triangles that cut each other", "extract_labels",
+    "survey of labels", "extract_label_masks", "volumes of masks", "distances to a surface",
+    "witnesses of triangles near a surface", "leaps of rays", "entries of tiles", "volume rendering",
+    "gradient opacity", "steep transfer functions", "volume rendering of uneven slices", "labels in volume rendering",
+    "projections", "radiographs", "projections of uneven slices", "surfaces without a mesh",
+    "surfaces of uneven slices", "labels on surfaces", "slices in space", "points as discs",
+    "a volume before and behind triangles", "slices before and behind triangles", "triangles and layers", "slices",
+    "slices of uneven stacks", "bilateral filter", "bilateral filter of uneven stacks", "filter near a level",
+    "grid of points", "nearest points", "clusters of voxels", "overlap of slices", "balls", "holes and growing",
+    "boxes and tubes", "field around points", "normals of points", "normals by the gradient", "gradients at points",
+    "gradients in uneven stacks", "filter of points", "outliers of points", "thinned points", "sparse cells of points",
+    "clusters of free points", "points of voxels",
+})  # fmt: skip
+"""Checks whose kernels, with the same variants, tests of operators compare with their twins on every device.  On the
+second device and later they are for a release: a driver takes minutes to build what they need."""
+
 OF_TYPES = {"VOXEL", "VALUE", "LABEL", "VOXEL_IS_SHORT"}
 OF_DEVICES = {"LANES", "WORDS_PER_ITEM", "HAS_BUILTIN_PREFETCH", "SCAN_GROUP", "CPU_NAME", "ATOMIC_LOADS"}
 
 
-def macros_of(device: Device) -> dict[str, set[str]]:
+def macros_of(programs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
     """What programs were built with, beside types and what the device needs."""
     found: dict[str, set[str]] = {}
-    for file, options in device.programs:
+    for file, options in programs:
         switched = {macro for macro, value in definitions_of(options).items() if value != "0"}
         found.setdefault(file, set()).update(switched - OF_TYPES - OF_DEVICES)
     return found
@@ -64,9 +89,11 @@ def remember(monkeypatch: pytest.MonkeyPatch, module: ModuleType, name: str) -> 
 @pytest.mark.long
 @pytest.mark.every_device
 def test_row_57_every_check_passes_and_launches_what_it_declares(
-    device: Device, monkeypatch: pytest.MonkeyPatch
+    device: Device, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """So each kernel and each of its variants is compared with its twin on every device, whatever other tests do."""
+    """So each kernel and each of its variants is compared with its twin on every device."""
+    left_out = request.node.get_closest_marker("further_device") and not is_set("CLRECON_RELEASE_TESTS")
+    checks = [check for check in CHECKS if not (left_out and check.name in ASKED_BY_OPERATORS)]
     launched: dict[str, int] = {}
 
     def note(doing: str) -> None:
@@ -78,18 +105,57 @@ def test_row_57_every_check_passes_and_launches_what_it_declares(
         remember(monkeypatch, module, name)
     monkeypatch.setattr(device, "trace", note)
     most: dict[str, int] = {}
-    for check in CHECKS:
+    for check in checks:
         launched.clear()
         monkeypatch.setattr(device, "programs", {})
         outcome = run_check(device, check)
         assert outcome["passed"], outcome
         assert set(check.kernels) <= set(launched), check.name
-        built = macros_of(device)
+        built = macros_of(device.programs)
         for file, macros in check.variants.items():
             assert set(macros) <= built.get(file, set()), (check.name, file)
         for kernel in check.kernels:
             most[kernel] = max(most.get(kernel, 0), launched[kernel])
-    assert {kernel for kernel, items in most.items() if items <= LEAST_ITEMS} == set(FEW)
+    assert {kernel for kernel, items in most.items() if items <= LEAST_ITEMS} == set(FEW) & set(most)
+
+
+def test_what_is_left_out_on_further_devices_are_checks() -> None:
+    assert ASKED_BY_OPERATORS <= {check.name for check in CHECKS}
+
+
+LAUNCHED = """
+import json, os, re
+kernels, programs = set(), set()
+def pytest_runtest_call(item):
+    device = item.funcargs.get("device")
+    if hasattr(device, "programs"):
+        device.trace = lambda doing: kernels.update(re.findall(r"kernel (\\w+) ", doing))
+def pytest_runtest_teardown(item):
+    programs.update(getattr(item.funcargs.get("device"), "programs", ()))
+def pytest_sessionfinish():
+    with open(os.environ["LAUNCHED"], "w") as file:
+        json.dump([sorted(kernels), sorted(programs)], file)
+"""
+"""A plugin of pytest that keeps which kernels were launched, and what programs were built with."""
+
+
+@pytest.mark.release
+def test_operators_ask_what_is_left_out_on_further_devices(device: Device, tmp_path: Path) -> None:
+    (tmp_path / "launched.py").write_text(LAUNCHED)
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "launched", "-p", "no:cacheprovider"]
+    command += ["-m", "every_device or oclgrind", "tests/operators", "tests/opencl"]
+    done = subprocess.run(
+        [*command, f"--basetemp={tmp_path / 'tests'}"], cwd=ROOT, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(tmp_path), "LAUNCHED": str(tmp_path / "launched.json"),
+             "CLRECON_TEST_DEVICE": str(device.index), "CLRECON_COVERAGE": ""},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+    kernels, programs = json.loads((tmp_path / "launched.json").read_text())
+    built = macros_of(programs)
+    for check in CHECKS:
+        if check.name in ASKED_BY_OPERATORS:
+            assert set(check.kernels) <= set(kernels), check.name
+            assert all(set(macros) <= built[file] for file, macros in check.variants.items()), check.name
 
 
 def test_row_57_mismatches_are_told() -> None:
