@@ -3,9 +3,10 @@
 
     python3 scripts/test.py [--fast] [PYTEST ARGUMENTS]
 
---fast leaves out the tests marked slow and the Oclgrind check.  Everything else goes to pytest; without such arguments
-the whole suite runs in as many processes as there are cores, four at most.  The exit status is not 0 if a step
-fails or no test ran.  See CONTRIBUTING.md for the variables that choose devices.
+--fast runs all guards, and of the other tests the first parameter on the first device, without those marked slow, long
+or fuzz and without the Oclgrind check.  Everything else goes to pytest; without such arguments the whole suite runs in
+as many processes as there are cores, four at most.  The exit status is not 0 if a step fails or no test ran.  See
+CONTRIBUTING.md for the variables that choose devices.
 """
 
 import os
@@ -84,11 +85,11 @@ def main() -> int:
     options = ["-n", str(cores), "--dist", "worksteal", "--max-worker-restart", "0"]
     spread = options if cores > 1 and not arguments else []
     # pytest comes last: its closing line is the closing line of this program
-    steps["pytest"] = [python, "-m", "pytest", "-q", *spread, *(["-m", "not slow"] if fast else []), *arguments]
-    environment = {**os.environ, "CLRECON_REQUIRE_TESTS": "1"}
+    steps["pytest"] = [python, "-m", "pytest", "-q", *spread, *arguments]
+    environment = {**os.environ, "CLRECON_REQUIRE_TESTS": "1", "CLRECON_FAST_TESTS": "1" if fast else ""}
     # Hundreds of tests start a process that imports clrecon: it is compiled once, whatever the machine's habit.
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
-    failed = run_steps(steps, environment, beside="oclgrind" if cores > 1 else "")
+    failed = run_steps(steps, environment, beside=("mypy" if fast else "oclgrind") if cores > 1 else "")
     if failed and failed != ["pytest"]:
         print(f"failed: {', '.join(failed)}", file=sys.stderr, flush=True)
     return 1 if failed else 0

@@ -16,6 +16,8 @@ CLRECON_REQUIRE_PLATFORMS
     Comma list of texts; each must be found in platform, version or driver of a device of its own.
 CLRECON_RELEASE_TESTS=1
     Tests marked ``release`` too.
+CLRECON_FAST_TESTS=1
+    All guards, and of other tests the first parameter on the first device, but for those marked slow, long or fuzz.
 CLRECON_COVERAGE=1
     Lines and branches of clrecon that the tests run are counted, see `coverage_figure`.
 CLRECON_REQUIRE_TESTS=1
@@ -122,6 +124,18 @@ def is_for_every_device(node: Any) -> bool:
     return any(node.get_closest_marker(name) for name in ("every_device", "oclgrind"))
 
 
+def is_left_out(item: pytest.Item, seen: set[str]) -> bool:
+    """True for what waits for a release and for what a fast session leaves out; `seen` gets the names of its tests."""
+    if item.get_closest_marker("release"):
+        return not is_set("CLRECON_RELEASE_TESTS")
+    if not is_set("CLRECON_FAST_TESTS") or item.path.is_relative_to(ROOT / "tests" / "guards"):
+        return False
+    name = item.nodeid.partition("[")[0]
+    is_new = name not in seen
+    seen.add(name)
+    return not is_new or any(item.get_closest_marker(mark) for mark in ("slow", "long", "fuzz"))
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
     """Collect without a search for garbage: half a million objects stay to the end, and no search looks at them."""
@@ -143,8 +157,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """
     devices = Devices.found[0] if Devices.found else []
     first, chosen, left = first_of(devices), [], []
+    seen: set[str] = set()
     for item in items:
-        if item.get_closest_marker("release") and not is_set("CLRECON_RELEASE_TESTS"):
+        if is_left_out(item, seen):
             left.append(item)
             continue
         device = item.callspec.params.get("device") if hasattr(item, "callspec") else None
