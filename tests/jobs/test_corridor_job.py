@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
+from contextlib import redirect_stdout
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -41,63 +44,97 @@ def load(path: Path) -> dict[str, Any]:
     return dict(json.loads(path.read_text()))
 
 
-@pytest.mark.parametrize(("level", "bar"), [("auto", tolerances.CORRIDOR_HALF_MM), ("226", tolerances.CORRIDOR_226_MM)])
+@pytest.fixture(scope="module")
+def plain(ct: Path, shared_folder: Path) -> Path:
+    """A folder with the report on L1 at 226 HU, and what was said."""
+    options = ("--labels", ct / "levels.nrrd", "--label", "L1", "--hu", "226")
+    return make_once(shared_folder, "corridors-plain", lambda folder: run_in(folder, ct, *options))
+
+
+@pytest.fixture(scope="module")
+def whole(ct: Path, plain: Path, shared_folder: Path) -> Path:
+    """The same at the bone's own level in RAS, with meshes, a picture, and two screws along the plain corridors."""
+
+    def make(folder: Path) -> None:
+        left, right = load(plain / "report.json")["vertebrae"][0]["corridors"]
+        entry, tip = ([*(-x for x in left[name][:2]), left[name][2]] for name in ("entry_mm", "tip_mm"))
+        given = ",".join(map(str, (*entry, *tip, round(2.0 * true_radius_mm(left) + 1.5, 2))))
+        ends = {name: [*(-x for x in right[f"{name}_mm"][:2]), right[f"{name}_mm"][2]] for name in ("entry", "tip")}
+        screws = folder.with_name("screws.json")
+        screws.write_text(json.dumps({"screws": [{"name": "inner", **ends, "diameter": 3.0, "label": "L1"}]}))
+        options = ("--labels", ct / "levels.nrrd", "--label", "L1", "--space", "ras")
+        outputs = ("-o", folder / "l1.ply", "--picture", folder / "l1.png")
+        device = os.environ.get("CLRECON_TEST_DEVICE", "") or "0"
+        run_in(folder, ct, *options, *outputs, "--screw", given, "--screws", screws, "--device", device)
+
+    return make_once(shared_folder, "corridors-whole", make)
+
+
+def true_radius_mm(side: dict[str, Any], to_lps: Any = (1.0, 1.0, 1.0)) -> float:
+    """How far the line of a corridor is from the true surface where it is nearest."""
+    line = np.linspace(*(np.multiply(to_lps, side[name]) for name in ("counted_from_mm", "tip_mm")), 60)
+    return float(-phantom_truth(SETTINGS).signed_distance(line).max())
+
+
+def run_in(folder: Path, *arguments: object) -> None:
+    """Run the command with a report into a new folder, and keep what it says beside it."""
+    folder.mkdir()
+    said = io.StringIO()
+    with redirect_stdout(said):
+        assert run(*arguments, "--report", folder / "report.json") == 0
+    (folder / "said.txt").write_text(said.getvalue())
+
+
+@pytest.mark.parametrize(
+    ("made", "bar"), [("whole", tolerances.CORRIDOR_HALF_MM), ("plain", tolerances.CORRIDOR_226_MM)]
+)
 def test_the_line_keeps_its_distance_in_the_truth(
-    ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], level: str, bar: float
+    device: Any, request: pytest.FixtureRequest, made: str, bar: float
 ) -> None:
-    report_path = tmp_path / "r.json"
-    assert run(ct, "--labels", ct / "levels.nrrd", "--label", "L1", "--hu", level, "--report", report_path) == 0
-    said = capsys.readouterr().out
+    folder: Path = request.getfixturevalue(made)
+    said = (folder / "said.txt").read_text()
     assert "not for planning an operation" in said and "sagittal not determined" in said and "at 226 HU" in said
-    report = load(report_path)
+    report = load(folder / "report.json")
     assert report["notice"].startswith("not for planning an operation")
-    assert "226 HU" in report["level_bias"] and report["grade_scale"] is None
+    assert "226 HU" in report["level_bias"]
+    assert (report["grade_scale"] is None) == (made == "plain")
+    to_lps = np.array([-1.0, -1.0, 1.0]) if made == "whole" else np.ones(3)
     truth = phantom_truth(SETTINGS)
     (vertebra,) = report["vertebrae"]
     for side in vertebra["corridors"]:
-        line = np.linspace(side["counted_from_mm"], side["tip_mm"], 60)
-        true = float(-truth.signed_distance(line).max())
-        assert abs(side["radius_mm"] - true) <= bar
+        entry, counted_from, tip = (to_lps * side[name] for name in ("entry_mm", "counted_from_mm", "tip_mm"))
+        assert abs(side["radius_mm"] - true_radius_mm(side, to_lps)) <= bar
         assert 2.5 < side["radius_mm"] < 5.0
         assert 5.0 < side["medial_angle_deg"] < 20.0
         low, high = side["sagittal_angle_range_deg"]
         assert low <= side["sagittal_angle_deg"] <= high and high - low > 5.0
         assert side["level_bias_mm"]["rays"] > 60
-        on_surface = truth.signed_distance(np.array([side["entry_mm"]]))[0]
+        on_surface = truth.signed_distance(entry[None])[0]
         assert abs(on_surface) < 1.0
-        assert side["entry_mm"][1] > side["counted_from_mm"][1] > side["tip_mm"][1]
+        assert entry[1] > counted_from[1] > tip[1]
     left, right = vertebra["corridors"]
-    assert left["side"] == "left" and left["entry_mm"][0] > right["entry_mm"][0]
+    assert left["side"] == "left" and to_lps[0] * left["entry_mm"][0] > to_lps[0] * right["entry_mm"][0]
 
 
 def test_files_are_written_and_screws_graded(
-    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    device: Any, ct: Path, plain: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    first = tmp_path / "first.json"
-    options = (ct, "--labels", ct / "levels.nrrd", "--label", "L2", "--hu", "400", "--space", "ras")
-    assert run(*options, "--report", first) == 0
-    left, right = load(first)["vertebrae"][0]["corridors"]
-    wide = 2.0 * left["radius_mm"] + 1.5
-    screws = tmp_path / "screws.json"
-    inner = {"name": "inner", "entry": right["entry_mm"], "tip": right["tip_mm"], "diameter": 3.0, "label": "L2"}
-    screws.write_text(json.dumps({"screws": [inner]}))
-    given = ",".join(map(str, (*left["entry_mm"], *left["tip_mm"], round(wide, 2))))
-    outputs = ("-o", tmp_path / "l2.ply", "--picture", tmp_path / "l2.png", "--report", tmp_path / "l2.json")
-    capsys.readouterr()
-    assert run(*options, *outputs, "--screw", given, "--screws", screws, "--device", device.index) == 0
-    said = capsys.readouterr().out
+    said = (whole / "said.txt").read_text()
     assert "grade B" in said and "grade A, no breach" in said and "Gertzbein-Robbins in five grades" in said
-    report = load(tmp_path / "l2.json")
+    report = load(whole / "report.json")
     wide_grade, inner_grade = report["vertebrae"][0]["screws"]
     assert wide_grade["grade"] == "B" and 0.4 < wide_grade["breach_mm"] < 1.1
     assert wide_grade["direction"] in ("medial", "lateral", "cranial", "caudal")
     assert (inner_grade["name"], inner_grade["grade"], inner_grade["side"]) == ("inner", "A", "right")
-    np.testing.assert_allclose(inner_grade["entry_mm"], right["entry_mm"], atol=2e-3)
-    names = ["L2", "L2_left", "L2_right", "L2_screw_1", "L2_screw_2"]
+    right = load(plain / "report.json")["vertebrae"][0]["corridors"][1]
+    np.testing.assert_allclose(np.multiply(inner_grade["entry_mm"], (-1, -1, 1)), right["entry_mm"], atol=2e-3)
+    names = ["L1", "L1_left", "L1_right", "L1_screw_1", "L1_screw_2"]
     assert [each["name"] for each in report["outputs"] if each["kind"] == "mesh"] == names
-    written = sorted(path.name for path in tmp_path.iterdir())
-    assert written == sorted([*(f"l2_{name}.ply" for name in names), "l2.png", "l2.json", "first.json", "screws.json"])
-    assert run(*options, *outputs, "--no-clobber") == 6
+    written = sorted(path.name for path in whole.iterdir())
+    assert written == sorted([*(f"l1_{name}.ply" for name in names), "l1.png", "report.json", "said.txt"])
+    (tmp_path / "l1_L1.ply").write_text("mine")
+    options = ("--labels", ct / "levels.nrrd", "--label", "L1", "-o", tmp_path / "l1.ply")
+    assert run(ct, *options, "--no-clobber") == 6
     assert "exists" in capsys.readouterr().err
 
 
