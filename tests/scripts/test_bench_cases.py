@@ -223,7 +223,7 @@ def test_the_mapper_on_opengl_is_measured(device: Any, tmp_path: Path, monkeypat
 
 
 @pytest.mark.opencl
-@pytest.mark.slow
+@pytest.mark.release
 def test_steps_of_a_view_are_measured(device: Any, tmp_path: Path) -> None:
     kept = run_cases(["view", "view-picks"], "cube32", device, tmp_path)
     steps = kept["view"]["steps"]
@@ -240,7 +240,7 @@ def test_a_peer_that_dies_is_an_error(tmp_path: Path) -> None:
         GpuPeer(np.array([None]), raycast.make_shots(volume)[0].scene(volume))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_surfaces_of_fresh_processes_are_measured(device: Any, tmp_path: Path) -> None:
     kept = run_cases(["isosurface-first-call", "memory"], "cube32", device, tmp_path)
     first = kept["isosurface-first-call"]

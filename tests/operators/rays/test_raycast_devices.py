@@ -162,6 +162,7 @@ def test_raycast_of_few_voxels_is_its_twin(device, mode, function, even):
         assert np.nanmax(np.abs(found.values - expected.values)) <= tolerances.RAY_TWIN_HU
 
 
+@pytest.mark.release  # each is compared with the twin
 @pytest.mark.parametrize("name", ["soft", "steep", "gradient opacity", "uneven", "mip", "mean", "drr"])
 def test_all_devices_give_one_picture(name):
     from skimage.metrics import structural_similarity

@@ -206,7 +206,7 @@ def test_what_is_beside_behind_or_as_small_as_a_pixel(device: Any) -> None:
 
 
 def test_clipped_meshes_are_open(device: Any) -> None:
-    mesh = Mesh(*ball(8.0))
+    mesh = Mesh(*ball(8.0, 30))
     for name in ("parallel", "perspective"):
         camera = CAMERAS[name]
         clip = Clip.plane((0.0, 0.0, 1.0), (0.2, 0.3, -1.0)) & Clip.plane((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))

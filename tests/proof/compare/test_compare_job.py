@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,10 +17,13 @@ from made_once import make_once
 from clrecon.cli.compare import _is_missed
 from clrecon.cli.main import main
 from clrecon.errors import DeviceError, NoSurfaceError, OutputError, UsageError
-from clrecon.proof.compare import child, processes
+from clrecon.jobs.run import to_json
+from clrecon.proof.compare import child, job, processes
 from clrecon.proof.compare.findings import CompareReport, MethodRecord
 from clrecon.proof.compare.job import make_comparison
+from clrecon.proof.compare.judge import Judge
 from clrecon.proof.compare.methods import COMPARED, CompareSettings
+from clrecon.proof.compare.request import Request
 from clrecon.proof.compare.table import COLUMNS
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
@@ -67,6 +71,21 @@ def whole(ball: Path, shared_folder: Path) -> Path:
         make_comparison(ball, folder, settings)
 
     return make_once(shared_folder, "compare-whole", make)
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Methods and measures without processes of their own, each of which takes seconds to import."""
+
+    def run_method(request: Request) -> dict[str, Any]:
+        return json.loads(to_json(child.run_method(request)))
+
+    def measure(told: Mapping[str, Any], methods: Mapping[str, int]) -> Iterator[tuple[str, dict[str, Any]]]:
+        judge = Judge(told)
+        yield from ((name, json.loads(to_json(judge.measure(name)))) for name in methods)
+
+    monkeypatch.setattr(job, "run_in_process", run_method)
+    monkeypatch.setattr(job, "measure_in_processes", measure)
 
 
 def _first_device() -> str | None:
@@ -155,10 +174,13 @@ def without_time(value: Any) -> Any:
 
 
 @pytest.mark.long
-def test_only_times_and_memory_differ_between_runs(device: Any, ball: Path, tmp_path: Path) -> None:
+def test_only_times_and_memory_differ_between_runs(
+    device: Any, ball: Path, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     settings = CompareSettings(methods=("t-mc", "vtk-fe", "cloud"), repeat=1, device=str(device.index))
     for name in ("one", "other"):
         make_comparison(ball, tmp_path / name, settings)
+        request.getfixturevalue("in_this_process")
     one, other = (read_report(tmp_path / name) for name in ("one", "other"))
     assert without_time(one) == without_time(other)
     pictures = sorted(path.name for path in (tmp_path / "one").glob("*.png"))
@@ -290,6 +312,7 @@ def test_a_folder_with_other_things_is_refused(tmp_path: Path, monkeypatch: pyte
     assert (tmp_path / "r" / "t-mc.png").read_text() == "mine"
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_an_earlier_comparison_is_replaced_as_a_whole(device: Any, ball: Path, tmp_path: Path) -> None:
     folder = tmp_path / "r"
     folder.mkdir()
