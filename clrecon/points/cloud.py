@@ -52,16 +52,28 @@ def _take_values(values: NDArray[Any] | VoxelNumbers, numbers: NDArray[np.intp])
 class PointCloud(Message):
     """Points in the patient frame LPS, millimetres, with normals, HU, labels and voxel indices where they are known.
 
-    points: array_like, shape (n, 3). LPS mm, finite; kept as float32, without a copy when they are C-contiguous
-        float32.  Others that reach 4096 mm from the origin, where float32 would round them by more than 2e-4 mm, are
-        kept as float64.
-    normals: array_like, shape (n, 3). Unit vectors that point out of bone, LPS; kept as float32.
-    hu: array_like, shape (n,). Hounsfield units; kept as float32.
-    labels: array_like, shape (n,). Clusters or labels of a label map, whole numbers; -1 is noise.  Kept as int32.
-    ijk: array_like, shape (n, 3). Voxel indices of points that are voxel centres; kept as int32.
-    report: Facts about the origin of this cloud, without patient data.  ``affine_ijk_to_lps_mm``, ``iso_value_hu`` and
+    Parameters
+    ----------
+    points : array_like, shape (n, 3)
+        LPS mm, finite; kept as float32, without a copy when they are C-contiguous float32.  Others that reach 4096 mm
+        from the origin, where float32 would round them by more than 2e-4 mm, are kept as float64.
+    normals : array_like, shape (n, 3), optional
+        Unit vectors that point out of bone, LPS; kept as float32.
+    hu : array_like, shape (n,), optional
+        Hounsfield units; kept as float32.
+    labels : array_like, shape (n,), optional
+        Clusters or labels of a label map, whole numbers; -1 is noise.  Kept as int32.
+    ijk : array_like, shape (n, 3), optional
+        Voxel indices of points that are voxel centres; kept as int32.
+    report : dict, optional
+        Facts about the origin of this cloud, without patient data.  ``affine_ijk_to_lps_mm``, ``iso_value_hu`` and
         ``certificate`` (the report of the volume) are written to the formats that have a place for them, as with a
         `Mesh`.
+
+    Raises
+    ------
+    UsageError
+        A shape or type cannot be used, a coordinate is not finite, or an array has another length than `points`.
     """
 
     def __init__(
@@ -201,7 +213,15 @@ class PointCloud(Message):
     def select(self, mask: ArrayLike) -> PointCloud:
         """Return the cloud of some of the points.
 
-        mask: array_like, shape (n,) bool, or (m,) of integers. Points to keep, or their numbers in the order wanted.
+        Parameters
+        ----------
+        mask : array_like, shape (n,) bool, or (m,) of integers
+            Points to keep, or their numbers in the order wanted.
+
+        Raises
+        ------
+        UsageError
+            The mask does not fit the cloud.
         """
         chosen = np.asarray(mask)
         if chosen.dtype == bool:
@@ -225,11 +245,15 @@ class PointCloud(Message):
     def in_space(self, space: str) -> tuple[NDArray[np.floating], NDArray[np.float32] | None]:
         """Return points and normals in another patient frame; the cloud itself is always LPS.
 
-        space: {"lps", "ras"}. RAS negates x and y.
+        Parameters
+        ----------
+        space : {"lps", "ras"}
+            RAS negates x and y.
 
-        Returns:
-        points: ndarray, shape (n, 3), mm, of the type of `points`
-        normals: ndarray, shape (n, 3), float32, or None
+        Returns
+        -------
+        points : ndarray, shape (n, 3), mm, of the type of `points`
+        normals : ndarray, shape (n, 3), float32, or None
         """
         signs = np.diag(frame_from_lps(space)).astype(np.float32)
         if space.lower() == "lps":
@@ -257,12 +281,30 @@ class PointCloud(Message):
         The file is either complete or absent, and an older file of that name is replaced in one step.  It holds no
         patient data, date or path.  docs/clouds.md says what each format keeps.
 
-        path: ``.ply``, ``.vtp``, ``.npz``, ``.xyz`` or ``.las`` (with the extra ``las``), upper or lower case.
-        space: {"lps", "ras"}. Patient frame of the coordinates in mm; the file names it.
-        no_clobber: A file of that name stays and is an `OutputError`.
-        keep_ids: The comments hold the hash of the frame of reference, by which files of one scan are told.
+        Parameters
+        ----------
+        path : str or path
+            ``.ply``, ``.vtp``, ``.npz``, ``.xyz`` or ``.las`` (with the extra ``las``), upper or lower case.
+        space : {"lps", "ras"}
+            Patient frame of the coordinates in mm; the file names it.
+        no_clobber : bool
+            True: a file of that name stays and is an `OutputError`.
+        keep_ids : bool
+            True: the comments hold the hash of the frame of reference, by which files of one scan are told.
 
-        Returns: Size of the file in bytes.
+        Returns
+        -------
+        int
+            Size of the file in bytes.
+
+        Raises
+        ------
+        UsageError
+            Unknown extension or space, or laspy is needed and not installed.
+        NoSurfaceError
+            The cloud has no point.
+        OutputError
+            The file cannot be written; an older one of that name is intact.
         """
         with keep_existing(no_clobber):
             return write_cloud(self, path, space, keep_ids=keep_ids)
@@ -282,6 +324,11 @@ class PointCloud(Message):
 
         The attributes are ``positions``, ``normals``, ``hu`` (n, 1) and ``label`` (n, 1), those that are known;
         ``to_legacy()`` of the result gives the class that has positions and normals alone.
+
+        Raises
+        ------
+        UsageError
+            open3d is not installed, or cannot be loaded.
         """
         try:
             import open3d
@@ -351,12 +398,18 @@ def count_numbers(numbers: NDArray[np.uint8], reasons: Sequence[str]) -> dict[st
 class PointStep:
     """The result of a function that takes a cloud and gives another one.
 
-    cloud: The new cloud: the points that are kept, in the order of the input.
-    removed: ndarray, shape (n,), uint8. For each point of the input 0 if it is kept, or the number of the reason why it
-        was removed, from 1.
-    reasons: The reasons: number r is ``reasons[r - 1]``, for example "noise" or "sheet".
-    facts: Further entries of the step's report: parameters as they were used, figures measured, doubtful points.
-    warnings: A line each.
+    Attributes
+    ----------
+    cloud : PointCloud
+        The new cloud: the points that are kept, in the order of the input.
+    removed : ndarray, shape (n,), uint8
+        For each point of the input 0 if it is kept, or the number of the reason why it was removed, from 1.
+    reasons : tuple of str
+        The reasons: number r is ``reasons[r - 1]``, for example "noise" or "sheet".
+    facts : mapping
+        Further entries of the step's report: parameters as they were used, figures measured, doubtful points.
+    warnings : tuple of str
+        A line each.
     """
 
     cloud: PointCloud

@@ -116,11 +116,24 @@ def judge_slices(
 def drop_ghost_slices(cloud: PointCloud, found: GhostSlices, *, volume: Volume | None = None) -> PointStep:
     """Remove the points of ghost slices.
 
-    cloud: Voxel centres, or with ``volume`` points of a surface, of which those nearer than one slice to a ghost go.
-    found: Of the volume that the cloud comes from, see `find_ghost_slices`.
-    volume: That volume, for clouds without ``ijk``.
+    Parameters
+    ----------
+    cloud : PointCloud
+        Voxel centres, or with ``volume`` points of a surface, of which those nearer than one slice to a ghost go.
+    found : GhostSlices
+        Of the volume that the cloud comes from, see `find_ghost_slices`.
+    volume : Volume, optional
+        That volume, for clouds without ``ijk``.
 
-    Returns: Reason "ghost slice".
+    Returns
+    -------
+    PointStep
+        Reason "ghost slice".
+
+    Raises
+    ------
+    UsageError
+        The cloud has no voxel indices and no volume is given, or its slices are not those that were tested.
     """
     nk = len(found.points)
     k = cloud.voxel_slices()
@@ -145,7 +158,16 @@ def fill_ghost_slices(volume: Volume, found: GhostSlices) -> Volume:
     It is for what looks at whole bodies, such as `remove_table`: a screen capture would tie body and table into one.
     No value of a filled slice was measured there: remove its points with `drop_ghost_slices` all the same.
 
-    found: Of this volume.
+    Parameters
+    ----------
+    volume : Volume
+    found : GhostSlices
+        Of this volume.
+
+    Raises
+    ------
+    UsageError
+        The volume has another number of slices than were tested.
     """
     if volume.shape_ijk[2] != len(found.points):
         raise UsageError(f"{len(found.points)} slices were tested, the volume has {volume.shape_ijk[2]}")

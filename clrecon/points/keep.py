@@ -188,17 +188,32 @@ def keep_clusters(
     Sheets go first, then small clusters; the largest are counted among what is left.  A seed keeps its cluster alone,
     several seeds theirs, and may not be used with ``largest``.
 
-    cloud: With labels, see `cluster_points`.
-    rules: ``largest``: the cluster of most points, ties by number; ``largest:N``: the N largest.  ``min:POINTS``:
-        clusters of at least so many points.  ``seed:X,Y,Z``: the cluster of the core point nearest to a place in LPS
-        mm. ``no-sheets``: no cluster of 500 points or more whose second principal standard deviation is over 15 times
-        its first: table tops, image planes.
-    cores: array_like, shape (n,), bool. Core points, see ``Clustering.cores``; without them a seed takes the nearest
-        point of any cluster.
-    figures: The figures of the clusters of this cloud, see ``Clustering.figures``; default: they are measured.
+    Parameters
+    ----------
+    cloud : PointCloud
+        With labels, see `cluster_points`.
+    rules : str or sequence of str
+        ``largest``: the cluster of most points, ties by number; ``largest:N``: the N largest.  ``min:POINTS``: clusters
+        of at least so many points.  ``seed:X,Y,Z``: the cluster of the core point nearest to a place in LPS mm.
+        ``no-sheets``: no cluster of 500 points or more whose second principal standard deviation is over 15 times its
+        first: table tops, image planes.
+    cores : array_like, shape (n,), bool, optional
+        Core points, see ``Clustering.cores``; without them a seed takes the nearest point of any cluster.
+    figures : ClusterFigures, optional
+        The figures of the clusters of this cloud, see ``Clustering.figures``; default: they are measured.
 
-    Returns: Reasons "noise", "sheet", "small cluster", "other cluster".  ``facts`` has the figures of the largest
-        clusters, those of all sheets, and how far the seeds are from their points.
+    Returns
+    -------
+    PointStep
+        Reasons "noise", "sheet", "small cluster", "other cluster".  ``facts`` has the figures of the largest clusters,
+        those of all sheets, and how far the seeds are from their points.
+
+    Raises
+    ------
+    UsageError
+        The cloud has no labels, a rule has another form, or ``cores`` do not fit.
+    NoSurfaceError
+        No cluster is left.
     """
     wanted = parse_keep_rules(rules)
     figures = measure_clusters(cloud) if figures is None or cloud.labels is None else figures

@@ -23,7 +23,7 @@ from clrecon.proof.compare.findings import CompareReport, MethodRecord
 from clrecon.proof.compare.job import make_comparison
 from clrecon.proof.compare.judge import Judge
 from clrecon.proof.compare.methods import COMPARED, CompareSettings
-from clrecon.proof.compare.request import Request
+from clrecon.proof.compare.processes import Request
 from clrecon.proof.compare.table import COLUMNS
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
