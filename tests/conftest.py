@@ -36,6 +36,11 @@ from typing import Any
 
 import pytest
 
+# Before numpy is imported: on a busy machine, as with several processes of pytest, threads of BLAS wait for each other
+# without leaving their cores, for up to 30 times as long as they work.
+for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")
+
 ROOT = Path(__file__).resolve().parent.parent
 
 

@@ -66,8 +66,9 @@ THIN_MM = 0.8
 LAST = 8
 """Lines of the last step, against all points of the surface."""
 
-AT_ONCE = 250_000
-"""Pairs of a line and a point of the surface whose distances are in memory together."""
+AT_ONCE = 50_000
+"""Pairs of a line and a point of the surface whose distances are in memory together: they fit a core's cache, and the
+product is too small for threads of BLAS, whose waiting for each other can take 30 times as long as the work."""
 
 
 @dataclass(frozen=True)
