@@ -103,6 +103,7 @@ from clrecon.spine.split import VertebraSplit as VertebraSplit
 from clrecon.spine.split import split_vertebrae as split_vertebrae
 from clrecon.system.progress import time_limit as time_limit
 from clrecon.viewer.notebook import to_html as to_html
+from clrecon.viewer.plotter import show as show
 
 __all__: list[str]
 __version__: str

@@ -7,7 +7,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes, pick, table
-from clrecon.cli.console import Console, describe_stage, printable
+from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import add_levels, add_selection, add_solid, describe_volume
 from clrecon.cli.mesh_options import add_label_arguments, label_choice
 from clrecon.cli.options import add_cropping, add_masking, add_reading
@@ -16,15 +16,11 @@ from clrecon.system.text import format_volume
 
 if TYPE_CHECKING:
     from clrecon.jobs.view.inputs import ViewSettings
-    from clrecon.system.display import DisplayProbe
 
 _EPILOG = """\
-Without --web and --html a window opens: turn with the mouse, move the slider, h shows all keys; q closes it. It needs a
-display with OpenGL. What is saved gets a name that no file has.
-
---web shows everything in a browser of this computer, drawn on the OpenCL device: a slider for the iso value, presets,
-slices, parts, measures, clips, and files of what is shown. It needs the package aiohttp, and no screen and no OpenGL:
-over a network use an ssh tunnel. Ctrl-C ends it.
+Without --html and --window everything is shown in a browser of this computer, drawn on the OpenCL device: a slider for
+the iso value, presets, slices, parts, measures, clips, and files of what is shown; h shows all keys. It needs no
+OpenGL; over a network use an ssh tunnel. Ctrl-C, or q in the page, ends it.
 
 The page of --html is one file: any browser from 2023 on shows it, without a server and offline. It asks for nothing
 from outside and holds no patient data: files are numbered, not named, unless --name is given. It turns, clips and
@@ -33,7 +29,8 @@ measures; parts (components, labels, files) are switched one by one. See docs/vi
 examples:
   clrecon view CT_FOLDER
   clrecon view CT_FOLDER bone.stl cloud.ply --labels spine.nii.gz --save-as shown.3mf
-  clrecon view CT_FOLDER --web
+  clrecon view CT_FOLDER --no-open --port 8000
+  clrecon view CT_FOLDER --window
   clrecon view CT_FOLDER --html page.html
   clrecon view CT_FOLDER --html spine.html --labels spine.nii.gz
   clrecon view bone.stl implant.ply --html both.html --name bone --name implant"""
@@ -50,18 +47,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="mesh file (.stl, .ply), or a scan: DICOM folder or file, NIfTI, NRRD or MetaImage file",
     )
     shown = parser.add_argument_group("what is shown")
+    shown.add_argument("--html", metavar="FILE", help="write a page that shows the inputs: .html")
+    shown.add_argument("--window", action="store_true", help="open a plain window of PyVista in place of the browser")
+    shown.add_argument(
+        "--no-open", dest="opens", action="store_false", help="only print the address, do not open the browser"
+    )
+    shown.add_argument("--port", type=int, metavar="N", help="of the view, on 127.0.0.1 (default: a free one)")
     shown.add_argument(
         "--save-as",
         action="append",
         default=[],
         metavar="FILE",
-        help="what the key s writes: a mesh, cloud, volume or picture by its extension; numbered where it exists;"
-        " repeat it for several (default: clrecon-view.stl, with --web a download)",
+        help="what the key s writes into the current folder: a mesh, cloud, volume or picture by its extension;"
+        " numbered where it exists; repeat it for several (default: a download)",
     )
-    shown.add_argument("--html", metavar="FILE", help="write a page that shows the inputs: .html")
-    shown.add_argument("--web", action="store_true", help="show them in a browser of this computer, until Ctrl-C")
-    shown.add_argument("--port", type=int, metavar="N", help="of --web, on 127.0.0.1 (default: a free one)")
-    shown.add_argument("--open", action="store_true", help="with --web: open the browser too, not only say the address")
+    for name in ("--web", "--open"):  # what they asked for is the default now
+        shown.add_argument(name, action="store_true", help=argparse.SUPPRESS)
     shown.add_argument(
         "--name",
         dest="names",
@@ -97,15 +98,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
     _check_faces(options)
-    if options.web:
-        return _serve(options, _settings(options), console)
+    if options.window:
+        return _show(options, console)
     if options.html is None:
-        from clrecon.system.display import DisplayProbe
-        from clrecon.system.progress import held_interrupts
-
-        # Both before numpy is loaded: the probe takes half a second, and numpy's threads hold Ctrl-C back too.
-        with held_interrupts(), DisplayProbe() as probe:
-            return _show(options, _settings(options), probe, console)
+        return _serve(options, _settings(options), console)
     from clrecon.jobs.view.job import write_view
 
     settings = _settings(options)
@@ -133,51 +129,44 @@ def _settings(options: argparse.Namespace) -> ViewSettings:
 
 def _check_faces(options: argparse.Namespace) -> None:
     """Refuse options that say two things, or nothing."""
-    if options.web and options.html is not None:
-        raise UsageError("--web shows a view and --html writes a page: ask for one of them")
-    for name in ("port", "open"):
-        if getattr(options, name) not in (None, False) and not options.web:
-            raise UsageError(f"--{name} belongs to --web: ask for that too")
-    if options.web and options.quiet and not (options.open or options.json):
-        raise UsageError("-q hides the address that is to be opened: leave it out, or ask for --open too")
-    if options.web and options.no_clobber:
-        raise UsageError("--web writes no file by itself: leave --no-clobber out")
-    if options.save_as and options.html is not None:
-        raise UsageError("--save-as says what is written while you look: leave out --html, or it")
-    if options.html is None and not options.web and options.no_clobber:
-        raise UsageError("a window replaces no file: leave --no-clobber out")
+    if options.window and options.html is not None:
+        raise UsageError("--window opens a window and --html writes a page: ask for one of them")
+    if options.window or options.html is not None:
+        for name, is_given in (
+            ("--port", options.port is not None), ("--no-open", not options.opens), ("--save-as", options.save_as)
+        ):  # fmt: skip
+            if is_given:
+                raise UsageError(f"{name} belongs to the view in the browser: leave out --window and --html, or it")
+    elif options.quiet and not (options.opens or options.json):
+        raise UsageError("-q hides the address that is to be opened: leave it out, or --no-open")
+    if options.html is None and options.no_clobber:
+        raise UsageError("a view replaces no file: leave --no-clobber out")
 
 
-def _show(options: argparse.Namespace, settings: ViewSettings, probe: DisplayProbe, console: Console) -> int:
+def _show(options: argparse.Namespace, console: Console) -> int:
     """Show a window until it is closed."""
-    from clrecon.system.display import NoDisplayError
-    from clrecon.viewer.window.open_window import open_window
+    from clrecon.system.display import DisplayProbe, NoDisplayError
 
-    facts: dict[str, Any] = {"device": None, "warnings": []}
+    warnings: list[str] = []
 
-    def ready(view: Any) -> None:
-        facts.update(device=view.painter.device.label, warnings=list(view.said))
-        for warning in view.said:
+    def ready(said: list[str]) -> None:
+        warnings.extend(said)
+        for warning in said:
             console.warn(warning)
-        console.say(f"device   {printable(facts['device'])}")
+        console.finish()
 
     try:
-        saved = open_window(
-            options.inputs,
-            settings,
-            save_as=options.save_as,
-            progress=console.progress,
-            ready=ready,
-            say=lambda line: console.say(f"wrote    {printable(line)}"),
-            describe=describe_stage,
-            probe=probe,
-        )
+        with DisplayProbe() as probe:  # it takes half a second, in which the settings are made
+            settings = _settings(options)
+            from clrecon.viewer.plotter import show_inputs
+
+            show_inputs(options.inputs, settings, progress=console.progress, ready=ready, probe=probe)
     except NoDisplayError as error:
         raise NoDisplayError(
-            f"{error}; without one: --web shows this in a browser, --html page.html writes a page, and clrecon render"
+            f"{error}; without --window this is shown in a browser, --html page.html writes a page, and clrecon render"
             " draws pictures"
         ) from error
-    console.result({**facts, "saved": saved})
+    console.result({"warnings": warnings})
     return 0
 
 
@@ -192,16 +181,14 @@ def _serve(options: argparse.Namespace, settings: ViewSettings, console: Console
             console.warn(warning)
         console.say(f"device   {printable(device)}")
         console.say(f"view     {server.address}", whole=True)
-        console.say(
-            "         open it in a browser of this computer; whoever has this address can see the scan; Ctrl-C ends"
-        )
+        console.say("         for browsers of this computer; whoever has this address can see the scan; Ctrl-C ends")
         console.finish()
 
     serve_view(
         options.inputs,
         settings,
         port=options.port,
-        opens=options.open,
+        opens=options.opens,
         save_as=options.save_as,
         wrote=lambda line: console.say(f"wrote    {printable(line)}"),
         progress=console.progress,

@@ -296,6 +296,27 @@ class Volume(BaseVolume):
         """
         return cls(*take_nibabel(image))
 
+    @explains_arguments
+    def show(self, iso_value: float | None = None, *, device: Any = None) -> None:
+        """Show the surface at an iso value, which a slider sets, in a window of pyvista; see `clrecon.show`.
+
+        Parameters
+        ----------
+        iso_value : float, optional
+            HU at the start; 200 by default.
+        device : Device, str or int, optional
+            See `clrecon.device`; None is the best of the machine.
+
+        Raises
+        ------
+        UsageError
+            There is no display, or OpenGL does not work on it.
+        DeviceError
+            The device does not exist.
+        """
+        given = {"iso_value": iso_value, "device": device}
+        public_function("show")(self, **{name: value for name, value in given.items() if value is not None})
+
     def _repr_html_(self) -> str | None:
         """Return the HTML that a notebook shows: three slices and the certificate; None where it shows the text."""
         html: str | None = public_function("to_html")(self)

@@ -216,6 +216,16 @@ class Mesh(BaseMesh):
             normals = None if normals is None else normals * signs.astype(normals.dtype)
         return cls(vertices, triangles, normals)
 
+    def show(self) -> None:
+        """Show the mesh in a window of pyvista, until it is closed; see `clrecon.show`.
+
+        Raises
+        ------
+        UsageError
+            The mesh has no triangle, there is no display, or OpenGL does not work on it.
+        """
+        public_function("show")(self)
+
     def _repr_html_(self) -> str | None:
         """Return the HTML that a notebook shows: the page, or a picture; None where it shows the text."""
         html: str | None = public_function("to_html")(self)

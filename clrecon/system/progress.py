@@ -7,7 +7,6 @@ reaches nobody: the one that waits for it asks."""
 from __future__ import annotations
 
 import math
-import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -45,27 +44,6 @@ class Steps:
     def take_slice(self, piece: slice) -> None:
         """Report the steps of a slice of a range, for `clrecon.system.pieces.in_threads`."""
         self.take(piece.stop - piece.start)
-
-
-@contextmanager
-def held_interrupts() -> Iterator[None]:
-    """Hold SIGINT back in this thread and in those that it starts within the block; on Windows nothing is held."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def take_interrupt() -> bool:
-    """True, once, where SIGINT has come while it was held back."""
-    if not hasattr(signal, "sigpending") or signal.SIGINT not in signal.sigpending():
-        return False
-    signal.sigwait({signal.SIGINT})
-    return True
 
 
 DEFAULT_SECONDS = 600.0

@@ -108,7 +108,7 @@ def measure_view_web(job: Job) -> dict[str, Any]:
 
 @contextmanager
 def _server(path: Path, job: Job) -> Iterator[str]:
-    command = [sys.executable, "-m", "clrecon", "view", str(path), "--web", "--json"]
+    command = [sys.executable, "-m", "clrecon", "view", str(path), "--no-open", "--json"]
     process = subprocess.Popen(
         [*command, "--device", str(job.device.index), "--hu", f"{job.hu:g}"], stdout=subprocess.PIPE, text=True
     )

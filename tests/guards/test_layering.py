@@ -85,9 +85,9 @@ def test_a_right_import_is_accepted(module: str, source: str) -> None:
 
 
 CALLS_PUBLIC = {
-    "clrecon/geometry/volume.py": {"write_volume", "to_html"},
+    "clrecon/geometry/volume.py": {"write_volume", "to_html", "show"},
     "clrecon/labels/label_map.py": {"to_html"},
-    "clrecon/mesh/mesh.py": {"to_html"},
+    "clrecon/mesh/mesh.py": {"to_html", "show"},
     "clrecon/points/cloud.py": {"to_html"},
     "clrecon/reading/common/source_facts.py": {"to_html"},
 }

@@ -19,7 +19,7 @@ def serve_view(
     settings: ViewSettings | None = None,
     *,
     port: int | None = None,
-    opens: bool = False,
+    opens: bool = True,
     save_as: Sequence[str] = (),
     wrote: Callable[[str], object] = ignore_line,
     progress: Progress | None = None,

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import ClreconError
 from clrecon.system.log import get_logger
-from clrecon.system.packages import import_package
 from clrecon.viewer.web.admission import LOOPBACK, make_secret, refuse_request
 from clrecon.viewer.web.connection import Connection, Session, ignore_line
 from clrecon.viewer.web.downloads import Download
@@ -56,7 +55,6 @@ class WebServer:
     def __init__(
         self, port: int | None = None, *, save_as: Sequence[str] = (), wrote: Callable[[str], object] = ignore_line
     ) -> None:
-        import_package("aiohttp", "a view in the browser")
         self._save_as, self._wrote = save_as, wrote
         self._listener = bind_port(port)
         self._secret = make_secret()

@@ -114,8 +114,8 @@ def test_the_mesh_job_writes_pages_too(tmp_path, device):
     [
         (["{a}", "--keep-largest", "1"], "--keep-largest says how a mesh is made"),
         (["{a}", "--save-as", "bone.abc"], "bone.abc: the extension says as what it is written, one of .png"),
-        (["{a}", "--save-as", "a.stl", "--html", "{page}"], "--save-as says what is written while you look"),
-        (["{a}", "--no-clobber"], "a window replaces no file"),
+        (["{a}", "--save-as", "a.stl", "--html", "{page}"], "--save-as belongs to the view in the browser"),
+        (["{a}", "--no-clobber"], "a view replaces no file"),
         (["{a}", "--html", "page.png"], "a page is a file .html, not 'page.png'"),
         (["{a}", "--html", "{page}", "--hu", "300"], "--hu says what is made of a scan, and all inputs are mesh files"),
         (["{a}", "--html", "{page}", "--keep-largest", "1"], "--keep-largest says what is made of a scan"),

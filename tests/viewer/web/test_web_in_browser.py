@@ -265,6 +265,7 @@ def test_left_right_and_the_wheel_step_the_iso_value(page) -> None:
     hu = page.find_element("id", "hu")
     ActionChains(page).scroll_from_origin(ScrollOrigin.from_element(hu), 0, -100).perform()
     wait_for(page, f"return clrecon.facts.iso.hu === {ISO}")
+    assert hu.get_attribute("value") == f"{ISO:g}"
 
 
 def test_keys_use_what_lies_under_the_pointer_in_slices_too(page) -> None:
@@ -358,6 +359,7 @@ def test_escape_stops_the_work(page, served, monkeypatch) -> None:
     wait_for(page, "return clrecon.facts.busy.includes('finding parts')")
     press(page, Keys.ESCAPE)
     wait_for(page, "return !clrecon.facts.busy.length")
+    assert not facts(page)["parts_known"]
 
 
 def test_what_has_to_be_said_is_said(page) -> None:

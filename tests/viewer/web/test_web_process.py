@@ -1,4 +1,4 @@
-"""`clrecon view --web` as a process: without VTK and without a screen, ended by Ctrl-C, and wrong arguments."""
+"""`clrecon view` as a process: without VTK and without a screen, ended by Ctrl-C, and wrong arguments."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def running(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, 
     screens = ("DISPLAY", "WAYLAND_DISPLAY")
     environment = {name: value for name, value in os.environ.items() if name not in screens}
     process = subprocess.Popen(
-        [sys.executable, "-c", WITHOUT, "view", *arguments, "--web", "--json"],
+        [sys.executable, "-c", WITHOUT, "view", *arguments, "--json"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
     )  # fmt: skip
     try:
@@ -88,7 +88,7 @@ def test_a_signal_ends_it_while_pictures_are_drawn(device, scan: Path, number: i
 def test_it_leaves_no_file_behind_and_opens_no_browser_without_a_screen(device, scan: Path, tmp_path: Path) -> None:
     os.environ["TMPDIR"], before = str(tmp_path), os.environ.get("TMPDIR")
     try:
-        with running(str(scan), "--device", str(device.index), "--open") as (process, said):
+        with running(str(scan), "--device", str(device.index)) as (process, said):
             assert any("there is no screen" in warning for warning in said["warnings"])
             assert len(list(tmp_path.glob("clrecon-*"))) == 1
             process.send_signal(signal.SIGINT)
@@ -103,15 +103,16 @@ def test_it_leaves_no_file_behind_and_opens_no_browser_without_a_screen(device, 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--web", "--port", "0"], "a port is a whole number from 1 to 65535, not 0"),
-        (["--web", "--port", "x"], "'x' is no whole number"),
-        (["--port", "8000"], "--port belongs to --web"),
-        (["--html", "page.html", "--open"], "--open belongs to --web"),
-        (["--web", "--html", "page.html"], "ask for one of them"),
-        (["--web", "-q"], "-q hides the address"),
-        (["--web", "--no-clobber"], "leave --no-clobber out"),
-        (["--web", "--solid"], "--solid says how a mesh is made"),
-        (["--web", "--hu", "100,200"], "a view begins with one iso value"),
+        (["--port", "0"], "a port is a whole number from 1 to 65535, not 0"),
+        (["--port", "x"], "'x' is no whole number"),
+        (["--html", "page.html", "--port", "8000"], "--port belongs to the view in the browser"),
+        (["--html", "page.html", "--no-open"], "--no-open belongs to the view in the browser"),
+        (["--window", "--save-as", "a.stl"], "--save-as belongs to the view in the browser"),
+        (["--window", "--html", "page.html"], "ask for one of them"),
+        (["--no-open", "-q"], "-q hides the address"),
+        (["--no-clobber"], "leave --no-clobber out"),
+        (["--solid"], "--solid says how a mesh is made"),
+        (["--hu", "100,200"], "a view begins with one iso value"),
     ],
 )
 def test_wrong_arguments_are_said_before_anything_is_read(
@@ -125,12 +126,12 @@ def test_wrong_arguments_are_said_before_anything_is_read(
 def test_a_port_that_is_taken_is_said_before_anything_is_read(capsys: pytest.CaptureFixture[str]) -> None:
     with bind_port() as listener:
         port = listener.getsockname()[1]
-        assert main(["view", "no_such_folder", "--web", "--port", str(port)]) == 3
+        assert main(["view", "no_such_folder", "--port", str(port)]) == 3
     assert (
         f"port {port} of 127.0.0.1 is taken by another program: name another with --port N" in capsys.readouterr().err
     )
 
 
 def test_an_input_that_is_not_there_ends_the_command(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["view", "no_such_folder", "--web"]) in (2, 3)
+    assert main(["view", "no_such_folder"]) in (2, 3)
     assert "no_such_folder" in capsys.readouterr().err

@@ -1,0 +1,247 @@
+"""Scans, meshes, clouds and label maps in a plain window of pyvista, with pyvista's own widgets."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clrecon.errors import NoSurfaceError
+from clrecon.jobs.view.inputs import ViewSettings, check_view_settings
+from clrecon.operators.surface.extract import SurfaceExtractor
+from clrecon.operators.surface.label_masks import extract_label_masks
+from clrecon.rendering.pictures.label_style import distinct_colors
+from clrecon.rendering.pictures.pillow import load_pillow
+from clrecon.rendering.pictures.styles import DEFAULT_ISO_VALUE
+from clrecon.system.display import Display, DisplayProbe, NoDisplayError
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.viewer.model.first_state import find_iso_range
+from clrecon.viewer.model.objects import ShownCloud, ShownLabels, ShownMesh, ShownObject, ShownScan, show_objects
+
+if TYPE_CHECKING:
+    import pyvista
+
+    from clrecon.geometry import Volume
+    from clrecon.labels import LabelMap
+    from clrecon.mesh import Mesh
+    from clrecon.points import PointCloud
+
+SIZE = (1100, 850)
+BONE = (0.90, 0.86, 0.78)
+
+KEYS = "c: clip plane, again: without   m: measure, again: without   1 to 6: sides of the patient   q: quit"
+
+_SIDES = {"1": (0, -1, 0), "2": (0, 1, 0), "3": (1, 0, 0), "4": (-1, 0, 0), "5": (0, 0, 1), "6": (0, 0, -1)}
+"""Where the camera stands, LPS: anterior, posterior, left, right, superior, inferior."""
+
+_LISTEN_MS = 100
+"""Between two moments in which Python sees a Ctrl-C: VTK's loop is not Python's."""
+
+
+def show(*shown: Volume | Mesh | PointCloud | LabelMap, iso_value: float | None = None, device: Any = None) -> None:
+    """Show objects in a window of pyvista, until it is closed.
+
+    A plain ``pyvista.Plotter``: drag turns, Shift and drag pans, the wheel zooms.  A slider sets the iso value of
+    volumes, whose surfaces are extracted on the device; ``c`` adds a plane that clips everything, ``m`` measures a
+    distance by two clicks, ``1`` to ``6`` are the sides of the patient, ``q`` closes the window.  ``clrecon view``
+    shows more, in the browser.
+
+    Parameters
+    ----------
+    shown : Volume, Mesh, PointCloud or LabelMap
+        Together, each in its place.
+    iso_value : float, optional
+        HU at the start; 200 by default.
+    device : Device, str or int, optional
+        For volumes and label maps, see `clrecon.device`; None is the best of the machine.
+
+    Raises
+    ------
+    UsageError
+        There is nothing to show, no display, or OpenGL does not work on it.
+    DeviceError
+        The device does not exist.
+    """
+    with DisplayProbe() as probe:
+        display = _wait_for_display(probe)
+    with open_plotter(show_objects(shown), iso_value=iso_value, device=device) as plotter:
+        _run(plotter, display)
+
+
+def show_inputs(
+    inputs: Sequence[str | Path],
+    settings: ViewSettings | None = None,
+    *,
+    progress: Progress = ignore_progress,
+    ready: Callable[[list[str]], object] = lambda said: None,
+    probe: DisplayProbe,
+) -> None:
+    """Read inputs and show them in a window until it is closed; `probe` was started before.
+
+    inputs: See `clrecon.jobs.view.inputs.open_inputs`.
+    ready: Called with what has to be said of the inputs, before the window opens.
+    """
+    from clrecon.viewer.session.opening import choose_iso, read_objects
+
+    settings = settings or ViewSettings()
+    check_view_settings(settings)
+    display = _wait_for_display(probe)
+    objects = read_objects(inputs, settings, progress)
+    iso_value = choose_iso(objects, settings.scan, progress)
+    scan = settings.scan
+    with open_plotter(objects, iso_value=iso_value, device=scan.device, memory=scan.memory) as plotter:
+        ready(list(dict.fromkeys(text for each in objects for text in each.said)))
+        _run(plotter, display)
+
+
+@contextmanager
+def open_plotter(
+    objects: Sequence[ShownObject],
+    *,
+    iso_value: float | None = None,
+    device: Any = None,
+    memory: int | None = None,
+    off_screen: bool = False,
+) -> Iterator[pyvista.Plotter]:
+    """A plotter with the objects, the slider of the iso value and the keys; it is closed with the block.
+
+    iso_value: HU at the start; None: 200, or the nearest value that the slider has.
+    """
+    load_pillow()
+    import pyvista
+
+    with ExitStack() as opened:
+        plotter = pyvista.Plotter(window_size=SIZE, title="clrecon view", off_screen=off_screen)
+        opened.callback(plotter.close)
+        plotter.set_background((0.055, 0.06, 0.07))
+        extractors, scans = [], [each for each in objects if isinstance(each, ShownScan)]
+        for each in objects:
+            if isinstance(each, ShownMesh):
+                plotter.add_mesh(each.mesh.to_pyvista(), color=BONE, name=each.name, smooth_shading=True)
+            elif isinstance(each, ShownCloud):
+                plotter.add_points(each.cloud.to_pyvista(), color=BONE, name=each.name, point_size=3)
+            elif isinstance(each, ShownLabels):
+                _add_labels(plotter, each, device, memory)
+            elif isinstance(each, ShownScan):
+                extractor = opened.enter_context(SurfaceExtractor(each.volume, device=device, memory=memory))
+                extractors.append((each.name, extractor))
+        if extractors:
+            _add_iso_slider(plotter, extractors, find_iso_range(scans), iso_value)
+        plotter.add_axes(xlabel="L", ylabel="P", zlabel="S", color="white")
+        plotter.add_text(KEYS, position="upper_left", font_size=9, color="white", name="keys")
+        _add_keys(plotter)
+        plotter.enable_parallel_projection()
+        plotter.view_vector(_SIDES["1"], viewup=(0, 0, 1))
+        yield plotter
+
+
+def _add_labels(plotter: pyvista.Plotter, shown: ShownLabels, device: Any, memory: int | None) -> None:
+    """Add the surface of each label in a colour of its own, translucent around the bone of a scan."""
+    found = extract_label_masks(shown.labels, device=device, memory=memory)
+    for (number, mesh), color in zip(found.items(), distinct_colors(len(found)), strict=True):
+        name = f"{shown.name} {shown.labels.name(number)}"
+        opacity = 1.0 if shown.within is None else 0.4
+        plotter.add_mesh(mesh.to_pyvista(), color=color, name=name, smooth_shading=True, opacity=opacity)
+
+
+def _add_iso_slider(
+    plotter: pyvista.Plotter,
+    extractors: Sequence[tuple[str, SurfaceExtractor]],
+    limits: tuple[float, float],
+    iso_value: float | None,
+) -> None:
+    """Add the surfaces of volumes, and a slider that extracts them anew where it is let go."""
+    import pyvista
+
+    surfaces = {name: pyvista.PolyData() for name, _ in extractors}
+
+    def extract(hu: float) -> None:
+        for name, extractor in extractors:
+            try:
+                mesh = extractor.extract(round(hu)).to_pyvista()
+            except NoSurfaceError:
+                mesh = pyvista.PolyData()
+            surfaces[name].copy_from(mesh, deep=False)
+
+    start = min(max(DEFAULT_ISO_VALUE if iso_value is None else iso_value, limits[0]), limits[1])
+    extract(start)
+    for name, surface in surfaces.items():
+        plotter.add_mesh(surface, color=BONE, name=name).prop.interpolation = "Phong"  # by our normals, without a copy
+    plotter.add_slider_widget(
+        extract, limits, value=start, title="iso value, HU", pointa=(0.25, 0.08), pointb=(0.75, 0.08), fmt="%.0f",
+        color="white",
+    )  # fmt: skip
+
+
+def _add_keys(plotter: pyvista.Plotter) -> None:
+    """Let keys look from the sides of the patient, and add or remove pyvista's widgets."""
+    from vtkmodules.vtkCommonDataModel import vtkPlane
+
+    plane, on = vtkPlane(), {"clip": False, "measure": False}
+
+    def cut(normal: Sequence[float], origin: Sequence[float]) -> None:
+        plane.SetNormal(*(-value for value in normal))  # what the arrow points to is taken away
+        plane.SetOrigin(*origin)
+
+    def toggle_clip() -> None:
+        on["clip"] = not on["clip"]
+        if on["clip"]:
+            plotter.add_plane_widget(cut, normal=(0, -1, 0), interaction_event="always", color="white")
+        else:
+            plotter.clear_plane_widgets()
+        for actor in plotter.renderer.actors.values():
+            if hasattr(actor, "prop") and hasattr(actor, "mapper"):  # texts and axes have none
+                (actor.mapper.AddClippingPlane if on["clip"] else actor.mapper.RemoveClippingPlane)(plane)
+        plotter.render()
+
+    def say_distance(first: object, last: object, mm: float) -> None:
+        plotter.add_text(f"{mm:.1f} mm", position="upper_right", color="yellow", name="distance")  # bone hides its own
+
+    def toggle_measure() -> None:
+        on["measure"] = not on["measure"]
+        if on["measure"]:
+            plotter.add_measurement_widget(say_distance, color="yellow")
+        else:
+            plotter.clear_measure_widgets()
+            plotter.remove_actor("distance")
+
+    plotter.add_key_event("c", toggle_clip)
+    plotter.add_key_event("m", toggle_measure)
+    for key, side in _SIDES.items():
+        up = (0, 0, 1) if side[2] == 0 else (0, -1, 0)
+        plotter.add_key_event(key, lambda side=side, up=up: plotter.view_vector(side, viewup=up))
+
+
+def _wait_for_display(probe: DisplayProbe) -> Display:
+    """Refuse where VTK would end the process with a segmentation fault, or show nothing."""
+    found = probe.wait()
+    if found.fault is not None:
+        raise NoDisplayError(f"no window can be opened: {found.fault}")
+    return found
+
+
+def _run(plotter: pyvista.Plotter, display: Display) -> None:
+    """Show a plotter until it is closed; Ctrl-C closes it."""
+    interrupted = False
+    if display.is_software:
+        plotter.disable_anti_aliasing()  # it would take most of the time
+
+    def interrupt(*_: object) -> None:
+        nonlocal interrupted
+        interrupted = True
+        plotter.iren.terminate_app()
+
+    in_main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGINT, interrupt) if in_main else None
+    try:
+        plotter.iren.add_observer("TimerEvent", lambda *_: None)  # `add_timer_event` would draw each time
+        plotter.iren.create_timer(_LISTEN_MS)
+        plotter.show(auto_close=False)
+    finally:
+        if in_main:
+            signal.signal(signal.SIGINT, before)
+    if interrupted:
+        raise KeyboardInterrupt

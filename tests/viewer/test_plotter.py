@@ -1,0 +1,158 @@
+"""A plain window of pyvista on a screen that Xvfb makes, driven by xdotool; and without a screen."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_once import make_once
+from screens import need_screen, open_screen, open_view
+from view_scenes import ISO, make_cloud, make_labels, make_mesh, make_scan
+
+import clrecon
+from clrecon.system.display import NoDisplayError
+from clrecon.viewer.model.objects import show_objects
+from clrecon.viewer.plotter import SIZE, open_plotter
+
+pytestmark = pytest.mark.xdist_group("screen")
+
+PICTURE = (slice(60, 680), slice(150, 950))
+"""Rows and columns above the slider and beside the axes."""
+
+HIDE = 'for f in $(ls {folders} 2>/dev/null); do mount --bind /dev/null $f || exit 99; done; exec "$@"'
+
+
+@pytest.fixture(scope="module")
+def display():
+    with open_screen() as name:
+        yield name
+
+
+@pytest.fixture(scope="module")
+def scan(shared_folder: Path, device) -> Path:
+    return make_once(shared_folder, "view_scan.nii.gz", lambda path: make_scan().save(path))
+
+
+def shows_bone(seen: np.ndarray) -> bool:
+    """True where something has the colour of bone."""
+    picture = seen[PICTURE].astype(int)
+    return bool(((picture[..., 0] > 90) & (picture[..., 0] > picture[..., 2] + 8)).mean() > 0.01)
+
+
+def test_a_session_at_the_window(display, scan, tmp_path):
+    with open_view(display, [scan, "--window", "--hu", f"{ISO:g}"], tmp_path) as window:
+        before = window.wait(shows_bone, "the surface")
+        assert before.shape[:2] == SIZE[::-1]
+        window.key("2")
+        behind = window.wait_change(before, PICTURE, 0.01, "the scene from behind")
+        window.key("c")
+        cut = window.wait_change(behind, PICTURE, 0.01, "a plane that clips")
+        window.key("c")
+        window.wait_change(cut, PICTURE, 0.01, "the whole scene")
+        start, end = ((0.25 + 0.5 * share) * SIZE[0] for share in (0.61, 0.9))  # 300 HU of -800 to 1000, and 820
+        window.drag((start, 0.92 * SIZE[1]), (end, 0.92 * SIZE[1]))
+        window.wait_change(behind, PICTURE, 0.002, "smaller balls at a higher iso value")
+        window.key("q")
+        code, said, complained = window.finish()
+    assert (code, said, "Traceback" in complained) == (0, "", False)
+
+
+def test_a_distance_is_measured_between_two_clicks(display, tmp_path):
+    make_mesh().save(tmp_path / "ball.stl")
+    with open_view(display, ["ball.stl", "--window"], tmp_path) as window:
+        before = window.wait(shows_bone, "the ball")
+        window.key("m")
+        x, y = SIZE[0] / 2, SIZE[1] / 2
+        window.click(x - 60, y)
+        window.click(x + 60, y)
+        window.wait_change(before, (slice(0, 60), slice(700, 1100)), 0.001, "the distance in words")
+        window.key("q")
+        assert window.finish()[0] == 0
+
+
+@pytest.mark.parametrize("how", ["interrupt", "window manager"])
+def test_it_ends_by_ctrl_c_and_by_the_window_manager(display, tmp_path, how):
+    make_mesh().save(tmp_path / "ball.stl")
+    with open_view(display, ["ball.stl", "--window"], tmp_path) as window:
+        window.wait(shows_bone, "the ball")
+        if how == "interrupt":
+            window.process.send_signal(signal.SIGINT)
+        else:
+            window.close()
+        code, _, complained = window.finish()
+    assert code == (130 if how == "interrupt" else 0)
+    assert complained.endswith("clrecon: error: interrupted\n" if how == "interrupt" else "")
+    assert "Traceback" not in complained
+
+
+@pytest.mark.opencl
+def test_everything_lies_in_one_scene_and_the_slider_sets_the_surface(device):
+    need_screen()
+    objects = show_objects([make_scan(), make_mesh(), make_cloud(), make_labels()], ["", "front"])
+    with open_plotter(objects, iso_value=ISO, device=device, off_screen=True) as plotter:
+        actors = plotter.renderer.actors
+        assert {"scan 1", "front", "cloud 3", "labels 4 one", "labels 4 two"} <= set(actors)
+        surface = actors["scan 1"].mapper.dataset
+        mesh = clrecon.extract_isosurface(make_scan(), ISO, device=device)
+        np.testing.assert_array_equal(np.sort(surface.points, axis=0), np.sort(mesh.vertices, axis=0))
+        assert plotter.camera.position[1] < plotter.camera.focal_point[1]  # it looks from anterior
+
+
+def test_methods_and_the_function_show_the_same(monkeypatch):
+    asked: list[tuple[tuple[object, ...], dict[str, object]]] = []
+    monkeypatch.setattr(clrecon, "show", lambda *shown, **given: asked.append((shown, given)), raising=False)
+    volume, mesh = make_scan(), make_mesh()
+    volume.show(iso_value=250)
+    mesh.show()
+    assert asked == [((volume,), {"iso_value": 250}), ((mesh,), {})]
+
+
+def refusal(arguments: list[str | Path], folder: Path, environment: dict[str, str], *before: str) -> tuple[int, str]:
+    done = subprocess.run(
+        [*before, sys.executable, "-m", "clrecon", "view", "--window", *map(str, arguments)],
+        cwd=folder, env=environment, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.stdout == ""
+    return done.returncode, done.stderr
+
+
+def check_refusal(found: tuple[int, str], words: str) -> None:
+    code, complained = found
+    assert code == 3
+    assert words in complained and complained.count("\n") == 1
+    for way_out in ("without --window", "--html", "clrecon render"):
+        assert way_out in complained
+
+
+def test_without_a_display_the_other_ways_are_said(tmp_path, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    check_refusal(refusal([tmp_path], tmp_path, dict(os.environ)), "there is no display here")
+    with pytest.raises(NoDisplayError, match="no window can be opened: there is no display here"):
+        clrecon.show(make_mesh())
+
+
+def test_a_display_that_does_not_answer_is_said(tmp_path, monkeypatch):
+    monkeypatch.setenv("DISPLAY", ":4711")
+    check_refusal(refusal([tmp_path], tmp_path, dict(os.environ)), "the display :4711 does not answer")
+
+
+def test_without_opengl_no_process_dies_of_a_signal(display, tmp_path, monkeypatch):
+    """The libraries of OpenGL are hidden in a mount namespace of the child."""
+    need_screen()
+    if shutil.which("unshare") is None or subprocess.run(["unshare", "-m", "true"], capture_output=True).returncode:
+        pytest.skip("needs unshare -m, which a container may not allow")
+    monkeypatch.setenv("DISPLAY", display)
+    names = "lib{GL,EGL,GLX_mesa,EGL_mesa,OSMesa}.so.*"
+    hide = HIDE.format(folders=f"/usr/lib/{names} /usr/lib/*-linux-gnu/{names} /usr/lib64/{names}")
+    before = ("unshare", "-m", "bash", "-c", hide, "hide")
+    tried = subprocess.run([*before, "true"], capture_output=True)
+    if tried.returncode:
+        pytest.skip(f"libraries cannot be hidden here: {tried.stderr.decode()[-200:]}")
+    check_refusal(refusal([tmp_path], tmp_path, dict(os.environ), *before), "OpenGL does not work")
