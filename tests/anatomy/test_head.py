@@ -74,6 +74,7 @@ def test_row_70_meshes_of_python_say_so(device: Any) -> None:
     assert warnings(300) == warnings((200, 400)) == warnings(50, phantom("pelvis", spacing=(4.0, 4.0, 4.0))) == []
 
 
+@pytest.mark.slow
 def test_row_70_commands_say_so_once(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_phantom(tmp_path / "ct", PhantomSettings(kind="head", **COARSE))
 
@@ -105,6 +106,7 @@ def test_row_70_the_skin_that_a_surface_shows_is_measured() -> None:
         assert measure_skin(Volume(drilled, volume.affine), square, upwards) == pytest.approx(area, abs=1.0)
 
 
+@pytest.mark.slow
 def test_row_70_surfaces_of_labels_say_so(
     device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

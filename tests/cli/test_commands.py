@@ -254,6 +254,7 @@ def test_no_driver_says_how_to_get_one(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_selftest_passes(device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """With the first checks of the table; all of them run in tests/proof."""
     from clrecon.proof import run as table

@@ -26,6 +26,7 @@ def sphere(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_json_stands_alone_on_stdout(device: Any, sphere: Path, tmp_path: Path) -> None:
     """One iteration leaves VTK's filter without its best offset, which it says on standard output."""
     call = [*CLRECON, "mesh", str(sphere), "-o", "a.stl", "--smooth", "1", "--device", str(device.index)]

@@ -18,6 +18,7 @@ def command_line(command: str, device, tmp_path: Path) -> tuple[str, ...]:
     return command, str(tmp_path / "ct"), *own[command], "--device", str(device.index)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 @pytest.mark.parametrize(
     ("command", "kernel", "number"),
@@ -36,6 +37,7 @@ def test_row_56_a_signal_ends_a_command_whose_kernel_hangs(device, tmp_path, com
     assert [path.name for path in tmp_path.iterdir()] == ["ct"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("command", "kernel"), [("mesh", "emit_triangles"), ("render", "composite_rays")])
 def test_row_56_the_time_limit_ends_a_command_whose_kernel_hangs(device, tmp_path, command, kernel):
     process = start_command(kernel, *command_line(command, device, tmp_path), "--timeout", "1")

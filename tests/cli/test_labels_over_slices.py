@@ -48,6 +48,7 @@ def test_a_sheet_shows_its_labels_in_their_colours_and_names_them(
     assert " L2 (21)" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_hidden_label_leaves_no_outline(spine: Path, tmp_path: Path, device: Any) -> None:
     common = ["render", str(spine), "--sheet", "6", "--view", "sagittal", "--device", str(device.index)]
     common += ["--labels", str(spine / "levels.nrrd"), "--label-color", "L3=red"]

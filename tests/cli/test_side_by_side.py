@@ -64,6 +64,7 @@ def made(target: Path) -> tuple[str, Any]:
     return hashlib.sha256(target.read_bytes()).hexdigest(), figures(json.loads(text))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extension", [".stl", ".vtp"])
 def test_rows_60_and_72_every_run_writes_the_same_bytes(device, ct: Path, tmp_path: Path, extension: str) -> None:
     plain, odd = make_targets(tmp_path, extension)

@@ -85,6 +85,7 @@ def run_in(folder: Path, *arguments: object) -> None:
     (folder / "said.txt").write_text(said.getvalue())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("made", "bar"), [("whole", tolerances.CORRIDOR_HALF_MM), ("plain", tolerances.CORRIDOR_226_MM)]
 )
@@ -116,6 +117,7 @@ def test_the_line_keeps_its_distance_in_the_truth(
     assert left["side"] == "left" and to_lps[0] * left["entry_mm"][0] > to_lps[0] * right["entry_mm"][0]
 
 
+@pytest.mark.slow
 def test_files_are_written_and_screws_graded(
     device: Any, ct: Path, plain: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -32,6 +32,7 @@ def commit() -> str:
         return hashlib.sha256("".join(read_kernel_source(file) for file in kernel_files()).encode()).hexdigest()
 
 
+@pytest.mark.slow
 def test_row_57_broken_kernels_are_noticed(device: Device) -> None:
     drawn = random.Random(commit()).sample([m for m in all_mutations() if not m.reason], DRAWN)
     outcomes = {mutation: judge(mutation, result) for mutation, result in run_mutations(drawn, device.index)}

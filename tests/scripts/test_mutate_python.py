@@ -136,6 +136,7 @@ def names(trace: Trace, changed: Change) -> set[str]:
     return {test.partition("::test_")[2] for test in trace.tests_of(changed.file, lines)}
 
 
+@pytest.mark.slow
 def test_the_tests_of_a_line_are_found_through_fixtures_and_caches(trace: Trace) -> None:
     runs = {line: {test.partition("::test_")[2] for test in tests} for line, tests in trace.lines[TIMES.file].items()}
     assert runs[TIMES.line] == {"area", "square_is_positive", "small"}
@@ -184,6 +185,7 @@ def test_tests_that_import_the_changed_file_come_first(tmp_path: Path) -> None:
     assert trace.tests_of("toy/deep.py", [1]) == [near, far, apart, f"{near}_too", f"{far}_too"]
 
 
+@pytest.mark.slow
 def test_a_trace_is_kept_while_nothing_but_tests_changes(
     copy: Copy, trace: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

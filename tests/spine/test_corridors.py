@@ -25,6 +25,7 @@ POSES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", POSES)
 def test_the_cylinder_is_the_corridor(name: str) -> None:
     vertebra, options = POSES[name]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import sys
 from collections.abc import Container, Iterable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -191,17 +192,25 @@ def walk_imports(
 ) -> Iterator[tuple[str, bool, int]]:
     """Yield (imported module, is it deferred, line) of every import; annotations-only imports count as deferred."""
     for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.expr):  # in which no statement stands
+            continue
         if isinstance(child, ast.Import):
             for alias in child.names:
                 yield alias.name, deferred, child.lineno
         elif isinstance(child, ast.ImportFrom):
             yield from _imports_from(child, module, is_package, deferred)
-        elif isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
+        elif isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef)):
             yield from walk_imports(child, module, is_package, True)
         elif isinstance(child, ast.If) and _is_type_checking(child.test):
             yield from walk_imports(child, module, is_package, True)
         else:
             yield from walk_imports(child, module, is_package, deferred)
+
+
+@cache
+def read_imports(source: str, module: str, is_package: bool = False) -> tuple[tuple[str, bool, int], ...]:
+    """The imports of a source, read once for all guards that ask."""
+    return tuple(walk_imports(ast.parse(source), module, is_package))
 
 
 def _imports_from(
@@ -226,7 +235,7 @@ def find_layer_faults(source: str, module: str, is_package: bool = False) -> lis
     if own not in LEFT_OF:
         return [f"{module}: layer {own!r} is not in the table of tests/support/house.py"]
     faults = []
-    for name, deferred, line in walk_imports(ast.parse(source), module, is_package):
+    for name, deferred, line in read_imports(source, module, is_package):
         top = name.split(".")[0]
         if top == "clrecon":
             other = layer_of(name)
@@ -245,7 +254,7 @@ def find_layer_faults(source: str, module: str, is_package: bool = False) -> lis
 def imported_files(source: str, known: Container[str]) -> set[str]:
     """Modules of `known` that `source` imports, wherever in the file and for whatever: deferred, for annotations."""
     found = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in statements_of(source):
         if isinstance(node, ast.ImportFrom) and node.module:
             found |= {
                 f"{node.module}.{alias.name}" if f"{node.module}.{alias.name}" in known else node.module

@@ -27,6 +27,7 @@ def view(device):
         yield make
 
 
+@pytest.mark.slow
 def test_every_mode_makes_a_picture_sharp_and_coarse(view):
     model, painter = view(scenes.make_scan(), scenes.make_mesh(), scenes.make_cloud(), scenes.make_labels())
     for mode in model.modes:
@@ -266,6 +267,7 @@ def test_a_scan_in_slabs_is_shown_too(device):
         assert np.array_equal(pictures[0].image, pictures[1].image)
 
 
+@pytest.mark.slow
 def test_kernels_are_built_for_every_kind_of_voxels(device):
     objects = show_objects([scenes.make_scan(), scenes.make_scan(dtype=np.float32), scenes.make_mesh()])
     told = []
