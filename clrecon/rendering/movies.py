@@ -199,15 +199,10 @@ def stage_animation(
         with stage_frame_folder(checked, path) as folder:
             yield folder
         return
-    if extension == ".mp4":
-        pass
-    elif extension == ".gif":
-        pass
-    else:
-        pass
+    write = {".mp4": write_video, ".gif": write_gif, ".apng": write_apng}[extension]
 
     def write_all(stream: BinaryIO) -> None:
-        write_apng(stream, checked, fps)
+        write(stream, checked, fps)
 
     with stage_file(path, write_all) as file:
         yield file
