@@ -1,1 +1,1 @@
-"""Mesh files: writers, one module for each format, chosen by the extension of the file."""
+"""Files of meshes and clouds: a module for each format, with its writer and its reader."""

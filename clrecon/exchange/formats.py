@@ -1,27 +1,93 @@
-"""Mesh files: one module for each format, chosen by the extension of the file.
+"""Formats of meshes and clouds, chosen by the extension of a file to write, by the first bytes of a cloud to read.
 
 A writer estimates the size of the file (exactly for STL, PLY and GLB, rather too small for the others), writes to a
 binary stream, and reads the file back.  VTP is written by VTK.  The other formats are written here and not by a
 library; each module says why: headers, comments and matrices that name frame and unit, a full disk that must be
 noticed, time and memory.
 
-The same mesh gives the same bytes every time.  No file holds patient data, a date or a path.
+The same mesh or cloud gives the same bytes every time.  No file holds patient data, a date or a path.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.exchange import glb, obj, page, ply, stl, threemf, vtp
-from clrecon.exchange.content import Assembly, Content, Writable
-from clrecon.exchange.file_format import FOUR_GIB, NO_LIMIT, FileFormat, find_extension, stage_content
+from clrecon.errors import NoSurfaceError, OutputError, RefusedInputError, UsageError
+from clrecon.exchange import glb, las, npz, obj, page, ply, stl, threemf, vtp, xyz
+from clrecon.exchange.content import Assembly, Content, PointContent, Writable
+from clrecon.exchange.raw_content import RawCloud
 from clrecon.geometry.vertices import float32_step
-from clrecon.system.files import StagedFile
+from clrecon.system.files import StagedFile, stage_file
+from clrecon.system.paths import open_regular
+from clrecon.system.text import escape_text, guess_word
+
+FOUR_GIB = 2**32 - 1
+NO_LIMIT = 2**62
+
+Contents = TypeVar("Contents", bound=PointContent | Assembly)
+
+
+@dataclass(frozen=True)
+class FileFormat(Generic[Contents]):
+    """A file format of meshes or clouds.
+
+    estimate: Estimates the size of the file in bytes; exact or rather too small.
+    write: Writes the contents to a stream.
+    verify: Reads the file back and raises `OutputError` unless sizes and counts are those of the contents.
+    most_bytes: Largest file that the format, or common readers of it, can handle.
+    """
+
+    estimate: Callable[[Contents], int]
+    write: Callable[[BinaryIO, Contents], None]
+    verify: Callable[[Path, Contents], None]
+    most_bytes: int
+
+
+def find_extension(path: str | os.PathLike[str], formats: Mapping[str, Any], noun: str) -> str:
+    """Return the extension of a file in lower case, such as ``.ply``.
+
+    formats: Its keys are the extensions that are written.
+    noun: What the file holds, "mesh" or "cloud".
+    """
+    try:
+        extension = os.path.splitext(os.fspath(path))[1].lower()
+    except TypeError as error:
+        raise UsageError(f"a {noun} file is named by a string or a path, not {type(path).__name__}") from error
+    if extension not in formats:
+        found = f"the extension {extension!r}{guess_word(extension, formats)}" if extension else "no extension"
+        raise UsageError(f"the name of the {noun} file has {found}: use one of {', '.join(formats)}")
+    return extension
+
+
+def stage_content(
+    content: Contents, path: str | os.PathLike[str], chosen: FileFormat[Contents], counted: str, others: str
+) -> AbstractContextManager[StagedFile]:
+    """Write contents under a temporary name; see `clrecon.system.files.stage_file`.
+
+    counted: What it holds, for example "12 triangles", for a message.
+    others: Formats without a limit, for a message.
+    """
+    expected_bytes = chosen.estimate(content)
+    if expected_bytes > chosen.most_bytes:
+        kind = os.path.splitext(os.fspath(path))[1][1:].upper()
+        raise OutputError(
+            f"{counted} make a {kind} file of about {expected_bytes / 2**30:.1f} GiB, at most 4 GiB can be"
+            f" read: write {others}"
+        )
+    return stage_file(
+        path,
+        lambda stream: chosen.write(stream, content),
+        lambda temporary: chosen.verify(temporary, content),
+        expected_bytes=expected_bytes,
+    )
+
 
 # STL: the format could hold more, but many programs keep offsets in 32 bits.  GLB: its length field has 32 bits.
 FORMATS: dict[str, FileFormat[Content]] = {
@@ -119,3 +185,94 @@ def _describe(mesh: Writable, extension: str, space: str, parts: int, *, keep_id
     if extension == ".html":
         return mesh.describe_parts(space, parts, keep_ids=keep_ids)
     return mesh.describe(space, keep_ids=keep_ids)
+
+
+CLOUD_FORMATS: dict[str, FileFormat[PointContent]] = {
+    ".ply": FileFormat(ply.estimate, ply.write, ply.verify, NO_LIMIT),
+    ".vtp": FileFormat(vtp.estimate, vtp.write, vtp.verify, NO_LIMIT),
+    ".npz": FileFormat(npz.estimate, npz.write, npz.verify, NO_LIMIT),
+    ".xyz": FileFormat(xyz.estimate, xyz.write, xyz.verify, NO_LIMIT),
+    ".las": FileFormat(las.estimate, las.write, las.verify, NO_LIMIT),
+}
+
+_KEPT = {".xyz": ("hu",), ".npz": ("normals", "hu", "labels", "ijk")}
+_KEPT_BY_OTHERS = ("normals", "hu", "labels")
+
+
+class WritableCloud(Protocol):
+    """Protocol of an object that can be written: a `PointCloud`."""
+
+    def __len__(self) -> int: ...
+    def describe(self, space: str, *, keep_ids: bool = False, with_ijk: bool = True) -> PointContent: ...
+
+
+def check_cloud_format(path: str | os.PathLike[str]) -> str:
+    """Return the extension of a cloud file in lower case, such as ``.ply``."""
+    extension = find_extension(path, CLOUD_FORMATS, "cloud")
+    if extension == ".las":
+        las.import_laspy()
+    return extension
+
+
+def describe_cloud_losses(content: PointContent, extension: str) -> list[str]:
+    """Return a line for what the cloud knows of its points and a file with this extension has no place for."""
+    names = {"normals": "normals", "hu": "HU", "labels": "labels"}  # voxel indices are for the steps of this program
+    lost = [
+        word
+        for name, word in names.items()
+        if getattr(content, name) is not None and name not in _KEPT.get(extension, _KEPT_BY_OTHERS)
+    ]
+    if not lost:
+        return []
+    return [f"{extension[1:].upper()} has no place for {' and '.join(lost)}: PLY, VTP, NPZ and LAS have"]
+
+
+def write_cloud(
+    cloud: WritableCloud, path: str | os.PathLike[str], space: str = "lps", *, keep_ids: bool = False
+) -> int:
+    """Write a cloud to a file; what `PointCloud.save` does.
+
+    Returns: Size of the file in bytes.
+    """
+    with stage_cloud(cloud, path, space, keep_ids=keep_ids) as staged:
+        staged.commit()
+    return staged.size
+
+
+def stage_cloud(
+    cloud: WritableCloud, path: str | os.PathLike[str], space: str = "lps", *, keep_ids: bool = False
+) -> AbstractContextManager[StagedFile]:
+    """Write a cloud under a temporary name, to be committed with other files; see `clrecon.system.files.stage_file`."""
+    extension = check_cloud_format(path)
+    has_place = "ijk" in _KEPT.get(extension, _KEPT_BY_OTHERS)
+    content = cloud.describe(space, keep_ids=keep_ids, with_ijk=has_place)
+    if len(cloud) == 0:
+        raise NoSurfaceError(f"the cloud is empty: no {extension[1:].upper()} file is written")
+    return stage_content(content, path, CLOUD_FORMATS[extension], f"{len(cloud):,} points", "PLY or VTP")
+
+
+_START_BYTES = 512
+
+
+def read_raw_cloud(path: str | os.PathLike[str]) -> RawCloud:
+    """Read a cloud file: PLY, VTP, NPZ, LAS, or a table of numbers."""
+    file = Path(path)
+    name = escape_text(file.name)
+    try:
+        with open_regular(file) as stream:
+            start = stream.read(_START_BYTES)
+    except FileNotFoundError as error:
+        raise UsageError(f"there is no cloud {escape_text(str(path), 200)}") from error
+    except OSError as error:
+        raise RefusedInputError(f"{name} cannot be read: {error.strerror or error}") from error
+    if start[:3] == b"ply" and start[3:4] in (b"\n", b"\r", b" "):
+        return ply.read_cloud(file)
+    if start[:4] in (b"PK\3\4", b"PK\5\6"):
+        return npz.read(file)
+    if start[:4] == b"LASF":
+        return las.read(file)
+    if b"<VTKFile" in start:
+        return vtp.read_cloud(file)
+    if b"\0" in start or not start.strip():
+        raise RefusedInputError(f"{name} is no cloud that is read: PLY, VTP, NPZ, LAS or a table of numbers (XYZ)")
+    return xyz.read(file)

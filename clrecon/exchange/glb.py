@@ -9,6 +9,12 @@ node maps them to the frame that glTF prescribes (metres, right-handed, Y up, th
 The head is up and the face is towards the viewer.  The matrix is a rotation times a scale, which keeps the winding.
 ``asset.extras`` has the inverse matrix (column-major, as glTF writes matrices), the frame, the unit and the
 certificate.  Own code, because this matrix and the extras matter most and the format takes only a page.
+
+The reader takes the meshes of a scene, placed by their nodes, of any program.
+
+Ours name the patient frame, and the matrix from the scene to it.  In files of others the scene is as glTF has it
+(metres, Y up, the front facing +Z), of a patient who stands: (L, P, S) = 1000 (X, -Z, Y) mm.  There corners that
+coincide are joined, because vertices are split where normals or colours have an edge.
 """
 
 from __future__ import annotations
@@ -19,9 +25,15 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
+from clrecon.errors import RefusedInputError
 from clrecon.exchange.content import BONE_COLOR, Assembly, Content, parts_of, refuse_file
+from clrecon.exchange.coordinates import find_places
+from clrecon.exchange.raw_content import MOST_LEVELS, Part, PlacedShapes, RawMesh, Shape, say_cut
+from clrecon.system.paths import open_regular
 from clrecon.system.pieces import local_origin
+from clrecon.system.text import escape_text
 
 NAMELESS = "surface"
 """Name of a node and mesh that have no other."""
@@ -178,3 +190,221 @@ def verify(path: Path, content: Content | Assembly) -> None:
         raise refuse_file("bytes of JSON differ", len(text), "none")
     if binary != (_binary_length(content), _BINARY_CHUNK):
         raise refuse_file("in the second chunk", binary, (_binary_length(content), _BINARY_CHUNK))
+
+
+_LONGEST_JSON = 1 << 26
+_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3}
+_TRIANGLES = 4
+_FOR_LOOKS = ("KHR_materials_", "KHR_texture_", "KHR_lights_")
+"""Extensions without which places stay the same."""
+_LPS_FROM_SCENE = np.array([(1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 0.001)]) * 1000.0
+
+
+class _File:
+    """The two chunks of a file."""
+
+    def __init__(self, document: dict[str, Any], binary: bytes):
+        self.document, self.binary = document, binary
+
+    def entry(self, kind: str, number: Any) -> dict[str, Any]:
+        """Return an object of one of the lists."""
+        entries = self.document.get(kind, [])
+        if type(number) is not int or not 0 <= number < len(entries) or not isinstance(entries[number], dict):
+            raise ValueError(f"{kind} has no number {number!r:.40}")
+        found: dict[str, Any] = entries[number]
+        return found
+
+    def values(self, number: Any, width: int, kinds: str) -> NDArray[Any]:
+        """Return the values of an accessor, shape (count, width)."""
+        accessor = self.entry("accessors", number)
+        form = _TYPES.get(accessor.get("componentType", 0), "")
+        if _WIDTHS.get(accessor.get("type", "")) != width or form[1:2] not in tuple(kinds) or "sparse" in accessor:
+            raise ValueError(f"accessor {number} is not of the plain kind that is read")
+        view = self.entry("bufferViews", accessor.get("bufferView"))
+        if view.get("buffer") != 0 or "uri" in self.entry("buffers", 0):
+            raise ValueError("its data are in another file")
+        item = np.dtype(form).itemsize
+        count, stride = _count(accessor, "count"), _count(view, "byteStride") or width * item
+        start, inside = _count(view, "byteOffset"), _count(accessor, "byteOffset")
+        last = inside + stride * (count - 1) + width * item
+        if count and (last > _count(view, "byteLength") or start + last > len(self.binary)):
+            raise ValueError(f"accessor {number} goes on behind the end of its data")
+        shape, strides = (count, width), (stride, item)
+        return np.ndarray(shape, form, self.binary, start + inside, strides) if count else np.zeros(shape, form)
+
+
+def read(path: Path) -> RawMesh:
+    """Read the triangles of a GLB file; those of each node are a part."""
+    name = escape_text(path.name)
+    try:
+        with open_regular(path) as stream:
+            file = _split(stream.read(), name)
+        return _collect(file, name)
+    except (
+        OSError, ValueError, TypeError, AttributeError, KeyError, OverflowError, MemoryError, RecursionError,
+    ) as error:  # fmt: skip
+        raise say_cut(name, error) from error
+
+
+def _split(data: bytes, name: str) -> _File:
+    """Return the document and the binary chunk."""
+    if data[:4] != b"glTF" or len(data) < 20:
+        raise RefusedInputError(f"{name} is no GLB file: it does not begin with the mark of one")
+    version, length, text_length = (int.from_bytes(data[at : at + 4], "little") for at in (4, 8, 12))
+    if version != 2:
+        raise RefusedInputError(f"{name} is glTF {version}: version 2 is read")
+    if length != len(data) or text_length > min(length - 20, _LONGEST_JSON) or data[16:20] != b"JSON":
+        raise ValueError(f"{length:,} bytes are needed with {text_length:,} of JSON, it has {len(data):,}")
+    document = json.loads(data[20 : 20 + text_length])
+    if not isinstance(document, dict):
+        raise ValueError("its JSON is no object")
+    place = 20 + text_length
+    size = int.from_bytes(data[place : place + 4], "little")
+    if len(data) > place and (data[place + 4 : place + 8] != b"BIN\0" or place + 8 + size > len(data)):
+        raise ValueError("its second chunk is no binary data of its length")
+    return _File(document, data[place + 8 : place + 8 + size])
+
+
+def _collect(file: _File, name: str) -> RawMesh:
+    document = file.document
+    needed = [text for text in document.get("extensionsRequired", ()) if not str(text).startswith(_FOR_LOOKS)]
+    if needed:
+        raise RefusedInputError(f"{name} needs the extension {escape_text(str(needed[0]))}, which is not read")
+    extras = document.get("asset", {}).get("extras", {})
+    extras = extras if isinstance(extras, dict) else {}
+    space = extras.get("SPACE")
+    to_patient = _LPS_FROM_SCENE
+    if isinstance(space, str) and f"matrix_to_{space}_mm" in extras:
+        to_patient = _matrix(extras[f"matrix_to_{space}_mm"])
+    else:
+        space = None
+    shapes, left_out = PlacedShapes(), 0
+
+    def visit(number: Any, above: NDArray[np.float64], level: int) -> None:
+        nonlocal left_out
+        if level > MOST_LEVELS:
+            raise ValueError("nodes within themselves")
+        shapes.count_step()
+        node = file.entry("nodes", number)
+        matrix = above @ _place_of(node)
+        if "mesh" in node:
+            left_out += _add_mesh(file, node, matrix, shapes, joins=space is None)
+        for child in node.get("children", ()):
+            visit(child, matrix, level + 1)
+
+    for number in _roots(file):
+        visit(number, to_patient, 0)
+    mesh = shapes.joined()
+    iso_value = extras.get("iso_value_hu")
+    lines = extras.get("certificate", ())
+    return RawMesh(
+        "GLB",
+        mesh.vertices,
+        mesh.triangles,
+        mesh.normals,
+        space,
+        iso_value if isinstance(iso_value, float | int) else None,
+        [line for line in lines if isinstance(line, str)],
+        [f"elements left out: {left_out:,} sets of points or lines"] if left_out else [],
+        "m",
+        shapes.parts,
+    )
+
+
+def _roots(file: _File) -> list[Any]:
+    """Return the nodes of the scene that is shown; without scenes those that are no child."""
+    if file.document.get("scenes"):
+        return list(file.entry("scenes", file.document.get("scene", 0)).get("nodes", ()))
+    nodes = file.document.get("nodes", [])
+    children = {child for node in nodes for child in node.get("children", ())}
+    return [number for number in range(len(nodes)) if number not in children]
+
+
+def _add_mesh(
+    file: _File, node: dict[str, Any], matrix: NDArray[np.float64], shapes: PlacedShapes, *, joins: bool
+) -> int:
+    """Add the triangles of a mesh; return the number of its primitives that are no triangles."""
+    mesh = file.entry("meshes", node["mesh"])
+    name = str(node.get("name") or mesh.get("name") or "")
+    if not joins and name == NAMELESS:
+        name = ""
+    left_out = 0
+    for primitive in mesh.get("primitives", ()):
+        mode = primitive.get("mode", _TRIANGLES)
+        if mode < _TRIANGLES:
+            left_out += 1
+            continue
+        if mode != _TRIANGLES or primitive.get("targets"):
+            raise ValueError("triangle strips, fans and morph targets are not read")
+        attributes = primitive["attributes"]
+        vertices = file.values(attributes["POSITION"], 3, "f")
+        normals = file.values(attributes["NORMAL"], 3, "f") if "NORMAL" in attributes else None
+        if normals is not None and len(normals) != len(vertices):
+            raise ValueError(f"{len(normals):,} normals for {len(vertices):,} vertices")
+        triangles = np.arange(len(vertices))
+        if "indices" in primitive:
+            triangles = file.values(primitive["indices"], 1, "u").ravel().astype(np.int64)
+        if len(triangles) % 3:
+            raise ValueError(f"{len(triangles):,} corners are not those of whole triangles")
+        shape = Shape(vertices, triangles.reshape(-1, 3), normals)
+        shapes.add(
+            _joined(shape) if joins else shape, matrix, Part(name, len(shape.triangles), _color(file, primitive))
+        )
+    return left_out
+
+
+def _joined(shape: Shape) -> Shape:
+    """Join corners that coincide; normals that differ there are left out."""
+    if (shape.triangles >= len(shape.vertices)).any():
+        raise ValueError(f"a triangle refers to vertex {int(shape.triangles.max()):,} of {len(shape.vertices):,}")
+    used = np.unique(shape.triangles)
+    first, place = find_places(shape.vertices[used])
+    number = np.zeros(len(shape.vertices), np.int64)
+    number[used] = place
+    normals = None if shape.normals is None else shape.normals[used]
+    if normals is not None and np.array_equal(normals[first][place], normals):
+        return Shape(shape.vertices[used][first], number[shape.triangles], normals[first])
+    return Shape(shape.vertices[used][first], number[shape.triangles])
+
+
+def _color(file: _File, primitive: dict[str, Any]) -> tuple[float, float, float] | None:
+    """Return the colour of a primitive's material; glTF has it linear."""
+    if "material" not in primitive:
+        return None
+    look = file.entry("materials", primitive["material"]).get("pbrMetallicRoughness", {})
+    factor = look.get("baseColorFactor")
+    if factor is None or factor[:3] == [*BONE_COLOR]:  # which ours have that have no colour
+        return None
+    linear = np.clip(np.array(factor[:3], dtype=np.float64), 0.0, 1.0)
+    curved = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    red, green, blue = (round(float(value), 4) for value in curved)
+    return red, green, blue
+
+
+def _place_of(node: dict[str, Any]) -> NDArray[np.float64]:
+    """Return the matrix of a node: as it is, or of its translation, rotation and scale."""
+    if "matrix" in node:
+        return _matrix(node["matrix"])
+    matrix = np.eye(4)
+    x, y, z, w = (float(value) for value in node.get("rotation", (0, 0, 0, 1)))
+    matrix[:3, :3] = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    matrix[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), dtype=np.float64)
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
+
+
+def _matrix(numbers: Any) -> NDArray[np.float64]:
+    """Return a matrix that is written column by column."""
+    return np.array(numbers, dtype=np.float64).reshape(4, 4).T
+
+
+def _count(entry: dict[str, Any], name: str) -> int:
+    value = entry.get(name, 0)
+    if type(value) is not int or not 0 <= value < 1 << 40:
+        raise ValueError(f"{name} is {value!r:.40}")
+    return value

@@ -2,7 +2,7 @@
   const facts = JSON.parse(find("facts").textContent);
   const scene = find("scene"), over = find("over"), message = find("message");
 
-  // The surface: what clrecon/exchange/page_coding.py wrote.
+  // The surface: what clrecon/exchange/page.py wrote.
 
   async function unpack() {
     const text = find("surface").textContent;

@@ -1,24 +1,91 @@
-"""VTP, the XML PolyData of VTK, written by VTK: raw binary data after the XML, with 64-bit headers.
+"""VTP, the XML PolyData of VTK: written by VTK, raw binary data after the XML, with 64-bit headers.
 
 VTK writes to a string, which is then written to our stream: VTK itself leaves a truncated file on a full disk.  The
 field arrays ``SPACE``, ``UNIT``, ``ISO_VALUE_HU``, ``AFFINE_IJK_TO_LPS_MM`` (16 numbers, row by row) and
 ``CERTIFICATE`` (one text for each fact) tell what the coordinates are; 3D Slicer reads ``SPACE``.
+
+The readers take files of any program; of meshes each polygon is a triangle.
+
+Own code because VTK crashes on harmed files: it follows offsets and counts wherever they lead.  Arrays may be text,
+base64 or raw bytes after the XML, plain or packed by zlib (VTK's "XML file formats").  Several pieces become one cloud.
+
+VTK's layout of points, triangles and point arrays is handled in `make_polydata` alone.
 """
 
 from __future__ import annotations
 
+import binascii
 import re
+import zlib
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.errors import OutputError
+from clrecon.errors import OutputError, RefusedInputError
 from clrecon.exchange.content import BONE_COLOR, Assembly, Content, PointContent, refuse_file
-from clrecon.exchange.vtk import make_polydata
+from clrecon.exchange.raw_content import Part, PlacedShapes, RawCloud, RawMesh, Shape, columns_of, say_cut
+from clrecon.system.paths import open_regular
+from clrecon.system.text import escape_text
+
+
+def make_polydata(
+    vertices: NDArray[np.floating],
+    triangles: NDArray[np.uint32] | None,
+    normals: NDArray[np.float32] | None,
+    hu: NDArray[np.float32] | None = None,
+    labels: NDArray[np.int32] | None = None,
+) -> Any:
+    """Build a ``vtkPolyData`` that shares the memory of the arrays.
+
+    VTK counts in signed integers: indices are seen as int32 without a copy below 2**31 vertices and are copied to
+    int64 above.
+
+    vertices: ndarray, shape (n, 3), float32 or float64, C-contiguous
+    triangles: ndarray, shape (m, 3), uint32, C-contiguous, every index below n, or None. None: a cloud, each point a
+        cell of its own, without which nothing of it is drawn.
+    normals: ndarray, shape (n, 3), float32, C-contiguous, or None. They become the active normals, named ``Normals``.
+    hu, labels: ndarray, shape (n,), float32 and int32. The point arrays ``HU``, which becomes the active scalars, and
+        ``label``.
+    """
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+
+    corners = 1 if triangles is None else 3
+    count = len(vertices) if triangles is None else len(triangles)
+    small = max(len(vertices), corners * count + 1) < 2**31
+    if triangles is None:
+        indices: NDArray[Any] = np.arange(count, dtype=np.int32 if small else np.int64)
+    else:
+        indices = triangles.view(np.int32) if small else triangles.astype(np.int64)
+    offsets = np.arange(0, indices.size + 1, corners, dtype=indices.dtype)
+    cells = vtkCellArray()
+    cells.SetData(numpy_to_vtk(offsets), numpy_to_vtk(indices.reshape(-1)))
+    points = vtkPoints()
+    points.SetData(numpy_to_vtk(vertices))
+    polydata = vtkPolyData()
+    polydata.SetPoints(points)
+    if triangles is None:
+        polydata.SetVerts(cells)
+    else:
+        polydata.SetPolys(cells)
+    data = polydata.GetPointData()
+    for name, values, put in (
+        ("Normals", normals, data.SetNormals),
+        ("HU", hu, data.SetScalars),
+        ("label", labels, data.AddArray),
+    ):
+        if values is not None:
+            array = numpy_to_vtk(values)
+            array.SetName(name)
+            put(array)
+    return polydata
+
 
 _END = b"</VTKFile>"
 
@@ -147,3 +214,337 @@ def verify(path: Path, content: PointContent | Assembly) -> None:
         raise refuse_file("at the end", repr(end[-16:]), _END.decode())
     if path.stat().st_size < least:
         raise refuse_file("bytes", path.stat().st_size, f"more than {least}")
+
+
+_TYPES = {
+    "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4", "Int64": "i8",
+    "UInt64": "u8", "Float32": "f4", "Float64": "f8",
+}  # fmt: skip
+_ZLIB = "vtkZLibDataCompressor"
+_MOST_BLOCKS = 1 << 24
+_MOST_COMPONENTS = 64
+_LONGEST_TEXT = 1 << 20
+
+
+@dataclass
+class Document:
+    """A file's XML, and the data behind it."""
+
+    root: ElementTree.Element
+    appended: bytes
+    base64: bool
+    order: str
+    header: np.dtype[Any]
+    packed: bool
+
+
+def read_cloud(path: Path) -> RawCloud:
+    """Read the points, the point arrays and the field arrays ``SPACE``, ``ISO_VALUE_HU`` and so on."""
+    name = escape_text(path.name)
+    try:
+        with open_regular(path) as stream:
+            document = parse_document(stream.read(), name)
+        return _collect_points(document, name)
+    except (OSError, ValueError, OverflowError, MemoryError, ElementTree.ParseError, zlib.error) as error:
+        raise say_cut(name, error) from error
+
+
+def has_polygons(path: Path) -> bool:
+    """True for a file whose XML counts polygons; its arrays are not looked at."""
+    with open_regular(path) as stream:
+        start = stream.read(_LONGEST_TEXT)
+    return any(int(count) for count in re.findall(rb'NumberOfPolys="(\d{1,15})"', start))
+
+
+def parse_document(data: bytes, name: str) -> Document:
+    """Return the parts of a file of PolyData."""
+    head, mark, tail = data.partition(b"<AppendedData")
+    if b"<!DOCTYPE" in head or b"<!ENTITY" in head:
+        raise ValueError("it declares a document type, which VTP has not")
+    start = tail.find(b"_") + 1
+    root = ElementTree.fromstring(head + b"</VTKFile>" if mark else head)
+    if root.tag != "VTKFile" or root.get("type") != "PolyData":
+        raise RefusedInputError(f"{name} holds '{escape_text(str(root.get('type')))}' of VTK: PolyData are read")
+    order = ">" if root.get("byte_order") == "BigEndian" else "<"
+    compressor = root.get("compressor")
+    if compressor not in (None, _ZLIB):
+        raise RefusedInputError(f"{name} is packed by {escape_text(str(compressor))}: write it with {_ZLIB}, or plain")
+    return Document(
+        root,
+        tail[start:] if mark else b"",
+        b"base64" in tail[:start],
+        order,
+        np.dtype(order + ("u8" if root.get("header_type") == "UInt64" else "u4")),
+        compressor is not None,
+    )
+
+
+def _collect_points(document: Document, name: str) -> RawCloud:
+    points, columns, left_out, normals = [], [], 0, None
+    for piece in document.root.iterfind("PolyData/Piece"):
+        count = read_count(piece, "NumberOfPoints")
+        array = piece.find("Points/DataArray")
+        if count == 0 or array is None:
+            continue
+        points.append(read_numbers(document, array, count, 3))
+        data = piece.find("PointData")
+        own = {}
+        for each in () if data is None else data.iterfind("DataArray"):
+            if each.get("type") in _TYPES:
+                own[each.get("Name", "")] = read_numbers(document, each, count)
+        normals = normals or (None if data is None else data.get("Normals"))
+        columns.append(own)
+        left_out += sum(read_count(piece, f"NumberOf{kind}") for kind in ("Lines", "Strips", "Polys"))
+    if not points:
+        raise RefusedInputError(f"{name} has no points")
+    texts, numbers = read_fields(document)
+    affine, iso_value = numbers.get("AFFINE_IJK_TO_LPS_MM"), numbers.get("ISO_VALUE_HU")
+    return RawCloud(
+        "VTP",
+        np.concatenate(points),
+        _named(columns, normals),
+        space=next(iter(texts.get("SPACE", ())), None),
+        affine=affine.reshape(4, 4) if affine is not None and affine.size == 16 else None,
+        iso_value_hu=float(iso_value[0]) if iso_value is not None and iso_value.size == 1 else None,
+        certificate=texts.get("CERTIFICATE", ()),
+        warnings=[f"elements left out: {left_out:,} lines, strips and polygons"] if left_out else [],
+    )
+
+
+def _named(pieces: Sequence[dict[str, NDArray[Any]]], normals: str | None) -> dict[str, NDArray[Any]]:
+    """Join the arrays that all pieces have; one of several components becomes as many columns."""
+    columns: dict[str, NDArray[Any]] = {}
+    for own in pieces[0]:
+        if not all(own in piece and piece[own].shape[1] == pieces[0][own].shape[1] for piece in pieces):
+            continue
+        values = np.concatenate([piece[own] for piece in pieces])
+        width = values.shape[1]
+        if width == 1:
+            columns[own] = values[:, 0]
+        elif width == 3 and own == (normals or "Normals"):
+            columns |= columns_of(values, ("nx", "ny", "nz"))
+        else:
+            columns |= columns_of(values, [f"{own}:{place}" for place in range(width)])
+    return columns
+
+
+def read_fields(document: Document) -> tuple[dict[str, tuple[str, ...]], dict[str, NDArray[Any]]]:
+    """Return the field arrays: texts, and numbers."""
+    texts: dict[str, tuple[str, ...]] = {}
+    numbers: dict[str, NDArray[Any]] = {}
+    for array in document.root.iterfind("PolyData/FieldData/*"):
+        own = array.get("Name", "")
+        count = read_count(array, "NumberOfTuples")
+        if array.get("type") == "String":
+            data = _bytes(document, array)[:_LONGEST_TEXT]
+            texts[own] = tuple(text.decode("utf-8", "replace") for text in data.split(b"\0")[:count])
+        elif array.get("type") in _TYPES:
+            numbers[own] = read_numbers(document, array, count).ravel()
+    return texts, numbers
+
+
+def read_count(element: ElementTree.Element, attribute: str) -> int:
+    """Return a whole number of an element, 0 where it is not given."""
+    value = element.get(attribute, "0")
+    if not re.fullmatch(r"\d{1,15}", value):
+        raise ValueError(f"{attribute} is '{value}'")
+    return int(value)
+
+
+def read_numbers(document: Document, array: ElementTree.Element, count: int, width: int | None = None) -> NDArray[Any]:
+    """Return the values of a DataArray, shape (count, components)."""
+    components = read_count(array, "NumberOfComponents") or 1
+    kind = _TYPES.get(array.get("type", ""))
+    if kind is None or components > _MOST_COMPONENTS or width not in (None, components):
+        raise ValueError(f"an array of {components} components of type '{array.get('type')}'")
+    if array.get("format") == "ascii":
+        values = np.array((array.text or "").split(), dtype=np.float64).astype(kind)
+    else:
+        data = _bytes(document, array)
+        values = np.frombuffer(data, dtype=document.order + kind).astype(kind)
+    if values.size != count * components:
+        raise ValueError(f"the array '{array.get('Name')}' has {values.size:,} numbers, {count * components:,} needed")
+    return values.reshape(count, components)
+
+
+def _bytes(document: Document, array: ElementTree.Element) -> bytes:
+    """Return the bytes of an array."""
+    form = array.get("format")
+    if form == "ascii":
+        return bytes(int(word) for word in (array.text or "").split())
+    if form == "binary":
+        return _unpack(document, _From64((array.text or "").strip().encode("ascii")))
+    if form == "appended":
+        rest = memoryview(document.appended)[read_count(array, "offset") :]
+        return _unpack(document, _From64(bytes(rest)) if document.base64 else _Raw(rest))
+    raise ValueError(f"an array of format '{form}'")
+
+
+class _Raw:
+    """Bytes as they are."""
+
+    def __init__(self, data: memoryview):
+        self._data, self._place = data, 0
+
+    def take(self, count: int) -> bytes:
+        """Return the next bytes."""
+        if count > len(self._data) - self._place:
+            raise ValueError(f"an array has {count:,} bytes and {len(self._data) - self._place:,} are there")
+        self._place += count
+        return bytes(self._data[self._place - count : self._place])
+
+    def end_part(self) -> None:
+        """End a part: nothing to do."""
+
+
+class _From64:
+    """Bytes in base64, in parts that each are padded to four characters."""
+
+    def __init__(self, text: bytes):
+        self._text, self._start, self._taken = text, 0, 0
+
+    def take(self, count: int) -> bytes:
+        """Return the next bytes of this part."""
+        first, last = self._taken // 3 * 4, -(-(self._taken + count) // 3) * 4
+        if last > len(self._text) - self._start:
+            raise ValueError(f"an array has {count:,} bytes and {len(self._text):,} characters are there")
+        data = binascii.a2b_base64(self._text[self._start + first : self._start + last])
+        skip = self._taken % 3
+        self._taken += count
+        if len(data) < skip + count:
+            raise ValueError("base64 ends early")
+        return data[skip : skip + count]
+
+    def end_part(self) -> None:
+        """Go on behind the padding."""
+        self._start += -(-self._taken // 3) * 4
+        self._taken = 0
+
+
+def _unpack(document: Document, source: _Raw | _From64) -> bytes:
+    """Return an array's bytes: after their number, or packed in blocks after the numbers of their bytes."""
+    size = document.header.itemsize
+    if not document.packed:
+        return source.take(int(np.frombuffer(source.take(size), document.header)[0]))
+    blocks, block_bytes, last_bytes = map(int, np.frombuffer(source.take(3 * size), document.header))
+    if blocks > _MOST_BLOCKS:
+        raise ValueError(f"an array of {blocks:,} blocks")
+    packed = [int(length) for length in np.frombuffer(source.take(blocks * size), document.header)]
+    source.end_part()
+    parts = []
+    for number, length in enumerate(packed):
+        expected = last_bytes if last_bytes and number == blocks - 1 else block_bytes
+        inflater = zlib.decompressobj()
+        parts.append(inflater.decompress(source.take(length), expected + 1))
+        if len(parts[-1]) != expected:
+            raise ValueError(f"a block of {expected:,} bytes has {len(parts[-1]):,}")
+    return b"".join(parts)
+
+
+def read_mesh(path: Path) -> RawMesh:
+    """Read the triangles of a VTP file; those of one number in the cell array ``PART`` are a part."""
+    name = escape_text(path.name)
+    try:
+        with open_regular(path) as stream:
+            document = parse_document(stream.read(), name)
+        return _collect_triangles(document, name)
+    except (OSError, ValueError, OverflowError, MemoryError, ElementTree.ParseError, zlib.error) as error:
+        raise say_cut(name, error) from error
+
+
+def _collect_triangles(document: Document, name: str) -> RawMesh:
+    shapes, left_out = PlacedShapes(), 0
+    warnings: list[str] = []
+    cells: list[dict[str, NDArray[Any]]] = []
+    for piece in document.root.iterfind("PolyData/Piece"):
+        if read_count(piece, "NumberOfStrips"):
+            raise RefusedInputError(f"{name} has triangle strips: only single triangles are read")
+        count = read_count(piece, "NumberOfPolys")
+        lines = {kind: read_count(piece, f"NumberOf{kind}") for kind in ("Verts", "Lines")}
+        left_out += sum(lines.values())
+        if count == 0:
+            continue
+        shape = _read_shape(document, piece, count, name, warnings)
+        shapes.add(shape, np.eye(4), Part("", count))
+        cells.append({} if any(lines.values()) else _cell_arrays(document, piece, count))
+    if left_out:
+        warnings.append(f"elements left out: {left_out:,} points and lines")
+    if not cells:
+        raise RefusedInputError(f"{name} has no triangles: it is no mesh, perhaps a cloud of points")
+    mesh = shapes.joined()
+    texts, numbers = read_fields(document)
+    iso_value = numbers.get("ISO_VALUE_HU")
+    number = _joined(cells, "PART", 1)
+    triangles, parts = mesh.triangles, []
+    if number is not None:
+        # Each part's triangles are to follow one another.
+        order = np.argsort(number[:, 0], kind="stable")
+        triangles = triangles[order]
+        parts = _parts(number[order, 0], _joined(cells, "COLOR", 3), order, texts.get("PART_NAMES", ()))
+    return RawMesh(
+        "VTP",
+        mesh.vertices,
+        triangles,
+        mesh.normals,
+        next(iter(texts.get("SPACE", ())), None),
+        float(iso_value[0]) if iso_value is not None and iso_value.size == 1 else None,
+        texts.get("CERTIFICATE", ()),
+        warnings,
+        parts=parts,
+    )
+
+
+def _read_shape(document: Document, piece: ElementTree.Element, count: int, name: str, warnings: list[str]) -> Shape:
+    points = piece.find("Points/DataArray")
+    arrays = {array.get("Name"): array for array in piece.iterfind("Polys/DataArray")}
+    if points is None or not {"connectivity", "offsets"} <= set(arrays):
+        raise ValueError("a piece without points or polygons")
+    vertices = read_numbers(document, points, read_count(piece, "NumberOfPoints"), 3)
+    ends = read_numbers(document, arrays["offsets"], count, 1).ravel().astype(np.int64)
+    wrong = np.flatnonzero(np.diff(ends, prepend=0) != 3)
+    if len(wrong):
+        first = int(wrong[0])
+        corners = int(ends[first] - (ends[first - 1] if first else 0))
+        raise RefusedInputError(f"polygon {first:,} of {name} has {corners} corners: only triangles are read")
+    triangles = read_numbers(document, arrays["connectivity"], 3 * count, 1).astype(np.int64).reshape(-1, 3)
+    data = piece.find("PointData")
+    active = "Normals" if data is None else data.get("Normals", "Normals")
+    normals = None
+    for array in piece.iterfind("PointData/DataArray"):
+        if array.get("Name") == active and array.get("NumberOfComponents") == "3":
+            values = read_numbers(document, array, len(vertices), 3)
+            cloud = RawCloud("VTP", vertices, columns_of(values, ("nx", "ny", "nz")))
+            normals = cloud.normals()
+            warnings += cloud.warnings
+    return Shape(vertices, triangles, normals)
+
+
+def _cell_arrays(document: Document, piece: ElementTree.Element, count: int) -> dict[str, NDArray[Any]]:
+    """Return the arrays of the triangles by which ours tell their parts."""
+    found = {array.get("Name"): array for array in piece.iterfind("CellData/DataArray")}
+    return {
+        name: read_numbers(document, found[name], count, width)
+        for name, width in (("PART", 1), ("COLOR", 3))
+        if name in found and (read_count(found[name], "NumberOfComponents") or 1) == width
+    }
+
+
+def _joined(cells: list[dict[str, NDArray[Any]]], name: str, width: int) -> NDArray[Any] | None:
+    """Return an array of all pieces; None where one has it not."""
+    if not all(name in own and own[name].shape[1] == width for own in cells):
+        return None
+    return np.concatenate([own[name] for own in cells])
+
+
+def _parts(
+    numbers: NDArray[Any], colors: NDArray[Any] | None, order: NDArray[np.int64], names: tuple[str, ...]
+) -> list[Part]:
+    parts = []
+    for number, first, count in zip(*np.unique(numbers, return_index=True, return_counts=True), strict=True):
+        color = None
+        if colors is not None and colors.dtype == np.uint8:
+            red, green, blue = (colors[order[first]] / 255.0).tolist()
+            color = (red, green, blue)
+        name = names[int(number)] if 0 <= number < len(names) else ""
+        parts.append(Part(name, int(count), color))
+    return parts

@@ -32,7 +32,7 @@ from clrecon.jobs.corridor_results import (
 from clrecon.jobs.inputs import read_with_labels
 from clrecon.jobs.outputs import check_distinct, check_kept, commit_all, name_outputs, stage_meshes
 from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name, stage_report
-from clrecon.labels.names import file_suffixes
+from clrecon.labels.label_map import file_suffixes
 from clrecon.labels.resample import resample_labels
 from clrecon.reading import Selection, read_selected
 from clrecon.spine.corridors import VertebraCorridors, measure_corridors

@@ -222,8 +222,7 @@ def _stage_files(
     files: DistanceFiles,
     settings: DistanceSettings,
 ) -> list[tuple[str, str | Path, Any]]:
-    from clrecon.exchange.file_format import stage_content
-    from clrecon.exchange.formats import FORMATS
+    from clrecon.exchange.formats import FORMATS, stage_content
 
     written: list[tuple[str, str | Path, Any]] = []
     if files.output is not None and colored is not None:

@@ -145,7 +145,7 @@ def _encode_map(labels: LabelMap, output: str | Path, source: str | Path, settin
         names = {field.name for field in fields(Selection)} - of_values
         chosen = {name: getattr(settings, name) for name in names}
         return encode_segmentation(labels, list_slices(source, **chosen))
-    from clrecon.labels.write_nifti import encode_nifti
+    from clrecon.labels.label_grids import encode_nifti
 
     return encode_nifti(labels, packed=kind.endswith(".gz"))
 
@@ -180,7 +180,7 @@ def check_files(
     source: str | Path, output: str | Path, picture: str | Path | None, report: str | Path | None
 ) -> list[tuple[str, str | Path]]:
     """Refuse outputs that cannot be written, before any work is done; return what each is, and its path."""
-    from clrecon.labels.write_nifti import load_nibabel
+    from clrecon.labels.label_grids import load_nibabel
     from clrecon.reading import tell_format
     from clrecon.system.files import check_writable
 

@@ -13,12 +13,10 @@ import numpy as np
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
 from clrecon.geometry.grid import Grid
 from clrecon.geometry.volume import Volume
-from clrecon.labels.folder import open_masks, read_masks
-from clrecon.labels.grids import read_grid_labels
-from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap
-from clrecon.labels.names import check_wanted
-from clrecon.labels.overlap import Wanted
+from clrecon.labels.label_grids import open_masks, read_grid_labels, read_masks
+from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap, check_wanted
 from clrecon.labels.segmentation import SEGMENTATION_CLASSES, read_segmentation, tell_pixel_bytes
+from clrecon.labels.segments import Wanted
 from clrecon.labels.structures import STRUCTURE_SET, read_structures
 from clrecon.reading.grids.grid_file import LABEL_MAP, GridFile
 from clrecon.reading.grids.reader import name_of_grid, open_grid, tell_kind

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
+from clrecon.labels.label_bodies import label_ml, slice_voxel_ml
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.resample import ResampledLabels, resample_labels
-from clrecon.labels.volumes import label_ml, slice_voxel_ml
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.exchange.meshes import read_3mf, read_glb, read_obj, read_ply_mesh, read_stl, read_vtp_mesh
-from clrecon.exchange.meshes.raw_mesh import RawMesh
+from clrecon.exchange import glb, obj, ply, stl, threemf, vtp
+from clrecon.exchange.raw_content import RawMesh
 from clrecon.geometry import SPACES, frame_from_lps
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.arguments import explains_arguments
@@ -20,12 +20,12 @@ from clrecon.system.text import escape_text
 log = get_logger(__name__)
 
 _READERS = {
-    ".stl": read_stl.read,
-    ".ply": read_ply_mesh.read,
-    ".obj": read_obj.read,
-    ".glb": read_glb.read,
-    ".3mf": read_3mf.read,
-    ".vtp": read_vtp_mesh.read,
+    ".stl": stl.read,
+    ".ply": ply.read_mesh,
+    ".obj": obj.read,
+    ".glb": glb.read,
+    ".3mf": threemf.read,
+    ".vtp": vtp.read_mesh,
 }
 
 MESH_INPUTS = tuple(_READERS)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.exchange.vtk import make_polydata
+from clrecon.exchange.vtp import make_polydata
 from clrecon.system.log import hush
 
 Points = NDArray[np.float64]

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.exchange.clouds.formats import write_cloud
 from clrecon.exchange.content import PointContent, describe_facts
 from clrecon.exchange.coordinates import as_stored
+from clrecon.exchange.formats import write_cloud
 from clrecon.geometry import frame_from_lps
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.base_classes import Message

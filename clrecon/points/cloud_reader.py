@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.exchange.clouds.reader import read_raw_cloud
+from clrecon.exchange.formats import read_raw_cloud
 from clrecon.geometry import SPACES, frame_from_lps
 from clrecon.points.cloud import MOST_POINTS, PointCloud
 from clrecon.system.arguments import explains_arguments

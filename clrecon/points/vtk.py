@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.exchange.vtk import make_polydata
+from clrecon.exchange.vtp import make_polydata
 
 
 def wrap_cloud(

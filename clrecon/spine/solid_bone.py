@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import AIR_HU, Volume
-from clrecon.labels.growth import Growth
-from clrecon.labels.solid import fill_solid
+from clrecon.labels.label_bodies import Growth, fill_solid
 
 Float64Array = NDArray[np.float64]
 Box = tuple[slice, slice, slice]
@@ -188,7 +187,8 @@ def fill_vertebra(volume: Volume, labels: NDArray[Any], number: int, level: floa
     """Make the solid bone of one label.
 
     Inside is what has the level or more and is the label's own (within the label, or one voxel beyond it), and what it
-    encloses: see `clrecon.labels.solid.fill_solid`.  The vertebral canal is open above and below, and so stays outside.
+    encloses: see `clrecon.labels.label_bodies.fill_solid`.  The vertebral canal is open above and below, and so stays
+    outside.
 
     labels: ndarray, shape (nk, nj, ni). Labels on the grid of the volume.
     level: HU.

@@ -99,7 +99,7 @@ def _draw(shown: Mesh | PointCloud) -> str:
 
 
 def _show_volume(volume: Volume) -> str:
-    from clrecon.exchange.certificate import certificate_lines
+    from clrecon.exchange.content import certificate_lines
     from clrecon.operators.reformat.cut import cut_slice
 
     try:

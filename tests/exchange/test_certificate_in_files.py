@@ -12,7 +12,7 @@ import pytest
 import sample_meshes as samples
 
 from clrecon import Mesh
-from clrecon.exchange.certificate import LINE_LENGTH, WARNINGS_WRITTEN, certificate_lines
+from clrecon.exchange.content import LINE_LENGTH, WARNINGS_WRITTEN, certificate_lines
 
 REPORT = {
     "series": {"number": 3, "uid_hash": "0123456789abcdef", "modality": "CT"},

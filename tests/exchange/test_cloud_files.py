@@ -11,8 +11,7 @@ import pytest
 import tolerances
 
 from clrecon.errors import NoSurfaceError, OutputError, RefusedInputError, UsageError
-from clrecon.exchange.clouds.formats import CLOUD_FORMATS, describe_cloud_losses, write_cloud
-from clrecon.exchange.file_format import FileFormat
+from clrecon.exchange.formats import CLOUD_FORMATS, FileFormat, describe_cloud_losses, write_cloud
 from clrecon.points import PointCloud
 from clrecon.points.cloud_reader import read_points
 

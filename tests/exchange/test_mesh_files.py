@@ -16,8 +16,7 @@ import tolerances
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
 from clrecon.exchange import formats as writers
 from clrecon.exchange.coordinates import find_places, rounded_apart
-from clrecon.exchange.file_format import FileFormat
-from clrecon.exchange.formats import FORMATS
+from clrecon.exchange.formats import FORMATS, FileFormat
 from clrecon.mesh import Mesh
 
 pytestmark = pytest.mark.unit

@@ -15,7 +15,7 @@ import sample_meshes as samples
 from clrecon.errors import UsageError
 from clrecon.exchange import page as pages
 from clrecon.exchange.formats import MOST_PARTS, stage_assembly
-from clrecon.exchange.page_coding import STEPS, decode_surface, encode_surface
+from clrecon.exchange.page import STEPS, decode_surface, encode_surface
 from clrecon.mesh import Mesh
 
 pytestmark = pytest.mark.unit

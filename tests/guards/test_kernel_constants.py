@@ -18,7 +18,7 @@ from clrecon.operators.rays.ray_pictures import PROJECTIONS
 from clrecon.operators.reformat.sheets import COMBINATIONS
 
 PAIRS = [
-    ("clrecon.labels.occupancy.REACH", "surface/label_masks.h", "REACH"),
+    ("clrecon.labels.label_levels.REACH", "surface/label_masks.h", "REACH"),
     ("clrecon.rendering.looks.piecewise.DENSE", "rays/steep_segments.h", "DENSE"),
     ("clrecon.rendering.looks.piecewise.PARTS", "rays/steep_segments.h", "PARTS"),
     ("clrecon.rendering.looks.piecewise.STEEP", "rays/steep_segments.h", "STEEP"),

@@ -134,7 +134,7 @@ def test_vtk_is_known_in_one_file_of_a_room() -> None:
     assert len(found) > 5
     assert others == VTK_ELSEWHERE
     assert imports_vtk("def f():\n    from vtkmodules.vtkCommonCore import vtkPoints")
-    assert not imports_vtk("from clrecon.exchange.vtk import make_polydata")
+    assert not imports_vtk("from clrecon.exchange.vtp import make_polydata")
 
 
 def test_twins_know_nothing_of_what_they_prove() -> None:

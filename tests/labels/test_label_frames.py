@@ -7,7 +7,7 @@ import pytest
 from pydicom import Dataset
 
 from clrecon.errors import RefusedInputError
-from clrecon.labels.frames import place_frames
+from clrecon.labels.segmentation import place_frames
 
 SQUARE = (1, 0, 0, 0, 1, 0)
 

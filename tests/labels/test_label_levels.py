@@ -5,17 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from clrecon.labels.enclosed import (
+from clrecon.labels.label_levels import (
     DRIFT,
     FACES_PER_AREA,
+    FULL,
+    LEVELS,
     MOST_SWEEPS,
+    MOST_TRIALS,
+    START,
+    STEEPNESS,
     Borders,
     choose_levels,
     count_faces,
     find_enclosed,
     level_biases,
+    next_level,
 )
-from clrecon.labels.occupancy import FULL, LEVELS, MOST_TRIALS, START, STEEPNESS, next_level
 
 STEP = 1.0 / (FACES_PER_AREA * STEEPNESS * FULL)
 """Voxels that a label loses by one face towards no label, when its level rises by one."""

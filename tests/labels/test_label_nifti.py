@@ -155,9 +155,9 @@ def test_hostile_headers_are_refused_without_taking_memory(tmp_path, field, valu
 
 
 def test_a_small_file_that_would_fill_the_memory_is_refused(tmp_path, monkeypatch):
-    from clrecon.labels import stream
+    from clrecon.labels import segments
 
-    monkeypatch.setattr(stream, "physical_memory_bytes", lambda: 2**20)
+    monkeypatch.setattr(segments, "physical_memory_bytes", lambda: 2**20)
     with pytest.raises(RefusedInputError, match="1000 x 1000 x 9 voxels: 0.0 GiB, more memory than there is"):
         read_labels(write_nifti(tmp_path / "a.nii.gz", np.zeros((9, 1000, 1000), np.uint8)))
     path = write_nifti(tmp_path / "b.nii.gz", np.zeros((1, 20_000, 14_000), np.uint8))  # 280 MB of zeros

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clrecon.errors import RefusedInputError
-from clrecon.labels.overlap import Painter, Wanted
+from clrecon.labels.segments import Painter, Wanted
 
 
 def painter(names, only=None):

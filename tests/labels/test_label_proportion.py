@@ -50,7 +50,7 @@ def test_zeros_are_not_unpacked(kind: str, zeros: dict[str, Path], monkeypatch: 
     def unpack(*_: Any) -> None:
         raise AssertionError("unpacked")
 
-    monkeypatch.setattr("clrecon.labels.grids.iterate_labels", unpack)
+    monkeypatch.setattr("clrecon.labels.label_grids.iterate_labels", unpack)
     assert is_large_map(zeros[kind]) and zeros[kind].stat().st_size < 40e6
     scan = Volume(np.zeros((17, 25, 31), np.int16), np.eye(4))
     with pytest.raises(RefusedInputError, match=r"2048 x 2048 x 1024 voxels, 325,994 times as many as the scan \(31 x"):

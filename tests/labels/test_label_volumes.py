@@ -7,7 +7,7 @@ import pytest
 
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
-from clrecon.labels.volumes import count_ml, label_ml, slice_voxel_ml
+from clrecon.labels.label_bodies import count_ml, label_ml, slice_voxel_ml
 
 pytestmark = pytest.mark.unit
 

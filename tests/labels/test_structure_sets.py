@@ -14,9 +14,9 @@ from clrecon import Volume, read_labels
 from clrecon.cli.main import main
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.labels.contours import fill_contours, unite_contours
+from clrecon.labels.label_bodies import label_ml, slice_voxel_ml
 from clrecon.labels.reader import read_all_labels
 from clrecon.labels.resample import resample_labels
-from clrecon.labels.volumes import label_ml, slice_voxel_ml
 from clrecon.reading.dicom import read_volume
 
 pytestmark = pytest.mark.unit

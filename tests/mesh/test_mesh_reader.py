@@ -11,7 +11,7 @@ from sample_meshes import ball
 import clrecon
 from clrecon import Mesh
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.exchange.meshes.read_stl import join_corners
+from clrecon.exchange.stl import join_corners
 from clrecon.mesh.mesh_reader import MESH_INPUTS
 
 BALL = Mesh(*ball(8.0, 12))

@@ -49,7 +49,7 @@ def _between(volume: Volume, bone: Bits, mm: float, least_ml: float) -> Bits:
     """Return the voxels near two pieces that have some volume each."""
     from scipy.ndimage import label
 
-    from clrecon.labels.volumes import slice_voxel_ml
+    from clrecon.labels.label_bodies import slice_voxel_ml
 
     pieces, count = label(bone)
     ml = slice_voxel_ml(volume)

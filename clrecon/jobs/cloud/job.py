@@ -184,7 +184,7 @@ def _write_files(
     progress: Progress,
 ) -> CloudReport:
     """Write all files, the report as the last one, and return it."""
-    from clrecon.exchange.clouds.formats import describe_cloud_losses, stage_cloud
+    from clrecon.exchange.formats import describe_cloud_losses, stage_cloud
 
     space, ids = settings.space, settings.keep_ids
     progress("write", 0, 0)
@@ -246,7 +246,7 @@ class CloudFiles:
 
         Returns: list of (str, path). Description and path of each output.
         """
-        from clrecon.exchange.clouds.formats import check_cloud_format
+        from clrecon.exchange.formats import check_cloud_format
         from clrecon.system.files import check_writable
 
         named = [

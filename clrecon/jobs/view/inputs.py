@@ -156,11 +156,11 @@ def _tell_kind(path: str | Path) -> str:
     if not file.is_file():
         raise UsageError(f"{escape_text(str(path), 200)}: there is no file of that name")
     if suffix == ".vtp":
-        from clrecon.exchange.clouds.read_vtp import has_polygons
+        from clrecon.exchange.vtp import has_polygons
 
         return "mesh" if has_polygons(file) else "cloud"
     if suffix == ".ply":
-        from clrecon.exchange.clouds.read_ply import read_header
+        from clrecon.exchange.ply import read_header
 
         with file.open("rb") as stream:
             elements = read_header(stream, escape_text(file.name)).elements

@@ -170,7 +170,7 @@ def find_spaces(mask: Mask) -> Spaces:
     numbers = np.flatnonzero(~outside)
     runs = _Runs.read(mask, found)
     runs = runs.where(~outside[runs.numbers])
-    from clrecon.labels.volumes import slice_voxel_ml  # label maps load pydicom, which others need not wait for
+    from clrecon.labels.label_bodies import slice_voxel_ml  # label maps load pydicom, which others need not wait for
 
     lengths = (runs.last - runs.first + 1).astype(np.float64)
     voxels = np.bincount(runs.numbers, lengths, found.count)[numbers]
@@ -188,7 +188,7 @@ def find_joints(mask: Mask, reach_mm: float, least_ml: float) -> Mask:
     device, shape, volume = mask.device, mask.shape_ijk, mask.volume
     words = mask_bytes(shape)["mask of the voxels"]
     found = find_components(device, mask.bits, beside=3 * words, memory=mask.memory)
-    from clrecon.labels.volumes import slice_voxel_ml  # label maps load pydicom, which others need not wait for
+    from clrecon.labels.label_bodies import slice_voxel_ml  # label maps load pydicom, which others need not wait for
 
     joints = Mask(volume, zero_words(device, words // 4), "joints", device=device, memory=mask.memory)
     if found.count < 2:
@@ -378,7 +378,7 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
     left = kinds["wide"] | kinds["air"]
     body = sealed | spaces.choose(~left)
     room = body - bone
-    from clrecon.labels.volumes import slice_voxel_ml  # label maps load pydicom, which others need not wait for
+    from clrecon.labels.label_bodies import slice_voxel_ml  # label maps load pydicom, which others need not wait for
 
     ml = slice_voxel_ml(volume)
     bone_ml = float(_count_by_slice(bone.to_numpy()) @ ml)

@@ -19,10 +19,20 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule
 from clrecon.geometry.vertices import describe_far
 from clrecon.labels import LabelMap
-from clrecon.labels.enclosed import FACES_PER_AREA, Borders, choose_levels, count_faces, find_enclosed, level_biases
-from clrecon.labels.occupancy import FULL, KEEP, REACH, STEEPNESS, next_level
-from clrecon.labels.solid import Box, find_boxes
-from clrecon.labels.volumes import label_ml
+from clrecon.labels.label_bodies import Box, find_boxes, label_ml
+from clrecon.labels.label_levels import (
+    FACES_PER_AREA,
+    FULL,
+    KEEP,
+    REACH,
+    STEEPNESS,
+    Borders,
+    choose_levels,
+    count_faces,
+    find_enclosed,
+    level_biases,
+    next_level,
+)
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.mesh_gates import judge_label_volume
 from clrecon.mesh.triangles import enclosed_ml

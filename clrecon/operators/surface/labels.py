@@ -19,9 +19,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.geometry.vertices import describe_far
 from clrecon.labels import LabelMap, ResampledLabels
-from clrecon.labels.growth import Growth
-from clrecon.labels.solid import Box, fill_solid, find_boxes
-from clrecon.labels.volumes import count_ml, label_ml, slice_voxel_ml
+from clrecon.labels.label_bodies import Box, Growth, count_ml, fill_solid, find_boxes, label_ml, slice_voxel_ml
 from clrecon.mesh import Mesh
 from clrecon.opencl import (
     Device,
@@ -345,7 +343,7 @@ def extract_labels(
     closed : bool
         As `extract_isosurface`.
     solid : bool
-        True: fill less dense parts within a label, see ``clrecon.labels.solid``.
+        True: fill less dense parts within a label, see ``clrecon.labels.label_bodies``.
     memory : int, optional
         Bytes that may be taken on the device; None is all that it has.  If the slices of all labels do not fit
         together, the labels are processed one by one; the meshes are the same.

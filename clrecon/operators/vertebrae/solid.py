@@ -16,9 +16,8 @@ from clrecon.geometry import Volume, column_spacing
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.labels import LabelMap
-from clrecon.labels.growth import Growth
+from clrecon.labels.label_bodies import Growth, find_boxes
 from clrecon.labels.resample import check_together, warn_of_place
-from clrecon.labels.solid import find_boxes
 from clrecon.opencl import Device, download
 from clrecon.operators.masks.mask import Mask
 from clrecon.operators.masks.regions import checked_mm

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.exchange.certificate import certificate_lines
+from clrecon.exchange.content import certificate_lines
 from clrecon.geometry.resample import LARGEST_SHEAR_DEGREES, describe_unevenness, resample_volume, shear_degrees
 from clrecon.geometry.volume import Volume
 from clrecon.reading.grids.grid_file import VOLUME, VolumeContent, import_extra

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.exchange.clouds.formats import CLOUD_FORMATS
-from clrecon.exchange.formats import ASSEMBLIES, FORMATS, stage_assembly
+from clrecon.exchange.formats import ASSEMBLIES, CLOUD_FORMATS, FORMATS, stage_assembly
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 from clrecon.operators.masks.mask import Mask

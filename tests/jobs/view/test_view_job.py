@@ -12,8 +12,7 @@ from sample_meshes import ball
 
 import clrecon
 from clrecon.cli.main import main
-from clrecon.exchange.page import parse_page
-from clrecon.exchange.page_coding import decode_surface
+from clrecon.exchange.page import decode_surface, parse_page
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 

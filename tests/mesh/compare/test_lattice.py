@@ -8,7 +8,7 @@ from sample_meshes import torus
 from surface_volumes import OBLIQUE, random_volume, smooth_volume
 from uneven_volume import uneven
 
-from clrecon.exchange.vtk import make_polydata
+from clrecon.exchange.vtp import make_polydata
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh

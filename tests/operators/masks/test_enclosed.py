@@ -11,7 +11,7 @@ from uneven_volume import uneven
 import clrecon
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.labels.volumes import slice_voxel_ml
+from clrecon.labels.label_bodies import slice_voxel_ml
 from clrecon.operators.masks import enclosed
 from clrecon.proof.phantom import PhantomSettings, make_phantom
 

@@ -9,8 +9,7 @@ import tolerances
 import clrecon
 from clrecon.exchange.coordinates import find_coincident
 from clrecon.exchange.formats import FORMATS, describe_rounding
-from clrecon.exchange.page import parse_page, read_facts
-from clrecon.exchange.page_coding import decode_surface
+from clrecon.exchange.page import decode_surface, parse_page, read_facts
 from clrecon.geometry import Volume
 from clrecon.geometry.vertices import FAR_MM, find_vertex_origin, float32_step
 from clrecon.labels import LabelMap

@@ -10,9 +10,8 @@ from scipy.spatial import cKDTree
 from clrecon.errors import DeviceError, RefusedInputError, UsageError
 from clrecon.geometry import apply_affine
 from clrecon.labels import LabelMap
-from clrecon.labels.enclosed import Borders, choose_levels, count_faces, find_enclosed
-from clrecon.labels.occupancy import FULL, KEEP
-from clrecon.labels.solid import find_boxes
+from clrecon.labels.label_bodies import find_boxes
+from clrecon.labels.label_levels import FULL, KEEP, Borders, choose_levels, count_faces, find_enclosed
 from clrecon.mesh.triangles import enclosed_ml
 from clrecon.opencl import Stopwatch
 from clrecon.operators.surface.label_masks import extract_label_masks, survey_labels

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
-from clrecon.exchange.clouds.raw_cloud import RawCloud, columns_of, say_cut
 from clrecon.exchange.content import PointContent, refuse_file
+from clrecon.exchange.raw_content import RawCloud, columns_of, say_cut
 from clrecon.system.text import escape_text
 
 _ENTRY_BYTES = 224

@@ -14,8 +14,8 @@ from typing import BinaryIO
 import numpy as np
 
 from clrecon.errors import RefusedInputError
-from clrecon.exchange.clouds.raw_cloud import RawCloud, columns_of, read_remarks, say_cut
 from clrecon.exchange.content import PointContent, refuse_file
+from clrecon.exchange.raw_content import RawCloud, columns_of, read_remarks, say_cut
 from clrecon.system.paths import open_regular
 from clrecon.system.pieces import chunks
 from clrecon.system.text import escape_text

@@ -14,8 +14,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from clrecon.errors import OutputError, RefusedInputError, UsageError
-from clrecon.exchange.clouds.raw_cloud import RawCloud, read_remarks, say_cut
 from clrecon.exchange.content import PointContent, refuse_file
+from clrecon.exchange.raw_content import RawCloud, read_remarks, say_cut
 from clrecon.system.packages import install_command
 from clrecon.system.text import escape_text
 

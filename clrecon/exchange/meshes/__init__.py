@@ -1,1 +1,0 @@
-"""Readers of mesh files: binary and text STL, PLY of any program."""

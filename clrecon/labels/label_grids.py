@@ -1,0 +1,275 @@
+"""Label maps in grid files: NIfTI with a label table, NRRD with 3D Slicer's segments and layers, MetaImage.
+
+A folder of masks, one file a structure, as TotalSegmentator writes it, is one map with the names of the files.
+
+nibabel writes the header of NIfTI-1 (.nii, .nii.gz).  The names are a label table as Caret and Connectome Workbench
+write it, which `read_labels` and other programs read.
+
+Source: 3D Slicer's segmentation file format; the label table of Caret and Connectome Workbench.
+"""
+
+from __future__ import annotations
+
+import gzip
+import html
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import RefusedInputError
+from clrecon.geometry.images import place_in_header
+from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap, find_number
+from clrecon.labels.segments import Painter, Wanted, empty_labels, iterate_labels
+from clrecon.reading.grids.grid_file import LABEL_MAP, GridFile, import_extra
+from clrecon.reading.grids.reader import name_of_grid, open_grid, tell_kind
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.text import count_of, escape_text
+
+_LABEL = re.compile(
+    rb"""<Label\b[^>]{0,500}?\bKey=["']([0-9]{1,9})["'][^>]{0,500}>\s*(?:<!\[CDATA\[(.*?)\]\]>|([^<]*))""", re.DOTALL
+)
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """One segment of a .seg.nrrd: the voxels of `layer` that hold `value`."""
+
+    number: int
+    name: str
+    layer: int
+    value: int
+
+
+def read_grid_labels(grid: GridFile, wanted: Wanted, progress: Progress = ignore_progress) -> LabelMap:
+    """Read a label map or a segmentation.
+
+    wanted: Of segments in layers only the others may overlap.
+    progress: Called as ``progress("read", slices done, all slices)``.
+    """
+    segments, said = _read_segments(grid)
+    ni, nj, nk = grid.shape_ijk
+    voxels = empty_labels(grid.name, (nk, nj, ni))
+    if grid.layers > 1:
+        return _merge_layers(grid, voxels, segments, wanted, said, progress)
+    for k, plane in enumerate(iterate_labels(grid)):
+        if plane.any():
+            voxels[k] = plane
+        progress("read", k + 1, nk)
+    names = {segment.number: segment.name for segment in segments} or _read_names(grid.extension)
+    return LabelMap(voxels, grid.affine, names, warnings=[*grid.warnings, *said])
+
+
+def _merge_layers(
+    grid: GridFile,
+    voxels: NDArray[Any],
+    segments: Sequence[_Segment],
+    wanted: Wanted,
+    said: list[str],
+    progress: Progress,
+) -> LabelMap:
+    """Merge segments that are stored in layers into one map; numbers that several layers use are renumbered."""
+    if len({segment.number for segment in segments}) < len(segments):
+        segments = [_Segment(n, s.name, s.layer, s.value) for n, s in enumerate(segments, start=1)]
+    painter = Painter(grid.name, voxels, {s.number: s.name for s in segments}, wanted)
+    by_number = {segment.number: segment for segment in segments}
+    unnamed = 0
+    for k, stack in enumerate(iterate_labels(grid)):
+        known = stack == 0
+        for segment in segments:
+            known[..., segment.layer] |= stack[..., segment.layer] == segment.value
+        unnamed += known.size - np.count_nonzero(known)
+        for number in painter.order:
+            painter.paint(k, number, stack[..., by_number[number].layer] == by_number[number].value)
+        progress("read", k + 1, len(voxels))
+    if unnamed:
+        said.append(f"{unnamed:,} voxels hold values that no segment of their layer has (LabelValue): left out")
+    return painter.finish(grid.affine, warnings=[*grid.warnings, *said])
+
+
+def _read_segments(grid: GridFile) -> tuple[list[_Segment], list[str]]:
+    """Return the segments that the header of a .seg.nrrd names, in their order, and what is to be said about them.
+
+    3D Slicer wrote neither layers nor values before version 4.11: segment n was layer n.
+    """
+    fields = grid.fields
+    found = {int(m[1]) for field in fields if (m := re.fullmatch(r"Segment([0-9]{1,5})_(Name|ID|LabelValue)", field))}
+    if grid.layers > 1 and not found:
+        raise RefusedInputError(f"{grid.name} has {grid.layers} layers and does not say which segments they hold")
+    names = {n: str(fields.get(f"Segment{n}_Name", "")) for n in sorted(found)}
+    values = _read_numbers(grid, names, "LabelValue")
+    layers = _read_numbers(grid, names, "Layer")
+    if names and not values and not layers and list(names) == list(range(grid.layers)):
+        told = (
+            [] if grid.layers == 1 else [f"its {grid.layers} segments name no layer: segment n is taken from layer n"]
+        )
+        return [_Segment(n + 1, name, n, 1) for n, name in names.items()], told
+    lost = {"LabelValue": len(names) - len(values), "Layer": len(names) - len(layers)}
+    if grid.layers > 1 and any(lost.values()):
+        what, count = max(lost.items(), key=lambda item: item[1])
+        raise RefusedInputError(
+            f"{grid.name} has {grid.layers} layers, and {count} of its {len(names)} segments have no {what}"
+            f" (SegmentN_{what}): which voxels are theirs is not known"
+        )
+    beyond = [layer for layer in layers.values() if not 0 <= layer < grid.layers]
+    if beyond:
+        raise RefusedInputError(f"{grid.name} has {grid.layers} layers, and a segment is in layer {beyond[0]}")
+    said = []
+    if lost["LabelValue"]:
+        said.append(f"{lost['LabelValue']} of {len(names)} segments have no LabelValue: their names are not known")
+    empty = [n for n, value in values.items() if value == 0]
+    if empty:
+        said.append(f"{len(empty)} of {len(names)} segments have LabelValue 0, which is no label: left out")
+    segments = [_Segment(v, names[n], layers.get(n, 0), v) for n, v in values.items() if v != 0]
+    return segments, said
+
+
+def _read_numbers(grid: GridFile, segments: Iterable[int], key: str) -> dict[int, int]:
+    try:
+        fields = {n: grid.fields.get(f"Segment{n}_{key}") for n in segments}
+        return {n: int(value) for n, value in fields.items() if value is not None}
+    except ValueError as error:
+        raise RefusedInputError(f"{grid.name} has a corrupt NRRD header: {key} of a segment is no number") from error
+
+
+def _read_names(extension: bytes) -> dict[int, str]:
+    """Return the names of a label table as Caret, Connectome Workbench and TotalSegmentator write it into a NIfTI
+    header.
+    """
+    names = {}
+    for match in _LABEL.finditer(extension):
+        text = (match[2] or match[3] or b"").decode("utf-8", "replace")
+        names[int(match[1])] = text if match[2] is not None else html.unescape(text)
+    return {number: text for number, text in names.items() if text.strip()}
+
+
+SAME_GRID_MM = 1e-3
+"""Largest distance of a voxel from its place in the first mask; a sform is float32."""
+
+
+def open_masks(folder: Path) -> dict[str, GridFile]:
+    """Read the headers of the masks of a folder, by the names of their structures in alphabetical order.
+
+    Hidden files, folders and files of other kinds are left out.
+    """
+    shown = escape_text(folder.name)
+    masks: dict[str, GridFile] = {}
+    for path in sorted(folder.iterdir(), key=lambda path: path.name):
+        kind = tell_kind(path) if path.is_file() and not path.name.startswith(".") else None
+        if kind == "DICOM":
+            raise RefusedInputError(
+                f"{shown} is a folder with DICOM files: of a DICOM SEG or RTSTRUCT give the file, of masks a folder"
+                " with one NIfTI, NRRD or MetaImage file a structure"
+            )
+        if kind is None:
+            continue
+        name = name_of_grid(path)
+        if name in masks:
+            raise RefusedInputError(
+                f"{shown} has two masks of one name: {masks[name].name} and {escape_text(path.name)}"
+            )
+        masks[name] = open_grid(path, kind, LABEL_MAP)
+    if not masks:
+        raise RefusedInputError(
+            f"{shown} is a folder without masks: one NIfTI, NRRD or MetaImage file a structure is read; or give the"
+            " file with the labels"
+        )
+    if len(masks) > LARGEST_NUMBER:
+        raise RefusedInputError(f"{shown} has {len(masks):,} masks: up to {LARGEST_NUMBER:,} are read")
+    return masks
+
+
+def read_masks(folder: Path, masks: dict[str, GridFile], wanted: Wanted, progress: Progress) -> LabelMap:
+    """Read the masks of a folder as one map; the first has number 1.
+
+    A voxel of several masks belongs to the first of them in alphabetical order, wanted ones before others.
+
+    masks: As `open_masks` returns them.
+    progress: Called as ``progress("read", masks done, all masks)``.
+    """
+    names = dict(enumerate(masks, start=1))
+    chosen = set(names) if wanted.labels is None else {find_number(one, names, names) for one in wanted.labels}
+    order = [*sorted(chosen), *(sorted(set(names) - chosen) if wanted.others else ())]
+    first = masks[names[order[0]]]
+    ni, nj, nk = first.shape_ijk
+    voxels = empty_labels(escape_text(folder.name), (nk, nj, ni))
+    shared = 0
+    for done, number in enumerate(order, start=1):
+        grid = masks[names[number]]
+        _check_same(first, grid)
+        shared += _add(voxels, number, grid)
+        progress("read", done, len(order))
+    warnings = [f"{warning} ({grid.name})" for grid in (masks[names[n]] for n in order) for warning in grid.warnings]
+    if shared:
+        warnings.append(
+            f"the masks overlap in {count_of(shared, 'voxel')}: each belongs to the first of its masks in alphabetical"
+            " order, labels that were chosen before others"
+        )
+    return LabelMap(voxels, first.affine, {number: names[number] for number in sorted(order)}, warnings=warnings)
+
+
+def _check_same(first: GridFile, other: GridFile) -> None:
+    shapes = [" x ".join(map(str, grid.shape_ijk)) for grid in (first, other)]
+    end = np.append(np.array(first.shape_ijk) - 1.0, 1.0)
+    corners = np.array([[i, j, k, 1.0] for i in (0.0, end[0]) for j in (0.0, end[1]) for k in (0.0, end[2])])
+    off = float(np.linalg.norm(corners @ (other.affine - first.affine).T, axis=1).max())
+    if shapes[0] != shapes[1] or off > SAME_GRID_MM:
+        raise RefusedInputError(
+            f"the masks {first.name} and {other.name} lie on two grids: {shapes[0]} and {shapes[1]} voxels"
+            + (f", up to {off:.3g} mm apart" if shapes[0] == shapes[1] else "")
+            + "; the masks of one folder belong to one grid"
+        )
+
+
+def _add(voxels: NDArray[Any], number: int, grid: GridFile) -> int:
+    """Write a mask into voxels that are free, and return how many of its voxels were not."""
+    value, shared = 0, 0
+    for k, plane in enumerate(iterate_labels(grid)):
+        mask = plane != 0
+        if not mask.any():
+            continue
+        found = np.unique(plane[mask])
+        value = value or int(found[0])
+        if len(found) > 1 or found[0] != value:
+            other = next(int(each) for each in found if each != value)
+            raise RefusedInputError(
+                f"{grid.name} holds several labels, {value} and {other}: a folder of masks has one file a structure;"
+                " give a label map as a file"
+            )
+        taken = voxels[k] != 0
+        shared += np.count_nonzero(mask & taken)
+        voxels[k][mask & ~taken] = number
+    return shared
+
+
+CARET_CODE = 30
+"""Code of the extension that holds Caret's XML."""
+
+
+def load_nibabel() -> Any:
+    """Import nibabel."""
+    return import_extra("nibabel", LABEL_MAP)
+
+
+def encode_nifti(labels: LabelMap, *, packed: bool) -> bytes:
+    """Return the bytes of the file; the same labels give the same bytes.
+
+    packed: Gzip, as in .nii.gz.
+    """
+    nibabel = load_nibabel()
+    image = nibabel.Nifti1Image(np.asarray(labels.voxels).transpose(2, 1, 0), None)
+    place_in_header(image.header, labels.affine)
+    table = "".join(
+        f'<Label Key="{number}" Red="1" Green="1" Blue="1" Alpha="1">{escape(name)}</Label>'
+        for number, name in labels.names.items()
+    )
+    text = f'<?xml version="1.0" encoding="UTF-8"?><CaretExtension><VolumeInformation Index="0"><LabelTable>{table}'
+    text += "</LabelTable></VolumeInformation></CaretExtension>"
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(CARET_CODE, text.encode("utf-8")))
+    content = bytes(image.to_bytes())
+    return gzip.compress(content, compresslevel=6, mtime=0) if packed else content
