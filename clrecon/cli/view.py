@@ -172,7 +172,7 @@ def _show(options: argparse.Namespace, console: Console) -> int:
 
 def _serve(options: argparse.Namespace, settings: ViewSettings, console: Console) -> int:
     """Serve until Ctrl-C, which is how it ends: exit code 0."""
-    from clrecon.viewer.web.serve import serve_view
+    from clrecon.viewer.web.server import serve_view
 
     def ready(server: Any, view: Any, warnings: list[str]) -> None:
         device = view.painter.device.label

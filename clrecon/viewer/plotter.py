@@ -18,8 +18,15 @@ from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.rendering.pictures.styles import DEFAULT_ISO_VALUE
 from clrecon.system.display import Display, DisplayProbe, NoDisplayError
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.viewer.model.first_state import find_iso_range
-from clrecon.viewer.model.objects import ShownCloud, ShownLabels, ShownMesh, ShownObject, ShownScan, show_objects
+from clrecon.viewer.model.objects import (
+    ShownCloud,
+    ShownLabels,
+    ShownMesh,
+    ShownObject,
+    ShownScan,
+    find_iso_range,
+    show_objects,
+)
 
 if TYPE_CHECKING:
     import pyvista
@@ -79,11 +86,7 @@ def show_inputs(
     ready: Callable[[list[str]], object] = lambda said: None,
     probe: DisplayProbe,
 ) -> None:
-    """Read inputs and show them in a window until it is closed; `probe` was started before.
-
-    inputs: See `clrecon.jobs.view.inputs.open_inputs`.
-    ready: Called with what has to be said of the inputs, before the window opens.
-    """
+    """Read inputs, say with `ready` what is to be said of them, and show them in a window until it is closed."""
     from clrecon.viewer.session.opening import choose_iso, read_objects
 
     settings = settings or ViewSettings()

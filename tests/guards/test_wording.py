@@ -20,7 +20,7 @@ from clrecon.jobs.options import InputSettings
 from clrecon.jobs.render.job import PictureFiles
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.system.arguments import in_python, name_parameter, spoken_by
-from clrecon.viewer.web.serve import serve_view
+from clrecon.viewer.web.server import serve_view
 
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 

@@ -17,7 +17,7 @@ from PIL import Image
 
 from clrecon.rendering import Rendering
 from clrecon.viewer.model.objects import show_objects
-from clrecon.viewer.model.tools import Pick
+from clrecon.viewer.model.state import Pick
 from clrecon.viewer.session.session import ViewSession
 from clrecon.viewer.web.server import WebServer
 

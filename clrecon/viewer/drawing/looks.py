@@ -13,7 +13,7 @@ from clrecon.labels import LabelMap
 from clrecon.labels.resample import ResampledLabels
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import PlaneCut, Projection, SlicesInSpace, Style, SurfaceLook, VolumeLook
-from clrecon.viewer.model.modes import ViewMode
+from clrecon.viewer.model.objects import ViewMode
 from clrecon.viewer.model.state import ShownPart, ViewState
 
 LEAST_OPACITY = 0.01

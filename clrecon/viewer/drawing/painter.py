@@ -25,17 +25,20 @@ from clrecon.rendering.views.directions import checked_size
 from clrecon.rendering.views.reformation import PLANES, find_plane
 from clrecon.system.progress import Progress
 from clrecon.system.text import unknown_name
-from clrecon.viewer.drawing.coarse import coarsen_mesh
 from clrecon.viewer.drawing.looks import LEAST_OPACITY, LabelledLook, Looks, to_voxels
-from clrecon.viewer.drawing.shown_meshes import make_meshes
-from clrecon.viewer.drawing.stage import Stage
-from clrecon.viewer.drawing.strips import take_strips
-from clrecon.viewer.drawing.warming import warm_kernels
-from clrecon.viewer.model.gestures import pixel_camera
-from clrecon.viewer.model.modes import ViewMode, find_modes
-from clrecon.viewer.model.objects import ShownCloud, ShownLabels, ShownMesh, ShownObject, ShownScan
-from clrecon.viewer.model.state import ShownPart, ViewState, as_point
-from clrecon.viewer.model.tools import Pick
+from clrecon.viewer.drawing.shown_meshes import coarsen_mesh, make_meshes
+from clrecon.viewer.drawing.stage import Stage, take_strips, warm_kernels
+from clrecon.viewer.model.changes import pixel_camera
+from clrecon.viewer.model.objects import (
+    ShownCloud,
+    ShownLabels,
+    ShownMesh,
+    ShownObject,
+    ShownScan,
+    ViewMode,
+    find_modes,
+)
+from clrecon.viewer.model.state import Pick, ShownPart, ViewState, as_point
 
 SMALLEST_SIDE = 64
 """Pixels of the shorter side of a coarse picture."""

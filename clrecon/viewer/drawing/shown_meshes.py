@@ -10,16 +10,99 @@ from clrecon.geometry import Volume
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
+from clrecon.mesh.triangles import vertex_normals
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.label_masks import extract_label_masks
 from clrecon.rendering.views.clip import Clip
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.viewer.drawing.coarse import select_triangles
-from clrecon.viewer.drawing.cutting import cut_mesh
 from clrecon.viewer.drawing.stage import Stage
-from clrecon.viewer.model.modes import find_modes
-from clrecon.viewer.model.objects import ShownLabels, ShownMesh, ShownScan
+from clrecon.viewer.model.objects import ShownLabels, ShownMesh, ShownScan, find_modes
 from clrecon.viewer.model.state import Color, ShownPart, ViewState
+
+TRIANGLES_A_CELL = 2.0
+"""Triangles that a surface leaves in each cell that it passes through."""
+
+
+def coarsen_mesh(mesh: Mesh, triangles: int) -> Mesh:
+    """Return a mesh with about as many triangles: vertices that share a cell become one, in their mean place.
+
+    It is for pictures alone: thin walls close up, and it is not manifold (Rossignac and Borrel 1993).
+    """
+    vertices = mesh.vertices.astype(np.float64)
+    cell = float(np.sqrt(TRIANGLES_A_CELL * mesh.area / triangles))
+    low = vertices.min(axis=0)
+    counts = np.floor(np.ptp(vertices, axis=0) / max(cell, 1e-9)).astype(np.int64) + 1
+    i, j, k = np.floor((vertices - low) / max(cell, 1e-9)).astype(np.int64).T
+    _, group = np.unique((k * counts[1] + j) * counts[0] + i, return_inverse=True)
+    group = group.ravel()
+    sizes = np.bincount(group)
+    places = np.stack([np.bincount(group, vertices[:, axis]) / sizes for axis in range(3)], axis=1)
+    joined = group[mesh.triangles]
+    a, b, c = joined.T
+    kept = joined[(a != b) & (b != c) & (c != a)]
+    points = places.astype(mesh.vertices.dtype)
+    used = kept.astype(np.uint32)
+    return Mesh(points, used, vertex_normals(points, used), dict(mesh.report), trusted=True)
+
+
+def select_triangles(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
+    """Return the mesh with some of its triangles, and the vertices that they need."""
+    triangles = mesh.triangles[kept]
+    used = np.zeros(mesh.vertex_count, np.bool_)
+    used[triangles] = True
+    numbers = np.cumsum(used, dtype=np.int64) - 1
+    normals = None if mesh.normals is None else mesh.normals[used]
+    return Mesh(
+        mesh.vertices[used], numbers[triangles].astype(np.uint32), normals, dict(mesh.report), trusted=True
+    )  # fmt: skip
+
+
+def cut_mesh(mesh: Mesh, clip: Clip) -> Mesh:
+    """Return the part of a mesh within a clip; triangles across a plane are cut at it."""
+    for plane in clip.planes:
+        mesh = _cut(mesh, plane)
+    return mesh
+
+
+def _cut(mesh: Mesh, plane: NDArray[np.float64]) -> Mesh:
+    """Cut by one plane.
+
+    Of a triangle across the plane one corner is alone on its side.  Turned so that it comes first, the triangle is cut
+    along two of its edges, and what is kept is a triangle or the rest, made of two.
+    """
+    heights = mesh.vertices @ plane[:3] - plane[3]
+    inside = heights >= 0.0
+    corners = inside[mesh.triangles]
+    count = corners.sum(axis=1)
+    if (count == 3).all():
+        return mesh
+    across = mesh.triangles[(count == 1) | (count == 2)].astype(np.int64)
+    kept = corners[(count == 1) | (count == 2)]
+    alone = np.argmax(np.where((kept.sum(axis=1) == 1)[:, None], kept, ~kept), axis=1)
+    turned = np.take_along_axis(across, (alone[:, None] + np.arange(3)) % 3, axis=1)
+    edges = np.sort(turned[:, [0, 1, 0, 2]].reshape(-1, 2), axis=1)
+    keys, which = np.unique(edges[:, 0] * mesh.vertex_count + edges[:, 1], return_inverse=True)
+    first, second = keys // mesh.vertex_count, keys % mesh.vertex_count
+    share = (heights[first] / (heights[first] - heights[second]))[:, None]
+
+    def between(values: NDArray) -> NDArray:
+        return np.concatenate([values, (values[first] + share * (values[second] - values[first])).astype(values.dtype)])
+
+    cuts = which.reshape(-1, 2) + mesh.vertex_count
+    is_corner = kept.sum(axis=1) == 1
+    a, b, c = turned.T
+    p, q = cuts.T
+    made = [
+        mesh.triangles[count == 3],
+        np.stack([a, p, q], axis=1)[is_corner],
+        np.stack([p, b, c], axis=1)[~is_corner],
+        np.stack([p, c, q], axis=1)[~is_corner],
+    ]
+    triangles = np.concatenate(made).astype(np.uint32)
+    normals = None if mesh.normals is None else between(mesh.normals)
+    joined = Mesh(between(mesh.vertices), triangles, normals, dict(mesh.report), trusted=True)
+    return select_triangles(joined, np.ones(len(triangles), np.bool_))
+
 
 CUT_HU_PER_MM = 100.0
 """Slope of the values across a cut: steep enough that whole HU place it to 0.005 mm."""

@@ -4,25 +4,144 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.errors import NoSurfaceError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.labels.resample import ResampledLabels
+from clrecon.mesh import Mesh
 from clrecon.opencl import Device, take_device
 from clrecon.operators.rays.point_pictures import PointPictures
+from clrecon.operators.rays.scene import ScenePictures
 from clrecon.operators.rays.volume_renderer import VolumeRenderer
 from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.surface.extract import SurfaceExtractor
+from clrecon.rendering import Rendering
+from clrecon.rendering.pictures.object_looks import MeshLook
+from clrecon.rendering.pictures.styles import PlaneCut, Style, SurfaceLook, VolumeLook
+from clrecon.rendering.views.camera import Camera
 from clrecon.system.base_classes import Closing
-from clrecon.system.progress import Progress
+from clrecon.system.progress import Progress, ignore_progress
 from clrecon.viewer.drawing.looks import LabelledLook
-from clrecon.viewer.model.objects import ShownLabels, ShownObject, ShownScan
+from clrecon.viewer.model.objects import ShownLabels, ShownMesh, ShownObject, ShownScan
 from clrecon.viewer.model.parts import FoundParts, find_clusters
 from clrecon.viewer.model.state import Point, ViewState
+
+STRIP_PIXELS = 1 << 18
+"""Pixels of a strip: some 50 ms of volume rendering on two cores."""
+
+STRIP_ROWS = 16
+"""Rows of a strip are a multiple of this, which tiles of rays fill."""
+
+
+def take_strips(
+    take: Callable[[Camera, tuple[int, int]], Rendering], camera: Camera, size: tuple[int, int]
+) -> Rendering:
+    """Take the picture of a parallel camera strip by strip, where it is large; others in one.
+
+    take: Takes a picture of a camera and a size; what it raises ends the work.
+    """
+    width, height = size
+    rows = max(STRIP_ROWS, STRIP_PIXELS // width // STRIP_ROWS * STRIP_ROWS)
+    if not camera.is_parallel or rows >= height:
+        return take(camera, size)
+    _, up, _ = camera.basis()
+    pixel = camera.pixel_mm(size)
+    strips = []
+    for first in range(0, height, rows):
+        end = min(first + rows, height)
+        shift = (0.5 * height - 0.5 * (first + end)) * pixel * up
+        own = replace(
+            camera,
+            position=_moved(camera.position, shift),
+            focal_point=_moved(camera.focal_point, shift),
+            parallel_scale=0.5 * (end - first) * pixel,
+        )
+        strips.append(take(own, (width, end - first)))
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(strip, name) for strip in strips])
+        for name in ("image", "depth", "expected_depth", "values")
+        if getattr(strips[0], name) is not None
+    }
+    report = {**strips[-1].report, "strips": len(strips)}
+    return replace(strips[0], camera=camera, report=report, **joined)
+
+
+def _moved(point: tuple[float, float, float], shift: Any) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in point + shift)
+    return x, y, z
+
+
+SIDE = 20
+"""Voxels along each side of the volume by which kernels are built."""
+
+PICTURE = (8, 8)
+
+
+def warm_kernels(objects: Sequence[ShownObject], device: Device, progress: Progress | None = None) -> None:
+    """Build what the first pictures, the slider and the parts need, on a small volume of each type of voxels.
+
+    Views are not kept waiting: nothing of theirs is used but the device.
+    """
+    tell = progress or ignore_progress
+    done = set()
+    for each in objects:
+        if isinstance(each, ShownScan):
+            kind = each.volume.voxels.dtype, each.volume.uneven
+            if kind not in done:
+                done.add(kind)
+                _warm_scan(_ball(*kind), device, tell)
+    if any(isinstance(each, ShownMesh) for each in objects):
+        _warm_mesh(device)
+
+
+def _ball(dtype: np.dtype, uneven: bool) -> Volume:
+    """Return a ball of 1000 HU in air."""
+    places = np.indices((SIDE,) * 3) - 0.5 * (SIDE - 1)
+    inside = (places**2).sum(axis=0) < (0.3 * SIDE) ** 2
+    voxels = np.where(inside, 1000, -1000).astype(dtype)
+    if not uneven:
+        return Volume(voxels, np.eye(4))
+    heights = np.arange(SIDE, dtype=np.float64) + 0.2 * (np.arange(SIDE) % 2)
+    positions = np.stack([np.zeros(SIDE), np.zeros(SIDE), heights], axis=1)
+    return Volume(voxels, np.eye(4), slice_positions=positions)
+
+
+def _warm_scan(volume: Volume, device: Device, tell: Progress) -> None:
+    camera = Camera.fit(volume, "anterior", size=PICTURE)
+    labels = LabelMap((volume.voxels > 0).astype(np.uint8), np.eye(4))
+    with DeviceVolume(volume, device=device) as resident, VolumeRenderer(resident) as renderer:
+        styles: list[Style] = [
+            SurfaceLook(200.0), PlaneCut(), VolumeLook("bone", jitter=True),
+            SurfaceLook(200.0, labels=labels), VolumeLook("bone", jitter=True, labels=labels), PlaneCut(labels=labels),
+        ]  # fmt: skip
+        for style in styles[:3]:
+            tell("build", 0, 0)
+            renderer.render(style, camera=camera, size=PICTURE, background="transparent")
+        with SurfaceExtractor(resident) as extractor:
+            for level in (200.0, 300.0):  # the second uses bricks
+                tell("build", 0, 0)
+                try:
+                    extractor.extract(level)
+                except NoSurfaceError:
+                    pass
+        find_clusters(resident, 1, 200.0, True, tell)
+        for style in styles[3:]:
+            tell("build", 0, 0)
+            renderer.render(style, camera=camera, size=PICTURE, background="transparent")
+
+
+def _warm_mesh(device: Device) -> None:
+    mesh = Mesh(np.eye(3), [(0, 1, 2)], np.tile([0.0, 0.0, 1.0], (3, 1)))
+    with ScenePictures([(mesh, MeshLook())], device=device) as scene:
+        scene.take(Camera((0.3, 0.3, 5.0), (0.3, 0.3, 0.3), (0.0, 1.0, 0.0), parallel_scale=1.0), PICTURE)
+
 
 MOST_FOUND, MOST_FOUND_BYTES = 6, 1 << 29
 """Sets of parts that are kept, of all views together, and the bytes of their label maps; two are kept whatever their

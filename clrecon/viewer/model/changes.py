@@ -1,4 +1,7 @@
-"""`ChangingView`: the state of a view, its camera and its parts, with every change as a step of undo."""
+"""`ChangingView`: the state of a view, its camera and its parts, with every change as a step of undo.
+
+Gestures move the camera by shares of the picture's height: x to the right, y down.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +15,131 @@ import numpy as np
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
+from clrecon.operators.rays.mesh_pictures import box_around
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.views.camera import Camera
-from clrecon.rendering.views.directions import checked_vector
+from clrecon.rendering.views.directions import DIRECTIONS, checked_vector
+from clrecon.rendering.views.reformation import PLANES
 from clrecon.system.text import unknown_name
-from clrecon.viewer.model.framing import fit_camera
-from clrecon.viewer.model.gestures import pan_camera, roll_camera, turn_camera, zoom_camera
-from clrecon.viewer.model.objects import ShownObject
+from clrecon.viewer.model.objects import ShownObject, ShownScan
 from clrecon.viewer.model.parts import FoundParts, carry_looks
 from clrecon.viewer.model.state import Color, ShownPart, ViewState, as_point
+
+FIT_PIXELS = 1000
+"""Height of the picture that a camera is fitted for; only its ratio to the width counts."""
+
+
+def fit_camera(
+    points: Float64Array, view: str | Sequence[float], aspect: float, view_angle: float | None = None
+) -> Camera:
+    """Return a camera that looks from a side of the patient, so that the box around points fits.
+
+    points: ndarray, shape (n, 3). LPS mm.
+    aspect: Width of the picture by its height.
+    """
+    size = (max(1, round(aspect * FIT_PIXELS)), FIT_PIXELS)
+    return Camera.fit(box_around([points]), view, view_angle=view_angle, size=size)
+
+
+def plane_step(scans: Sequence[ShownScan], plane: str) -> Float64Array:
+    """Return the step from one slice of a plane to the next, away from the eye: (3,) in mm.
+
+    It is the distance of the first scan's voxels along its axis that is nearest to the normal of the plane; 1 mm
+    without a scan.
+    """
+    normal = -np.array(DIRECTIONS[PLANES[plane]])
+    if not scans:
+        return normal
+    columns = scans[0].volume.affine[:3, :3]
+    along = np.abs(normal @ columns)
+    return normal * float(along[int(np.argmax(along / np.linalg.norm(columns, axis=0)))])
+
+
+TURN_DEGREES = 180.0
+"""By which a gesture over the height of the picture turns."""
+
+MOST_MM, LEAST_MM = 1e5, 1e-2
+"""Half heights between which a camera zooms: from a hundred metres to a hundredth of a millimetre."""
+
+
+def turn_camera(camera: Camera, dx: float, dy: float) -> Camera:
+    """Turn about the focal point as if the pointer held what is seen there, as pyvista's trackball does."""
+    right, up, _ = camera.basis()
+    turn = _rotation(up, -dx * TURN_DEGREES) @ _rotation(right, -dy * TURN_DEGREES)
+    away = turn @ np.subtract(camera.position, camera.focal_point)
+    return replace(camera, position=as_point(np.add(camera.focal_point, away)), up=as_point(turn @ up))
+
+
+def roll_camera(camera: Camera, degrees: float) -> Camera:
+    """Turn about the view; positive degrees turn the picture clockwise."""
+    _, up, forward = camera.basis()
+    return replace(camera, up=as_point(_rotation(forward, -degrees) @ up))
+
+
+def pan_camera(camera: Camera, dx: float, dy: float) -> Camera:
+    """Shift what is seen by shares of the picture's height, at the focal point."""
+    right, up, _ = camera.basis()
+    height = _height_mm(camera)
+    shift = height * (dy * up - dx * right)
+    return replace(
+        camera,
+        position=as_point(np.add(camera.position, shift)),
+        focal_point=as_point(np.add(camera.focal_point, shift)),
+    )
+
+
+def zoom_camera(camera: Camera, factor: float, at: tuple[float, float] = (0.0, 0.0)) -> Camera:
+    """Show everything `factor` times as large; what is seen at a place of the picture stays there.
+
+    at: From the middle of the picture, in shares of its height.
+    """
+    if not (math.isfinite(factor) and factor > 0.0):
+        raise UsageError(f"the factor of a zoom is a number above 0, not {factor!r}")
+    before = _height_mm(camera)
+    height = min(2.0 * MOST_MM, max(2.0 * LEAST_MM, before / factor))
+    if camera.is_parallel:
+        nearer = replace(camera, parallel_scale=0.5 * height)
+    else:
+        offset = np.subtract(camera.position, camera.focal_point) * (height / before)
+        nearer = replace(camera, position=as_point(np.add(camera.focal_point, offset)))
+    lost = 1.0 - before / height
+    return pan_camera(nearer, at[0] * lost, at[1] * lost)
+
+
+def pixel_camera(camera: Camera, size: tuple[int, int], x: float, y: float) -> Camera:
+    """Return a camera whose picture of one pixel is seen along the ray of a place in this camera's picture.
+
+    size: (width, height)
+    x, y: Pixels from the top left corner; the first pixel's centre is (0.5, 0.5).
+    """
+    right, up, forward = camera.basis()
+    width, height = size
+    pixel = 2.0 * camera.half_height() / height
+    offset = (x - 0.5 * width) * pixel * right + (0.5 * height - y) * pixel * up
+    if camera.is_parallel:
+        return replace(
+            camera,
+            position=as_point(np.add(camera.position, offset)),
+            focal_point=as_point(np.add(camera.focal_point, offset)),
+            parallel_scale=0.5 * pixel,
+        )
+    along = forward + offset
+    along /= np.linalg.norm(along)
+    angle = max(1e-3, math.degrees(pixel))
+    return replace(camera, focal_point=as_point(camera.position + camera.distance * along), view_angle=angle)
+
+
+def _height_mm(camera: Camera) -> float:
+    """Return the height of the picture at the focal point."""
+    return 2.0 * camera.half_height() * (1.0 if camera.is_parallel else camera.distance)
+
+
+def _rotation(axis: Float64Array, degrees: float) -> Float64Array:
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    radians = math.radians(degrees)
+    return np.asarray(np.eye(3) + math.sin(radians) * cross + (1.0 - math.cos(radians)) * cross @ cross)
+
 
 MOST_UNDO = 200
 """Changes that can be taken back."""

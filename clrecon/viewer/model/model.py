@@ -18,13 +18,31 @@ from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import checked_vector
 from clrecon.rendering.views.reformation import PLANES
 from clrecon.system.text import format_hu, unknown_name
-from clrecon.viewer.model.changes import ChangingView, checked_numbers
-from clrecon.viewer.model.first_state import find_iso_range, first_parts
-from clrecon.viewer.model.framing import fit_camera, plane_step
-from clrecon.viewer.model.modes import SLICE_WINDOW, ViewMode, find_modes
-from clrecon.viewer.model.objects import ShownLabels, ShownObject, ShownScan
-from clrecon.viewer.model.state import Box, Point, ShownPart, ViewState, as_point
-from clrecon.viewer.model.tools import POINTS_OF, TOOLS, ClipPlane, Measure, Pick, clip_direction, measure_points
+from clrecon.viewer.model.changes import ChangingView, checked_numbers, fit_camera, plane_step
+from clrecon.viewer.model.objects import (
+    SLICE_WINDOW,
+    ShownLabels,
+    ShownObject,
+    ShownScan,
+    ViewMode,
+    find_iso_range,
+    find_modes,
+    first_parts,
+)
+from clrecon.viewer.model.state import (
+    POINTS_OF,
+    TOOLS,
+    Box,
+    ClipPlane,
+    Measure,
+    Pick,
+    Point,
+    ShownPart,
+    ViewState,
+    as_point,
+    clip_direction,
+    measure_points,
+)
 
 BOX_SHARE = 0.5
 """Of what there is along each axis, in a clip box about the cross."""

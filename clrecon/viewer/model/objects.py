@@ -1,9 +1,11 @@
-"""What a view shows: scans, meshes, clouds and label maps, read once and shared by all views of a process."""
+"""What a view shows: scans, meshes, clouds and label maps, the modes of scans, and what they show at the start."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,10 +16,57 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
 from clrecon.points import PointCloud
+from clrecon.rendering.looks.presets import PRESETS
+from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.views.camera import box_corners
+from clrecon.viewer.model.state import ShownPart, as_point
 
 if TYPE_CHECKING:
     from clrecon.jobs.view.inputs import OpenedInput
+
+
+SLICE_WINDOW = (-450.0, 1050.0)
+"""HU shown as black and white in slices at the start: a window for bone."""
+
+
+@dataclass(frozen=True)
+class ViewMode:
+    """A mode.
+
+    name, words: The words say what is seen.
+    kind: "surface", "volume" (volume rendering), "projection", "slices" or "labels".
+    style: Name of the preset or of the projection.
+    joins: Other objects are shown with it in one picture.
+    window: HU of black and white of a projection; None: chosen from the picture.
+    """
+
+    name: str
+    words: str
+    kind: str
+    style: str = ""
+    joins: bool = True
+    window: tuple[float, float] | None = None
+
+
+@cache
+def find_modes() -> dict[str, ViewMode]:
+    """Return all modes by name, in the order in which they are listed."""
+    modes = [ViewMode("surface", "the surface at the iso value", "surface")]
+    modes += [
+        ViewMode(preset.name, preset.description, "volume", preset.name)
+        for preset in PRESETS.values()
+        if preset.mode == "dvr"
+    ]
+    modes += [
+        ViewMode(
+            preset.mode, preset.description.partition(" (mode")[0], "projection", preset.mode, False, preset.window
+        )
+        for preset in PRESETS.values()
+        if preset.mode != "dvr"
+    ]
+    modes.append(ViewMode("slices", "translucent slices in space", "slices"))
+    modes.append(ViewMode("labels", "the labels alone, as solid shapes", "labels"))
+    return {mode.name: mode for mode in modes}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -164,3 +213,50 @@ def _with_normals(mesh: Mesh) -> Mesh:
 def wrap_inputs(inputs: Sequence[OpenedInput], names: Sequence[str] = ()) -> list[ShownObject]:
     """Wrap what `clrecon.jobs.view.inputs.open_inputs` has read."""
     return show_objects([each.subject for each in inputs], names, [each.said for each in inputs])
+
+
+ISO_ENDS = (-1000.0, 2000.0)
+"""Ends of the slider, as far as the values of the scan go: air, and dense cortex."""
+
+
+def first_parts(objects: Sequence[ShownObject]) -> list[ShownPart]:
+    """Return the objects as wholes, and the labels of label maps."""
+    parts = []
+    for each in objects:
+        count: int | None = None
+        if isinstance(each, ShownMesh):
+            count = each.mesh.triangle_count
+        elif isinstance(each, ShownCloud):
+            count = len(each.cloud)
+        parts.append(ShownPart(key=str(each.number), name=each.name, kind=each.kind, object=each.number, count=count))
+        if isinstance(each, ShownLabels):
+            parts += _label_parts(each)
+    return parts
+
+
+def _label_parts(shown: ShownLabels) -> list[ShownPart]:
+    """Return a part for each label, and within a scan one for what has none."""
+    labels = shown.labels
+    voxel_ml = abs(float(np.linalg.det(labels.affine[:3, :3]))) / 1000.0
+    colors = distinct_colors(len(labels.numbers))
+    parts = [
+        ShownPart(
+            key=f"{shown.number}/{number}", name=labels.name(number), kind="label", object=shown.number,
+            number=number, ml=voxels * voxel_ml, count=voxels, color=as_point(color),
+        )
+        for (number, voxels), color in zip(labels.counts.items(), colors, strict=True)
+    ]  # fmt: skip
+    if shown.within is not None:
+        parts.append(ShownPart(key=f"{shown.number}/0", name="without a label", kind="rest", object=shown.number))
+    return parts
+
+
+def find_iso_range(scans: Sequence[ShownScan]) -> tuple[float, float]:
+    """Return the ends of the slider: values that some scan has."""
+    ranges = [each.volume.hu_range for each in scans]
+    known = [each for each in ranges if each is not None]
+    if not known:
+        return ISO_ENDS
+    low, high = min(each[0] for each in known), max(each[1] for each in known)
+    first, last = max(low, ISO_ENDS[0]), min(high, ISO_ENDS[1])
+    return (float(math.ceil(first)), float(math.floor(last))) if math.ceil(first) < math.floor(last) else (low, high)

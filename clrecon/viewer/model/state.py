@@ -1,19 +1,159 @@
-"""`ViewState`: everything that a view shows, frozen: what a painter draws, and what undo goes back to."""
+"""`ViewState`: everything that a view shows, frozen: what a painter draws, and what undo goes back to; picks, measures,
+clip planes."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from clrecon.errors import UsageError
+from clrecon.rendering.pictures.annotations import orientation_letters
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
-from clrecon.viewer.model.tools import ClipPlane, Measure, Pick
+from clrecon.rendering.views.directions import DIRECTIONS, checked_vector
+from clrecon.system.text import unknown_name
 
 Color = tuple[float, float, float]
 Point = tuple[float, float, float]
 Box = tuple[Point, Point]
+
+POINTS_OF = {"distance": 2, "angle": 3, "curve": None, "seed": 1}
+"""Tools, and the points that make a measure of each; a curve has as many as it gets."""
+
+TOOLS = tuple(POINTS_OF)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pick:
+    """A place that was pointed at.
+
+    point: (x, y, z). LPS mm.
+    object: Number of the object that is seen there; None in a slice.
+    part: Key of its part.
+    hu: HU of the scan there, trilinear.
+    """
+
+    point: Point
+    object: int | None = None
+    part: str | None = None
+    hu: float | None = None
+
+    def describe(self) -> dict[str, Any]:
+        """Return it for JSON."""
+        return {
+            "point": [round(value, 3) for value in self.point],
+            "object": self.object,
+            "part": self.part,
+            "hu": None if self.hu is None else round(self.hu, 1),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measure:
+    """What was measured.
+
+    kind: "distance", "angle", "curve" (its length) or "seed".
+    points: tuple of (x, y, z). LPS mm.
+    value: None for a seed.
+    unit: "mm", "degrees" or "".
+    text: As it is written beside the picture.
+    """
+
+    kind: str
+    points: tuple[Point, ...]
+    value: float | None
+    unit: str
+    text: str
+
+    def describe(self) -> dict[str, Any]:
+        """Return it for JSON."""
+        points = [[round(value, 3) for value in point] for point in self.points]
+        return {"kind": self.kind, "points": points, "value": self.value, "unit": self.unit, "text": self.text}
+
+
+def measure_points(kind: str, points: Sequence[Point]) -> Measure:
+    """Measure points.
+
+    kind: One of `TOOLS`.
+    points: sequence of (x, y, z). LPS mm; the angle is that at the second of three.
+    """
+    places = np.array(points, dtype=np.float64).reshape(-1, 3)
+    if kind == "seed":
+        (point,) = points
+        return Measure(kind=kind, points=(point,), value=None, unit="", text=", ".join(f"{x:.1f}" for x in point))
+    if kind == "angle":
+        if len(places) != 3:
+            raise UsageError(f"an angle is made of 3 points, not of {len(places)}")
+        sides = places[[0, 2]] - places[1]
+        lengths = np.linalg.norm(sides, axis=1)
+        if lengths.min() < 1e-6:
+            raise UsageError("two points of the angle lie in one place: pick them anew")
+        cosine = float(sides[0] @ sides[1] / (lengths[0] * lengths[1]))
+        value = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
+        return Measure(kind=kind, points=tuple(points), value=round(value, 3), unit="degrees", text=f"{value:.1f}°")
+    if len(places) < 2:
+        raise UsageError(
+            f"a {kind} is made of at least 2 points, there {'is' if len(places) == 1 else 'are'} {len(places)}"
+        )
+    value = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+    return Measure(kind=kind, points=tuple(points), value=round(value, 4), unit="mm", text=f"{value:.1f} mm")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipPlane:
+    """A plane that cuts everything, along a direction in the patient.
+
+    direction: (x, y, z). Unit vector in LPS towards the side that is taken away.
+    name: Of the direction.
+    low, high: Of what is shown along the direction, mm.
+    share: 0 takes all away, 1 nothing.
+    flipped: The other side is taken away, with 0 nothing and with 1 all.
+    """
+
+    direction: Point
+    name: str
+    low: float
+    high: float
+    share: float = 1.0
+    flipped: bool = False
+
+    @property
+    def row(self) -> tuple[float, float, float, float]:
+        """Normal and offset as of `clrecon.Clip`: ``normal . p >= offset`` is kept."""
+        height = self.low + self.share * (self.high - self.low)
+        sign = 1.0 if self.flipped else -1.0
+        x, y, z = (sign * value for value in self.direction)
+        return x, y, z, sign * height
+
+    def describe(self) -> dict[str, Any]:
+        """Return it for JSON."""
+        at = self.low + self.share * (self.high - self.low)
+        return {
+            "name": self.name,
+            "words": f"{self.name if self.name.isalpha() else orientation_letters(np.array(self.direction))} side",
+            "direction": [round(value, 5) for value in self.direction],
+            "share": round(self.share, 5),
+            "at_mm": round(at, 2),
+            "flipped": self.flipped,
+        }
+
+
+def clip_direction(direction: str | Sequence[float]) -> tuple[Point, str]:
+    """Return the unit vector of a side of the patient or of a vector in LPS, and its name."""
+    if isinstance(direction, str):
+        if direction not in DIRECTIONS:
+            raise UsageError(unknown_name("side of the patient", direction, DIRECTIONS))
+        return DIRECTIONS[direction], direction
+    vector = np.array(checked_vector("the direction of a clip plane", direction))
+    length = float(np.linalg.norm(vector))
+    if length < 1e-9:
+        raise UsageError("the direction of a clip plane has a length above 0")
+    x, y, z = (vector / length).tolist()
+    return (x, y, z), f"{x:.2f}, {y:.2f}, {z:.2f}"
 
 
 def as_point(vector: Any) -> Point:

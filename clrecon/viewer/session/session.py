@@ -22,7 +22,7 @@ from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.drawing.saving import check_target, save_shown
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import ShownMesh, ShownObject
-from clrecon.viewer.model.tools import Pick
+from clrecon.viewer.model.state import Pick
 from clrecon.viewer.session.commands import check_command
 from clrecon.viewer.session.picture_facts import picture_key, seen_pieces
 from clrecon.viewer.session.worker import CLOSE_S, Job, Worker

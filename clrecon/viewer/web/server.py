@@ -1,27 +1,175 @@
-"""The server of a view: one page, one WebSocket a browser, and downloads, on 127.0.0.1 behind a secret."""
+"""The server of a view: one page, one WebSocket a browser, and downloads, on 127.0.0.1 behind a secret.
+
+It listens on the loopback address alone, where every user and every program of the machine can reach it, and so can the
+pages that a browser has open.  Three checks, each of which a request has to pass:
+
+- *Host* is a loopback name.  A page whose own name was turned to 127.0.0.1 (DNS rebinding) sends that name.  The port
+  is not compared: behind a tunnel it is another one.
+- *Origin*, which browsers send with what a page asks for, is the server itself.
+- The *secret* of 256 random bits is in the address.  There is no cookie: a browser would send it to every other port of
+  the machine as well, where servers of other users may listen.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
+import hmac
 import logging
+import os
+import re
+import secrets
 import signal
+import socket
 import sys
 import tempfile
+import threading
+import webbrowser
 from collections.abc import Awaitable, Callable, Iterator, Sequence
+from functools import cache
+from html import escape
+from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from clrecon.errors import ClreconError
+from clrecon.errors import ClreconError, UsageError
+from clrecon.exchange.page import hash_code, read_page_code
+from clrecon.jobs.view.inputs import ViewSettings, check_view_settings
+from clrecon.system.arguments import name_parameter
 from clrecon.system.log import get_logger
-from clrecon.viewer.web.admission import LOOPBACK, make_secret, refuse_request
-from clrecon.viewer.web.connection import Connection, Session, ignore_line
-from clrecon.viewer.web.downloads import Download
-from clrecon.viewer.web.listening import bind_port
-from clrecon.viewer.web.page import compose_page
+from clrecon.system.progress import Progress
+from clrecon.viewer.drawing.saving import check_names
+from clrecon.viewer.session.opening import OpenedView, open_view
+from clrecon.viewer.web.connection import Connection, Download, Session, ignore_line
 
 if TYPE_CHECKING:
     from aiohttp import web
+
+
+LOOPBACK = "127.0.0.1"
+
+_OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
+
+
+def make_secret() -> str:
+    """Return 256 random bits as text for an address."""
+    return secrets.token_urlsafe(32)
+
+
+def refuse_request(
+    host: str | None, origin: str | None, given: str | None, secret: str, *, by_page: bool = False
+) -> str | None:
+    """Return why a request is refused, or None for one that is let in.
+
+    host, origin: The header fields of these names.
+    given: The secret of its address.
+    secret: The right one.
+    by_page: True for what only scripts of pages ask for: a request without an Origin is refused too.
+
+    Returns: One line that holds nothing of the request.
+    """
+    if host is None or not _OWN_HOST.fullmatch(host):
+        return "refused: this server answers to 127.0.0.1 and localhost alone"
+    if (origin is not None or by_page) and origin != f"http://{host}":
+        return "refused: the request comes from a page of another server"
+    if not hmac.compare_digest((given or "").encode("utf-8", "replace"), secret.encode()):
+        return "refused: the secret is missing or wrong, open the whole address that clrecon printed"
+    return None
+
+
+class Page(NamedTuple):
+    """The document and its Content-Security-Policy, which goes into the header of the answer."""
+
+    content: bytes
+    policy: str
+
+
+def compose_page(host: str) -> Page:
+    """Return the page for a server under the name `host`, as the browser calls it, with its port.
+
+    The page may run its own script and style, whose hashes the policy names, show pictures that it received, and talk
+    to this server.  Nothing else.
+    """
+    content, script, style = _compose()
+    policy = (
+        f"default-src 'none'; script-src '{script}'; style-src '{style}'; img-src blob: data:; connect-src 'self'"
+        f" ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
+    return Page(content, policy)
+
+
+@cache
+def _compose() -> tuple[bytes, str, str]:
+    """Return the document and the hashes of its script and style."""
+    script = "\n".join((read_page_code("page_shared.js"), _code("page.js")))
+    style = "\n".join((read_page_code("page.css"), _code("page.css")))
+    filled = {"STYLE": style, "SCRIPT": script}
+    document = re.sub("@([A-Z]+)@", lambda place: filled[place[1]], _code("page.html") + "\n")
+    return document.encode(), hash_code(script), hash_code(style)
+
+
+def _code(name: str) -> str:
+    return (files(__package__) / name).read_text(encoding="utf-8").strip()
+
+
+LARGEST_PORT = 65535
+_WAITING = 64
+
+
+def bind_port(port: int | None = None) -> socket.socket:
+    """Return a socket that listens on a port of 127.0.0.1; it is closed by the caller.
+
+    port: Default: a free one.
+    """
+    if port is not None and (isinstance(port, bool) or not 1 <= port <= LARGEST_PORT):
+        raise UsageError(f"a port is a whole number from 1 to {LARGEST_PORT}, not {port!r}")
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        if sys.platform == "win32":  # there the other option would let two programs share a port
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
+        else:  # a server that has just ended does not block its port for a minute
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((LOOPBACK, port or 0))
+        listener.listen(_WAITING)
+    except OSError as error:
+        listener.close()
+        other = f"name another with {name_parameter('port', 'N')}, or leave it out for a free one"
+        if error.errno == errno.EADDRINUSE:
+            raise UsageError(f"port {port} of {LOOPBACK} is taken by another program: {other}") from error
+        if error.errno == errno.EACCES:
+            raise UsageError(f"port {port} is reserved by the system: {other}") from error
+        raise UsageError(f"port {port or 'any'} of {LOOPBACK} cannot be used ({error.strerror}): {other}") from error
+    return listener
+
+
+def has_screen() -> bool:
+    """False where a browser would have to open in the terminal, or nowhere."""
+    if sys.platform in ("win32", "darwin"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def open_browser(address: str, folder: Path) -> None:
+    """Open an address in the user's browser, without waiting for it.
+
+    The browser gets the name of a file in `folder` that leads to the address: other users of the machine can see the
+    words with which a program was started, and the address holds the secret.
+    """
+    with tempfile.NamedTemporaryFile(
+        "w", encoding="utf-8", suffix=".html", dir=folder, delete=False
+    ) as file:  # only its owner can read it
+        shown = escape(address)
+        file.write(
+            f'<!DOCTYPE html><meta http-equiv="refresh" content="0; url={shown}"><a href="{shown}">clrecon</a>\n'
+        )
+
+    def start() -> None:
+        with contextlib.suppress(Exception):  # the address was printed
+            webbrowser.open(Path(file.name).as_uri())
+
+    threading.Thread(target=start, name="clrecon-open-browser", daemon=True).start()
+
 
 log = get_logger(__name__)
 
@@ -241,3 +389,49 @@ def _ended_by_signals() -> Iterator[asyncio.Event]:
             with contextlib.suppress(ValueError, RuntimeError):
                 loop.remove_signal_handler(number)
                 signal.signal(number, handler)
+
+
+def serve_view(
+    inputs: Sequence[str | Path],
+    settings: ViewSettings | None = None,
+    *,
+    port: int | None = None,
+    opens: bool = True,
+    save_as: Sequence[str] = (),
+    wrote: Callable[[str], object] = ignore_line,
+    progress: Progress | None = None,
+    ready: Callable[[WebServer, OpenedView, list[str]], object] = lambda server, view, warnings: None,
+) -> None:
+    """Show inputs in browsers, until SIGINT (Ctrl-C), SIGTERM or SIGHUP.
+
+    The server listens on 127.0.0.1 alone and lets in what knows its secret.
+
+    inputs: See `clrecon.jobs.view.inputs.open_inputs`.
+    port: Default: a free one.
+    opens: Open the user's browser.
+    save_as: Files that a save writes into the current folder, in place of a download; numbered where they exist.
+    wrote: Called with a line for each of these.
+    progress: Of the reading.
+    ready: Called with the server, what was read and warnings, once the address can be opened.
+    """
+    settings = settings or ViewSettings()
+    check_view_settings(settings)
+    check_names(save_as)
+    with (
+        WebServer(port, save_as=save_as, wrote=wrote) as server,
+        open_view(inputs, settings, progress=progress) as view,
+        view.session() as first,  # nobody looks through it: it builds kernels while the address is being opened
+    ):
+
+        def begin(folder: Path) -> None:
+            first.prepare()
+            warnings = list(view.said)
+            if opens and has_screen():
+                open_browser(server.address, folder)
+            elif opens:
+                warnings.append(
+                    "no browser was opened: there is no screen; open the address on a computer that has one"
+                )
+            ready(server, view, warnings)
+
+        server.serve(view.session, begin)

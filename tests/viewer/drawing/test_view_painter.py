@@ -14,7 +14,7 @@ from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import show_objects
-from clrecon.viewer.model.tools import Pick
+from clrecon.viewer.model.state import Pick
 
 pytestmark = pytest.mark.opencl
 
@@ -278,7 +278,7 @@ def test_kernels_are_built_for_every_kind_of_voxels(device):
 
 @pytest.mark.unit
 def test_a_coarse_mesh_is_near_the_fine_one():
-    from clrecon.viewer.drawing.coarse import coarsen_mesh
+    from clrecon.viewer.drawing.shown_meshes import coarsen_mesh
 
     fine = scenes.make_mesh(radius=20.0)
     coarse = coarsen_mesh(fine, 500)

@@ -7,7 +7,7 @@ import pytest
 
 from clrecon.errors import UsageError
 from clrecon.rendering.views.camera import Camera
-from clrecon.viewer.model.gestures import pan_camera, pixel_camera, roll_camera, turn_camera, zoom_camera
+from clrecon.viewer.model.changes import pan_camera, pixel_camera, roll_camera, turn_camera, zoom_camera
 
 PARALLEL = Camera((10.0, -300.0, 40.0), (10.0, 20.0, 40.0), (0.0, 0.0, 1.0), parallel_scale=80.0)
 PERSPECTIVE = Camera((10.0, -300.0, 40.0), (10.0, 20.0, 40.0), (0.0, 0.0, 1.0), view_angle=30.0)

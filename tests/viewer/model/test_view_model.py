@@ -13,8 +13,7 @@ from clrecon.labels.resample import ResampledLabels
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import ShownLabels, ShownMesh, ShownScan, show_objects
 from clrecon.viewer.model.parts import FoundParts
-from clrecon.viewer.model.state import ShownPart
-from clrecon.viewer.model.tools import Pick
+from clrecon.viewer.model.state import Pick, ShownPart
 
 pytestmark = pytest.mark.unit
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from clrecon.viewer.web.admission import make_secret, refuse_request
+from clrecon.viewer.web.server import make_secret, refuse_request
 
 pytestmark = pytest.mark.unit
 

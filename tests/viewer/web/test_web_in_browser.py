@@ -18,7 +18,7 @@ from web_views import PATIENCE, serving
 
 from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.model.objects import show_objects
-from clrecon.viewer.session.keys import KEYS
+from clrecon.viewer.session.commands import KEYS
 from clrecon.viewer.session.session import ViewSession
 
 pytestmark = [pytest.mark.slow, pytest.mark.opencl]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from clrecon.viewer.session.picture_facts import SCENE
-from clrecon.viewer.web.pacing import Asked, Pace
+from clrecon.viewer.web.pictures import Asked, Pace
 
 pytestmark = pytest.mark.unit
 

@@ -7,9 +7,8 @@ from importlib.resources import files
 
 import pytest
 
-from clrecon.viewer.session.commands import COMMANDS, check_command
-from clrecon.viewer.session.keys import KEYS, page_words
-from clrecon.viewer.web.page import compose_page
+from clrecon.viewer.session.commands import COMMANDS, KEYS, check_command, page_words
+from clrecon.viewer.web.server import compose_page
 
 pytestmark = pytest.mark.unit
 

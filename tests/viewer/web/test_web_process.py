@@ -20,7 +20,7 @@ from web_views import browsing
 
 from clrecon.cli.main import main
 from clrecon.reading.grids.write_volume import write_volume
-from clrecon.viewer.web.listening import bind_port
+from clrecon.viewer.web.server import bind_port
 
 SECONDS_TO_END = 10.0
 """Of patience; it takes milliseconds where nothing else runs."""

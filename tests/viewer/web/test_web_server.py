@@ -19,8 +19,7 @@ from web_views import PATIENCE, Views, browsing, serving
 
 from clrecon.errors import UsageError
 from clrecon.viewer.web import connection, server
-from clrecon.viewer.web.listening import bind_port
-from clrecon.viewer.web.server import WebServer
+from clrecon.viewer.web.server import WebServer, bind_port
 
 pytestmark = pytest.mark.unit
 

@@ -1,13 +1,22 @@
-"""Which picture a browser gets next: small ones while something moves, sharp ones at rest, the views by turns.
+"""The pictures of one browser: which comes next, and each as one message.
 
-No clock, no thread, no socket: the connection tells what happened and asks what to draw.
+Small ones come while something moves, sharp ones at rest, the views by turns.  A message is a line of facts as JSON,
+behind its length (4 bytes, lowest first), and a JPEG.  JPEG has no opacity: the picture lies over the page's ground.
 """
 
 from __future__ import annotations
 
+import io
+import json
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.rendering import Rendering
+from clrecon.rendering.pictures.pillow import load_pillow
+from clrecon.rendering.views.camera import Camera
 from clrecon.viewer.session.picture_facts import VIEWS
 
 
@@ -79,3 +88,55 @@ class Pace:
         if self.moving:
             self._coarse[view] = None
         return Asked(view, self._sizes[view], self.moving)
+
+
+MOVING_QUALITY, SHARP_QUALITY = 70, 92
+"""Of JPEG.  Above 90 the colours are not halved: edges of labels stay where they are."""
+
+
+def encode_picture(picture: Rendering, ground: tuple[int, int, int], sharp: bool, facts: dict[str, Any]) -> bytes:
+    """Return the message of a picture.
+
+    ground: Red, green and blue of the page's ground, 0 to 255.
+    sharp: At rest: in high quality.
+    facts: What else the page is to know of it; size and camera are added.
+    """
+    load_pillow()
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(_lay_over(picture.image, ground)).save(
+        stream,
+        "JPEG",
+        quality=SHARP_QUALITY if sharp else MOVING_QUALITY,
+        subsampling=0 if sharp else 2,
+    )
+    width, height = picture.size
+    told = {**facts, "sharp": sharp, "size": [width, height], "camera": describe_camera(picture.camera)}
+    head = json.dumps(told, separators=(",", ":"), allow_nan=False).encode()
+    return len(head).to_bytes(4, "little") + head + stream.getvalue()
+
+
+def describe_camera(camera: Camera | None) -> dict[str, Any] | None:
+    """Return what a page needs to draw points of the patient over a picture; None for a picture without a camera.
+
+    ``half_height`` is that of the picture in mm, of a perspective one in mm per mm of distance along the view.
+    """
+    if camera is None:
+        return None
+    right, up, forward = (vector.tolist() for vector in camera.basis())
+    return {
+        "position": list(camera.position),
+        "right": right,
+        "up": up,
+        "forward": forward,
+        "half_height": camera.half_height(),
+        "parallel": camera.is_parallel,
+    }
+
+
+def _lay_over(image: NDArray[np.uint8], ground: tuple[int, int, int]) -> NDArray[np.uint8]:
+    """Return (h, w, 3) of an image with opacity over a colour, in whole numbers: this runs for each moving picture."""
+    opacity = image[..., 3:].astype(np.uint16)
+    behind = np.array(ground, dtype=np.uint16) * (255 - opacity)
+    return ((image[..., :3] * opacity + behind + 127) // 255).astype(np.uint8)
