@@ -43,9 +43,14 @@ def environment_of(tmp_path, **variables):
     ("variables", "fault"),
     [
         ({"HOME": "/proc/nowhere"}, "~/.cache cannot be written"),
-        ({"HOME": "/dev/null", "XDG_CACHE_HOME": "relative"}, "XDG_CACHE_HOME is no absolute path"),
-        ({"POCL_CACHE_DIR": "/proc/nowhere"}, "POCL_CACHE_DIR cannot be written"),
-        ({"POCL_CACHE_DIR": ""}, "POCL_CACHE_DIR is set to nothing"),
+        *(
+            pytest.param(variables, fault, marks=pytest.mark.first_device)  # what is wrong is found without a device
+            for variables, fault in (
+                ({"HOME": "/dev/null", "XDG_CACHE_HOME": "relative"}, "XDG_CACHE_HOME is no absolute path"),
+                ({"POCL_CACHE_DIR": "/proc/nowhere"}, "POCL_CACHE_DIR cannot be written"),
+                ({"POCL_CACHE_DIR": ""}, "POCL_CACHE_DIR is set to nothing"),
+            )
+        ),
     ],
 )
 def test_row_59_no_place_for_built_kernels(device, variables, fault, tmp_path):
