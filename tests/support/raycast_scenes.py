@@ -211,13 +211,15 @@ class DeviceCaster:
         return Shot(found.image, found.depth, found.expected_depth, values)
 
 
-def casters() -> list[Any]:
-    """Parameters for a test: the twin, and the device that truths are asked of."""
+def casters(*twin_marks: pytest.MarkDecorator) -> list[Any]:
+    """Parameters for a test: the twin, with these marks, and the device that truths are asked of.
+
+    Where the two are compared as well, a truth of the device is one of the twin, which may wait for a release.
+    """
     devices, reason = conftest.Devices.get()
     if not devices and conftest.is_set("CLRECON_REQUIRE_DEVICE"):
         raise pytest.UsageError(f"CLRECON_REQUIRE_DEVICE is set: {reason}")
     on_devices = [
         pytest.param(DeviceCaster(device), id=conftest.device_id(device)) for device in conftest.first_of(devices)
     ]
-    # What the kernel and its twin both show is true of the twin where the two are compared: of itself at a release.
-    return [pytest.param(TwinCaster(), id="twin", marks=pytest.mark.release), *on_devices]
+    return [pytest.param(TwinCaster(), id="twin", marks=twin_marks), *on_devices]

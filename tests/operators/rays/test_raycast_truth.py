@@ -32,7 +32,7 @@ BONE = TransferFunction([(-1000, 1, 1, 1, 0), (300, 1, 1, 1, 0), (300, 1, 1, 1, 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "cast" in metafunc.fixturenames:
-        metafunc.parametrize("cast", casters())
+        metafunc.parametrize("cast", casters(pytest.mark.release))
 
 
 @pytest.mark.parametrize("ray_step", [0.1, 0.37, 0.5, 1.0, 2.3])

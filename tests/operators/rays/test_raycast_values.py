@@ -28,7 +28,7 @@ from clrecon.rendering.views.clip import Clip
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "cast" in metafunc.fixturenames:
-        metafunc.parametrize("cast", casters())
+        metafunc.parametrize("cast", casters(pytest.mark.release))
 
 
 @pytest.mark.parametrize("perspective", [False, True])
