@@ -65,7 +65,8 @@ def _box_of(name: str, given: Sequence[float | None]) -> Box:
     if name == "around":
         x, y, z, radius = values
         if not all(map(math.isfinite, values)) or radius <= 0.0:
-            raise UsageError(f"{named} takes a point and a length above 0 in mm, not {_write_numbers(values)}")
+            shown = ",".join(f"{value:g}" for value in values)
+            raise UsageError(f"{named} takes a point and a length above 0 in mm, not {shown}")
         return (x - radius, y - radius, z - radius), (x + radius, y + radius, z + radius)
     sides = values if name == "clip_box" else [-everywhere, everywhere, -everywhere, everywhere, *values]
     low_corner, high_corner = tuple(sides[0::2]), tuple(sides[1::2])
@@ -75,7 +76,3 @@ def _box_of(name: str, given: Sequence[float | None]) -> Box:
                 f"{named} runs from {low:g} to {high:g} mm along {axis}: it holds nothing; give the lower end first"
             )
     return low_corner, high_corner
-
-
-def _write_numbers(values: Sequence[float]) -> str:
-    return ",".join(f"{value:g}" for value in values)

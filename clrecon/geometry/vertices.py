@@ -47,7 +47,7 @@ def check_vertex_rule(vertex_rule: str, topology: str = "separated") -> None:
         )
 
 
-def describe_rule(vertex_rule: str) -> list[str]:
+def warnings_of_rule(vertex_rule: str) -> list[str]:
     """Return the warning for a rule that does not follow the HU, none for the others."""
     if vertex_rule != "golden":
         return []
@@ -141,7 +141,7 @@ def largest_coordinate(volume: Volume, origin: Float64Array | None = None, borde
     return float(np.abs(corners if origin is None else corners - origin).max())
 
 
-def describe_far(volume: Volume) -> list[str]:
+def warnings_of_far(volume: Volume) -> list[str]:
     """Return the warning that goes with `find_vertex_origin`; no warning for a volume that is near."""
     largest = largest_coordinate(volume)
     if largest < FAR_MM:

@@ -33,11 +33,6 @@ FindCrossings = Callable[..., NDArray[np.int64]]
 """Finds pairs of triangles that cut each other, from the same arguments as `find_self_intersections`."""
 
 
-def count_self_intersections(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> int:
-    """Count the pairs of triangles that cut each other, see `find_self_intersections`."""
-    return len(find_self_intersections(vertices, triangles))
-
-
 def find_self_intersections(
     vertices: NDArray[np.floating],
     triangles: NDArray[np.uint32],

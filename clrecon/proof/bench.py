@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.jobs.outputs import check_kept
-from clrecon.jobs.presets import DEFAULT_PRESET, find_preset
+from clrecon.jobs.presets import DEFAULT_PRESET, find_iso_preset
 from clrecon.jobs.run import Laps, platform_name, stage_report
 from clrecon.proof.timing import alternate, free_cores, processor_name, spread, summarise, usable_cores
 from clrecon.system.paths import keep_existing
@@ -188,7 +188,7 @@ def _get_volume(source: str | Path | None, series: str | None, progress: Progres
     if source is not None:
         from clrecon.reading import read_volume
 
-        return read_volume(source, series, progress=progress), find_preset(DEFAULT_PRESET).iso_value
+        return read_volume(source, series, progress=progress), find_iso_preset(DEFAULT_PRESET).iso_value
     from clrecon.geometry import Volume
     from clrecon.proof.phantom import PhantomSettings, make_phantom
 

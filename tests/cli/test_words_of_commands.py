@@ -9,7 +9,7 @@ import pytest
 from clrecon.cli.main import COMMANDS, main
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.presets import find_preset as find_level
+from clrecon.jobs.presets import find_iso_preset as find_level
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.rendering.looks.presets import find_preset as find_look
 from clrecon.system.text import count_of, guess_word

@@ -8,12 +8,12 @@ import pytest
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume, frame_from_lps
 from clrecon.geometry.vertices import (
-    describe_far,
     find_vertex_origin,
     float32_step,
     is_far,
     largest_coordinate,
     power_of_two_over,
+    warnings_of_far,
 )
 
 
@@ -31,7 +31,7 @@ def test_far_begins_at_4096_mm(x, far):
     words = [
         "the volume reaches 4096 mm from the origin, where float32 comes in steps of 0.00049 mm: vertices are float64"
     ]
-    assert describe_far(volume) == words * far
+    assert warnings_of_far(volume) == words * far
     origin = find_vertex_origin(volume)
     assert (None if origin is None else origin.tolist()) == ([x + 1.0, 1.0, 1.0] if far else None)
 

@@ -10,7 +10,6 @@ import sample_meshes as samples
 
 from clrecon.mesh import Mesh, intersections
 from clrecon.mesh.intersections import (
-    count_self_intersections,
     find_beside,
     find_changed_intersections,
     find_self_intersections,
@@ -21,7 +20,7 @@ pytestmark = pytest.mark.unit
 
 def count(arrays: samples.Arrays) -> int:
     mesh = Mesh(*arrays)
-    return count_self_intersections(mesh.vertices, mesh.triangles)
+    return len(find_self_intersections(mesh.vertices, mesh.triangles))
 
 
 def count_by_solving(vertices: np.ndarray, triangles: np.ndarray) -> int:
@@ -197,7 +196,7 @@ def test_pairs_that_touch_fold_and_overlap_are_counted_exactly(kind, seed):
     elif kind == "float64":
         places = 1e3 * places + 1.0 / 3.0
     triangles = np.array([random.choice(len(places), 3, replace=False) for _ in range(30)], np.uint32)
-    found = count_self_intersections(places, triangles)
+    found = len(find_self_intersections(places, triangles))
     assert found == count_exactly(places, triangles) > 50
 
 

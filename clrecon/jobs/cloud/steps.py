@@ -15,7 +15,7 @@ import numpy as np
 
 from clrecon.errors import ClreconError, DeviceError, RefusedInputError
 from clrecon.jobs.cloud.settings import CloudSettings
-from clrecon.jobs.presets import DEFAULT_PRESET, find_preset
+from clrecon.jobs.presets import DEFAULT_PRESET, find_iso_preset
 from clrecon.points.cloud import count_numbers
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
@@ -80,7 +80,7 @@ def _extract_cloud(
 def iso_value_of(settings: CloudSettings) -> float:
     """Return the iso value that was given, or that of the default preset of meshes."""
     if settings.hu is None or settings.is_band:
-        return find_preset(DEFAULT_PRESET).iso_value
+        return find_iso_preset(DEFAULT_PRESET).iso_value
     assert not isinstance(settings.hu, (tuple, list))
     return float(settings.hu)  # type: ignore[arg-type]
 

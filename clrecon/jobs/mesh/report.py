@@ -11,7 +11,7 @@ from clrecon.geometry.certificate import without_ids
 from clrecon.jobs.mesh.labels import describe_label
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, describe_level
-from clrecon.jobs.presets import find_preset
+from clrecon.jobs.presets import find_iso_preset
 from clrecon.jobs.run import RunReport, peak_memory_bytes, platform_name
 from clrecon.version import package_version
 
@@ -208,7 +208,7 @@ def describe_job(
             "format": meshes[0]["output"]["format"],
             "bytes": sum(mesh["output"]["bytes"] for mesh in meshes),
         },
-        preset_reason=None if preset is None else find_preset(preset).source,
+        preset_reason=None if preset is None else find_iso_preset(preset).source,
         gates=gates,
         seconds=seconds,
         peak_memory_bytes=peak_memory_bytes(),

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.jobs.options import InputSettings
-from clrecon.jobs.presets import DEFAULT_PRESET, HIGHEST_BONE_HU, LOWEST_BONE_HU, find_preset, find_purpose
+from clrecon.jobs.presets import DEFAULT_PRESET, HIGHEST_BONE_HU, LOWEST_BONE_HU, find_iso_preset, find_purpose
 from clrecon.system.arguments import name_parameter
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ class MeshSettings(InputSettings):
             find_purpose(self.purpose)
         self._check_half_way()
         if self.preset is not None:
-            find_preset(self.preset)
+            find_iso_preset(self.preset)
         self._check_levels()
         self._check_keep()
         self._check_all_parts()
@@ -277,7 +277,7 @@ class MeshSettings(InputSettings):
 
             return (half_iso_value(*self.half_way).iso_value,)
         if self.iso_value is None:
-            return (find_preset(self.preset or DEFAULT_PRESET).iso_value,)
+            return (find_iso_preset(self.preset or DEFAULT_PRESET).iso_value,)
         if isinstance(self.iso_value, Sequence):
             return tuple(tuple(level) if isinstance(level, Sequence) else level for level in self.iso_value)
         return (self.iso_value,)
@@ -332,7 +332,7 @@ class MeshSettings(InputSettings):
     def preset_used(self) -> str | None:
         """Name of the preset behind `levels`; None if the value was given, is half way, or there is none."""
         named = any(given is not None for given in (self.iso_value, self.below, self.half_way))
-        return None if named or not self.follows_hu else find_preset(self.preset or DEFAULT_PRESET).name
+        return None if named or not self.follows_hu else find_iso_preset(self.preset or DEFAULT_PRESET).name
 
     @property
     def selects(self) -> bool:

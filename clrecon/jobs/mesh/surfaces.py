@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from clrecon.errors import RefusedInputError
 from clrecon.jobs.mesh.settings import MeshSettings, name_level
-from clrecon.jobs.presets import find_preset, find_purpose
+from clrecon.jobs.presets import find_iso_preset, find_purpose
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_hu
@@ -149,7 +149,7 @@ def describe_level(
         return {"iso_value_reason": "none: the masks of the labels", "iso_value_choice": None}, []
     if choice is None:
         preset = settings.preset_used
-        reason = "as given" if preset is None else f"preset {preset}: {find_preset(preset).source}"
+        reason = "as given" if preset is None else f"preset {preset}: {find_iso_preset(preset).source}"
         return {"iso_value_reason": reason, "iso_value_choice": None}, []
     warnings = []
     low, high = volume.hu_range or (math.nan, math.nan)

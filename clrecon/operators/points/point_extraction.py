@@ -14,7 +14,7 @@ from clrecon.anatomy.head import warn_of_face
 from clrecon.errors import DeviceError, DeviceFailedError, DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import data_range
-from clrecon.geometry.vertices import describe_far, find_vertex_origin
+from clrecon.geometry.vertices import find_vertex_origin, warnings_of_far
 from clrecon.opencl import (
     Device,
     Program,
@@ -444,7 +444,7 @@ def _voxels(
             **({"paper": _measure_paper(volume, numbers)} if paper else {}),
             "warnings": [
                 *resident.device.warnings,
-                *describe_far(volume),
+                *warnings_of_far(volume),
                 *warn_of_face(volume, band[:1] if math.isfinite(band[0]) else (), "cloud"),
                 *(() if taken is None else taken.warnings),
                 *run.warnings,

@@ -13,7 +13,7 @@ from clrecon.anatomy.head import warn_of_face
 from clrecon.errors import ClreconError, DeviceError, DeviceMemoryError, NoSurfaceError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, data_range
-from clrecon.geometry.vertices import describe_far, describe_rule
+from clrecon.geometry.vertices import warnings_of_far, warnings_of_rule
 from clrecon.opencl import Device, Program, Stopwatch, result_pages
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import BrickStates, brick_bytes, compare_bricks, measure_bricks
@@ -262,9 +262,9 @@ class Extraction:
             "kernel_seconds": dict(self.stopwatch.by_kernel),
             "warnings": [
                 *self.device.warnings,
-                *describe_far(self.grid.volume),
+                *warnings_of_far(self.grid.volume),
                 *warn_of_face(self.grid.volume, said["inside_hu"], "surface"),
-                *describe_rule(rule.vertex_rule),
+                *warnings_of_rule(rule.vertex_rule),
                 *self.warnings,
             ],
         }

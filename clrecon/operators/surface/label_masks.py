@@ -17,7 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 from clrecon.errors import DeviceMemoryError, RefusedInputError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule
-from clrecon.geometry.vertices import describe_far
+from clrecon.geometry.vertices import warnings_of_far
 from clrecon.labels import LabelMap
 from clrecon.labels.label_bodies import Box, find_boxes, label_ml
 from clrecon.labels.label_levels import (
@@ -332,7 +332,12 @@ class MaskExtraction:
             "device_bytes": self.device_bytes,
             "seconds": dict(self.stopwatch.seconds),
             "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": [*self.device.warnings, *describe_far(self.grid.volume), *self.labels.warnings, *self.warnings],
+            "warnings": [
+                *self.device.warnings,
+                *warnings_of_far(self.grid.volume),
+                *self.labels.warnings,
+                *self.warnings,
+            ],
         }
 
 

@@ -17,7 +17,7 @@ from clrecon.anatomy.head import SKIN_HU, warn_of_skin
 from clrecon.errors import DeviceMemoryError, NoSurfaceError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
-from clrecon.geometry.vertices import describe_far
+from clrecon.geometry.vertices import warnings_of_far
 from clrecon.labels import LabelMap, ResampledLabels
 from clrecon.labels.label_bodies import Box, Growth, count_ml, fill_solid, find_boxes, label_ml, slice_voxel_ml
 from clrecon.mesh import Mesh
@@ -267,7 +267,7 @@ class LabelExtraction:
             "kernel_seconds": dict(self.stopwatch.by_kernel),
             "warnings": [
                 *self.device.warnings,
-                *describe_far(self.volume),
+                *warnings_of_far(self.volume),
                 *_warn_of_uneven_growth(self.volume, self.growth),
                 *self.warnings,
             ],

@@ -111,11 +111,10 @@ def sheet_letters(sheet: Sheet, rows: NDArray[np.bool_]) -> dict[str, str]:
     right = sheet.steps[rows]
     up = np.cross(right, sheet.normals[rows])
     edges = {"left": -right, "right": right, "top": up, "bottom": -up}
-    return {edge: _shared_letters(directions) for edge, directions in edges.items()}
-
-
-def _shared_letters(directions: NDArray[np.float64]) -> str:
-    return os.path.commonprefix([orientation_letters(direction) for direction in directions])
+    return {
+        edge: os.path.commonprefix([orientation_letters(direction) for direction in directions])
+        for edge, directions in edges.items()
+    }
 
 
 def bar_length(width_mm: float) -> float:

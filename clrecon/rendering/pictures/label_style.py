@@ -66,7 +66,7 @@ class LabelStyle(Message):
         for number, color in _by_number(labels, _COLORS, colors).items():
             table[number, :3] = find_color(color)
         for number, factor in _by_number(labels, "opacities", opacity).items():
-            table[number, 3] = _check_opacity(_label_name(labels, number), factor)
+            table[number, 3] = _check_opacity("0" if number == NO_LABEL else labels.name(number), factor)
         table.flags.writeable = False
         return cls(labels, table)
 
@@ -84,14 +84,6 @@ def find_shown(labels: LabelMap, label: int | str) -> int:
     return NO_LABEL if str(label).strip() == "0" else labels.find(label)
 
 
-def _label_name(labels: LabelMap, number: int) -> str:
-    return "0" if number == NO_LABEL else labels.name(number)
-
-
-def _number_and_name(labels: LabelMap, number: int) -> str:
-    return "0" if number == NO_LABEL else f"{number} {labels.name(number)}"
-
-
 def _by_number(labels: LabelMap, what: str, mapping: Mapping | None) -> dict:
     if mapping is None:
         return {}
@@ -103,7 +95,8 @@ def _by_number(labels: LabelMap, what: str, mapping: Mapping | None) -> dict:
         if number == NO_LABEL and what == _COLORS:
             raise UsageError("what has no label (0) keeps the colours of the picture: it gets an opacity alone")
         if number in found:
-            raise UsageError(f"{what} of labels: label {_number_and_name(labels, number)} is named twice")
+            shown = "0" if number == NO_LABEL else f"{number} {labels.name(number)}"
+            raise UsageError(f"{what} of labels: label {shown} is named twice")
         found[number] = value
     return found
 

@@ -8,7 +8,7 @@ import pytest
 
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
-from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS, find_preset
+from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS, find_iso_preset
 
 
 def test_bone_is_the_default() -> None:
@@ -41,7 +41,7 @@ def test_components_are_told_apart_only_where_asked(settings: dict, selects: boo
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
 def test_presets_are_whole_numbers_of_hu_in_the_range_of_ct(name: str) -> None:
-    preset = find_preset(name)
+    preset = find_iso_preset(name)
     assert (preset.name, MeshSettings(preset=name).levels) == (name, (preset.iso_value,))
     assert preset.iso_value == int(preset.iso_value)
     assert -1000 < preset.iso_value < 3071

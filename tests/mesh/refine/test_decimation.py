@@ -14,7 +14,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh, split_components
 from clrecon.mesh.compare.distances import SurfaceDistance
-from clrecon.mesh.intersections import count_self_intersections
+from clrecon.mesh.intersections import find_self_intersections
 from clrecon.mesh.refine.clusters import Clusters, _find_flat
 from clrecon.mesh.refine.collapses import Quadrics
 from clrecon.mesh.refine.decimation import _collapse, _mend, check_refinement, decimate_mesh, smooth_mesh
@@ -128,7 +128,7 @@ def test_torn_topology_is_mended(seed, bound):
     assert (after["zero_area_faces"], after["duplicate_faces"], after["unused_vertices"]) == (0, 0, 0)
     assert after["components"] == before["components"]
     assert 0.0 < small.report["refinement"]["decimate"]["reached"] < 0.6
-    assert count_self_intersections(small.vertices, small.triangles) == 0
+    assert len(find_self_intersections(small.vertices, small.triangles)) == 0
     check_within(small, mesh, 0.125 if bound is None else bound)
 
 

@@ -11,7 +11,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange.coordinates import find_coincident
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SurfaceDistance
-from clrecon.mesh.intersections import count_self_intersections
+from clrecon.mesh.intersections import find_self_intersections
 from clrecon.mesh.refine import decimation
 from clrecon.mesh.refine.decimation import _PASS_BAND, default_deviation, smooth_mesh
 from clrecon.mesh.refine.shifts import move_vertices, shorten_steps
@@ -89,12 +89,12 @@ def test_sheets_that_nearly_touch_do_not_cut_each_other():
         (upper.vertices + np.where(peak, 3.02, 0.02)[:, None] * [0, 0, 1] + [0.31, 0.17, 0], upper.triangles),
     )
     mesh = Mesh(*sheets)
-    assert count_self_intersections(mesh.vertices, mesh.triangles) == 0
+    assert len(find_self_intersections(mesh.vertices, mesh.triangles)) == 0
     origin = mesh.vertices.min(axis=0)
     free = smooth_windowed_sinc((mesh.vertices - origin).astype(np.float32), mesh.triangles, 20, _PASS_BAND)
-    assert count_self_intersections(free, mesh.triangles) > 0
+    assert len(find_self_intersections(free, mesh.triangles)) > 0
     smooth = smooth_mesh(mesh, 20, 1.0)
-    assert count_self_intersections(smooth.vertices, smooth.triangles) == 0
+    assert len(find_self_intersections(smooth.vertices, smooth.triangles)) == 0
     assert 0 < smooth.report["refinement"]["smooth"]["vertices_taken_back"] < 0.2 * mesh.vertex_count
 
 
