@@ -1,4 +1,4 @@
-"""`ViewSession`: what a window or a browser holds: model, painter and worker, and nothing of a toolkit."""
+"""`ViewSession`: what a face of a view holds: model, painter and workers, and nothing of a toolkit."""
 
 from __future__ import annotations
 

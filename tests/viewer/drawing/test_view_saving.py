@@ -11,6 +11,7 @@ from clrecon.errors import UsageError
 from clrecon.mesh.mesh_reader import read_mesh
 from clrecon.points.cloud_reader import read_points
 from clrecon.reading import read_volume
+from clrecon.viewer.drawing.saving import free_name
 
 PATIENCE = 60.0
 
@@ -106,3 +107,20 @@ def test_a_file_that_exists_stays_where_that_is_asked_for(session, tmp_path):
         assert view.wait(PATIENCE)
     assert (tmp_path / "a.stl").read_text() == "mine" and (tmp_path / "b.stl").exists()
     assert "a.stl" in view.facts()["error"] and "exists" in view.facts()["error"]
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("wanted", "second", "third"),
+    [
+        ("bone.stl", "bone-2.stl", "bone-3.stl"),
+        ("ct.nii.gz", "ct-2.nii.gz", "ct-3.nii.gz"),
+        ("a.b.stl", "a.b-2.stl", "a.b-3.stl"),
+    ],
+)
+def test_names_are_counted_until_one_is_free(tmp_path, wanted, second, third):
+    assert free_name(tmp_path / wanted) == tmp_path / wanted
+    (tmp_path / wanted).touch()
+    assert free_name(tmp_path / wanted) == tmp_path / second
+    (tmp_path / second).symlink_to(tmp_path / "nowhere")  # a name that is taken, though nothing is there
+    assert free_name(tmp_path / wanted) == tmp_path / third

@@ -434,7 +434,7 @@ def test_what_is_shown_is_saved_as_a_download(page, folder: Path) -> None:
 
 
 def test_files_that_were_named_are_written_here_and_q_ends_it(browser, device, tmp_path: Path) -> None:
-    from clrecon.mesh.reader import read_mesh
+    from clrecon.mesh.mesh_reader import read_mesh
 
     objects = show_objects([scenes.make_mesh()])
     wrote: list[str] = []

@@ -1,0 +1,70 @@
+"""When a picture is stale, and which pieces of lines nothing hides in it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import view_scenes as scenes
+
+from clrecon.rendering import Rendering
+from clrecon.rendering.views.camera import Camera
+from clrecon.viewer.model.model import ViewModel
+from clrecon.viewer.model.objects import show_objects
+from clrecon.viewer.session.picture_facts import VIEWS, picture_key, seen_pieces
+
+pytestmark = pytest.mark.unit
+
+CAMERA = Camera((0.0, -100.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), parallel_scale=50.0)
+SIZE = (100, 100)
+
+
+def wall(left: int, right: int, mm: float) -> Rendering:
+    """A picture of a wall over some columns, so far from the eye."""
+    depth = np.full(SIZE[::-1], np.nan, np.float32)
+    depth[:, left:right] = mm
+    image = np.zeros((*SIZE[::-1], 4), np.uint8)
+    return Rendering(image, depth, depth, CAMERA, None, "surface", {})
+
+
+def lengths(pieces: list[list[list[float]]]) -> list[float]:
+    return [float(np.linalg.norm(np.subtract(last, first))) for first, last in pieces]
+
+
+def test_a_line_is_hidden_behind_a_wall_and_seen_beside_it():
+    line = np.array([[-40.0, 0.0, 0.0], [40.0, 0.0, 0.0]])  # 100 mm from the eye, 80 columns wide
+    assert lengths(seen_pieces(wall(40, 60, 50.0), [line], expected=False)) == pytest.approx([30.0, 30.0], abs=1.5)
+    assert lengths(seen_pieces(wall(40, 60, 150.0), [line], expected=False)) == pytest.approx([80.0])
+    assert seen_pieces(wall(0, 100, 50.0), [line], expected=False) == []
+
+
+def test_a_line_on_the_surface_and_one_beside_the_picture_are_seen():
+    on, beside = np.array([[-40.0, 0, 0], [40.0, 0, 0]]), np.array([[100.0, 0, 0], [200.0, 0, 0]])
+    assert len(seen_pieces(wall(0, 100, 100.0), [on, beside], expected=True)) == 2
+
+
+def changed_views(**changes: object) -> set[str]:
+    state = ViewModel(show_objects([scenes.make_scan(), scenes.make_mesh()])).snapshot()
+    made = replace(state, **changes)
+    return {view for view in VIEWS if picture_key(state, view) != picture_key(made, view)}
+
+
+@pytest.mark.parametrize(
+    ("changes", "views"),
+    [
+        ({"cross": (1.0, 2.0, 3.0)}, {"axial", "coronal", "sagittal"}),
+        ({"cross": (1.0, 2.0, 3.0), "mode": "slices"}, {"scene", "axial", "coronal", "sagittal"}),  # of the mode alone
+        ({"iso_value": 321.0}, {"scene"}),
+        ({"window": (0.0, 80.0)}, {"axial", "coronal", "sagittal", "curve"}),
+        ({"table": False}, set(VIEWS)),
+        ({"parts_at": 300.0, "tool": "seed", "points": (), "measures": ()}, set()),
+    ],
+)
+def test_a_picture_is_stale_by_what_it_shows(changes, views):
+    assert changed_views(**changes) == views
+
+
+def test_in_mode_slices_the_cross_leaves_the_picture():
+    state = replace(ViewModel(show_objects([scenes.make_scan()])).snapshot(), mode="slices")
+    assert picture_key(state, "scene") == picture_key(replace(state, cross=(1.0, 2.0, 3.0)), "scene")
