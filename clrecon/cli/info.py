@@ -12,7 +12,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 from clrecon.cli.common import pick
@@ -407,13 +407,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.info import describe_input
+    from clrecon.jobs.info import InfoSettings, describe_input
 
-    found = describe_input(
-        options.input,
-        **pick(options, ("series", "phase", "allow_gaps", "force", "follow_links", "rescale", "pixels", "strict")),
-        progress=console.progress,
-    )
+    settings = InfoSettings(**pick(options, {own.name for own in fields(InfoSettings)}))
+    found = describe_input(options.input, settings, progress=console.progress)
     console.result(found.listing)
     if not options.json and not options.quiet:
         lines = render_listing(found.listing, describe_certificate(found.listing["certificate"]), found.refused)

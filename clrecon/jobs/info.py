@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from clrecon.errors import ClreconError, NoDicomError, RefusedInputError
+from clrecon.reading import Selection, list_selected
 from clrecon.system.progress import Progress
+
+
+@dataclass(frozen=True, kw_only=True)
+class InfoSettings(Selection):
+    """What is judged: a series that is named, or the reader's choice; any usable series is enough then.
+
+    series, phase, allow_gaps, force, follow_links, rescale: See `clrecon.reading.Selection`.
+    pixels: Read the pixels of the series that is judged.
+    strict: A failed gate is a problem, and so is a listing without a chosen series.
+    """
+
+    pixels: bool = False
+    strict: bool = False
 
 
 class InputListing(NamedTuple):
@@ -27,52 +42,22 @@ class InputListing(NamedTuple):
 
 
 def describe_input(
-    source: str | Path,
-    series: str | None = None,
-    *,
-    phase: int | None = None,
-    allow_gaps: bool = False,
-    force: bool = False,
-    follow_links: bool = False,
-    rescale: tuple[float, float] | None = None,
-    pixels: bool = False,
-    strict: bool = False,
-    progress: Progress | None = None,
+    source: str | Path, settings: InfoSettings | None = None, *, progress: Progress | None = None
 ) -> InputListing:
-    """List the series of an input and certify one.
-
-    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
-    series: Number, SeriesInstanceUID, its hash or description of the series to judge; None leaves the choice to the
-        reader, and any usable series is enough then.
-    phase, allow_gaps: As in `clrecon.read_volume`, of the series that is judged.
-    force, follow_links, rescale: As in `clrecon.read_volume`.
-    pixels: Read the pixels of the series that is judged.
-    strict: A failed gate is a problem, and so is a listing without a chosen series.
-    """
-    from clrecon.reading import list_series
-
-    found = list_series(
-        source,
-        series,
-        phase=phase,
-        allow_gaps=allow_gaps,
-        force=force,
-        follow_links=follow_links,
-        rescale=rescale,
-        pixels=pixels,
-        progress=progress,
-    )
+    """List the series of an input, a DICOM folder or file or a file of another format, and certify one."""
+    settings = settings or InfoSettings()
+    found = list_selected(source, settings, pixels=settings.pixels, progress=progress)
     entries = [entry.as_dict() for entry in found.series]
     listing: dict[str, Any] = {"series": entries, "chosen": found.chosen, "certificate": found.certificate}
     notes, problem, refused = list(found.warnings), found.refusal, None
     if found.chosen is not None:
         problem = _judge(next(entry for entry in entries if entry["number"] == found.chosen))
         if problem is None:
-            failed = _judge_gates(listing) if strict else None
+            failed = _judge_gates(listing) if settings.strict else None
             return InputListing(listing, notes, failed)
         refused, listing["chosen"] = found.chosen, None
         notes.append(str(problem))
-    if series is None and not strict and any(not entry["problems"] for entry in entries):
+    if settings.series is None and not settings.strict and any(not entry["problems"] for entry in entries):
         return InputListing(listing, notes, None, refused)
     notes.pop()  # the command ends with this problem
     return InputListing(listing, notes, problem, refused)

@@ -9,7 +9,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -141,10 +141,7 @@ def _encode_map(labels: LabelMap, output: str | Path, source: str | Path, settin
         from clrecon.labels.write_segmentation import encode_segmentation
         from clrecon.reading.dicom.reader import list_slices
 
-        of_values = {"rescale"}  # the other fields of a selection say which slices are read
-        names = {field.name for field in fields(Selection)} - of_values
-        chosen = {name: getattr(settings, name) for name in names}
-        return encode_segmentation(labels, list_slices(source, **chosen))
+        return encode_segmentation(labels, list_slices(source, settings))
     from clrecon.labels.label_grids import encode_nifti
 
     return encode_nifti(labels, packed=kind.endswith(".gz"))

@@ -6,12 +6,12 @@ The kind is told from the content of the file; its name is not trusted.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.reading.common.selection import check_rescale
+from clrecon.reading.common.selection import Selection, check_rescale
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.text import escape_text
 
@@ -25,30 +25,34 @@ _NAMES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz", ".nrrd", ".nhdr", ".mha"
 """File extensions of these formats, only for messages."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Selection:
-    """The part of an input that is read.
-
-    series: Series of the input; None leaves the choice to `read_volume`.
-    phase: Number of the phase, if the series has several.
-    allow_gaps: Read a stack with missing slices.
-    force: Read data sets without preamble or meta header.
-    follow_links: Read the files and folders that symbolic links out of the folder lead to.
-    rescale: (slope, intercept). In place of what the files say.
-    """
-
-    series: int | str | None = None
-    phase: int | None = None
-    allow_gaps: bool = False
-    force: bool = False
-    follow_links: bool = False
-    rescale: tuple[float, float] | None = None
-
-
 def read_selected(path: str | os.PathLike[str], selection: Selection, *, progress: Progress | None = None) -> Volume:
     """Read the part of an input that a selection names, see `read_volume`."""
-    chosen = {field.name: getattr(selection, field.name) for field in fields(Selection)}
-    return read_volume(path, **chosen, progress=progress)
+    rescale = check_rescale(selection.rescale)
+    kind = tell_format(path)
+    if kind is None:
+        from clrecon.reading.dicom.reader import read_series
+
+        return read_series(path, selection, progress)
+    _refuse_options(kind, selection)
+    from clrecon.reading.grids import read_grid
+
+    return read_grid(Path(path), kind, rescale=rescale, progress=progress)
+
+
+def list_selected(
+    path: str | os.PathLike[str], selection: Selection, *, pixels: bool = False, progress: Progress | None = None
+) -> SeriesListing:
+    """List an input, with the certificate of the part that a selection names, see `list_series`."""
+    rescale = check_rescale(selection.rescale)
+    kind = tell_format(path)
+    if kind is None:
+        from clrecon.reading.dicom.reader import list_scan
+
+        return list_scan(path, selection, pixels, progress)
+    _refuse_options(kind, selection)
+    from clrecon.reading.grids import list_grid
+
+    return list_grid(Path(path), kind, rescale=rescale, pixels=pixels, progress=progress)
 
 
 @explains_arguments
@@ -110,25 +114,10 @@ def read_volume(
         ``series`` matches no series or several; the ``phase`` does not exist; an option for DICOM is given with another
         format; a package is missing; or ``path`` is empty.
     """
-    given = check_rescale(rescale)
-    kind = tell_format(path)
-    if kind is None:
-        from clrecon.reading.dicom import read_volume as read_dicom
-
-        return read_dicom(
-            path,
-            series,
-            phase=phase,
-            allow_gaps=allow_gaps,
-            force=force,
-            follow_links=follow_links,
-            rescale=given,
-            progress=progress,
-        )
-    _refuse_options(kind, series=series, phase=phase, allow_gaps=allow_gaps, force=force, follow_links=follow_links)
-    from clrecon.reading.grids import read_grid
-
-    return read_grid(Path(path), kind, rescale=given, progress=progress)
+    chosen = Selection(
+        series=series, phase=phase, allow_gaps=allow_gaps, force=force, follow_links=follow_links, rescale=rescale
+    )
+    return read_selected(path, chosen, progress=progress)
 
 
 @explains_arguments
@@ -164,29 +153,15 @@ def list_series(
         There is nothing to list; all DICOM files, or a file of another format, are corrupt; ``series`` or ``phase``
         names nothing or several; a package is missing; or an option for DICOM is given with another format.
     """
-    given = check_rescale(rescale)
-    kind = tell_format(path)
-    if kind is None:
-        from clrecon.reading.dicom import list_series as list_dicom
-
-        return list_dicom(
-            path,
-            series,
-            phase=phase,
-            allow_gaps=allow_gaps,
-            force=force,
-            follow_links=follow_links,
-            rescale=given,
-            pixels=pixels,
-            progress=progress,
-        )
-    _refuse_options(kind, series=series, phase=phase, allow_gaps=allow_gaps, force=force, follow_links=follow_links)
-    from clrecon.reading.grids import list_grid
-
-    return list_grid(Path(path), kind, rescale=given, pixels=pixels, progress=progress)
+    chosen = Selection(
+        series=series, phase=phase, allow_gaps=allow_gaps, force=force, follow_links=follow_links, rescale=rescale
+    )
+    return list_selected(path, chosen, pixels=pixels, progress=progress)
 
 
-def _refuse_options(kind: str, **options: Any) -> None:
+def _refuse_options(kind: str, selection: Selection) -> None:
+    """Refuse what only DICOM has: all but the rescale."""
+    options = {field.name: getattr(selection, field.name) for field in fields(Selection) if field.name != "rescale"}
     given = [name for name, value in options.items() if value is not None and value is not False]
     if given:
         raise UsageError(f"{' and '.join(given)}: only for DICOM, the input is a {kind} file")

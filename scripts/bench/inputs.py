@@ -99,7 +99,7 @@ class BenchInput:
         from clrecon.geometry import Volume
 
         if self.folder is not None:
-            from clrecon.reading.dicom import read_volume
+            from clrecon.reading import read_volume
 
             return read_volume(self.folder)
         print(f"making {self.name} ...", file=sys.stderr)

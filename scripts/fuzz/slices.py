@@ -35,7 +35,7 @@ from pydicom.uid import ExplicitVRLittleEndian
 from trials import Answer, Trial, digest
 
 from clrecon.geometry import Volume
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 
 GEOMETRY = (
     "ImagePositionPatient ImageOrientationPatient PixelSpacing SliceThickness SpacingBetweenSlices SliceLocation"

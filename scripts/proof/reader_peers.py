@@ -45,7 +45,7 @@ class Reading:
 
 
 def read_clrecon(folder: Path, options: dict[str, Any]) -> Reading:
-    from clrecon.reading.dicom import read_volume
+    from clrecon.reading import read_volume
 
     volume = read_volume(folder, **options)
     made = Candidate(volume.voxels.transpose(2, 1, 0), volume.ijk_to_lps)

@@ -10,7 +10,7 @@ from uneven_volume import positions, uneven
 from clrecon import Volume
 from clrecon.errors import UsageError
 from clrecon.geometry.blocks import crop_volume
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 
 pytestmark = pytest.mark.unit
 

@@ -16,7 +16,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import compose_affine, is_left_handed
 from clrecon.geometry.affine import facts_of_orientation
 from clrecon.geometry.blocks import crop_volume
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 
 pytestmark = pytest.mark.unit
 

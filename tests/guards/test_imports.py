@@ -64,7 +64,7 @@ def test_a_heavy_import_would_be_seen(tmp_path: Path) -> None:
 
 
 def test_geometry_dicom_mesh_and_phantom_work_without_pyopencl(tmp_path: Path) -> None:
-    rooms = "clrecon.reading.dicom, clrecon.mesh, clrecon.proof.phantom, clrecon.proof"
+    rooms = "clrecon.reading.dicom.reader, clrecon.mesh, clrecon.proof.phantom, clrecon.proof"
     code = f"import clrecon, {rooms}\nprint(clrecon.Volume)"
     done = run_python(f"{NO_PYOPENCL}\n{code}", tmp_path)
     assert done.returncode == 0, done.stderr

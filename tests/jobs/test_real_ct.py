@@ -15,7 +15,7 @@ from clrecon.geometry import AIR_HU
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.operators.surface.extract import extract_isosurface
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 
 HU = 226
 

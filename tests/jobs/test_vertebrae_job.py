@@ -13,7 +13,7 @@ import pytest
 from clrecon.cli.main import main
 from clrecon.labels import read_labels, resample_labels
 from clrecon.proof.phantom.job import make_phantom
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 
 pytest.importorskip("nibabel")
 

@@ -14,7 +14,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.certificate import amend
 from clrecon.labels import read_labels, resample_labels
 from clrecon.labels.reader import is_large_map, read_all_labels
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 
 pytest.importorskip("highdicom")
 

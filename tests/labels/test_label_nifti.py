@@ -212,7 +212,7 @@ def test_without_nibabel_the_command_is_named(tmp_path, monkeypatch):
 
 def test_real_labels_lie_on_their_ct(real_data):
     from clrecon.labels import resample_labels
-    from clrecon.reading.dicom import read_volume
+    from clrecon.reading import read_volume
 
     folder = real_data / "thoracolumbar_labels"
     labels = read_labels(folder / "ct_2mm_labels.nii.gz")

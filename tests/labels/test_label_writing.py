@@ -11,7 +11,7 @@ from clrecon.errors import RefusedInputError
 from clrecon.labels import LabelMap, read_labels, resample_labels
 from clrecon.labels.label_grids import encode_nifti
 from clrecon.labels.write_segmentation import encode_segmentation
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import Selection, read_volume
 from clrecon.reading.dicom.reader import list_slices
 
 PLANS = {
@@ -62,8 +62,8 @@ def test_another_reader_of_nifti_sees_the_same(scan, tmp_path):
 def test_a_segmentation_lies_on_its_scan(scan, tmp_path):
     volume = read_volume(scan)
     labels = labels_of(volume)
-    content = encode_segmentation(labels, list_slices(scan))
-    assert content == encode_segmentation(labels, list_slices(scan))
+    content = encode_segmentation(labels, list_slices(scan, Selection()))
+    assert content == encode_segmentation(labels, list_slices(scan, Selection()))
     (tmp_path / "a.dcm").write_bytes(content)
     back = read_labels(tmp_path / "a.dcm")
     assert back.names == labels.names
@@ -76,8 +76,11 @@ def test_a_segmentation_lies_on_its_scan(scan, tmp_path):
 
 def test_a_segmentation_references_its_slices_and_names_nobody(scan, tmp_path):
     labels = labels_of(read_volume(scan))
-    (tmp_path / "a.dcm").write_bytes(encode_segmentation(labels, list_slices(scan)))
-    seg, slices = pydicom.dcmread(tmp_path / "a.dcm"), [pydicom.dcmread(path) for path, _, _ in list_slices(scan)]
+    (tmp_path / "a.dcm").write_bytes(encode_segmentation(labels, list_slices(scan, Selection())))
+    seg, slices = (
+        pydicom.dcmread(tmp_path / "a.dcm"),
+        [pydicom.dcmread(path) for path, _, _ in list_slices(scan, Selection())],
+    )
     assert seg.StudyInstanceUID == slices[0].StudyInstanceUID
     assert seg.FrameOfReferenceUID == slices[0].FrameOfReferenceUID
     (series,) = seg.ReferencedSeriesSequence
@@ -98,11 +101,11 @@ def test_a_segmentation_references_its_slices_and_names_nobody(scan, tmp_path):
 def test_highdicom_reads_the_segmentation(scan, tmp_path):
     highdicom = pytest.importorskip("highdicom")
     labels = labels_of(read_volume(scan))
-    (tmp_path / "a.dcm").write_bytes(encode_segmentation(labels, list_slices(scan)))
+    (tmp_path / "a.dcm").write_bytes(encode_segmentation(labels, list_slices(scan, Selection())))
     seg = highdicom.seg.segread(tmp_path / "a.dcm")
     assert list(seg.segment_numbers) == sorted(NAMES)
     assert [seg.get_segment_description(n).segment_label for n in seg.segment_numbers] == list(NAMES.values())
-    uids = [pydicom.dcmread(path).SOPInstanceUID for path, _, _ in list_slices(scan)]
+    uids = [pydicom.dcmread(path).SOPInstanceUID for path, _, _ in list_slices(scan, Selection())]
     pixels = seg.get_pixels_by_source_instance(uids, assert_missing_frames_are_empty=True)
     for place, number in enumerate(sorted(NAMES)):
         assert np.array_equal(pixels[..., place] > 0, labels.voxels == number)
@@ -110,7 +113,7 @@ def test_highdicom_reads_the_segmentation(scan, tmp_path):
 
 def test_what_a_segmentation_cannot_be_made_of_is_refused(scan, tmp_path):
     labels = labels_of(read_volume(scan))
-    slices = list_slices(scan)
+    slices = list_slices(scan, Selection())
     with pytest.raises(RefusedInputError, match="7 slices and the scan 6"):
         encode_segmentation(labels, slices[:-1])
     dataset = pydicom.dcmread(slices[2][0])

@@ -14,7 +14,7 @@ from clrecon.cli.main import main
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.labels import read_labels
 from clrecon.labels.reader import is_large_map, read_all_labels
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 
 pytestmark = pytest.mark.unit
 SHAPE = (4, 6, 7)

@@ -17,7 +17,7 @@ from clrecon.labels.contours import fill_contours, unite_contours
 from clrecon.labels.label_bodies import label_ml, slice_voxel_ml
 from clrecon.labels.reader import read_all_labels
 from clrecon.labels.resample import resample_labels
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 
 pytestmark = pytest.mark.unit
 

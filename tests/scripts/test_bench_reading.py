@@ -11,7 +11,7 @@ import pytest
 from bench_harness import FOLDER
 from dicom_series import Plan, write_series
 
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 
 import inputs  # isort: skip
 import reading  # isort: skip

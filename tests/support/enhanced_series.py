@@ -16,7 +16,7 @@ from tolerances import AFFINE_MM
 
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 
 FileChange = Callable[[Dataset], None]
 SHARED = ("PlaneOrientationSequence", "PixelMeasuresSequence", "CTImageFrameTypeSequence")

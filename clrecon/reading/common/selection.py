@@ -1,14 +1,35 @@
-"""Slope and intercept as the user gives them, in place of what the files say."""
+"""The part of an input that is read, and slope and intercept as the user gives them."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from clrecon.errors import UsageError
 from clrecon.system.arguments import name_parameter
 
 LARGEST = 1e6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """The part of an input that is read.
+
+    series: Series of the input; None leaves the choice to `read_volume`.
+    phase: Number of the phase, if the series has several.
+    allow_gaps: Read a stack with missing slices.
+    force: Read data sets without preamble or meta header.
+    follow_links: Read the files and folders that symbolic links out of the folder lead to.
+    rescale: (slope, intercept). In place of what the files say.
+    """
+
+    series: int | str | None = None
+    phase: int | None = None
+    allow_gaps: bool = False
+    force: bool = False
+    follow_links: bool = False
+    rescale: tuple[float, float] | None = None
 
 
 class Rescale(NamedTuple):

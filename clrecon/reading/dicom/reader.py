@@ -1,4 +1,4 @@
-"""`read_volume` and `list_series` of DICOM, and what a listing says of each series."""
+"""`read_series` and `list_scan` for DICOM, and what a listing says of each series."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from clrecon.geometry import Volume, column_spacing
 from clrecon.geometry.certificate import Certificate
 from clrecon.reading.common.likeness import Likeness, judge_slices
 from clrecon.reading.common.plausibility import examine_voxels
-from clrecon.reading.common.selection import Rescale
+from clrecon.reading.common.selection import Rescale, Selection, check_rescale
 from clrecon.reading.common.source_facts import SeriesEntry, SeriesListing
 from clrecon.reading.dicom.headers.slice_header import SliceHeader
 from clrecon.reading.dicom.parse.elements import describe_way_out
@@ -94,21 +94,10 @@ _START_BYTES = 512
 _UNKNOWN = {"not DICOM", "NumPy array"}
 
 
-def read_volume(
-    path: str | os.PathLike[str],
-    series: int | str | None = None,
-    *,
-    phase: int | None = None,
-    allow_gaps: bool = False,
-    force: bool = False,
-    follow_links: bool = False,
-    rescale: Rescale | None = None,
-    progress: Progress | None = None,
-) -> Volume:
-    """Read one CT series as a volume in HU and LPS mm.
+def read_series(path: str | os.PathLike[str], selection: Selection, progress: Progress | None = None) -> Volume:
+    """Read one CT series as a volume in HU and LPS mm, see `clrecon.read_volume`.
 
     path: A folder, searched with its subfolders (any file names; DICOMDIR not needed), or one file.
-    series, phase, allow_gaps, force, follow_links, rescale, progress: As in `clrecon.read_volume`.
 
     Returns: ``voxels`` (nk, nj, ni) int16, int32 or float32 in HU, padding at the air beside it
         (``report["padding_hu"]``); ``affine`` index (i, j, k) to LPS mm, slices by ascending position along the normal;
@@ -119,10 +108,10 @@ def read_volume(
     Source: DICOM PS3.3 C.7.6.2 (Image Plane), C.7.5.1 (padding), C.8.2.1 (CT image, rescale).
     """
     with _quiet_warnings():
-        scan, found = _scan_and_group(path, progress, force, follow_links, rescale)
-        choice = choose_series(found, series)
-        left = describe_left(found, choice, series)
-        chosen = choice.series.choose(_checked_phase(phase), allow_gaps)
+        scan, found = _scan_and_group(path, selection, progress)
+        choice = choose_series(found, selection.series)
+        left = describe_left(found, choice, selection.series)
+        chosen = choice.series.choose(_checked_phase(selection), selection.allow_gaps)
         stack = chosen.stack
         if chosen.problems or stack is None or stack.affine is None:
             raise RefusedInputError(_describe_refusal(chosen))
@@ -142,69 +131,51 @@ def read_volume(
     return Volume(voxels, stack.affine, report, stack.slice_positions, hu_range=(facts.hu_min, facts.hu_max))
 
 
-def list_slices(
-    path: str | os.PathLike[str],
-    series: int | str | None = None,
-    *,
-    phase: int | None = None,
-    allow_gaps: bool = False,
-    force: bool = False,
-    follow_links: bool = False,
-) -> list[tuple[Path, int, int]]:
-    """List the slices of which `read_volume` makes a volume, slice k at place k.
-
-    path, series, phase, allow_gaps, force, follow_links: As in `read_volume`.
+def list_slices(path: str | os.PathLike[str], selection: Selection) -> list[tuple[Path, int, int]]:
+    """List the slices of which `read_series` makes a volume, slice k at place k.
 
     Returns: list of (Path, int, int). File of the slice, its frame there from 0, and number of frames of the file.
     """
     with _quiet_warnings():
-        _, found = _scan_and_group(path, None, force, follow_links)
-        chosen = choose_series(found, series).series.choose(_checked_phase(phase), allow_gaps)
+        _, found = _scan_and_group(path, selection, None)
+        choice = choose_series(found, selection.series)
+        chosen = choice.series.choose(_checked_phase(selection), selection.allow_gaps)
         if chosen.problems or chosen.stack is None:
             raise RefusedInputError(_describe_refusal(chosen))
         return [(header.file, header.frame, header.frames) for header in chosen.stack.slices]
 
 
-def _checked_phase(phase: int | None) -> int | None:
+def _checked_phase(selection: Selection) -> int | None:
+    phase = selection.phase
     if phase is None or isinstance(phase, int) and not isinstance(phase, bool) and phase >= 1:
         return phase
     raise UsageError(f"a phase is a number from 1, not {phase!r}")
 
 
-def list_series(
-    path: str | os.PathLike[str],
-    series: int | str | None = None,
-    *,
-    phase: int | None = None,
-    allow_gaps: bool = False,
-    force: bool = False,
-    follow_links: bool = False,
-    rescale: Rescale | None = None,
-    pixels: bool = False,
-    progress: Progress | None = None,
+def list_scan(
+    path: str | os.PathLike[str], selection: Selection, pixels: bool = False, progress: Progress | None = None
 ) -> SeriesListing:
     """List the series at a path, with the geometry and problems of each, and the certificate of the chosen one.
 
-    path, series, phase, allow_gaps, force, follow_links, rescale, progress: As in `read_volume`, which would read the
-        series chosen here.
+    selection: `read_series` would read the series chosen here.
     pixels: True: also read the pixels of the chosen series, for padding, range of HU and saturation.  False: read only
         headers.
     """
-    phase = _checked_phase(phase)
+    phase = _checked_phase(selection)
     with _quiet_warnings():
-        scan, found = _scan_and_group(path, progress, force, follow_links, rescale)
+        scan, found = _scan_and_group(path, selection, progress)
         warnings = collect_scan_warnings(scan)
         number, certificate, refusal = None, None, None
         try:
-            choice = choose_series(found, series)
+            choice = choose_series(found, selection.series)
         except (NoDicomError, RefusedInputError) as error:
             refusal = error
             warnings.append(str(error))
         else:
             chosen = choice.series
             number = chosen.number
-            warnings += describe_left(found, choice, series)
-            judged = chosen.choose(phase, allow_gaps)
+            warnings += describe_left(found, choice, selection.series)
+            judged = chosen.choose(phase, selection.allow_gaps)
             found = [judged if one is chosen else one for one in found]
             certificate = _certify_chosen(judged, scan, warnings, pixels, progress)
         entries = [describe_series(one, collect_series_warnings(one)) for one in found]
@@ -251,11 +222,7 @@ def _describe_single(path: Path) -> str:
 
 
 def _scan_and_group(
-    path: str | os.PathLike[str],
-    progress: Progress | None,
-    force: bool,
-    follow_links: bool,
-    rescale: Rescale | None = None,
+    path: str | os.PathLike[str], selection: Selection, progress: Progress | None
 ) -> tuple[Scan, list[Series]]:
     try:
         folder = Path(path)
@@ -264,7 +231,8 @@ def _scan_and_group(
         raise UsageError(f"a path is a string or a path object, not {type(path).__name__}") from error
     if empty:
         raise UsageError("the input path is empty")
-    scan = scan_path(folder, progress, force, follow_links)
+    scan = scan_path(folder, progress, selection.force, selection.follow_links)
+    rescale = check_rescale(selection.rescale)
     if rescale is not None:
         scan.rescale = rescale
         scan.slices = [_rescaled(header, rescale) for header in scan.slices]

@@ -275,7 +275,7 @@ def test_a_label_without_growth_between_other_slices(device):
 
 def test_a_real_vertebra_is_sound(device, real_data):
     from clrecon.labels import read_labels
-    from clrecon.reading.dicom import read_volume
+    from clrecon.reading import read_volume
 
     folder = real_data / "thoracolumbar_labels"
     volume, labels = read_volume(folder / "ct_2mm_jpeg2000"), read_labels(folder / "ct_2mm_labels.nii.gz")

@@ -12,7 +12,7 @@ from clrecon.proof.phantom import PhantomSettings, apply_point_spread, make_phan
 from clrecon.proof.phantom.series import place_slices
 from clrecon.proof.phantom.settings import TEXT_HU, draw_ghosts
 from clrecon.proof.phantom.spine import draw_spine
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 
 SMALL = {"size": (24, 20), "slices": 20, "spacing": (11.0, 10.0, 2.5)}
 CLEAN = {"noise": 0.0, "point_spread_mm": 0.0}

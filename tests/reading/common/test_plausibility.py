@@ -11,8 +11,8 @@ import pytest
 from dicom_series import Plan, set_values, write_series
 
 from clrecon.errors import RefusedInputError
+from clrecon.reading import read_volume
 from clrecon.reading.common.plausibility import examine_voxels
-from clrecon.reading.dicom import read_volume
 from clrecon.reading.dicom.pixels.voxels import read_voxels
 from clrecon.reading.dicom.series.scan import scan_path
 from clrecon.reading.dicom.series.series import group_series

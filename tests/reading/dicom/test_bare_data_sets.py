@@ -11,7 +11,7 @@ from pydicom.uid import JPEG2000Lossless
 
 from clrecon.cli.main import main
 from clrecon.errors import NoDicomError, RefusedInputError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 
 PLAN = Plan(shape=(3, 3, 4))
 MARK_END = 132

@@ -7,7 +7,7 @@ import shutil
 import pytest
 from dicom_series import ROOT, Plan, set_values, write_series
 
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 from clrecon.reading.dicom.series.census import CLOSEST, LOCALIZERS, WIDER
 
 SLICES = 24

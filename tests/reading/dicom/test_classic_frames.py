@@ -12,7 +12,7 @@ from pydicom.tag import Tag
 from pydicom.uid import RLELossless
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 from clrecon.reading.dicom.headers.multiframe import PLACE_POINTERS
 
 PLAN = Plan(shape=(7, 5, 6))

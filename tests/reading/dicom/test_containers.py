@@ -14,7 +14,7 @@ from dicom_series import Plan, write_series
 
 from clrecon.errors import NoDicomError
 from clrecon.mesh import Mesh
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 from clrecon.reading.dicom.series.foreign_files import advise_on, describe_container
 
 

@@ -39,7 +39,7 @@ from pydicom.encaps import encapsulate, encapsulate_extended
 from pydicom.uid import ExplicitVRBigEndian
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 from clrecon.reading.dicom.parse import transfer_syntaxes
 from clrecon.reading.dicom.parse import transfer_syntaxes as codecs
 from clrecon.reading.dicom.parse.elements import read_elements

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from dicom_series import Plan, set_values, write_series
 
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 
 
 def judge(folder):

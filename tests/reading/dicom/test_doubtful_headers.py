@@ -10,7 +10,7 @@ from dicom_series import Plan, set_raw, set_values, write_series
 from pydicom.uid import SecondaryCaptureImageStorage
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 
 
 @pytest.mark.parametrize(

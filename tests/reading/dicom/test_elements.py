@@ -20,7 +20,7 @@ from pydicom.datadict import DicomDictionary
 from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian, ImplicitVRLittleEndian
 from pydicom.valuerep import EXPLICIT_VR_LENGTH_16, EXPLICIT_VR_LENGTH_32
 
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 from clrecon.reading.dicom.parse import elements, plain
 from clrecon.reading.dicom.parse import transfer_syntaxes as codecs
 from clrecon.reading.dicom.parse.elements import parse_carefully

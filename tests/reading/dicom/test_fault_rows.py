@@ -17,7 +17,7 @@ from tolerances import AFFINE_MM
 
 from clrecon.cli.main import main
 from clrecon.errors import ClreconError, NoDicomError, RefusedInputError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 
 PLAN = {"shape": (4, 3, 5)}
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pydicom")  # it writes what no one should

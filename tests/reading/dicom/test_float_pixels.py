@@ -9,7 +9,7 @@ from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian, 
 from stored_pixels import set_pixels
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 
 
 def set_floats(make, width=32, **values):

@@ -25,7 +25,7 @@ from dicom_series import Plan, make_dataset, save_dataset, write_series
 from pydicom.encaps import encapsulate
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 from clrecon.reading.dicom.pixels import stored
 from clrecon.reading.dicom.pixels.stored import StoredPixels
 

@@ -10,7 +10,7 @@ from dicom_series import Plan, make_dataset, save_dataset, write_series
 from pydicom.uid import ImplicitVRLittleEndian
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 
 PLAN = {"shape": (3, 3, 4), "name": "{}".format}
 

@@ -12,7 +12,7 @@ from pydicom.encaps import encapsulate
 from pydicom.uid import DeflatedExplicitVRLittleEndian, JPEG2000Lossless
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 from clrecon.reading.dicom.parse import elements, plain
 from clrecon.reading.dicom.parse import elements as careful
 from clrecon.reading.dicom.pixels.stored import StoredPixels

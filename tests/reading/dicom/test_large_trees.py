@@ -15,7 +15,7 @@ from dicom_series import write_series
 from tolerances import HEADER_BYTES, SCAN_PEAK_BYTES_A_FILE
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 from clrecon.reading.dicom.headers import header
 from clrecon.reading.dicom.parse import elements, plain
 from clrecon.reading.dicom.parse.elements import PREFIX_BYTES, read_start

@@ -10,7 +10,7 @@ import pytest
 from dicom_series import Plan, write_series
 
 from clrecon.errors import NoDicomError, RefusedInputError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import Selection, list_series, read_volume
 from clrecon.reading.dicom.reader import list_slices
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="links need a right there")
@@ -43,7 +43,7 @@ def test_slices_that_are_links_refuse_the_series_unless_they_are_followed(tmp_pa
     volume = read_volume(tmp_path / "ct", follow_links=True)
     assert np.array_equal(volume.voxels, plan.hu()) and volume.report["warnings"] == []
     assert list_series(tmp_path / "ct", follow_links=True).series[0].slices == 9
-    assert len(list_slices(tmp_path / "ct", follow_links=True)) == 9
+    assert len(list_slices(tmp_path / "ct", Selection(follow_links=True))) == 9
 
 
 def test_a_folder_of_links_alone_says_how_they_are_followed(tmp_path, plan):

@@ -10,7 +10,7 @@ from dicom_series import Plan, make_dataset, save_dataset, set_values, write_ser
 from pydicom.uid import MRImageStorage
 
 from clrecon.errors import NoDicomError, RefusedInputError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 from clrecon.reading.dicom.series import scan
 from clrecon.reading.dicom.series import scan as disk
 

@@ -8,8 +8,8 @@ import tolerances
 from dicom_series import Plan, write_series
 
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.reading import list_series, read_volume
 from clrecon.reading.common.likeness import judge_slices, measure_likeness
-from clrecon.reading.dicom import list_series, read_volume
 from clrecon.reading.dicom.stack.mixtures import alternates
 
 GAP = 1.25

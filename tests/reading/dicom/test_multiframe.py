@@ -32,7 +32,7 @@ from pydicom.uid import (
 )
 from tolerances import AFFINE_MM, THOUSAND_FRAMES_S
 
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 from clrecon.reading.dicom.headers.header import read_headers
 from clrecon.reading.dicom.headers.slice_header import OtherImage
 

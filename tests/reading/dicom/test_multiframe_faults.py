@@ -20,7 +20,7 @@ from pydicom.dataset import Dataset
 from tolerances import THOUSAND_FRAMES_S
 
 from clrecon.errors import NoDicomError, RefusedInputError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 from clrecon.reading.dicom.headers import multiframe
 
 

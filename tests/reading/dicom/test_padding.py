@@ -11,7 +11,7 @@ from dicom_series import Plan, set_values, write_series
 
 from clrecon.geometry import AIR_HU
 from clrecon.proof.surface.extract import extract_isosurface
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 from clrecon.reading.dicom.pixels.padding import PaddingMasks, pack_mask
 
 SHAPE = (6, 40, 40)

@@ -9,7 +9,7 @@ from pydicom.dataelem import RawDataElement
 from pydicom.tag import Tag
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 from dicom_series import Plan, make_dataset, save_dataset, set_values, write_series
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 from clrecon.reading.dicom.series.phases import have_same_pixels
 from clrecon.reading.dicom.series.scan import scan_path
 

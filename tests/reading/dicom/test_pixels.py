@@ -18,7 +18,7 @@ from stored_pixels import set_pixels
 from tolerances import AFFINE_MM
 
 from clrecon.errors import NoDicomError, RefusedInputError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 from clrecon.reading.dicom.pixels import stored
 from clrecon.system import memory
 

@@ -12,7 +12,7 @@ from dicom_series import Plan, write_series
 from pydicom.encaps import encapsulate
 from pydicom.uid import RLELossless
 
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 from clrecon.reading.dicom.pixels import voxels as pixels
 from clrecon.system import memory
 

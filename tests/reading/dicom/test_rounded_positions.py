@@ -7,7 +7,7 @@ import pytest
 from dicom_series import Plan, set_raw, write_series
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 
 SLICES = 60
 

@@ -16,7 +16,7 @@ from pydicom.data import get_testdata_file
 from pydicom.uid import MRImageStorage, SecondaryCaptureImageStorage
 
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 from clrecon.reading.dicom.series.series import SPLIT_ANGLE_RAD, Planes
 
 CONTRACT = (

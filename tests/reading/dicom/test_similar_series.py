@@ -8,7 +8,7 @@ import pytest
 from dicom_series import ROOT, Plan, set_values, write_series
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 
 
 def hash_of(series: int) -> str:

@@ -9,7 +9,7 @@ from lost_slices import MISSING
 from tolerances import AFFINE_MM, ROUNDED_AFFINE_MM
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 
 PLANS = {
     "straight": Plan(),

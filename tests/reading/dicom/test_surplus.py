@@ -18,7 +18,7 @@ from pydicom.uid import (
 )
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 from clrecon.reading.dicom.headers import surplus
 
 NAME = "IM{:04d}".format

@@ -13,7 +13,7 @@ from trap_plan import BODY_HU
 
 from clrecon.errors import ClreconError, RefusedInputError
 from clrecon.geometry import Volume
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 
 BOUNDS_MM = {"written": AFFINE_MM, "rounded": ROUNDED_AFFINE_MM, "far": FAR_AFFINE_MM, "jitter": JITTER_AFFINE_MM}
 

@@ -7,7 +7,7 @@ import pytest
 from hostile_bytes import Seed, phantom_seeds
 
 from clrecon.errors import ClreconError, RefusedInputError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 
 PIXEL_STRIDE = 7
 SERIES_STRIDE = 11

@@ -9,7 +9,7 @@ from dicom_series import Plan, write_series
 from lost_slices import MISSING
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.dicom import list_series, read_volume
+from clrecon.reading import list_series, read_volume
 
 OBLIQUE = (20.0, -15.0, 30.0)
 

@@ -23,7 +23,7 @@ from pydicom.dataset import Dataset
 from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.dicom import read_volume
+from clrecon.reading import read_volume
 from clrecon.reading.dicom.parse.values import decode_text
 
 PLAN = Plan(shape=(4, 5, 6), origin=(-98.0, 31.25, -400.0), name="IM{:04d}".format)

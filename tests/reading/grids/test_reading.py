@@ -16,7 +16,7 @@ from volume_files import WRITERS, make_ct, write_metaimage
 import clrecon
 from clrecon.cli.main import main
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
-from clrecon.jobs.info import describe_input
+from clrecon.jobs.info import InfoSettings, describe_input
 
 pytest.importorskip("nibabel")
 pytest.importorskip("nrrd")
@@ -67,7 +67,7 @@ def test_options_for_dicom_alone_are_refused(tmp_path, option):
         clrecon.read_volume(path, **option)
     assert clrecon.read_volume(path, None, allow_gaps=False, phase=None).voxels.shape == (4, 6, 7)
     with pytest.raises(UsageError, match="series: only for DICOM"):
-        describe_input(path, "1")
+        describe_input(path, InfoSettings(series="1"))
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_the_report_and_the_listing_have_the_entries_of_dicom(tmp_path, name):
     assert set(entry) == set(describe_input(tmp_path / "ct").listing["series"][0])
     assert entry["affine_ijk_to_lps_mm"] == volume.affine.tolist() and entry["problems"] == []
     assert listing["certificate"]["hu_range"] is None
-    read = describe_input(path, pixels=True).listing["certificate"]
+    read = describe_input(path, InfoSettings(pixels=True)).listing["certificate"]
     assert read == volume.report
     assert entry["modality"] == "unknown" and entry["description"].endswith("voxels int16")
 
@@ -108,7 +108,7 @@ def test_doubts_fail_gates_that_strict_counts(tmp_path):
     for path, failed in ((plain, None), (offset, "hu_known"), (unclear, "header_clear")):
         gates = clrecon.read_volume(path).report["gates"]
         assert [gate["name"] for gate in gates if gate["ok"] is False] == [failed] * (failed is not None)
-        problem = describe_input(path, pixels=True, strict=True).problem
+        problem = describe_input(path, InfoSettings(pixels=True, strict=True)).problem
         assert (problem is None) if failed is None else f"fails 1 gate: {failed}: " in str(problem)
 
 
@@ -125,7 +125,7 @@ def test_figures_that_no_scan_has_fail_gates_of_dicom_too(tmp_path):
         (failed,) = [gate for gate in report["gates"] if gate["ok"] is False]
         assert failed["name"] == name and said in failed["text"]
         assert any(failed["text"] in text for text in report["warnings"])
-        assert f"fails 1 gate: {name}: " in str(describe_input(path, pixels=True, strict=True).problem)
+        assert f"fails 1 gate: {name}: " in str(describe_input(path, InfoSettings(pixels=True, strict=True)).problem)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -10,7 +10,7 @@ from uneven_volume import uneven
 from clrecon import Volume, read_volume, write_volume
 from clrecon.errors import OutputError, UsageError
 from clrecon.geometry.resample import resample_volume
-from clrecon.reading.dicom import read_volume as read_dicom
+from clrecon.reading import read_volume as read_dicom
 
 nibabel = pytest.importorskip("nibabel")
 sitk = pytest.importorskip("SimpleITK")
