@@ -10,6 +10,7 @@ from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.options import add_reading, parse_levels
 from clrecon.errors import UsageError
+from clrecon.jobs.outputs import MESH_FILES
 
 PARTLY_DONE = 8
 
@@ -65,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o",
         "--output",
         metavar="OUT",
-        help="meshes: OUT_L3, OUT_L3_left and OUT_L3_right; .stl, .ply, .obj, .glb, .vtp or .3mf",
+        help=f"meshes: OUT_L3, OUT_L3_left and OUT_L3_right; {MESH_FILES}",
     )
     output.add_argument("--picture", metavar="FILE", help="slices through each corridor: .png, .jpg or .tif")
     output.add_argument("--report", metavar="FILE", help="write all figures as JSON")

@@ -11,6 +11,7 @@ from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.options import add_reading
 from clrecon.jobs.inside import DEFAULT_VIEW
+from clrecon.jobs.outputs import MESH_FILES
 from clrecon.system.text import format_volume
 
 _EPILOG = """\
@@ -32,9 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = _EPILOG
     parser.add_argument("input", metavar="INPUT", help="DICOM folder or file; or a NIfTI, NRRD or MetaImage file")
-    parser.add_argument(
-        "-o", "--output", metavar="OUT", required=True, help="mesh files: .stl .ply .obj .glb .vtp or .3mf"
-    )
+    parser.add_argument("-o", "--output", metavar="OUT", required=True, help=f"mesh files: {MESH_FILES}")
     parser.add_argument(
         "--labels",
         metavar="FILE|FOLDER",

@@ -22,6 +22,7 @@ from clrecon.cli.mesh_options import (
     label_choice,
 )
 from clrecon.cli.options import LEVELS_HELP, add_cropping, add_masking, add_reading, parse_hu, parse_levels, parse_point
+from clrecon.jobs.outputs import MESH_FILES, OBJECT_FILES
 from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 from clrecon.system.text import count_of, format_digits, format_ml, format_volume
 
@@ -71,9 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="INPUT",
         help="DICOM folder (subfolders and any file names are fine) or file; or a NIfTI, NRRD or MetaImage file",
     )
-    parser.add_argument(
-        "-o", "--output", metavar="OUT", required=True, help="mesh file: .stl .ply .obj .glb .vtp .3mf, or .html"
-    )
+    parser.add_argument("-o", "--output", metavar="OUT", required=True, help=f"mesh file: {MESH_FILES}")
     add_purpose(parser)
     add_reading(parser)
     add_masking(parser)
@@ -108,7 +107,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     components.add_argument(
         "--one-file",
         action="store_true",
-        help="labels, components of --split or several iso values in one file (.3mf, .glb, .obj, .vtp or .html), each"
+        help=f"labels, components of --split or several iso values in one file ({OBJECT_FILES}), each"
         " an object with its name and a colour of its own",
     )
     add_label_arguments(parser)

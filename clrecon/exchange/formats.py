@@ -5,49 +5,84 @@ binary stream, and reads the file back.  VTP is written by VTK.  The other forma
 library; each module says why: headers, comments and matrices that name frame and unit, a full disk that must be
 noticed, time and memory.
 
+Nothing here loads numpy or the module of a format before a file is written or read: help texts name the extensions.
+
 The same mesh or cloud gives the same bytes every time.  No file holds patient data, a date or a path.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Any, BinaryIO, Generic, Protocol, TypeVar
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, Protocol
 
 from clrecon.errors import NoSurfaceError, OutputError, RefusedInputError, UsageError
-from clrecon.exchange import glb, las, npz, obj, page, ply, stl, threemf, vtp, xyz
-from clrecon.exchange.content import Assembly, Content, PointContent, Writable
-from clrecon.exchange.raw_content import RawCloud
-from clrecon.geometry.vertices import float32_step
 from clrecon.system.files import StagedFile, stage_file
 from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text, guess_word
 
+if TYPE_CHECKING:
+    from clrecon.exchange.content import Assembly, Content, PointContent, Writable
+    from clrecon.exchange.raw_content import RawCloud
+
 FOUR_GIB = 2**32 - 1
 NO_LIMIT = 2**62
 
-Contents = TypeVar("Contents", bound=PointContent | Assembly)
 
+@dataclass(frozen=True, kw_only=True)
+class FileFormat:
+    """A format of meshes, of clouds or of both, and the module of this package that writes and reads its files.
 
-@dataclass(frozen=True)
-class FileFormat(Generic[Contents]):
-    """A file format of meshes or clouds.
+    The module is imported when a file is written or read.  It has `estimate` (bytes of a file, exact or rather too
+    small), `write`, `verify` (reads the file back and raises `OutputError` unless sizes and counts are those of the
+    contents), and `read_mesh` and `read_cloud`.
 
-    estimate: Estimates the size of the file in bytes; exact or rather too small.
-    write: Writes the contents to a stream.
-    verify: Reads the file back and raises `OutputError` unless sizes and counts are those of the contents.
+    holds_many: Several named meshes can stand in a file.
     most_bytes: Largest file that the format, or common readers of it, can handle.
     """
 
-    estimate: Callable[[Contents], int]
-    write: Callable[[BinaryIO, Contents], None]
-    verify: Callable[[Path, Contents], None]
-    most_bytes: int
+    module: str
+    meshes: bool = False
+    clouds: bool = False
+    is_read: bool = True
+    holds_many: bool = False
+    most_bytes: int = NO_LIMIT
+
+    @property
+    def code(self) -> Any:
+        """The module."""
+        return import_module(f"clrecon.exchange.{self.module}")
+
+
+# STL: the format could hold more, but many programs keep offsets in 32 bits.  GLB: its length field has 32 bits.
+REGISTRY = {
+    ".stl": FileFormat(module="stl", meshes=True, most_bytes=FOUR_GIB),
+    ".ply": FileFormat(module="ply", meshes=True, clouds=True),
+    ".obj": FileFormat(module="obj", meshes=True, holds_many=True),
+    ".glb": FileFormat(module="glb", meshes=True, holds_many=True, most_bytes=FOUR_GIB),
+    ".vtp": FileFormat(module="vtp", meshes=True, clouds=True, holds_many=True),
+    ".3mf": FileFormat(module="threemf", meshes=True, holds_many=True),
+    ".html": FileFormat(module="page", meshes=True, holds_many=True, is_read=False),
+    ".npz": FileFormat(module="npz", clouds=True),
+    ".xyz": FileFormat(module="xyz", clouds=True),
+    ".las": FileFormat(module="las", clouds=True),
+}
+"""The formats by the extensions of their files, in the order in which messages and help name them."""
+
+FORMATS = {extension: own for extension, own in REGISTRY.items() if own.meshes}
+CLOUD_FORMATS = {extension: own for extension, own in REGISTRY.items() if own.clouds}
+ASSEMBLIES = tuple(extension for extension, own in FORMATS.items() if own.holds_many)
+MESH_INPUTS = tuple(extension for extension, own in FORMATS.items() if own.is_read)
+CLOUD_INPUTS = (*CLOUD_FORMATS, ".csv", ".txt")
+
+
+def list_extensions(extensions: Sequence[str]) -> str:
+    """Name extensions in a sentence: ``.a, .b or .c``."""
+    return f"{', '.join(extensions[:-1])} or {extensions[-1]}"
 
 
 def find_extension(path: str | os.PathLike[str], formats: Mapping[str, Any], noun: str) -> str:
@@ -67,14 +102,15 @@ def find_extension(path: str | os.PathLike[str], formats: Mapping[str, Any], nou
 
 
 def stage_content(
-    content: Contents, path: str | os.PathLike[str], chosen: FileFormat[Contents], counted: str, others: str
+    content: PointContent | Assembly, path: str | os.PathLike[str], chosen: FileFormat, counted: str, others: str
 ) -> AbstractContextManager[StagedFile]:
     """Write contents under a temporary name; see `clrecon.system.files.stage_file`.
 
     counted: What it holds, for example "12 triangles", for a message.
     others: Formats without a limit, for a message.
     """
-    expected_bytes = chosen.estimate(content)
+    code = chosen.code
+    expected_bytes = code.estimate(content)
     if expected_bytes > chosen.most_bytes:
         kind = os.path.splitext(os.fspath(path))[1][1:].upper()
         raise OutputError(
@@ -83,32 +119,10 @@ def stage_content(
         )
     return stage_file(
         path,
-        lambda stream: chosen.write(stream, content),
-        lambda temporary: chosen.verify(temporary, content),
+        lambda stream: code.write(stream, content),
+        lambda temporary: code.verify(temporary, content),
         expected_bytes=expected_bytes,
     )
-
-
-# STL: the format could hold more, but many programs keep offsets in 32 bits.  GLB: its length field has 32 bits.
-FORMATS: dict[str, FileFormat[Content]] = {
-    ".stl": FileFormat(stl.estimate, stl.write, stl.verify, FOUR_GIB),
-    ".ply": FileFormat(ply.estimate, ply.write, ply.verify, NO_LIMIT),
-    ".obj": FileFormat(obj.estimate, obj.write, obj.verify, NO_LIMIT),
-    ".glb": FileFormat(glb.estimate, glb.write, glb.verify, FOUR_GIB),
-    ".vtp": FileFormat(vtp.estimate, vtp.write, vtp.verify, NO_LIMIT),
-    ".3mf": FileFormat(threemf.estimate, threemf.write, threemf.verify, NO_LIMIT),
-    ".html": FileFormat(page.estimate, page.write, page.verify, NO_LIMIT),
-}
-
-
-ASSEMBLIES: dict[str, FileFormat[Assembly]] = {
-    ".glb": FileFormat(glb.estimate, glb.write, glb.verify, FOUR_GIB),
-    ".3mf": FileFormat(threemf.estimate, threemf.write, threemf.verify, NO_LIMIT),
-    ".obj": FileFormat(obj.estimate, obj.write, obj.verify, NO_LIMIT),
-    ".vtp": FileFormat(vtp.estimate, vtp.write, vtp.verify, NO_LIMIT),
-    ".html": FileFormat(page.estimate, page.write, page.verify, NO_LIMIT),
-}
-"""Formats that hold several named objects in a file."""
 
 
 MOST_PARTS = 20
@@ -120,7 +134,7 @@ def check_assembly(path: str | os.PathLike[str]) -> None:
     extension = check_format(path)
     if extension not in ASSEMBLIES:
         raise UsageError(
-            f"{extension} holds one mesh: several with their names in one file are .3mf, .glb, .obj, .vtp or .html"
+            f"{extension} holds one mesh: several with their names in one file are {list_extensions(ASSEMBLIES)}"
         )
 
 
@@ -128,6 +142,8 @@ def stage_assembly(
     meshes: Sequence[Writable], path: str | os.PathLike[str], space: str = "lps", *, keep_ids: bool = False
 ) -> AbstractContextManager[StagedFile]:
     """Write several meshes as the objects of one file, as `stage_mesh` does one."""
+    from clrecon.exchange.content import Assembly
+
     check_assembly(path)
     for mesh in meshes:
         mesh.check()
@@ -138,7 +154,7 @@ def stage_assembly(
     if not content.parts:
         raise NoSurfaceError("the surfaces are empty: no file is written")
     count = sum(mesh.triangle_count for mesh in meshes)
-    return stage_content(content, path, ASSEMBLIES[extension], f"{count} triangles", "fewer labels")
+    return stage_content(content, path, FORMATS[extension], f"{count} triangles", "fewer labels")
 
 
 def check_format(path: str | os.PathLike[str]) -> str:
@@ -148,9 +164,11 @@ def check_format(path: str | os.PathLike[str]) -> str:
 
 def describe_rounding(mesh: Writable, extension: str) -> list[str]:
     """Return the warning for a format that rounds the vertices more than the mesh does; no warning for the others."""
-    if extension != ".stl" or mesh.vertices.dtype == np.float32:
+    if extension != ".stl" or mesh.vertices.dtype.name == "float32":
         return []
-    step = float32_step(float(np.abs(mesh.vertices).max()))
+    from clrecon.geometry.vertices import float32_step
+
+    step = float32_step(float(abs(mesh.vertices).max()))
     return [
         f"STL holds float32: so far from the origin its vertices are rounded to steps of {step:.2g} mm;"
         " PLY, VTP, OBJ, GLB and 3MF keep them"
@@ -187,14 +205,6 @@ def _describe(mesh: Writable, extension: str, space: str, parts: int, *, keep_id
     return mesh.describe(space, keep_ids=keep_ids)
 
 
-CLOUD_FORMATS: dict[str, FileFormat[PointContent]] = {
-    ".ply": FileFormat(ply.estimate, ply.write, ply.verify, NO_LIMIT),
-    ".vtp": FileFormat(vtp.estimate, vtp.write, vtp.verify, NO_LIMIT),
-    ".npz": FileFormat(npz.estimate, npz.write, npz.verify, NO_LIMIT),
-    ".xyz": FileFormat(xyz.estimate, xyz.write, xyz.verify, NO_LIMIT),
-    ".las": FileFormat(las.estimate, las.write, las.verify, NO_LIMIT),
-}
-
 _KEPT = {".xyz": ("hu",), ".npz": ("normals", "hu", "labels", "ijk")}
 _KEPT_BY_OTHERS = ("normals", "hu", "labels")
 
@@ -210,7 +220,7 @@ def check_cloud_format(path: str | os.PathLike[str]) -> str:
     """Return the extension of a cloud file in lower case, such as ``.ply``."""
     extension = find_extension(path, CLOUD_FORMATS, "cloud")
     if extension == ".las":
-        las.import_laspy()
+        CLOUD_FORMATS[extension].code.import_laspy()
     return extension
 
 
@@ -265,14 +275,21 @@ def read_raw_cloud(path: str | os.PathLike[str]) -> RawCloud:
         raise UsageError(f"there is no cloud {escape_text(str(path), 200)}") from error
     except OSError as error:
         raise RefusedInputError(f"{name} cannot be read: {error.strerror or error}") from error
-    if start[:3] == b"ply" and start[3:4] in (b"\n", b"\r", b" "):
-        return ply.read_cloud(file)
-    if start[:4] in (b"PK\3\4", b"PK\5\6"):
-        return npz.read(file)
-    if start[:4] == b"LASF":
-        return las.read(file)
-    if b"<VTKFile" in start:
-        return vtp.read_cloud(file)
-    if b"\0" in start or not start.strip():
+    extension = _tell_cloud(start)
+    if extension is None:
         raise RefusedInputError(f"{name} is no cloud that is read: PLY, VTP, NPZ, LAS or a table of numbers (XYZ)")
-    return xyz.read(file)
+    cloud: RawCloud = CLOUD_FORMATS[extension].code.read_cloud(file)
+    return cloud
+
+
+def _tell_cloud(start: bytes) -> str | None:
+    """Return the extension that the first bytes of a file should have; None where it is no cloud."""
+    if start[:3] == b"ply" and start[3:4] in (b"\n", b"\r", b" "):
+        return ".ply"
+    if start[:4] in (b"PK\3\4", b"PK\5\6"):
+        return ".npz"
+    if start[:4] == b"LASF":
+        return ".las"
+    if b"<VTKFile" in start:
+        return ".vtp"
+    return None if b"\0" in start or not start.strip() else ".xyz"

@@ -234,7 +234,7 @@ class _File:
         return np.ndarray(shape, form, self.binary, start + inside, strides) if count else np.zeros(shape, form)
 
 
-def read(path: Path) -> RawMesh:
+def read_mesh(path: Path) -> RawMesh:
     """Read the triangles of a GLB file; those of each node are a part."""
     name = escape_text(path.name)
     try:

@@ -115,7 +115,7 @@ def _check_records(data: bytes, start: int) -> None:
         raise ValueError(f"{count:,} and {extended:,} variable records have no room in it")
 
 
-def read(path: Path) -> RawCloud:
+def read_cloud(path: Path) -> RawCloud:
     """Read the points of a file without compression, with its extra dimensions."""
     name = escape_text(path.name)
     laspy = import_laspy()

@@ -96,7 +96,7 @@ def _open_array(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], n
     return shape, dtype
 
 
-def read(path: Path) -> RawCloud:
+def read_cloud(path: Path) -> RawCloud:
     """Read points and what is known of them.
 
     The points are the entry ``points``, ``xyz``, ``pos`` or ``arr_0``, the others as this module writes them.

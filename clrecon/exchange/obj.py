@@ -125,7 +125,7 @@ _ELSE = (b"l", b"p", b"curv", b"curv2", b"surf")
 _NAMES = (b"o", b"g")
 
 
-def read(path: Path) -> RawMesh:
+def read_mesh(path: Path) -> RawMesh:
     """Read an OBJ file; each object (``o``, else ``g``) that has faces is a part."""
     name = escape_text(path.name)
     try:

@@ -99,7 +99,7 @@ _VERTEX = re.compile(rb"^[ \t]*vertex[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)[ \t]*$", 
 _END = re.compile(rb"^[ \t]*end[ \t]?facet\b", re.MULTILINE | re.IGNORECASE)
 
 
-def read(path: Path) -> RawMesh:
+def read_mesh(path: Path) -> RawMesh:
     """Read an STL file; one whose length is that of its count is binary, whatever it begins with."""
     name = escape_text(path.name)
     try:

@@ -204,7 +204,7 @@ class _Model:
     colors: dict[int, list[tuple[float, float, float]]] = field(default_factory=dict)
 
 
-def read(path: Path) -> RawMesh:
+def read_mesh(path: Path) -> RawMesh:
     """Read the objects of a 3MF file that its build places; the triangles of each are a part."""
     name = escape_text(path.name)
     try:

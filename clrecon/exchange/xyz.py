@@ -70,7 +70,7 @@ def verify(path: Path, content: PointContent) -> None:
         raise refuse_file("at the end", repr(end), "a line end")
 
 
-def read(path: Path) -> RawCloud:
+def read_cloud(path: Path) -> RawCloud:
     """Read a table of numbers: three columns or more, parted by blanks, tabulators, commas or semicolons.
 
     Lines that begin with ``#``, ``//`` or ``%`` are comments.  The last line before the first point names the columns

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
+from clrecon.exchange.formats import CLOUD_INPUTS, MESH_INPUTS
 from clrecon.jobs.options import InputSettings
 from clrecon.system.arguments import name_parameter
 
@@ -22,14 +23,8 @@ if TYPE_CHECKING:
     from clrecon.points import PointCloud
 
 
-CLOUD_INPUTS = (".ply", ".vtp", ".npz", ".xyz", ".las", ".csv", ".txt")
-"""Extensions of files that are read as clouds, see `clrecon.read_points`."""
-
-MESH_INPUTS = (".stl", ".ply", ".obj", ".glb", ".3mf", ".vtp")
-"""Extensions of files that are read as meshes, see `clrecon.read_mesh`."""
-
 MESH_ONLY = tuple(extension for extension in MESH_INPUTS if extension not in CLOUD_INPUTS)
-"""Those of them that are not read as clouds."""
+"""Extensions of files that are read as meshes, and not as clouds."""
 
 OTHER_CLOUDS = (".pcd", ".e57", ".laz", ".pts", ".ptx", ".asc")
 """Extensions of clouds that are not read."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from clrecon.errors import ClreconError, OutputError, UsageError
+from clrecon.exchange.formats import ASSEMBLIES, FORMATS, list_extensions
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress
 from clrecon.system.text import count_of
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
     from clrecon.rendering import Rendering
     from clrecon.system.files import Staged, StagedFile
 
+
+MESH_FILES, OBJECT_FILES = list_extensions(tuple(FORMATS)), list_extensions(ASSEMBLIES)
+"""Extensions of mesh files, and of those that hold several objects, for help texts."""
 
 MOST_FILES = 1000
 """Most meshes of a job.  More are useless crumbs, and each keeps a file open until all are written."""

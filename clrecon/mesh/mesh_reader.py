@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.exchange import glb, obj, ply, stl, threemf, vtp
+from clrecon.exchange.formats import FORMATS, MESH_INPUTS
 from clrecon.exchange.raw_content import RawMesh
 from clrecon.geometry import SPACES, frame_from_lps
 from clrecon.mesh.mesh import Mesh
@@ -18,18 +18,6 @@ from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.text import escape_text
 
 log = get_logger(__name__)
-
-_READERS = {
-    ".stl": stl.read,
-    ".ply": ply.read_mesh,
-    ".obj": obj.read,
-    ".glb": glb.read,
-    ".3mf": threemf.read,
-    ".vtp": vtp.read_mesh,
-}
-
-MESH_INPUTS = tuple(_READERS)
-"""Extensions of files that are read as meshes."""
 
 
 @explains_arguments
@@ -66,12 +54,12 @@ def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh
         frame_from_lps(asked)
     file = Path(path)
     name = escape_text(file.name)
-    reader = _READERS.get(file.suffix.lower())
-    if reader is None:
+    extension = file.suffix.lower()
+    if extension not in MESH_INPUTS:
         raise UsageError(f"{name}: meshes are read from files {', '.join(MESH_INPUTS)}")
     if not os.path.lexists(file):
         raise UsageError(f"there is no mesh {escape_text(str(path), 200)}")
-    raw = reader(file)
+    raw: RawMesh = FORMATS[extension].code.read_mesh(file)
     warnings = raw.warnings
     named = None if raw.space is None else raw.space.upper()
     if named is not None and named.lower() not in SPACES:

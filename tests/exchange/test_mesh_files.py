@@ -16,7 +16,7 @@ import tolerances
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
 from clrecon.exchange import formats as writers
 from clrecon.exchange.coordinates import find_places, rounded_apart
-from clrecon.exchange.formats import FORMATS, FileFormat
+from clrecon.exchange.formats import FORMATS
 from clrecon.mesh import Mesh
 
 pytestmark = pytest.mark.unit
@@ -315,7 +315,7 @@ class FullDisk(io.RawIOBase):
 def test_every_writer_notices_a_full_disk(mesh, extension):
     content = mesh.describe_parts("lps", 1) if extension == ".html" else mesh.describe("lps")
     with pytest.raises(OSError, match="No space left"):
-        FORMATS[extension].write(FullDisk(700), content)
+        FORMATS[extension].code.write(FullDisk(700), content)
 
 
 @pytest.mark.faults
@@ -324,16 +324,16 @@ def test_a_file_that_was_cut_or_belongs_to_another_mesh_is_found(mesh, extension
     path = tmp_path / f"bone{extension}"
     mesh.save(path)
     content = mesh.describe("lps")
-    FORMATS[extension].verify(path, content)
+    FORMATS[extension].code.verify(path, content)
     whole = path.read_bytes()
     for length in (len(whole) - 2, len(whole) // 2, 90):
         path.write_bytes(whole[:length])
         with pytest.raises(OutputError, match="did not arrive on the disk"):
-            FORMATS[extension].verify(path, content)
+            FORMATS[extension].code.verify(path, content)
     path.write_bytes(whole)
     fewer = Mesh(mesh.vertices, mesh.triangles[1:], mesh.normals, mesh.report)
     with pytest.raises(OutputError, match="did not arrive on the disk"):
-        FORMATS[extension].verify(path, fewer.describe("lps"))
+        FORMATS[extension].code.verify(path, fewer.describe("lps"))
 
 
 @pytest.mark.faults
@@ -341,13 +341,7 @@ def test_a_file_that_was_cut_or_belongs_to_another_mesh_is_found(mesh, extension
 def test_an_older_file_survives_a_failed_check(mesh, extension, tmp_path, monkeypatch):
     path = tmp_path / f"bone{extension}"
     path.write_bytes(b"older")
-    broken = FileFormat(
-        FORMATS[extension].estimate,
-        lambda stream, content: stream.write(b"x" * 200),
-        FORMATS[extension].verify,
-        2**40,
-    )
-    monkeypatch.setitem(writers.FORMATS, extension, broken)
+    monkeypatch.setattr(FORMATS[extension].code, "write", lambda stream, content: stream.write(b"x" * 200))
     with pytest.raises(OutputError, match="did not arrive on the disk"):
         mesh.save(path)
     assert path.read_bytes() == b"older"
@@ -358,7 +352,7 @@ def test_an_older_file_survives_a_failed_check(mesh, extension, tmp_path, monkey
 def test_estimate_is_about_right(extension, tmp_path):
     mesh = Mesh(*samples.torus(200, 100))
     size = mesh.save(tmp_path / f"bone{extension}")
-    estimate = FORMATS[extension].estimate(mesh.describe("lps"))
+    estimate = FORMATS[extension].code.estimate(mesh.describe("lps"))
     assert 0.5 * size <= estimate <= 1.1 * size
     if extension in (".stl", ".ply", ".glb"):
         assert estimate == size
@@ -368,7 +362,7 @@ def test_estimate_of_3mf_counts_the_digits_of_triangles():
     """A triangle of five digits an index has 45 bytes; 6 are taken for it besides.  XML shrinks to a seventh."""
     vertices, triangles = samples.torus(200, 100)
     estimates = [
-        FORMATS[".3mf"].estimate(Mesh(vertices, triangles[:count]).describe("lps")) for count in (7_000, 14_000)
+        FORMATS[".3mf"].code.estimate(Mesh(vertices, triangles[:count]).describe("lps")) for count in (7_000, 14_000)
     ]
     assert estimates[1] - estimates[0] == 1_000 * (len('<triangle v1="19999" v2="19999" v3="19999"/>\n') + 6)
 
@@ -378,7 +372,7 @@ def test_more_vertices_than_a_ply_file_can_count_are_refused():
     large = dataclasses.replace(content, vertices=samples.LongTable(2**31 + 1))
     stream = io.BytesIO()
     with pytest.raises(OutputError, match="^2147483649 vertices are too many for a PLY file, at most 2147483648$"):
-        FORMATS[".ply"].write(stream, large)
+        FORMATS[".ply"].code.write(stream, large)
     assert stream.getvalue() == b""
 
 
@@ -388,13 +382,12 @@ def test_the_end_of_a_vtp_file_is_quoted_where_it_is_wrong(mesh, tmp_path):
     assert content.endswith(b"</VTKFile>")
     (tmp_path / "bone.vtp").write_bytes(content[:-10] + b"0123456789abcdefghij")
     with pytest.raises(OutputError, match=r": b'456789abcdefghij' at the end, </VTKFile> expected;"):
-        FORMATS[".vtp"].verify(tmp_path / "bone.vtp", mesh.describe("lps"))
+        FORMATS[".vtp"].code.verify(tmp_path / "bone.vtp", mesh.describe("lps"))
 
 
 def test_too_large_for_the_format(mesh, tmp_path, monkeypatch):
     small = FORMATS[".stl"]
-    limited = FileFormat(small.estimate, small.write, small.verify, 5000)
-    monkeypatch.setitem(writers.FORMATS, ".stl", limited)
+    monkeypatch.setitem(FORMATS, ".stl", dataclasses.replace(small, most_bytes=5000))
     with pytest.raises(OutputError, match=r"at most 4 GiB can be read: write PLY or VTP"):
         mesh.save(tmp_path / "bone.stl")
     assert list(tmp_path.iterdir()) == []

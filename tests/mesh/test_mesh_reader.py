@@ -11,8 +11,8 @@ from sample_meshes import ball
 import clrecon
 from clrecon import Mesh
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.exchange.formats import MESH_INPUTS
 from clrecon.exchange.stl import join_corners
-from clrecon.mesh.mesh_reader import MESH_INPUTS
 
 BALL = Mesh(*ball(8.0, 12))
 
@@ -101,9 +101,3 @@ def test_harmed_files_are_refused_in_one_line(tmp_path: Path) -> None:
         clrecon.read_mesh(tmp_path / "a.off")
     with pytest.raises(UsageError, match=f"there is no mesh {tmp_path}/missing.stl"):
         clrecon.read_mesh(tmp_path / "missing.stl")
-
-
-def test_the_job_knows_the_files_that_are_read() -> None:
-    from clrecon.jobs.inputs import MESH_INPUTS as OF_JOBS
-
-    assert OF_JOBS == MESH_INPUTS

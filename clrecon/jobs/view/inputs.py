@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.exchange.formats import MESH_INPUTS
 from clrecon.jobs.distance import read_side
 from clrecon.jobs.inputs import crop_labels, is_cloud_file, refuse_other_clouds
 from clrecon.jobs.mesh.labels import open_labels
@@ -19,7 +20,6 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.options import InputSettings
 from clrecon.jobs.preprocess import mask_volume
 from clrecon.mesh import Mesh
-from clrecon.mesh.mesh_reader import MESH_INPUTS
 from clrecon.reading import read_selected, tell_format
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress

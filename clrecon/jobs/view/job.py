@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.exchange.formats import stage_assembly, stage_mesh
+from clrecon.exchange.formats import MESH_INPUTS, stage_assembly, stage_mesh
 from clrecon.exchange.page import read_facts
 from clrecon.geometry.certificate import without_ids
 from clrecon.jobs.distance import doubt_frames, read_side
@@ -20,7 +20,6 @@ from clrecon.jobs.outputs import check_kept, commit_all
 from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name
 from clrecon.jobs.view.inputs import ViewSettings
 from clrecon.mesh import Mesh
-from clrecon.mesh.mesh_reader import MESH_INPUTS
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.system.arguments import name_parameter
 from clrecon.system.files import check_writable

@@ -89,7 +89,7 @@ def test_a_ply_has_the_colour_at_its_vertices(scan: Path, device: Any, tmp_path:
 @pytest.mark.parametrize(
     ("extra", "words"),
     [
-        (["-o", "a.stl", "--one-file"], ".3mf, .glb, .obj, .vtp"),
+        (["-o", "a.stl", "--one-file"], ".obj, .glb, .vtp, .3mf"),
         (["-o", "a.glb", "--one-file", "--hide-label", "L4"], "L4"),
         (["-o", "a.glb", "--hide-label", "2", "--hide-label", "3", "--hide-label", "9"], "all labels are hidden"),
         (["-o", "a.glb", "--label-color", "L3=nocolour"], "nocolour"),
