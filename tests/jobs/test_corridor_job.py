@@ -72,7 +72,8 @@ def whole(ct: Path, plain: Path, shared_folder: Path) -> Path:
 
 def true_radius_mm(side: dict[str, Any], to_lps: Any = (1.0, 1.0, 1.0)) -> float:
     """How far the line of a corridor is from the true surface where it is nearest."""
-    line = np.linspace(*(np.multiply(to_lps, side[name]) for name in ("counted_from_mm", "tip_mm")), 60)
+    start, tip = (np.multiply(to_lps, side[name]) for name in ("counted_from_mm", "tip_mm"))
+    line = np.linspace(start, tip, 60)
     return float(-phantom_truth(SETTINGS).signed_distance(line).max())
 
 
