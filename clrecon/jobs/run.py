@@ -56,9 +56,11 @@ def _choose_device(name: str | int | Device | None) -> Device:
 
 
 def _prepare_device(chosen: Future[Device], prepare: Callable[[Device], None]) -> None:
-    from clrecon.opencl import work_on
+    from clrecon.opencl import with_fallback
 
-    work_on(chosen.result(), lambda device, told: prepare(device))
+    for attempt in with_fallback(chosen.result()):
+        with attempt as (device, _):
+            prepare(device)
 
 
 class DeviceOpening:

@@ -21,6 +21,7 @@ from clrecon.opencl.device import Device, has_hung_commands, keep_for_hung_comma
 from clrecon.opencl.launching import Stopwatch, launch, settle, wait
 from clrecon.opencl.program import Kernel, Program, load_program
 from clrecon.opencl.select import (
+    Attempt,
     choose_device,
     choose_remembered,
     choose_unchecked,
@@ -28,11 +29,12 @@ from clrecon.opencl.select import (
     list_platforms,
     remembered_fault,
     take_device,
-    work_on,
+    with_fallback,
 )
 from clrecon.opencl.sources import kernel_constant, kernel_files, kernel_number, read_kernel_source
 
 __all__ = [
+    "Attempt",
     "Device",
     "Kernel",
     "MemoryLimits",
@@ -66,5 +68,5 @@ __all__ = [
     "take_device",
     "upload",
     "wait",
-    "work_on",
+    "with_fallback",
 ]

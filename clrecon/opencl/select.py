@@ -19,9 +19,9 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from clrecon.errors import DeviceError, DeviceFailedError, DeviceLostError
 from clrecon.opencl import quirks
@@ -374,7 +374,7 @@ def find_candidates(name: str | int | None) -> tuple[list[Device], bool]:
     return sorted(matches, key=lambda device: device.score, reverse=True), not is_named
 
 
-Made = TypeVar("Made")
+Given = TypeVar("Given")
 
 
 def take_device(name: str | int | Device | None) -> Device:
@@ -399,34 +399,63 @@ def _find_cpu(device: Device) -> Device | None:
     return max(usable, key=lambda cpu: cpu.score, default=None)
 
 
-def work_on(device: Device, work: Callable[[Device, list[str]], Made]) -> Made:
-    """Do some work on a device: on a lost one once more with a fresh context, and at last on its stand-in.
+class Attempt(Generic[Given]):
+    """One turn of a loop that tries again: errors of a kind that end its ``with`` block are left to the loop."""
 
-    device: As `take_device` returns it.  Once its stand-in has taken over, that does all further work.
-    work: Called with the device to work on, and with warnings for the report of the work.  It makes everything anew
-        each time that it is called.
+    def __init__(self, given: Given, caught: type[DeviceError]):
+        self.given = given
+        self._caught = caught
+        self._error: DeviceError | None = None
+
+    def __enter__(self) -> Given:
+        return self.given
+
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> bool:
+        self._error = error if isinstance(error, self._caught) else None
+        return self._error is not None
+
+    def take_error(self) -> DeviceError | None:
+        """Return the error that ended the block, and let go of it: its frames hold buffers."""
+        error, self._error = self._error, None
+        return error
+
+
+def with_fallback(device: Device) -> Iterator[Attempt[tuple[Device, list[str]]]]:
+    """Yield attempts at some work: on a lost device once more with a fresh context, and at last on its stand-in.
+
+        for attempt in with_fallback(take_device(name)):
+            with attempt as (current, warnings):
+                made = ...
+
+    The block makes everything anew on `current`; `warnings` are for the report of the work.  Once the stand-in has
+    taken over, it does all further work.
+
+    device: As `take_device` returns it.
     """
     lost: list[str] = []
     first: DeviceFailedError | None = None
     while True:
         current = device.current
-        try:
-            return work(current, [*device.handed_over, *lost])
-        except DeviceError as error:
-            settle(current, error)
-            if first is not None:  # nothing was gained
-                device.handed_over.clear()
-                raise first from error
-            if not isinstance(error, DeviceFailedError):
-                raise
-            if isinstance(error, DeviceLostError) and not lost:
-                lost.append(f"{error}: started again with a fresh context")
-                log.info("%s", lost[-1])
-            elif device.stand_in is not None and not device.handed_over and not find_fault(device.stand_in):
-                first = error
-                device.hand_over(f"{error}: all was done on {device.stand_in.label} instead of {device.label}")
-                lost.clear()
-            elif (cpu := _find_cpu(current)) is not None:
-                raise type(error)(f"{error}; {cpu.label} may do it: {name_parameter('device', cpu.index)}") from error
-            else:
-                raise
+        attempt = Attempt((current, [*device.handed_over, *lost]), DeviceError)
+        yield attempt
+        error = attempt.take_error()
+        if error is None:
+            return
+        settle(current, error)
+        if first is not None:  # nothing was gained
+            device.handed_over.clear()
+            raise first from error
+        if not isinstance(error, DeviceFailedError):
+            raise error
+        if isinstance(error, DeviceLostError) and not lost:
+            lost.append(f"{error}: started again with a fresh context")
+            log.info("%s", lost[-1])
+        elif device.stand_in is not None and not device.handed_over and not find_fault(device.stand_in):
+            first = error
+            device.hand_over(f"{error}: all was done on {device.stand_in.label} instead of {device.label}")
+            lost.clear()
+        elif (cpu := _find_cpu(current)) is not None:
+            raise type(error)(f"{error}; {cpu.label} may do it: {name_parameter('device', cpu.index)}") from error
+        else:
+            raise error
+        del error  # its frames hold buffers

@@ -170,7 +170,8 @@ def _alternate_sides(
 @case("isosurface-cold", "host volume to host mesh, kernels built, against flying edges with all cores")
 def measure_cold(job: Job) -> dict[str, Any]:
     """One process; every call uploads the volume and extracts vertices, normals and triangles of an open surface."""
-    from clrecon.operators.surface.extract import extract_isosurface, prepare_isosurface
+    from clrecon.operators.surface.extract import extract_isosurface
+    from clrecon.operators.surface.extraction import prepare_isosurface
 
     volume = job.input.volume()
     prepare_isosurface(job.device, volume.voxels.dtype)
@@ -194,7 +195,8 @@ def walk_levels(hu: float) -> Iterator[float]:
 @case("isosurface-resident", "a new iso value on a volume that is on the device, against flying edges")
 def measure_resident(job: Job) -> dict[str, Any]:
     """Time both sides at the same iso values, none of them twice."""
-    from clrecon.operators.surface.extract import SurfaceExtractor, prepare_isosurface
+    from clrecon.operators.surface.extract import SurfaceExtractor
+    from clrecon.operators.surface.extraction import prepare_isosurface
 
     volume = job.input.volume()
     prepare_isosurface(job.device, volume.voxels.dtype)

@@ -124,7 +124,7 @@ def _fit(found: Sequence[dict[str, Any]], over: str) -> dict[str, dict[str, floa
 def measure_scaling(job: Job) -> dict[str, Any]:
     """Time the first n slices of the input at the iso value; then several iso values on at most 149 slices."""
     from clrecon.geometry import Volume
-    from clrecon.operators.surface.extract import prepare_isosurface
+    from clrecon.operators.surface.extraction import prepare_isosurface
 
     volume = job.input.volume()
     prepare_isosurface(job.device, volume.voxels.dtype)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from ct_files import sphere_voxels, write_series
 
-import clrecon.operators.surface.extract
+import clrecon.operators.surface.extraction
 from clrecon.cli.main import main
 
 PNG = bytes.fromhex("89504e470d0a1a0a0000000d49484452000000010000000108000000003a7e9b55")
@@ -20,7 +20,7 @@ PNG = bytes.fromhex("89504e470d0a1a0a0000000d49484452000000010000000108000000003
 def no_device_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     """These inputs are refused before a device computes anything: any machine will do."""
     monkeypatch.setattr(clrecon.operators, "choose_device", lambda name=None: object())
-    monkeypatch.setattr(clrecon.operators.surface.extract, "prepare_isosurface", lambda device: None)
+    monkeypatch.setattr(clrecon.operators.surface.extraction, "prepare_isosurface", lambda device: None)
 
 
 @pytest.fixture

@@ -169,7 +169,7 @@ def prepare_surfaces(
 ) -> None:
     """Build the kernels for surfaces of this topology and, if wanted, for components, growing and so on."""
     from clrecon.operators.primitives.union_find import prepare_components
-    from clrecon.operators.surface.extract import prepare_isosurface
+    from clrecon.operators.surface.extraction import prepare_isosurface
 
     prepare_isosurface(device, topology=topology, inside=inside, vertex_rule=vertex_rule, grown=grows)
     if grows:

@@ -145,12 +145,15 @@ def judge_parts(
 def _count_crossings(mesh: Mesh, device: Device | None, steps: Steps) -> int:
     """Count the pairs of triangles that cut each other."""
     from clrecon.mesh.intersections import find_self_intersections
-    from clrecon.opencl import work_on
+    from clrecon.opencl import with_fallback
     from clrecon.operators.surface.decimation import find_crossings
 
     if device is None:
         return len(find_self_intersections(mesh.vertices, mesh.triangles, steps=steps))
-    return len(work_on(device, lambda current, _: find_crossings(current, mesh.vertices, mesh.triangles, steps=steps)))
+    for attempt in with_fallback(device):
+        with attempt as (current, _):
+            crossings = find_crossings(current, mesh.vertices, mesh.triangles, steps=steps)
+    return len(crossings)
 
 
 def describe_purposes(parts: Sequence[Part]) -> list[str]:

@@ -211,7 +211,9 @@ def filter_bilateral(
     resident, is_new = take_volume(volume, device, memory, "a filter")
     try:
         settings = BilateralSettings.checked(resident.volume, sigma_mm, sigma_hu, dimensions, near, normals, taps)
-        made: Any = resident.attempt(lambda told: _filter(resident, settings, told, progress, keep=not is_new))
+        for attempt in resident.with_fallback():
+            with attempt as (_, told):
+                made: Any = _filter(resident, settings, told, progress or ignore_progress, keep=not is_new)
         return made  # type: ignore[no-any-return]
     finally:
         if is_new:
@@ -219,7 +221,7 @@ def filter_bilateral(
 
 
 def _filter(
-    resident: DeviceVolume, settings: BilateralSettings, told: list[str], progress: Progress | None, *, keep: bool
+    resident: DeviceVolume, settings: BilateralSettings, told: list[str], progress: Progress, *, keep: bool
 ) -> Volume | DeviceVolume:
     found = run_bilateral(resident, settings, progress=progress)
     facts = {
@@ -258,19 +260,22 @@ def run_bilateral(
     settings: BilateralSettings,
     *,
     stopwatch: Stopwatch | None = None,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
 ) -> Filtered:
     """Filter the voxels of a volume, slab by slab where they do not fit the device as a whole."""
-    run = _Run(resident, settings, stopwatch or Stopwatch(), progress or ignore_progress)
+    run = _Run(resident, settings, stopwatch or Stopwatch(), progress)
     nk = resident.volume.shape_ijk[2]
-    slices = resident.plan(BILATERAL, nk, run.needs)
-    if slices == 0:
+    planned = resident.plan(BILATERAL, nk, run.needs)
+    if planned == 0:
         limits = resident.limits
         raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
             f"a slice with the {2 * run.halo} slices around it needs {sum(run.needs(1).values()):,} bytes:"
             f" {limits.describe()}; {'use another device' if limits.asked_bytes is None else 'allow more'}"
         )
-    return resident.halve(BILATERAL, slices, run.run, warnings=run.warnings)
+    for attempt in resident.attempts(BILATERAL, planned, run.warnings):
+        with attempt as slices:
+            found = run.run(slices)
+    return found
 
 
 class _Run:

@@ -19,7 +19,7 @@ from clrecon.operators.masks.shapes import MaskComponents
 from clrecon.operators.masks.voxel_mask import check_shape, checked_band, mark_band, mask_bytes, zero_words
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.progress import Progress
+from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_band
 
 if TYPE_CHECKING:  # label maps load pydicom, which others need not wait for
@@ -82,14 +82,12 @@ class Mask(MaskComponents):
         band = checked_band(hu)
         name = format_band(*band)
         with open_volume(volume, device, memory, "a mask") as resident:
-
-            def make(told: list[str]) -> Mask:
-                marked = mark_band(resident, band, progress=progress)
-                made = cls(resident.volume, marked.mask_d, name, device=resident.device, memory=resident.memory)
-                made._extents = marked
-                return made
-
-            return resident.attempt(make)
+            for attempt in resident.with_fallback():
+                with attempt as (current, _):
+                    marked = mark_band(resident, band, progress=progress or ignore_progress)
+            made = cls(resident.volume, marked.mask_d, name, device=current, memory=resident.memory)
+        made._extents = marked
+        return made
 
     @classmethod
     @explains_arguments
@@ -306,12 +304,11 @@ class Mask(MaskComponents):
         packed = np.zeros((nk, nj, 4 * -(-ni // 32)), np.uint8)
         packed[..., : -(-ni // 8)] = np.packbits(chosen, axis=2, bitorder="little")
 
-        def make(told: list[str]) -> Mask:
-            check_budget(resident.device, mask_bytes(volume.shape_ijk), resident.memory)
-            words_d = upload(resident.device, packed.view("<u4").astype(np.uint32, copy=False))
-            return cls(volume, words_d, name, device=resident.device, memory=resident.memory)
-
-        return resident.attempt(make)
+        for attempt in resident.with_fallback():
+            with attempt as (current, _):
+                check_budget(current, mask_bytes(volume.shape_ijk), resident.memory)
+                words_d = upload(current, packed.view("<u4").astype(np.uint32, copy=False))
+        return cls(volume, words_d, name, device=current, memory=resident.memory)
 
     @classmethod
     def _spanned(cls, resident: DeviceVolume, spans: RowSpans, name: str) -> Mask:
@@ -324,18 +321,17 @@ class Mask(MaskComponents):
                 f" ({', '.join(f'{x:.1f}' for x in high)}) mm"
             )
 
-        def make(told: list[str]) -> Mask:
-            device = resident.device
-            sizes = mask_bytes(volume.shape_ijk)
-            check_budget(device, {**sizes, "spans of rows": 8 * n}, resident.memory)
-            mask_d = zero_words(device, sizes["mask of the voxels"] // 4)
-            write_runs(
-                device, upload(device, spans.columns), upload(device, spans.row_counts),
-                upload(device, np.zeros(n, np.int32)), upload(device, np.ones(1, np.uint8)), mask_d, volume.shape_ijk,
-            )  # fmt: skip
-            return cls(volume, mask_d, name, device=device, memory=resident.memory)
-
-        return resident.attempt(make)
+        sizes = mask_bytes(volume.shape_ijk)
+        for attempt in resident.with_fallback():
+            with attempt as (device, _):
+                check_budget(device, {**sizes, "spans of rows": 8 * n}, resident.memory)
+                mask_d = zero_words(device, sizes["mask of the voxels"] // 4)
+                write_runs(
+                    device, upload(device, spans.columns), upload(device, spans.row_counts),
+                    upload(device, np.zeros(n, np.int32)), upload(device, np.ones(1, np.uint8)), mask_d,
+                    volume.shape_ijk,
+                )  # fmt: skip
+        return cls(volume, mask_d, name, device=device, memory=resident.memory)
 
 
 def _checked_value(value: float, dtype: np.dtype[Any]) -> Any:

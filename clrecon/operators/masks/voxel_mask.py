@@ -128,7 +128,7 @@ def mark_band(
     pad: int = 0,
     beside: Mapping[str, int] | None = None,
     stopwatch: Stopwatch | None = None,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
 ) -> VoxelMask:
     """Mark the voxels from ``hu[0]`` to ``hu[1]`` HU, both included; NaN lies in no band.
 
@@ -150,15 +150,18 @@ def mark_band(
         part = {f"{what} of a slab": size for what, size in mask_bytes((ni, nj, slices), pad).items()}
         return {"volume": slices * resident.slice_bytes, **masks, **({} if slices == nk else part)}
 
-    slices = resident.plan(BAND, nk, needs)
-    if slices == 0:
+    planned = resident.plan(BAND, nk, needs)
+    if planned == 0:
         limits = resident.limits
         raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
             f"the mask of the voxels and one slice need {sum(needs(1).values()):,} bytes: {limits.describe()};"
             f" {'use another device' if limits.asked_bytes is None else 'allow more'}"
         )
-    run = _Marking(resident, bounds, words, pad, stopwatch, progress or ignore_progress)
-    return resident.halve(BAND, slices, run.mark)
+    run = _Marking(resident, bounds, words, pad, stopwatch, progress)
+    for attempt in resident.attempts(BAND, planned):
+        with attempt as slices:
+            mask = run.mark(slices)
+    return mask
 
 
 class _Marking:

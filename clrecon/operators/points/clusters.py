@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import checked_affine
-from clrecon.opencl import Device, Stopwatch, check_memory, take_device, work_on
+from clrecon.opencl import Device, Stopwatch, check_memory, take_device, with_fallback
 from clrecon.operators.masks.voxel_mask import checked_band, mark_band, mark_voxels, mask_bytes
 from clrecon.operators.points.free_clusters import cluster_free_points
 from clrecon.operators.points.point_extraction import extract_points
@@ -23,7 +23,7 @@ from clrecon.points.cloud import VoxelNumbers
 from clrecon.points.keep import REPORTED, ClusterFigures, measure_clusters
 from clrecon.points.stencil import Lattice, Stencil, checked_eps, make_stencil
 from clrecon.system.arguments import explains_arguments, name_parameter
-from clrecon.system.progress import Progress
+from clrecon.system.progress import Progress, ignore_progress
 
 DEFAULT_MIN_SAMPLES = 6
 
@@ -124,6 +124,7 @@ def cluster_points(
     Ester, Kriegel, Sander and Xu 1996.
     """
     check_memory(memory)
+    tell = progress or ignore_progress
     if eps is not None:
         checked_eps(eps)
     if isinstance(cloud, PointCloud):
@@ -132,13 +133,16 @@ def cluster_points(
         if not len(cloud):
             raise UsageError("the cloud is empty: there is nothing to cluster")
         if not cloud.has_ijk:
-            return _cluster_free(cloud, eps, min_samples, volume, device, memory, progress)
+            return _cluster_free(cloud, eps, min_samples, volume, device, memory, tell)
         return _cluster_cloud(cloud, eps, min_samples, volume, device, memory)
     if hu is None or volume is not None:
         raise UsageError(f"clusters of a volume need {name_parameter('hu', 'LO,HI')} and no other volume")
     band = checked_band(hu)
     with open_volume(cloud, device, memory, "a search for clusters") as resident:
-        return resident.attempt(lambda told: _cluster_band(resident, band, eps, min_samples, told, progress))
+        for attempt in resident.with_fallback():
+            with attempt as (_, told):
+                made = _cluster_band(resident, band, eps, min_samples, told, tell)
+    return made
 
 
 @dataclass(frozen=True)
@@ -220,7 +224,7 @@ def _cluster_band(
     eps: float | None,
     min_samples: int | str,
     told: list[str],
-    progress: Progress | None,
+    progress: Progress,
 ) -> Clustering:
     volume, device, stopwatch = resident.volume, resident.device, Stopwatch()
     request = _Request.of(Lattice.of(volume), eps, min_samples)
@@ -247,7 +251,7 @@ def _cluster_free(
     volume: Volume | DeviceVolume | None,
     device: Device | str | int | None,
     memory: int | None,
-    progress: Progress | None,
+    progress: Progress,
 ) -> Clustering:
     if volume is not None:
         raise UsageError("the points are no voxels (they have no ijk), so that a volume says nothing of them")
@@ -306,17 +310,21 @@ def _cluster_cloud(
     request = _Request.of(lattice, eps, min_samples)
     taken = take_device(device) if not isinstance(volume, DeviceVolume) else volume.device
 
-    def work(current: Device, told: list[str]) -> Clustering:
-        stopwatch = Stopwatch()
-        with stopwatch.running(current):
-            mask = mark_voxels(current, voxels, lattice.shape_ijk, pad=pad_for(request.stencil), stopwatch=stopwatch)
-            search = ClusterSearch(current, mask, request.stencil, request.samples, memory=memory, stopwatch=stopwatch)
-            labels, cores = search.label(), search.flag_cores()
-            if order is not None:
-                labels, cores = _restore_order(search, labels, cores, order)
-        return request.finish(cloud, labels, cores, search, stopwatch, current, told)
-
-    return work_on(taken, work)
+    for attempt in with_fallback(taken):
+        with attempt as (current, told):
+            stopwatch = Stopwatch()
+            with stopwatch.running(current):
+                mask = mark_voxels(
+                    current, voxels, lattice.shape_ijk, pad=pad_for(request.stencil), stopwatch=stopwatch
+                )
+                search = ClusterSearch(
+                    current, mask, request.stencil, request.samples, memory=memory, stopwatch=stopwatch
+                )
+                labels, cores = search.label(), search.flag_cores()
+                if order is not None:
+                    labels, cores = _restore_order(search, labels, cores, order)
+            made = request.finish(cloud, labels, cores, search, stopwatch, current, told)
+    return made
 
 
 Order = NDArray[np.int64] | None

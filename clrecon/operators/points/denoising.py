@@ -23,7 +23,7 @@ from clrecon.opencl import (
     load_program,
     take_device,
     upload,
-    work_on,
+    with_fallback,
 )
 from clrecon.operators.points.grid import fill_grid, plan_grid
 from clrecon.operators.points.neighbours import NeighbourSearch, Part, check_neighbours, take_points
@@ -122,31 +122,31 @@ def remove_outliers(
     if isinstance(deviations, bool) or not isinstance(deviations, (int, float)) or not 0.0 <= deviations < math.inf:
         raise UsageError(f"deviations are a number from 0 on, usually 1 to 3, not {deviations!r}")
 
-    def work(device: Device, told: list[str]) -> PointStep:
-        stopwatch = Stopwatch()
-        search = NeighbourSearch(device, points, k, DistanceMeasure.needs(len(points)), memory, stopwatch)
-        distances = DistanceMeasure(search, stopwatch)
-        neighbours_d = allocate(device, 4 * k * search.most_places)
-        for part in search.each_part("outliers", progress):
-            search.list_places(part, neighbours_d)
-            distances.measure(part, neighbours_d)
-        means = distances.read()[0].astype(np.float64)
-        mean = float(means.mean())
-        deviation = float(means.std(ddof=1)) if len(means) > 1 else 0.0
-        bound = mean + deviations * deviation
-        removed = (means > bound).astype(np.uint8)
-        facts = {
-            "neighbours": k,
-            "deviations": float(deviations),
-            "mean_distance_mm": mean,
-            "deviation_mm": deviation,
-            "largest_kept_mm": bound,
-            "seconds": dict(stopwatch.seconds),
-            "device": device.label,
-        }
-        return PointStep(cloud.select(removed == 0), removed, ("outlier",), facts, (*warnings, *told))
-
-    return work_on(take_device(device), work)
+    for attempt in with_fallback(take_device(device)):
+        with attempt as (current, told):
+            stopwatch = Stopwatch()
+            search = NeighbourSearch(current, points, k, DistanceMeasure.needs(len(points)), memory, stopwatch)
+            distances = DistanceMeasure(search, stopwatch)
+            neighbours_d = allocate(current, 4 * k * search.most_places)
+            for part in search.each_part("outliers", progress):
+                search.list_places(part, neighbours_d)
+                distances.measure(part, neighbours_d)
+            means = distances.read()[0].astype(np.float64)
+            mean = float(means.mean())
+            deviation = float(means.std(ddof=1)) if len(means) > 1 else 0.0
+            bound = mean + deviations * deviation
+            removed = (means > bound).astype(np.uint8)
+            facts = {
+                "neighbours": k,
+                "deviations": float(deviations),
+                "mean_distance_mm": mean,
+                "deviation_mm": deviation,
+                "largest_kept_mm": bound,
+                "seconds": dict(stopwatch.seconds),
+                "device": current.label,
+            }
+            step = PointStep(cloud.select(removed == 0), removed, ("outlier",), facts, (*warnings, *told))
+    return step
 
 
 FEATURES = ("paper", "variation")
@@ -232,14 +232,14 @@ def denoise_points(
     k, warnings = check_neighbours(k, len(points), FEWEST_NEIGHBOURS)
     settings = _Settings.checked(k, range_factor, iterations, features, paper)
 
-    def work(device: Device, told: list[str]) -> PointStep:
-        run = _Run(settings, device, memory, progress)
-        moved = points
-        for _ in range(settings.iterations):
-            moved = moved + run.moves(moved)
-        return run.describe(cloud, moved, (*warnings, *told))
-
-    return work_on(take_device(device), work)
+    for attempt in with_fallback(take_device(device)):
+        with attempt as (current, told):
+            run = _Run(settings, current, memory, progress)
+            moved = points
+            for _ in range(settings.iterations):
+                moved = moved + run.moves(moved)
+            step = run.describe(cloud, moved, (*warnings, *told))
+    return step
 
 
 @dataclass(frozen=True)

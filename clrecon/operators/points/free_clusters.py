@@ -24,7 +24,7 @@ from clrecon.opencl import (
     load_program,
     memory_limits,
     take_device,
-    work_on,
+    with_fallback,
 )
 from clrecon.operators.points.grid import (
     MOST_PAIRS,
@@ -154,25 +154,25 @@ def cluster_free_points(
         return FreeClusters(np.full(n, -1, np.int32), np.zeros(n, bool), 0, facts, (warning,))
     plan = plan_cells(places, eps)
 
-    def work(current: Device, told: list[str]) -> FreeClusters:
-        stopwatch = Stopwatch()
-        with stopwatch.running(current):
-            search = find_clusters(
-                current, plan, eps, min_samples, memory=memory, stopwatch=stopwatch, progress=progress
-            )
-        labels, cores, count, cells = search
-        found = {
-            "clusters": count,
-            "core_points": int(cores.sum()),
-            "noise_points": int((labels < 0).sum()),
-            "cell_edge_mm": float(plan.edge),
-            "cells": cells,
-            "device": current.label,
-            "kernel_seconds": dict(stopwatch.by_kernel),
-        }
-        return FreeClusters(labels, cores, count, facts | found, tuple(told))
-
-    return work_on(take_device(device), work)
+    for attempt in with_fallback(take_device(device)):
+        with attempt as (current, told):
+            stopwatch = Stopwatch()
+            with stopwatch.running(current):
+                search = find_clusters(
+                    current, plan, eps, min_samples, memory=memory, stopwatch=stopwatch, progress=progress
+                )
+            labels, cores, count, cells = search
+            found = {
+                "clusters": count,
+                "core_points": int(cores.sum()),
+                "noise_points": int((labels < 0).sum()),
+                "cell_edge_mm": float(plan.edge),
+                "cells": cells,
+                "device": current.label,
+                "kernel_seconds": dict(stopwatch.by_kernel),
+            }
+            made = FreeClusters(labels, cores, count, facts | found, tuple(told))
+    return made
 
 
 def find_clusters(

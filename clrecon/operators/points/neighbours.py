@@ -24,7 +24,7 @@ from clrecon.opencl import (
     load_program,
     memory_limits,
     take_device,
-    work_on,
+    with_fallback,
 )
 from clrecon.operators.points.grid import (
     MOST_CELLS_ALONG,
@@ -373,14 +373,14 @@ def find_neighbours(
     places = take_points(points)
     k, warnings = check_neighbours(k, len(places))
 
-    def work(device: Device, told: list[str]) -> Neighbours:
-        results = {"neighbours": 4 * k * len(places), "distances": 4 * k * len(places)}
-        search = NeighbourSearch(device, places, k, results, memory, Stopwatch())
-        indices, indices_d = empty_output(device, (len(places), k), np.int32)
-        distances, distances_d = empty_output(device, (len(places), k), np.float32)
-        for part in search.each_part("neighbours", progress):
-            search.list_numbers(part, indices_d, distances_d)
-        indices, distances = download(device, indices, indices_d), download(device, distances, distances_d)
-        return Neighbours(indices, distances, (*warnings, *told))
-
-    return work_on(take_device(device), work)
+    for attempt in with_fallback(take_device(device)):
+        with attempt as (current, told):
+            results = {"neighbours": 4 * k * len(places), "distances": 4 * k * len(places)}
+            search = NeighbourSearch(current, places, k, results, memory, Stopwatch())
+            indices, indices_d = empty_output(current, (len(places), k), np.int32)
+            distances, distances_d = empty_output(current, (len(places), k), np.float32)
+            for part in search.each_part("neighbours", progress):
+                search.list_numbers(part, indices_d, distances_d)
+            indices, distances = download(current, indices, indices_d), download(current, distances, distances_d)
+            found = Neighbours(indices, distances, (*warnings, *told))
+    return found

@@ -23,7 +23,7 @@ from clrecon.opencl import (
     load_program,
     take_device,
     upload,
-    work_on,
+    with_fallback,
 )
 from clrecon.operators.points.neighbours import NeighbourSearch, Part, check_neighbours, take_points
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
@@ -53,7 +53,7 @@ def find_gradients(
     points: NDArray[np.floating],
     *,
     stopwatch: Stopwatch,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
     warnings: list[str] | None = None,
 ) -> NDArray[np.float32]:
     """Find the gradient of a volume at points.
@@ -74,15 +74,13 @@ def find_gradients(
         held = min(slices + BELOW + ABOVE, nk) * resident.slice_bytes
         return {"volume": held, "places": places.nbytes, "gradients": places.nbytes}
 
-    slices = resident.plan(GRADIENTS, nk, needs)
-    if slices < 1:
+    planned = resident.plan(GRADIENTS, nk, needs)
+    if planned < 1:
         raise DeviceMemoryError(f"no gradients can be found: {describe_shortage(resident.limits, needs(1))}")
-    return resident.halve(
-        GRADIENTS,
-        slices,
-        lambda slices: _all_slabs(resident, places, slices, stopwatch, progress or ignore_progress),
-        warnings=warnings,
-    )
+    for attempt in resident.attempts(GRADIENTS, planned, warnings):
+        with attempt as slices:
+            gradients = _all_slabs(resident, places, slices, stopwatch, progress)
+    return gradients
 
 
 def _all_slabs(
@@ -226,21 +224,21 @@ def estimate_normals(
     if volume is not None and viewpoint is not None:
         raise UsageError("normals are oriented by a volume or away from a viewpoint, not both: leave out one")
     place = None if viewpoint is None else _check_viewpoint(viewpoint)
+    tell = progress or ignore_progress
     if volume is None:
-        taken = take_device(device)
-        return work_on(
-            taken, lambda device, told: _Run(cloud, k, device, memory, [*warnings, *told], progress).step(place)
-        )
+        for attempt in with_fallback(take_device(device)):
+            with attempt as (current, told):
+                step = _Run(cloud, k, current, memory, [*warnings, *told], tell).step(place)
+        return step
     with open_volume(volume, device, memory, "the orientation of normals") as resident:
-
-        def work(told: list[str]) -> PointStep:
-            run = _Run(cloud, k, resident.device, resident.memory, [*warnings, *told], progress)
-            gradients = find_gradients(
-                resident, points, stopwatch=run.stopwatch, progress=progress, warnings=run.warnings
-            )
-            return run.step(gradients=gradients)
-
-        return resident.attempt(work)
+        for attempt in resident.with_fallback():
+            with attempt as (current, told):
+                run = _Run(cloud, k, current, resident.memory, [*warnings, *told], tell)
+                gradients = find_gradients(
+                    resident, points, stopwatch=run.stopwatch, progress=tell, warnings=run.warnings
+                )
+                step = run.step(gradients=gradients)
+    return step
 
 
 def _check_viewpoint(viewpoint: ArrayLike) -> NDArray[np.float64]:
@@ -259,7 +257,7 @@ class _Run:
     device: Device
     memory: int | None
     warnings: list[str]
-    progress: Progress | None
+    progress: Progress
 
     def __post_init__(self) -> None:
         self.stopwatch = Stopwatch()

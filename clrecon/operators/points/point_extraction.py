@@ -130,8 +130,9 @@ class VoxelEmission:
         labels = self.selection.labels
         with self.stopwatch.timed("build"):
             prepare_voxels(self.resident.device, self.volume.voxels.dtype, None if labels is None else labels.dtype)
-        slices = self._plan()
-        self.resident.halve(self.kind, slices, lambda slices: self._go_on(slices, progress), warnings=self.warnings)
+        for attempt in self.resident.attempts(self.kind, self._plan(), self.warnings):
+            with attempt as slices:
+                self._go_on(slices, progress)
         try:
             return _join(self._parts)
         except MemoryError as error:
@@ -423,36 +424,37 @@ def _voxels(
     number = 0 if labels is None or label is None else labels.find(label)
     chosen = Selection(*ends, shell, None if taken is None else taken.voxels, number, paper)
 
-    def make(told: list[str]) -> PointCloud:
-        run = VoxelEmission(resident, chosen)
-        run.warnings += told
-        positions, hu, numbers = run.run(progress)
-        if not len(hu):
-            where = "" if labels is None else f"of label {number} {labels.name(number)} " if number else "of a label "
-            raise _refuse_band(volume, band, where)
-        points = positions if run.origin is None else positions + run.origin
-        of_label = None if chosen.labels is None else chosen.labels.reshape(-1)[numbers].astype(np.int32)
-        report = {
-            "iso_value_hu": band[0] if math.isinf(band[1]) and not math.isinf(band[0]) else None,
-            "band_hu": [None if math.isinf(end) else end for end in band],
-            "voxels_in_band": run.marked,
-            "share": len(hu) / volume.voxels.size,
-            **({"label": number or None} if labels is not None else {}),
-            "affine_ijk_to_lps_mm": volume.affine.tolist(),
-            "certificate": volume.report,
-            **run.describe(),
-            **({"paper": _measure_paper(volume, numbers)} if paper else {}),
-            "warnings": [
-                *resident.device.warnings,
-                *warnings_of_far(volume),
-                *warn_of_face(volume, band[:1] if math.isfinite(band[0]) else (), "cloud"),
-                *(() if taken is None else taken.warnings),
-                *run.warnings,
-            ],
-        }
-        return PointCloud.of_known(points, None, hu, of_label, VoxelNumbers(numbers, volume.shape_ijk), report)
-
-    return resident.attempt(make)
+    for attempt in resident.with_fallback():
+        with attempt as (current, warnings):
+            run = VoxelEmission(resident, chosen, warnings=warnings)
+            positions, hu, numbers = run.run(progress)
+            if not len(hu):
+                which = "" if labels is None else "of a label "
+                if labels is not None and number:
+                    which = f"of label {number} {labels.name(number)} "
+                raise _refuse_band(volume, band, which)
+            points = positions if run.origin is None else positions + run.origin
+            of_label = None if chosen.labels is None else chosen.labels.reshape(-1)[numbers].astype(np.int32)
+            report = {
+                "iso_value_hu": band[0] if math.isinf(band[1]) and not math.isinf(band[0]) else None,
+                "band_hu": [None if math.isinf(end) else end for end in band],
+                "voxels_in_band": run.marked,
+                "share": len(hu) / volume.voxels.size,
+                **({"label": number or None} if labels is not None else {}),
+                "affine_ijk_to_lps_mm": volume.affine.tolist(),
+                "certificate": volume.report,
+                **run.describe(),
+                **({"paper": _measure_paper(volume, numbers)} if paper else {}),
+                "warnings": [
+                    *current.warnings,
+                    *warnings_of_far(volume),
+                    *warn_of_face(volume, band[:1] if math.isfinite(band[0]) else (), "cloud"),
+                    *(() if taken is None else taken.warnings),
+                    *run.warnings,
+                ],
+            }
+            cloud = PointCloud.of_known(points, None, hu, of_label, VoxelNumbers(numbers, volume.shape_ijk), report)
+    return cloud
 
 
 def _measure_paper(volume: Volume, numbers: NDArray[Any]) -> dict[str, float]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
-from clrecon.opencl import Device, Stopwatch, check_memory, take_device, work_on
+from clrecon.opencl import Device, Stopwatch, check_memory, take_device, with_fallback
 from clrecon.operators.points.field import FieldSettings, NodeField, Signs, decide_signs
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.points import PointCloud
@@ -291,14 +291,13 @@ def reconstruct_surface(
     own = _own_spacing(cloud) if spacing is None else float(spacing)
     settings = _choose_lengths(own, noisy, reach, smoothing, bridge)
 
-    def work(current: Device, told: list[str]) -> Mesh:
-        run = _Reconstruction(cloud, normals, settings, current, memory, progress or ignore_progress)
-        mesh = run.make(widenings)
-        mesh.report["spacing_from"] = "points" if spacing is None else "caller"
-        mesh.report["warnings"] = [*told, *mesh.report["warnings"]]
-        return mesh
-
-    return work_on(take_device(device), work)
+    for attempt in with_fallback(take_device(device)):
+        with attempt as (current, warnings):
+            run = _Reconstruction(cloud, normals, settings, current, memory, progress or ignore_progress)
+            mesh = run.make(widenings)
+    mesh.report["spacing_from"] = "points" if spacing is None else "caller"
+    mesh.report["warnings"] = [*warnings, *mesh.report["warnings"]]
+    return mesh
 
 
 def _check_numbers(widenings: object, lengths: Mapping[str, float | None]) -> None:

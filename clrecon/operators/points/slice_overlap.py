@@ -11,7 +11,7 @@ from clrecon.operators.masks.voxel_mask import VoxelMask, checked_band, mark_ban
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points.ghost_slices import GhostSlices, judge_slices
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.progress import Progress
+from clrecon.system.progress import Progress, ignore_progress
 
 
 def prepare_slice_overlap(device: Device) -> Program:
@@ -80,14 +80,16 @@ def find_ghost_slices(
     """
     band = checked_band(hu)
 
-    def work(told: list[str]) -> GhostSlices:
-        stopwatch = Stopwatch()
+    with open_volume(volume, device, memory, "a search for ghost slices") as resident:
         ni, nj, nk = resident.volume.shape_ijk
         beside = {"counts of rows": 12 * nj * nk}
-        mask = mark_band(resident, band, beside=beside, stopwatch=stopwatch, progress=progress)
-        with stopwatch.running(resident.device):
-            counts = count_overlaps(resident.device, mask, stopwatch=stopwatch)
-        return judge_slices(counts, ni * nj, band, tuple(told))
-
-    with open_volume(volume, device, memory, "a search for ghost slices") as resident:
-        return resident.attempt(work)
+        for attempt in resident.with_fallback():
+            with attempt as (current, warnings):
+                stopwatch = Stopwatch()
+                mask = mark_band(
+                    resident, band, beside=beside, stopwatch=stopwatch, progress=progress or ignore_progress
+                )
+                with stopwatch.running(current):
+                    counts = count_overlaps(current, mask, stopwatch=stopwatch)
+                ghosts = judge_slices(counts, ni * nj, band, tuple(warnings))
+    return ghosts

@@ -26,7 +26,7 @@ from clrecon.opencl import (
     memory_limits,
     take_device,
     upload,
-    work_on,
+    with_fallback,
 )
 from clrecon.operators.points.grid import GridPlan, PointGrid, fill_grid, plan_grid, prepare_grid
 from clrecon.operators.points.neighbours import find_neighbours
@@ -107,18 +107,18 @@ def thin_points(
         raise UsageError(f"{name_parameter('spacing', spacing)}: a positive length in mm is needed")
     plan, tell = plan_grid(made.points, float(spacing)), progress or ignore_progress
 
-    def work(current: Device, told: list[str]) -> PointStep:
-        stopwatch = Stopwatch()
-        tell("thin", 0, 1)
-        with stopwatch.running(current):
-            chosen = np.sort(choose_points(current, plan, memory=memory, stopwatch=stopwatch))
-        removed = np.ones(len(made), np.uint8)
-        removed[chosen] = 0
-        facts = {"spacing_mm": float(spacing), "device": current.label, "kernel_seconds": dict(stopwatch.by_kernel)}
-        tell("thin", 1, 1)
-        return PointStep(made.select(chosen), removed, (REASON,), facts, tuple(told))
-
-    return work_on(take_device(device), work)
+    for attempt in with_fallback(take_device(device)):
+        with attempt as (current, told):
+            stopwatch = Stopwatch()
+            tell("thin", 0, 1)
+            with stopwatch.running(current):
+                chosen = np.sort(choose_points(current, plan, memory=memory, stopwatch=stopwatch))
+            removed = np.ones(len(made), np.uint8)
+            removed[chosen] = 0
+            facts = {"spacing_mm": float(spacing), "device": current.label, "kernel_seconds": dict(stopwatch.by_kernel)}
+            tell("thin", 1, 1)
+            step = PointStep(made.select(chosen), removed, (REASON,), facts, tuple(told))
+    return step
 
 
 REASONS = ("sparse cell", "not reached by growth", "smaller component")
@@ -297,18 +297,17 @@ def remove_sparse_cells(
     tell("cells", 1, 2)
     plan = plan_grid(made.points, length)
 
-    def work(current: Device, told: list[str]) -> PointStep:
-        stopwatch = Stopwatch()
-        with stopwatch.running(current):
-            grown = grow_cells(
-                current, plan, int(fewest), int(threshold), keep_largest, memory=memory, stopwatch=stopwatch
-            )
-        asked = {"edge_is_default": edge is None, "fewest": int(fewest), "threshold": int(threshold)}
-        made_on = {"device": current.label, "kernel_seconds": dict(stopwatch.by_kernel)}
-        facts = {"edge_mm": float(plan.edge), **asked, **grown.facts, **made_on}
-        return _finish(made, grown, facts, keep_largest, told)
-
-    step = work_on(taken, work)
+    for attempt in with_fallback(taken):
+        with attempt as (current, told):
+            stopwatch = Stopwatch()
+            with stopwatch.running(current):
+                grown = grow_cells(
+                    current, plan, int(fewest), int(threshold), keep_largest, memory=memory, stopwatch=stopwatch
+                )
+            asked = {"edge_is_default": edge is None, "fewest": int(fewest), "threshold": int(threshold)}
+            made_on = {"device": current.label, "kernel_seconds": dict(stopwatch.by_kernel)}
+            facts = {"edge_mm": float(plan.edge), **asked, **grown.facts, **made_on}
+            step = _finish(made, grown, facts, keep_largest, told)
     tell("cells", 2, 2)
     return step
 

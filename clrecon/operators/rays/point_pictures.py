@@ -28,7 +28,7 @@ from clrecon.opencl import (
     settle,
     take_device,
     upload,
-    work_on,
+    with_fallback,
 )
 from clrecon.operators.rays.picture_buffers import highlight_table
 from clrecon.points import PointCloud
@@ -353,30 +353,29 @@ class PointPictures(Closing):
             normals = None if normals is None else normals[kept]
         stopwatch = Stopwatch()
 
-        def draw(device: Device, told: list[str]) -> Rendering:
-            found = draw_splats(
-                device, points, table, normals, camera, size, radius, base=self._base, lighting=style.light,
-                background=background, memory=self.memory, progress=progress, stopwatch=stopwatch,
-            )  # fmt: skip
-            report = {
-                "mode": "points",
-                "device": device.label,
-                "driver": device.driver,
-                "points": len(points),
-                "radius_mm": radius,
-                "color_by": colors.color_by,
-                "legend": colors.legend,
-                "legend_left_out": colors.left_out,
-                "window_hu": colors.window,
-                "shading": found.shading,
-                "slabs": found.parts,
-                "seconds": dict(stopwatch.seconds),
-                "kernel_seconds": dict(stopwatch.by_kernel),
-                "warnings": [*device.warnings, *told, *_warn_of_radius(radius, camera, size)],
-            }
-            return Rendering(found.image, found.depth, found.depth, camera, None, "points", report)
-
-        return work_on(self._device, draw)
+        for attempt in with_fallback(self._device):
+            with attempt as (device, told):
+                found = draw_splats(
+                    device, points, table, normals, camera, size, radius, base=self._base, lighting=style.light,
+                    background=background, memory=self.memory, progress=progress, stopwatch=stopwatch,
+                )  # fmt: skip
+        report = {
+            "mode": "points",
+            "device": device.label,
+            "driver": device.driver,
+            "points": len(points),
+            "radius_mm": radius,
+            "color_by": colors.color_by,
+            "legend": colors.legend,
+            "legend_left_out": colors.left_out,
+            "window_hu": colors.window,
+            "shading": found.shading,
+            "slabs": found.parts,
+            "seconds": dict(stopwatch.seconds),
+            "kernel_seconds": dict(stopwatch.by_kernel),
+            "warnings": [*device.warnings, *told, *_warn_of_radius(radius, camera, size)],
+        }
+        return Rendering(found.image, found.depth, found.depth, camera, None, "points", report)
 
     def _radius(self, style: PointLook) -> float:
         if style.radius_mm is not None:

@@ -328,7 +328,7 @@ def take_picture(
     size: tuple[int, int],
     ray_step: float,
     background: str | Sequence[float] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
 ) -> Rendering:
     """Take one picture of a volume on a device.
 
@@ -338,12 +338,10 @@ def take_picture(
     progress: Called as ``progress("slabs", slices done, all slices)``.
     """
 
-    def take(told: list[str]) -> Rendering:
-        job = _Job(resident, style, camera, size, ray_step, background, progress or ignore_progress)
-        job.warnings[:0] = told
-        return job.run()
-
-    return resident.attempt(take)
+    for attempt in resident.with_fallback():
+        with attempt as (_, warnings):
+            made = _Job(resident, style, camera, size, ray_step, background, progress, warnings).run()
+    return made
 
 
 def take_with_layers(
@@ -361,20 +359,15 @@ def take_with_layers(
     draw: Draws the picture; it is called again where the device has no room, or another one takes over.
     """
 
-    def take(told: list[str]) -> Rendering:
-        job = _Job(resident, style, camera, size, ray_step, None, ignore_progress)
-        job.warnings[:0] = told
-        slices = plan_ray_slabs(resident, beside, {}, job.labels)
-
-        def attempt(slices: int) -> Rendering:
-            sampled = DrawnVolume(
-                resident.device, partial(job.sample_between, slices), job.near_mm, job.stopwatch, job.warnings
-            )
-            return draw(sampled)
-
-        return resident.halve(RAYS, slices, attempt, warnings=job.warnings)
-
-    return resident.attempt(take)
+    for attempt in resident.with_fallback():
+        with attempt as (device, warnings):
+            job = _Job(resident, style, camera, size, ray_step, None, ignore_progress, warnings)
+            planned = plan_ray_slabs(resident, beside, {}, job.labels)
+            for slabs in resident.attempts(RAYS, planned, job.warnings):
+                with slabs as slices:
+                    sample = partial(job.sample_between, slices)
+                    made = draw(DrawnVolume(device, sample, job.near_mm, job.stopwatch, job.warnings))
+    return made
 
 
 class _Job:
@@ -387,12 +380,13 @@ class _Job:
         ray_step: float,
         background: str | Sequence[float] | None,
         progress: Progress,
+        warnings: list[str],
     ):
         self.resident, self.style, self.camera, self.size = resident, style, camera, size
         self.ray_step, self.background, self.progress = ray_step, background, progress
         label_style = style.label_style if isinstance(style, VolumeLook) else None
         self.labels = None if label_style is None else resident.bring(label_style.labels)
-        self.warnings = [] if self.labels is None else list(self.labels.warnings)
+        self.warnings = [*warnings, *([] if self.labels is None else self.labels.warnings)]
         self.lighting = style.light if isinstance(style, VolumeLook) else Lighting()
         self.stopwatch = Stopwatch()
         self.box = volume_box(resident.volume)
@@ -400,9 +394,11 @@ class _Job:
 
     def run(self) -> Rendering:
         """Take the picture, with thinner slabs if the device has no room for the planned ones."""
-        resident = self.resident
-        slices = plan_ray_slabs(resident, *PictureBuffers.needs(self.size), self.labels)
-        return resident.halve(RAYS, slices, self._take, warnings=self.warnings)
+        planned = plan_ray_slabs(self.resident, *PictureBuffers.needs(self.size), self.labels)
+        for attempt in self.resident.attempts(RAYS, planned, self.warnings):
+            with attempt as slices:
+                made = self._take(slices)
+        return made
 
     def _take(self, slices: int) -> Rendering:
         """Go through the slabs and collect the picture."""

@@ -30,7 +30,7 @@ from clrecon.opencl import (
     load_program,
     take_device,
     upload,
-    work_on,
+    with_fallback,
 )
 from clrecon.operators.masks.voxel_mask import zero_words
 from clrecon.operators.rays.mesh_pictures import (
@@ -365,7 +365,9 @@ class ScenePictures(Closing):
                 translucent = renderer, style
         finish = partial(self._finish, drawn, camera, size, background, tell)
         if translucent is None:
-            made = work_on(self._device, lambda device, told: finish(device, Stopwatch(), told, None))
+            for attempt in with_fallback(self._device):
+                with attempt as (device, warnings):
+                    made = finish(device, Stopwatch(), warnings, None)
         else:
             renderer, look = translucent
             beside = {

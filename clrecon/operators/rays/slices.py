@@ -61,7 +61,7 @@ def overlay_slices(
     camera: Camera,
     size: tuple[int, int],
     background: str | Sequence[float] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
 ) -> Rendering:
     """Show slices of a volume in space, each translucent at its own place: sheared and uneven stacks too.
 
@@ -76,12 +76,14 @@ def overlay_slices(
     """
     chosen = choose_slices(resident.volume, style.slices)
 
-    def take(told: list[str]) -> Rendering:
-        overlay = _Overlay(resident, style, camera, size, chosen, progress or ignore_progress)
-        overlay.warnings[:0] = told
-        return overlay.run(background)
-
-    return resident.attempt(take)
+    for attempt in resident.with_fallback():
+        with attempt as (_, warnings):
+            overlay = _Overlay(resident, style, camera, size, chosen, progress, warnings)
+            planned = overlay.plan(*PictureBuffers.needs(size))
+            for slabs in resident.attempts(SLICES, planned, overlay.warnings):
+                with slabs as slices:
+                    made = overlay.take(slices, background)
+    return made
 
 
 def overlay_with_layers(
@@ -99,18 +101,15 @@ def overlay_with_layers(
     """
     chosen = choose_slices(resident.volume, style.slices)
 
-    def take(told: list[str]) -> Rendering:
-        overlay = _Overlay(resident, style, camera, size, chosen, ignore_progress)
-        overlay.warnings[:0] = told
-        near_mm = float(overlay.view.table[NEAR_ROW, 0])
-
-        def attempt(slices: int) -> Rendering:
-            sample = partial(overlay.sample_between, slices)
-            return draw(DrawnVolume(resident.device, sample, near_mm, overlay.stopwatch, overlay.warnings))
-
-        return overlay.plan(beside, {}, attempt)
-
-    return resident.attempt(take)
+    for attempt in resident.with_fallback():
+        with attempt as (device, warnings):
+            overlay = _Overlay(resident, style, camera, size, chosen, ignore_progress, warnings)
+            near_mm = float(overlay.view.table[NEAR_ROW, 0])
+            for slabs in resident.attempts(SLICES, overlay.plan(beside, {}), overlay.warnings):
+                with slabs as slices:
+                    sample = partial(overlay.sample_between, slices)
+                    made = draw(DrawnVolume(device, sample, near_mm, overlay.stopwatch, overlay.warnings))
+    return made
 
 
 class _Colors(NamedTuple):
@@ -167,6 +166,7 @@ class _Overlay:
         size: tuple[int, int],
         chosen: list[int],
         progress: Progress,
+        warnings: list[str],
     ):
         self.resident, self.chosen, self.style, self.progress = resident, chosen, style, progress
         self.colors = _Colors.of(style)
@@ -175,16 +175,10 @@ class _Overlay:
         planes = None if style.clip is None else style.clip.planes
         self.view = RayView.of(resident.volume, camera, size, 1.0, planes=planes, box=box, focus=box)
         self.stopwatch = Stopwatch()
-        self.warnings = _warn(resident.volume, camera)
+        self.warnings = [*warnings, *_warn(resident.volume, camera)]
 
-    def run(self, background: str | Sequence[float] | None) -> Rendering:
-        """Take the picture, with fewer slices at a time if the device has no room for the planned number."""
-        return self.plan(*PictureBuffers.needs(self.view.size), lambda slices: self._take(slices, background))
-
-    def plan(
-        self, picture: Mapping[str, int], states: Mapping[str, int], attempt: Callable[[int], Rendering]
-    ) -> Rendering:
-        """Attempt a picture with all slices that fit beside it at once, then with fewer."""
+    def plan(self, picture: Mapping[str, int], states: Mapping[str, int]) -> int:
+        """Return how many slices fit beside a picture at once."""
         resident, count = self.resident, len(self.chosen)
 
         def needs(slices: int) -> dict[str, int]:
@@ -198,7 +192,7 @@ class _Overlay:
             check_budget(resident.device, needs(1), resident.memory)
         if slices < count:
             resident.make_way()
-        return resident.halve(SLICES, max(slices, 1), attempt, warnings=self.warnings)
+        return max(slices, 1)
 
     def sample_between(self, slices: int, between: Between) -> None:
         """Add what slices show between two layers to the states of the rays."""
@@ -206,7 +200,8 @@ class _Overlay:
         for first in range(0, len(self.order), slices):
             self._draw(self.order[first : first + slices], 0, output, between)
 
-    def _take(self, slices: int, background: str | Sequence[float] | None) -> Rendering:
+    def take(self, slices: int, background: str | Sequence[float] | None) -> Rendering:
+        """Take the picture, so many slices at a time."""
         stopwatch, device = self.stopwatch, self.resident.device
         parts = [self.order[first : first + slices] for first in range(0, len(self.order), slices)]
         output = PictureBuffers(device, self.view.size, background, len(parts) > 1)

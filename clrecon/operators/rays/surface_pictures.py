@@ -42,7 +42,7 @@ def cast_surface(
     size: tuple[int, int],
     ray_step: float,
     background: str | Sequence[float] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
 ) -> Rendering:
     """Show where the field first reaches an iso value along each ray.
 
@@ -65,12 +65,10 @@ def cast_surface(
     """
     rule = choose_iso_rule(resident.volume, style.iso_value, values=resident.values)
 
-    def take(told: list[str]) -> Rendering:
-        job = _Job(resident, rule, style, camera, size, float(ray_step), progress or ignore_progress)
-        job.warnings[:0] = told
-        return job.run(background)
-
-    return resident.attempt(take)
+    for attempt in resident.with_fallback():
+        with attempt as (_, warnings):
+            made = _Job(resident, rule, style, camera, size, float(ray_step), progress, warnings).run(background)
+    return made
 
 
 class _Job:
@@ -85,20 +83,24 @@ class _Job:
         size: tuple[int, int],
         ray_step: float,
         progress: Progress,
+        warnings: list[str],
     ):
         self.resident, self.rule, self.look, self.progress = resident, rule, style, progress
         self.camera, self.size, self.ray_step = camera, size, ray_step
         self.planes = np.empty((0, 4)) if style.clip is None else style.clip.planes
         self.style = style.label_style
         self.labels = None if self.style is None else resident.bring(self.style.labels)
-        self.warnings = [] if self.labels is None else list(self.labels.warnings)
+        self.warnings = [*warnings, *([] if self.labels is None else self.labels.warnings)]
         self.stopwatch = Stopwatch()
         self.frame = FieldFrame.of(resident.volume)
 
     def run(self, background: str | Sequence[float] | None) -> Rendering:
         """Take the picture, with thinner slabs if the device has no room for the planned ones."""
-        slices = plan_ray_slabs(self.resident, *PictureBuffers.needs(self.size), self.labels)
-        return self.resident.halve(RAYS, slices, lambda slices: self._take(slices, background), warnings=self.warnings)
+        planned = plan_ray_slabs(self.resident, *PictureBuffers.needs(self.size), self.labels)
+        for attempt in self.resident.attempts(RAYS, planned, self.warnings):
+            with attempt as slices:
+                made = self._take(slices, background)
+        return made
 
     def _take(self, slices: int, background: str | Sequence[float] | None) -> Rendering:
         resident, device, nk = self.resident, self.resident.device, self.resident.volume.shape_ijk[2]

@@ -45,7 +45,7 @@ from clrecon.rendering.views.directions import ANTERIOR, DEFAULT_SIZE, checked_s
 from clrecon.rendering.views.reformation import find_plane
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.base_classes import Closing
-from clrecon.system.progress import Progress
+from clrecon.system.progress import Progress, ignore_progress
 
 MASKED_BY = ("field_of_view", "remove_table", "region", LEFT_OUT)
 """Entries of the report of a volume of which a part was turned into air, or left out."""
@@ -198,6 +198,7 @@ class VolumeRenderer(Closing):
             raise UsageError("mode mesh shows a mesh, and this is a volume: extract a surface first")
         seen_from = default_view(style.mode, self.volume) if view is None and camera is None else view
         place = Place.checked(style, camera, seen_from, up, zoom, view_angle, center)
+        progress = progress or ignore_progress
         if isinstance(style, CurveCut):
             return self._reformat(style, place, size, background, progress)
         is_sheet = isinstance(style, PlaneCut) and style.sheet is not None
@@ -220,7 +221,7 @@ class VolumeRenderer(Closing):
         step = self._checked_step(style.ray_step)
         return take_picture(self._resident, style, camera, size, step, ground, progress)
 
-    def _within(self, progress: Progress | None) -> VolumeRenderer:
+    def _within(self, progress: Progress) -> VolumeRenderer:
         """Return the renderer of the volume without what lies outside of the body, which is kept."""
         if self._inner is None:
             self._resident.make_way()
@@ -235,7 +236,7 @@ class VolumeRenderer(Closing):
         See `shown_box`; the last box is kept for styles that show the same part of the volume.
         """
         if isinstance(style, Projection) and style.leaves_out and LEFT_OUT not in self.volume.report:
-            return self._within(None).frame(style)
+            return self._within(ignore_progress).frame(style)
         key = framing_key(self.volume, style)
         if self._framed is None or self._framed[0] != key:
             self._framed = key, shown_box(self._resident, style)
@@ -269,7 +270,7 @@ class VolumeRenderer(Closing):
         place: Place,
         size: tuple[int, int],
         background: str | Sequence[float],
-        progress: Progress | None,
+        progress: Progress,
     ) -> Rendering:
         plane = place.camera
         if plane is None:
@@ -289,7 +290,7 @@ class VolumeRenderer(Closing):
         place: Place,
         size: Sequence[int] | None,
         background: str | Sequence[float],
-        progress: Progress | None,
+        progress: Progress,
     ) -> Rendering:
         return take_curve(self._resident, style, place.view, place.up, size, background, progress)
 

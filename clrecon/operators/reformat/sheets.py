@@ -226,17 +226,16 @@ def sample_sheet(
     if not isinstance(combine, str) or combine not in COMBINATIONS:
         raise UsageError(f"the samples of a slab are combined by one of {', '.join(COMBINATIONS)}, not {combine!r}")
 
-    def take(told: list[str]) -> Reformation:
-        run = _Run(resident, sheet, samples, combine, stopwatch or Stopwatch())
-        slices = run.plan()
-        made = resident.halve(
-            SHEETS, slices, lambda slices: run.all_slabs(slices, progress), fewest=min(2, slices), warnings=told
-        )
-        if warnings is not None:
-            warnings.extend(told)
-        return made
-
-    return resident.attempt(take)
+    for attempt in resident.with_fallback():
+        with attempt as (_, told):
+            run = _Run(resident, sheet, samples, combine, stopwatch or Stopwatch())
+            planned = run.plan()
+            for slabs in resident.attempts(SHEETS, planned, told, fewest=min(2, planned)):
+                with slabs as slices:
+                    made = run.all_slabs(slices, progress)
+    if warnings is not None:
+        warnings.extend(told)
+    return made
 
 
 class CutJob:

@@ -15,6 +15,7 @@ from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import ValueRange
 from clrecon.opencl import (
+    Attempt,
     Device,
     MemoryLimits,
     Program,
@@ -27,7 +28,7 @@ from clrecon.opencl import (
     settle,
     take_device,
     upload,
-    work_on,
+    with_fallback,
 )
 from clrecon.operators.resident.tables import StackTable, ray_variants
 from clrecon.system.base_classes import Closing
@@ -70,7 +71,7 @@ class DeviceVolume(Closing):
     ----------
     volume : Volume
     device : Device
-        Another one once the CPU device took over, see `attempt`.
+        Another one once the CPU device took over, see `with_fallback`.
     memory : int or None
     uploaded_bytes : int
         Bytes of voxels uploaded so far.  CPU devices read the computer's own memory: nothing is copied.
@@ -300,7 +301,7 @@ class DeviceVolume(Closing):
         Parameters
         ----------
         what : str
-            Purpose of the slabs.  If thinner slabs were necessary for this purpose before, see `halve`, they are
+            Purpose of the slabs.  If thinner slabs were necessary for this purpose before, see `attempts`, they are
             planned again.
         total : int
             Slices of the volume, or of a grid of samples around it.
@@ -322,73 +323,49 @@ class DeviceVolume(Closing):
             low, high = (middle, high) if fits else (low, middle)
         return low
 
-    def attempt(self, work: Callable[[list[str]], Made]) -> Made:
-        """Do the work of an operator: once more if the device was lost, on the CPU device if it has no room or fails.
-
-        Parameters
-        ----------
-        work : callable
-            Called with warnings for its report.  It plans and makes everything anew each time, on `device`.
-
-        Raises
-        ------
-        DeviceError
-            The device failed, and no other takes over: it was named, or is a CPU device.
-        """
-
-        def on_device(device: Device, told: list[str]) -> Made:
+    def with_fallback(self) -> Iterator[Attempt[tuple[Device, list[str]]]]:
+        """Yield attempts at the work of an operator, each anew on `device`, see `clrecon.opencl.with_fallback`."""
+        for attempt in with_fallback(self._taken_device):
+            current, _ = attempt.given
             with self._lock:
-                if device is not self.device:
+                if current is not self.device:
                     self.release()
-                    self.device = device
+                    self.device = current
                     self.most_slices.clear()
-            return work(told)
+            yield attempt
 
-        return work_on(self._taken_device, on_device)
+    def attempts(
+        self, what: str, slices: int, warnings: list[str] | None = None, *, fewest: int = 1
+    ) -> Iterator[Attempt[int]]:
+        """Yield attempts with `slices` in a slab, then with half as many as long as the device has no room.
 
-    def halve(
-        self,
-        what: str,
-        slices: int,
-        attempt: Callable[[int], Made],
-        *,
-        fewest: int = 1,
-        warnings: list[str] | None = None,
-    ) -> Made:
-        """Try with ``slices`` slices in a slab, then with half as many as long as the device has no room.
+            for attempt in resident.attempts("surface", planned, warnings):
+                with attempt as slices:
+                    made = ...
 
-        Parameters
-        ----------
-        what : str
-            As in `plan`.
-        slices : int
-            Result of `plan`.
-        attempt : callable
-            Called with the number of slices.  It must make all its buffers itself, because earlier ones are gone.
-        fewest : int
-            Fewest slices that are tried.
-        warnings : list of str, optional
-            Gets a line for each halving.
+        The block makes all its buffers in functions that it calls: earlier ones are gone, and its own would stay.
 
-        Raises
-        ------
-        DeviceMemoryError
-            Slabs of ``fewest`` slices do not fit either.
+        what: As in `plan`, whose result `slices` are.
+        warnings: Gets a line for each halving.
+        fewest: Fewest slices that are tried.
         """
         is_last = False
         while True:
-            try:
-                return attempt(slices)
-            except DeviceMemoryError as error:
-                settle(self.device, error)
-                self.release()
-                if is_last:
-                    raise
-                is_last = slices <= fewest  # once more, with nothing else on the device
-                slices = self.most_slices[what] = max(fewest, -(-slices // 2))
-                log.info("%s: no room on %s, continued with slabs of %d slices", what, self.device.label, slices)
-                if warnings is not None:
-                    warnings.append(f"{error}: continued with slabs of {count_of(slices, 'slice')}")
+            attempt = Attempt(slices, DeviceMemoryError)
+            yield attempt
+            error = attempt.take_error()
+            if error is None:
+                return
+            settle(self.device, error)
+            self.release()
+            if is_last:
+                raise error
+            is_last = slices <= fewest  # once more, with nothing else on the device
+            slices = self.most_slices[what] = max(fewest, -(-slices // 2))
+            log.info("%s: no room on %s, continued with slabs of %d slices", what, self.device.label, slices)
+            if warnings is not None:
+                warnings.append(f"{error}: continued with slabs of {count_of(slices, 'slice')}")
+            del error  # its frames hold buffers
 
 
 @contextmanager

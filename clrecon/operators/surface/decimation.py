@@ -35,7 +35,7 @@ from clrecon.opencl import (
     take_device,
     upload,
     wait,
-    work_on,
+    with_fallback,
 )
 from clrecon.operators.masks.voxel_mask import zero_words
 from clrecon.system.arguments import explains_arguments
@@ -369,14 +369,10 @@ def decimate_mesh(
     decimation.check_refinement(mesh, max_deviation_mm)
     if device is None:
         return decimation.decimate_mesh(mesh, fraction, max_deviation_mm, progress=progress)
-    return work_on(
-        take_device(device),
-        lambda device, told: decimation.decimate_mesh(
-            mesh,
-            fraction,
-            max_deviation_mm,
-            progress=progress,
-            make_bounds=partial(DeviceBounds, device),
-            find_crossings=partial(find_crossings, device),
-        ),  # fmt: skip
-    )
+    for attempt in with_fallback(take_device(device)):
+        with attempt as (current, _):
+            decimated = decimation.decimate_mesh(
+                mesh, fraction, max_deviation_mm, progress=progress, make_bounds=partial(DeviceBounds, current),
+                find_crossings=partial(find_crossings, current),
+            )  # fmt: skip
+    return decimated

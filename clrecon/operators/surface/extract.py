@@ -17,8 +17,7 @@ from clrecon.opencl import Device
 from clrecon.operators.masks.enclosed import fill_enclosed
 from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
 from clrecon.operators.surface import marching_cubes
-from clrecon.operators.surface.extraction import Extraction, Part, prepare_isosurface
-from clrecon.operators.surface.growing import prepare_growing
+from clrecon.operators.surface.extraction import Extraction
 from clrecon.operators.surface.marching_cubes import Placement
 from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
@@ -26,7 +25,7 @@ from clrecon.operators.surface.trilinear import check_row
 from clrecon.points import PointCloud
 from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.base_classes import Closing
-from clrecon.system.progress import Progress
+from clrecon.system.progress import Progress, ignore_progress
 
 
 class SurfaceExtractor(Closing):
@@ -120,7 +119,13 @@ class SurfaceExtractor(Closing):
                     f" {name_parameter('grow_from')} out, or take the topology separated"
                 )
             seeds, grid = Seeds.read(grow_from, self._resident), replace(grid, grows=True)
-        return self._resident.attempt(lambda told: self._extract(grid, told, progress, seeds))
+        for attempt in self._resident.with_fallback():
+            with attempt as (_, warnings):
+                run = Extraction(self._resident, grid, self._placement(grid), warnings, seeds=seeds)
+                positions, normals, triangles = run.run(progress or ignore_progress)
+                report = run.describe(len(positions), len(triangles))
+                mesh = Mesh(run.placement.to_lps(positions), triangles, normals, report, trusted=True)
+        return mesh
 
     @explains_arguments
     def extract_vertices(
@@ -135,7 +140,15 @@ class SurfaceExtractor(Closing):
             range have none.
         """
         grid = self._choose_grid(iso_value, closed, "separated", below)
-        return self._resident.attempt(lambda told: self._extract_vertices(grid, told, progress))
+        for attempt in self._resident.with_fallback():
+            with attempt as (_, warnings):
+                run = Extraction(self._resident, grid, self._placement(grid), warnings, vertices_only=True)
+                positions, normals, _ = run.run(progress or ignore_progress)
+                report = run.describe(len(positions), 0)
+                level = report["iso_value_hu"]
+                hu = None if level is None else np.full(len(positions), level, np.float32)
+                cloud = PointCloud.of_known(run.placement.to_lps(positions), normals, hu, report=report)
+        return cloud
 
     def _choose_grid(
         self, iso_value: Level, closed: bool, topology: str, below: bool, vertex_rule: str = "linear"
@@ -150,36 +163,6 @@ class SurfaceExtractor(Closing):
         if min(grid.shape) < 2:
             raise NoSurfaceError(f"an open volume of {grid.shape} voxels has no cells: leave it closed")
         return grid
-
-    def _run(self, run: Extraction, told: list[str], progress: Progress | None) -> Part:
-        rule, volume = run.grid.rule, self.volume
-        run.warnings += told
-        if progress is not None:
-            progress("build", 0, 1)
-        with run.stopwatch.timed("build"):
-            prepare_isosurface(
-                self.device, volume.voxels.dtype, rule.topology, volume.uneven, rule.inside, rule.vertex_rule,
-                run.grid.grows,
-            )  # fmt: skip
-            if run.grid.grows:
-                prepare_growing(self.device)
-        if progress is not None:
-            progress("build", 1, 1)
-        return run.run(plan_slabs(run.grid, self._resident), progress)
-
-    def _extract(self, grid: SampleGrid, told: list[str], progress: Progress | None, seeds: Seeds | None) -> Mesh:
-        run = Extraction(self._resident, grid, self._placement(grid), seeds=seeds)
-        positions, normals, triangles = self._run(run, told, progress)
-        report = run.describe(len(positions), len(triangles))
-        return Mesh(run.placement.to_lps(positions), triangles, normals, report, trusted=True)
-
-    def _extract_vertices(self, grid: SampleGrid, told: list[str], progress: Progress | None) -> PointCloud:
-        run = Extraction(self._resident, grid, self._placement(grid), vertices_only=True)
-        positions, normals, _ = self._run(run, told, progress)
-        report = run.describe(len(positions), 0)
-        iso_value = report["iso_value_hu"]
-        hu = None if iso_value is None else np.full(len(positions), iso_value, np.float32)
-        return PointCloud.of_known(run.placement.to_lps(positions), normals, hu, report=report)
 
     def _placement(self, grid: SampleGrid) -> Placement:
         border = grid.rule.border

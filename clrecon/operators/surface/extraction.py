@@ -18,10 +18,10 @@ from clrecon.opencl import Device, Program, Stopwatch, result_pages
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import BrickStates, brick_bytes, compare_bricks, measure_bricks
 from clrecon.operators.surface import marching_cubes
-from clrecon.operators.surface.growing import Grown, grow, growing_needs, join_slabs
+from clrecon.operators.surface.growing import Grown, grow, growing_needs, join_slabs, prepare_growing
 from clrecon.operators.surface.marching_cubes import Classified, Counted, Placement, count
 from clrecon.operators.surface.seeds import Seeds
-from clrecon.operators.surface.slabs import BRICKS, SampleGrid, Slab
+from clrecon.operators.surface.slabs import BRICKS, SampleGrid, Slab, plan_slabs
 from clrecon.operators.surface.trilinear import prepare_trilinear
 from clrecon.system.progress import Progress
 from clrecon.system.text import format_hu
@@ -103,6 +103,7 @@ class Extraction:
         resident: DeviceVolume,
         grid: SampleGrid,
         placement: Placement,
+        warnings: list[str],
         *,
         vertices_only: bool = False,
         seeds: Seeds | None = None,
@@ -120,36 +121,35 @@ class Extraction:
         self.slabs = self.first = self.vertices = self.triangles = 0
         self.parts: list[Part] = []
         self.largest = {"volume": 0, "scratch": 0, "output": 0}
-        self.warnings: list[str] = []
+        self.warnings = warnings
 
-    def run(self, slices: int, progress: Progress | None) -> Part:
-        """Process the grid, `slices` at a time or fewer."""
-        self.resident.halve(
-            self.grid.kind, slices, lambda slices: self._go_on(slices, progress), warnings=self.warnings
-        )
+    def run(self, progress: Progress) -> Part:
+        """Build the kernels, and process the grid, as many slices at a time as fit the device."""
+        rule, volume, gk = self.grid.rule, self.grid.volume, self.grid.shape[2]
+        progress("build", 0, 1)
+        with self.stopwatch.timed("build"):
+            prepare_isosurface(
+                self.device, volume.voxels.dtype, rule.topology, volume.uneven, rule.inside, rule.vertex_rule,
+                self.grid.grows,
+            )  # fmt: skip
+            if self.grid.grows:
+                prepare_growing(self.device)
+        progress("build", 1, 1)
+        planned = plan_slabs(self.grid, self.resident)
+        for attempt in self.resident.attempts(self.grid.kind, planned, self.warnings):
+            with attempt as slices:  # what is done already stays
+                if self._seeds is not None and self._grown is None and slices < gk:
+                    self._grow(self._seeds, slices)
+                while self.first < gk:
+                    self._add_slab(Slab(self.grid, self.first, min(self.first + slices, gk)))
+                    if self.slabs > 1 or self.first < gk:
+                        progress("slabs", self.first, gk)
         if self.vertices == 0:
             raise _refuse_level(self.device, self.grid.volume, self.grid.rule)
         try:
             return _join(self.parts)
         except MemoryError as error:
             raise DeviceError(f"the mesh does not fit the memory of this computer: {error}") from error
-
-    def _go_on(self, slices: int, progress: Progress | None) -> None:
-        """Process the slices that are not yet done."""
-        gk = self.grid.shape[2]
-        if self._seeds is not None and self._grown is None and slices < gk:
-            self._grow(self._seeds, slices)
-        while self.first < gk:
-            slab = Slab(self.grid, self.first, min(self.first + slices, gk))
-            part = self._one_slab(slab)
-            self.parts.append(part)
-            self.vertices, self.triangles = self.vertices + len(part[0]), self.triangles + len(part[2])
-            if max(self.vertices, self.triangles) >= 2**32:
-                raise marching_cubes.too_many(self.vertices, self.triangles)
-            self.slabs += 1
-            self.first = slab.end
-            if progress is not None and (slab.end < gk or self.slabs > 1):
-                progress("slabs", slab.end, gk)
 
     def _grow(self, seeds: Seeds, slices: int) -> None:
         """Find the cells of the part of the surface that is made, from the bits of the whole grid, slab by slab."""
@@ -169,7 +169,8 @@ class Extraction:
         bricks = self._compare_bricks(slab, voxels_d)
         return marching_cubes.classify(self.device, slab, voxels_d, self.levels, self.stopwatch, bricks)
 
-    def _one_slab(self, slab: Slab) -> Part:
+    def _add_slab(self, slab: Slab) -> None:
+        """Make the part of the surface that belongs to a slab."""
         device, stopwatch = self.device, self.stopwatch
         volume, inside = self.grid.volume, self.grid.rule.inside
         program = prepare_isosurface(
@@ -194,7 +195,12 @@ class Extraction:
             device, slab, program, voxels_d, classified, counted, self.placement, self.vertices, stopwatch
         )
         self.grid.volume.release_slices(*slab.voxel_slices)
-        return part
+        self.parts.append(part)
+        self.vertices, self.triangles = self.vertices + len(part[0]), self.triangles + len(part[2])
+        if max(self.vertices, self.triangles) >= 2**32:
+            raise marching_cubes.too_many(self.vertices, self.triangles)
+        self.slabs += 1
+        self.first = slab.end
 
     def _upload_part(self, slab: Slab) -> Any:
         return self.resident.part(*slab.voxel_slices, self.stopwatch)

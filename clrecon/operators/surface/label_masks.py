@@ -50,7 +50,7 @@ from clrecon.opencl import (
     memory_limits,
     take_device,
     upload,
-    work_on,
+    with_fallback,
 )
 from clrecon.operators.resident.tables import label_variants
 from clrecon.operators.surface import marching_cubes
@@ -59,7 +59,7 @@ from clrecon.operators.surface.labels import Window, each_label, group_boxes
 from clrecon.operators.surface.marching_cubes import Classified, Counted, Placement, count
 from clrecon.operators.surface.slabs import SampleGrid
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.progress import Progress
+from clrecon.system.progress import Progress, ignore_progress
 
 
 def prepare_survey(device: Device, label_dtype: DTypeLike = np.uint8) -> Program:
@@ -154,7 +154,7 @@ class HeldMap:
 class MaskExtraction:
     """One extraction: the data that its labels share."""
 
-    def __init__(self, labels: LabelMap, device: Device, memory: int | None, closed: bool):
+    def __init__(self, labels: LabelMap, device: Device, memory: int | None, closed: bool, warnings: list[str]):
         self.labels = labels
         self.device = device
         self.memory = memory
@@ -167,7 +167,7 @@ class MaskExtraction:
         frames[:, 2, 3] = np.maximum(frames[:, 2, 3], KEEP)
         self.placement = replace(placement, slice_frames=frames, margin=np.maximum(placement.margin, np.float32(KEEP)))
         self.levels: dict[int, int] = {}
-        self.warnings: list[str] = []
+        self.warnings = warnings
 
     def programs(self) -> tuple[Program, Program]:
         """The kernels, see `prepare_label_masks`."""
@@ -463,12 +463,11 @@ def extract_label_masks(
     marching_cubes.check_row(labels.shape_ijk[0])
     chosen = labels.choose(numbers)
 
-    def make(current: Device, told: list[str]) -> dict[int, Mesh]:
-        run = MaskExtraction(labels, current, memory, closed)
-        run.warnings += told
-        return _make_meshes(run, chosen, progress)
-
-    return work_on(take_device(device), make)
+    for attempt in with_fallback(take_device(device)):
+        with attempt as (current, warnings):
+            run = MaskExtraction(labels, current, memory, closed, warnings)
+            meshes = _make_meshes(run, chosen, progress or ignore_progress)
+    return meshes
 
 
 def warn_of_volume(report: Mapping[str, Any]) -> list[str]:
@@ -479,7 +478,7 @@ def warn_of_volume(report: Mapping[str, Any]) -> list[str]:
     return [f"label {report['label']}: {gate['text']}; labels that fill the map or touch at its ends lose volume there"]
 
 
-def _make_meshes(run: MaskExtraction, chosen: Sequence[int], progress: Progress | None) -> dict[int, Mesh]:
+def _make_meshes(run: MaskExtraction, chosen: Sequence[int], progress: Progress) -> dict[int, Mesh]:
     labels = run.labels
     everywhere, faces = survey_labels(labels, run.device, run.memory, run.stopwatch)
     if run.grid.rule.closed and faces[:, 1].any() and (enclosed := find_enclosed(labels.voxels, faces, everywhere)):
@@ -490,8 +489,7 @@ def _make_meshes(run: MaskExtraction, chosen: Sequence[int], progress: Progress 
     run.groups = len(groups)
 
     def extract(held: HeldMap, number: int, box: Box) -> tuple[Part, int]:
-        if progress is not None:
-            progress("labels", len(meshes), len(boxes))
+        progress("labels", len(meshes), len(boxes))
         return run.extract_one(held, number, box)
 
     for number, ((positions, normals, triangles), level) in each_label(groups, run.hold, extract, run.warnings):

@@ -41,7 +41,7 @@ from clrecon.operators.surface.extraction import Part, voxel_level
 from clrecon.operators.surface.marching_cubes import Classified, Placement, count
 from clrecon.operators.surface.slabs import SampleGrid, Slab
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.progress import Progress
+from clrecon.system.progress import Progress, ignore_progress
 
 Held = TypeVar("Held")
 Made = TypeVar("Made")
@@ -126,7 +126,15 @@ def prepare_labels(
 class LabelExtraction:
     """One extraction: the data that its labels share."""
 
-    def __init__(self, resident: DeviceVolume, taken: ResampledLabels, rule: IsoRule, growth: Growth, solid: bool):
+    def __init__(
+        self,
+        resident: DeviceVolume,
+        taken: ResampledLabels,
+        rule: IsoRule,
+        growth: Growth,
+        solid: bool,
+        warnings: list[str],
+    ):
         volume, device = resident.volume, resident.device
         self.resident = resident
         self.volume = volume
@@ -142,7 +150,7 @@ class LabelExtraction:
         self.grid = SampleGrid(volume, rule)
         self.level = voxel_level(device, volume, rule)
         self.placement = Placement.of(volume, rule.border)
-        self.warnings: list[str] = []
+        self.warnings = warnings
 
     def programs(self) -> tuple[Program, Program]:
         """The kernels, see `prepare_labels`."""
@@ -375,12 +383,10 @@ def extract_labels(
         marching_cubes.check_row(resident.volume.shape_ijk[0])
         growth = Growth.of(resident.volume, grow_mm)
 
-        def make(told: list[str]) -> dict[int, Mesh]:
-            run = LabelExtraction(resident, taken, rule, growth, solid)
-            run.warnings += told
-            return _make_meshes(run, labels, taken, numbers, progress)
-
-        meshes = resident.attempt(make)
+        for attempt in resident.with_fallback():
+            with attempt as (_, warnings):
+                run = LabelExtraction(resident, taken, rule, growth, solid, warnings)
+                meshes = _make_meshes(run, labels, taken, numbers, progress or ignore_progress)
     if not meshes:
         raise _refuse_all(resident.volume, taken, labels, rule)
     return meshes
@@ -400,7 +406,7 @@ def _make_meshes(
     labels: LabelMap,
     taken: ResampledLabels,
     numbers: Sequence[int | str] | int | str | None,
-    progress: Progress | None,
+    progress: Progress,
 ) -> dict[int, Mesh]:
     """Make the meshes of labels that have one; a label that was named must have one."""
     chosen = labels.choose(numbers)
@@ -420,7 +426,7 @@ def _extract_each(
     run: LabelExtraction,
     boxes: dict[int, Box],
     refuse: Callable[[int], NoSurfaceError] | None,
-    progress: Progress | None,
+    progress: Progress,
 ) -> Iterator[tuple[int, Part]]:
     """Yield labels with their surfaces, as many at once as fit the device; labels without surface are left out or
     refused.
@@ -430,8 +436,7 @@ def _extract_each(
     done = 0
 
     def extract(held: HeldSlices, number: int, box: Box) -> Part | None:
-        if progress is not None:
-            progress("labels", done, len(boxes))
+        progress("labels", done, len(boxes))
         return run.extract_one(held, number, box)
 
     for number, part in each_label(groups, run.find_inside, extract, run.warnings):

@@ -6,7 +6,6 @@ It is made in the part of the volume around the label, with slices across the pa
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -238,10 +237,8 @@ def _inside(resident: DeviceVolume, crop: LabelCrop, iso_value: float, grow_mm: 
     if not boxes or not ((taken.voxels == crop.number) & rule.mark_inside(volume.voxels)).any():
         return inside != 0
 
-    def find(told: list[str]) -> Any:
-        run = LabelExtraction(resident, taken, rule, growth, solid=True)
-        held = run.find_inside(boxes)
-        return download(resident.device, inside[held.first : held.end], held.inside_d)
-
-    resident.attempt(find)
+    for attempt in resident.with_fallback():
+        with attempt:
+            held = LabelExtraction(resident, taken, rule, growth, True, []).find_inside(boxes)
+            download(resident.device, inside[held.first : held.end], held.inside_d)
     return inside == crop.number

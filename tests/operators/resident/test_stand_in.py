@@ -13,7 +13,7 @@ from surface_volumes import smooth_volume
 
 import clrecon
 from clrecon.errors import DeviceError, DeviceFailedError, DeviceMemoryError
-from clrecon.opencl import allocate, list_devices, take_device, work_on
+from clrecon.opencl import allocate, list_devices, take_device, with_fallback
 from clrecon.operators.resident.device_volume import DeviceVolume
 
 NEVER_LAST = 1 << 30
@@ -173,12 +173,11 @@ def test_row_56_a_lost_device_is_told_in_the_report(device, gpu, volume, monkeyp
 def test_the_stand_in_is_asked_once(device, gpu):
     asked = []
 
-    def work(current, told):
-        asked.append(current)
-        allocate(current, 16)
-        raise DeviceFailedError(f"{current.label} fails")
-
     with pytest.raises(DeviceFailedError, match=f"^{re.escape(gpu.label)} fails$"):
-        work_on(gpu, work)
+        for attempt in with_fallback(gpu):
+            with attempt as (current, _):
+                asked.append(current)
+                allocate(current, 16)
+                raise DeviceFailedError(f"{current.label} fails")
     assert asked == [gpu, device]
     assert gpu.handed_over == []

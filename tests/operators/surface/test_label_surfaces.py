@@ -108,7 +108,7 @@ def test_growth_is_that_of_the_twin_to_the_last_sample(device, grow_mm):
             growth = Growth.of(volume, grow_mm)
             rule = choose_iso_rule(volume, 3)
             taken = resample_labels(LabelMap(labels, affine), volume)
-            run = operator.LabelExtraction(DeviceVolume(volume, device=device), taken, rule, growth, False)
+            run = operator.LabelExtraction(DeviceVolume(volume, device=device), taken, rule, growth, False, [])
             held = run.find_inside({1: (slice(0, shape[0]), slice(0, shape[1]), slice(0, shape[2]))})
             inside = operator.download(device, np.empty_like(taken.voxels), held.inside_d)
             assert np.array_equal(inside, twin.find_solid(volume, labels, 3, grow_mm=grow_mm))
@@ -303,6 +303,6 @@ def test_a_volume_that_is_held_is_used_whole_where_a_mesh_of_half_the_bytes_fits
         resident.whole(Stopwatch())
         rule, growth = choose_iso_rule(volume, 3), Growth.of(volume, 1.0)
         taken = resample_labels(LabelMap(labels, np.eye(4)), volume)
-        run = operator.LabelExtraction(resident, taken, rule, growth, False)
+        run = operator.LabelExtraction(resident, taken, rule, growth, False, [])
         assert run.slices_for({1: (slice(20, 22), slice(1, 4), slice(2, 6))}) == slices
         assert sum(run.needs(0, 40).values()) == 4 * volume.voxels.size
