@@ -24,11 +24,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  clrecon bench CT_FOLDER --hu 250 --device all --report bench.json"
     )
     parser.add_argument("input", metavar="INPUT", nargs="?", help="DICOM folder or file (default: a made-up spine)")
-    parser.add_argument("--hu", type=float, metavar="N", help="iso value in HU (default: the preset bone)")
+    parser.add_argument("--hu", type=float, metavar="N", help="iso value in HU (default: the preset bone)", first=True)
     parser.add_argument("--series", metavar="S", help='number or hash of the series, see "clrecon info"')
     add_device(parser)
-    parser.add_argument("--runs", type=int, default=_RUNS, metavar="N", help=f"timed pairs (default: {_RUNS})")
-    parser.add_argument("--report", metavar="FILE", help="write the figures as JSON")
+    parser.add_argument(
+        "--runs", type=int, default=_RUNS, metavar="N", help=f"timed pairs (default: {_RUNS})", first=True
+    )
+    parser.add_argument("--report", metavar="FILE", help="write the figures as JSON", first=True)
     add_no_clobber(parser)
 
 

@@ -85,7 +85,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="DICOM folder (subfolders and any file names are fine) or file; a NIfTI, NRRD or MetaImage file; or a"
         f" cloud of points ({', '.join(CLOUD_INPUTS)})",
     )
-    parser.add_argument("-o", "--output", metavar="OUT", required=True, help="cloud file: .ply .vtp .npz .xyz or .las")
+    parser.add_argument(
+        "-o", "--output", metavar="OUT", required=True, help="cloud file: .ply .vtp .npz .xyz or .las", first=True
+    )
     parser.add_argument(
         "--space",
         type=str.lower,
@@ -122,7 +124,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_no_clobber(checks)
     add_keep_ids(checks)
-    checks.add_argument("--report", metavar="FILE", help="write the figures of each step, device and times as JSON")
+    checks.add_argument(
+        "--report", metavar="FILE", help="write the figures of each step, device and times as JSON", first=True
+    )
 
 
 def _add_points(parser: argparse.ArgumentParser) -> None:
@@ -133,17 +137,20 @@ def _add_points(parser: argparse.ArgumentParser) -> None:
         metavar="|".join(POINT_KINDS),
         help="surface: where the HU cross the iso value, between the voxels; voxels: the centres of those within;"
         " shell: of these the outer ones (default: surface, with a band voxels)",
+        first=True,
     )
     group.add_argument(
         "--hu",
         type=parse_level,
         metavar="N|LO,HI",
         help="iso value, inside is N and above; or a band, both ends included (default: that of bone)",
+        first=True,
     )
     group.add_argument(
         "--labels",
         metavar="FILE|FOLDER",
         help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
+        first=True,
     )
     group.add_argument("--label", metavar="NAME|N", help="points of this label only (default: of all)")
     group.add_argument(
@@ -172,6 +179,7 @@ def _add_steps(parser: argparse.ArgumentParser) -> None:
         metavar="eps=MM,min=N",
         help="density clusters (DBSCAN) without noise: neighbours are within eps, and a core point has min of them,"
         " itself included; min=plane+1 makes noise of lone slices (default: 1.5 times the largest voxel step, 6)",
+        first=True,
     )
     group.add_argument(
         "--keep",
@@ -180,6 +188,7 @@ def _add_steps(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="clusters that stay: largest, largest:N, min:POINTS, seed:X,Y,Z (the nearest), no-sheets (tables and image"
         " planes go); may be given again",
+        first=True,
     )
     group.add_argument(
         "--outliers",
@@ -197,11 +206,13 @@ def _add_steps(parser: argparse.ArgumentParser) -> None:
         metavar=",".join(DENOISERS),
         help="grid: points alone in a cell of a grid go; bilateral: points move along their normals to the weighted"
         " mean height of their neighbours, edges stay",
+        first=True,
     )
     group.add_argument(
         "--normals",
         action="store_true",
         help="unit normals that point out of bone; points of a surface have those of the scan until they are moved",
+        first=True,
     )
     group.add_argument(
         "--viewpoint",

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import copy
 import re
 import sys
 import textwrap
 import traceback
 from collections.abc import Callable, Collection, Sequence
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 from clrecon.cli.console import STREAMED, Console, fit_help
 from clrecon.errors import ClreconError, OutputError, UsageError
@@ -44,11 +45,16 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
 
 
 class Parser(argparse.ArgumentParser):
-    """An argparse parser whose errors are `UsageError`: one line, exit code 3."""
+    """An argparse parser whose errors are `UsageError`: one line, exit code 3.
+
+    Options declared with ``first=True`` are those that most people need: ``-h`` shows these alone.
+    """
 
     def __init__(self, **options: object):
         options.setdefault("formatter_class", _Formatter)
         super().__init__(allow_abbrev=False, **options)  # type: ignore[arg-type]
+        for kind in (None, "store_true", "store_false", "append", argparse.BooleanOptionalAction):
+            self.register("action", kind, _make_markable(self._registry_get("action", kind, kind)))
 
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
         """Parse as argparse does, but also accept lists that begin with a minus, as in ``--seed -12,3,40``."""
@@ -97,11 +103,75 @@ class Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, f"{arg_string!r:.80} is no {number}{unit}") from None
 
     def format_help(self) -> str:
-        """Return the help text, with no line longer than the terminal."""
+        """Return the help text; where all options do not fit one screen, those that most people need."""
+        full = self.format_full_help()
+        if full.count("\n") <= SCREEN_LINES or self._subparsers is not None:
+            return full
+        firsts = [action for action in self._actions if not action.option_strings or getattr(action, "is_first", False)]
+        formatter = self._get_formatter()
+        needed = [_name_value(action, formatter) for action in firsts if action.required or not action.option_strings]
+        formatter.add_usage(" ".join((self.prog, *needed, "[options]")), [], [])
+        formatter.add_text(self.description)
+        formatter.start_section("the options that most people need")
+        formatter.add_arguments([_with_short_help(action) for action in firsts])
+        formatter.end_section()
+        formatter.add_text("\n".join(_find_examples(self.epilog or "")))
+        count = sum(bool(action.option_strings) for action in self._actions)
+        called = self.prog.removeprefix("clrecon ")
+        formatter.add_text(f"all {count} options, by group: clrecon help {called}, or clrecon {called} --help-all")
+        return fit_help(formatter.format_help(), sys.stdout)
+
+    def format_full_help(self) -> str:
+        """Return the help text with all options, by group, and no line longer than the terminal."""
         return fit_help(super().format_help(), sys.stdout)
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message} (see: {self.prog} --help)")
+
+
+def _make_markable(kind: Any) -> Callable[..., argparse.Action]:
+    """Return the maker of a kind of action that takes `first` too: an option that most people need."""
+
+    def make(*given: Any, first: bool = False, **how: Any) -> argparse.Action:
+        action: Any = kind(*given, **how)
+        action.is_first = first
+        return cast("argparse.Action", action)
+
+    return make
+
+
+def _name_value(action: argparse.Action, formatter: argparse.HelpFormatter) -> str:
+    """Return an argument as it stands in the usage: ``INPUT``, ``-o OUT``."""
+    return " ".join((*action.option_strings[:1], formatter._format_args(action, action.dest.upper())))
+
+
+def _with_short_help(action: argparse.Action) -> argparse.Action:
+    """Return a copy of an option with the first clause of its help, without what stands in brackets at length."""
+    short = copy.copy(action)
+    short.help = re.sub(r" \([^()]{26,}\)", "", action.help or "").partition(";")[0]
+    return short
+
+
+SCREEN_LINES = 40
+"""Lines that the help of ``-h`` has at most."""
+
+_EXAMPLES_SHOWN = 3
+
+
+def _find_examples(epilog: str) -> list[str]:
+    """Return the heading of the examples in an epilog and the first of them; nothing where it has none."""
+    lines = epilog.split("\n")
+    start = next((place for place, line in enumerate(lines) if line in ("example:", "examples:")), len(lines))
+    return lines[start : start + 1 + _EXAMPLES_SHOWN]
+
+
+class _FullHelp(argparse.Action):
+    """Print the help with all options, and stop."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *values: object) -> NoReturn:  # type: ignore[override]
+        assert isinstance(parser, Parser)
+        parser._print_message(parser.format_full_help(), sys.stdout)
+        parser.exit()
 
 
 def _options_in(arguments: Sequence[str]) -> list[str]:
@@ -127,7 +197,9 @@ def _join_negative_lists(arguments: Sequence[str]) -> list[str]:
 
 
 def add_common(parser: argparse.ArgumentParser) -> None:
-    """Add --json, -q, -v and --debug."""
+    """Add --help-all, --json, -q, -v and --debug."""
+    parser._option_string_actions["--help"].help = "show the options that most people need, on one screen, and exit"
+    parser.add_argument("--help-all", action=_FullHelp, nargs=0, help="show all options, by group, and exit")
     streams = [option for option in ("-o", "--report") if option in parser._option_string_actions]
     if "-o" in streams and parser.prog.split()[-1] not in STREAMED:
         streams.remove("-o")
@@ -171,6 +243,7 @@ def add_device(parser: argparse._ActionsContainer, computes: bool = True) -> Non
         metavar="D",
         help='OpenCL device: an index of "clrecon devices", "cpu", "gpu" or a part of its name'
         " (default: CLRECON_DEVICE, else the best)",
+        first=True,
     )
     if computes:
         parser.add_argument(

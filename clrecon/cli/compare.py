@@ -46,26 +46,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="DICOM folder (subfolders and any file names are fine) or file; or a NIfTI, NRRD or MetaImage file",
     )
     parser.add_argument(
-        "-o", "--output", metavar="OUT", required=True, help="folder for the page: new, empty, or of a comparison"
+        "-o",
+        "--output",
+        metavar="OUT",
+        required=True,
+        help="folder for the page: new, empty, or of a comparison",
+        first=True,
     )
     compared = parser.add_argument_group("comparison")
     compared.add_argument(
-        "--methods", type=_parse_names, default=(), metavar="M[,M...]", help="methods, see below (default: all)"
+        "--methods",
+        type=_parse_names,
+        default=(),
+        metavar="M[,M...]",
+        help="methods to compare; see below (default: all)",
+        first=True,
     )
     compared.add_argument(
         "--reference", type=str.lower, default="t-mc", metavar="M", help="method to compare with (default: t-mc)"
     )
     compared.add_argument(
-        "--truth", metavar="FILE", help="truth.json of a phantom: errors against its true surface are measured too"
+        "--truth",
+        metavar="FILE",
+        help="truth.json of a phantom: errors against its true surface are measured too",
+        first=True,
     )
     compared.add_argument(
         "--paper",
         action="store_true",
         help="also compare a picture of each method with the middle slice by SSIM and MSE, as a paper does, beside"
         " controls that show what this is worth",
+        first=True,
     )
     compared.add_argument(
-        "--repeat", type=int, default=3, metavar="N", help="warm runs of each method; the median counts (default: 3)"
+        "--repeat",
+        type=int,
+        default=3,
+        metavar="N",
+        help="warm runs of each method; the median counts (default: 3)",
+        first=True,
     )
     add_reading(parser)
     add_masking(parser)
@@ -78,6 +97,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N|auto|half:B,T",
         help="iso value in HU, inside is N and above; auto: half way between bone and the tissue beside it, measured in"
         " the scan; half:BONE,TISSUE: half way between these two",
+        first=True,
     )
     level.add_argument(
         "--preset",

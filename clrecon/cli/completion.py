@@ -80,7 +80,7 @@ def _survey() -> dict[str, _Words]:
             command.help, [_describe(name, action) for action in parser._actions if action.option_strings]
         )
     found["completion"].first = list(SHELLS)
-    found[HELP] = _Words("show the options of a command", first=list(COMMANDS))
+    found[HELP] = _Words("show all options of a command", first=list(COMMANDS))
     return found
 
 

@@ -35,15 +35,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE|FOLDER",
         required=True,
         help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
+        first=True,
     )
     parser.add_argument(
-        "--label", metavar="NAME|N", action="append", help="a vertebra of the map; may be given again", default=[]
+        "--label",
+        metavar="NAME|N",
+        action="append",
+        help="a vertebra of the map; may be given again",
+        default=[],
+        first=True,
     )
     parser.add_argument(
         "--hu",
         metavar="auto|N",
         default="auto",
         help="HU at which the bone's surface lies (default: auto, half way between bone and the tissue beside it)",
+        first=True,
     )
     parser.add_argument(
         "--margin",
@@ -51,6 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=1.0,
         metavar="MM",
         help="distance that a screw of the largest diameter keeps from the surface (default: 1)",
+        first=True,
     )
     screws = parser.add_argument_group("given screws, which are graded (Gertzbein-Robbins, A to E)")
     screws.add_argument(
@@ -59,6 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         help="entry, tip and diameter in mm of the frame of --space; may be given again",
+        first=True,
     )
     screws.add_argument("--screws", metavar="FILE", help="screws as JSON or CSV, see docs/corridor.md")
     output = parser.add_argument_group("files")
@@ -67,9 +76,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--output",
         metavar="OUT",
         help=f"meshes: OUT_L3, OUT_L3_left and OUT_L3_right; {MESH_FILES}",
+        first=True,
     )
-    output.add_argument("--picture", metavar="FILE", help="slices through each corridor: .png, .jpg or .tif")
-    output.add_argument("--report", metavar="FILE", help="write all figures as JSON")
+    output.add_argument(
+        "--picture", metavar="FILE", help="slices through each corridor: .png, .jpg or .tif", first=True
+    )
+    output.add_argument("--report", metavar="FILE", help="write all figures as JSON", first=True)
     output.add_argument(
         "--space",
         type=str.lower,

@@ -34,14 +34,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--samples", type=int, metavar="N", help="points on each mesh, evenly by area (default: 50000)")
     output = parser.add_argument_group("files")
-    output.add_argument("-o", "--output", metavar="PLY", help="write A coloured by its distance from B: .ply")
-    output.add_argument("--picture", metavar="FILE", help="picture of it with its scale: .png, .jpg or .tif")
+    output.add_argument(
+        "-o", "--output", metavar="PLY", help="write A coloured by its distance from B: .ply", first=True
+    )
+    output.add_argument(
+        "--picture", metavar="FILE", help="picture of it with its scale: .png, .jpg or .tif", first=True
+    )
     output.add_argument(
         "--range",
         dest="range_mm",
         type=float,
         metavar="MM",
         help="distance at which the colours end (default: 1, 2 or 5 x 10^n mm that hold 95 %% of the distances)",
+        first=True,
     )
     output.add_argument(
         "--view", default="anterior", metavar="V", help="view of the picture: anterior (default), left, AZ,EL ..."
@@ -53,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="lps|ras",
         help="patient frame of the coloured mesh (default: lps)",
     )
-    output.add_argument("--report", metavar="FILE", help="write all figures as JSON")
+    output.add_argument("--report", metavar="FILE", help="write all figures as JSON", first=True)
     add_no_clobber(output)
     device = parser.add_argument_group("device, for the picture alone")
     add_device(device)

@@ -33,13 +33,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("input", metavar="INPUT", help="DICOM folder or file; or a NIfTI, NRRD or MetaImage file")
     parser.add_argument(
-        "-o", "--output", metavar="OUT", required=True, help="volume file: .nii.gz, .nii, .nrrd or .mha"
+        "-o", "--output", metavar="OUT", required=True, help="volume file: .nii.gz, .nii, .nrrd or .mha", first=True
     )
     parser.add_argument(
         "--resample",
         type=float,
         metavar="MM",
         help="resample (trilinear) to a regular grid with this step along all axes; without it voxels stay as they are",
+        first=True,
     )
     parser.add_argument(
         "--space",

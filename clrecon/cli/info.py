@@ -398,9 +398,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--pixels",
         action="store_true",
         help="read the pixels of the series marked * too: share of padding, range of HU, saturated metal",
+        first=True,
     )
     parser.add_argument(
-        "--strict", action="store_true", help="exit with 4 when it fails a gate, see docs/certificate.md"
+        "--strict", action="store_true", help="exit with 4 when it fails a gate, see docs/certificate.md", first=True
     )
     add_reading(parser)
 

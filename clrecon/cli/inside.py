@@ -33,12 +33,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = _EPILOG
     parser.add_argument("input", metavar="INPUT", help="DICOM folder or file; or a NIfTI, NRRD or MetaImage file")
-    parser.add_argument("-o", "--output", metavar="OUT", required=True, help=f"mesh files: {MESH_FILES}")
+    parser.add_argument("-o", "--output", metavar="OUT", required=True, help=f"mesh files: {MESH_FILES}", first=True)
     parser.add_argument(
         "--labels",
         metavar="FILE|FOLDER",
         required=True,
         help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
+        first=True,
     )
     parser.add_argument(
         "--label",
@@ -47,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         required=True,
         help="label of a vertebra; may be given again",
+        first=True,
     )
     pictures = parser.add_argument_group("pictures")
     pictures.add_argument(
@@ -54,6 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="a picture of each part, opaque, with others faded: .png, .jpg or .tif; inside.png becomes"
         " inside_canal.png and so on",
+        first=True,
     )
     pictures.add_argument(
         "--view",
@@ -68,6 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar="N",
         help="level of the solid bone, within one voxel of the label (default: the label's own voxels)",
+        first=True,
     )
     parts.add_argument(
         "--dense",
@@ -94,7 +98,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_memory(device)
     add_no_clobber(device)
     add_keep_ids(device)
-    device.add_argument("--report", metavar="FILE", help="write volumes, thickness, certificate, device, times as JSON")
+    device.add_argument(
+        "--report", metavar="FILE", help="write volumes, thickness, certificate, device, times as JSON", first=True
+    )
 
 
 def _parse_band(text: str) -> tuple[float | None, float | None]:

@@ -159,7 +159,7 @@ def _dispatch(arguments: list[str], console: Console) -> int:
             module.add_arguments(subparser)
             common.add_common(subparser)
             subparser.epilog = "\n\n".join(filter(None, (subparser.epilog, EXIT_CODES)))
-    commands.add_parser(HELP, help="show the options of a command: clrecon help COMMAND")
+    commands.add_parser(HELP, help="show all options of a command: clrecon help COMMAND")
     try:
         options = parser.parse_args(arguments)
     except SystemExit as stop:  # --help
@@ -179,10 +179,11 @@ def _dispatch(arguments: list[str], console: Console) -> int:
 
 
 def _as_help_option(arguments: list[str]) -> list[str]:
-    """Write ``help COMMAND`` as ``COMMAND --help``, and ``help`` alone as ``--help``."""
+    """Write ``help COMMAND`` as ``COMMAND --help-all``, and ``help`` alone as ``--help``."""
     if arguments[:1] != [HELP]:
         return arguments
-    return [*(word for word in arguments[1:] if word != HELP), "--help"]
+    words = [word for word in arguments[1:] if word != HELP]
+    return [*words, "--help-all" if any(word in COMMANDS for word in words) else "--help"]
 
 
 def _escape_unencodable() -> None:

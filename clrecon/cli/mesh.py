@@ -72,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="INPUT",
         help="DICOM folder (subfolders and any file names are fine) or file; or a NIfTI, NRRD or MetaImage file",
     )
-    parser.add_argument("-o", "--output", metavar="OUT", required=True, help=f"mesh file: {MESH_FILES}")
+    parser.add_argument("-o", "--output", metavar="OUT", required=True, help=f"mesh file: {MESH_FILES}", first=True)
     add_purpose(parser)
     add_reading(parser)
     add_masking(parser)
@@ -121,7 +121,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_levels(surface: argparse._ArgumentGroup) -> None:
     """Declare --hu, --below, --preset and --keep-outside: which values a surface encloses."""
     level = surface.add_mutually_exclusive_group()
-    level.add_argument("--hu", type=parse_hu, default={}, metavar="N[,N...]|A:B|auto|half:B,T", help=LEVELS_HELP)
+    level.add_argument(
+        "--hu", type=parse_hu, default={}, metavar="N[,N...]|A:B|auto|half:B,T", help=LEVELS_HELP, first=True
+    )
     level.add_argument(
         "--below",
         type=parse_levels,
@@ -145,6 +147,7 @@ def add_solid(surface: argparse._ArgumentGroup) -> None:
         action=argparse.BooleanOptionalAction,
         help="fill what the bone encloses: marrow, and canals that the ends of the scan cut; the brain, the chest and"
         " air stay out; with --labels: what is less dense within a label",
+        first=True,
     )
     surface.add_argument(
         "--seal",
@@ -164,13 +167,16 @@ def add_selection(components: argparse._ArgumentGroup) -> None:
         help="bone: keep the components whose walls look like bone, not heart and vessels with contrast medium, nor a"
         " table",
     )
-    components.add_argument("--keep-largest", type=int, metavar="N", help="keep the N largest components only")
+    components.add_argument(
+        "--keep-largest", type=int, metavar="N", help="keep the N largest components only", first=True
+    )
     components.add_argument(
         "--min-volume",
         dest="min_volume_ml",
         type=float,
         metavar="ML",
         help="keep components of at least ML millilitres only",
+        first=True,
     )
     components.add_argument(
         "--seed",
@@ -189,7 +195,9 @@ def _add_checks(parser: argparse.ArgumentParser) -> None:
     add_strict(checks)
     add_no_clobber(checks)
     add_keep_ids(checks)
-    checks.add_argument("--report", metavar="FILE", help="write affine, counts, quality, device and times as JSON")
+    checks.add_argument(
+        "--report", metavar="FILE", help="write affine, counts, quality, device and times as JSON", first=True
+    )
 
 
 def run(options: argparse.Namespace, console: Console) -> int:

@@ -31,6 +31,7 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
         "--labels",
         metavar="FILE|FOLDER",
         help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
+        first=True,
     )
     group.add_argument(
         "--label", metavar="NAME|N", action="append", help="this label only; may be given again (default: all)"
@@ -202,6 +203,7 @@ def add_refinement(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar="SHARE",
         help="take away this share of the triangles, such as 0.9, or as much as the largest deviation lets",
+        first=True,
     )
     group.add_argument(
         "--max-deviation",
@@ -231,6 +233,7 @@ def add_purpose(parser: argparse._ActionsContainer) -> None:
         metavar="PURPOSE",
         help="what the mesh is for, with the settings that this takes (others given beside it win); "
         + "; ".join(map(_describe_purpose, PURPOSES.values())),
+        first=True,
     )
 
 

@@ -75,6 +75,7 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help='number, hash, UID (or the start of one) or description of the series, see "clrecon info" (default: the CT'
         " series with most slices; of similar ones original before derived, then the thinnest)",
+        first=True,
     )
     group.add_argument(
         "--phase", type=int, metavar="N", help="number of the phase, of a series with several volumes at one place"
@@ -174,6 +175,7 @@ def add_masking(parser: argparse.ArgumentParser) -> None:
         "--remove-table",
         action="store_true",
         help="turn what is not the patient's body into air first: table, blankets, cables",
+        first=True,
     )
     group.add_argument(
         "--allow-bone-loss",

@@ -28,10 +28,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  clrecon phantom phantom/ --levels C1-L5 --scoliosis 35 --facet-gap 0.3 --spacing 0.7 0.7 1"
     )
     parser.add_argument("output", metavar="OUT", help="folder for the series")
-    parser.add_argument("--kind", type=str.lower, metavar="K", help="what to make, see below (default: spine)")
-    parser.add_argument("--size", metavar="N", help="columns and rows, like 256 or 256x192 (default: 256)")
     parser.add_argument(
-        "--slices", type=int, metavar="N", help="default: as many as the levels need, 120 without levels"
+        "--kind", type=str.lower, metavar="K", help="what to make; see below (default: spine)", first=True
+    )
+    parser.add_argument("--size", metavar="N", help="columns and rows, like 256 or 256x192 (default: 256)", first=True)
+    parser.add_argument(
+        "--slices", type=int, metavar="N", help="default: as many as the levels need, 120 without levels", first=True
     )
     parser.add_argument(
         "--spacing",
@@ -39,8 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs=3,
         metavar=("DJ", "DI", "DK"),
         help="mm between rows, columns, slices (default: by kind, of a spine 1 1 1.25)",
+        first=True,
     )
-    parser.add_argument("--tilt", type=float, metavar="DEG", help="gantry tilt (default: 0)")
+    parser.add_argument("--tilt", type=float, metavar="DEG", help="gantry tilt (default: 0)", first=True)
     parser.add_argument(
         "--oblique", type=float, nargs=3, metavar=("X", "Y", "Z"), help="degrees about the patient's axes"
     )
@@ -49,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar="HU",
         help="standard deviation of the noise (default: 12, of an analytic shape 0)",
+        first=True,
     )
     parser.add_argument(
         "--point-spread",
@@ -59,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--radius", dest="radius_mm", type=float, metavar="MM", help="radius of an analytic shape")
     parser.add_argument(
-        "--table", type=str.lower, metavar="T", help="what a body lies on: none, flat, curved or headrest"
+        "--table", type=str.lower, metavar="T", help="what a body lies on: none, flat, curved or headrest", first=True
     )
     parser.add_argument(
         "--table-gap",
@@ -73,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--ghosts", action="store_true", default=None, help="of a spine: two foreign slices, and a localizer"
     )
     spine = parser.add_argument_group("of a spine")
-    spine.add_argument("--levels", metavar="C1-L5", help="vertebrae to show, like L4-L5 or C3-C7,T1-T5")
+    spine.add_argument("--levels", metavar="C1-L5", help="vertebrae to show, like L4-L5 or C3-C7,T1-T5", first=True)
     spine.add_argument(
         "--facet-gap", dest="facet_gap_mm", type=float, metavar="MM", help="distance of neighbours in the facet joints"
     )
@@ -89,7 +93,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--phases", type=int, metavar="N", help="series at the same places, with ever more contrast medium"
     )
     parser.add_argument("--missing", metavar="N,M-O", help="numbers of slices that are left out, like 20-22,40")
-    parser.add_argument("--seed", type=int, metavar="N", help="place within a voxel, noise and texture (default: 0)")
+    parser.add_argument(
+        "--seed", type=int, metavar="N", help="place within a voxel, noise and texture (default: 0)", first=True
+    )
     add_no_clobber(parser)
 
 

@@ -73,7 +73,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " --mode mesh); may be left out with --mesh",
     )
     parser.add_argument(
-        "-o", "--output", metavar="OUT", help="picture: .png, .jpg or .tif; may be left out with --turntable"
+        "-o",
+        "--output",
+        metavar="OUT",
+        help="picture: .png, .jpg or .tif; may be left out with --turntable",
+        first=True,
     )
     add_looks(parser)
     add_camera(parser)

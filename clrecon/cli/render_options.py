@@ -149,11 +149,19 @@ def _add_repeated(
     metavar: str,
     text: str,
     dest: str | None = None,
+    first: bool = False,
 ) -> None:
     """Add an option that can be repeated; its values make a list."""
     dest = dest or option.removeprefix("--").replace("-", "_")
     group.add_argument(
-        option, dest=dest, type=parse, metavar=metavar, action="append", default=[], help=f"{text}; may be given again"
+        option,
+        dest=dest,
+        type=parse,
+        metavar=metavar,
+        action="append",
+        default=[],
+        help=f"{text}; may be given again",
+        first=first,
     )
 
 
@@ -165,9 +173,14 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
         type=str.lower,
         metavar="M",
         help=f"one of: {', '.join(describe_modes())} (default: what the other options ask)",
+        first=True,
     )
     group.add_argument(
-        "--preset", type=str.lower, metavar="NAME", help="colours, opacities, light and mode by tissue (default: bone)"
+        "--preset",
+        type=str.lower,
+        metavar="NAME",
+        help="colours, opacities, light and mode by tissue (default: bone)",
+        first=True,
     )
     group.add_argument(
         "--transfer-function",
@@ -181,6 +194,7 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar="HU",
         help="iso value of mode surface, inside is HU and above (default: 200)",
+        first=True,
     )
     group.add_argument(
         "--color",
@@ -203,6 +217,7 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
         metavar="LOW,HIGH|NAME",
         help=f"HU that are black and white, of modes that show HU, or one of {', '.join(WINDOWS)}; mm of water in mode"
         " drr",
+        first=True,
     )
     group.add_argument(
         "--keep-air", action="store_true", help="of mode minip: count what lies outside of the body and of masks too"
@@ -236,7 +251,7 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
         group, "--view", parse_views, "V[,V...]|AZ,EL",
         f"where the camera stands: {', '.join(VIEWS)}; or degrees from anterior to the patient's left and to the head;"
         " of slices also axial, coronal, sagittal (default: anterior; of mode slice axial, of slices 30,30, of cpr"
-        " left); several make a picture each: out_left.png",
+        " left); several make a picture each: out_left.png", first=True,
     )  # fmt: skip
     group.add_argument(
         "--up", type=parse_direction, metavar="SIDE|X,Y,Z", help="what is at the top (default: superior, else anterior)"
@@ -249,7 +264,11 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
         help="LPS mm in the middle of the picture, of a slice too (default: the middle of what is shown)",
     )
     group.add_argument(
-        "--size", type=parse_picture_size, metavar="W[xH]", help="pixels of the picture (default: 1024x1024)"
+        "--size",
+        type=parse_picture_size,
+        metavar="W[xH]",
+        help="pixels of the picture (default: 1024x1024)",
+        first=True,
     )
     group.add_argument(
         "--perspective",
@@ -324,6 +343,7 @@ def add_labels(parser: argparse.ArgumentParser) -> None:
         "--labels",
         metavar="FILE|FOLDER",
         help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
+        first=True,
     )
     _add_repeated(group, "--label-color", parse_label_color, "LABEL=COLOUR", "colour of a label, by name or number")
     _add_repeated(
@@ -354,7 +374,10 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
     """Add the options of the turntable."""
     group = parser.add_argument_group("motion")
     group.add_argument(
-        "--turntable", metavar="OUT", help="turn round the patient: .mp4, .gif, .apng, or a folder of PNG files"
+        "--turntable",
+        metavar="OUT",
+        help="turn round the patient: .mp4, .gif, .apng, or a folder of PNG files",
+        first=True,
     )
     group.add_argument("--frames", type=int, metavar="N", help=f"frames of the turn (default: {_FRAMES})")
     group.add_argument("--fps", type=float, metavar="N", help=f"frames a second (default: {_FPS:g})")

@@ -43,19 +43,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE|FOLDER",
         required=True,
         help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
+        first=True,
     )
     parser.add_argument(
-        "--label", metavar="NAME|N", action="append", default=[], help="this label only; may be given again"
+        "--label", metavar="NAME|N", action="append", default=[], help="this label only; may be given again", first=True
     )
     parser.add_argument(
         "--percentiles",
         type=_parse_numbers,
         metavar="P,P",
         help="percentiles of HU, from 0 to 100 (default: 5,25,50,75,95)",
+        first=True,
     )
     output = parser.add_argument_group("files")
-    output.add_argument("--csv", metavar="FILE", help="write the figures as a table, one line a label")
-    output.add_argument("--report", metavar="FILE", help="write figures, certificate of the scan and warnings as JSON")
+    output.add_argument("--csv", metavar="FILE", help="write the figures as a table, one line a label", first=True)
+    output.add_argument(
+        "--report", metavar="FILE", help="write figures, certificate of the scan and warnings as JSON", first=True
+    )
     add_no_clobber(output)
     add_keep_ids(output)
     add_reading(parser)

@@ -41,10 +41,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("input", metavar="INPUT", help="DICOM folder or file, or a NIfTI, NRRD or MetaImage file")
     parser.add_argument(
-        "-o", "--output", metavar="OUT", required=True, help="label map: .nii.gz, .nii, or .dcm (DICOM SEG)"
+        "-o", "--output", metavar="OUT", required=True, help="label map: .nii.gz, .nii, or .dcm (DICOM SEG)", first=True
     )
     parser.add_argument(
-        "--picture", metavar="PNG", help="picture of discs and labels (default: beside the map, with its name)"
+        "--picture",
+        metavar="PNG",
+        help="picture of discs and labels (default: beside the map, with its name)",
+        first=True,
     )
     add_reading(parser)
     group = parser.add_argument_group("vertebrae")
@@ -54,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar="N",
         help="bone is N HU and more (default: half way between discs and marrow, 120 to 226)",
+        first=True,
     )
     group.add_argument(
         "--seed",
@@ -63,24 +67,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         help="a point in the body of a vertebra, LPS mm; one for each vertebra, in place of the search for discs",
+        first=True,
     )
     group.add_argument(
         "--name-at",
         type=_parse_name,
         metavar="X,Y,Z=L3",
         help="name the level of the vertebra at this point (LPS mm), and from it all others",
+        first=True,
     )
     group.add_argument(
         "--first",
         metavar="LEVEL",
         help="name the level of the uppermost vertebra that is found (T1), and from it all others; without --first and"
         " --name-at they are numbered from the head",
+        first=True,
     )
     group.add_argument("--keep-unsure", action="store_true", help="write vertebrae of low confidence too")
     checks = parser.add_argument_group("checks")
     add_no_clobber(checks)
     add_keep_ids(checks)
-    checks.add_argument("--report", metavar="FILE", help="write vertebrae, confidence, discs and times as JSON")
+    checks.add_argument(
+        "--report", metavar="FILE", help="write vertebrae, confidence, discs and times as JSON", first=True
+    )
 
 
 def run(options: argparse.Namespace, console: Console) -> int:

@@ -47,8 +47,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="mesh file (.stl, .ply), or a scan: DICOM folder or file, NIfTI, NRRD or MetaImage file",
     )
     shown = parser.add_argument_group("what is shown")
-    shown.add_argument("--html", metavar="FILE", help="write a page that shows the inputs: .html")
-    shown.add_argument("--window", action="store_true", help="open a plain window of PyVista in place of the browser")
+    shown.add_argument("--html", metavar="FILE", help="write a page that shows the inputs: .html", first=True)
+    shown.add_argument(
+        "--window", action="store_true", help="open a plain window of PyVista in place of the browser", first=True
+    )
     shown.add_argument(
         "--no-open", dest="opens", action="store_false", help="only print the address, do not open the browser"
     )
@@ -60,6 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="what the key s writes into the current folder: a mesh, cloud, volume or picture by its extension;"
         " numbered where it exists; repeat it for several (default: a download)",
+        first=True,
     )
     for name in ("--web", "--open"):  # what they asked for is the default now
         shown.add_argument(name, action="store_true", help=argparse.SUPPRESS)

@@ -32,7 +32,7 @@ ODD = [
 ]  # fmt: skip
 UNTRIED = {"bench", "selftest", "demo", "completion"}
 """Commands that take seconds each; their options are tried by the tests of the command line."""
-NEVER = ("-h", "--help", "--debug")
+NEVER = ("-h", "--help", "--help-all", "--debug")
 COMMAND_LIMIT_S = 20.0
 """Processor time of a command: all kernels of a picture are built in 7 s, once."""
 LIBRARIES_BYTES = 256 * 1024 * 1024

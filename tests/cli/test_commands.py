@@ -316,7 +316,7 @@ def test_phantom_refuses_settings(
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
 def test_every_command_has_help_and_the_common_options(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([command, "--help"]) == 0
+    assert main([command, "--help-all"]) == 0
     text = capsys.readouterr().out
     for option in ("--json", "--quiet", "--verbose", "--debug", "exit codes: 0 done"):
         assert option in text

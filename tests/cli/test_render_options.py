@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import pytest
 
+from clrecon.cli.common import Parser
 from clrecon.cli.main import main
 from clrecon.cli.render_options import add_camera, add_clipping, add_labels
 
@@ -19,15 +19,15 @@ GIVEN_TWICE = {
 
 
 @pytest.fixture
-def parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser()
+def parser() -> Parser:
+    parser = Parser()
     for add in (add_camera, add_clipping, add_labels):
         add(parser)
     return parser
 
 
 @pytest.mark.parametrize("name", GIVEN_TWICE)
-def test_what_may_be_given_again_makes_a_list(name: str, parser: argparse.ArgumentParser) -> None:
+def test_what_may_be_given_again_makes_a_list(name: str, parser: Parser) -> None:
     texts, values = GIVEN_TWICE[name]
     option = f"--{name.replace('_', '-')}"
     (action,) = (action for action in parser._actions if option in action.option_strings)

@@ -23,7 +23,7 @@ def test_help_is_a_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == alone
     assert main(["help", "mesh"]) == 0
     of_mesh = capsys.readouterr().out
-    assert main(["mesh", "--help"]) == 0
+    assert main(["mesh", "--help-all"]) == 0
     assert capsys.readouterr().out == of_mesh
     assert "--keep-largest" in of_mesh
     assert main(["help", "help"]) == 0

@@ -36,7 +36,7 @@ def test_lines_break_between_words_and_go_on_under_their_text(narrow):
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
 def test_help_fits_60_columns_and_its_examples_can_be_pasted(command, narrow, capsys):
-    assert main([command, "--help"]) == 0
+    assert main([command, "--help-all"]) == 0
     lines = capsys.readouterr().out.split("\n")
     # what is longer is one word with its indentation, or in brackets that argparse keeps whole
     assert not [line for line in lines if len(line) > 60 and len(line.split()) > 1]
@@ -47,7 +47,7 @@ def test_help_fits_60_columns_and_its_examples_can_be_pasted(command, narrow, ca
 
 def test_texts_of_help_are_broken_anew_as_a_whole(narrow, capsys):
     """Lines that were full are one text: no short rest of a line before the next."""
-    assert main(["view", "--help"]) == 0
+    assert main(["view", "--help-all"]) == 0
     lines = capsys.readouterr().out.split("\n")
     at = next(place for place, line in enumerate(lines) if line.startswith("The page of --html is one file"))
     text = lines[at : lines.index("", at)]
@@ -68,7 +68,7 @@ def test_texts_of_help_are_broken_anew_as_a_whole(narrow, capsys):
     ],
 )
 def test_each_row_of_a_list_keeps_a_line_of_its_own(command, rows, narrow, capsys):
-    assert main([command, "--help"]) == 0
+    assert main([command, "--help-all"]) == 0
     lines = capsys.readouterr().out.split("\n")
     for row in rows:
         assert len([line for line in lines if line.startswith(row)]) == 1, row
@@ -76,10 +76,10 @@ def test_each_row_of_a_list_keeps_a_line_of_its_own(command, rows, narrow, capsy
 
 def test_words_with_hyphens_stay_whole_and_prose_has_one_margin(narrow, capsys):
     for command in ("mesh", "compare"):
-        assert main([command, "--help"]) == 0
+        assert main([command, "--help-all"]) == 0
         lines = capsys.readouterr().out.split("\n")
         assert not [line for line in lines if line.rstrip().endswith(("bilateral-", "soft-", "non-"))]
-    assert main(["inside", "--help"]) == 0
+    assert main(["inside", "--help-all"]) == 0
     lines = capsys.readouterr().out.split("\n")
     at = lines.index("take vertebrae apart: dense and trabecular bone, canal,")
     assert lines[at + 1] == "volumes"

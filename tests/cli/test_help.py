@@ -1,0 +1,77 @@
+"""Two levels of help: one screen with the options that most people need, and all options by group."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from importlib import import_module
+
+import pytest
+
+from clrecon.cli.common import SCREEN_LINES, Parser, add_common
+from clrecon.cli.main import COMMANDS, main
+from tests.support.command_lines import parse_command
+
+
+@pytest.fixture(autouse=True)
+def screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+
+
+def parser_of(command: str) -> Parser:
+    parser = Parser(prog=f"clrecon {command}")
+    import_module(COMMANDS[command].module).add_arguments(parser)
+    add_common(parser)
+    return parser
+
+
+def shown(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    assert main(arguments) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    return captured.out
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_short_help_fits_one_screen_and_says_where_the_rest_is(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text, whole = shown([command, "-h"], capsys), shown(["help", command], capsys)
+    assert shown([command, "--help"], capsys) == text
+    lines = text.split("\n")
+    assert len(lines) <= SCREEN_LINES and max(map(len, lines)) <= 100
+    assert lines[0].startswith(f"usage: clrecon {command} ")
+    assert COMMANDS[command].help in text
+    if text != whole:
+        assert f"clrecon help {command}, or clrecon {command} --help-all" in lines[-2]
+        assert [line for line in lines if "--help-all" in line] == [lines[-2]]
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_full_help_has_each_option(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    text = shown(["help", command], capsys)
+    assert shown([command, "--help-all"], capsys) == text
+    words = set(text.replace(",", " ").split())
+    for action in parser_of(command)._actions:
+        if action.help != argparse.SUPPRESS:
+            assert set(action.option_strings) <= words
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_examples_of_the_short_help_are_understood(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    parts = shown([command, "-h"], capsys).replace("\\\n", "").partition("examples:\n")
+    lines = [line for line in parts[2].split("\n\n")[0].split("\n") if line]
+    assert not parts[1] or 2 <= len(lines) <= 3
+    for line in lines:
+        for called in line.split("&&"):
+            program, *arguments = shlex.split(called)
+            assert program == "clrecon"
+            parse_command(arguments)
+
+
+def test_mesh_shows_the_twelve_options_that_most_people_need(capsys: pytest.CaptureFixture[str]) -> None:
+    text = shown(["mesh", "-h"], capsys)
+    first = [line.split()[0] for line in text.split("\n") if line.startswith("  -")]
+    assert len(first) == 12 and {"-o", "--hu", "--for", "--labels", "--device"} <= set(first)
+    assert "--topology" not in text and text.count("  clrecon mesh CT_FOLDER") == 3
+    assert "iso value in HU, inside is N and above\n" in text
