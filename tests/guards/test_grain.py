@@ -15,7 +15,7 @@ CEILINGS = {
     "modules": 775,
     "small_modules_with_one_reader": 130,
     "docstrings_with_raises": 117,
-    "options_in_several_files": 21,
+    "options_in_several_files": 22,
     "modules_with_own_all": 0,
 }
 """Who takes something away lowers the figure in the same commit; who needs more says why in the commit."""
