@@ -11,44 +11,39 @@ import io
 import json
 import math
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import frame_from_lps
-from clrecon.geometry.certificate import without_ids
 from clrecon.jobs.corridor_results import (
     KNOWN_BIAS,
     NOT_FOR_PLANNING,
     CorridorReport,
     cylinder_meshes,
     describe_vertebra,
+    draw_corridors,
 )
-from clrecon.jobs.inputs import read_with_labels
-from clrecon.jobs.outputs import check_distinct, check_kept, commit_all, name_outputs, stage_meshes
-from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name, stage_report
+from clrecon.jobs.outputs import check_distinct, check_kept, name_outputs
+from clrecon.jobs.run import Run
 from clrecon.labels.label_map import file_suffixes
 from clrecon.labels.resample import resample_labels
-from clrecon.reading import Selection, read_selected
+from clrecon.reading import Selection
 from clrecon.spine.corridors import VertebraCorridors, measure_corridors
 from clrecon.spine.measures import SCALE, Screw, ScrewGrade, grade_screw
 from clrecon.system.arguments import name_parameter
-from clrecon.system.paths import keep_existing, read_regular
-from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.paths import read_regular
+from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text
-from clrecon.version import package_version
 
 if TYPE_CHECKING:
     from clrecon.anatomy.iso_choice import IsoChoice
     from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
-    from clrecon.system.files import StagedFile
 
 
 LARGEST_MARGIN_MM = 5.0
@@ -194,48 +189,60 @@ def make_corridors(
     source: str | Path,
     settings: CorridorSettings,
     files: CorridorFiles | None = None,
-    *,
-    no_clobber: bool = False,
-    progress: Progress | None = None,
+    **how: Any,
 ) -> CorridorReport:
     """Find the corridors through the pedicles of labelled vertebrae, and grade given screws.
 
     source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
-    no_clobber: Files that exist stay and are an `OutputError`, before any work.
-    progress: ``progress(stage, done, total)``.
+    **how: See `Run`.
     """
-    files, progress, watch = files or CorridorFiles(), progress or ignore_progress, Laps()
-    with keep_existing(no_clobber):
-        _check_files(source, settings, files)
-    volume, labels = _read_inputs(source, settings, progress)
-    watch.lap("read")
-    numbers = list(dict.fromkeys(labels.find(label) for label in settings.only))
-    names = file_suffixes({number: labels.name(number) for number in numbers})
-    with keep_existing(no_clobber):
-        _name_files(settings, files, list(names.values()))
-    level, choice = _choose_level(volume, settings, progress)
-    watch.lap("choose")
-    taken = resample_labels(labels, volume)
-    found = []
-    for done, number in enumerate(numbers):
-        progress("corridors", done, len(numbers))
-        _check_inside(taken.inside[number], names[number])
-        found.append(measure_corridors(volume, taken.voxels, number, level, names[number]))
-    graded = _grade_screws(found, labels, numbers, settings.screws)
-    watch.lap("corridors")
-    with keep_existing(no_clobber), ExitStack() as stack:
-        staged, outputs = _stage_files(stack, volume, labels, found, numbers, graded, level, settings, files, progress)
-        watch.lap("write")
+    files = files or CorridorFiles()
+    with Run(settings, **how) as run:
+        with run.keeping():
+            _check_files(source, settings, files)
+        volume, labels = run.read_labelled(source)
+        run.lap("read")
+        numbers = list(dict.fromkeys(labels.find(label) for label in settings.only))
+        names = file_suffixes({number: labels.name(number) for number in numbers})
+        with run.keeping():
+            _name_files(files, list(names.values()))
+        level, choice = _choose_level(volume, settings, run.progress)
+        run.lap("choose")
+        taken = resample_labels(labels, volume)
+        found = []
+        for done, number in enumerate(numbers):
+            run.progress("corridors", done, len(numbers))
+            _check_inside(taken.inside[number], names[number])
+            found.append(measure_corridors(volume, taken.voxels, number, level, names[number]))
+        graded = _grade_screws(found, labels, numbers, settings.screws)
+        run.lap("corridors")
+        outputs = _draw_sheets(run, volume, found, graded, level, files)
+        if files.output is not None:
+            outputs += _write_meshes(
+                run, volume, labels, dict(zip(numbers, found, strict=True)), graded, level, files.output
+            )
+        run.lap("write")
         vertebrae = [
             describe_vertebra(each, number, settings.margin, settings.space, own)
             for each, number, own in zip(found, numbers, graded, strict=True)
         ]
-        warnings = [*taken.warnings, *_warn_of_corridors(found)]
-        report = _compose_report(volume, settings, (level, choice), vertebrae, outputs, warnings, watch)
-        if files.report is not None:
-            staged.append(stack.enter_context(stage_report(files.report, report)))
-        commit_all(staged)
-    return report
+        report = run.report(
+            CorridorReport,
+            [*taken.warnings, *_warn_of_corridors(found)],
+            volume,
+            notice=NOT_FOR_PLANNING,
+            level_bias=KNOWN_BIAS,
+            iso_value_hu=level,
+            iso_value_reason="as given" if choice is None else choice.reason,
+            iso_value_choice=None if choice is None else choice.measurements(),
+            space=settings.space,
+            margin_mm=float(settings.margin),
+            grade_scale=SCALE if any(graded) else None,
+            vertebrae=vertebrae,
+            outputs=outputs,
+            affine_ijk_to_lps_mm=volume.affine.tolist(),
+        )
+        return run.finish(report, files.report)
 
 
 def _check_files(source: str | Path, settings: CorridorSettings, files: CorridorFiles) -> None:
@@ -265,7 +272,7 @@ def _picture_paths(files: CorridorFiles, names: Sequence[str]) -> list[str | Pat
     return name_outputs(files.picture, list(names) if len(names) > 1 else [""])
 
 
-def _name_files(settings: CorridorSettings, files: CorridorFiles, names: Sequence[str]) -> None:
+def _name_files(files: CorridorFiles, names: Sequence[str]) -> None:
     """Refuse files that exist and stay, and those that two outputs would share, now that the labels are known."""
     from clrecon.system.files import check_writable
 
@@ -278,19 +285,6 @@ def _name_files(settings: CorridorSettings, files: CorridorFiles, names: Sequenc
     check_distinct(pictures, meshes, report)
     for _, path in (*pictures, *meshes):
         check_writable(path)
-
-
-def _read_inputs(source: str | Path, settings: CorridorSettings, progress: Progress) -> tuple[Volume, LabelMap]:
-    from clrecon.labels import read_labels
-
-    def read_map(volume: Volume | None) -> LabelMap | None:
-        return read_labels(settings.labels, None, volume=volume)
-
-    volume, labels = read_with_labels(
-        partial(read_selected, source, settings, progress=progress), settings.labels, read_map
-    )
-    assert labels is not None
-    return volume, labels
 
 
 def _choose_level(volume: Volume, settings: CorridorSettings, progress: Progress) -> tuple[float, IsoChoice | None]:
@@ -331,81 +325,52 @@ def _grade_screws(
     return graded
 
 
-def _stage_files(
-    stack: ExitStack,
+def _draw_sheets(
+    run: Run,
     volume: Volume,
-    labels: LabelMap,
     found: Sequence[VertebraCorridors],
-    numbers: Sequence[int],
     graded: Sequence[list[tuple[Screw, ScrewGrade]]],
     level: float,
-    settings: CorridorSettings,
     files: CorridorFiles,
-    progress: Progress,
-) -> tuple[list[Any], list[dict[str, Any]]]:
-    """Write pictures and meshes under temporary names; return them and their entries."""
-    staged: list[StagedFile] = []
+) -> list[dict[str, Any]]:
+    """Write the picture of each vertebra, and return their entries."""
     outputs = []
-    names = [each.name for each in found]
-    for path, each, own in zip(_picture_paths(files, names), found, graded, strict=False):
-        staged.append(stack.enter_context(_stage_picture(path, volume, each, own, level, settings)))
-        outputs.append({"kind": "picture", "name": each.name, "bytes": staged[-1].size})
-    if files.output is None:
-        return list(staged), outputs
-    vertebrae = _extract_vertebrae(volume, labels, numbers, level, settings, progress)
+    for path, each, own in zip(_picture_paths(files, [each.name for each in found]), found, graded, strict=False):
+        footer = [
+            f"{screw.name}: {screw.diameter:g} mm, {grade.side}, grade {grade.grade}"
+            + (f", {grade.breach_mm:.1f} mm {grade.direction}" if grade.direction else "")
+            for screw, grade in own[:6]
+        ]
+        footer += [f"surface at {level:g} HU; green: corridor, yellow: largest screw, red: given screw"]
+        footer += [NOT_FOR_PLANNING]
+        picture = draw_corridors(volume, each, [screw for screw, _ in own], run.settings.margin, footer)
+        outputs.append({"kind": "picture", "name": each.name, "bytes": run.write_picture(path, picture).size})
+    return outputs
+
+
+def _write_meshes(
+    run: Run,
+    volume: Volume,
+    labels: LabelMap,
+    found: dict[int, VertebraCorridors],
+    graded: Sequence[list[tuple[Screw, ScrewGrade]]],
+    level: float,
+    output: str | Path,
+) -> list[dict[str, Any]]:
+    """Write vertebrae, filled as the mesh job does with solid labels, and cylinders; return their entries."""
+    from clrecon.operators.surface.labels import extract_labels
+
+    vertebrae = extract_labels(
+        volume, labels, level, device=run.settings.device, numbers=list(found), solid=True,
+        memory=run.settings.memory, progress=run.progress,
+    )  # fmt: skip
     meshes: dict[str, Mesh] = {}
-    for number, each, own in zip(numbers, found, graded, strict=True):
+    for (number, each), own in zip(found.items(), graded, strict=True):
         meshes[each.name] = vertebrae[number]
         cylinders = cylinder_meshes(each, [screw for screw, _ in own])
         meshes |= {f"{each.name}_{name}": mesh for name, mesh in cylinders.items()}
-    paths = name_outputs(files.output, list(meshes))
-    written = stage_meshes(stack, list(meshes.values()), paths, settings.space, progress, keep_ids=settings.keep_ids)
-    outputs += [{"kind": "mesh", "name": name, "bytes": each.size} for name, each in zip(meshes, written, strict=True)]
-    return [*staged, *written], outputs
-
-
-def _extract_vertebrae(
-    volume: Volume,
-    labels: LabelMap,
-    numbers: Sequence[int],
-    level: float,
-    settings: CorridorSettings,
-    progress: Progress,
-) -> dict[int, Mesh]:
-    """Extract the surfaces of the vertebrae, filled, as the mesh job does with solid labels."""
-    from clrecon.operators.surface.labels import extract_labels
-
-    return extract_labels(
-        volume, labels, level, device=settings.device, numbers=list(numbers), solid=True, memory=settings.memory,
-        progress=progress,
-    )  # fmt: skip
-
-
-def _stage_picture(
-    path: str | Path,
-    volume: Volume,
-    found: VertebraCorridors,
-    graded: Sequence[tuple[Screw, ScrewGrade]],
-    level: float,
-    settings: CorridorSettings,
-) -> Any:
-    from clrecon.jobs.corridor_results import draw_corridors
-    from clrecon.rendering.pictures.picture import check_image_path, encode_image
-    from clrecon.system.files import stage_file
-
-    footer = [f"surface at {level:g} HU; green: corridor, yellow: largest screw, red: given screw", NOT_FOR_PLANNING]
-    footer[:0] = [
-        f"{screw.name}: {screw.diameter:g} mm, {grade.side}, grade {grade.grade}"
-        + (f", {grade.breach_mm:.1f} mm {grade.direction}" if grade.direction else "")
-        for screw, grade in graded[:6]
-    ]
-    picture = draw_corridors(volume, found, [screw for screw, _ in graded], settings.margin, footer)
-    content = encode_image(picture, check_image_path(path))
-
-    def write(stream: BinaryIO) -> None:
-        stream.write(content)
-
-    return stage_file(path, write, expected_bytes=len(content))
+    written = run.write_meshes(list(meshes.values()), name_outputs(output, list(meshes)))
+    return [{"kind": "mesh", "name": name, "bytes": each.size} for name, each in zip(meshes, written, strict=True)]
 
 
 def _warn_of_corridors(found: Sequence[VertebraCorridors]) -> list[str]:
@@ -421,37 +386,3 @@ def _warn_of_corridors(found: Sequence[VertebraCorridors]) -> list[str]:
                     " the line, the label's own border the rest: the radius is that of the label"
                 )
     return warnings
-
-
-def _compose_report(
-    volume: Volume,
-    settings: CorridorSettings,
-    level: tuple[float, IsoChoice | None],
-    vertebrae: list[dict[str, Any]],
-    outputs: list[dict[str, Any]],
-    warnings: Sequence[str],
-    watch: Laps,
-) -> CorridorReport:
-    certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
-    told = [*certificate.pop("warnings", []), *warnings]
-    iso_value, choice = level
-    seconds = {part: round(value, 4) for part, value in watch.seconds.items()}
-    return CorridorReport(
-        notice=NOT_FOR_PLANNING,
-        level_bias=KNOWN_BIAS,
-        iso_value_hu=iso_value,
-        iso_value_reason="as given" if choice is None else choice.reason,
-        iso_value_choice=None if choice is None else choice.measurements(),
-        space=settings.space,
-        margin_mm=float(settings.margin),
-        grade_scale=SCALE if any(each["screws"] for each in vertebrae) else None,
-        vertebrae=vertebrae,
-        outputs=outputs,
-        affine_ijk_to_lps_mm=volume.affine.tolist(),
-        version=package_version(),
-        platform=platform_name(),
-        warnings=list(dict.fromkeys(map(str, told))),
-        volume=certificate,
-        seconds={**seconds, "total": round(watch.total(), 4)},
-        peak_memory_bytes=peak_memory_bytes(),
-    )

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume, frame_from_lps
+from clrecon.jobs.run import ScanReport
 from clrecon.mesh import Mesh
 from clrecon.rendering.pictures.annotations import PictureData, orientation_letters
 from clrecon.rendering.pictures.sheets import Panel, Stroke, draw_sheet
 from clrecon.spine.corridors import SIDES, Corridor, VertebraCorridors, screw_diameter
 from clrecon.spine.measures import SCALE, Bias, Screw, ScrewGrade
 from clrecon.spine.solid_bone import sample_volume
-from clrecon.system.records import Record
 
 NOT_FOR_PLANNING = "not for planning an operation: a measurement on one surface at one level, checked on phantoms alone"
 
@@ -32,8 +32,8 @@ KNOWN_BIAS = (
 """What is known of the surface at a level; docs/corridor.md has the table."""
 
 
-@dataclass(frozen=True, eq=False)
-class CorridorReport(Record):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CorridorReport(ScanReport):
     """The report of the corridor job; the fields are the entries of its JSON.
 
     notice: What the figures are not for.
@@ -43,7 +43,6 @@ class CorridorReport(Record):
     grade_scale: The scale of `screws`, None without any.
     outputs: Files with what they hold.
     affine_ijk_to_lps_mm: nested list (4, 4)
-    volume: The certificate of the volume without its warnings.
     """
 
     notice: str
@@ -57,12 +56,6 @@ class CorridorReport(Record):
     vertebrae: list[dict[str, Any]]
     outputs: list[dict[str, Any]]
     affine_ijk_to_lps_mm: list[list[float]]
-    version: str
-    platform: str
-    warnings: list[str]
-    volume: Mapping[str, Any]
-    seconds: Mapping[str, float]
-    peak_memory_bytes: int | None
 
 
 def _point_placer(space: str) -> Callable[[NDArray[Any] | None], list[float] | None]:

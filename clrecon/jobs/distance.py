@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,25 +17,20 @@ from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import frame_from_lps
-from clrecon.jobs.outputs import check_distinct, check_kept, commit_all, stage_picture
-from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name, stage_report
+from clrecon.jobs.run import JobReport, Run
 from clrecon.mesh import Mesh
-from clrecon.mesh.compare.distances import SAMPLES
-from clrecon.mesh.compare.signed import MeshDeviation, measure_distance, measure_vertex_distances
+from clrecon.mesh.compare.distances import SAMPLES, DistanceSummary
+from clrecon.mesh.compare.signed import MeshDeviation, SideDistance, measure_distance, measure_vertex_distances
 from clrecon.mesh.mesh_reader import read_mesh
 from clrecon.rendering.views.directions import find_view
-from clrecon.system.files import Staged, check_writable
-from clrecon.system.log import get_logger, log_warnings
-from clrecon.system.paths import keep_existing
-from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.records import Record
+from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text, format_digits
-from clrecon.version import package_version
 
 if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.rendering import Rendering
     from clrecon.rendering.looks.colors import ColorScale
+    from clrecon.system.files import StagedFile
 
 
 MOST_SAMPLES = 10_000_000
@@ -74,10 +68,35 @@ class DistanceSettings:
         find_view(self.view)
 
 
-log = get_logger(__name__)
-
 _LEAST_RANGE_MM = 1e-3
 """Least distance at which colours end where it is chosen; float32 is as exact 8 m from the origin."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DistanceReport(JobReport):
+    """Report of `measure_meshes`; distances are mm.
+
+    a, b: Each mesh: ``name``, ``kind``, ``space`` and ``space_from`` of its file, ``vertices``, ``triangles``,
+        ``closed``, ``area_mm2``, ``volume_ml``, ``bounds_mm`` (LPS).
+    a_to_b_signed_mm, b_to_a_signed_mm: None where the other mesh is not closed.
+    colors: ``range_mm``, ``signed`` and ``beyond_share`` of vertices of A: how distances became colours.
+    outputs: ``kind``, ``name`` and ``bytes`` of each file.
+    device: Where a picture was drawn.
+    """
+
+    a: Mapping[str, Any]
+    b: Mapping[str, Any]
+    hausdorff_mm: float
+    hd95_mm: float
+    assd_mm: float
+    a_to_b_mm: DistanceSummary
+    b_to_a_mm: DistanceSummary
+    a_to_b_signed_mm: SideDistance | None
+    b_to_a_signed_mm: SideDistance | None
+    samples: int
+    colors: Mapping[str, Any] | None
+    outputs: list[dict[str, Any]]
+    device: str | None
 
 
 @dataclass(frozen=True)
@@ -99,59 +118,61 @@ def measure_meshes(
     reference: str | Path,
     files: DistanceFiles | None = None,
     settings: DistanceSettings | None = None,
-    *,
-    no_clobber: bool = False,
-    progress: Progress | None = None,
+    **how: Any,
 ) -> DistanceReport:
     """Measure how far two meshes lie apart.
 
     mesh, reference: Files A and B, see `clrecon.read_mesh`.
-    no_clobber: Files that exist stay and are an `OutputError`, before any work.
-    progress: ``progress(stage, done, total)``.
+    **how: See `Run`.
     """
     files, settings = files or DistanceFiles(), settings or DistanceSettings()
-    progress = progress or ignore_progress
-    watch = Laps()
-    with keep_existing(no_clobber):
-        _check_files(files, (mesh, reference))
-    device = None if files.picture is None else _open_device(settings.device)
-    progress("read", 0, 0)
-    meshes = [read_side(path, settings.mesh_space) for path in (mesh, reference)]
-    entries = [describe_mesh(own, path) for own, path in zip(meshes, (mesh, reference), strict=True)]
-    for entry in entries:
-        if not entry["area_mm2"]:
-            raise NoSurfaceError(f"{entry['name']} has no triangle with an area: there is nothing to measure")
-    watch.lap("read")
-    names = (entries[0]["name"], entries[1]["name"])
-    found = measure_distance(meshes[0], meshes[1], settings.samples, names=names, progress=progress)
-    colored = None
-    if files.output is not None or files.picture is not None:
-        colored = _color_mesh(meshes[0], meshes[1], found, settings, progress)
-    watch.lap("measure")
-    drawn = None
-    if device is not None and colored is not None:
-        progress("render", 0, 0)
-        drawn = _draw_mesh(meshes[0], colored, names[1], settings, device)
-        watch.lap("render")
-    warnings = [text for own in meshes for text in own.report["file"]["warnings"]]
-    warnings += [*doubt_frames(meshes, entries), *found.warnings]
-    with keep_existing(no_clobber), ExitStack() as staged:
-        written = _stage_files(staged, meshes[0], colored, drawn, files, settings)
-        outputs = [
-            {"kind": what, "name": os.path.basename(os.fspath(path)), "bytes": file.size}
-            for what, path, file in written
-        ]
-        watch.lap("write")
-        report = _describe_distances(found, entries, colored, outputs, device, warnings, watch)
-        own: list[Staged] = [file for _, _, file in written]
-        if files.report is not None:
-            own.append(staged.enter_context(stage_report(files.report, report)))
-        commit_all(own)
-    log_warnings(log, report.warnings)
-    return report
+    with Run(settings, **how) as run:
+        _check_formats(files)
+        named = [("the coloured mesh", files.output), ("the picture", files.picture), ("the report", files.report)]
+        run.check(named, mesh, reference)
+        device = None if files.picture is None else _open_device(settings.device)
+        run.progress("read", 0, 0)
+        meshes = [read_side(path, settings.mesh_space) for path in (mesh, reference)]
+        entries = [describe_mesh(own, path) for own, path in zip(meshes, (mesh, reference), strict=True)]
+        for entry in entries:
+            if not entry["area_mm2"]:
+                raise NoSurfaceError(f"{entry['name']} has no triangle with an area: there is nothing to measure")
+        run.lap("read")
+        names = (entries[0]["name"], entries[1]["name"])
+        found = measure_distance(meshes[0], meshes[1], settings.samples, names=names, progress=run.progress)
+        colored = None
+        if files.output is not None or files.picture is not None:
+            colored = _color_mesh(meshes[0], meshes[1], found, settings, run.progress)
+        run.lap("measure")
+        drawn = None
+        if device is not None and colored is not None:
+            run.progress("render", 0, 0)
+            drawn = _draw_mesh(meshes[0], colored, names[1], settings, device)
+            run.lap("render")
+        outputs = _write_files(run, meshes[0], colored, drawn, files, settings)
+        run.lap("write")
+        warnings = [text for own in meshes for text in own.report["file"]["warnings"]]
+        report = run.report(
+            DistanceReport,
+            [*warnings, *doubt_frames(meshes, entries), *found.warnings],
+            a=entries[0],
+            b=entries[1],
+            hausdorff_mm=found.hausdorff_mm,
+            hd95_mm=found.hd95_mm,
+            assd_mm=found.assd_mm,
+            a_to_b_mm=found.to_reference_mm,
+            b_to_a_mm=found.from_reference_mm,
+            a_to_b_signed_mm=found.to_reference_signed_mm,
+            b_to_a_signed_mm=found.from_reference_signed_mm,
+            samples=found.samples,
+            colors=None if colored is None else colored.describe(),
+            outputs=outputs,
+            device=None if device is None else device.current.label,
+        )
+        return run.finish(report, files.report)
 
 
-def _check_files(files: DistanceFiles, sources: tuple[str | Path, str | Path]) -> None:
+def _check_formats(files: DistanceFiles) -> None:
     from clrecon.rendering.pictures.picture import check_image_path
     from clrecon.rendering.pictures.pillow import load_pillow
 
@@ -162,12 +183,6 @@ def _check_files(files: DistanceFiles, sources: tuple[str | Path, str | Path]) -
     if files.picture is not None:
         load_pillow()
         check_image_path(files.picture)
-    named = [("the coloured mesh", files.output), ("the picture", files.picture), ("the report", files.report)]
-    outputs: list[tuple[str, str | Path]] = [(what, path) for what, path in named if path is not None]
-    check_distinct(outputs)
-    for _, path in outputs:
-        check_writable(path)
-    check_kept(outputs, *sources)
 
 
 def _open_device(name: str | None) -> Device:
@@ -186,6 +201,10 @@ class _Colored:
     @property
     def colors(self) -> NDArray[np.uint8]:
         return self.scale.colors(self.distances)
+
+    def describe(self) -> dict[str, Any]:
+        beyond = float(np.mean(np.abs(self.distances) > self.scale.limit))
+        return {"range_mm": self.scale.limit, "signed": self.scale.signed, "beyond_share": beyond}
 
 
 def _color_mesh(
@@ -214,63 +233,29 @@ def _draw_mesh(mesh: Mesh, colored: _Colored, other: str, settings: DistanceSett
     return add_scale(picture.annotated(letters=True, scale_bar=True), colored.scale, title)
 
 
-def _stage_files(
-    staged: ExitStack,
+def _write_files(
+    run: Run,
     mesh: Mesh,
     colored: _Colored | None,
     drawn: Rendering | None,
     files: DistanceFiles,
     settings: DistanceSettings,
-) -> list[tuple[str, str | Path, Any]]:
+) -> list[dict[str, Any]]:
     from clrecon.exchange.formats import FORMATS, stage_content
 
-    written: list[tuple[str, str | Path, Any]] = []
+    written: list[tuple[str, str | Path, StagedFile]] = []
     if files.output is not None and colored is not None:
         content = replace(
             mesh.describe(settings.space), vertex_colors=colored.colors, distances=colored.distances.astype(np.float32)
         )
         counted = f"{mesh.triangle_count} triangles"
-        file = staged.enter_context(stage_content(content, files.output, FORMATS[".ply"], counted, "fewer triangles"))
+        file = run.stage(stage_content(content, files.output, FORMATS[".ply"], counted, "fewer triangles"))
         written.append(("mesh", files.output, file))
     if files.picture is not None and drawn is not None:
-        written.append(("picture", files.picture, stage_picture(staged, drawn, files.picture)))
-    return written
-
-
-def _describe_distances(
-    found: MeshDeviation,
-    entries: list[dict[str, Any]],
-    colored: _Colored | None,
-    outputs: list[dict[str, Any]],
-    device: Device | None,
-    warnings: list[str],
-    watch: Laps,
-) -> DistanceReport:
-    colors = None
-    if colored is not None:
-        limit = colored.scale.limit
-        beyond = float(np.mean(np.abs(colored.distances) > limit))
-        colors = {"range_mm": limit, "signed": colored.scale.signed, "beyond_share": beyond}
-    return DistanceReport(
-        a=entries[0],
-        b=entries[1],
-        hausdorff_mm=found.hausdorff_mm,
-        hd95_mm=found.hd95_mm,
-        assd_mm=found.assd_mm,
-        a_to_b_mm=found.to_reference_mm,  # type: ignore[arg-type]
-        b_to_a_mm=found.from_reference_mm,  # type: ignore[arg-type]
-        a_to_b_signed_mm=found.to_reference_signed_mm,
-        b_to_a_signed_mm=found.from_reference_signed_mm,
-        samples=found.samples,
-        colors=colors,
-        outputs=outputs,
-        device=None if device is None else device.current.label,
-        version=package_version(),
-        platform=platform_name(),
-        warnings=list(dict.fromkeys(warnings)),
-        seconds={part: round(value, 4) for part, value in {**watch.seconds, "total": watch.total()}.items()},
-        peak_memory_bytes=peak_memory_bytes(),
-    )
+        written.append(("picture", files.picture, run.write_picture(files.picture, drawn)))
+    return [
+        {"kind": what, "name": os.path.basename(os.fspath(path)), "bytes": file.size} for what, path, file in written
+    ]
 
 
 _OTHER_UNIT = 100.0
@@ -334,37 +319,3 @@ def doubt_frames(meshes: Sequence[Mesh], entries: Sequence[dict[str, Any]]) -> l
 def _frame_of_reference(mesh: Mesh) -> str | None:
     lines = mesh.report.get("certificate_lines") or ()
     return next((line.split()[1] for line in lines if line.startswith("frame_of_reference ")), None)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class DistanceReport(Record):
-    """Report of `measure_meshes`; distances are mm.
-
-    a, b: Each mesh: ``name``, ``kind``, ``space`` and ``space_from`` of its file, ``vertices``, ``triangles``,
-        ``closed``, ``area_mm2``, ``volume_ml``, ``bounds_mm`` (LPS).
-    a_to_b_mm, b_to_a_mm: ``mean``, ``rms``, ``p95`` and ``max`` of the distances without sign.
-    a_to_b_signed_mm, b_to_a_signed_mm: See `clrecon.mesh.compare.signed.SideDistance`; None where the other mesh is not
-        closed.
-    colors: ``range_mm``, ``signed`` and ``beyond_share`` of vertices of A: how distances became colours.
-    outputs: ``kind``, ``name`` and ``bytes`` of each file.
-    device: Where a picture was drawn.
-    """
-
-    a: Mapping[str, Any]
-    b: Mapping[str, Any]
-    hausdorff_mm: float
-    hd95_mm: float
-    assd_mm: float
-    a_to_b_mm: Mapping[str, float]
-    b_to_a_mm: Mapping[str, float]
-    a_to_b_signed_mm: Mapping[str, float] | None
-    b_to_a_signed_mm: Mapping[str, float] | None
-    samples: int
-    colors: Mapping[str, Any] | None
-    outputs: list[dict[str, Any]]
-    device: str | None
-    version: str
-    platform: str
-    warnings: list[str]
-    seconds: Mapping[str, float]
-    peak_memory_bytes: int | None

@@ -7,31 +7,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.jobs.inputs import read_with_labels
-from clrecon.jobs.outputs import (
-    check_distinct,
-    check_kept,
-    check_outputs,
-    commit_all,
-    name_outputs,
-    refuse_files,
-    stage_meshes,
-    stage_picture,
-)
-from clrecon.jobs.run import DeviceOpening, Laps, RunReport, peak_memory_bytes, platform_name, stage_report
-from clrecon.reading import Selection, read_selected
+from clrecon.jobs.outputs import check_distinct, check_kept, check_outputs, name_outputs, refuse_files
+from clrecon.jobs.run import DeviceOpening, Run, RunReport
+from clrecon.reading import Selection
 from clrecon.system.arguments import name_parameter
-from clrecon.system.log import get_logger, log_warnings
-from clrecon.system.paths import keep_existing
-from clrecon.system.progress import Progress, ignore_progress
-from clrecon.version import package_version
+from clrecon.system.log import get_logger
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -40,7 +25,6 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.operators.vertebrae.inside import VertebraInside
     from clrecon.rendering import Rendering
-    from clrecon.system.files import StagedFile
 
 
 DEFAULT_VIEW = "130,20"
@@ -97,12 +81,6 @@ def draw_parts(
     return pictures
 
 
-def describe_picture(part: str, picture: Rendering, path: str | Path, size: int) -> dict[str, Any]:
-    """Return one object of ``pictures``."""
-    kind = os.path.splitext(os.fspath(path))[1].lower().lstrip(".")
-    return {"part": part, "faded": list(FADED[part]), "size": list(picture.size), "format": kind, "bytes": size}
-
-
 @dataclass(frozen=True, kw_only=True)
 class InsideSettings(Selection):
     """Settings of the job.
@@ -152,6 +130,20 @@ class InsideSettings(Selection):
 log = get_logger(__name__)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InsideReport(RunReport):
+    """The report of the job: a `RunReport` with further entries, which docs/contract.md explains.
+
+    vertebrae: One for each label, see `clrecon.VertebraInside.as_dict`, with ``meshes`` beside: ``part``, ``vertices``,
+        ``triangles``, ``format`` and ``bytes`` of each file, and ``pictures``.
+    """
+
+    vertebrae: list[dict[str, Any]]
+    close_mm: float
+    space: str
+    unit: str = "mm"
+
+
 def make_inside(
     source: str | Path,
     output: str | Path,
@@ -159,8 +151,7 @@ def make_inside(
     *,
     picture: str | Path | None = None,
     report_path: str | Path | None = None,
-    no_clobber: bool = False,
-    progress: Progress | None = None,
+    **how: Any,
 ) -> InsideReport:
     """Read a CT series and its labels, look into vertebrae, and write the surfaces of their parts.
 
@@ -172,35 +163,53 @@ def make_inside(
     output: Mesh file; its extension gives the format.
     picture: Picture, .png, .jpg or .tif: one of each part, with names like those of the meshes.
     report_path: File for the report as JSON.
-    no_clobber: Files that exist stay and are an `OutputError`.
-    progress: ``progress(stage, done, total)``.
+    **how: See `Run`.
     """
     from clrecon.operators.vertebrae.inside import PARTS
+    from clrecon.operators.vertebrae.solid import CLOSE_MM
 
-    progress = progress or ignore_progress
-    watch = Laps()
-    with keep_existing(no_clobber):
-        _check_files(source, output, picture, report_path, settings)
-    volume, labels, device = _open_inputs(source, settings, progress)
-    suffixes = _name_labels(labels, settings)
-    if no_clobber:
-        names = [name_part(suffix, part, several=len(suffixes) > 1) for suffix in suffixes for part in PARTS]
-        refuse_files(name_outputs(output, names) + ([] if picture is None else name_outputs(picture, names)))
-    watch.lap("read")
-    found: list[_FoundVertebra] = []
-    for number, suffix in zip(_find_numbers(labels, settings), suffixes, strict=True):
-        progress("inside", len(found), len(suffixes) if len(suffixes) > 1 else 0)
-        inside = _look_inside(volume, labels, number, settings, device)
-        found.append(_FoundVertebra(suffix, inside, inside.extract_meshes(memory=settings.memory)))
-    watch.lap("inside")
-    if picture is not None:
-        for place, one in enumerate(found):
-            progress("render", place, len(found) if len(found) > 1 else 0)
-            one.pictures = draw_parts(one.meshes, settings.view, device, settings.memory)
-        watch.lap("render")
-    with keep_existing(no_clobber):
-        report = _write_files(found, (output, picture, report_path), volume, settings, device, watch, progress)
-    log_warnings(log, report.warnings, volume.report.get("warnings", ()))
+    with Run(settings, **how) as run:
+        with run.keeping():
+            _check_files(source, output, picture, report_path, settings)
+        run.progress("device", 0, 0)
+        with DeviceOpening(settings.device, _prepare_kernels) as opening:
+            volume, labels = run.read_labelled(source)
+            device = opening.wait()
+        suffixes = _name_labels(labels, settings)
+        several = len(suffixes) > 1
+        if run.no_clobber:
+            names = [name_part(suffix, part, several=several) for suffix in suffixes for part in PARTS]
+            refuse_files(name_outputs(output, names) + ([] if picture is None else name_outputs(picture, names)))
+        run.lap("read")
+        found: list[_FoundVertebra] = []
+        for number, suffix in zip(_find_numbers(labels, settings), suffixes, strict=True):
+            run.progress("inside", len(found), len(suffixes) if several else 0)
+            inside = _look_inside(volume, labels, number, settings, device)
+            found.append(_FoundVertebra(suffix, inside, inside.extract_meshes(memory=settings.memory)))
+        run.lap("inside")
+        if picture is not None:
+            for place, one in enumerate(found):
+                run.progress("render", place, len(found) if several else 0)
+                one.pictures = draw_parts(one.meshes, settings.view, device, settings.memory)
+            run.lap("render")
+        vertebrae = [_write_vertebra(run, one, output, picture, report_path, several=several) for one in found]
+        run.lap("write")
+        warnings = [
+            f"{vertebra['name']}: {warning}" if several else warning
+            for vertebra in vertebrae
+            for warning in vertebra["warnings"]
+        ]
+        report = run.report(
+            InsideReport,
+            [*device.current.warnings, *warnings],
+            volume,
+            on=device.current,
+            affine_ijk_to_lps_mm=volume.affine.tolist(),
+            vertebrae=vertebrae,
+            close_mm=settings.close_mm or CLOSE_MM,
+            space=settings.space.lower(),
+        )
+        run.finish(report, report_path)
     log.info("%d vertebrae looked into, on %s in %.3f s", len(found), report.device, report.seconds["total"])
     return report
 
@@ -239,22 +248,6 @@ def _check_files(
     check_kept(outputs, source, settings.labels)
 
 
-def _open_inputs(source: str | Path, settings: InsideSettings, progress: Progress) -> tuple[Volume, LabelMap, Device]:
-    """Read the input while the device opens and builds its kernels."""
-    from clrecon.labels import read_labels
-
-    progress("device", 0, 0)
-    with DeviceOpening(settings.device, _prepare_kernels) as opening:
-        volume, labels = read_with_labels(
-            partial(read_selected, source, settings, progress=progress),
-            settings.labels,
-            lambda volume: read_labels(settings.labels, volume=volume),
-        )
-        device = opening.wait()
-    assert labels is not None
-    return volume, labels, device
-
-
 def _prepare_kernels(device: Device) -> None:
     from clrecon.operators.surface.label_masks import prepare_label_masks
 
@@ -289,122 +282,38 @@ def _look_inside(
     )  # fmt: skip
 
 
-def _write_files(
-    found: list[_FoundVertebra],
-    outputs: tuple[str | Path, str | Path | None, str | Path | None],
-    volume: Volume,
-    settings: InsideSettings,
-    device: Device,
-    watch: Laps,
-    progress: Progress,
-) -> InsideReport:
-    """Write all files, with the report of all vertebrae as the last one, and return the report."""
-    from clrecon.operators.vertebrae.solid import CLOSE_MM
-
-    output, picture, report_path = outputs
-    suffixes = [one.suffix for one in found]
-    with ExitStack() as staged:
-        files: list[StagedFile] = []
-        vertebrae: list[dict[str, Any]] = []
-        for one in found:
-            names = [name_part(one.suffix, part, several=len(suffixes) > 1) for part in one.meshes]
-            paths = name_outputs(output, names, report_path)
-            written = stage_meshes(
-                staged, list(one.meshes.values()), paths, settings.space, progress, keep_ids=settings.keep_ids
-            )
-            told: dict[str, Any] = {**one.inside.as_dict(), "name": one.suffix, "pictures": []}
-            parts = zip(one.meshes, one.meshes.values(), paths, written, strict=True)
-            told["meshes"] = [describe_mesh_file(part, mesh, path, file.size) for part, mesh, path, file in parts]
-            files += written
-            for part, drawn in one.pictures.items():
-                assert picture is not None
-                (path,) = name_outputs(picture, [name_part(one.suffix, part, several=len(suffixes) > 1)])
-                files.append(stage_picture(staged, drawn, path))
-                told["pictures"].append(describe_picture(part, drawn, path, files[-1].size))
-                told["warnings"] += drawn.report["warnings"]
-            vertebrae.append(told)
-        watch.lap("write")
-        seconds = {part: round(value, 4) for part, value in {**watch.seconds, "total": watch.total()}.items()}
-        report = describe_inside(
-            volume, vertebrae, settings, device.current, close_mm=settings.close_mm or CLOSE_MM, seconds=seconds
-        )
-        if report_path is not None:
-            files.append(staged.enter_context(stage_report(report_path, report)))
-        commit_all(files)
-    return report
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class InsideReport(RunReport):
-    """The report of the job: a `RunReport` with further entries, which docs/contract.md explains.
-
-    vertebrae: One for each label, see `clrecon.VertebraInside.as_dict`, with ``meshes`` beside: ``part``, ``vertices``,
-        ``triangles``, ``format`` and ``bytes`` of each file, and ``pictures``.
-    """
-
-    affine_ijk_to_lps_mm: list[list[float]]
-    vertebrae: list[dict[str, Any]]
-    close_mm: float
-    space: str
-    unit: str = "mm"
-    device: str
-    driver: str
-    memory_allowed_bytes: int | None
-    version: str
-    platform: str
-    warnings: list[str]
-    volume: Mapping[str, Any]
-    seconds: Mapping[str, float]
-    peak_memory_bytes: int | None
-
-
-def describe_mesh_file(part: str, mesh: Mesh, path: str | Path, size: int) -> dict[str, Any]:
-    """Return one object of ``meshes``."""
-    kind = os.path.splitext(os.fspath(path))[1].lower().lstrip(".")
-    return {
-        "part": part,
-        "vertices": mesh.vertex_count,
-        "triangles": mesh.triangle_count,
-        "format": kind,
-        "bytes": size,
-    }
-
-
-def describe_inside(
-    volume: Volume,
-    vertebrae: Sequence[dict[str, Any]],
-    settings: InsideSettings,
-    device: Device,
+def _write_vertebra(
+    run: Run,
+    one: _FoundVertebra,
+    output: str | Path,
+    picture: str | Path | None,
+    report_path: str | Path | None,
     *,
-    close_mm: float,
-    seconds: Mapping[str, float],
-) -> InsideReport:
-    """Compose the report of a job.
-
-    vertebrae: Entries of each vertebra; their warnings become those of the job.
-    """
-    from clrecon.geometry.certificate import without_ids  # numpy: not loaded for the help
-
-    certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
-    told = [*certificate.pop("warnings", []), *device.warnings]
-    several = len(vertebrae) > 1
-    told += [
-        f"{vertebra['name']}: {warning}" if several else warning
-        for vertebra in vertebrae
-        for warning in vertebra["warnings"]
+    several: bool,
+) -> dict[str, Any]:
+    """Write meshes and pictures of a vertebra, and return its entries in the report."""
+    told: dict[str, Any] = {**one.inside.as_dict(), "name": one.suffix, "pictures": []}
+    paths = name_outputs(output, [name_part(one.suffix, part, several=several) for part in one.meshes], report_path)
+    written = run.write_meshes(list(one.meshes.values()), paths)
+    told["meshes"] = [
+        {
+            "part": part,
+            "vertices": mesh.vertex_count,
+            "triangles": mesh.triangle_count,
+            "format": _format_of(path),
+            "bytes": file.size,
+        }
+        for (part, mesh), path, file in zip(one.meshes.items(), paths, written, strict=True)
     ]
-    return InsideReport(
-        affine_ijk_to_lps_mm=volume.affine.tolist(),
-        vertebrae=[dict(vertebra) for vertebra in vertebrae],
-        close_mm=close_mm,
-        space=settings.space.lower(),
-        device=device.label,
-        driver=device.driver,
-        memory_allowed_bytes=settings.memory,
-        version=package_version(),
-        platform=platform_name(),
-        warnings=list(dict.fromkeys(map(str, told))),
-        volume=certificate,
-        seconds=seconds,
-        peak_memory_bytes=peak_memory_bytes(),
-    )
+    for part, drawn in one.pictures.items():
+        assert picture is not None
+        (path,) = name_outputs(picture, [name_part(one.suffix, part, several=several)])
+        size = run.write_picture(path, drawn).size
+        entry = {"part": part, "faded": list(FADED[part]), "size": list(drawn.size)}
+        told["pictures"].append(entry | {"format": _format_of(path), "bytes": size})
+        told["warnings"] += drawn.report["warnings"]
+    return told
+
+
+def _format_of(path: str | Path) -> str:
+    return os.path.splitext(os.fspath(path))[1].lower().lstrip(".")

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING
 
 from clrecon.errors import ClreconError, OutputError, UsageError
 from clrecon.exchange.formats import ASSEMBLIES, FORMATS, list_extensions
@@ -18,7 +18,6 @@ from clrecon.system.text import count_of
 
 if TYPE_CHECKING:
     from clrecon.mesh import Mesh
-    from clrecon.rendering import Rendering
     from clrecon.system.files import Staged, StagedFile
 
 
@@ -217,16 +216,3 @@ def commit_all(files: Sequence[Staged]) -> None:
                 if done == 0:
                     raise
                 raise OutputError(f"{error} ({done} of {len(files)} files of this job are in place already)") from error
-
-
-def stage_picture(stack: ExitStack, picture: Rendering, path: str | Path) -> StagedFile:
-    """Write a picture under a temporary name that `stack` removes unless it is committed."""
-    from clrecon.rendering.pictures.picture import encode_image
-    from clrecon.system.files import stage_file
-
-    content = encode_image(picture, os.path.splitext(os.fspath(path))[1].lower())
-
-    def write(stream: BinaryIO) -> None:
-        stream.write(content)
-
-    return stack.enter_context(stage_file(path, write, expected_bytes=len(content)))

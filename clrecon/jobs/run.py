@@ -7,23 +7,36 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar, TypeVar
 
 from clrecon.errors import Cancelled, ClreconError
-from clrecon.system.log import get_logger
+from clrecon.jobs.outputs import check_distinct, check_kept, commit_all
+from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.paths import keep_existing
+from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
+from clrecon.version import package_version
 
 if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+    from clrecon.labels import LabelMap
+    from clrecon.mesh import Mesh
     from clrecon.opencl import Device
-    from clrecon.system.files import StagedFile
+    from clrecon.rendering.pictures.annotations import PictureData
+    from clrecon.system.files import Staged, StagedFile
 
+Report = TypeVar("Report", bound="JobReport")
+StagedAs = TypeVar("StagedAs", bound="Staged")
 
 log = get_logger(__name__)
 
@@ -47,6 +60,10 @@ class Laps:
     def total(self) -> float:
         """Seconds since the first lap began."""
         return perf_counter() - self._start
+
+    def rounded(self) -> dict[str, float]:
+        """Return the seconds of each part and ``total``, as reports have them."""
+        return {part: round(value, 4) for part, value in {**self.seconds, "total": self.total()}.items()}
 
 
 def _choose_device(name: str | int | Device | None) -> Device:
@@ -166,24 +183,189 @@ def peak_memory_bytes(status: Path = _OWN_STATUS) -> int | None:
     return int(peak) if sys.platform == "darwin" else int(peak) * 1024
 
 
-class RunReport(Record):
-    """The entries that all reports share; each report is a dataclass with these fields and its own, in JSON order.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class JobReport(Record):
+    """The entries that all reports share.  In JSON they come last: first those that a report declares itself.
 
-    affine_ijk_to_lps_mm: nested list (4, 4)
-    memory_allowed_bytes: Most bytes that may be taken on the device; None: all.
     version, platform: Version of clrecon; system, machine and Python.
     warnings: Those of the volume first, each once.
-    volume: The `Certificate` of the volume without its warnings.
-    seconds: Seconds by part of the job, with ``other`` and ``total``.
+    seconds: Seconds by part of the job, with ``total``.
     """
 
-    affine_ijk_to_lps_mm: list[list[float]]
-    device: str
-    driver: str
-    memory_allowed_bytes: int | None
+    _LAST: ClassVar[tuple[str, ...]] = ("version", "platform", "warnings", "volume", "seconds", "peak_memory_bytes")
+    """Names of the entries at the end, in their order."""
+
     version: str
     platform: str
     warnings: list[str]
-    volume: Mapping[str, Any]
     seconds: Mapping[str, float]
     peak_memory_bytes: int | None
+
+    def _entries(self) -> dict[str, Any]:
+        own = super()._entries()
+        return {name: own[name] for name in own if name not in self._LAST} | {
+            name: own[name] for name in self._LAST if name in own
+        }
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScanReport(JobReport):
+    """Those of jobs that read a scan.
+
+    volume: The `Certificate` of the volume without its warnings.
+    """
+
+    volume: Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunReport(ScanReport):
+    """Those of jobs that work on a device.
+
+    affine_ijk_to_lps_mm: nested list (4, 4); None where no scan was read
+    memory_allowed_bytes: Most bytes that may be taken on the device; None: all.
+    """
+
+    _LAST = ("device", "driver", "memory_allowed_bytes", *JobReport._LAST)
+
+    affine_ijk_to_lps_mm: list[list[float]] | None
+    device: str
+    driver: str
+    memory_allowed_bytes: int | None
+
+
+class Run(Laps):
+    """One run of a job: checks and stages its files, times it, composes the shared part of its report, and commits.
+
+    All files are on the disk before the first replaces an older one; those that are not committed at the end of the
+    ``with`` block are removed.
+
+    settings: Those of the job; of their fields ``keep_ids``, ``labels``, ``memory`` and ``space`` are used here.
+    no_clobber: Files that exist stay and are an `OutputError`, before any work.
+    """
+
+    def __init__(self, settings: Any, *, no_clobber: bool = False, progress: Progress = ignore_progress):
+        super().__init__()
+        self.settings, self.no_clobber, self.progress = settings, no_clobber, progress
+        self._keep_ids: bool = getattr(settings, "keep_ids", False)
+        self._stack = ExitStack()
+        self._files: list[Staged] = []
+        self._logged: Iterable[str] = ()
+
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, traceback)
+
+    def keeping(self) -> AbstractContextManager[None]:
+        """In the ``with`` block, files that exist stay if the run was asked for it.
+
+        Nothing but checks and staging belongs there: the caches of kernels are files too.
+        """
+        return keep_existing(self.no_clobber)
+
+    def check(self, outputs: Sequence[tuple[str, str | Path | None]], *inputs: str | Path | None) -> None:
+        """Refuse outputs that are the same file, cannot be written, or would replace one of the inputs.
+
+        outputs: Description and path of each file; None: it is not written.
+        """
+        from clrecon.system.files import check_writable
+
+        named = [(what, path) for what, path in outputs if path is not None]
+        check_distinct(named)
+        with self.keeping():
+            for _, path in named:
+                check_writable(path)
+        check_kept(named, *inputs)
+
+    def read(self, source: str | Path) -> Volume:
+        """Read the scan."""
+        from clrecon.reading import read_selected
+
+        return read_selected(source, self.settings, progress=self.progress)
+
+    def read_labelled(self, source: str | Path, only: Sequence[str | int] | None = None) -> tuple[Volume, LabelMap]:
+        """Read the scan and the label map of the settings; with `only` these labels of it."""
+        from clrecon.jobs.inputs import read_with_labels
+        from clrecon.labels import read_labels
+
+        path = self.settings.labels
+        volume, labels = read_with_labels(
+            partial(self.read, source), path, lambda volume: read_labels(path, only, volume=volume)
+        )
+        assert labels is not None
+        return volume, labels
+
+    def stage(self, staging: AbstractContextManager[StagedAs]) -> StagedAs:
+        """Write a file under a temporary name."""
+        with self.keeping():
+            file = self._stack.enter_context(staging)
+        self._files.append(file)
+        return file
+
+    def write(self, path: str | Path, content: bytes) -> StagedFile:
+        """Write bytes under a temporary name."""
+        from clrecon.system.files import stage_file
+
+        return self.stage(stage_file(path, lambda stream: stream.write(content), expected_bytes=len(content)))
+
+    def write_picture(self, path: str | Path, picture: PictureData) -> StagedFile:
+        """Write a picture under a temporary name."""
+        from clrecon.rendering.pictures.picture import encode_image
+
+        return self.write(path, encode_image(picture, os.path.splitext(os.fspath(path))[1].lower()))
+
+    def write_meshes(self, meshes: Sequence[Mesh], paths: Sequence[str | Path]) -> list[StagedFile]:
+        """Write each mesh under a temporary name."""
+        from clrecon.exchange.formats import stage_mesh
+        from clrecon.system.files import allow_open_files
+
+        allow_open_files(len(meshes))
+        staged: list[StagedFile] = []
+        for mesh, path in zip(meshes, paths, strict=True):
+            self.progress("write", len(staged), len(meshes) if len(meshes) > 1 else 0)
+            staged.append(self.stage(stage_mesh(mesh, path, self.settings.space, keep_ids=self._keep_ids)))
+        return staged
+
+    def report(
+        self,
+        kind: type[Report],
+        warnings: Iterable[str],
+        volume: Volume | None = None,
+        *,
+        on: Device | None = None,
+        **own: Any,
+    ) -> Report:
+        """Compose a report.
+
+        kind: A `JobReport`; with `volume` a `ScanReport`, with the device `on` a `RunReport`.
+        warnings: Those of the job.
+        **own: Entries that `kind` declares; and ``seconds``, where the laps alone are not enough.
+        """
+        told: Iterable[str] = ()
+        if volume is not None:
+            from clrecon.geometry.certificate import without_ids
+
+            certificate = dict(volume.report) if self._keep_ids else without_ids(volume.report)
+            self._logged = told = certificate.pop("warnings", ())
+            own["volume"] = certificate
+        if on is not None:
+            own.update(device=on.label, driver=on.driver, memory_allowed_bytes=self.settings.memory)
+        return kind(
+            version=package_version(),
+            platform=platform_name(),
+            warnings=list(dict.fromkeys(map(str, (*told, *warnings)))),
+            peak_memory_bytes=peak_memory_bytes(),
+            **{"seconds": self.rounded(), **own},
+        )
+
+    def finish(self, report: Report, path: str | Path | None) -> Report:
+        """Put all files in their places, the report at `path` as the last, and log its warnings; return the report."""
+        if path is not None:
+            self.stage(stage_report(path, report))
+        commit_all(self._files)
+        log_warnings(log, report.warnings, self._logged)
+        return report

@@ -8,34 +8,24 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry.certificate import without_ids
-from clrecon.jobs.outputs import check_distinct, check_kept, commit_all
-from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name, stage_report
-from clrecon.reading import Selection, read_selected
+from clrecon.jobs.run import Run, ScanReport
+from clrecon.reading import Selection
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.pictures.pillow import load_font, load_pillow
-from clrecon.system.files import Staged, StagedFile, stage_file
-from clrecon.system.log import get_logger, log_warnings
-from clrecon.system.paths import keep_existing
-from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.records import Record
-from clrecon.version import package_version
 
 if TYPE_CHECKING:
-    from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
     from clrecon.spine import VertebraSplit
+    from clrecon.spine.split import Vertebra
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +62,24 @@ class VertebraeSettings(Selection):
         check_landmark(self.name_at, self.first)
 
 
-log = get_logger(__name__)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class VertebraeReport(ScanReport):
+    """Report of `make_vertebrae`.
+
+    vertebrae: All that were found, from the head downwards.
+    low_confidence: How many of them have a confidence below 0.5.
+    written: How many the label map has.
+    discs: ``centre_mm`` and ``normal`` (downwards) of each disc, LPS.
+    output: ``format`` and ``bytes`` of the label map.
+    """
+
+    vertebrae: list[Vertebra]
+    low_confidence: int
+    written: int
+    discs: list[dict[str, list[float]]]
+    left_out: list[str]
+    level_hu: float
+    output: Mapping[str, Any]
 
 
 def make_vertebrae(
@@ -83,8 +90,7 @@ def make_vertebrae(
     picture_path: str | Path | None = None,
     with_picture: bool = True,
     report_path: str | Path | None = None,
-    no_clobber: bool = False,
-    progress: Progress | None = None,
+    **how: Any,
 ) -> VertebraeReport:
     """Read a CT series, find its vertebrae, and write a label map and a picture of the discs and labels.
 
@@ -95,44 +101,65 @@ def make_vertebrae(
     picture_path: PNG; by default beside the label map, with its name.
     with_picture: False: without `picture_path` there is no picture.
     report_path: File for the report as JSON.
-    no_clobber: Files that exist stay and are an `OutputError`, before any work.
-    progress: ``progress(stage, done, total)``.
+    **how: See `Run`.
     """
     from clrecon.spine import split_vertebrae
 
     settings = settings or VertebraeSettings()
-    progress = progress or ignore_progress
     picture = picture_beside(output) if picture_path is None and with_picture else picture_path
-    watch = Laps()
-    with keep_existing(no_clobber):
-        check_files(source, output, picture, report_path)
-    volume = read_selected(source, settings, progress=progress)
-    watch.lap("read")
-    split = split_vertebrae(
-        volume,
-        level=settings.level,
-        seeds=list(settings.seeds) or None,
-        name_at=settings.name_at,
-        first=settings.first,
-        keep_unsure=settings.keep_unsure,
-        progress=progress,
-    )
-    watch.lap("split")
-    progress("write", 0, 0)
-    content = _encode_map(split.labels, output, source, settings)
-    with keep_existing(no_clobber), ExitStack() as staged:
-        files: list[Staged] = [_stage_content(staged, output, content)]
+    with Run(settings, **how) as run:
+        _check_formats(source, output, picture)
+        run.check([("the label map", output), ("the picture", picture), ("the report", report_path)], source)
+        volume = run.read(source)
+        run.lap("read")
+        split = split_vertebrae(
+            volume,
+            level=settings.level,
+            seeds=list(settings.seeds) or None,
+            name_at=settings.name_at,
+            first=settings.first,
+            keep_unsure=settings.keep_unsure,
+            progress=run.progress,
+        )
+        run.lap("split")
+        run.progress("write", 0, 0)
+        file = run.write(output, _encode_map(split.labels, output, source, settings))
         if picture is not None:
-            files.append(_stage_content(staged, picture, draw_vertebrae(split)))
-        watch.lap("write")
-        seconds = {part: round(value, 4) for part, value in {**watch.seconds, "total": watch.total()}.items()}
-        facts = {"format": map_format(output), "bytes": len(content)}
-        report = describe_split(volume, split, settings, facts, seconds)
-        if report_path is not None:
-            files.append(staged.enter_context(stage_report(report_path, report)))
-        commit_all(files)
-    log_warnings(log, report.warnings, volume.report.get("warnings", ()))
-    return report
+            run.write(picture, draw_vertebrae(split))
+        run.lap("write")
+        discs = [
+            {"centre_mm": [round(float(v), 2) for v in centre], "normal": [round(float(v), 4) for v in normal]}
+            for centre, normal in zip(split.discs_mm, split.disc_normals, strict=True)
+        ]
+        report = run.report(
+            VertebraeReport,
+            _warn_of_confidence(split, settings),
+            volume,
+            vertebrae=split.vertebrae,
+            low_confidence=len(split.low_confidence),
+            written=len(split.labels.numbers),
+            discs=discs,
+            left_out=split.left_out,
+            level_hu=split.level_hu,
+            output={"format": map_format(output), "bytes": file.size},
+        )
+        return run.finish(report, report_path)
+
+
+def _check_formats(source: str | Path, output: str | Path, picture: str | Path | None) -> None:
+    """Refuse names of files that say another format."""
+    from clrecon.labels.label_grids import load_nibabel
+    from clrecon.reading import tell_format
+
+    kind = map_format(output)
+    if kind in NIFTI:
+        load_nibabel()
+    elif (found := tell_format(source)) is not None:
+        raise UsageError(f"DICOM SEG belongs to a scan in DICOM, and this is {found}: write the label map as .nii.gz")
+    if picture is not None and not os.fspath(picture).lower().endswith(".png"):
+        raise UsageError(f"the picture of the discs is a .png file, not {os.path.basename(os.fspath(picture))[-40:]!r}")
+    if picture is not None:
+        load_pillow()
 
 
 def _encode_map(labels: LabelMap, output: str | Path, source: str | Path, settings: VertebraeSettings) -> bytes:
@@ -147,12 +174,15 @@ def _encode_map(labels: LabelMap, output: str | Path, source: str | Path, settin
     return encode_nifti(labels, packed=kind.endswith(".gz"))
 
 
-def _write_content(content: bytes, stream: BinaryIO) -> None:
-    stream.write(content)
-
-
-def _stage_content(stack: ExitStack, path: str | Path, content: bytes) -> StagedFile:
-    return stack.enter_context(stage_file(path, partial(_write_content, content), expected_bytes=len(content)))
+def _warn_of_confidence(split: VertebraSplit, settings: VertebraeSettings) -> list[str]:
+    fate = "is in the label map all the same" if settings.keep_unsure else "is not in the label map"
+    warnings = [
+        f"{one.name} has low confidence ({one.confidence:.2f}) and {fate}: {'; '.join(one.doubts)}"
+        for one in split.low_confidence
+    ]
+    if (settings.name_at or settings.first) is not None and split.low_confidence:
+        warnings.append("names are counted past vertebrae of low confidence: check them with the picture")
+    return warnings
 
 
 NIFTI, SEGMENTATION = ("nii", "nii.gz"), ("dcm",)
@@ -171,32 +201,6 @@ def picture_beside(output: str | Path) -> str:
     """Return the name of the picture beside a label map: ``spine.nii.gz`` has ``spine.png``."""
     text = os.fspath(output)
     return text[: -len(map_format(output)) - 1] + ".png"
-
-
-def check_files(
-    source: str | Path, output: str | Path, picture: str | Path | None, report: str | Path | None
-) -> list[tuple[str, str | Path]]:
-    """Refuse outputs that cannot be written, before any work is done; return what each is, and its path."""
-    from clrecon.labels.label_grids import load_nibabel
-    from clrecon.reading import tell_format
-    from clrecon.system.files import check_writable
-
-    kind = map_format(output)
-    if kind in NIFTI:
-        load_nibabel()
-    elif (found := tell_format(source)) is not None:
-        raise UsageError(f"DICOM SEG belongs to a scan in DICOM, and this is {found}: write the label map as .nii.gz")
-    if picture is not None and not os.fspath(picture).lower().endswith(".png"):
-        raise UsageError(f"the picture of the discs is a .png file, not {os.path.basename(os.fspath(picture))[-40:]!r}")
-    if picture is not None:
-        load_pillow()
-    named = (("the label map", output), ("the picture", picture), ("the report", report))
-    owned = [(what, path) for what, path in named if path is not None]
-    check_distinct(owned)
-    for _, path in owned:
-        check_writable(path)
-    check_kept(owned, source)
-    return list(owned)
 
 
 PIXELS_PER_MM = 3
@@ -263,68 +267,3 @@ def _tint_slice(
             shade = np.array(LOW_COLOR)
         picture[own] = (1.0 - TINT) * picture[own] + TINT * shade
     return np.asarray(np.rint(picture), dtype=np.uint8)
-
-
-@dataclass(frozen=True, eq=False)
-class VertebraeReport(Record):
-    """Report of `make_vertebrae`.
-
-    vertebrae: All that were found, from the head downwards, see `clrecon.spine.split.Vertebra`.
-    low_confidence: How many of them have a confidence below 0.5.
-    written: How many the label map has.
-    discs: ``centre_mm`` and ``normal`` (downwards) of each disc, LPS.
-    output: ``format`` and ``bytes`` of the label map.
-    volume: The certificate of the volume without its warnings.
-    """
-
-    vertebrae: list[Any]
-    low_confidence: int
-    written: int
-    discs: list[dict[str, list[float]]]
-    left_out: list[str]
-    level_hu: float
-    output: Mapping[str, Any]
-    version: str
-    platform: str
-    warnings: list[str]
-    volume: Mapping[str, Any]
-    seconds: Mapping[str, float]
-    peak_memory_bytes: int | None
-
-
-def describe_split(
-    volume: Volume,
-    split: VertebraSplit,
-    settings: VertebraeSettings,
-    output: Mapping[str, Any],
-    seconds: Mapping[str, float],
-) -> VertebraeReport:
-    """Describe the result of a job."""
-    certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
-    told = [str(warning) for warning in certificate.pop("warnings", [])]
-    fate = "is in the label map all the same" if settings.keep_unsure else "is not in the label map"
-    told += [
-        f"{one.name} has low confidence ({one.confidence:.2f}) and {fate}: {'; '.join(one.doubts)}"
-        for one in split.low_confidence
-    ]
-    if (settings.name_at or settings.first) is not None and split.low_confidence:
-        told.append("names are counted past vertebrae of low confidence: check them with the picture")
-    rounded = [
-        {"centre_mm": [round(float(v), 2) for v in centre], "normal": [round(float(v), 4) for v in normal]}
-        for centre, normal in zip(split.discs_mm, split.disc_normals, strict=True)
-    ]
-    return VertebraeReport(
-        vertebrae=split.vertebrae,
-        low_confidence=len(split.low_confidence),
-        written=len(split.labels.numbers),
-        discs=rounded,
-        left_out=split.left_out,
-        level_hu=split.level_hu,
-        output=output,
-        version=package_version(),
-        platform=platform_name(),
-        warnings=list(dict.fromkeys(told)),
-        volume=certificate,
-        seconds=seconds,
-        peak_memory_bytes=peak_memory_bytes(),
-    )

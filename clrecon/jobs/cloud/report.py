@@ -42,7 +42,6 @@ class CloudReport(RunReport):
     outputs: ``what``, ``format`` and ``bytes`` of each file but the report.
     """
 
-    affine_ijk_to_lps_mm: list[list[float]] | None  # type: ignore[assignment]
     kind: str | None
     iso_value_hu: float | None
     hu: list[float | None] | None
@@ -63,15 +62,6 @@ class CloudReport(RunReport):
     removed_labels: list[dict[str, Any]] | None
     surface: Mapping[str, Any] | None
     outputs: list[dict[str, Any]]
-    device: str
-    driver: str
-    memory_allowed_bytes: int | None
-    version: str
-    platform: str
-    warnings: list[str]
-    volume: Mapping[str, Any]
-    seconds: Mapping[str, float]
-    peak_memory_bytes: int | None
 
 
 def describe_file(what: str, path: str | Path, size: int) -> dict[str, Any]:

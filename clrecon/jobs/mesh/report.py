@@ -89,8 +89,11 @@ class MeshReport(RunReport):
     """
 
     _LEFT_OUT = ("preset_reason",)
+    _LAST = (
+        *("device", "driver", "memory_allowed_bytes", "slabs", "device_bytes", "version", "platform", "warnings"),
+        *("volume", *_OF_ONE, "meshes", "output", "preset_reason", "gates", "seconds", "peak_memory_bytes"),
+    )
 
-    affine_ijk_to_lps_mm: list[list[float]]
     iso_value_hu: float | None
     iso_level_hu: float | None
     inside: str | None
@@ -124,15 +127,8 @@ class MeshReport(RunReport):
     all_parts: bool
     split: bool
     purpose: str | None
-    device: str
-    driver: str
-    memory_allowed_bytes: int | None
     slabs: int
     device_bytes: Mapping[str, int]
-    version: str
-    platform: str
-    warnings: list[str]
-    volume: Mapping[str, Any]
     quality: Mapping[str, Any] | None
     walls: Mapping[str, Any] | None
     iso_distance: Mapping[str, Any] | None
@@ -144,8 +140,6 @@ class MeshReport(RunReport):
     output: Mapping[str, Any]
     preset_reason: str | None
     gates: list[dict[str, Any]]
-    seconds: Mapping[str, float]
-    peak_memory_bytes: int | None
 
 
 def describe_job(

@@ -137,7 +137,6 @@ class PictureReport(RunReport):
     pictures: See `describe_picture`, with the files.
     """
 
-    affine_ijk_to_lps_mm: list[list[float]] | None  # type: ignore[assignment]
     mode: str
     preset: str | None
     transfer_function: Mapping[str, Any] | None
@@ -157,15 +156,6 @@ class PictureReport(RunReport):
     cloud: Mapping[str, Any] | None
     pictures: list[dict[str, Any]]
     turntable: Mapping[str, Any] | None
-    device: str
-    driver: str
-    memory_allowed_bytes: int | None
-    version: str
-    platform: str
-    warnings: list[str]
-    volume: Mapping[str, Any]
-    seconds: Mapping[str, float]
-    peak_memory_bytes: int | None
 
 
 def describe_pictures(

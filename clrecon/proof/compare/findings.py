@@ -128,7 +128,6 @@ class CompareReport(RunReport):
     paper: The table against the middle slice.
     """
 
-    affine_ijk_to_lps_mm: list[list[float]]
     date: str
     shape_ijk: list[int]
     spacing_mm: list[float]
@@ -150,15 +149,6 @@ class CompareReport(RunReport):
     size: list[int]
     slices: list[dict[str, Any]]
     paper: Mapping[str, Any] | None
-    device: str
-    driver: str
-    memory_allowed_bytes: int | None
-    version: str
-    platform: str
-    warnings: list[str]
-    volume: Mapping[str, Any]
-    seconds: Mapping[str, float]
-    peak_memory_bytes: int | None
 
 
 SAME_MM = 1e-3
