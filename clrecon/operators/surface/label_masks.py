@@ -55,8 +55,8 @@ from clrecon.opencl import (
 from clrecon.operators.resident.tables import label_variants
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Part
-from clrecon.operators.surface.labels import Window, each_label, group_boxes
-from clrecon.operators.surface.marching_cubes import Classified, Counted, Placement, count
+from clrecon.operators.surface.labels import ExtractionByLabel
+from clrecon.operators.surface.marching_cubes import Counted, Placement, count
 from clrecon.operators.surface.slabs import SampleGrid
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
@@ -151,23 +151,18 @@ class HeldMap:
     occupied_d: Any
 
 
-class MaskExtraction:
+class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
     """One extraction: the data that its labels share."""
 
     def __init__(self, labels: LabelMap, device: Device, memory: int | None, closed: bool, warnings: list[str]):
-        self.labels = labels
-        self.device = device
-        self.memory = memory
-        self.stopwatch = Stopwatch()
-        self.groups = 1
-        self.device_bytes: dict[str, int] = {}
-        self.grid = SampleGrid(Volume(labels.voxels, labels.affine), IsoRule(0.5, FULL // 2, FULL / 2, 0.0, closed))
-        placement = Placement.of(self.grid.volume, self.grid.rule.border)
+        grid = SampleGrid(Volume(labels.voxels, labels.affine), IsoRule(0.5, FULL // 2, FULL / 2, 0.0, closed))
+        placement = Placement.of(grid.volume, grid.rule.border)
         frames = placement.slice_frames.copy()
         frames[:, 2, 3] = np.maximum(frames[:, 2, 3], KEEP)
-        self.placement = replace(placement, slice_frames=frames, margin=np.maximum(placement.margin, np.float32(KEEP)))
+        placement = replace(placement, slice_frames=frames, margin=np.maximum(placement.margin, np.float32(KEEP)))
+        super().__init__(device, memory, grid, placement, warnings)
+        self.labels = labels
         self.levels: dict[int, int] = {}
-        self.warnings = warnings
 
     def programs(self) -> tuple[Program, Program]:
         """The kernels, see `prepare_label_masks`."""
@@ -199,11 +194,6 @@ class MaskExtraction:
         """Return the bytes of two flags for each 16 samples of a row."""
         ni, nj, _ = self.labels.shape_ijk
         return 8 * -(-ni // SAMPLES_PER_FLAGS) * nj * slices
-
-    def group(self, boxes: dict[int, Box]) -> list[dict[int, Box]]:
-        """Group all labels together if their slices fit the device, else one by one: the meshes are the same."""
-        scratch = max(sum(self.window(box, (0, 0)).scratch().values()) for box in boxes.values())
-        return group_boxes(boxes, self.needs(*self.slices_for(boxes)), scratch, memory_limits(self.device, self.memory))
 
     def hold(self, boxes: dict[int, Box]) -> HeldMap:
         """Upload the slices that the labels need, and find the occupancy of all labels."""
@@ -250,10 +240,6 @@ class MaskExtraction:
             first_slice=begin_k, slices=end_k - begin_k,
         )  # fmt: skip
 
-    def window(self, box: Box, held: tuple[int, int]) -> Window:
-        """Return the slices of the sample grid around a label's box."""
-        return Window(self.grid, box[0].start, box[0].stop + 2 * self.grid.rule.border, held)
-
     def keep_enclosed(self, numbers: Sequence[int], boxes: dict[int, Box]) -> None:
         """Find the levels of enclosed labels, which do not depend on the labels that are asked for."""
         own = {number: boxes[number] for number in numbers}
@@ -284,26 +270,16 @@ class MaskExtraction:
         device, stopwatch = self.device, self.stopwatch
         own, surface = self.programs()
         window = self.window(box, (held.first, held.end))
-        needs = {**self.needs(held.first, held.end), **window.scratch()}
-        check_budget(device, needs, self.memory, less_may_fit=True)
-        mask_d = allocate(device, 4 * window.mask_rows * self.grid.words)
-        classified = Classified(mask_d, allocate(device, 4 * window.mask_rows))
+        classified = self.empty_mask(window)
         with stopwatch.running(device):
             self._smooth(held, number, box, held.occupancy_d)
             launch(
                 device, own["classify_mask"], window.mask_rows, stopwatch=stopwatch,
-                map=held.map_d, mask=mask_d, row_extents=classified.row_extents_d, label=number,
+                map=held.map_d, mask=classified.mask_d, row_extents=classified.row_extents_d, label=number,
                 begin_j=box[1].start, end_j=box[1].stop, **window.arguments,
             )  # fmt: skip
             counted = count(device, window, classified, stopwatch)
-        output = counted.output()
-        check_budget(device, {**needs, **output}, self.memory, less_may_fit=True)
-        scratch = window.scratch()
-        self.device_bytes = {
-            "volume": sum(needs.values()) - sum(scratch.values()),
-            "scratch": sum(scratch.values()),
-            "output": sum(output.values()),
-        }
+        self.check_output(window, counted)
         emission = marching_cubes.Emission(
             device, window, surface, held.occupancy_d, classified, counted, self.placement, stopwatch
         )
@@ -326,18 +302,7 @@ class MaskExtraction:
             "surface": "mask",
             "closed_at_border": self.grid.rule.closed,
             "affine_ijk_to_lps_mm": self.labels.affine.tolist(),
-            "device": self.device.label,
-            "driver": self.device.driver,
-            "slabs": self.groups,
-            "device_bytes": self.device_bytes,
-            "seconds": dict(self.stopwatch.seconds),
-            "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": [
-                *self.device.warnings,
-                *warnings_of_far(self.grid.volume),
-                *self.labels.warnings,
-                *self.warnings,
-            ],
+            **self.facts({}, [*warnings_of_far(self.grid.volume), *self.labels.warnings]),
         }
 
 
@@ -485,14 +450,7 @@ def _make_meshes(run: MaskExtraction, chosen: Sequence[int], progress: Progress)
         run.keep_enclosed(enclosed, everywhere)
     boxes = {number: everywhere[number] for number in chosen}
     meshes: dict[int, Mesh] = {}
-    groups = run.group(boxes)
-    run.groups = len(groups)
-
-    def extract(held: HeldMap, number: int, box: Box) -> tuple[Part, int]:
-        progress("labels", len(meshes), len(boxes))
-        return run.extract_one(held, number, box)
-
-    for number, ((positions, normals, triangles), level) in each_label(groups, run.hold, extract, run.warnings):
+    for number, ((positions, normals, triangles), level) in run.extract_each(boxes, progress):
         own = {"label": number, "label_name": labels.name(number), "label_ml": label_ml(labels, number)}
         mesh = Mesh(run.placement.to_lps(positions), triangles, normals, {**run.describe(), **own}, trusted=True)
         mesh_ml = enclosed_ml(mesh.vertices, triangles) if run.grid.rule.closed else None

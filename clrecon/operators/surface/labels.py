@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -23,7 +23,6 @@ from clrecon.labels.label_bodies import Box, Growth, count_ml, fill_solid, find_
 from clrecon.mesh import Mesh
 from clrecon.opencl import (
     Device,
-    MemoryLimits,
     Program,
     Stopwatch,
     allocate,
@@ -32,13 +31,14 @@ from clrecon.opencl import (
     download,
     launch,
     load_program,
+    memory_limits,
     upload,
 )
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.resident.tables import label_variants, voxel_variants
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Part, voxel_level
-from clrecon.operators.surface.marching_cubes import Classified, Placement, count
+from clrecon.operators.surface.marching_cubes import Classified, Counted, Placement, count
 from clrecon.operators.surface.slabs import SampleGrid, Slab
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
@@ -57,13 +57,6 @@ class Window(Slab):
     def voxel_slices(self) -> tuple[int, int]:
         """First and end of the slices of the volume on the device."""
         return self.held
-
-
-def group_boxes(boxes: dict[int, Box], needs: dict[str, int], scratch: int, room: MemoryLimits) -> list[dict[int, Box]]:
-    """Group all labels together if `needs` fits, and `scratch` fits one buffer; else one by one."""
-    if not describe_shortage(room, {**needs, "scratch": min(scratch, room.buffer_bytes)}):
-        return [boxes]
-    return [{number: box} for number, box in boxes.items()]
 
 
 def each_label(
@@ -104,6 +97,94 @@ SPARE_SLICES = 3
 """Slices needed beyond a label's box: the far end of a crossed edge, its gradient, and the last slices of the mask."""
 
 
+class ExtractionByLabel(Generic[Held, Made]):
+    """What extractions of labels one by one share: the grid, the device and its memory, and the labels that fit it."""
+
+    def __init__(self, device: Device, memory: int | None, grid: SampleGrid, placement: Placement, warnings: list[str]):
+        self.device = device
+        self.memory = memory
+        self.grid = grid
+        self.placement = placement
+        self.warnings = warnings
+        self.stopwatch = Stopwatch()
+        self.groups = 1
+        self.device_bytes: dict[str, int] = {}
+
+    def slices_for(self, boxes: dict[int, Box]) -> tuple[int, int]:
+        """Return first and end of the slices that these labels need."""
+        raise NotImplementedError
+
+    def needs(self, first: int, end: int) -> dict[str, int]:
+        """Return the bytes on the device for these slices."""
+        raise NotImplementedError
+
+    def hold(self, boxes: dict[int, Box]) -> Held:
+        """Upload the slices that the labels need, and compute what they share."""
+        raise NotImplementedError
+
+    def extract_one(self, held: Held, number: int, box: Box) -> Made:
+        """Return the surface of one label."""
+        raise NotImplementedError
+
+    def group(self, boxes: dict[int, Box]) -> list[dict[int, Box]]:
+        """Group all labels together if their slices fit the device, else one by one: the meshes are the same."""
+        scratch = max(sum(self.window(box, (0, 0)).scratch().values()) for box in boxes.values())
+        room, needs = memory_limits(self.device, self.memory), self.needs(*self.slices_for(boxes))
+        if not describe_shortage(room, {**needs, "scratch": min(scratch, room.buffer_bytes)}):
+            return [boxes]
+        return [{number: box} for number, box in boxes.items()]
+
+    def window(self, box: Box, held: tuple[int, int]) -> Window:
+        """Return the slices of the sample grid around a label's box."""
+        return Window(self.grid, box[0].start, box[0].stop + 2 * self.grid.rule.border, held)
+
+    def extract_each(self, boxes: dict[int, Box], progress: Progress) -> Iterator[tuple[int, Made]]:
+        """Yield labels with their surfaces, as many at once as fit the device."""
+        groups = self.group(boxes) if boxes else []
+        self.groups = len(groups)
+        done = 0
+
+        def extract(held: Held, number: int, box: Box) -> Made:
+            progress("labels", done, len(boxes))
+            return self.extract_one(held, number, box)
+
+        for number, made in each_label(groups, self.hold, extract, self.warnings):
+            done += made is not None
+            yield number, made
+
+    def empty_mask(self, window: Window) -> Classified:
+        """Make the mask of a label on the device, if it has room for what finds the surface."""
+        check_budget(self.device, self._needs(window), self.memory, less_may_fit=True)
+        mask_d = allocate(self.device, 4 * window.mask_rows * self.grid.words)
+        return Classified(mask_d, allocate(self.device, 4 * window.mask_rows))
+
+    def check_output(self, window: Window, counted: Counted) -> None:
+        """Refuse a mesh that does not fit beside the other buffers; record the memory of the label."""
+        needs, scratch, output = self._needs(window), window.scratch(), counted.output()
+        check_budget(self.device, {**needs, **output}, self.memory, less_may_fit=True)
+        self.device_bytes = {
+            "volume": sum(needs.values()) - sum(scratch.values()),
+            "scratch": sum(scratch.values()),
+            "output": sum(output.values()),
+        }
+
+    def _needs(self, window: Window) -> dict[str, int]:
+        return {**self.needs(*window.held), **window.scratch()}
+
+    def facts(self, settings: dict[str, Any], warnings: Sequence[str]) -> dict[str, Any]:
+        """Return the report entries of the work, which all labels share, with `settings` among them."""
+        return {
+            "device": self.device.label,
+            "driver": self.device.driver,
+            "slabs": self.groups,
+            "device_bytes": self.device_bytes,
+            **settings,
+            "seconds": dict(self.stopwatch.seconds),
+            "kernel_seconds": dict(self.stopwatch.by_kernel),
+            "warnings": [*self.device.warnings, *warnings, *self.warnings],
+        }
+
+
 @dataclass(frozen=True)
 class HeldSlices:
     """The slices of a volume on the device, with the label that each sample is inside of."""
@@ -123,7 +204,7 @@ def prepare_labels(
     return own, marching_cubes.prepare_marching_cubes(device, dtype, label_dtype, uneven)
 
 
-class LabelExtraction:
+class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
     """One extraction: the data that its labels share."""
 
     def __init__(
@@ -136,21 +217,16 @@ class LabelExtraction:
         warnings: list[str],
     ):
         volume, device = resident.volume, resident.device
+        self.level = voxel_level(device, volume, rule)
+        placement = Placement.of(volume, rule.border)
+        super().__init__(device, resident.memory, SampleGrid(volume, rule), placement, warnings)
         self.resident = resident
         self.volume = volume
         self.labels = taken.voxels
         self.rule = rule
         self.growth = growth
-        self.device = device
         self.solid = solid
-        self.stopwatch = Stopwatch()
-        self.groups = 1
         self.share_by_hu = 1.0  # of the vertices of the label that was extracted last
-        self.device_bytes: dict[str, int] = {}
-        self.grid = SampleGrid(volume, rule)
-        self.level = voxel_level(device, volume, rule)
-        self.placement = Placement.of(volume, rule.border)
-        self.warnings = warnings
 
     def programs(self) -> tuple[Program, Program]:
         """The kernels, see `prepare_labels`."""
@@ -175,12 +251,7 @@ class LabelExtraction:
         needs = self.needs(0, self.volume.shape_ijk[2])
         return not describe_shortage(self.resident.limits, needs | {"mesh": sum(needs.values()) // 2})
 
-    def group(self, boxes: dict[int, Box]) -> list[dict[int, Box]]:
-        """Group all labels together if their slices fit the device, else one by one: the meshes are the same."""
-        scratch = max(sum(self.window(box, (0, 0)).scratch().values()) for box in boxes.values())
-        return group_boxes(boxes, self.needs(*self.slices_for(boxes)), scratch, self.resident.limits)
-
-    def find_inside(self, boxes: dict[int, Box]) -> HeldSlices:
+    def hold(self, boxes: dict[int, Box]) -> HeldSlices:
         """Upload the slices that the labels need, and find which samples are inside of which label."""
         device, stopwatch, resident = self.device, self.stopwatch, self.resident
         first, end = self.slices_for(boxes)
@@ -215,37 +286,23 @@ class LabelExtraction:
         with self.stopwatch.timed("upload"):
             return upload(self.device, part)
 
-    def window(self, box: Box, held: tuple[int, int]) -> Window:
-        """Return the slices of the sample grid around a label's box."""
-        return Window(self.grid, box[0].start, box[0].stop + 2 * self.rule.border, held)
-
     def extract_one(self, held: HeldSlices, number: int, box: Box) -> Part | None:
         """Return positions, normals and triangles of one label, None if no sample is inside of it."""
-        device, stopwatch, memory = self.device, self.stopwatch, self.resident.memory
+        device, stopwatch = self.device, self.stopwatch
         own, surface = self.programs()
         window = self.window(box, (held.first, held.end))
-        needs = {**self.needs(held.first, held.end), **window.scratch()}
-        check_budget(device, needs, memory, less_may_fit=True)
-        mask_d = allocate(device, 4 * window.mask_rows * self.grid.words)
+        classified = self.empty_mask(window)
         half_way_d = allocate(device, 4)
-        classified = Classified(mask_d, allocate(device, 4 * window.mask_rows))
         with stopwatch.running(device):
             launch(
                 device, own["classify_label"], window.mask_rows, stopwatch=stopwatch,
-                inside=held.inside_d, mask=mask_d, row_extents=classified.row_extents_d, half_way_count=half_way_d,
-                label=number, **window.arguments,
+                inside=held.inside_d, mask=classified.mask_d, row_extents=classified.row_extents_d,
+                half_way_count=half_way_d, label=number, **window.arguments,
             )  # fmt: skip
             counted = count(device, window, classified, stopwatch)
         if counted.triangles == 0:
             return None
-        output = counted.output()
-        check_budget(device, {**needs, **output}, memory, less_may_fit=True)
-        scratch = window.scratch()
-        self.device_bytes = {
-            "volume": sum(needs.values()) - sum(scratch.values()),
-            "scratch": sum(scratch.values()),
-            "output": sum(output.values()),
-        }
+        self.check_output(window, counted)
         part = marching_cubes.emit(
             device, window, surface, held.voxels_d, classified, counted, self.placement, 0, stopwatch,
             {"inside": held.inside_d, "label": number, "half_way_count": half_way_d},
@@ -265,20 +322,10 @@ class LabelExtraction:
             "outside_hu": rule.outside if rule.closed else None,
             "affine_ijk_to_lps_mm": self.volume.affine.tolist(),
             "certificate": self.volume.report,
-            "device": self.device.label,
-            "driver": self.device.driver,
-            "slabs": self.groups,
-            "device_bytes": self.device_bytes,
-            "grow_mm": self.growth.grow_mm,
-            "solid": self.solid,
-            "seconds": dict(self.stopwatch.seconds),
-            "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": [
-                *self.device.warnings,
-                *warnings_of_far(self.volume),
-                *_warn_of_uneven_growth(self.volume, self.growth),
-                *self.warnings,
-            ],
+            **self.facts(
+                {"grow_mm": self.growth.grow_mm, "solid": self.solid},
+                [*warnings_of_far(self.volume), *_warn_of_uneven_growth(self.volume, self.growth)],
+            ),
         }
 
 
@@ -416,35 +463,14 @@ def _make_meshes(
     if missing and refuse is not None:
         raise refuse(missing[0])
     meshes: dict[int, Mesh] = {}
-    for number, part in _extract_each(run, boxes, refuse, progress):
+    for number, part in run.extract_each(boxes, progress):
+        if part is None:
+            if refuse is not None:
+                raise refuse(number)
+            continue
         report = {**run.describe(), **_describe_label(run.volume, labels, taken, number, boxes[number])}
         meshes[number] = _as_mesh(run, taken, report, part)
     return meshes
-
-
-def _extract_each(
-    run: LabelExtraction,
-    boxes: dict[int, Box],
-    refuse: Callable[[int], NoSurfaceError] | None,
-    progress: Progress,
-) -> Iterator[tuple[int, Part]]:
-    """Yield labels with their surfaces, as many at once as fit the device; labels without surface are left out or
-    refused.
-    """
-    groups = run.group(boxes) if boxes else []
-    run.groups = len(groups)
-    done = 0
-
-    def extract(held: HeldSlices, number: int, box: Box) -> Part | None:
-        progress("labels", done, len(boxes))
-        return run.extract_one(held, number, box)
-
-    for number, part in each_label(groups, run.find_inside, extract, run.warnings):
-        if part is not None:
-            done += 1
-            yield number, part
-        elif refuse is not None:
-            raise refuse(number)
 
 
 def _as_mesh(run: LabelExtraction, taken: ResampledLabels, report: dict[str, Any], part: Part) -> Mesh:

@@ -239,6 +239,6 @@ def _inside(resident: DeviceVolume, crop: LabelCrop, iso_value: float, grow_mm: 
 
     for attempt in resident.with_fallback():
         with attempt:
-            held = LabelExtraction(resident, taken, rule, growth, True, []).find_inside(boxes)
+            held = LabelExtraction(resident, taken, rule, growth, True, []).hold(boxes)
             download(resident.device, inside[held.first : held.end], held.inside_d)
     return inside == crop.number

@@ -109,7 +109,7 @@ def test_growth_is_that_of_the_twin_to_the_last_sample(device, grow_mm):
             rule = choose_iso_rule(volume, 3)
             taken = resample_labels(LabelMap(labels, affine), volume)
             run = operator.LabelExtraction(DeviceVolume(volume, device=device), taken, rule, growth, False, [])
-            held = run.find_inside({1: (slice(0, shape[0]), slice(0, shape[1]), slice(0, shape[2]))})
+            held = run.hold({1: (slice(0, shape[0]), slice(0, shape[1]), slice(0, shape[2]))})
             inside = operator.download(device, np.empty_like(taken.voxels), held.inside_d)
             assert np.array_equal(inside, twin.find_solid(volume, labels, 3, grow_mm=grow_mm))
 
