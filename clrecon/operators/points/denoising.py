@@ -31,7 +31,7 @@ from clrecon.operators.points.normals import FEWEST_NEIGHBOURS, PlaneFits
 from clrecon.points import PointCloud, PointStep
 from clrecon.points.spacing import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.progress import Progress
+from clrecon.system.progress import Progress, ignore_progress
 
 
 def prepare_outliers(device: Device) -> Program:
@@ -128,7 +128,7 @@ def remove_outliers(
             search = NeighbourSearch(current, points, k, DistanceMeasure.needs(len(points)), memory, stopwatch)
             distances = DistanceMeasure(search, stopwatch)
             neighbours_d = allocate(current, 4 * k * search.most_places)
-            for part in search.each_part("outliers", progress):
+            for part in search.each_part("outliers", progress or ignore_progress):
                 search.list_places(part, neighbours_d)
                 distances.measure(part, neighbours_d)
             means = distances.read()[0].astype(np.float64)
@@ -234,7 +234,7 @@ def denoise_points(
 
     for attempt in with_fallback(take_device(device)):
         with attempt as (current, told):
-            run = _Run(settings, current, memory, progress)
+            run = _Run(settings, current, memory, progress or ignore_progress)
             moved = points
             for _ in range(settings.iterations):
                 moved = moved + run.moves(moved)
@@ -268,7 +268,7 @@ class _Settings:
 class _Run:
     """All iterations on one device."""
 
-    def __init__(self, settings: _Settings, device: Device, memory: int | None, progress: Progress | None):
+    def __init__(self, settings: _Settings, device: Device, memory: int | None, progress: Progress):
         self.settings, self.device, self.memory, self.progress = settings, device, memory, progress
         self.stopwatch = Stopwatch()
         self.feature_points: int | None = None

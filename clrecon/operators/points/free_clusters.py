@@ -121,7 +121,7 @@ def cluster_free_points(
     *,
     device: Device | str | int | None = None,
     memory: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
 ) -> FreeClusters:
     """Cluster points anywhere in space by density (DBSCAN), equal to scikit-learn label for label.
 
@@ -184,7 +184,7 @@ def find_clusters(
     per_chunk: int | None = None,
     memory: int | None = None,
     stopwatch: Stopwatch | None = None,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_], int, int]:
     """Cluster the points of a plan on one device; parameters are those of `cluster_free_points`.
 
@@ -197,21 +197,20 @@ def find_clusters(
     count: Number of clusters.
     cells: Number of cells with points.
     """
-    tell = ignore_progress if progress is None else progress
     n = len(plan.points)
     shortage = describe_shortage(memory_limits(device, memory), {**plan.needs(device), "clusters": 23 * n})
     if shortage:
         raise DeviceMemoryError(f"the clusters of the points cannot be found: {shortage}")
     grid = fill_grid(device, plan, memory=memory, stopwatch=stopwatch)
-    tell("clusters", 1, 4)
+    progress("clusters", 1, 4)
     search = ClusterSearch(device, grid, eps, min_samples, per_chunk, stopwatch)
     search.check_pairs()
     search.find_cores()
-    tell("clusters", 2, 4)
+    progress("clusters", 2, 4)
     search.join()
-    tell("clusters", 3, 4)
+    progress("clusters", 3, 4)
     labels, cores = search.label()
-    tell("clusters", 4, 4)
+    progress("clusters", 4, 4)
     return labels, cores, search.count, grid.cells
 
 

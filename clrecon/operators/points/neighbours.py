@@ -275,14 +275,14 @@ class NeighbourSearch:
         """Write the neighbours of the points of a part as numbers, and their distances, to their rows of (n, k)."""
         self._launch(part, False, neighbours_d, distances_d)
 
-    def each_part(self, stage: str, progress: Progress | None) -> Iterator[Part]:
+    def each_part(self, stage: str, progress: Progress) -> Iterator[Part]:
         """Yield the parts, and tell how many points are done."""
-        tell, done = progress or ignore_progress, 0
+        done = 0
         for part in self.parts:
             with self._stopwatch.running(self.device):
                 yield part
             done += part.place_count
-            tell(stage, done, self.grid.n)
+            progress(stage, done, self.grid.n)
 
 
 def _rounding_of(plan: GridPlan) -> float:
@@ -379,7 +379,7 @@ def find_neighbours(
             search = NeighbourSearch(current, places, k, results, memory, Stopwatch())
             indices, indices_d = empty_output(current, (len(places), k), np.int32)
             distances, distances_d = empty_output(current, (len(places), k), np.float32)
-            for part in search.each_part("neighbours", progress):
+            for part in search.each_part("neighbours", progress or ignore_progress):
                 search.list_numbers(part, indices_d, distances_d)
             indices, distances = download(current, indices, indices_d), download(current, distances, distances_d)
             found = Neighbours(indices, distances, (*warnings, *told))

@@ -36,7 +36,7 @@ from clrecon.operators.surface.slabs import OUTPUT_SHARE
 from clrecon.points import POINT_KINDS, PointCloud
 from clrecon.points.cloud import MOST_POINTS, VoxelNumbers
 from clrecon.system.arguments import explains_arguments, name_parameter
-from clrecon.system.progress import Progress
+from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_hu
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ class VoxelEmission:
         """Purpose of the slabs, see `DeviceVolume.plan`."""
         return "shell of voxels" if self.selection.shell else "voxels"
 
-    def run(self, progress: Progress | None = None) -> Points:
+    def run(self, progress: Progress = ignore_progress) -> Points:
         """Make the points of the whole volume."""
         labels = self.selection.labels
         with self.stopwatch.timed("build"):
@@ -172,7 +172,7 @@ class VoxelEmission:
             )
         return slices
 
-    def _go_on(self, slices: int, progress: Progress | None) -> None:
+    def _go_on(self, slices: int, progress: Progress) -> None:
         nk = self.volume.shape_ijk[2]
         while self._next < nk:
             end = min(self._next + slices, nk)
@@ -183,7 +183,7 @@ class VoxelEmission:
             self._next = end
             if sum(len(part[1]) for part in self._parts) > MOST_POINTS:
                 raise DeviceError(f"the cloud has more than {MOST_POINTS:,} points: choose a narrower band of HU")
-            if progress is not None and (end < nk or self.slabs > 1):
+            if end < nk or self.slabs > 1:
                 progress("slabs", end, nk)
 
     def _one_slab(self, first: int, end: int) -> tuple[Points, int]:
@@ -371,6 +371,7 @@ def extract_points(
     DeviceError
         As `extract_isosurface`.
     """
+    progress = progress or ignore_progress
     kind = _check(iso_value, kind, hu, labels, label, paper)
     with open_volume(volume, device, memory, "a cloud of points") as resident:
         if iso_value is None and hu is None:
@@ -416,7 +417,7 @@ def _refuse_band(volume: Volume, band: Band, where: str) -> NoSurfaceError:
 
 def _voxels(
     resident: DeviceVolume, band: Band, shell: bool, labels: LabelMap | None, label: int | str | None, paper: bool,
-    progress: Progress | None,
+    progress: Progress,
 ) -> PointCloud:  # fmt: skip
     volume = resident.volume
     ends = band_bounds(volume, band)
@@ -471,7 +472,7 @@ def _measure_paper(volume: Volume, numbers: NDArray[Any]) -> dict[str, float]:
 
 
 def _surface(
-    resident: DeviceVolume, level: Any, labels: LabelMap | None, label: int | str | None, progress: Progress | None
+    resident: DeviceVolume, level: Any, labels: LabelMap | None, label: int | str | None, progress: Progress
 ) -> PointCloud:
     if labels is None:
         from clrecon.operators.surface.extract import SurfaceExtractor  # which voxels need not wait for

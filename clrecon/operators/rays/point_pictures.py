@@ -41,7 +41,7 @@ from clrecon.rendering.pictures.object_looks import PointLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.arguments import name_parameter
 from clrecon.system.base_classes import Closing
-from clrecon.system.progress import Progress
+from clrecon.system.progress import Progress, ignore_progress
 
 LARGEST_DISC = kernel_number("rays/splats.cl", "MOST_PIXELS")
 """Largest radius of a disc in pixels."""
@@ -91,7 +91,7 @@ def draw_splats(
     lighting: Lighting | None = None,
     background: str | Sequence[float] | None = None,
     memory: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
     stopwatch: Stopwatch | None = None,
 ) -> SplatPicture:
     """Draw each point as a disc that faces the camera; the nearest disc is seen.
@@ -170,7 +170,7 @@ class _Splats:
         normals: NDArray[np.float32] | None,
         count: int,
         stopwatch: Stopwatch,
-        progress: Progress | None,
+        progress: Progress,
     ) -> SplatPicture:
         """Draw the picture with `count` points at a time."""
         device, (width, height) = self.device, self.size
@@ -184,8 +184,7 @@ class _Splats:
         picture: dict[str, Any] = {"view": view_d, "width": width, "height": height}
 
         def tell(done: int) -> None:
-            if progress is not None:
-                progress("points", done, 3 * n)
+            progress("points", done, 3 * n)
 
         def hold(first: int) -> Any:
             nonlocal whole_d
@@ -357,7 +356,8 @@ class PointPictures(Closing):
             with attempt as (device, told):
                 found = draw_splats(
                     device, points, table, normals, camera, size, radius, base=self._base, lighting=style.light,
-                    background=background, memory=self.memory, progress=progress, stopwatch=stopwatch,
+                    background=background, memory=self.memory, progress=progress or ignore_progress,
+                    stopwatch=stopwatch,
                 )  # fmt: skip
         report = {
             "mode": "points",

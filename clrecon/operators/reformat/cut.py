@@ -123,7 +123,7 @@ def cut_slice(
             plane = find_plane(resident.volume, plane, pixels, zoom=zoom, up=up, pixel_mm=style.pixel_mm)
         elif pixel_mm is not None or zoom != 1.0 or up is not None:
             raise UsageError("zoom, up and the size of pixels are those of the camera: leave them out, or the camera")
-        return take_cut(resident, style, plane, pixels, background, progress)
+        return take_cut(resident, style, plane, pixels, background, progress or ignore_progress)
 
 
 def take_cut(
@@ -132,7 +132,7 @@ def take_cut(
     plane: Camera,
     size: tuple[int, int],
     background: str | Sequence[float] = "black",
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
 ) -> Rendering:
     """Cut the slice of a camera, as `cut_slice` does, with the labels of the style."""
     job = CutJob(resident, style, progress)
@@ -238,7 +238,7 @@ def reformat_curve(
     style = CurveCut(curve, kind=kind, angle=angle, width_mm=width_mm, pixel_mm=pixel_mm,
                      thickness=thickness, combine=combine, window=window)  # fmt: skip
     with open_volume(volume, device, memory, "a slice") as resident:
-        return take_curve(resident, style, view, up, size, background, progress)
+        return take_curve(resident, style, view, up, size, background, progress or ignore_progress)
 
 
 def take_curve(
@@ -248,7 +248,7 @@ def take_curve(
     up: str | ArrayLike | None,
     size: Sequence[int] | None,
     background: str | Sequence[float] = "black",
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
 ) -> Rendering:
     """Make the picture along the curve of a style, as `reformat_curve` does, with its labels."""
     job = CutJob(resident, style, progress)
@@ -300,7 +300,7 @@ def _warn_of_part(found: dict[str, Any] | None) -> list[str]:
 
 
 def _find_line(
-    volume: Volume, curve: Curve | ArrayLike | str, progress: Progress | None
+    volume: Volume, curve: Curve | ArrayLike | str, progress: Progress
 ) -> tuple[Curve, dict[str, Any] | None]:
     """Return the centre line, and the facts about it if it was searched for."""
     if isinstance(curve, Curve):
@@ -384,7 +384,7 @@ def take_contact_sheet(
     shown: Grid,
     size: tuple[int, int],
     background: str | Sequence[float] = "black",
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
 ) -> Rendering:
     """Show parallel slices side by side, each with its place in mm and the sides of the patient.
 
@@ -400,8 +400,7 @@ def take_contact_sheet(
         ``report["tiles"]`` has ``middle_lps_mm``, ``slice`` (number of its plane of voxels, or None), ``left`` and
         ``top`` (pixels) of each.
     """
-    tell = progress or ignore_progress
-    job = CutJob(resident, style, None)
+    job = CutJob(resident, style, ignore_progress)
     _, plane = plane_sheet(plane, size)
     if style.slices is not None:
         plane = _turn_to_slices(resident.volume, plane, job.warnings)
@@ -420,7 +419,7 @@ def take_contact_sheet(
     tiles: list[dict[str, Any]] = []
     made = None
     for n, (place, (left, top)) in enumerate(zip(places, layout.corners, strict=True)):
-        tell("render", n, len(places))
+        progress("render", n, len(places))
         middle = np.asarray(plane.focal_point) + place.offset_mm * forward
         own = replace(
             plane, focal_point=tuple(middle), position=tuple(np.asarray(plane.position) + place.offset_mm * forward),
@@ -435,7 +434,7 @@ def take_contact_sheet(
             numbers[part] = labels
         image[part] = write_on_tile(drawn, _name_place(place, middle, forward), edges)
         tiles.append({"slice": place.number, "middle_lps_mm": middle.round(3).tolist(), "left": left, "top": top})
-    tell("render", len(places), len(places))
+    progress("render", len(places), len(places))
     assert made is not None
     report = job.describe(made, layout.pixel_mm) | {"edges": edges, "tiles": tiles, "tile_size": [width, height]}
     return job.finish(image, values, None, None, numbers, report, background)

@@ -37,7 +37,7 @@ from clrecon.rendering.pictures.label_style import draw_labels, facts_of_overlay
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.reformation import Sheet, SlabSamples, slab_samples
-from clrecon.system.progress import Progress
+from clrecon.system.progress import Progress, ignore_progress
 
 COMBINATIONS = {name: kernel_constant("reformat/sample.cl", f"COMBINE_{name.upper()}") for name in styles.COMBINATIONS}
 """How the samples of a slab are combined: the kernel's numbers."""
@@ -151,7 +151,7 @@ class _Run:
             raise kind(f"two slices at a time are too much: {shortage}; give more memory or a smaller picture")
         return slices
 
-    def all_slabs(self, slices: int, progress: Progress | None) -> Reformation:
+    def all_slabs(self, slices: int, progress: Progress) -> Reformation:
         """Take the samples of `slices` slices at a time; each slab repeats the last slice of the one before."""
         places, shape = self.places, (self.sheet.height, self.sheet.width)
         takes_whole = self.takes_whole and slices == self.volume.shape_ijk[2]
@@ -177,8 +177,7 @@ class _Run:
                 )  # fmt: skip
             self.volume.release_slices(own_first, held_end)
             count, own_first = count + 1, own_end
-            if progress is not None:
-                progress("slabs", own_end - places.first, self.slices)
+            progress("slabs", own_end - places.first, self.slices)
         with self.stopwatch.timed("download"):
             values = download(self.device, np.empty(shape, np.float32), values_d)
             weights = download(self.device, np.empty(shape, np.float32), weights_d)
@@ -210,7 +209,7 @@ def sample_sheet(
     combine: str = "mean",
     *,
     stopwatch: Stopwatch | None = None,
-    progress: Progress | None = None,
+    progress: Progress = ignore_progress,
     warnings: list[str] | None = None,
 ) -> Reformation:
     """Return the values of all pixels of a sheet: the trilinear field, combined through a thick slice.
@@ -241,7 +240,7 @@ def sample_sheet(
 class CutJob:
     """One picture of sheets through a volume: the device, how samples are combined, labels, and the report."""
 
-    def __init__(self, resident: DeviceVolume, style: PlaneCut | CurveCut, progress: Progress | None):
+    def __init__(self, resident: DeviceVolume, style: PlaneCut | CurveCut, progress: Progress):
         self.resident, self.style, self.progress = resident, style, progress
         self.samples = slab_samples(resident.volume, style.thickness)
         self.window = BONE_WINDOW if style.window is None else checked_window(style.window)
