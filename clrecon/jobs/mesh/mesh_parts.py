@@ -63,21 +63,19 @@ def extract_surfaces(
     labels: LabelMap | None = None,
 ) -> list[Mesh]:
     """Extract all surfaces with one mesh each; `labels` are those that they may grow from."""
-    from clrecon.operators.surface.extract import extract_isosurfaces
+    from clrecon.operators.surface.extract import SurfaceExtractor
 
     levels = [surface.iso_value for surface in surfaces if surface.iso_value is not None]
     if settings.method_used in ("i-mc", "t-mc-soup", "skimage") or settings.vertex_rule != "linear":
         return [extract_one(volume, level, device, settings, labels, progress) for level in levels]
-    return extract_isosurfaces(
-        volume,
-        levels,
-        device=device,
-        closed=settings.closed,
-        topology=settings.topology,
-        below=settings.below is not None,
-        memory=settings.memory,
-        progress=progress,
-    )
+    with SurfaceExtractor(volume, device=device, memory=settings.memory) as extractor:
+        return [
+            extractor.extract(
+                level, closed=settings.closed, topology=settings.topology, below=settings.below is not None,
+                progress=progress,
+            )
+            for level in levels
+        ]  # fmt: skip
 
 
 def select_parts(
