@@ -92,7 +92,7 @@ def _ours() -> list[MeshCase]:
                     tolerance=_step(extension) if shift else 0.0,
                 )
             )
-    for extension in ASSEMBLIES:
+    for extension in sorted(ASSEMBLIES, key=lambda own: own not in (".glb", ".3mf")):  # as the page has them
         for space in ("lps", "ras"):
             if extension != ".html":
                 cases.append(_three(extension, space))
