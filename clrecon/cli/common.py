@@ -13,6 +13,8 @@ from typing import Any, NoReturn, cast
 
 from clrecon.cli.console import STREAMED, Console, fit_help
 from clrecon.errors import ClreconError, OutputError, UsageError
+from clrecon.jobs.options import InputSettings
+from clrecon.system.options import options_of
 from clrecon.system.progress import DEFAULT_SECONDS, check_time_limit
 from clrecon.system.text import guess_word
 
@@ -217,6 +219,30 @@ def pick(options: argparse.Namespace, names: Collection[str]) -> dict[str, Any]:
     return {name: value for name, value in vars(options).items() if name in names}
 
 
+def add_fields(container: argparse._ActionsContainer, settings: type, group: str) -> None:
+    """Add the options of a group that are fields of settings."""
+    for name, default, own in options_of(settings, group):
+        how: dict[str, Any] = {"metavar": own.metavar, "default": default, "type": _as_argument(own.parse), **own.how}
+        if own.metavar is None:
+            how = {"action": "store_true", **own.how}
+        container.add_argument(own.flag, dest=name, help=own.help, first=own.first, **how)
+
+
+def _as_argument(parse: Callable[[str], Any] | None) -> Callable[[str], Any] | None:
+    """Return a reader of a value whose ValueError is told in its own words, which argparse would replace."""
+    if parse in (None, int, float, str.lower):
+        return parse
+
+    def read(text: str) -> Any:
+        assert parse is not None
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return read
+
+
 def add_keep_ids(parser: argparse._ActionsContainer) -> None:
     """Add --keep-ids."""
     parser.add_argument(
@@ -266,29 +292,7 @@ def _parse_seconds(text: str) -> float:
 
 def add_memory(parser: argparse._ActionsContainer) -> None:
     """Add --memory."""
-    parser.add_argument(
-        "--memory",
-        type=parse_size,
-        metavar="SIZE",
-        help="memory that may be taken on the device, such as 500MB or 2GiB (default: all of it);"
-        " what does not fit goes through in slabs, with the same result",
-    )
-
-
-_SIZE = re.compile(r"([0-9]+(?:\.[0-9]*)?) *([kmgt]?)(i?)b?", re.IGNORECASE)
-
-_MOST_MEMORY = 2.0**63
-
-
-def parse_size(text: str) -> int:
-    """Read an amount of memory: a number with B, kB, MB, GB (powers of 1000), KiB, MiB or GiB (of 1024)."""
-    match = _SIZE.fullmatch(text.strip())
-    if match is None or (match[3] and not match[2]):
-        raise argparse.ArgumentTypeError(f"{text!r} is no amount of memory: write it as 500MB or 2GiB")
-    size = float(match[1]) * (1024 if match[3] else 1000) ** " kmgt".index(match[2].lower() or " ")
-    if size >= _MOST_MEMORY:
-        raise argparse.ArgumentTypeError(f"{text!r} is more memory than there can be: write it as 500MB or 2GiB")
-    return int(size)
+    add_fields(parser, InputSettings, "memory")
 
 
 def guard(action: Callable[[], int], console: Console, debug: bool) -> int:

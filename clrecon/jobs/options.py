@@ -7,52 +7,160 @@ forms of both.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from clrecon.errors import UsageError
 from clrecon.reading import Selection
+from clrecon.system.options import option
 
 if TYPE_CHECKING:
     from clrecon.geometry.boxes import Box
+
+
+REGION_FORMS = "box:X0,X1,Y0,Y1,Z0,Z1, hu:LO,HI, label:FILE:NAME, mask:FILE, seed:X,Y,Z, tube:MM and tube:MM:FILE"
+"""The forms of a region rule, for messages and help."""
+
+PREPROCESS_FORMS = (
+    "bilateral[:MM[:HU]], bilateral-2d[:MM[:HU]], bilateral-near[:MM[:HU]], median[:MM], gaussian[:MM],"
+    " curvature-flow[:N], non-local-means[:HU], level:HU, erode:MM, dilate:MM, open:MM, close:MM, fill, fill-slices"
+    " and region"
+)
+"""The forms of a step, for messages and help."""
+
+
+def _parse_clip_box(text: str) -> tuple[float, ...]:
+    """Read ``X0,X1,Y0,Y1,Z0,Z1`` in mm; an empty number leaves that side open."""
+    return _parse_box_numbers(
+        text, 6, "is no box: X0,X1,Y0,Y1,Z0,Z1 in mm, a side that stays open empty, such as ,,-50,20,,", ends=True
+    )
+
+
+def _parse_between(text: str) -> tuple[float, ...]:
+    return _parse_box_numbers(
+        text, 2, "are no two heights: Z0,Z1 in mm, one of them may be empty, such as -450,-400", ends=True
+    )
+
+
+def _parse_around(text: str) -> tuple[float, ...]:
+    return _parse_box_numbers(text, 4, "is no point and length: X,Y,Z,R in mm, such as 10,-124,-424,30", ends=False)
+
+
+def _parse_box_numbers(text: str, count: int, fault: str, *, ends: bool) -> tuple[float, ...]:
+    """Read so many numbers between commas, see `_parse_region_numbers`."""
+    values = _parse_region_numbers(text, ends=ends)
+    if values is None or len(values) != count:
+        raise ValueError(f"{text!r} {fault}")
+    return values
+
+
+def _parse_radius(text: str) -> float | str:
+    try:
+        return text if text == "auto" else float(text)
+    except ValueError:
+        raise ValueError(f"{text!r} is no radius in mm") from None
+
+
+_SIZE = re.compile(r"([0-9]+(?:\.[0-9]*)?) *([kmgt]?)(i?)b?", re.IGNORECASE)
+
+_MOST_MEMORY = 2.0**63
+
+
+def parse_bytes(text: str) -> int:
+    """Read an amount of memory: a number with B, kB, MB, GB (powers of 1000), KiB, MiB or GiB (of 1024)."""
+    match = _SIZE.fullmatch(text.strip())
+    if match is None or (match[3] and not match[2]):
+        raise ValueError(f"{text!r} is no amount of memory: write it as 500MB or 2GiB")
+    size = float(match[1]) * (1024 if match[3] else 1000) ** " kmgt".index(match[2].lower() or " ")
+    if size >= _MOST_MEMORY:
+        raise ValueError(f"{text!r} is more memory than there can be: write it as 500MB or 2GiB")
+    return int(size)
 
 
 @dataclass(frozen=True, kw_only=True)
 class InputSettings(Selection):
     """Settings of the input: what is read, which parts become air, and the device for the computation.
 
-    series, phase, allow_gaps, force, follow_links, rescale: See `clrecon.reading.Selection`.
-    remove_table: First turn everything except the patient's body into air, see `clrecon.anatomy.body.remove_table`.
-    allow_bone_loss: Continue even if this removes more than 2 % of the bone, or `preprocess` more than half of what is
-        at the level and above.
-    field_of_view: float or "auto". First turn everything farther from the centre of the slices (mm) into air; "auto":
-        the circle that fits them.
-    clip_box: (x0, x1, y0, y1, z0, z1). Crop the scan to a box by whole voxels, see
-        `clrecon.geometry.blocks.crop_volume`; infinite numbers leave a side open.  mm of the frame `space` where the
-        job has one, else LPS; so are the next two.
-    between: (z0, z1). Crop it to these heights.
-    around: (x, y, z, r). Crop it to a cube around a point; `r` is half of its side.
-    region: Rules of the region of interest, outside of which everything becomes air, see
-        `clrecon.jobs.options.parse_region_rules`; mm of the frame `space` where the job has one, else LPS.
-    preprocess: Steps before the surface, see `clrecon.jobs.options.parse_preprocess`.
+    Options say in their help what they do; beside that:
+
+    field_of_view: float or "auto". mm from the centre of the slices; see `clrecon.anatomy.body.remove_table` for the
+        table.
+    clip_box, between, around: mm of the frame `space` where the job has one, else LPS; infinite numbers leave a side
+        open.  Whole voxels, see `clrecon.geometry.blocks.crop_volume`.
+    region: mm as above, see `parse_region_rules`.
+    preprocess: See `parse_preprocess`.
     keep_ids: Write the hashes of the UIDs of series and frame of reference into reports and mesh files.
     device: Name or index of an OpenCL device; None leaves the choice to `choose_device`.
-    memory: Bytes that may be taken on the device; None is all that it has.  A volume that does not fit is processed in
-        slabs.
+    memory: Bytes.
     """
 
-    remove_table: bool = False
-    allow_bone_loss: bool = False
-    field_of_view: float | str | None = None
-    clip_box: Sequence[float] | None = None
-    between: Sequence[float] | None = None
-    around: Sequence[float] | None = None
-    region: Sequence[str] | None = None
-    preprocess: str | Sequence[str] | None = None
+    remove_table: bool = option(
+        "--remove-table",
+        None,
+        "turn what is not the patient's body into air first: table, blankets, cables",
+        group="masking",
+        default=False,
+        first=True,
+    )
+    allow_bone_loss: bool = option(
+        "--allow-bone-loss",
+        None,
+        "go on where --remove-table takes more than 2 %% of the bone, or a step of --preprocess more than half of"
+        " what is at the level and above, which else is refused",
+        group="masking",
+        default=False,
+    )
+    field_of_view: float | str | None = option(
+        "--fov",
+        "RADIUS_MM",
+        "turn what lies further from the centre of the slices into air first (without a number: the largest circle"
+        " that fits the slice)",
+        group="masking",
+        parse=_parse_radius,
+        nargs="?",
+        const="auto",
+    )
+    clip_box: Sequence[float] | None = option(
+        "--clip-box",
+        "X0,X1,Y0,Y1,Z0,Z1",
+        "keep a box; a side that is left empty is open",
+        group="crop",
+        parse=_parse_clip_box,
+    )
+    between: Sequence[float] | None = option(
+        "--between", "Z0,Z1", "keep what lies between two heights", group="crop", parse=_parse_between
+    )
+    around: Sequence[float] | None = option(
+        "--around", "X,Y,Z,R", "keep a cube: R mm from a point to each side", group="crop", parse=_parse_around
+    )
+    region: Sequence[str] | None = option(
+        "--region",
+        "RULE",
+        f"turn what lies outside of the region of interest into air first: {REGION_FORMS}; several of one kind add"
+        " up, of different kinds cut each other; a seed grows within the others; a tube without a file goes along the"
+        " spinal canal",
+        group="masking",
+        action="append",
+    )
+    preprocess: str | Sequence[str] | None = option(
+        "--preprocess",
+        "STEP[,STEP...]",
+        f"steps before the surface, in this order: {PREPROCESS_FORMS}; morphology works on what is at the iso"
+        " value and above, or at level:HU; region is the place of --region, which else comes first",
+        group="masking",
+    )
     keep_ids: bool = False
     device: str | None = None
-    memory: int | None = None
+    memory: int | None = option(
+        "--memory",
+        "SIZE",
+        "memory that may be taken on the device, such as 500MB or 2GiB (default: all of it);"
+        " what does not fit goes through in slabs, with the same result",
+        group="memory",
+        parse=parse_bytes,
+    )
 
     def __post_init__(self) -> None:
         if self.memory is not None and self.memory < 1:
@@ -100,9 +208,6 @@ class InputSettings(Selection):
         """Patient frame of the region's numbers: that of what is written, LPS where a job has none."""
         return str(getattr(self, "space", "lps"))
 
-
-REGION_FORMS = "box:X0,X1,Y0,Y1,Z0,Z1, hu:LO,HI, label:FILE:NAME, mask:FILE, seed:X,Y,Z, tube:MM and tube:MM:FILE"
-"""The forms of a region rule, for messages and help."""
 
 _REGION_NUMBERS = {"box": 6, "hu": 2, "seed": 3, "tube": 1}
 
@@ -216,13 +321,6 @@ MORPHOLOGY = ("erode", "dilate", "open", "close", "fill", "fill-slices")
 """Steps on the voxels at the level and above."""
 
 _WITH_RADIUS = ("erode", "dilate", "open", "close")
-
-PREPROCESS_FORMS = (
-    "bilateral[:MM[:HU]], bilateral-2d[:MM[:HU]], bilateral-near[:MM[:HU]], median[:MM], gaussian[:MM],"
-    " curvature-flow[:N], non-local-means[:HU], level:HU, erode:MM, dilate:MM, open:MM, close:MM, fill, fill-slices"
-    " and region"
-)
-"""The forms of a step, for messages and help."""
 
 
 @dataclass(frozen=True)

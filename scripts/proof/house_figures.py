@@ -85,12 +85,13 @@ def _docstrings(tree: ast.Module) -> list[str]:
 
 
 def _option_places(modules: dict[str, tuple[str, ast.Module]]) -> Counter[str]:
-    """Count in how many files each option of the command line is declared with ``add_argument``."""
+    """Count in how many files each option of the command line is declared, by ``add_argument`` or as a field."""
     places: set[tuple[str, str]] = set()
     for name, (_, tree) in modules.items():
         for node in ast.walk(tree):
-            if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument":
-                flags = [str(word.value) for word in node.args if isinstance(word, ast.Constant)]
+            called = getattr(node, "func", None)
+            if "add_argument" == getattr(called, "attr", "") or "option" == getattr(called, "id", ""):
+                flags = [str(word.value) for word in getattr(node, "args", ()) if isinstance(word, ast.Constant)]
                 places |= {(flag, name) for flag in flags if flag.startswith("--")}
     return Counter(flag for flag, _ in places)
 

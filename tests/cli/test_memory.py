@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 
 import pytest
 
-from clrecon.cli.common import parse_size
 from clrecon.cli.main import main
+from clrecon.jobs.options import parse_bytes
 
 
 @pytest.mark.parametrize(
@@ -17,13 +16,13 @@ from clrecon.cli.main import main
      ("64 MiB", 64 * 2**20), ("1TB", 10**12)],
 )  # fmt: skip
 def test_amounts_are_read(text, size):
-    assert parse_size(text) == size
+    assert parse_bytes(text) == size
 
 
 @pytest.mark.parametrize("text", ["", "much", "-5MB", "5XB", "5iB", "MB", "1e9", "5MB5"])
 def test_what_is_no_amount_is_refused(text):
-    with pytest.raises(argparse.ArgumentTypeError, match="500MB or 2GiB"):
-        parse_size(text)
+    with pytest.raises(ValueError, match="500MB or 2GiB"):
+        parse_bytes(text)
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,15 @@ def parser_of(command: str) -> Parser:
 
 
 def find_options(source: str) -> list[str]:
-    """Options of a command line that stand in the texts of a module, docstrings and comments included."""
+    """Options of a command line that stand in the texts of a module, docstrings and comments included, other than in
+    the declarations of fields as options."""
+    declared = [
+        str(ast.get_source_segment(source, node))
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "option"
+    ]
+    for text in declared:
+        source = source.replace(text, "")
     return OPTION.findall(source)
 
 
@@ -143,4 +151,5 @@ def test_no_option_is_named_outside_of_the_command_line() -> None:
 
 def test_a_named_option_and_a_named_parameter_are_found() -> None:
     assert find_options('raise UsageError("leave --open out, or -o; a--b, x - -y, ---")') == ["--open"]
+    assert find_options('a: int = option("--open", "N", "see --report")\nb = "--seed"') == ["--seed"]
     assert named_parameters("x = f\"{name_parameter('force', True)}\"\nname_parameter(setting)") == {"force"}

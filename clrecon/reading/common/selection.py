@@ -8,28 +8,69 @@ from typing import Any, NamedTuple
 
 from clrecon.errors import UsageError
 from clrecon.system.arguments import name_parameter
+from clrecon.system.options import option
 
 LARGEST = 1e6
 
 
+def _parse_rescale(text: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 2:
+        raise ValueError(f"{text!r} is no slope and intercept: SLOPE,INTERCEPT, such as 1,-1024")
+    return numbers
+
+
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """The part of an input that is read.
+    """The part of an input that is read."""
 
-    series: Series of the input; None leaves the choice to `read_volume`.
-    phase: Number of the phase, if the series has several.
-    allow_gaps: Read a stack with missing slices.
-    force: Read data sets without preamble or meta header.
-    follow_links: Read the files and folders that symbolic links out of the folder lead to.
-    rescale: (slope, intercept). In place of what the files say.
-    """
-
-    series: int | str | None = None
-    phase: int | None = None
-    allow_gaps: bool = False
-    force: bool = False
-    follow_links: bool = False
-    rescale: tuple[float, float] | None = None
+    series: int | str | None = option(
+        "--series",
+        "S",
+        'number, hash, UID (or the start of one) or description of the series, see "clrecon info" (default: the CT'
+        " series with most slices; of similar ones original before derived, then the thinnest)",
+        group="reading",
+        first=True,
+    )
+    phase: int | None = option(
+        "--phase",
+        "N",
+        "number of the phase, of a series with several volumes at one place",
+        group="reading",
+        parse=int,
+    )
+    allow_gaps: bool = option(
+        "--allow-gaps",
+        None,
+        "read a stack with missing slices: what is there is placed exactly, surfaces bridge the gap",
+        group="reading",
+        default=False,
+    )
+    force: bool = option(
+        "--force",
+        None,
+        "read data sets without preamble or meta header too, their encoding guessed; leave out what is left"
+        " over behind the pixels",
+        group="reading",
+        default=False,
+    )
+    follow_links: bool = option(
+        "--follow-links",
+        None,
+        "read the files and folders that symbolic links out of the folder lead to (git-annex, DataLad)",
+        group="reading",
+        default=False,
+    )
+    rescale: tuple[float, float] | None = option(
+        "--rescale",
+        "SLOPE,INTERCEPT",
+        "compute HU as SLOPE x stored value + INTERCEPT, regardless of the files, like 1,-1024",
+        group="reading",
+        parse=_parse_rescale,
+    )
 
 
 class Rescale(NamedTuple):
