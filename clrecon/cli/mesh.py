@@ -6,13 +6,21 @@ import argparse
 from dataclasses import fields
 from typing import Any
 
-from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, describe_space, megabytes, pick
+from clrecon.cli.common import (
+    add_device,
+    add_fields,
+    add_keep_ids,
+    add_memory,
+    add_no_clobber,
+    describe_space,
+    megabytes,
+    pick,
+)
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh_options import (
     add_label_arguments,
     add_methods,
     add_purpose,
-    add_refinement,
     add_strict,
     describe_cells,
     describe_labels,
@@ -22,6 +30,7 @@ from clrecon.cli.mesh_options import (
     label_choice,
 )
 from clrecon.cli.options import LEVELS_HELP, add_cropping, add_masking, add_reading, parse_hu, parse_levels, parse_point
+from clrecon.jobs.mesh.settings import MeshSettings, is_label_seed, settings_for
 from clrecon.jobs.outputs import MESH_FILES, OBJECT_FILES
 from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 from clrecon.system.text import count_of, format_digits, format_ml, format_volume
@@ -111,7 +120,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " an object with its name and a colour of its own",
     )
     add_label_arguments(parser)
-    add_refinement(parser)
+    add_fields(parser.add_argument_group("refinement"), MeshSettings, "refinement")
     device = parser.add_argument_group("device")
     add_device(device)
     add_memory(device)
@@ -160,24 +169,7 @@ def add_solid(surface: argparse._ArgumentGroup) -> None:
 
 def add_selection(components: argparse._ArgumentGroup) -> None:
     """Declare --keep, --keep-largest, --min-volume and --seed: which components stay."""
-    components.add_argument(
-        "--keep",
-        type=str.lower,
-        metavar="bone",
-        help="bone: keep the components whose walls look like bone, not heart and vessels with contrast medium, nor a"
-        " table",
-    )
-    components.add_argument(
-        "--keep-largest", type=int, metavar="N", help="keep the N largest components only", first=True
-    )
-    components.add_argument(
-        "--min-volume",
-        dest="min_volume_ml",
-        type=float,
-        metavar="ML",
-        help="keep components of at least ML millilitres only",
-        first=True,
-    )
+    add_fields(components, MeshSettings, "selection")
     components.add_argument(
         "--seed",
         dest="seeds",
@@ -203,7 +195,6 @@ def _add_checks(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
     from clrecon.jobs.mesh.job import make_mesh, makes_objects
-    from clrecon.jobs.mesh.settings import MeshSettings, is_label_seed, settings_for
 
     names = {own.name for own in fields(MeshSettings)} - {"purpose"}
     given = {**pick(options, names), **options.hu, "labels": label_choice(options)}

@@ -184,35 +184,6 @@ def describe_cells(report: dict[str, Any]) -> list[str]:
 SCAN_GATE_FAILED, GATE_FAILED = 7, 8
 """Exit code for a failed gate with ``--strict``; everything is written."""
 
-_ITERATIONS = 20
-
-
-def add_refinement(parser: argparse.ArgumentParser) -> None:
-    """Add --smooth, --decimate and --max-deviation."""
-    group = parser.add_argument_group("refinement")
-    group.add_argument(
-        "--smooth",
-        type=int,
-        nargs="?",
-        const=_ITERATIONS,
-        metavar="N",
-        help=f"smooth with N iterations of a windowed sinc filter (default: {_ITERATIONS})",
-    )
-    group.add_argument(
-        "--decimate",
-        type=float,
-        metavar="SHARE",
-        help="take away this share of the triangles, such as 0.9, or as much as the largest deviation lets",
-        first=True,
-    )
-    group.add_argument(
-        "--max-deviation",
-        dest="max_deviation_mm",
-        type=float,
-        metavar="MM",
-        help="smoothing and decimation each move nothing further (default: a quarter of the shortest voxel step)",
-    )
-
 
 def add_strict(parser: argparse._ActionsContainer) -> None:
     """Add --strict."""

@@ -16,9 +16,13 @@ from clrecon.errors import UsageError
 from clrecon.jobs.options import InputSettings
 from clrecon.jobs.presets import DEFAULT_PRESET, HIGHEST_BONE_HU, LOWEST_BONE_HU, find_iso_preset, find_purpose
 from clrecon.system.arguments import name_parameter
+from clrecon.system.options import option
 
 if TYPE_CHECKING:
     from clrecon.labels import LabelMap
+
+
+_ITERATIONS = 20
 
 
 def name_level(level: float | Sequence[float]) -> str:
@@ -79,9 +83,24 @@ class MeshSettings(InputSettings):
     method: str | None = None
     grow_from: Sequence[str | Sequence[float]] = ()
     vertex_rule: str = "linear"
-    keep: str | None = None
-    keep_largest: int | None = None
-    min_volume_ml: float | None = None
+    keep: str | None = option(
+        "--keep",
+        "bone",
+        "bone: keep the components whose walls look like bone, not heart and vessels with contrast medium, nor a table",
+        group="selection",
+        parse=str.lower,
+    )
+    keep_largest: int | None = option(
+        "--keep-largest", "N", "keep the N largest components only", group="selection", parse=int, first=True
+    )
+    min_volume_ml: float | None = option(
+        "--min-volume",
+        "ML",
+        "keep components of at least ML millilitres only",
+        group="selection",
+        parse=float,
+        first=True,
+    )
     seeds: Sequence[Sequence[float]] = ()
     solid: bool = False
     seal_mm: float | None = None
@@ -89,9 +108,30 @@ class MeshSettings(InputSettings):
     split: bool = False
     one_file: bool = False
     labels: LabelChoice | None = None
-    smooth: int | None = None
-    decimate: float | None = None
-    max_deviation_mm: float | None = None
+    smooth: int | None = option(
+        "--smooth",
+        "N",
+        f"smooth with N iterations of a windowed sinc filter (default: {_ITERATIONS})",
+        group="refinement",
+        parse=int,
+        nargs="?",
+        const=_ITERATIONS,
+    )
+    decimate: float | None = option(
+        "--decimate",
+        "SHARE",
+        "take away this share of the triangles, such as 0.9, or as much as the largest deviation lets",
+        group="refinement",
+        parse=float,
+        first=True,
+    )
+    max_deviation_mm: float | None = option(
+        "--max-deviation",
+        "MM",
+        "smoothing and decimation each move nothing further (default: a quarter of the shortest voxel step)",
+        group="refinement",
+        parse=float,
+    )
     purpose: str | None = None
     strict: bool = False
 
