@@ -7,10 +7,10 @@ import shlex
 from importlib import import_module
 
 import pytest
+from command_lines import parse_command
 
 from clrecon.cli.common import SCREEN_LINES, Parser, add_common
 from clrecon.cli.main import COMMANDS, main
-from tests.support.command_lines import parse_command
 
 
 @pytest.fixture(autouse=True)
