@@ -121,8 +121,8 @@ def install_alone(wheel: Path, folder: Path) -> Path:
 SELFTEST = """
 import sys
 from clrecon.cli.main import main
-from clrecon.proof import table
-table.CHECKS = table.CHECKS[:5]  # a program is found, or it is not
+from clrecon.proof import run
+run.CHECKS = run.CHECKS[:5]  # a program is found, or it is not
 sys.exit(main(["selftest"]))
 """
 

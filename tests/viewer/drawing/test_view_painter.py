@@ -52,13 +52,13 @@ def test_a_surface_picture_is_that_of_render(view, device):
 
 @pytest.mark.parametrize("mode", ["surface", "bone", "mip", "drr", "slices"])
 def test_a_large_picture_in_strips_is_the_same(view, monkeypatch, mode):
-    from clrecon.viewer.drawing import strips
+    from clrecon.viewer.drawing import stage
 
     model, painter = view()
     model.set_mode(mode)
     model.turn(0.1, 0.05)
     whole = painter.picture(model.snapshot(), SIZE)
-    monkeypatch.setattr(strips, "STRIP_PIXELS", 96 * 32)
+    monkeypatch.setattr(stage, "STRIP_PIXELS", 96 * 32)
     parts = painter.picture(model.snapshot(), SIZE)
     assert parts.report.get("strips", 1) == (1 if mode == "drr" else 3) and parts.camera == whole.camera
     apart = np.abs(parts.image.astype(int) - whole.image.astype(int)).max(axis=2)
