@@ -11,10 +11,10 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 100_500,
-    "modules": 775,
-    "small_modules_with_one_reader": 130,
-    "docstrings_with_raises": 117,
+    "lines": 95_200,
+    "modules": 424,
+    "small_modules_with_one_reader": 21,
+    "docstrings_with_raises": 124,
     "options_in_several_files": 22,
     "modules_with_own_all": 0,
 }

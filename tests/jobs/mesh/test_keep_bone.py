@@ -35,7 +35,7 @@ def make_scan(heart: float = 380.0, bone: float = 900.0) -> Volume:
 @pytest.fixture
 def read(monkeypatch: pytest.MonkeyPatch) -> Any:
     def use(volume: Volume) -> None:
-        monkeypatch.setattr("clrecon.reading.dicom.read_volume", lambda source, series, **options: volume)
+        monkeypatch.setattr("clrecon.reading.dicom.reader.read_series", lambda source, selection, progress: volume)
 
     return use
 

@@ -33,7 +33,7 @@ def ball(bone: float = 1040.0, tissue: float = 40.0) -> Volume:
 def scan(monkeypatch: pytest.MonkeyPatch) -> list[Volume]:
     """What the job reads: the one entry of this list."""
     volumes = [ball()]
-    monkeypatch.setattr("clrecon.reading.dicom.read_volume", lambda source, series, **options: volumes[0])
+    monkeypatch.setattr("clrecon.reading.dicom.reader.read_series", lambda source, selection, progress: volumes[0])
     return volumes
 
 

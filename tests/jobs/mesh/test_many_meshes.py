@@ -28,7 +28,8 @@ def boxes(monkeypatch: pytest.MonkeyPatch) -> None:
     voxels[8:10, 15:17, 4:6] = 300
     report = {"hu_range": [-1000.0, 800.0], "warnings": ["the table is in the picture"]}
     monkeypatch.setattr(
-        "clrecon.reading.dicom.read_volume", lambda source, series, **options: Volume(voxels, AFFINE, dict(report))
+        "clrecon.reading.dicom.reader.read_series",
+        lambda source, selection, progress: Volume(voxels, AFFINE, dict(report)),
     )
 
 
