@@ -88,6 +88,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_reading(parser)
     add_masking(parser)
+    _add_surface(parser)
+    device = parser.add_argument_group("device")
+    add_device(device)
+    add_memory(device)
+    checks = parser.add_argument_group("files and checks")
+    add_no_clobber(checks)
+    add_keep_ids(checks)
+
+
+def _add_surface(parser: argparse.ArgumentParser) -> None:
     surface = parser.add_argument_group("surface")
     level = surface.add_mutually_exclusive_group()
     level.add_argument(
@@ -108,12 +118,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     surface.add_argument(
         "--open", dest="closed", action="store_false", help="leave the surface open at the border of the volume"
     )
-    device = parser.add_argument_group("device")
-    add_device(device)
-    add_memory(device)
-    checks = parser.add_argument_group("files and checks")
-    add_no_clobber(checks)
-    add_keep_ids(checks)
 
 
 def _parse_names(text: str) -> tuple[str, ...]:

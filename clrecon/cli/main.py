@@ -18,7 +18,7 @@ from clrecon.cli.common import EXIT_CODES, Parser, guard, has_hung_device
 from clrecon.cli.console import Console, run_with_streams
 from clrecon.errors import UsageError
 from clrecon.system.arguments import Speaker, in_python, spoken_by
-from clrecon.system.log import own_streams
+from clrecon.system.foreign_words import own_streams
 from clrecon.system.progress import DEFAULT_SECONDS, time_limit
 
 _DESTINATIONS = {

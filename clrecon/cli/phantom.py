@@ -76,6 +76,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ghosts", action="store_true", default=None, help="of a spine: two foreign slices, and a localizer"
     )
+    _add_spine(parser)
+    parser.add_argument("--missing", metavar="N,M-O", help="numbers of slices that are left out, like 20-22,40")
+    parser.add_argument(
+        "--seed", type=int, metavar="N", help="place within a voxel, noise and texture (default: 0)", first=True
+    )
+    add_no_clobber(parser)
+
+
+def _add_spine(parser: argparse.ArgumentParser) -> None:
     spine = parser.add_argument_group("of a spine")
     spine.add_argument("--levels", metavar="C1-L5", help="vertebrae to show, like L4-L5 or C3-C7,T1-T5", first=True)
     spine.add_argument(
@@ -92,11 +101,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     spine.add_argument(
         "--phases", type=int, metavar="N", help="series at the same places, with ever more contrast medium"
     )
-    parser.add_argument("--missing", metavar="N,M-O", help="numbers of slices that are left out, like 20-22,40")
-    parser.add_argument(
-        "--seed", type=int, metavar="N", help="place within a voxel, noise and texture (default: 0)", first=True
-    )
-    add_no_clobber(parser)
 
 
 def _list_kinds() -> str:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.exchange.vtp import make_polydata
-from clrecon.system.log import hush
+from clrecon.system.foreign_words import hush
 
 Points = NDArray[np.float64]
 

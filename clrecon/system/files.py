@@ -22,10 +22,9 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import TYPE_CHECKING, BinaryIO, Protocol
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.system.log import get_logger
 from clrecon.system.paths import (
     checked_target,
     existing_stay,
@@ -39,10 +38,12 @@ from clrecon.system.paths import (
     system_errors,
 )
 
+if TYPE_CHECKING:
+    import logging
+
 if sys.platform != "win32":
     import fcntl
 
-log = get_logger(__name__)
 
 _FILES_OF_OTHERS = 200
 """Number of files kept free for libraries, drivers and their caches, beside the files that a job writes."""
@@ -52,6 +53,12 @@ _TEMPORARY = re.compile(r"\.clrecon-[0-9a-f]{16}\.(?:tmp|folder)")
 _own_names: set[str] = set()
 """Names of the temporary files and folders that this process is writing.  They are not examined: with a thousand of
 them that would be slow."""
+
+
+def _log() -> logging.Logger:
+    from clrecon.system.log import get_logger  # loads logging: help, which reads this file too, need not wait for it
+
+    return get_logger(__name__)
 
 
 def replace_file(
@@ -104,7 +111,7 @@ class StagedFile:
                 self._stream.close()  # Windows cannot rename an open file.
         place_file(self._temporary, self._target, self._path, keep=self._keep)
         _sync_folder(self._target.parent)
-        log.info("file written: %d bytes", self.size)
+        _log().info("file written: %d bytes", self.size)
 
 
 @contextlib.contextmanager
@@ -297,7 +304,7 @@ def _sweep(folder: Path) -> None:
                         shutil.rmtree(temporary, ignore_errors=True)
                     else:
                         temporary.unlink()
-                    log.info("what a process that has ended left unfinished was removed")
+                    _log().info("what a process that has ended left unfinished was removed")
             finally:
                 os.close(descriptor)
 
@@ -370,4 +377,4 @@ class StagedFolder:
         """Move the folder to its place; that of an earlier run is removed at the end of the ``with`` block."""
         with hold_interrupts():
             place_folder(self._made, self._folder, self._path, keep=self._keep)
-        log.info("folder written: %d bytes", self.size)
+        _log().info("folder written: %d bytes", self.size)

@@ -53,7 +53,7 @@ def test_nothing_is_missing_of_a_quiet_command(tmp_path: Path) -> None:
 def test_files_are_not_written_over_a_closed_stream() -> None:
     """The next file that is opened would be standard output for a library in C, and get its words."""
     code = (
-        "import os; from clrecon.system.log import own_streams\n"
+        "import os; from clrecon.system.foreign_words import own_streams\n"
         "with own_streams(): print(os.open(os.devnull, os.O_RDONLY) > 2, file=__import__('sys').stderr)"
     )
     done = subprocess.run(["/bin/sh", "-c", f'"{sys.executable}" -c "{code}" >&-'], capture_output=True, text=True)

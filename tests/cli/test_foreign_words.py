@@ -14,7 +14,7 @@ import pytest
 from volume_files import make_ct, write_metaimage
 
 from clrecon.proof.phantom import PhantomSettings, write_phantom
-from clrecon.system.log import hush, own_streams
+from clrecon.system.foreign_words import hush, own_streams
 
 CLRECON = [sys.executable, "-m", "clrecon"]
 
@@ -38,7 +38,7 @@ def test_json_stands_alone_on_stdout(device: Any, sphere: Path, tmp_path: Path) 
 
 def test_a_library_that_writes_to_descriptor_1(tmp_path: Path) -> None:
     code = (
-        "import os, sys; from clrecon.system.log import hush, own_streams\n"
+        "import os, sys; from clrecon.system.foreign_words import hush, own_streams\n"
         "with own_streams(show='show' in sys.argv):\n"
         "    os.write(1, b'foreign '); print('own')\n"
         "    with hush(): os.write(1, b'hushed '); os.write(2, b'hushed ')\n"

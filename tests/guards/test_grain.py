@@ -12,7 +12,7 @@ from house_figures import count_grain
 
 CEILINGS = {
     "lines": 95_200,
-    "modules": 424,
+    "modules": 425,
     "small_modules_with_one_reader": 21,
     "docstrings_with_raises": 124,
     "options_in_several_files": 22,

@@ -23,8 +23,7 @@ def gpu(device, monkeypatch):
     """The GPU that is chosen where no device is named, beside the CPU device."""
     gpu = pretended_gpu(device)
     gpu.stand_in = None
-    for place in ("select", "stand_in"):
-        monkeypatch.setattr(f"clrecon.opencl.{place}.list_devices", lambda: [device, gpu])
+    monkeypatch.setattr("clrecon.opencl.select.list_devices", lambda: [device, gpu])
     for variable in ("CLRECON_DEVICE", "PYOPENCL_CTX"):
         monkeypatch.delenv(variable, raising=False)
     return gpu

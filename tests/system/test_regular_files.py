@@ -86,7 +86,7 @@ def test_a_phantom_does_not_wait_for_its_truth(tmp_path):
 
 OWN = {
     "system/files.py": "locks of folders",
-    "system/log.py": "streams of a command",
+    "system/foreign_words.py": "streams of a command",
     "system/paths.py": "a name that is taken; the helper itself",
     "system/memory.py": "maps a file that it has looked at; the system",
     "cli/console.py": "the null device; what the command has just written",

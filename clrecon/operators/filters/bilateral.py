@@ -149,8 +149,7 @@ def filter_bilateral(
     memory: int | None = None,
     progress: Progress | None = None,
 ) -> VolumeKind:
-    """Filter a volume by distance and difference: noise goes, edges of more than some ``sigma_hu`` stay (Tomasi and
-    Manduchi 1998).
+    """Filter a volume by distance and difference (Tomasi and Manduchi 1998): noise goes, edges of ``sigma_hu`` stay.
 
     Each voxel becomes the mean of its neighbours with the weights ``exp(-|t|^2 / (2 sigma_mm^2) - d^2 / (2
     sigma_hu^2))``, ``|t|`` the distance in mm and d the difference in HU.  Distances are those of the voxels' places,
@@ -158,9 +157,8 @@ def filter_bilateral(
     infinite voxels of floats stay as they are, and count nowhere.
 
     The window is the box around the ball of 2.5 sigma_mm.  Of one with more than ``taps`` voxels the nearest stay, in
-    whole rings of equal distance.
-
-    It removes specks and smooths plateaus.  It does not make the surface more accurate: see docs/filters.md.
+    whole rings of equal distance.  It removes specks and smooths plateaus; it does not make the surface more accurate:
+    see docs/filters.md.
 
     Parameters
     ----------

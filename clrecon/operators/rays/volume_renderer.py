@@ -233,7 +233,7 @@ class VolumeRenderer(Closing):
     def frame(self, style: Style) -> Grid:
         """Return what cameras fit: the volume, or the box of what is left of it where a part is masked, cut or hidden.
 
-        See `shown_box`; the last box is kept for styles that show the same part of the volume.
+        The last box is kept for styles that show the same part of the volume.
         """
         if isinstance(style, Projection) and style.leaves_out and LEFT_OUT not in self.volume.report:
             return self._within(ignore_progress).frame(style)

@@ -324,7 +324,7 @@ class DeviceVolume(Closing):
         return low
 
     def with_fallback(self) -> Iterator[Attempt[tuple[Device, list[str]]]]:
-        """Yield attempts at the work of an operator, each anew on `device`, see `clrecon.opencl.with_fallback`."""
+        """Yield attempts at the work of an operator, each anew on `device`."""
         for attempt in with_fallback(self._taken_device):
             current, _ = attempt.given
             with self._lock:
@@ -337,7 +337,7 @@ class DeviceVolume(Closing):
     def attempts(
         self, what: str, slices: int, warnings: list[str] | None = None, *, fewest: int = 1
     ) -> Iterator[Attempt[int]]:
-        """Yield attempts with `slices` in a slab, then with half as many as long as the device has no room.
+        """Yield attempts with ``slices`` in a slab, then with half as many as long as the device has no room.
 
             for attempt in resident.attempts("surface", planned, warnings):
                 with attempt as slices:
@@ -345,7 +345,7 @@ class DeviceVolume(Closing):
 
         The block makes all its buffers in functions that it calls: earlier ones are gone, and its own would stay.
 
-        what: As in `plan`, whose result `slices` are.
+        what: As in `plan`, whose result ``slices`` are.
         warnings: Gets a line for each halving.
         fewest: Fewest slices that are tried.
         """

@@ -37,7 +37,7 @@ from clrecon.reading.grids.grid_file import (
     file_beside,
     import_extra,
 )
-from clrecon.system.log import hush
+from clrecon.system.foreign_words import hush
 from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 

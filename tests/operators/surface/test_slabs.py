@@ -16,8 +16,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.operators.resident import device_volume
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.operators.surface import extract as isosurface
-from clrecon.operators.surface import marching_cubes
+from clrecon.operators.surface import extraction, marching_cubes
 from clrecon.operators.surface import marching_cubes as cells
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
 from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
@@ -45,7 +44,7 @@ def test_a_resident_volume_can_be_asked_for_a_surface_that_does_not_fit_as_a_who
     volume = smooth_volume()
     with SurfaceExtractor(volume, device=device) as extractor:
         extractor.extract(100, closed=False)
-        monkeypatch.setattr(isosurface, "plan_slabs", lambda *_: 4)
+        monkeypatch.setattr(extraction, "plan_slabs", lambda *_: 4)
         mesh = extractor.extract(100)
         assert mesh.report["slabs"] > 1
         again = extractor.extract(100, closed=False)
@@ -95,7 +94,7 @@ def test_building_and_slices_that_are_done_are_told(device, monkeypatch):
     building = [("build", 0, 1), ("build", 1, 1)]
     assert told == building
     told.clear()
-    monkeypatch.setattr(isosurface, "plan_slabs", lambda *_: 10)
+    monkeypatch.setattr(extraction, "plan_slabs", lambda *_: 10)
     extract_isosurface(volume, 100, device=device, progress=lambda *step: told.append(step))
     assert told == [*building, ("slabs", 10, 25), ("slabs", 20, 25), ("slabs", 25, 25)]
 

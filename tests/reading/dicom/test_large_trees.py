@@ -65,7 +65,9 @@ def test_row_47_many_files_are_walked_once_and_stay_small(
     gc.collect()
     tracemalloc.start()
     found = scan_path(tmp_path / "tree", lambda *call: calls.append(call))
-    kept, peak = tracemalloc.get_traced_memory()
+    peak = tracemalloc.get_traced_memory()[1]
+    gc.collect()  # in a large process Python itself comes late to what is left in circles
+    kept = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
     assert len(found.slices) == count and starts == [PREFIX_BYTES] * count and len(parses) == count
     assert kept / count < HEADER_BYTES
