@@ -64,8 +64,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " numbered where it exists; repeat it for several (default: a download)",
         first=True,
     )
-    for name in ("--web", "--open"):  # what they asked for is the default now
-        shown.add_argument(name, action="store_true", help=argparse.SUPPRESS)
     shown.add_argument(
         "--name",
         dest="names",

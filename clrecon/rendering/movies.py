@@ -4,7 +4,7 @@ Frames are taken from an iterator and written one by one, so that a thousand nee
 place and the encoder are checked before the first frame is computed.  Folders of frames appear as a whole.
 
 Pillow writes GIF and APNG, but holds all frames in memory until the end.  Here Pillow compresses each frame as a
-separate picture, whose compressed blocks are copied into the moving picture: the memory of one frame suffices.  MP4 is
+separate picture, whose compressed blocks are copied into the animation: the memory of one frame suffices.  MP4 is
 written by the program ffmpeg: it gets frames through a pipe, and writes the file to a temporary folder.  Every browser
 and every slide program plays H.264 in yuv420p.
 

@@ -4,7 +4,6 @@ somewhere."""
 from __future__ import annotations
 
 import re
-from argparse import SUPPRESS
 from collections import Counter
 from html.parser import HTMLParser
 from pathlib import Path
@@ -145,8 +144,7 @@ def test_every_public_name_has_its_entry(pages: dict[str, Page]) -> None:
 def test_every_command_has_a_page_with_its_options(site: Path) -> None:
     for command in COMMANDS:
         text = (site / "commands" / f"{command}.html").read_text(encoding="utf-8")
-        told = [action for action in command_parser(command)._actions if action.help != SUPPRESS]
-        options = [name for action in told for name in action.option_strings]
+        options = [name for action in command_parser(command)._actions for name in action.option_strings]
         assert [name for name in options if name not in text] == [], command
         assert "\u2013" not in text, "two hyphens of an option became a dash"
 

@@ -1,4 +1,4 @@
-"""The render job: from a CT series to pictures, moving pictures and their report.
+"""The render job: from a CT series to pictures, animations and their report.
 
 Its files are checked early, and written under temporary names.
 """

@@ -1,4 +1,4 @@
-"""Decimation and smoothing within a bound in mm of the original surface.
+"""Decimation and smoothing within an error bound in mm of the original surface.
 
 fast-simplification chooses which edges are collapsed.  This module adds the bound and the topology: places where the
 result would violate them are undone, and further collapses are tried.

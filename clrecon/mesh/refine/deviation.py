@@ -1,4 +1,4 @@
-"""Deviation: whether a decimated surface and the original are within a bound of each other.
+"""Deviation: whether a decimated surface and the original lie within the error bound of each other.
 
 Upper bounds of distances to a surface are found by numpy, where vertices of it near each point are known.
 """

@@ -1,4 +1,4 @@
-"""Decimation within a bound, and what a device finds for it: triangles that cut each other, and upper bounds of
+"""Decimation within an error bound, and what a device finds for it: triangles that cut each other, and upper bounds of
 distances.
 
 The device marks the triangles that may cut another one, in float32; `clrecon.mesh.intersections` then looks at these
