@@ -13,7 +13,7 @@ import clrecon
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.opencl import Stopwatch, download, list_devices
-from clrecon.operators.filters.bilateral import SlicesThere, list_mixed_groups, row_words, run_bilateral
+from clrecon.operators.filters.bilateral import SlicesThere, _Run, list_mixed_groups, row_words, run_bilateral
 from clrecon.operators.filters.settings import BilateralSettings
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.proof.filters import filter_twins as near_twin
@@ -291,6 +291,27 @@ def test_progress_is_told(device):
     told = []
     clrecon.filter_bilateral(ball(), sigma_hu=30.0, device=device, progress=lambda *step: told.append(step))
     assert told[0] == ("filter", 0, 20) and told[-1] == ("filter", 20, 20)
+
+
+def test_progress_near_a_level_goes_on_over_the_slabs(device):
+    told, volume = [], ball()
+    clrecon.filter_bilateral(
+        volume, sigma_hu=30.0, near=100, device=device, memory=2 * volume.voxels.nbytes + 100_000,
+        progress=lambda *step: told.append(step),
+    )  # fmt: skip
+    counts = [count for stage, count, _ in told if stage == "filter"]
+    assert counts == sorted(set(counts)) and counts[-1] == 20 and len(counts) > 2
+
+
+def test_the_memory_of_a_slab_near_a_level(device):
+    """Of 700 voxels in a row: 44 groups in 2 words.  Four masks of the rows that are there, one of the core, a list."""
+    volume = ball((9, 6, 700))
+    settings = BilateralSettings.checked(volume, None, 40.0, 3, 100.0, False, 27)
+    with DeviceVolume(volume, device=device) as resident:
+        run = _Run(resident, settings, Stopwatch(), lambda *step: None)
+        there = 2 + 2 * run.halo
+        groups = 4 * 2 * (4 * there * 6 + 2 * 6) + 4 * 44 * 2 * 6
+        assert there < 9 and run.needs(2)["groups near the level"] == groups
 
 
 def refuse(stage, done, total):

@@ -53,6 +53,7 @@ def test_the_largest_reach():
     window = choose_window(cube(), 100.0, 2, 4096)
     assert max(window.reach) == LARGEST_REACH == 14
     assert window.share == pytest.approx(29**2 / (2 * np.pi * 100.0**2), rel=0.01)
+    assert len(window.rows()) == 29
 
 
 @pytest.mark.parametrize("volume", [Volume(np.zeros((6, 5, 4)), OBLIQUE), uneven()], ids=["oblique", "uneven"])
