@@ -1,20 +1,24 @@
 #!/usr/bin/env python3
 """Comparison of two checkouts of clrecon: the same commands are run with both, and all outputs compared byte for byte.
 
-    python scripts/proof/compare_versions.py OLD NEW [CT ...] [--labels FILE] [--device D] [--only TEXT] [--quick]
+    python scripts/proof/compare_versions.py OLD NEW [CT ...] [--labels FILE [--vertebra L3]] [--device D]
+                                             [--only TEXT] [--phantoms NAMES]
 
 OLD and NEW are folders of the project: `git worktree add ../old COMMIT` makes such a folder.  Each runs with the
-environment in its own `.venv-test` or `.venv`; a missing environment is made.  Two phantoms are always compared (a
-spine, and an oblique skull with tilted slices), and after them the series of each CT_FOLDER.
+environment in its own `.venv-test` or `.venv`; a missing environment is made.  Three phantoms are compared (a spine, an
+oblique skull with tilted slices, and three vertebrae with their label map), unless --phantoms names others or none, and
+after them the series of each CT_FOLDER.
 
-Exit codes, meshes, pictures, reports and the text on the console are compared.  In reports, the names in VOLATILE are
-ignored, such as times and the size of a process.  The exit status is 0 when nothing differs, and 1 with a line for each
-difference.
+Exit codes, meshes, clouds, volumes, label maps, pages, pictures, reports and the text on the console are compared.  In
+reports, the names in VOLATILE are ignored, such as times and the size of a process.  Left out are selftest, bench and
+compare, whose figures are times, and demo, which is phantom, mesh and render.  The exit status is 0 when nothing
+differs, and 1 with a line for each difference.
 """
 
 from __future__ import annotations
 
 import argparse
+import difflib
 import json
 import re
 import subprocess
@@ -37,7 +41,16 @@ PHANTOMS = {
         *("--kind", "skull", "--size", "112x96", "--slices", "70", "--spacing", "2.0", "2.2", "2.5"),
         *("--tilt", "9", "--oblique", "5", "-8", "20", "--table", "headrest"),
     ],
+    "levels": ["--levels", "L2-L4", "--size", "128x96", "--spacing", "1.4", "1.4", "1.5", "--scoliosis", "6"],
 }
+
+LABEL_MAPS = ("levels.nrrd", "materials.nrrd")
+"""Label maps that phantoms have beside them."""
+
+COMMANDS = (
+    *("mesh", "cloud", "inside", "render", "view", "export", "vertebrae", "corridor", "stats", "distance", "info"),
+    *("devices", "phantom", "selftest", "bench", "compare", "demo", "completion", "help"),
+)
 
 MESHES = {
     "bone.stl": [],
@@ -58,6 +71,24 @@ LABEL_MESHES = {
     "labels.ply": [],
     "solid.ply": ["--solid"],
     "masks.ply": ["--surface", "mask"],
+}
+
+CLOUDS = {
+    "surface.ply": ["--normals"],
+    "shell.npz": ["--points", "shell", "--hu", "250", "--remove-table"],
+    "kept.xyz": ["--cluster", "eps=4,min=6", "--keep", "largest:2", "--space", "ras"],
+    "voxels.las": ["--points", "voxels", "--denoise", "grid"],
+}
+
+VOLUMES = {
+    "ct.nii.gz": [],
+    "step.mha": ["--resample", "2", "--remove-table"],
+    "part.nrrd": ["--filter", "bilateral", "--around", "0,-150,-300,40"],
+}
+
+OF_VERTEBRAE = {
+    "corridor": [["-o", "line.ply", "--picture", "line.png"], ["--screw", "0,0,0,0,0,40,5"]],
+    "inside": [["-o", "inside.stl", "--hu", "250"], ["-o", "dense.glb", "--dense", "350:900", "--picture", "part.png"]],
 }
 
 _SMALL = ["--size", "200x160"]
@@ -99,7 +130,8 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--labels", type=Path, help="label map of the last CT_FOLDER")
     parser.add_argument("--device", default="0")
     parser.add_argument("--only", default="", help="only commands whose words hold this text")
-    parser.add_argument("--quick", action="store_true", help="the first phantom alone")
+    parser.add_argument("--vertebra", default="L3", help="name or number in the label map (default: %(default)s)")
+    parser.add_argument("--phantoms", default=",".join(PHANTOMS), metavar="NAMES", help="comma list, may be empty")
     return parser.parse_args()
 
 
@@ -114,31 +146,58 @@ def _program(checkout: Path) -> list[str]:
 def _compare_all(options: argparse.Namespace, scratch: Path) -> Iterator[str]:
     old, new = _program(options.old), _program(options.new)
     inputs: dict[str, Path] = {}
-    for name, arguments in list(PHANTOMS.items())[: 1 if options.quick else None]:
+    for name in filter(None, options.phantoms.split(",")):
         inputs[name] = scratch / name
         for program, folder in ((old, scratch / f"{name}.old"), (new, inputs[name])):
-            subprocess.run([*program, "phantom", str(folder), *arguments, "-q"], check=True)
+            subprocess.run([*program, "phantom", str(folder), *PHANTOMS[name], "-q"], check=True)
         yield from (f"phantom {name}: {line}" for line in _compare_folders(scratch / f"{name}.old", inputs[name]))
     inputs.update((folder.name, folder.absolute()) for folder in options.inputs)
-    for name, folder in inputs.items():
-        labels = folder / "materials.nrrd" if (folder / "materials.nrrd").exists() else None
-        if options.labels is not None and folder.name == options.inputs[-1].name:
+    for name, folder in [("none", scratch), *inputs.items()]:
+        labels = next((path for path in (folder / file for file in LABEL_MAPS) if path.exists()), None)
+        if options.labels is not None and options.inputs and folder.name == options.inputs[-1].name:
             labels = options.labels.absolute()
-        for number, command in enumerate(_commands(folder, labels, options.device)):
+        commands = list(_commands_alone()) if name == "none" else list(_commands(folder, labels, options))
+        if name != "none":
+            commands.append(
+                _distance_of([scratch / f"new-{name}-{number}" for number in range(len(commands))], commands)
+            )
+        for number, command in enumerate(commands):
             if options.only not in " ".join(command):
                 continue
-            folders = [scratch / f"{side}-{name}-{number}" for side in ("old", "new")]
-            texts = [_run([*program, *command], place) for program, place in zip((old, new), folders, strict=True)]
+            pair = [scratch / f"{side}-{name}-{number}" for side in ("old", "new")]
+            texts = [_run([*program, *command], place) for program, place in zip((old, new), pair, strict=True)]
             shown = " ".join(command).replace(str(folder), name)
-            found = [] if texts[0] == texts[1] else [f"{a!r} became {b!r}" for a, b in _pairs(*texts) if a != b]
-            found += _compare_folders(*folders)
+            found = [*_differing_lines(*texts), *_compare_folders(*pair)]
             print(f"{'differs' if found else 'equal'}  {shown}", file=sys.stderr, flush=True)
             yield from (f"{shown}: {line}" for line in found)
 
 
-def _commands(folder: Path, labels: Path | None, device: str) -> Iterator[list[str]]:
+def _commands_alone() -> Iterator[list[str]]:
+    yield ["--version"]
+    yield ["help"]
+    yield from (["help", command] for command in COMMANDS)
+    yield from (["completion", shell] for shell in ("bash", "zsh", "fish"))
+    yield ["devices", "--json"]
+
+
+def _commands(folder: Path, labels: Path | None, options: argparse.Namespace) -> Iterator[list[str]]:
+    device = options.device
     yield ["info", str(folder), "--pixels", "--json"]
     yield ["info", str(folder), "--strict"]
+    for name, arguments in CLOUDS.items():
+        yield ["cloud", str(folder), "-o", name, *arguments, "--device", device, "--report", f"{name}.json"]
+    for name, arguments in VOLUMES.items():
+        yield ["export", str(folder), "-o", name, *arguments, "--device", device]
+    yield ["view", str(folder), "--html", "page.html", "--hu", "250", "--keep-largest", "3", "--device", device]
+    yield ["vertebrae", str(folder), "-o", "spine.nii.gz", "--picture", "spine.png", "--report", "spine.json"]
+    if labels is not None:
+        own = ["--labels", str(labels)]
+        yield ["stats", str(folder), *own, "--csv", "stats.csv", "--report", "stats.json"]
+        yield ["cloud", str(folder), "-o", "labels.ply", *own, "--device", device, "--report", "labels.json"]
+        own += ["--label", options.vertebra]
+        for command, ways in OF_VERTEBRAE.items():
+            for way in ways:
+                yield [command, str(folder), *own, *way, "--device", device, "--report", "report.json"]
     for name, arguments in MESHES.items():
         yield ["mesh", str(folder), "-o", name, *arguments, "--device", device, "--report", f"{name}.json"]
     for name, arguments in LABEL_MESHES.items() if labels is not None else ():
@@ -151,6 +210,15 @@ def _commands(folder: Path, labels: Path | None, device: str) -> Iterator[list[s
     if labels is not None:
         own = ["-o", "labels.png", "--labels", str(labels), *_SMALL]
         yield ["render", str(folder), *own, "--device", device, "--report", "labels.png.json"]
+
+
+def _distance_of(folders: list[Path], commands: list[list[str]]) -> list[str]:
+    """Return the command that measures one mesh of `commands` against another."""
+    pair = [
+        str(next(folder for folder, command in zip(folders, commands, strict=True) if name in command) / name)
+        for name in ("bone.stl", "auto.ply")
+    ]
+    return ["distance", *pair, "-o", "apart.ply", "--picture", "apart.png", "--report", "apart.json"]
 
 
 def _run(command: list[str], folder: Path) -> tuple[int, str, str]:
@@ -166,13 +234,13 @@ def _still(text: str) -> str:
     return re.sub(r"\b[\d.]+ s each\b", "N s each", text)
 
 
-def _pairs(old: tuple[int, str, str], new: tuple[int, str, str]) -> Iterator[tuple[Any, Any]]:
-    yield old[0], new[0]
+def _differing_lines(old: tuple[int, str, str], new: tuple[int, str, str]) -> Iterator[str]:
+    """Return what differs of exit code, stdout and stderr: lines that went with a minus, others with a plus."""
+    if old[0] != new[0]:
+        yield f"exit code {old[0]} became {new[0]}"
     for a, b in zip(old[1:], new[1:], strict=True):
-        before, after = a.splitlines(), b.splitlines()
-        length = max(len(before), len(after))
-        padded = (lines + [""] * (length - len(lines)) for lines in (before, after))
-        yield from zip(*padded, strict=True)
+        compared = difflib.unified_diff(a.splitlines(), b.splitlines(), n=0, lineterm="")
+        yield from (line for line in list(compared)[2:] if not line.startswith("@@"))
 
 
 def _compare_folders(old: Path, new: Path) -> list[str]:

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 import pytest
-from compare_versions import _compare_folders, _still, differing_names
+from compare_versions import (
+    COMMANDS,
+    _commands,
+    _compare_folders,
+    _differing_lines,
+    _distance_of,
+    _still,
+    differing_names,
+)
+
+from clrecon.cli.main import COMMANDS as OF_CLRECON
 
 
 def test_a_value_that_changed_is_named() -> None:
@@ -44,3 +55,20 @@ def test_only_times_are_left_out_of_the_console() -> None:
     times = "time     1.9 s (read 0.72, write 0.03)\n3 frames, 0.041 s each\n"
     text = f"read 1/9\rread 9/9\rvertices 12\n{times}warning: 3 s\n"
     assert _still(text) == "vertices 12\n3 frames, N s each\nwarning: 3 s\n"
+
+
+def test_every_command_is_compared_or_left_out_by_name(tmp_path: Path) -> None:
+    options = argparse.Namespace(device="0", vertebra="L3")
+    commands = list(_commands(tmp_path, tmp_path / "levels.nrrd", options))
+    folders = [tmp_path / str(number) for number in range(len(commands))]
+    commands.append(_distance_of(folders, commands))
+    assert set(COMMANDS) == {*OF_CLRECON, "help"}
+    alone = {"phantom", "completion", "devices", "help"}
+    assert {command[0] for command in commands} == {*OF_CLRECON} - alone - {"selftest", "bench", "compare", "demo"}
+    assert [Path(path).name for path in commands[-1][1:3]] == ["bone.stl", "auto.ply"]
+
+
+def test_a_line_that_came_moves_no_others() -> None:
+    old, new = (0, "a\nb\nc\n", ""), (4, "a\nnew\nb\n", "warning\n")
+    assert list(_differing_lines(old, new)) == ["exit code 0 became 4", "+new", "-c", "+warning"]
+    assert list(_differing_lines(old, old)) == []
