@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
-from contextlib import ExitStack
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,12 +12,10 @@ from typing import TYPE_CHECKING
 from clrecon.errors import ClreconError, OutputError, UsageError
 from clrecon.exchange.formats import ASSEMBLIES, FORMATS, list_extensions
 from clrecon.system.arguments import name_parameter
-from clrecon.system.progress import Progress
 from clrecon.system.text import count_of
 
 if TYPE_CHECKING:
-    from clrecon.mesh import Mesh
-    from clrecon.system.files import Staged, StagedFile
+    from clrecon.system.files import Staged
 
 
 MESH_FILES, OBJECT_FILES = list_extensions(tuple(FORMATS)), list_extensions(ASSEMBLIES)
@@ -165,43 +162,6 @@ def check_outputs(
     for _, path in outputs:
         check_writable(path)
     return outputs
-
-
-def stage_meshes(
-    stack: ExitStack,
-    meshes: Sequence[Mesh],
-    paths: Sequence[str | Path],
-    space: str,
-    progress: Progress,
-    *,
-    keep_ids: bool = False,
-) -> list[StagedFile]:
-    """Write all meshes under temporary names that `stack` removes unless they are committed."""
-    from clrecon.exchange.formats import stage_mesh
-    from clrecon.system.files import allow_open_files
-
-    allow_open_files(len(meshes))
-    staged: list[StagedFile] = []
-    for mesh, path in zip(meshes, paths, strict=True):
-        progress("write", len(staged), len(meshes) if len(meshes) > 1 else 0)
-        staged.append(stack.enter_context(stage_mesh(mesh, path, space, keep_ids=keep_ids)))
-    return staged
-
-
-def stage_together(
-    stack: ExitStack,
-    meshes: Sequence[Mesh],
-    path: str | Path,
-    space: str,
-    progress: Progress,
-    *,
-    keep_ids: bool = False,
-) -> StagedFile:
-    """Write all meshes as named objects of one file under a temporary name, as `stage_meshes` does several files."""
-    from clrecon.exchange.formats import stage_assembly
-
-    progress("write", 0, 0)
-    return stack.enter_context(stage_assembly(meshes, path, space, keep_ids=keep_ids))
 
 
 def commit_all(files: Sequence[Staged]) -> None:

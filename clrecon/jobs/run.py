@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from clrecon.rendering.pictures.annotations import PictureData
     from clrecon.system.files import Staged, StagedFile
 
+Found = TypeVar("Found")
 Report = TypeVar("Report", bound="JobReport")
 StagedAs = TypeVar("StagedAs", bound="Staged")
 
@@ -61,9 +62,12 @@ class Laps:
         """Seconds since the first lap began."""
         return perf_counter() - self._start
 
-    def rounded(self) -> dict[str, float]:
-        """Return the seconds of each part and ``total``, as reports have them."""
-        return {part: round(value, 4) for part, value in {**self.seconds, "total": self.total()}.items()}
+    def rounded(self, parts: Sequence[str] = ()) -> dict[str, float]:
+        """Return the seconds of each part and ``total``, as reports have them; of `parts` all, and ``other``."""
+        seconds, total = {part: self.seconds.get(part, 0.0) for part in parts or self.seconds}, self.total()
+        if parts:
+            seconds["other"] = max(0.0, total - sum(seconds.values()))
+        return {part: round(value, 4) for part, value in {**seconds, "total": total}.items()}
 
 
 def _choose_device(name: str | int | Device | None) -> Device:
@@ -194,6 +198,8 @@ class JobReport(Record):
 
     _LAST: ClassVar[tuple[str, ...]] = ("version", "platform", "warnings", "volume", "seconds", "peak_memory_bytes")
     """Names of the entries at the end, in their order."""
+    PARTS: ClassVar[tuple[str, ...]] = ()
+    """Parts whose seconds are always told, also where they are 0; none: those that there were."""
 
     version: str
     platform: str
@@ -240,17 +246,22 @@ class Run(Laps):
     All files are on the disk before the first replaces an older one; those that are not committed at the end of the
     ``with`` block are removed.
 
-    settings: Those of the job; of their fields ``keep_ids``, ``labels``, ``memory`` and ``space`` are used here.
+    settings: Those of the job; of their fields ``keep_ids``, ``labels``, ``memory``, ``space`` and ``device`` are used
+        here.
     no_clobber: Files that exist stay and are an `OutputError`, before any work.
+    progress: ``progress(stage, done, total)``.
+
+    files: Those that are written so far.
+    logged: Warnings that are in the log already: those of the volume of the report.
     """
 
-    def __init__(self, settings: Any, *, no_clobber: bool = False, progress: Progress = ignore_progress):
+    def __init__(self, settings: Any, *, no_clobber: bool = False, progress: Progress | None = None):
         super().__init__()
-        self.settings, self.no_clobber, self.progress = settings, no_clobber, progress
+        self.settings, self.no_clobber, self.progress = settings, no_clobber, progress or ignore_progress
+        self.files: list[Staged] = []
+        self.logged: Iterable[str] = ()
         self._keep_ids: bool = getattr(settings, "keep_ids", False)
         self._stack = ExitStack()
-        self._files: list[Staged] = []
-        self._logged: Iterable[str] = ()
 
     def __enter__(self) -> Run:
         return self
@@ -299,11 +310,21 @@ class Run(Laps):
         assert labels is not None
         return volume, labels
 
+    def read_beside(self, prepare: Callable[[Device], None], read: Callable[[], Found]) -> tuple[Found, Device]:
+        """Read the input while the device opens and builds its kernels; return both."""
+        self.progress("device", 0, 0)
+        with DeviceOpening(self.settings.device, prepare) as opening:
+            found = read()
+            self.lap("read")
+            device = opening.wait()
+            self.lap("device")
+        return found, device
+
     def stage(self, staging: AbstractContextManager[StagedAs]) -> StagedAs:
         """Write a file under a temporary name."""
         with self.keeping():
             file = self._stack.enter_context(staging)
-        self._files.append(file)
+        self.files.append(file)
         return file
 
     def write(self, path: str | Path, content: bytes) -> StagedFile:
@@ -330,42 +351,56 @@ class Run(Laps):
             staged.append(self.stage(stage_mesh(mesh, path, self.settings.space, keep_ids=self._keep_ids)))
         return staged
 
+    def write_together(self, meshes: Sequence[Mesh], path: str | Path) -> StagedFile:
+        """Write all meshes as named objects of one file under a temporary name."""
+        from clrecon.exchange.formats import stage_assembly
+
+        self.progress("write", 0, 0)
+        return self.stage(stage_assembly(meshes, path, self.settings.space, keep_ids=self._keep_ids))
+
+    def certificate(self, volume: Volume) -> dict[str, Any]:
+        """Return the certificate of a volume as reports have it: with hashes of UIDs if they are asked for."""
+        from clrecon.geometry.certificate import without_ids
+
+        return dict(volume.report) if self._keep_ids else without_ids(volume.report)
+
     def report(
         self,
         kind: type[Report],
         warnings: Iterable[str],
         volume: Volume | None = None,
+        /,
         *,
         on: Device | None = None,
+        before: Iterable[str] = (),
         **own: Any,
     ) -> Report:
         """Compose a report.
 
-        kind: A `JobReport`; with `volume` a `ScanReport`, with the device `on` a `RunReport`.
-        warnings: Those of the job.
-        **own: Entries that `kind` declares; and ``seconds``, where the laps alone are not enough.
+        kind: A `JobReport`; a `ScanReport` has the certificate of `volume`, a `RunReport` the device `on`.
+        warnings: Those of the job, which come after those of the volume.
+        before: Those of the job that come before.
+        **own: Entries that `kind` declares.
         """
-        told: Iterable[str] = ()
-        if volume is not None:
-            from clrecon.geometry.certificate import without_ids
-
-            certificate = dict(volume.report) if self._keep_ids else without_ids(volume.report)
-            self._logged = told = certificate.pop("warnings", ())
+        certificate = {} if volume is None else self.certificate(volume)
+        self.logged = certificate.pop("warnings", ())
+        if issubclass(kind, ScanReport):
             own["volume"] = certificate
         if on is not None:
             own.update(device=on.label, driver=on.driver, memory_allowed_bytes=self.settings.memory)
         return kind(
             version=package_version(),
             platform=platform_name(),
-            warnings=list(dict.fromkeys(map(str, (*told, *warnings)))),
+            warnings=list(dict.fromkeys(map(str, (*before, *self.logged, *warnings)))),
+            seconds=self.rounded(kind.PARTS),
             peak_memory_bytes=peak_memory_bytes(),
-            **{"seconds": self.rounded(), **own},
+            **own,
         )
 
     def finish(self, report: Report, path: str | Path | None) -> Report:
         """Put all files in their places, the report at `path` as the last, and log its warnings; return the report."""
         if path is not None:
             self.stage(stage_report(path, report))
-        commit_all(self._files)
-        log_warnings(log, report.warnings, self._logged)
+        commit_all(self.files)
+        log_warnings(log, report.warnings, self.logged)
         return report

@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 import math
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.jobs.cloud.report import CloudReport, describe_clouds, describe_file
+from clrecon.jobs.cloud.report import CloudReport, describe_file, report_of
 from clrecon.jobs.cloud.settings import OF_SCANS, CloudSettings
 from clrecon.jobs.cloud.steps import CloudSteps, find_ghosts, iso_value_of, prepare_chain, take_points
-from clrecon.jobs.inputs import is_cloud_file, read_with_labels, refuse_other_clouds, refuse_scan_settings
-from clrecon.jobs.outputs import check_distinct, check_kept, commit_all
+from clrecon.jobs.inputs import is_cloud_file, refuse_other_clouds, refuse_scan_settings
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
-from clrecon.jobs.run import DeviceOpening, Laps, stage_report
-from clrecon.reading import read_selected
+from clrecon.jobs.run import Run
 from clrecon.system.arguments import name_parameter
-from clrecon.system.files import allow_open_files
-from clrecon.system.log import get_logger, log_warnings
-from clrecon.system.paths import keep_existing, refuse_existing, resolve_target
-from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.log import get_logger
+from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -31,20 +26,12 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.points import PointCloud
     from clrecon.points.ghost_slices import GhostSlices
-    from clrecon.system.files import Staged
 
 
 log = get_logger(__name__)
 
 
-def make_cloud(
-    source: str | Path,
-    files: CloudFiles,
-    settings: CloudSettings | None = None,
-    *,
-    no_clobber: bool = False,
-    progress: Progress | None = None,
-) -> CloudReport:
+def make_cloud(source: str | Path, files: CloudFiles, settings: CloudSettings | None = None, **how: Any) -> CloudReport:
     """Read a CT series or a cloud, run the steps that are asked for, and write the cloud that is left.
 
     The steps run in the order of `clrecon.jobs.cloud.settings.STEPS`.  Checks come first: the outputs, then the device,
@@ -52,19 +39,39 @@ def make_cloud(
     as the commit mark.
 
     source: DICOM folder or file, a file of another format, or a file of points, see `clrecon.read_points`.
-    no_clobber: Files that exist stay and are an `OutputError`, before any work.
-    progress: ``progress(stage, done, total)``.
+    **how: See `Run`.
     """
     settings = settings or CloudSettings()
-    progress = progress or ignore_progress
-    watch = Laps()
-    with keep_existing(no_clobber):
-        outputs = files.check()
-        for _, path in outputs:
-            refuse_existing(path, resolve_target(path))
-    check_kept(outputs, source, settings.labels)
-    refuse_other_clouds(source)
-    is_cloud = is_cloud_file(source)
+    with Run(settings, **how) as run:
+        files.check_formats()
+        run.check(files.named, source, settings.labels)
+        refuse_other_clouds(source)
+        is_cloud = is_cloud_file(source)
+        _check_kind(settings, is_cloud)
+        (subject, labels), device = run.read_beside(
+            partial(prepare_chain, settings=settings, is_cloud=is_cloud), lambda: _read_input(source, is_cloud, run)
+        )
+        ghosts = None
+        if not is_cloud and settings.masks:
+            subject, ghosts = _mask_scan(subject, device, settings, run.progress)  # type: ignore[arg-type]
+            run.lap("mask")
+        steps = take_points(subject, labels, device, settings, run.progress, ghosts)
+        run.lap("steps")
+        steps.check(settings.allow_point_loss)
+        surface = None if files.surface is None else _reconstruct_surface(steps, settings, device.current, run.progress)
+        run.lap("surface")
+        outputs, losses = _write_files(run, steps, surface, files)
+        report = report_of(
+            run, subject, steps, device.current, surface=surface, has_removed=files.removed is not None,
+            outputs=outputs, losses=losses,
+        )  # fmt: skip
+        run.finish(report, files.report)
+    log.info("%d points of %d on %s in %.3f s", report.points, report.points_first, report.device, run.total())
+    return report
+
+
+def _check_kind(settings: CloudSettings, is_cloud: bool) -> None:
+    """Refuse settings that mean nothing for the kind of input."""
     if is_cloud:
         refuse_scan_settings(settings, OF_SCANS)
     elif settings.input_space is not None:
@@ -82,46 +89,18 @@ def make_cloud(
             " clouds of points"
         )
 
-    subject, labels, device = _open_input(source, is_cloud, settings, progress, watch)
-    ghosts = None
-    if not is_cloud and settings.masks:
-        subject, ghosts = _mask_scan(subject, device, settings, progress)  # type: ignore[arg-type]
-        watch.lap("mask")
-    steps = take_points(subject, labels, device, settings, progress, ghosts)
-    watch.lap("steps")
-    steps.check(settings.allow_point_loss)
-    surface = _reconstruct_surface(steps, files, settings, device.current, progress)
-    watch.lap("surface")
-    with keep_existing(no_clobber):
-        report = _write_files(subject, steps, surface, files, settings, device.current, watch, progress)
-    log_warnings(log, report.warnings, subject.report.get("warnings", ()))
-    log.info("%d points of %d on %s in %.3f s", report.points, report.points_first, report.device, watch.total())
-    return report
 
+def _read_input(source: str | Path, is_cloud: bool, run: Run) -> tuple[Volume | PointCloud, LabelMap | None]:
+    """Read the cloud, or the scan and its labels."""
+    settings: CloudSettings = run.settings
+    if is_cloud:
+        from clrecon.points.cloud_reader import read_points
 
-def _open_input(
-    source: str | Path, is_cloud: bool, settings: CloudSettings, progress: Progress, watch: Laps
-) -> tuple[Volume | PointCloud, LabelMap | None, Device]:
-    """Read the input while the device opens and builds its kernels."""
-    progress("device", 0, 0)
-    labels = None
-    subject: Volume | PointCloud
-    with DeviceOpening(settings.device, partial(prepare_chain, settings=settings, is_cloud=is_cloud)) as opening:
-        if is_cloud:
-            from clrecon.points.cloud_reader import read_points
-
-            progress("read", 0, 0)
-            subject = read_points(source, space=settings.input_space)
-        else:
-            subject, labels = read_with_labels(
-                partial(read_selected, source, settings, progress=progress),
-                settings.labels,
-                partial(_read_map, settings),
-            )
-        watch.lap("read")
-        device = opening.wait()
-        watch.lap("device")
-    return subject, labels, device
+        run.progress("read", 0, 0)
+        return read_points(source, space=settings.input_space), None
+    if settings.labels is None:
+        return run.read(source), None
+    return run.read_labelled(source, None if settings.label is None else [settings.label])
 
 
 def _mask_scan(
@@ -142,20 +121,8 @@ def _mask_scan(
     return preprocess_volume(volume, settings, device, [band], progress), ghosts
 
 
-def _read_map(settings: CloudSettings, volume: Volume | None) -> LabelMap | None:
-    if settings.labels is None:
-        return None
-    from clrecon.labels import read_labels
-
-    return read_labels(settings.labels, None if settings.label is None else [settings.label], volume=volume)
-
-
-def _reconstruct_surface(
-    steps: CloudSteps, files: CloudFiles, settings: CloudSettings, device: Device, progress: Progress
-) -> Mesh | None:
-    """Make the mesh around the points, if its file is named."""
-    if files.surface is None:
-        return None
+def _reconstruct_surface(steps: CloudSteps, settings: CloudSettings, device: Device, progress: Progress) -> Mesh:
+    """Make the mesh around the points."""
     of_scan = any(step["step"] == "points" for step in steps.entries)
     if steps.cloud.normals is None:
         more = "" if of_scan else f", and name a point inside of the cloud ({name_parameter('viewpoint')})"
@@ -170,60 +137,33 @@ def _reconstruct_surface(
     from clrecon.operators.points.reconstruct import reconstruct_surface
 
     progress("surface", 0, 0)
-    return reconstruct_surface(steps.cloud, device=device, memory=settings.memory, progress=progress)
+    mesh: Mesh = reconstruct_surface(steps.cloud, device=device, memory=settings.memory, progress=progress)
+    return mesh
 
 
 def _write_files(
-    subject: Volume | PointCloud,
-    steps: CloudSteps,
-    surface: Mesh | None,
-    files: CloudFiles,
-    settings: CloudSettings,
-    device: Device,
-    watch: Laps,
-    progress: Progress,
-) -> CloudReport:
-    """Write all files, the report as the last one, and return it."""
+    run: Run, steps: CloudSteps, surface: Mesh | None, files: CloudFiles
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Write the files but the report; return their entries, and warnings of what the cloud's format cannot hold."""
     from clrecon.exchange.formats import describe_cloud_losses, stage_cloud
+    from clrecon.system.files import allow_open_files
 
-    space, ids = settings.space, settings.keep_ids
-    progress("write", 0, 0)
+    space, keep_ids = run.settings.space, run.settings.keep_ids
+    run.progress("write", 0, 0)
     allow_open_files(4)
-    written: list[Staged] = []
-    entries: list[dict[str, Any]] = []
-    with ExitStack() as staged:  # all files are on the disk before the first replaces an older one
-        wanted = [("cloud", files.output, steps.cloud), ("removed", files.removed, None)]
-        for what, path, cloud in wanted:
-            if path is not None:
-                chosen = steps.removed_cloud() if cloud is None else cloud
-                file = staged.enter_context(stage_cloud(chosen, path, space, keep_ids=ids))
-                written.append(file)
-                entries.append(describe_file(what, path, file.size))
-        if surface is not None and files.surface is not None:
-            from clrecon.exchange.formats import stage_mesh  # with all its writers
+    outputs: list[dict[str, Any]] = []
+    for what, path in (("cloud", files.output), ("removed", files.removed)):
+        if path is not None:
+            chosen = steps.cloud if what == "cloud" else steps.removed_cloud()
+            outputs.append(describe_file(what, path, run.stage(stage_cloud(chosen, path, space, keep_ids=keep_ids))))
+    if surface is not None and files.surface is not None:
+        from clrecon.exchange.formats import stage_mesh
 
-            mesh_file = staged.enter_context(stage_mesh(surface, files.surface, space, keep_ids=ids))
-            written.append(mesh_file)
-            entries.append(describe_file("surface", files.surface, mesh_file.size))
-        losses = describe_cloud_losses(steps.cloud.describe(space, with_ijk=False), f".{entries[0]['format']}")
-        watch.lap("write")
-        report = describe_clouds(
-            subject, steps, settings, device, surface=surface, has_removed=files.removed is not None, outputs=entries,
-            warnings=[*steps.warnings, *(surface.report["warnings"] if surface is not None else ()), *losses],
-            seconds=_seconds(watch),
-        )  # fmt: skip
-        if files.report is not None:
-            written.append(staged.enter_context(stage_report(files.report, report)))
-        commit_all(written)
-    return report
-
-
-def _seconds(watch: Laps) -> dict[str, float]:
-    parts = ("device", "read", "mask", "steps", "surface", "write")
-    seconds = {part: watch.seconds.get(part, 0.0) for part in parts}
-    seconds["other"] = max(0.0, watch.total() - sum(seconds.values()))
-    seconds["total"] = watch.total()
-    return {part: round(value, 4) for part, value in seconds.items()}
+        file = run.stage(stage_mesh(surface, files.surface, space, keep_ids=keep_ids))
+        outputs.append(describe_file("surface", files.surface, file))
+    losses = describe_cloud_losses(steps.cloud.describe(space, with_ijk=False), f".{outputs[0]['format']}")
+    run.lap("write")
+    return outputs, losses
 
 
 @dataclass(frozen=True)
@@ -241,29 +181,22 @@ class CloudFiles:
     surface: str | Path | None = None
     report: str | Path | None = None
 
-    def check(self) -> list[tuple[str, str | Path]]:
-        """Refuse outputs that cannot be written, before any work is done.
-
-        Returns: list of (str, path). Description and path of each output.
-        """
-        from clrecon.exchange.formats import check_cloud_format
-        from clrecon.system.files import check_writable
-
-        named = [
+    @property
+    def named(self) -> list[tuple[str, str | Path | None]]:
+        """Description and path of each file."""
+        return [
             ("the cloud", self.output),
             ("the cloud of removed points", self.removed),
             ("the surface", self.surface),
             ("the report", self.report),
         ]
-        outputs = [(what, path) for what, path in named if path is not None]
-        for path in (self.output, self.removed):
-            if path is not None:
-                check_cloud_format(path)
-        if self.surface is not None:
-            from clrecon.exchange.formats import check_format
 
+    def check_formats(self) -> None:
+        """Refuse formats that cannot be written."""
+        from clrecon.exchange.formats import check_cloud_format, check_format
+
+        check_cloud_format(self.output)
+        if self.removed is not None:
+            check_cloud_format(self.removed)
+        if self.surface is not None:
             check_format(self.surface)
-        check_distinct(outputs)
-        for _, path in outputs:
-            check_writable(path)
-        return outputs

@@ -7,12 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from clrecon.geometry.certificate import without_ids
 from clrecon.jobs.cloud.settings import CloudSettings
 from clrecon.jobs.cloud.steps import CloudSteps, name_reasons
 from clrecon.jobs.inputs import describe_cloud
-from clrecon.jobs.run import RunReport, peak_memory_bytes, platform_name
-from clrecon.version import package_version
+from clrecon.jobs.run import Run, RunReport
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -21,6 +19,7 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
     from clrecon.points import PointCloud
+    from clrecon.system.files import Staged
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,6 +40,8 @@ class CloudReport(RunReport):
         ``votes_against_share``, ``wall_share``, ``lost_share``, ``open_cubes``, ``warnings``.
     outputs: ``what``, ``format`` and ``bytes`` of each file but the report.
     """
+
+    PARTS = ("device", "read", "mask", "steps", "surface", "write")
 
     kind: str | None
     iso_value_hu: float | None
@@ -64,47 +65,46 @@ class CloudReport(RunReport):
     outputs: list[dict[str, Any]]
 
 
-def describe_file(what: str, path: str | Path, size: int) -> dict[str, Any]:
+def describe_file(what: str, path: str | Path, file: Staged) -> dict[str, Any]:
     """Return one entry of ``outputs``."""
-    return {"what": what, "format": os.path.splitext(os.fspath(path))[1].lower().lstrip("."), "bytes": size}
+    return {"what": what, "format": os.path.splitext(os.fspath(path))[1].lower().lstrip("."), "bytes": file.size}
 
 
-def describe_clouds(
+def report_of(
+    run: Run,
     subject: Volume | PointCloud,
     steps: CloudSteps,
-    settings: CloudSettings,
     device: Device,
     *,
     surface: Mesh | None,
     has_removed: bool,
     outputs: list[dict[str, Any]],
-    warnings: Sequence[str],
-    seconds: Mapping[str, float],
+    losses: Sequence[str],
 ) -> CloudReport:
     """Compose the report of a job.
 
     subject: What was read.
     has_removed: The points that went were written too.
     outputs: Results of `describe_file`.
-    warnings: Those of the job; those of the input come before them.
+    losses: Warnings of what the format of the cloud cannot hold.
     """
-    from clrecon.geometry import Volume
+    from clrecon.points import PointCloud
 
+    settings: CloudSettings = run.settings
     cloud, first = steps.cloud, steps.first.report
-    certificate: dict[str, Any] = {}
-    read = None
-    if isinstance(subject, Volume):
-        certificate = dict(subject.report) if settings.keep_ids else without_ids(subject.report)
-        affine = subject.affine.tolist()
-    else:
-        read, affine = describe_cloud(subject), subject.report.get("affine_ijk_to_lps_mm")
-    told = [*certificate.pop("warnings", []), *((read or {}).get("file") or {}).get("warnings", ())]
-    band = first.get("band_hu")
-    return CloudReport(
-        affine_ijk_to_lps_mm=affine,
-        kind=None if read is not None else settings.kind,
+    volume = None if isinstance(subject, PointCloud) else subject
+    read = describe_cloud(subject) if isinstance(subject, PointCloud) else None
+    of_file = ((read or {}).get("file") or {}).get("warnings", ())
+    of_surface = () if surface is None else surface.report["warnings"]
+    return run.report(
+        CloudReport,
+        [*of_file, *device.warnings, *steps.warnings, *of_surface, *losses],
+        volume,
+        on=device,
+        affine_ijk_to_lps_mm=first.get("affine_ijk_to_lps_mm") if volume is None else volume.affine.tolist(),
+        kind=None if volume is None else settings.kind,
         iso_value_hu=first.get("iso_value_hu"),
-        hu=band,
+        hu=first.get("band_hu"),
         label=settings.label,
         cloud_read=read,
         points=len(cloud),
@@ -121,15 +121,6 @@ def describe_clouds(
         removed_labels=name_reasons(steps.reasons) if has_removed else None,
         surface=None if surface is None else _describe_surface(surface),
         outputs=outputs,
-        device=device.label,
-        driver=device.driver,
-        memory_allowed_bytes=settings.memory,
-        version=package_version(),
-        platform=platform_name(),
-        warnings=list(dict.fromkeys([*map(str, told), *device.warnings, *warnings])),
-        volume=certificate,
-        seconds=seconds,
-        peak_memory_bytes=peak_memory_bytes(),
     )
 
 

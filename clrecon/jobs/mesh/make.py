@@ -19,8 +19,7 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface, check_known_values, choose_level, plan_surfaces
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
-from clrecon.jobs.run import DeviceOpening, Laps
-from clrecon.reading import read_selected
+from clrecon.jobs.run import Run
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, Steps
 from clrecon.system.text import format_ml
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
     from clrecon.anatomy.iso_choice import IsoChoice
     from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
-    from clrecon.mesh import Mesh
     from clrecon.opencl import Device
 
 
@@ -52,40 +50,49 @@ class MadeParts:
     origins: list[dict[str, Any]]
 
 
-def make_parts(
-    source: str | Path,
-    settings: MeshSettings,
-    progress: Progress,
-    watch: Laps,
-    check_map: Callable[[LabelMap], None] | None = None,
-) -> MadeParts:
+def make_parts(source: str | Path, run: Run, check_map: Callable[[LabelMap], None] | None = None) -> MadeParts:
     """Read a scan, extract its surfaces and select components.
 
-    watch: Gets the times of the parts.
+    run: Its settings are those of the mesh job; it gets the times of the parts.
     check_map: Called with the label map whose labels become meshes, before the device works.
     """
+    settings: MeshSettings = run.settings
+    (volume, labels), device = _read_inputs(source, run, check_map)
     surfaces = plan_surfaces(settings.levels, below=settings.below is not None)
-    volume, labels, device = _open_inputs(source, settings, progress, watch, check_map)
-    volume = mask_parts(volume, surfaces, settings, device, progress)
-    watch.lap("mask")
-    volume, surfaces, choice = _choose_surfaces(volume, surfaces, settings, device, progress, watch)
-    solid = fill_solid(volume, surfaces, settings, device.current, progress, watch)
-    surfaces, extracted = _extract_meshes(solid, surfaces, labels, device, settings, progress)
+    volume = mask_parts(volume, surfaces, settings, device, run.progress)
+    run.lap("mask")
+    check_known_values(volume, settings)
+    choice = choose_level(volume, settings, run.progress)
+    if choice is not None:
+        surfaces = plan_surfaces([choice.iso_value])
+    run.lap("choose")
+    check_levels(volume, surfaces)
+    volume = solid = mask_and_preprocess(volume, surfaces, settings, device, run.progress)
+    run.lap("mask")
+    if settings.solid:
+        solid = fill_solid(volume, surfaces, settings, device.current, run.progress)
+        run.lap("solid")
+    if labels is not None and settings.labels is not None and settings.labels_pick:
+        surfaces, extracted = extract_label_surfaces(
+            solid, surfaces, labels, settings.labels, device, settings, run.progress
+        )
+    else:
+        extracted = extract_surfaces(solid, surfaces, device, settings, run.progress, labels)
     origins = [mesh.report for mesh in extracted]
-    watch.lap("surface")
-    parts = _select_parts(volume, surfaces, extracted, device.current, settings, progress)
+    run.lap("surface")
+    steps = Steps(run.progress if settings.selects else None, "select", SELECT_STEPS * len(surfaces))
+    parts: list[Part] = []
+    for place, (surface, mesh) in enumerate(zip(surfaces, extracted, strict=True), start=1):
+        parts += select_parts(surface, mesh, settings, device.current, volume, steps)
+        steps.take(SELECT_STEPS * place - steps.done)
     return MadeParts(volume, solid, parts, device, choice, origins)
 
 
-def _open_inputs(
-    source: str | Path,
-    settings: MeshSettings,
-    progress: Progress,
-    watch: Laps,
-    check_map: Callable[[LabelMap], None] | None,
-) -> tuple[Volume, LabelMap | None, Device]:
-    """Read the input while the device opens and builds its kernels."""
-    progress("device", 0, 0)
+def _read_inputs(
+    source: str | Path, run: Run, check_map: Callable[[LabelMap], None] | None
+) -> tuple[tuple[Volume, LabelMap | None], Device]:
+    """Read the scan and its labels while the device opens and builds its kernels."""
+    settings: MeshSettings = run.settings
 
     def read_map(volume: Volume | None) -> LabelMap | None:
         labels = open_labels(settings.labels, volume)
@@ -99,62 +106,8 @@ def _open_inputs(
         decimates=settings.decimate_used is not None and settings.method != "g-mc" and settings.memory is None,
         solid=settings.solid,
     )  # fmt: skip
-    with DeviceOpening(settings.device, prepare) as opening:
-        volume, labels = read_with_labels(
-            partial(read_selected, source, settings, progress=progress),
-            None if settings.labels is None else settings.labels.path,
-            read_map,
-        )
-        watch.lap("read")
-        device = opening.wait()
-        watch.lap("device")
-    return volume, labels, device
-
-
-def _choose_surfaces(
-    volume: Volume, surfaces: list[Surface], settings: MeshSettings, device: Device, progress: Progress, watch: Laps
-) -> tuple[Volume, list[Surface], IsoChoice | None]:
-    """Return the volume for extraction, its surfaces, and the choice of the iso value if it was not given."""
-    check_known_values(volume, settings)
-    choice = choose_level(volume, settings, progress)
-    if choice is not None:
-        surfaces = plan_surfaces([choice.iso_value])
-    watch.lap("choose")
-    check_levels(volume, surfaces)
-    volume = mask_and_preprocess(volume, surfaces, settings, device, progress)
-    watch.lap("mask")
-    return volume, surfaces, choice
-
-
-def _extract_meshes(
-    volume: Volume,
-    surfaces: list[Surface],
-    labels: LabelMap | None,
-    device: Device,
-    settings: MeshSettings,
-    progress: Progress,
-) -> tuple[list[Surface], list[Mesh]]:
-    """Extract the surfaces, those of labels included, with one mesh each."""
-    if labels is not None and settings.labels is not None and settings.labels_pick:
-        return extract_label_surfaces(volume, surfaces, labels, settings.labels, device, settings, progress)
-    return surfaces, extract_surfaces(volume, surfaces, device, settings, progress, labels)
-
-
-def _select_parts(
-    volume: Volume,
-    surfaces: Sequence[Surface],
-    extracted: Sequence[Mesh],
-    device: Device,
-    settings: MeshSettings,
-    progress: Progress,
-) -> list[Part]:
-    """Select the components of each surface that are written."""
-    steps = Steps(progress if settings.selects else None, "select", SELECT_STEPS * len(surfaces))
-    parts: list[Part] = []
-    for place, (surface, mesh) in enumerate(zip(surfaces, extracted, strict=True), start=1):
-        parts += select_parts(surface, mesh, settings, device, volume, steps)
-        steps.take(SELECT_STEPS * place - steps.done)
-    return parts
+    path = None if settings.labels is None else settings.labels.path
+    return run.read_beside(prepare, lambda: read_with_labels(partial(run.read, source), path, read_map))
 
 
 def prepare_surfaces(
@@ -229,20 +182,13 @@ def mask_and_preprocess(
 
 
 def fill_solid(
-    volume: Volume,
-    surfaces: Sequence[Surface],
-    settings: MeshSettings,
-    device: Device,
-    progress: Progress,
-    watch: Laps,
+    volume: Volume, surfaces: Sequence[Surface], settings: MeshSettings, device: Device, progress: Progress
 ) -> Volume:
-    """Return the volume with what the only surface encloses filled, if the settings ask for that.
+    """Return the volume with what the only surface encloses filled.
 
     At levels of bone, spaces that are too wide for marrow stay open, and such that hold air; at others, as that of
     skin, all is filled.
     """
-    if not settings.solid:
-        return volume
     from clrecon.operators.masks.enclosed import LARGEST_MARROW_MM, fill_enclosed
 
     level = surfaces[0].iso_value
@@ -252,7 +198,6 @@ def fill_solid(
         volume, level, seal_mm=settings.seal_mm, largest_mm=LARGEST_MARROW_MM if of_bone else None, keep_air=of_bone,
         device=device, memory=settings.memory, progress=progress,
     )  # fmt: skip
-    watch.lap("solid")
     return filled
 
 

@@ -68,14 +68,15 @@ def extract_surfaces(
     levels = [surface.iso_value for surface in surfaces if surface.iso_value is not None]
     if settings.method_used in ("i-mc", "t-mc-soup", "skimage") or settings.vertex_rule != "linear":
         return [extract_one(volume, level, device, settings, labels, progress) for level in levels]
+    meshes: list[Mesh] = []
     with SurfaceExtractor(volume, device=device, memory=settings.memory) as extractor:
-        return [
-            extractor.extract(
+        for level in levels:
+            mesh = extractor.extract(
                 level, closed=settings.closed, topology=settings.topology, below=settings.below is not None,
                 progress=progress,
-            )
-            for level in levels
-        ]  # fmt: skip
+            )  # fmt: skip
+            meshes.append(mesh)
+    return meshes
 
 
 def select_parts(

@@ -7,19 +7,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from clrecon.geometry.certificate import without_ids
 from clrecon.jobs.mesh.labels import describe_label
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, describe_level
 from clrecon.jobs.presets import find_iso_preset
-from clrecon.jobs.run import RunReport, peak_memory_bytes, platform_name
-from clrecon.version import package_version
+from clrecon.jobs.run import RunReport
 
 if TYPE_CHECKING:
-    from clrecon.anatomy.iso_choice import IsoChoice
-    from clrecon.geometry import Volume
+    from clrecon.jobs.mesh.make import MadeParts
+    from clrecon.jobs.run import Run
     from clrecon.mesh import Mesh
-    from clrecon.opencl import Device
     from clrecon.system.files import StagedFile
 
 _OF_ONE = ("quality", "walls", "iso_distance", "refinement", "print", "cells", "growing")
@@ -93,6 +90,10 @@ class MeshReport(RunReport):
         *("device", "driver", "memory_allowed_bytes", "slabs", "device_bytes", "version", "platform", "warnings"),
         *("volume", *_OF_ONE, "meshes", "output", "preset_reason", "gates", "seconds", "peak_memory_bytes"),
     )
+    PARTS = (
+        *("device", "read", "upload", "build", "kernels", "download"),
+        *("mask", "choose", "solid", "select", "refine", "measure", "write"),
+    )
 
     iso_value_hu: float | None
     iso_level_hu: float | None
@@ -142,33 +143,36 @@ class MeshReport(RunReport):
     gates: list[dict[str, Any]]
 
 
-def describe_job(
-    volume: Volume,
-    parts: Sequence[Part],
+_DEVICE_PARTS = ("upload", "build", "kernels", "download")
+"""Parts whose seconds are those of the surfaces as they were extracted."""
+
+
+def report_of(
+    run: Run,
+    made: MadeParts,
     meshes: Sequence[dict[str, Any]],
-    settings: MeshSettings,
-    device: Device,
-    choice: IsoChoice | None,
-    *,
     gates: list[dict[str, Any]],
     warnings: Sequence[str],
-    seconds: Mapping[str, float],
 ) -> MeshReport:
     """Make the report of a job.
 
     meshes: Result of `describe_part` for each part.
-    choice: The choice of the iso value if it was neither given nor a preset.
     warnings: Warnings of the job; those of the volume and the meshes come before them.
     """
-    certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
-    told = [*certificate.pop("warnings", []), *_warn_of_meshes(parts, meshes)]
-    level, level_warnings = describe_level(volume, settings, choice)
-    told += level_warnings
+    settings: MeshSettings = run.settings
+    parts = made.parts
+    level, level_warnings = describe_level(made.solid, settings, made.choice)
     common = ("iso_value_hu", "iso_level_hu", "inside", "inside_hu", "inside_levels_hu")
     preset = settings.preset_used
     of_one: dict[str, Any] = {name: meshes[0][name] if len(meshes) == 1 else None for name in _OF_ONE}
-    return MeshReport(
-        affine_ijk_to_lps_mm=volume.affine.tolist(),
+    for part in _DEVICE_PARTS:
+        run.seconds[part] = sum(float(origin.get("seconds", {}).get(part, 0.0)) for origin in made.origins)
+    report = run.report(
+        MeshReport,
+        [*_warn_of_meshes(parts, meshes), *level_warnings, *warnings],
+        made.solid,
+        on=made.device.current,
+        affine_ijk_to_lps_mm=made.solid.affine.tolist(),
         **{name: _common(mesh[name] for mesh in meshes) for name in common},
         outside_hu=_common(part.mesh.report.get("outside_hu") for part in parts),
         **level,
@@ -187,26 +191,16 @@ def describe_job(
         all_parts=settings.all_parts,
         split=settings.split,
         purpose=settings.purpose,
-        device=device.label,
-        driver=device.driver,
-        memory_allowed_bytes=settings.memory,
         slabs=max((part.mesh.report.get("slabs", 1) for part in parts), default=1),
         device_bytes=_largest(part.mesh.report.get("device_bytes", {}) for part in parts),
-        version=package_version(),
-        platform=platform_name(),
-        warnings=[*dict.fromkeys(map(str, told)), *warnings],
-        volume=certificate,
         **of_one,
         meshes=list(meshes),
-        output={
-            "format": meshes[0]["output"]["format"],
-            "bytes": sum(mesh["output"]["bytes"] for mesh in meshes),
-        },
+        output={"format": meshes[0]["output"]["format"], "bytes": sum(file.size for file in run.files)},
         preset_reason=None if preset is None else find_iso_preset(preset).source,
         gates=gates,
-        seconds=seconds,
-        peak_memory_bytes=peak_memory_bytes(),
     )
+    run.logged = made.volume.report.get("warnings", ())
+    return report
 
 
 def _warn_of_meshes(parts: Sequence[Part], meshes: Sequence[dict[str, Any]]) -> list[str]:

@@ -8,35 +8,32 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.jobs.inputs import is_cloud_file, is_mesh_file, read_with_labels, refuse_scan_settings
-from clrecon.jobs.outputs import check_distinct, check_kept, commit_all
+from clrecon.jobs.outputs import check_distinct, check_kept
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.render.picture_taker import PictureTaker, read_curve, read_function, read_look
 from clrecon.jobs.render.report import (
     PictureReport,
     describe_picture,
-    describe_pictures,
     find_emptiness,
+    report_of,
     warn_of_picture,
 )
 from clrecon.jobs.render.settings import RenderSettings
-from clrecon.jobs.run import DeviceOpening, Laps, stage_report
+from clrecon.jobs.run import Run
 from clrecon.mesh import Mesh
 from clrecon.mesh.mesh_reader import read_mesh
-from clrecon.reading import read_selected
 from clrecon.rendering.pictures.modes import check_known
 from clrecon.rendering.pictures.styles import Projection, SurfaceLook
 from clrecon.system.arguments import name_parameter
 from clrecon.system.files import allow_open_files
-from clrecon.system.log import get_logger, log_warnings
-from clrecon.system.paths import keep_existing
+from clrecon.system.log import get_logger
 from clrecon.system.progress import Progress, ignore_progress
 
 if TYPE_CHECKING:
@@ -45,19 +42,14 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.points import PointCloud
     from clrecon.rendering import Rendering
-    from clrecon.system.files import Staged, StagedFile
+    from clrecon.system.files import StagedFile
 
 
 log = get_logger(__name__)
 
 
 def make_pictures(
-    source: str | Path,
-    files: PictureFiles,
-    settings: RenderSettings | None = None,
-    *,
-    no_clobber: bool = False,
-    progress: Progress | None = None,
+    source: str | Path, files: PictureFiles, settings: RenderSettings | None = None, **how: Any
 ) -> PictureReport:
     """Read a CT series or a cloud and take the pictures that are asked for.
 
@@ -67,55 +59,51 @@ def make_pictures(
 
     source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`; for mode points a file
         of points, see `clrecon.read_points`, and for mode mesh one of a mesh, see `clrecon.read_mesh`.
-    no_clobber: What exists stays and is an `OutputError`, before any work; an empty folder of frames is filled.
-    progress: ``progress(stage, done, total)``.
+    **how: See `Run`; an empty folder of frames is filled.
     """
     settings = settings or RenderSettings()
-    progress = progress or ignore_progress
     if (files.turntable is None) != (settings.turntable is None):
         raise UsageError("a turntable needs both: where it goes, and how it turns")
-    watch = Laps()
-    with keep_existing(no_clobber):
-        outputs = check_pictures(files, settings)
-    check_kept(outputs, source, *settings.files_read)
-    allow_open_files(3 * len(settings.views_used) + 2)  # 3 for each view, turntable and report
-    function = read_function(settings.transfer_function)
-    curve = read_curve(settings.curve)
-    meshes = [read_mesh(mesh.path, space=settings.mesh_space) for mesh in settings.meshes]
-
-    subject, labels, device = _open_input(source, settings, progress, watch)
-    taker = PictureTaker(
-        subject, device, settings, function=function, curve=curve, labels=labels, meshes=meshes, progress=progress
-    )
-    with (
-        keep_existing(no_clobber),
-        taker,
-        ExitStack() as staged,
-    ):  # all files are on the disk before any of them replaces an older one
-        pictures, written = _take_views(taker, settings, files, staged, watch, progress)
-        turntable, moving = _take_turntable(taker, settings, files, staged, watch, progress)
-        written += moving
-        device = device.current
-        report = describe_pictures(subject, settings, taker, device, pictures, turntable, _seconds(watch))
-        if files.report is not None:
-            written.append(staged.enter_context(stage_report(files.report, report)))
-        commit_all(written)
-    log_warnings(log, report.warnings, subject.report.get("warnings", ()))
-    log.info("%d files of pictures made on %s in %.3f s", len(written), device.label, watch.total())
+    with Run(settings, **how) as run:
+        with run.keeping():
+            outputs = check_pictures(files, settings)
+        check_kept(outputs, source, *settings.files_read)
+        allow_open_files(3 * len(settings.views_used) + 2)  # 3 for each view, turntable and report
+        function = read_function(settings.transfer_function)
+        curve = read_curve(settings.curve)
+        meshes = [read_mesh(mesh.path, space=settings.mesh_space) for mesh in settings.meshes]
+        _check_kind(source, settings)
+        (subject, labels), device = run.read_beside(
+            partial(_prepare_kernels, settings=settings), lambda: _read_input(source, run)
+        )
+        if settings.mode not in _OTHER_INPUTS:
+            subject = _mask_scan(subject, settings, device, run.progress)  # type: ignore[arg-type]
+            run.lap("mask")
+        with PictureTaker(
+            subject, device, settings,
+            function=function, curve=curve, labels=labels, meshes=meshes, progress=run.progress,
+        ) as taker:  # fmt: skip
+            pictures = [] if files.picture is None else _take_views(run, taker, files)
+            turntable = _take_turntable(run, taker, files)
+            report = report_of(run, subject, taker, device.current, pictures, turntable)
+            run.finish(report, files.report)
+    log.info("%d files of pictures made on %s in %.3f s", len(run.files), report.device, run.total())
     return report
 
 
-def _open_input(
-    source: str | Path, settings: RenderSettings, progress: Progress, watch: Laps
-) -> tuple[Volume | PointCloud | Mesh, LabelMap | None, Device]:
-    """Read the scan and its labels, the cloud or the mesh, while the device opens and builds its kernels."""
-    is_mesh = settings.mode == "mesh"
-    is_cloud = is_cloud_file(source) and not is_mesh
-    if is_mesh:
+_OTHER_INPUTS = ("mesh", "points")
+"""Modes whose input is no scan."""
+
+
+def _check_kind(source: str | Path, settings: RenderSettings) -> None:
+    """Refuse an input that the mode does not show, and settings that mean nothing for it."""
+    if settings.mode == "mesh":
         refuse_scan_settings(settings, noun="a mesh")
-    elif is_mesh_file(source):
+        return
+    is_cloud = is_cloud_file(source)
+    if is_mesh_file(source):
         raise UsageError(f"the input is a mesh, which mode mesh shows, and not mode {settings.mode}")
-    elif is_cloud != (settings.mode == "points"):
+    if is_cloud != (settings.mode == "points"):
         raise UsageError(
             f"the input is a cloud of points, which mode points shows, and not mode {settings.mode}"
             if is_cloud
@@ -123,31 +111,20 @@ def _open_input(
         )
     if is_cloud:
         refuse_scan_settings(settings)
-    progress("device", 0, 0)
-    with DeviceOpening(settings.device, partial(_prepare_kernels, settings=settings)) as opening:
-        subject: Volume | PointCloud | Mesh
-        labels = None
-        if is_mesh:
-            progress("read", 0, 0)
-            subject = read_mesh(source, space=settings.mesh_space)
-        elif is_cloud:
-            from clrecon.points.cloud_reader import read_points
 
-            progress("read", 0, 0)
-            subject = read_points(source)
-        else:
-            subject, labels = read_with_labels(
-                partial(read_selected, source, settings, progress=progress),
-                None if settings.labels is None else settings.labels.path,
-                partial(read_look, settings.labels),
-            )
-        watch.lap("read")
-        device = opening.wait()
-        watch.lap("device")
-    if not (is_cloud or is_mesh):
-        subject = _mask_scan(subject, settings, device, progress)  # type: ignore[arg-type]
-        watch.lap("mask")
-    return subject, labels, device
+
+def _read_input(source: str | Path, run: Run) -> tuple[Volume | PointCloud | Mesh, LabelMap | None]:
+    """Read the scan and its labels, the cloud or the mesh."""
+    settings: RenderSettings = run.settings
+    if settings.mode in _OTHER_INPUTS:
+        run.progress("read", 0, 0)
+        if settings.mode == "mesh":
+            return read_mesh(source, space=settings.mesh_space), None
+        from clrecon.points.cloud_reader import read_points
+
+        return read_points(source), None
+    path = None if settings.labels is None else settings.labels.path
+    return read_with_labels(partial(run.read, source), path, partial(read_look, settings.labels))
 
 
 def _mask_scan(volume: Volume, settings: RenderSettings, device: Device, progress: Progress) -> Volume:
@@ -199,46 +176,27 @@ def _prepare_kernels(device: Device, settings: RenderSettings) -> None:
         taker.take_view("anterior")
 
 
-def _take_views(
-    taker: PictureTaker,
-    settings: RenderSettings,
-    files: PictureFiles,
-    staged: ExitStack,
-    watch: Laps,
-    progress: Progress,
-) -> tuple[list[dict[str, Any]], list[Staged]]:
-    """Take the picture of each view and write it under a temporary name; returns the report's entries of them."""
+def _take_views(run: Run, taker: PictureTaker, files: PictureFiles) -> list[dict[str, Any]]:
+    """Take the picture of each view and write it under a temporary name; return the report's entries of them."""
     pictures: list[dict[str, Any]] = []
-    written: list[Staged] = []
-    if files.picture is None:
-        return pictures, written
     views = taker.views
     for place, view in enumerate(views):
-        progress("render", place, len(views) if len(views) > 1 else 0)
+        run.progress("render", place, len(views) if len(views) > 1 else 0)
         picture = taker.take_view(view)
-        watch.lap("render")
+        run.lap("render")
         name = name_view(view, views)
-        own = stage_picture(staged, picture, files, name)
-        outputs = {what: {"format": format_of(path), "bytes": file.size} for what, (path, file) in own.items()}
-        pictures.append(describe_picture(picture, name, view) | outputs)
+        pictures.append(describe_picture(picture, name, view) | _write_picture(run, picture, files, name))
         taker.warnings += warn_of_picture(picture, taker.device.warnings)
-        written += [file for _, file in own.values()]
-        watch.lap("write")
-    return pictures, written
+        run.lap("write")
+    return pictures
 
 
-def _take_turntable(
-    taker: PictureTaker,
-    settings: RenderSettings,
-    files: PictureFiles,
-    staged: ExitStack,
-    watch: Laps,
-    progress: Progress,
-) -> tuple[dict[str, Any] | None, list[Staged]]:
-    """Write the turntable frame by frame under a temporary name; returns the report's entry of it."""
+def _take_turntable(run: Run, taker: PictureTaker, files: PictureFiles) -> dict[str, Any] | None:
+    """Write the turntable frame by frame under a temporary name; return the report's entry of it."""
+    settings: RenderSettings = run.settings
     turn = settings.turntable
     if files.turntable is None or turn is None:
-        return None, []
+        return None
     from clrecon.rendering.movies import animation_kind, stage_animation, turntable_cameras
 
     first = settings.camera(taker.box, taker.views[0], turning=True)
@@ -254,28 +212,17 @@ def _take_turntable(
             empty = None if empty is None or why is None else [*empty, why]
             yield picture
 
-    progress("frames", 0, turn.frames)
-    moving = staged.enter_context(
-        stage_animation(frames(), files.turntable, turn.fps, total=turn.frames, progress=progress)
-    )
-    seconds = watch.lap("turntable")
+    run.progress("frames", 0, turn.frames)
+    moving = run.stage(stage_animation(frames(), files.turntable, turn.fps, total=turn.frames, progress=run.progress))
+    seconds = run.lap("turntable")
     taker.warnings += (empty or [])[:1]  # one frame that is not empty is enough
-    described = {
+    return {
         "frames": turn.frames,
         "fps": turn.fps,
         "degrees": turn.degrees,
         "seconds_a_frame": round(seconds / turn.frames, 4),
         "output": {"format": animation_kind(files.turntable)[1:] or "folder", "bytes": moving.size},
     }
-    return described, [moving]
-
-
-def _seconds(watch: Laps) -> dict[str, float]:
-    parts = ("device", "read", "mask", "render", "turntable", "write")
-    seconds = {part: watch.seconds.get(part, 0.0) for part in parts}
-    seconds["other"] = max(0.0, watch.total() - sum(seconds.values()))
-    seconds["total"] = watch.total()
-    return {part: round(value, 4) for part, value in seconds.items()}
 
 
 OPAQUE_ONLY = (".jpg", ".jpeg", ".mp4", ".gif")
@@ -383,32 +330,19 @@ def _check_outside_frames(folder: str | Path, owned: Sequence[tuple[str, str | P
             raise UsageError(f"{what} cannot lie in {folder}, which holds frames and nothing else: name another folder")
 
 
-def stage_picture(
-    stack: ExitStack, picture: Rendering, files: PictureFiles, name: str
-) -> dict[str, tuple[str | Path, StagedFile]]:
-    """Write a picture, and its depths and values if asked for, under temporary names.
+def _write_picture(run: Run, picture: Rendering, files: PictureFiles, name: str) -> dict[str, dict[str, Any]]:
+    """Write a picture, and its depths and values if asked for; return their entries in the report."""
+    from clrecon.rendering.pictures.picture import encode_floats
 
-    Returns: ``output`` and, if asked for, ``depth_output`` and ``values_output``: each with its path and its staged
-        file.
-    """
-    from clrecon.rendering.pictures.picture import encode_floats, encode_image
-    from clrecon.system.files import stage_file
-
-    def stage(path: str | Path, content: bytes) -> tuple[str | Path, StagedFile]:
-        def write(stream: BinaryIO) -> None:
-            stream.write(content)
-
-        named = path_of(path, name)
-        return named, stack.enter_context(stage_file(named, write, expected_bytes=len(content)))
+    def entry(path: str | Path, file: StagedFile) -> dict[str, Any]:
+        return {"format": format_of(path), "bytes": file.size}
 
     assert files.picture is not None
-    staged = {"output": stage(files.picture, encode_image(picture, f".{format_of(files.picture)}"))}
-    if files.depth is not None:
-        staged["depth_output"] = stage(
-            files.depth, encode_floats(picture.depth, f".{format_of(files.depth)}", picture.pixel_mm)
-        )
-    if files.values is not None and picture.values is not None:
-        staged["values_output"] = stage(
-            files.values, encode_floats(picture.values, f".{format_of(files.values)}", picture.pixel_mm)
-        )
-    return staged
+    path = path_of(files.picture, name)
+    outputs = {"output": entry(path, run.write_picture(path, picture))}
+    for what, named, floats in (("depth", files.depth, picture.depth), ("values", files.values, picture.values)):
+        if named is not None and floats is not None:
+            path = path_of(named, name)
+            content = encode_floats(floats, f".{format_of(path)}", picture.pixel_mm)
+            outputs[f"{what}_output"] = entry(path, run.write(path, content))
+    return outputs

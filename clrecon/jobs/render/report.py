@@ -7,16 +7,14 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from clrecon.anatomy.head import SKIN_SEEN_HU, warn_of_face
-from clrecon.geometry.certificate import without_ids
 from clrecon.jobs.inputs import describe_cloud
 from clrecon.jobs.render.settings import LabelLook, RenderSettings
-from clrecon.jobs.run import RunReport, peak_memory_bytes, platform_name
+from clrecon.jobs.run import Run, RunReport
 from clrecon.rendering.pictures.annotations import edge_letters
 from clrecon.rendering.pictures.label_style import NO_LABEL, find_shown
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, Style, SurfaceLook, VolumeLook
 from clrecon.system.arguments import name_parameter
-from clrecon.version import package_version
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -137,6 +135,8 @@ class PictureReport(RunReport):
     pictures: See `describe_picture`, with the files.
     """
 
+    PARTS = ("device", "read", "mask", "render", "turntable", "write")
+
     mode: str
     preset: str | None
     transfer_function: Mapping[str, Any] | None
@@ -158,14 +158,13 @@ class PictureReport(RunReport):
     turntable: Mapping[str, Any] | None
 
 
-def describe_pictures(
+def report_of(
+    run: Run,
     subject: Volume | PointCloud | Mesh,
-    settings: RenderSettings,
     taker: PictureTaker,
     device: Device,
     pictures: Sequence[dict[str, Any]],
     turntable: dict[str, Any] | None,
-    seconds: Mapping[str, float],
 ) -> PictureReport:
     """Compose the report of a job.
 
@@ -175,22 +174,22 @@ def describe_pictures(
     from clrecon.geometry import Volume
     from clrecon.points import PointCloud
 
+    settings: RenderSettings = run.settings
     volume = subject if isinstance(subject, Volume) else None
-    certificate: dict[str, Any] = {}
-    if volume is not None:
-        certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
-    warnings = [str(text) for text in certificate.pop("warnings", [])] + device.warnings + taker.warnings
-    if volume is not None:
-        warnings += warn_of_face(volume, _skin_shown(taker.style), "picture")
     cloud = describe_cloud(subject) if isinstance(subject, PointCloud) else None
     meshes = _describe_meshes(subject, settings, taker)
     files = [(each or {}).get("file") or {} for each in (cloud, *meshes)]
-    warnings = [*(text for file in files for text in file.get("warnings", ())), *warnings]
+    face = [] if volume is None else warn_of_face(volume, _skin_shown(taker.style), "picture")
     style, lighting = taker.style, taker.lighting
     clip = getattr(style, "clip", None)
     surface = style if isinstance(style, SurfaceLook) else None
     colored = style if isinstance(style, SurfaceLook | PointLook | MeshLook) else None
-    return PictureReport(
+    return run.report(
+        PictureReport,
+        [*device.warnings, *taker.warnings, *face],
+        volume,
+        on=device,
+        before=[text for file in files for text in file.get("warnings", ())],
         affine_ijk_to_lps_mm=subject.report.get("affine_ijk_to_lps_mm") if volume is None else volume.affine.tolist(),
         mode=style.mode,
         preset=settings.preset_used,
@@ -211,15 +210,6 @@ def describe_pictures(
         cloud=cloud,
         pictures=list(pictures),
         turntable=turntable,
-        device=device.label,
-        driver=device.driver,
-        memory_allowed_bytes=settings.memory,
-        version=package_version(),
-        platform=platform_name(),
-        warnings=list(dict.fromkeys(warnings)),
-        volume=certificate,
-        seconds=seconds,
-        peak_memory_bytes=peak_memory_bytes(),
     )
 
 

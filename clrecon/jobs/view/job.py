@@ -3,32 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.exchange.formats import MESH_INPUTS, stage_assembly, stage_mesh
+from clrecon.exchange.formats import MESH_INPUTS
 from clrecon.exchange.page import read_facts
-from clrecon.geometry.certificate import without_ids
 from clrecon.jobs.distance import doubt_frames, read_side
 from clrecon.jobs.mesh.bone import judge_surfaces
 from clrecon.jobs.mesh.make import make_parts
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.outputs import check_kept, commit_all
-from clrecon.jobs.run import Laps, peak_memory_bytes, platform_name
+from clrecon.jobs.outputs import commit_all
+from clrecon.jobs.run import JobReport, Run
 from clrecon.jobs.view.inputs import ViewSettings
 from clrecon.mesh import Mesh
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.system.arguments import name_parameter
-from clrecon.system.files import check_writable
 from clrecon.system.log import get_logger, log_warnings
-from clrecon.system.paths import keep_existing
-from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.records import Record
 from clrecon.system.text import escape_text
-from clrecon.version import package_version
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -59,9 +52,7 @@ def write_view(
     inputs: Sequence[str | Path],
     output: str | Path,
     settings: ViewSettings | None = None,
-    *,
-    no_clobber: bool = False,
-    progress: Progress | None = None,
+    **how: Any,
 ) -> ViewReport:
     """Write a page that shows scans and meshes together, each in its place.
 
@@ -70,47 +61,38 @@ def write_view(
 
     inputs: Scans, as `clrecon.read_volume` takes them, and mesh files, as `clrecon.read_mesh` takes them.
     output: ``.html``.
-    no_clobber: A file of that name stays and is an `OutputError`, before any work.
-    progress: ``progress(stage, done, total)``.
+    **how: See `Run`.
     """
-    settings, progress = settings or ViewSettings(), progress or ignore_progress
-    watch = Laps()
-    _check_inputs(inputs, output, settings)
-    with keep_existing(no_clobber):
-        check_writable(output)
-    check_kept([("the page", output)], *inputs, None if settings.scan.labels is None else settings.scan.labels.path)
-    # Mesh files first: they are read in a moment, and a wrong one is said before the device works on a scan.
-    order = sorted(range(len(inputs)), key=lambda place: not is_mesh_file(inputs[place]))
-    found = {place: _read_input(inputs[place], settings, progress, watch) for place in order}
-    shown = [found[place] for place in range(len(inputs))]
-    meshes = _name_and_color(shown, settings)
-    warnings = [text for one in shown for text in one.warnings] + _doubt_frames(shown)
-    progress("write", 0, 0)
-    space, keep_ids = settings.scan.space, settings.scan.keep_ids
-    stage = stage_mesh(meshes[0], output, space, keep_ids=keep_ids) if len(meshes) == 1 else None
-    with keep_existing(no_clobber), ExitStack() as staged:
-        file = staged.enter_context(stage or stage_assembly(meshes, output, space, keep_ids=keep_ids))
-        commit_all([file])
-    watch.lap("write")
-    facts = read_facts(output)
-    report = ViewReport(
-        inputs=[one.entry for one in shown],
-        parts=[
-            {"name": part["name"], "triangles": part["count"], "ml": part["ml"], "color": part["color"]}
-            for part in facts["parts"]
-        ],
-        vertices=facts["vertices"],
-        triangles=facts["triangles"],
-        half_step_mm=facts["half_step_mm"],
-        space=space,
-        output={"format": "html", "bytes": file.size},
-        device=next((one.device for one in shown if one.device), None),
-        version=package_version(),
-        platform=platform_name(),
-        warnings=list(dict.fromkeys(warnings)),
-        seconds={part: round(value, 4) for part, value in {**watch.seconds, "total": watch.total()}.items()},
-        peak_memory_bytes=peak_memory_bytes(),
-    )
+    settings = settings or ViewSettings()
+    with Run(settings.scan, **how) as run:
+        _check_inputs(inputs, output, settings)
+        labels = settings.scan.labels
+        run.check([("the page", output)], *inputs, None if labels is None else labels.path)
+        # Mesh files first: they are read in a moment, and a wrong one is said before the device works on a scan.
+        order = sorted(range(len(inputs)), key=lambda place: not is_mesh_file(inputs[place]))
+        found = {place: _read_input(inputs[place], settings, run) for place in order}
+        shown = [found[place] for place in range(len(inputs))]
+        meshes = _name_and_color(shown, settings)
+        warnings = [text for one in shown for text in one.warnings] + _doubt_frames(shown)
+        file = run.write_meshes(meshes, [output])[0] if len(meshes) == 1 else run.write_together(meshes, output)
+        run.lap("write")
+        commit_all(run.files)
+        facts = read_facts(output)
+        report = run.report(
+            ViewReport,
+            warnings,
+            inputs=[one.entry for one in shown],
+            parts=[
+                {"name": part["name"], "triangles": part["count"], "ml": part["ml"], "color": part["color"]}
+                for part in facts["parts"]
+            ],
+            vertices=facts["vertices"],
+            triangles=facts["triangles"],
+            half_step_mm=facts["half_step_mm"],
+            space=settings.scan.space,
+            output={"format": "html", "bytes": file.size},
+            device=next((one.device for one in shown if one.device), None),
+        )
     log_warnings(log, report.warnings)
     return report
 
@@ -146,15 +128,15 @@ def _is_set(value: object, default: object) -> bool:
     return value != default and not (isinstance(value, Sequence) and not value)
 
 
-def _read_input(path: str | Path, settings: ViewSettings, progress: Progress, watch: Laps) -> _ShownInput:
+def _read_input(path: str | Path, settings: ViewSettings, run: Run) -> _ShownInput:
     if is_mesh_file(path):
-        progress("read", 0, 0)
+        run.progress("read", 0, 0)
         shown = _read_mesh(path, settings)
-        watch.lap("read")
+        run.lap("read")
         return shown
-    made = make_parts(path, settings.scan, progress, watch)
+    made = make_parts(path, run)
     judge_surfaces(made.parts, made.volume, settings.scan)
-    watch.lap("select")
+    run.lap("select")
     meshes = []
     for part in made.parts:
         if len(made.parts) > 1 and "part_name" not in part.mesh.report:
@@ -163,7 +145,7 @@ def _read_input(path: str | Path, settings: ViewSettings, progress: Progress, wa
     return _ShownInput(
         meshes,
         {
-            **_describe_scan(path, made.volume, meshes, settings),
+            **_describe_scan(path, made.volume, meshes, run),
             "surface": ", ".join(dict.fromkeys(part.surface.describe() for part in made.parts)),
         },
         [
@@ -192,8 +174,8 @@ def _read_mesh(path: str | Path, settings: ViewSettings) -> _ShownInput:
     return _ShownInput([mesh], entry, list(file["warnings"]))
 
 
-def _describe_scan(path: str | Path, volume: Volume, meshes: Sequence[Mesh], settings: ViewSettings) -> dict[str, Any]:
-    certificate = dict(volume.report) if settings.scan.keep_ids else without_ids(volume.report)
+def _describe_scan(path: str | Path, volume: Volume, meshes: Sequence[Mesh], run: Run) -> dict[str, Any]:
+    certificate = run.certificate(volume)
     certificate.pop("warnings", None)
     return {
         "name": escape_text(Path(path).name),
@@ -235,7 +217,7 @@ def _doubt_frames(shown: Sequence[_ShownInput]) -> list[str]:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ViewReport(Record):
+class ViewReport(JobReport):
     """Report of `write_view`.
 
     inputs: Each input: ``name`` of the file or folder without those above it, ``kind`` ("scan", "STL" ...), ``space``
@@ -247,6 +229,8 @@ class ViewReport(Record):
     device: None where no input is a scan.
     """
 
+    _LAST = ("device", *JobReport._LAST)
+
     inputs: list[dict[str, Any]]
     parts: list[dict[str, Any]]
     vertices: int
@@ -255,8 +239,3 @@ class ViewReport(Record):
     space: str
     output: Mapping[str, Any]
     device: str | None
-    version: str
-    platform: str
-    warnings: list[str]
-    seconds: Mapping[str, float]
-    peak_memory_bytes: int | None

@@ -136,7 +136,7 @@ def test_a_step_that_fails_leaves_the_old_files(
     else:
         home = {
             "encode_floats": "clrecon.rendering.pictures.picture.encode_floats",
-            "stage_report": "clrecon.jobs.render.job.stage_report",
+            "stage_report": "clrecon.jobs.run.stage_report",
             "stage_animation": "clrecon.rendering.movies.stage_animation",
             "commit": "clrecon.system.files.StagedFile.commit",
         }[fails]
@@ -160,7 +160,7 @@ def test_a_folder_of_frames_waits_for_the_report(
 
     other = replace(settings, turntable=Turntable(3), views=("left",))
     with monkeypatch.context() as patch, pytest.raises(OutputError, match="full"):
-        patch.setattr("clrecon.jobs.render.job.stage_report", fail)
+        patch.setattr("clrecon.jobs.run.stage_report", fail)
         make_pictures(sphere[0], PictureFiles(turntable=frames, report=tmp_path / "a.json"), other)
     assert {path.name: path.read_bytes() for path in frames.iterdir()} == older
     assert [path.name for path in tmp_path.iterdir()] == ["frames"]
