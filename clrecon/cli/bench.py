@@ -98,7 +98,9 @@ def _describe_device(entry: dict[str, Any]) -> list[str]:
     if peer is not None:
         threads = f"{peer['threads']} thread{'s' * (peer['threads'] != 1)}"
         rows.append(("flying edges", _seconds(peer["seconds"]["median"]), f"{_range(peer['seconds'])}, {threads}"))
-        rows.append(("ratio", f"{entry['ratio']['median']:.2f}", _ratio_range(entry["ratio"])))
+        ratio = entry["ratio"]
+        spread = f"quartiles {ratio['q1']:.2f} to {ratio['q3']:.2f}, above 1 clrecon is faster"
+        rows.append(("ratio", f"{ratio['median']:.2f}", spread))
     voxels, triangles = (format_digits(entry[name], 2) for name in ("mvoxels_per_s", "mtriangles_per_s"))
     rates = f"{voxels} Mvoxel/s, {triangles} Mtriangle/s"
     counts = f"{entry['vertices']:,} vertices, {entry['triangles']:,} triangles"
@@ -111,7 +113,3 @@ def _seconds(value: float) -> str:
 
 def _range(spread: dict[str, float]) -> str:
     return f"quartiles {_seconds(spread['q1'])} to {_seconds(spread['q3'])}"
-
-
-def _ratio_range(spread: dict[str, float]) -> str:
-    return f"quartiles {spread['q1']:.2f} to {spread['q3']:.2f}, above 1 clrecon is faster"

@@ -7,10 +7,21 @@ import math
 from dataclasses import fields
 from typing import Any
 
-from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes, pick
+from clrecon.cli.common import (
+    add_cropping,
+    add_device,
+    add_keep_ids,
+    add_masking,
+    add_memory,
+    add_no_clobber,
+    add_reading,
+    describe_times,
+    megabytes,
+    parse_point,
+    pick,
+)
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
-from clrecon.cli.options import add_cropping, add_masking, add_reading, parse_point
 from clrecon.jobs.cloud.settings import DENOISERS, GHOSTS, POINT_KINDS, STEPS, CloudSettings
 from clrecon.jobs.inputs import CLOUD_INPUTS
 from clrecon.system.text import count_of, format_band
@@ -49,7 +60,6 @@ def parse_denoisers(text: str) -> tuple[str, ...]:
     return tuple(part.strip().lower() for part in text.split(","))
 
 
-_PARTS = ("device", "read", "mask", "steps", "surface", "write", "other")
 _EXAMPLES = """\
 examples:
   clrecon cloud CT_FOLDER -o bone.ply
@@ -261,7 +271,7 @@ def describe_cloud_job(report: dict[str, Any]) -> list[str]:
         f"cloud    {count_of(report['points'], 'point')}{_describe_known(report)}",
         *_describe_surface(report["surface"]),
         f"device   {printable(report['device'])}",
-        f"time     {_describe_times(report['seconds'])}",
+        f"time     {describe_times(report['seconds'])}",
     ]
 
 
@@ -329,8 +339,3 @@ def _describe_surface(surface: dict[str, Any] | None) -> list[str]:
     return [
         f"surface  {surface['vertices']:,} vertices, {surface['triangles']:,} triangles, closed, {against}, {walls}"
     ]
-
-
-def _describe_times(seconds: dict[str, float]) -> str:
-    parts = ", ".join(f"{part} {seconds[part]:.2f}" for part in _PARTS if seconds.get(part, 0.0) >= 0.005)
-    return f"{seconds['total']:.2f} s ({parts})"

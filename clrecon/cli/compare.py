@@ -7,10 +7,19 @@ from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
-from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, pick, table
+from clrecon.cli.common import (
+    add_device,
+    add_keep_ids,
+    add_masking,
+    add_memory,
+    add_no_clobber,
+    add_reading,
+    parse_hu,
+    pick,
+    table,
+)
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
-from clrecon.cli.options import add_masking, add_reading, parse_hu
 from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 from clrecon.proof.compare.methods import COMPARED
 
@@ -147,7 +156,9 @@ def run(options: argparse.Namespace, console: Console) -> int:
     console.result(report)
     for line in _describe(report):
         console.say(line)
-    console.say(f"wrote    {printable(options.output)}: index.html, report.json and {_count_pictures(report)} pictures")
+    named = [method[which] for method in report["methods"] for which in ("picture", "difference")]
+    pictures = sum(name is not None for name in named) + 2 * len(report["slices"])
+    console.say(f"wrote    {printable(options.output)}: index.html, report.json and {pictures} pictures")
     for warning in report["warnings"]:
         console.warn(warning)
     return PARTLY_DONE if any(_is_missed(method, options.methods) for method in report["methods"]) else 0
@@ -156,11 +167,6 @@ def run(options: argparse.Namespace, console: Console) -> int:
 def _is_missed(method: dict[str, Any], asked: Sequence[str]) -> bool:
     """True for a method that failed, or that was asked for by name and did not run."""
     return method["state"] == "failed" or (method["state"] != "done" and method["name"] in asked)
-
-
-def _count_pictures(report: dict[str, Any]) -> int:
-    named = [method[which] for method in report["methods"] for which in ("picture", "difference")]
-    return sum(name is not None for name in named) + 2 * len(report["slices"])
 
 
 def _describe(report: dict[str, Any]) -> list[str]:

@@ -10,7 +10,8 @@ import sys
 import tempfile
 import textwrap
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -337,8 +338,9 @@ _FILES = {"output": "-o", "csv": "--csv"}
 _PIECE = 1 << 20
 
 
-def run_with_streams(command: str, run: Callable[[], int], options: argparse.Namespace, console: Console) -> int:
-    """Run a command; what it should write to ``-`` goes to standard output once the command is done.
+@contextmanager
+def filled_streams(command: str, options: argparse.Namespace, console: Console) -> Iterator[None]:
+    """Let a command run in the block; what it should write to ``-`` goes to standard output once it is done.
 
     A file is made as a whole first, checked as any other, and then copied: nothing of it appears if the command fails.
     """
@@ -347,7 +349,8 @@ def run_with_streams(command: str, run: Callable[[], int], options: argparse.Nam
     has_report = getattr(options, "report", None) == DASH
     takers = [_FILES[name] for name in wanted] + ["--report"] * has_report
     if not takers:
-        return run()
+        yield
+        return
     if len(takers) > 1 or (wanted and options.json):
         both = " and ".join([*takers, *(["--json"] * bool(wanted and options.json))])
         raise UsageError(f"{both} cannot share standard output: name a file for one of them")
@@ -356,14 +359,17 @@ def run_with_streams(command: str, run: Callable[[], int], options: argparse.Nam
     if has_report:
         console.stream_result()
         options.report, options.json = None, True  # measured and made as with --json
-        return run()
-    return _stream_file(command, run, options, console, *next(iter(wanted.items())))
+        yield
+        return
+    with _streamed_file(command, options, console, *next(iter(wanted.items()))):
+        yield
 
 
-def _stream_file(
-    command: str, run: Callable[[], int], options: argparse.Namespace, console: Console, option: str, value: str
-) -> int:
-    """Run a command with one of its files in a folder of its own, and copy it to standard output."""
+@contextmanager
+def _streamed_file(
+    command: str, options: argparse.Namespace, console: Console, option: str, value: str
+) -> Iterator[None]:
+    """Let a command write one of its files in a folder of its own, and copy it to standard output."""
     extension = ".csv" if option == "csv" else STREAMED.get(command)
     if extension is None:
         raise UsageError(f"{_FILES[option]} {value}: {command} writes several files, which one stream cannot hold")
@@ -377,14 +383,13 @@ def _stream_file(
         path = Path(folder) / f"stream{extension if value == DASH else value[1:]}"
         setattr(options, option, str(path))
         console.stream_file(str(path), _NAME)
-        code = run()
+        yield
         made = sorted(os.listdir(folder))
         if made != [path.name]:
             raise UsageError(f"{_FILES[option]} {value}: {len(made)} files were made, and one stream holds one")
         with open(path, "rb") as stream:
             while piece := stream.read(_PIECE):
                 console.send(piece)
-        return code
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 

@@ -5,10 +5,17 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes
+from clrecon.cli.common import (
+    add_device,
+    add_keep_ids,
+    add_memory,
+    add_no_clobber,
+    add_reading,
+    megabytes,
+    parse_levels,
+)
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
-from clrecon.cli.options import add_reading, parse_levels
 from clrecon.errors import UsageError
 from clrecon.jobs.outputs import MESH_FILES
 

@@ -6,10 +6,19 @@ import argparse
 from dataclasses import fields
 from typing import Any
 
-from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes, pick
+from clrecon.cli.common import (
+    add_cropping,
+    add_device,
+    add_keep_ids,
+    add_masking,
+    add_memory,
+    add_no_clobber,
+    add_reading,
+    megabytes,
+    pick,
+)
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
-from clrecon.cli.options import add_cropping, add_masking, add_reading
 
 _PARTS = ("read", "mask", "resample", "write")
 _EPILOG = """\

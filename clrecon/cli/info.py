@@ -15,9 +15,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
-from clrecon.cli.common import pick
+from clrecon.cli.common import add_reading, pick
 from clrecon.cli.console import Console, is_terminal, printable
-from clrecon.cli.options import add_reading
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -6,10 +6,18 @@ import argparse
 import math
 from typing import Any
 
-from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, describe_space, megabytes, pick
+from clrecon.cli.common import (
+    add_device,
+    add_keep_ids,
+    add_memory,
+    add_no_clobber,
+    add_reading,
+    describe_space,
+    megabytes,
+    pick,
+)
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
-from clrecon.cli.options import add_reading
 from clrecon.jobs.inside import DEFAULT_VIEW
 from clrecon.jobs.outputs import MESH_FILES
 from clrecon.system.text import format_volume

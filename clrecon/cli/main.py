@@ -10,12 +10,13 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
+from functools import partial
 from importlib import import_module
 from types import FrameType
 from typing import NamedTuple
 
 from clrecon.cli.common import EXIT_CODES, Parser, guard, has_hung_device
-from clrecon.cli.console import Console, run_with_streams
+from clrecon.cli.console import Console, filled_streams
 from clrecon.errors import UsageError
 from clrecon.system.arguments import Speaker, in_python, spoken_by
 from clrecon.system.foreign_words import own_streams
@@ -117,7 +118,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     console = Console(as_json="--json" in flags)
     debug = "--debug" in flags
     with own_streams(show=debug):
-        return guard(lambda: _dispatch(arguments, console), console, debug)
+        return guard(partial(_dispatch, arguments, console), console, debug)
 
 
 def run() -> None:
@@ -174,8 +175,12 @@ def _dispatch(arguments: list[str], console: Console) -> int:
         raise UsageError(f"no command given: use one of {', '.join(COMMANDS)} (see: clrecon --help)")
     console.set_loudness(quiet=options.quiet, verbose=options.verbose)
     limit = getattr(options, "timeout", None)
-    with spoken_by(speaker_of(commands.choices[called])), time_limit(DEFAULT_SECONDS if limit is None else limit):
-        return run_with_streams(called, lambda: int(module.run(options, console)), options, console)
+    with (
+        spoken_by(speaker_of(commands.choices[called])),
+        time_limit(DEFAULT_SECONDS if limit is None else limit),
+        filled_streams(called, options, console),
+    ):
+        return int(module.run(options, console))
 
 
 def _as_help_option(arguments: list[str]) -> list[str]:

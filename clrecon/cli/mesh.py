@@ -7,13 +7,21 @@ from dataclasses import fields
 from typing import Any
 
 from clrecon.cli.common import (
+    LEVELS_HELP,
+    add_cropping,
     add_device,
     add_fields,
     add_keep_ids,
+    add_masking,
     add_memory,
     add_no_clobber,
+    add_reading,
     describe_space,
+    describe_times,
     megabytes,
+    parse_hu,
+    parse_levels,
+    parse_point,
     pick,
 )
 from clrecon.cli.console import Console, printable
@@ -29,8 +37,9 @@ from clrecon.cli.mesh_options import (
     finish_with_gates,
     label_choice,
 )
-from clrecon.cli.options import LEVELS_HELP, add_cropping, add_masking, add_reading, parse_hu, parse_levels, parse_point
-from clrecon.jobs.mesh.settings import MeshSettings, is_label_seed, settings_for
+from clrecon.jobs.mesh.purposes import settings_for
+from clrecon.jobs.mesh.seeds import is_label_seed
+from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.outputs import MESH_FILES, OBJECT_FILES
 from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 from clrecon.system.text import count_of, format_digits, format_ml, format_volume
@@ -237,7 +246,7 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
         *describe_refinement(report["meshes"]),
         *describe_purposes(report["meshes"]),
         f"device   {printable(report['device'])}{_describe_slabs(report)}",
-        f"time     {_describe_times(report['seconds'])}",
+        f"time     {describe_times(report['seconds'], _PARTS)}",
     ]
 
 
@@ -333,8 +342,3 @@ def _describe_quality(report: dict[str, Any]) -> list[str]:
     volume = "" if report["volume_ml"] is None else f", {format_volume(report['volume_ml'])}"
     parts = f"{report['components']:,} component{'s' * (report['components'] != 1)}"
     return [f"         {parts}, {closed}, {manifold}, {report['area_mm2']:,.0f} mm2{volume}"]
-
-
-def _describe_times(seconds: dict[str, float]) -> str:
-    parts = ", ".join(f"{part} {seconds[part]:.2f}" for part in _PARTS if seconds.get(part, 0.0) >= 0.005)
-    return f"{seconds['total']:.2f} s ({parts})"

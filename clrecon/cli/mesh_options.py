@@ -7,8 +7,8 @@ import argparse
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from clrecon.cli.common import parse_point
 from clrecon.cli.console import Console
-from clrecon.cli.options import parse_point
 from clrecon.errors import UsageError
 from clrecon.jobs.presets import PURPOSES, Purpose
 from clrecon.system.text import count_of, format_digits, format_ml, format_volume

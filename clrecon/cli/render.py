@@ -5,10 +5,19 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes
+from clrecon.cli.common import (
+    add_cropping,
+    add_device,
+    add_keep_ids,
+    add_masking,
+    add_memory,
+    add_no_clobber,
+    add_reading,
+    describe_times,
+    megabytes,
+)
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
-from clrecon.cli.options import add_cropping, add_masking, add_reading
 from clrecon.cli.render_options import (
     add_camera,
     add_clipping,
@@ -20,7 +29,7 @@ from clrecon.cli.render_options import (
     render_settings,
 )
 from clrecon.errors import UsageError
-from clrecon.jobs.inputs import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file, is_mesh_file
+from clrecon.jobs.inputs import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file, is_only_mesh
 from clrecon.jobs.render.settings import MeshFile, color_apart, describe_modes, describe_presets
 from clrecon.system.text import count_of
 
@@ -106,7 +115,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     files = PictureFiles(options.output, options.depth, options.values, options.turntable, options.report)
     if options.mode is None and is_cloud_file(options.input):
         options.mode = "points"
-    if options.mode is None and is_mesh_file(options.input):
+    if options.mode is None and is_only_mesh(options.input):
         options.mode = "mesh"
     report = make_pictures(
         options.input, files, render_settings(options), no_clobber=options.no_clobber, progress=console.progress
@@ -146,7 +155,7 @@ def describe_report(report: dict[str, Any]) -> list[str]:
         *(f"         {line}" for line in _describe_labels(report["pictures"])),
         *(f"mesh     {line}" for line in map(_describe_mesh, report["meshes"][report["mode"] == "mesh" :])),
         f"device   {printable(report['device'])}",
-        f"time     {_describe_times(report['seconds'])}",
+        f"time     {describe_times(report['seconds'], _PARTS)}",
     ]
 
 
@@ -241,8 +250,3 @@ def _describe_files(report: dict[str, Any], files: Any) -> list[str]:
     if files.report:
         lines.append(f"report   {printable(files.report)}")
     return lines
-
-
-def _describe_times(seconds: dict[str, float]) -> str:
-    parts = ", ".join(f"{part} {seconds[part]:.2f}" for part in _PARTS if seconds.get(part, 0.0) >= 0.005)
-    return f"{seconds['total']:.2f} s ({parts})"

@@ -8,10 +8,9 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from clrecon.cli.common import add_keep_ids, add_no_clobber, table
+from clrecon.cli.common import add_keep_ids, add_no_clobber, add_reading, table
 from clrecon.cli.console import Console, is_terminal, printable
 from clrecon.cli.mesh import describe_volume
-from clrecon.cli.options import add_reading
 
 _EPILOG = """\
 Each voxel counts with its own volume: slices that lie unevenly are right. A label map on another grid is brought to

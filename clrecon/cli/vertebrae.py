@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_keep_ids, add_no_clobber, megabytes, pick, table
+from clrecon.cli.common import add_keep_ids, add_no_clobber, add_reading, megabytes, parse_point, pick, table
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
-from clrecon.cli.options import add_reading, parse_point
 from clrecon.system.text import count_of
 
 PARTLY = 8

@@ -6,11 +6,21 @@ import argparse
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
-from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes, pick, table
+from clrecon.cli.common import (
+    add_cropping,
+    add_device,
+    add_keep_ids,
+    add_masking,
+    add_memory,
+    add_no_clobber,
+    add_reading,
+    megabytes,
+    pick,
+    table,
+)
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import add_levels, add_selection, add_solid, describe_volume
 from clrecon.cli.mesh_options import add_label_arguments, label_choice
-from clrecon.cli.options import add_cropping, add_masking, add_reading
 from clrecon.errors import UsageError
 from clrecon.system.text import format_volume
 

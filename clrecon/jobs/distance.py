@@ -125,12 +125,14 @@ def measure_meshes(
     mesh, reference: Files A and B, see `clrecon.read_mesh`.
     **how: See `Run`.
     """
+    from clrecon.operators import take_device
+
     files, settings = files or DistanceFiles(), settings or DistanceSettings()
     with Run(settings, **how) as run:
         _check_formats(files)
         named = [("the coloured mesh", files.output), ("the picture", files.picture), ("the report", files.report)]
         run.check(named, mesh, reference)
-        device = None if files.picture is None else _open_device(settings.device)
+        device = None if files.picture is None else take_device(settings.device)
         run.progress("read", 0, 0)
         meshes = [read_side(path, settings.mesh_space) for path in (mesh, reference)]
         entries = [describe_mesh(own, path) for own, path in zip(meshes, (mesh, reference), strict=True)]
@@ -183,12 +185,6 @@ def _check_formats(files: DistanceFiles) -> None:
     if files.picture is not None:
         load_pillow()
         check_image_path(files.picture)
-
-
-def _open_device(name: str | None) -> Device:
-    from clrecon.operators import take_device
-
-    return take_device(name)
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from clrecon.points import PointCloud
 
 
-MESH_ONLY = tuple(extension for extension in MESH_INPUTS if extension not in CLOUD_INPUTS)
-"""Extensions of files that are read as meshes, and not as clouds."""
-
 OTHER_CLOUDS = (".pcd", ".e57", ".laz", ".pts", ".ptx", ".asc")
 """Extensions of clouds that are not read."""
 
@@ -38,9 +35,15 @@ def is_cloud_file(source: str | Path) -> bool:
     return os.path.splitext(os.fspath(source))[1].lower() in CLOUD_INPUTS and not os.path.isdir(source)
 
 
-def is_mesh_file(source: str | Path) -> bool:
+def is_only_mesh(source: str | Path) -> bool:
     """True for a file, or the name of one, whose extension only meshes have; that of PLY is one of clouds too."""
-    return os.path.splitext(os.fspath(source))[1].lower() in MESH_ONLY and not os.path.isdir(source)
+    extension = os.path.splitext(os.fspath(source))[1].lower()
+    return extension in MESH_INPUTS and extension not in CLOUD_INPUTS and not os.path.isdir(source)
+
+
+def may_be_mesh(source: str | Path) -> bool:
+    """True for a file that can be read as a mesh, by its extension, where clouds are no input."""
+    return os.path.splitext(os.fspath(source))[1].lower() in MESH_INPUTS
 
 
 def refuse_other_clouds(source: str | Path) -> None:

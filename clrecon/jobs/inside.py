@@ -165,6 +165,7 @@ def make_inside(
     report_path: File for the report as JSON.
     **how: See `Run`.
     """
+    from clrecon.labels import file_suffixes
     from clrecon.operators.vertebrae.inside import PARTS
     from clrecon.operators.vertebrae.solid import CLOSE_MM
 
@@ -175,14 +176,15 @@ def make_inside(
         with DeviceOpening(settings.device, _prepare_kernels) as opening:
             volume, labels = run.read_labelled(source)
             device = opening.wait()
-        suffixes = _name_labels(labels, settings)
+        numbers = list(dict.fromkeys(labels.find(label) for label in settings.only))
+        suffixes = list(file_suffixes({number: labels.name(number) for number in numbers}).values())
         several = len(suffixes) > 1
         if run.no_clobber:
             names = [name_part(suffix, part, several=several) for suffix in suffixes for part in PARTS]
             refuse_files(name_outputs(output, names) + ([] if picture is None else name_outputs(picture, names)))
         run.lap("read")
         found: list[_FoundVertebra] = []
-        for number, suffix in zip(_find_numbers(labels, settings), suffixes, strict=True):
+        for number, suffix in zip(numbers, suffixes, strict=True):
             run.progress("inside", len(found), len(suffixes) if several else 0)
             inside = _look_inside(volume, labels, number, settings, device)
             found.append(_FoundVertebra(suffix, inside, inside.extract_meshes(memory=settings.memory)))
@@ -252,17 +254,6 @@ def _prepare_kernels(device: Device) -> None:
     from clrecon.operators.surface.label_masks import prepare_label_masks
 
     prepare_label_masks(device)
-
-
-def _find_numbers(labels: LabelMap, settings: InsideSettings) -> list[int]:
-    return list(dict.fromkeys(labels.find(label) for label in settings.only))
-
-
-def _name_labels(labels: LabelMap, settings: InsideSettings) -> list[str]:
-    """Return the names of the vertebrae in files and in the report."""
-    from clrecon.labels import file_suffixes
-
-    return list(file_suffixes({number: labels.name(number) for number in _find_numbers(labels, settings)}).values())
 
 
 def name_part(suffix: str, part: str, *, several: bool) -> str:

@@ -176,10 +176,6 @@ class InputSettings(Selection):
                 " preprocessing too"
             )
         _ = self.crop
-        self._check_region()
-
-    def _check_region(self) -> None:
-
         if self.region:
             parse_region_rules(self.region)
         if self.region_later and not self.region:

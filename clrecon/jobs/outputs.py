@@ -28,7 +28,7 @@ MOST_FILES = 1000
 def name_outputs(output: str | Path, names: Sequence[str], report_path: str | Path | None = None) -> list[str | Path]:
     """Name the files of several meshes: ``bone.stl`` and ``200hu`` give ``bone_200hu.stl``; an empty name adds nothing.
 
-    names: One for each mesh, see `clrecon.jobs.mesh.mesh_parts.Part`.
+    names: One for each mesh, see `clrecon.jobs.mesh.surfaces.Part`.
     """
     if len(names) > MOST_FILES:
         raise UsageError(

@@ -11,8 +11,8 @@ import ct_files
 import pytest
 import tolerances
 
+from clrecon.cli.common import parse_hu
 from clrecon.cli.main import main
-from clrecon.cli.options import parse_hu
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ import ct_files
 import numpy as np
 import pytest
 
+from clrecon.cli.common import parse_hu
 from clrecon.cli.main import main
-from clrecon.cli.options import parse_hu
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 

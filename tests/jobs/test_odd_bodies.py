@@ -12,8 +12,8 @@ from odd_bodies import BODIES, OddBodies, OddBody
 from clrecon.cli.mesh_options import describe_purposes
 from clrecon.errors import ClreconError, NoSurfaceError, RefusedInputError
 from clrecon.jobs.mesh.job import make_mesh
-from clrecon.jobs.mesh.refinement import LEFT_SHARE
-from clrecon.jobs.mesh.settings import MeshSettings, settings_for
+from clrecon.jobs.mesh.purposes import LEFT_SHARE, settings_for
+from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.render.job import PictureFiles, make_pictures
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.system.text import format_ml

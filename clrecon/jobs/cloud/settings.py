@@ -119,7 +119,8 @@ class CloudSettings(InputSettings):
         if self.spacing is not None:
             _check_mm("the spacing of points", self.spacing)
         self._check_hu()
-        self._check_labels()
+        if self.label is not None and self.labels is None:
+            raise UsageError("a label is one of a label map: give its file too")
         self._check_viewpoint()
         if self.keep:
             from clrecon.points.keep import parse_keep_rules
@@ -140,10 +141,6 @@ class CloudSettings(InputSettings):
                 raise UsageError(f"the band {self.hu[0]:g},{self.hu[1]:g} HU holds nothing: give its lower end first")
             if self.points == "surface":
                 raise UsageError("a surface has one iso value, not a band: give one number of HU, or other points")
-
-    def _check_labels(self) -> None:
-        if self.label is not None and self.labels is None:
-            raise UsageError("a label is one of a label map: give its file too")
 
     def _check_viewpoint(self) -> None:
         if self.viewpoint is None:

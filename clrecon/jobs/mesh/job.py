@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import judge_label_volumes, name_label_files
-from clrecon.jobs.mesh.make import MadeParts, make_parts
-from clrecon.jobs.mesh.mesh_parts import first_names, warn_of_crumbs
-from clrecon.jobs.mesh.refinement import describe_purposes, judge_parts, measure_parts, refine_surface, warn_of_gates
+from clrecon.jobs.mesh.make import MadeParts, first_names, make_parts, warn_of_crumbs
+from clrecon.jobs.mesh.purposes import describe_purposes
+from clrecon.jobs.mesh.refinement import judge_parts, measure_parts, refine_surface, warn_of_gates
 from clrecon.jobs.mesh.report import MeshReport, describe_part, report_of
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface, plan_surfaces
@@ -143,7 +143,7 @@ def _refine_and_measure(run: Run, made: MadeParts, measure: bool) -> list[dict[s
     if measure:
         measure_parts(made.parts, made.solid, settings, made.device, run.progress)
     gates = judge_parts(made.parts, made.solid, settings, run.progress)
-    return gates + judge_label_volumes(made.parts, settings.closed)
+    return gates + (judge_label_volumes(made.parts, settings.closed) if settings.labels_pick else [])
 
 
 def _warn_of_leftovers(output: str | Path, paths: Sequence[str | Path]) -> list[str]:

@@ -143,9 +143,7 @@ def _extract_masks(
 
 
 def describe_label(origin: dict[str, Any]) -> dict[str, Any]:
-    """Return the report entries of a label's mesh, taken from the mesh's own report; empty for other meshes."""
-    if "label" not in origin:
-        return {}
+    """Return the report entries of a label's mesh, taken from the mesh's own report."""
     return {"label_number": origin["label"], **{name: origin[name] for name in _FACTS}}
 
 

@@ -1,7 +1,4 @@
-"""Smoothing and decimation of the surfaces of a job, the gates of its meshes, and facts for people who print them.
-
-The facts are size, walls, cavities and parts left out.
-"""
+"""Smoothing and decimation of the surfaces of a job, and the gates of its meshes."""
 
 from __future__ import annotations
 
@@ -11,15 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part
-from clrecon.system.arguments import name_parameter
 from clrecon.system.pieces import side_by_side
 from clrecon.system.progress import Progress, Steps, ignore_progress
-from clrecon.system.text import count_of, format_digits
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from clrecon.geometry import Volume
     from clrecon.mesh import Mesh
     from clrecon.mesh.compare.iso_distance import IsoDistance
@@ -156,101 +148,8 @@ def _count_crossings(mesh: Mesh, device: Device | None, steps: Steps) -> int:
     return len(crossings)
 
 
-def describe_purposes(parts: Sequence[Part]) -> list[str]:
-    """Measure what the purpose of the meshes needs, as ``print`` in the `facts` of each; return warnings."""
-
-    warnings = []
-    for part in parts:
-        part.facts["print"] = None if part.pieces is None else describe_print(part.mesh, *part.pieces)
-        if part.facts["print"] is not None:
-            name = f"{part.name}: " if part.name else ""
-            warnings += [name + text for text in warn_of_print(part.facts["print"])]
-    return warnings
-
-
 def warn_of_gates(gates: Sequence[dict[str, Any]]) -> list[str]:
     """Return one line for each failed gate, with the name of its mesh if there are several."""
     from clrecon.system.records import failed_gates
 
     return [f"{gate['mesh']}: {line}" if gate["mesh"] else line for gate in gates for line in failed_gates([gate])]
-
-
-THIN_MM = 1.0
-"""Thinner walls break or are not printed at all by common printers (layers of 0.1 to 0.3 mm, nozzles of 0.4 mm)."""
-
-LEFT_SHARE = 0.5
-"""What was left out in volumes of what was kept, from which on there is a warning: the other leg of a pair."""
-
-THIN_SHARE = 0.05
-"""Share of the surface with thin walls from which on there is a warning."""
-
-
-def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> dict[str, float]:
-    """Measure the volumes that components enclose; `vertices` have shape (n, 3), in mm, `triangles` (m, 3).
-
-    Returns: ``pieces``, ``pieces_ml`` : components that enclose something, and how much ``cavities``, ``cavities_ml`` :
-        walls of cavities, and what they enclose
-    """
-    from clrecon.mesh.refine.shifts import measure_volumes
-    from clrecon.system.pieces import local_origin
-
-    found = measure_volumes(vertices - local_origin(vertices), triangles).mm3 / 1000.0
-    return {
-        "pieces": int((found > 0.0).sum()),
-        "pieces_ml": float(found[found > 0.0].sum()),
-        "cavities": int((found < 0.0).sum()),
-        "cavities_ml": float(-found[found < 0.0].sum()),
-    }
-
-
-def describe_print(mesh: Mesh, found: dict[str, float], kept: dict[str, float]) -> dict[str, Any]:
-    """Return the facts for people who print a mesh: ``print`` of the report.
-
-    mesh: The mesh as it is written.
-    found, kept: `measure_pieces` of the surface as it was extracted, and of what was kept of it.
-
-    Returns: ``size_mm`` : x, y, z of the box around it ``wall`` : see `clrecon.mesh.compare.distances.measure_walls`
-        ``left_out`` : pieces and cavities as in `measure_pieces`; cavities that are left out are filled; and
-        ``not_bone``, ``not_bone_ml``, the pieces whose walls are not like bone or that are crumbs, None where that was
-        not asked ``pieces``, ``pieces_ml``, ``cavities``, ``cavities_ml`` : those that are in it
-    """
-    from clrecon.mesh.compare.distances import measure_walls
-
-    size = mesh.vertices.max(axis=0).astype(float) - mesh.vertices.min(axis=0)
-    return {
-        "size_mm": size.tolist(),
-        "wall": measure_walls(mesh.vertices, mesh.triangles, THIN_MM),
-        "left_out": {
-            **{name: max(found[name] - kept[name], 0) for name in found},
-            **{name: mesh.report.get(name) for name in ("not_bone", "not_bone_ml")},
-        },
-        **kept,
-    }
-
-
-def warn_of_print(facts: dict[str, Any]) -> list[str]:
-    """Return warnings about the facts of `describe_print`: thin walls, closed cavities, the wrong piece."""
-    warnings = []
-    wall, left_out = facts["wall"], facts["left_out"]
-    if wall["thin_share"] is not None and wall["thin_share"] > THIN_SHARE:
-        warnings.append(
-            f"{100 * wall['thin_share']:.0f} % of the surface has a wall below {wall['thin_mm']:g} mm, which can break"
-            f" or be lost in a print: lower {name_parameter('iso_value')}, or print it larger"
-        )
-    if facts["cavities"]:
-        warnings.append(
-            f"{count_of(facts['cavities'], 'closed cavity', 'closed cavities')} of"
-            f" {format_digits(facts['cavities_ml'], 2)} ml together are in it: powder or"
-            f" resin stays in them; {name_parameter('keep_largest', 1)} fills them"
-        )
-    bone_told = left_out.get("not_bone") is not None
-    other_ml = left_out["pieces_ml"] - (left_out["not_bone_ml"] if bone_told else 0.0)
-    if other_ml > LEFT_SHARE * facts["pieces_ml"]:
-        away, seed = name_parameter("remove_table", True), name_parameter("seeds", "X,Y,Z")
-        table = "" if bone_told else f" The piece of largest area can be a table ({away});"
-        warnings.append(
-            f"{'bone that' if bone_told else 'what'} was left out encloses {format_digits(other_ml)} ml, beside the"
-            f" {format_digits(facts['pieces_ml'])} ml that were kept: is it the right piece?{table}"
-            f" {seed} keeps the one at a point, {name_parameter('all_parts', True)} keeps all"
-        )
-    return warnings

@@ -57,7 +57,7 @@ def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], 
         "quality": {name: value for name, value in quality.items() if name not in _SAID_ABOVE} or None,
         "cells": origin.get("cells"),
         "growing": origin.get("growing"),
-        **describe_label(origin),
+        **({} if part.surface.label is None else describe_label(origin)),
         **part.facts,
     }
 

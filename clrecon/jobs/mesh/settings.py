@@ -1,20 +1,17 @@
-"""Settings of the mesh job, validated on construction.
-
-Beside them the choice of labels that become meshes, what the methods of marching cubes go with, and the settings that
-follow from the purpose of a mesh.
-"""
+"""Settings of the mesh job, validated on construction, and the choice of labels that become meshes."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
+from clrecon.jobs.mesh.seeds import LABEL_SEED, check_growing, check_point, is_label_seed
 from clrecon.jobs.options import InputSettings
-from clrecon.jobs.presets import DEFAULT_PRESET, HIGHEST_BONE_HU, LOWEST_BONE_HU, find_iso_preset, find_purpose
+from clrecon.jobs.presets import DEFAULT_PRESET, find_iso_preset, find_purpose
 from clrecon.system.arguments import name_parameter
 from clrecon.system.options import option
 
@@ -67,7 +64,7 @@ class MeshSettings(InputSettings):
     decimate: Share of the triangles to remove, see `clrecon.mesh.decimate_mesh`; None: none.
     max_deviation_mm: Bound of smoothing and of decimation, mm; None: a quarter of the shortest voxel step.
     purpose: Purpose of the mesh, for which more is measured.  It sets nothing here, see
-        `clrecon.jobs.mesh.settings.settings_for`.
+        `clrecon.jobs.mesh.purposes.settings_for`.
     strict: Measure everything that a gate needs, triangles that cut each other included.
     **shared: See `clrecon.jobs.options.InputSettings`.
     """
@@ -154,8 +151,7 @@ class MeshSettings(InputSettings):
             raise UsageError(f"the smallest volume to keep must be above 0 ml, not {self.min_volume_ml}")
         super().__post_init__()
         for seed in self.seeds:
-            if len(seed) != 3 or not all(map(math.isfinite, seed)):
-                raise UsageError(f"a seed is a point of three numbers in mm, not {tuple(seed)}")
+            check_point(seed)
         self._check_refinement()
         self._check_solid()
         if self.one_file and not (self.labels_pick or self.split or len(self.levels) > 1):
@@ -168,10 +164,11 @@ class MeshSettings(InputSettings):
 
         frame_from_lps(self.space)
         check_topology(self.topology)
-        check_growing(
-            self.method_used, self.grow_from, self.vertex_rule, topology=self.topology, inside=self.inside,
-            labels=self.labels,
-        )  # fmt: skip
+        if self.grow_from or self.method_used != "t-mc" or self.vertex_rule != "linear":
+            check_growing(
+                self.method_used, self.grow_from, self.vertex_rule, topology=self.topology, inside=self.inside,
+                has_labels=self.labels is not None, makes_labels=self.labels is not None and bool(self.labels.wanted),
+            )  # fmt: skip
         if self.labels_pick and self.below is not None:
             raise UsageError("labels take what lies from one iso value on, not below it")
         if self.labels_pick and self.topology != "separated":
@@ -448,107 +445,3 @@ class LabelChoice:
 def _as_tuple(color: Any) -> tuple[float, float, float]:
     red, green, blue = (float(value) for value in color)
     return red, green, blue
-
-
-LABEL_SEED = "label:"
-"""What a seed that is a label begins with."""
-
-
-def is_label_seed(seed: object) -> bool:
-    """Return whether a seed is a label of the label map."""
-    return isinstance(seed, str) and seed.startswith(LABEL_SEED)
-
-
-def check_growing(
-    method: str,
-    grow_from: Sequence[str | Sequence[float]],
-    vertex_rule: str,
-    *,
-    topology: str,
-    inside: str,
-    labels: LabelChoice | None,
-) -> None:
-    """Check the seeds, the method and the vertex rule of a mesh job, each and with its other settings."""
-    for seed in grow_from:
-        _check_seed(seed)
-    if method == "t-mc" and not grow_from and vertex_rule == "linear":
-        return  # what every device does: the operators need not be loaded
-    from clrecon.geometry.vertices import check_vertex_rule
-    from clrecon.operators.surface.methods import check_method
-
-    chosen = check_method(
-        method, grows=bool(grow_from), vertex_rule=vertex_rule, topology=topology, plain=inside == "above"
-    )
-    check_vertex_rule(vertex_rule, topology)
-    from_labels = any(map(is_label_seed, grow_from))
-    if from_labels and labels is None:
-        raise UsageError(f"a label to grow from needs its label map: give its file with {name_parameter('labels')}")
-    if from_labels and labels is not None and labels.wanted:
-        raise UsageError("a label map to grow from makes no meshes of its own: leave the labels for meshes out")
-    if labels is not None and not from_labels and (chosen.grows or not chosen.on_device or vertex_rule != "linear"):
-        raise UsageError(
-            f"labels pick the cells of their surfaces: leave {name_parameter('method')},"
-            f" {name_parameter('grow_from')} and {name_parameter('vertex_rule')} out, or grow from label:NAME"
-        )
-
-
-def _check_seed(seed: str | Sequence[float]) -> None:
-    if isinstance(seed, str):
-        if seed != "auto" and not (is_label_seed(seed) and seed[len(LABEL_SEED) :].strip()):
-            raise UsageError(f"{name_parameter('grow_from')} is auto, X,Y,Z in mm or label:NAME, not {seed!r}")
-    elif len(seed) != 3 or not all(map(math.isfinite, seed)):
-        raise UsageError(f"a seed is a point of three numbers in mm, not {tuple(seed)}")
-
-
-def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of `MeshSettings` that a purpose sets, with the given fields, which win.
-
-    given: Fields; None, False and empty values count as not given.
-
-    Returns: The given fields, and ``purpose``.  If components are chosen in another way, the purpose leaves none out.
-        Bone is distinguished from other material only if all iso values are those of bone, from 100 to 1500 HU or
-        ``"auto"``; it is made solid if there is one of them, and ``solid`` is not given as False.  Labels whose surface
-        HU place are made solid one by one.
-    """
-    if name is None:
-        return dict(given)
-    purpose = find_purpose(name)
-    fields = dict(purpose.settings)
-    if purpose.is_for_print:
-        if not given.get("closed", True):
-            raise UsageError(f"a surface for {name} is closed: leave {name_parameter('closed', False)} out")
-        if any(given.get(other) for other in ("seeds", "min_volume_ml", "split", "labels", "all_parts")):
-            del fields["keep_largest"]
-        chosen = any(given.get(other) for other in ("keep_largest", "seeds", "min_volume_ml"))
-        levels = _levels_of_bone(given)
-        if (chosen and not given.get("all_parts")) or not levels:
-            del fields["keep"]
-        if levels != 1 or given.get("solid") is False:
-            del fields["solid"]
-        if given.get("solid") is not False and _are_hollow(given):
-            given = {**given, "labels": replace(given["labels"], solid=True)}
-    elif given.get("region"):
-        fields["preprocess"] += ",region"  # the paper's order
-    taken = {field: value for field, value in fields.items() if not given.get(field)}
-    return {**given, **taken, "purpose": name}
-
-
-def _without_parts(given: dict[str, Any]) -> MeshSettings:
-    """Return the settings of these fields without those that a purpose alone makes valid."""
-    return MeshSettings(**{name: value for name, value in given.items() if name not in ("all_parts", "seal_mm")})
-
-
-def _are_hollow(given: dict[str, Any]) -> bool:
-    """True where these fields of `MeshSettings` ask for surfaces of labels in which marrow leaves walls inside."""
-    settings = _without_parts(given)
-    return settings.labels_pick and settings.labels is not None and settings.labels.surface == "hu"
-
-
-def _levels_of_bone(given: dict[str, Any]) -> int:
-    """Return the number of iso surfaces that these fields of `MeshSettings` ask for, 0 if one is not of bone."""
-    settings = _without_parts(given)
-    if settings.labels is not None or settings.inside != "above":
-        return 0
-    levels = [float(level) for level in settings.levels if not isinstance(level, tuple)]
-    of_bone = all(math.isnan(level) or LOWEST_BONE_HU <= level <= HIGHEST_BONE_HU for level in levels)
-    return len(levels) if of_bone else 0

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.jobs.inputs import is_cloud_file, is_mesh_file, read_with_labels, refuse_scan_settings
+from clrecon.jobs.inputs import is_cloud_file, is_only_mesh, read_with_labels, refuse_scan_settings
 from clrecon.jobs.outputs import check_distinct, check_kept
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.render.picture_taker import PictureTaker, read_curve, read_function, read_look
@@ -101,7 +101,7 @@ def _check_kind(source: str | Path, settings: RenderSettings) -> None:
         refuse_scan_settings(settings, noun="a mesh")
         return
     is_cloud = is_cloud_file(source)
-    if is_mesh_file(source):
+    if is_only_mesh(source):
         raise UsageError(f"the input is a mesh, which mode mesh shows, and not mode {settings.mode}")
     if is_cloud != (settings.mode == "points"):
         raise UsageError(

@@ -195,8 +195,10 @@ def _open_cloud(path: str | Path, space: str | None) -> OpenedInput:
 
 def _open_scan(path: str | Path, settings: ViewSettings, progress: Progress) -> OpenedInput:
     """Read a scan, and mask and crop it; a file of whole numbers from 0 is a label map."""
+    from clrecon.labels.reader import is_dicom_map
+
     scan, name = settings.scan, escape_text(Path(path).name)
-    if tell_format(path) is None and _is_dicom_map(path):
+    if tell_format(path) is None and is_dicom_map(path):
         labels = _read_labels(path)
         return OpenedInput(labels, labels.warnings)
     volume = read_selected(path, scan, progress=progress)
@@ -213,12 +215,6 @@ def _open_scan(path: str | Path, settings: ViewSettings, progress: Progress) -> 
         volume = restrict_volume(volume, scan, device, [], progress)
         volume = preprocess_volume(volume, scan, device, [], progress)
     return OpenedInput(volume, tuple(volume.report.get("warnings", ())), dict(volume.report))
-
-
-def _is_dicom_map(path: str | Path) -> bool:
-    from clrecon.labels.reader import is_dicom_map
-
-    return is_dicom_map(path)
 
 
 def _read_labels(path: str | Path) -> LabelMap:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.exchange.formats import MESH_INPUTS
 from clrecon.exchange.page import read_facts
 from clrecon.jobs.distance import doubt_frames, read_side
+from clrecon.jobs.inputs import may_be_mesh
 from clrecon.jobs.mesh.bone import judge_surfaces
 from clrecon.jobs.mesh.make import make_parts
 from clrecon.jobs.mesh.settings import MeshSettings
@@ -43,11 +43,6 @@ class _ShownInput:
     device: str | None = None
 
 
-def is_mesh_file(path: str | Path) -> bool:
-    """True for a file that is read as a mesh, by its extension; everything else is taken for a scan."""
-    return Path(path).suffix.lower() in MESH_INPUTS
-
-
 def write_view(
     inputs: Sequence[str | Path],
     output: str | Path,
@@ -69,7 +64,7 @@ def write_view(
         labels = settings.scan.labels
         run.check([("the page", output)], *inputs, None if labels is None else labels.path)
         # Mesh files first: they are read in a moment, and a wrong one is said before the device works on a scan.
-        order = sorted(range(len(inputs)), key=lambda place: not is_mesh_file(inputs[place]))
+        order = sorted(range(len(inputs)), key=lambda place: not may_be_mesh(inputs[place]))
         found = {place: _read_input(inputs[place], settings, run) for place in order}
         shown = [found[place] for place in range(len(inputs))]
         meshes = _name_and_color(shown, settings)
@@ -105,9 +100,9 @@ def _check_inputs(inputs: Sequence[str | Path], output: str | Path, settings: Vi
         raise UsageError(f"a page is a file .html, not {escape_text(Path(output).name)[-40:]!r}")
     if len(settings.names) > len(inputs):
         raise UsageError(f"{len(settings.names)} names for {len(inputs)} input{'s' * (len(inputs) > 1)}: one for each")
-    scans = [path for path in inputs if not is_mesh_file(path)]
+    scans = [path for path in inputs if not may_be_mesh(path)]
     for path in inputs:
-        if is_mesh_file(path) and not Path(path).is_file():
+        if may_be_mesh(path) and not Path(path).is_file():
             raise UsageError(f"{escape_text(str(path), 200)}: there is no file of that name")
     changed = [
         own.name
@@ -129,7 +124,7 @@ def _is_set(value: object, default: object) -> bool:
 
 
 def _read_input(path: str | Path, settings: ViewSettings, run: Run) -> _ShownInput:
-    if is_mesh_file(path):
+    if may_be_mesh(path):
         run.progress("read", 0, 0)
         shown = _read_mesh(path, settings)
         run.lap("read")

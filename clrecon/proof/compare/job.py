@@ -16,8 +16,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import ClreconError, DeviceError, NoSurfaceError, UsageError
-from clrecon.jobs.mesh.make import mask_and_preprocess, mask_parts
-from clrecon.jobs.mesh.mesh_parts import check_levels
+from clrecon.jobs.mesh.make import check_levels, mask_and_preprocess, mask_parts
 from clrecon.jobs.mesh.surfaces import choose_level, describe_level, plan_surfaces
 from clrecon.jobs.outputs import check_kept
 from clrecon.jobs.run import DeviceOpening, Laps, to_json

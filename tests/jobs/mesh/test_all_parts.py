@@ -13,8 +13,9 @@ import clrecon
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.jobs.mesh import mesh_parts
-from clrecon.jobs.mesh.settings import MeshSettings, settings_for
+from clrecon.jobs.mesh import make
+from clrecon.jobs.mesh.purposes import settings_for
+from clrecon.jobs.mesh.settings import MeshSettings
 
 RADII = (13.0, 10.0, 8.0)
 CAVITY = 3.0
@@ -91,7 +92,7 @@ def test_crumbs_are_counted_with_the_option_that_drops_them(device, bones, tmp_p
 
 
 def test_too_many_objects_are_refused_with_the_number_of_crumbs(device, bones, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(mesh_parts, "MOST_FILES", 100)
+    monkeypatch.setattr(make, "MOST_FILES", 100)
     code, _ = run(bones, tmp_path / "a.stl", device, "--split")
     assert code == 3
     error = capsys.readouterr().err

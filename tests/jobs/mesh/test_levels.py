@@ -15,7 +15,7 @@ from clrecon.anatomy.iso_choice import half_iso_value
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.jobs.mesh.job import make_mesh
-from clrecon.jobs.mesh.mesh_parts import check_levels
+from clrecon.jobs.mesh.make import check_levels
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import choose_level, describe_level, plan_surfaces
 from clrecon.jobs.preprocess import mask_volume

@@ -11,7 +11,7 @@ import pytest
 
 from clrecon.errors import DeviceMemoryError, NoSurfaceError, OutputError, UsageError
 from clrecon.geometry import Volume
-from clrecon.jobs.mesh import mesh_parts
+from clrecon.jobs.mesh import make
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.settings import MeshSettings
 
@@ -184,7 +184,7 @@ def test_one_surface_that_is_not_there_ends_the_job(
 def test_too_many_components_are_refused_with_advice(
     device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mesh_parts, "MOST_FILES", 2)
+    monkeypatch.setattr(make, "MOST_FILES", 2)
     with pytest.raises(
         UsageError, match="3 components, 2 of them below 0.1 ml; at most 2 are written one by one: .*min_volume_ml=0.1"
     ):

@@ -13,8 +13,8 @@ from scipy.ndimage import gaussian_filter
 from clrecon import Volume
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
-from clrecon.jobs.mesh.refinement import warn_of_print
-from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings, settings_for
+from clrecon.jobs.mesh.purposes import settings_for, warn_of_print
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 
