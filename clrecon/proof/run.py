@@ -21,20 +21,16 @@ from typing import IO, Any
 
 from clrecon.errors import ClreconError, DeviceError
 from clrecon.opencl import Device, list_devices
-from clrecon.proof.checking.check import Check
-from clrecon.proof.filters import filter_checks
-from clrecon.proof.masks import mask_checks
+from clrecon.proof.checking import Check
 from clrecon.proof.points import cloud_checks, voxel_checks
-from clrecon.proof.primitives import primitive_checks
 from clrecon.proof.rays import layer_checks, ray_checks
-from clrecon.proof.reformat import sheet_checks
-from clrecon.proof.resident import brick_checks
 from clrecon.proof.surface import decimation_checks, surface_checks
+from clrecon.proof.volumes import volume_checks
 from clrecon.system.progress import Progress, device_seconds, ignore_progress
 
 CHECKS: tuple[Check, ...] = (
-    *primitive_checks.CHECKS,
-    *brick_checks.CHECKS,
+    *volume_checks.PRIMITIVE_CHECKS,
+    *volume_checks.BRICK_CHECKS,
     *surface_checks.SURFACE_CHECKS,
     *decimation_checks.CROSSING_CHECKS,
     *surface_checks.LABEL_CHECKS,
@@ -42,11 +38,11 @@ CHECKS: tuple[Check, ...] = (
     *ray_checks.LEAP_CHECKS,
     *ray_checks.PICTURE_CHECKS,
     *layer_checks.CHECKS,
-    *sheet_checks.CHECKS,
-    *filter_checks.CHECKS,
+    *volume_checks.SHEET_CHECKS,
+    *volume_checks.FILTER_CHECKS,
     *cloud_checks.GRID_CHECKS,
     *voxel_checks.BAND_CHECKS,
-    *mask_checks.CHECKS,
+    *volume_checks.MASK_CHECKS,
     *cloud_checks.FIELD_CHECKS,
     *cloud_checks.FILTER_CHECKS,
     *cloud_checks.CLUSTER_CHECKS,

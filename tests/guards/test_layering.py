@@ -140,9 +140,12 @@ def test_vtk_is_known_in_one_file_of_a_room() -> None:
 def test_twins_know_nothing_of_what_they_prove() -> None:
     rooms = {path.parent.name for path in (PACKAGE / "operators").glob("*/__init__.py")}
     twins = [
-        path for room in sorted(rooms) for path in (PACKAGE / "proof" / room).glob("*.py") if "_check" not in path.name
+        path
+        for room in sorted({*rooms, "volumes"})
+        for path in (PACKAGE / "proof" / room).glob("*.py")
+        if "_check" not in path.name
     ]
-    assert len(twins) > 15
+    assert len(twins) > 12
     for path in twins:
         source = path.read_text(encoding="utf-8")
         imported = {layer_of(name) for name, *_ in read_imports(source, path.stem) if "clrecon" in name}

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from clrecon.opencl.sources import kernel_files, read_kernel_source
-from clrecon.proof.checking.check import Check
+from clrecon.proof.checking import Check
 from clrecon.proof.run import CHECKS
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -24,7 +24,7 @@ from clrecon.errors import DeviceError
 from clrecon.opencl import Device
 from clrecon.opencl.sources import definitions_of
 from clrecon.proof import run
-from clrecon.proof.checking.check import LEAST_ITEMS, Check, require_close, require_equal, require_share
+from clrecon.proof.checking import LEAST_ITEMS, Check, require_close, require_equal, require_share
 from clrecon.proof.rays import ray_checks
 from clrecon.proof.run import CHECKS, run_check, run_selftest
 from clrecon.proof.surface import surface_checks

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
-from clrecon.proof.masks.mask_twins import dilate, erode, fill_holes
+from clrecon.proof.volumes.volume_twins import dilate, erode, fill_holes
 
 Bits = NDArray[np.bool_]
 

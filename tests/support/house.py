@@ -73,6 +73,7 @@ _layer(
     "system",
     "opencl",
     "geometry",
+    "exchange",
     "reading",
     "labels",
     "mesh",

@@ -19,10 +19,10 @@ from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
-from clrecon.mesh.compare.cells import GridCells
 from clrecon.operators.points.clusters import Clustering
 from clrecon.operators.points.neighbours import Neighbours
 from clrecon.points import PointCloud, PointStep
+from clrecon.proof.compare.mesh_cells import GridCells
 from clrecon.proof.compare.methods import CompareSettings
 from clrecon.proof.phantom import PhantomSettings, phantom_truth
 from clrecon.reading.common.source_facts import SeriesEntry, SeriesListing

@@ -15,10 +15,10 @@ import numpy as np
 from clrecon.errors import ClreconError
 from clrecon.jobs.run import to_json
 from clrecon.mesh import Mesh
-from clrecon.mesh.compare.cells import GridCells, find_mesh_cells, measure_cells
 from clrecon.mesh.compare.distances import SAMPLES, SurfaceDistance, compare_meshes, summarise_distances
-from clrecon.mesh.compare.mesh_slices import measure_slices
-from clrecon.mesh.compare.truth import REACH_MM, measure_truth
+from clrecon.proof.compare.mesh_cells import GridCells, find_mesh_cells, measure_cells
+from clrecon.proof.compare.mesh_slices import measure_slices
+from clrecon.proof.compare.mesh_truth import REACH_MM, measure_truth
 from clrecon.proof.compare.processes import load_array, load_mesh, load_volume
 
 MEASURES = ("quality", "cells", "slices", "surfaces", "truth", "points")

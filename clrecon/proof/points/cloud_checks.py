@@ -22,18 +22,11 @@ from clrecon.operators.points.thinning import choose_points, grow_cells
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
 from clrecon.points.spacing import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
-from clrecon.proof.checking.check import Check, require_close, require_equal, require_share
-from clrecon.proof.checking.scenes import OBLIQUE, random_integers, stack
+from clrecon.proof.checking import OBLIQUE, Check, random_integers, require_close, require_equal, require_share, stack
 from clrecon.proof.points import clusters as clusters_twin
-from clrecon.proof.points import clusters as passes_twin
 from clrecon.proof.points import field as twin
 from clrecon.proof.points import grid as grid_twin
-from clrecon.proof.points import grid as sparse_twin
-from clrecon.proof.points import grid as thin_twin
 from clrecon.proof.points import neighbours as filter_twin
-from clrecon.proof.points import neighbours as neighbours_twin
-from clrecon.proof.points import neighbours as normals_twin
-from clrecon.proof.points import neighbours as outliers_twin
 from clrecon.proof.points import voxels as gradients_twin
 
 
@@ -72,7 +65,7 @@ def _check_neighbours(device: Device) -> str:
     many = scattered_points(30_000)  # in some 15,000 cells, of which a work-item takes 16
     for points, k in ((scattered, 16), (scattered, 5), (lattice, 16), (many, 2)):
         found = find_neighbours(points, k, device=device)
-        indices, distances = neighbours_twin.find_neighbours(points, k)
+        indices, distances = filter_twin.find_neighbours(points, k)
         require_equal(found.indices, indices, f"{k} nearest of {len(points):,} points")
         require_equal(found.distances, distances, f"distances of the {k} nearest of {len(points):,} points")
     return "2 to 16 neighbours of up to 30,000 points equal"
@@ -108,16 +101,16 @@ def _check_passes(device: Device) -> str:
     plan = plan_cells(points, EPS)
     made, grid = fill_grid(device, plan), grid_twin.make_grid(points, float(plan.edge))
     search = ClusterSearch(device, made, EPS, samples, per_chunk)
-    pairs = passes_twin.count_pairs(grid, float(plan.edge), samples)
+    pairs = clusters_twin.count_pairs(grid, float(plan.edge), samples)
     require_close(search.count_pairs(), pairs, 1e-3, "pairs of points")
     search.find_cores()
     search.join_within()
     _, labels, cores = clusters_twin.cluster_points(points, EPS, samples)
-    expected = passes_twin.join_chunks(grid, cores[grid.order], EPS * (1.0 + 1e-6), per_chunk)
+    expected = clusters_twin.join_chunks(grid, cores[grid.order], EPS * (1.0 + 1e-6), per_chunk)
     found = download(device, np.empty(made.cells, np.uint32), search.labels_d)
     require_equal(found, expected, "labels within chunks")
     search.note_words()
-    roots = passes_twin.note_words(grid, expected)
+    roots = clusters_twin.note_words(grid, expected)
     require_equal(download(device, np.empty(roots.shape, np.uint32), search.roots_d), roots, "roots of words")
     search.hook_chunks()
     require_equal(search.label()[0], labels, "labels of clusters that were found in small chunks")
@@ -127,7 +120,7 @@ def _check_passes(device: Device) -> str:
 def _check_thin(device: Device) -> str:
     points = scattered_points(20_000)
     chosen = choose_points(device, plan_grid(points, 2.1))
-    require_equal(chosen, thin_twin.choose_points(points, 2.1), "points nearest to the means of cells")
+    require_equal(chosen, grid_twin.choose_points(points, 2.1), "points nearest to the means of cells")
     return f"{len(chosen):,} points of 20,000 equal"
 
 
@@ -135,7 +128,7 @@ def _check_sparse_cells(device: Device) -> str:
     points = scattered_points(20_000)
     for edge, fewest, threshold, largest in ((1.1, 2, 3, False), (1.6, 2, 4, True)):
         found = grow_cells(device, plan_grid(points, edge), fewest, threshold, largest).removed
-        expected = sparse_twin.grow_cells(points, edge, fewest, threshold, largest)
+        expected = grid_twin.grow_cells(points, edge, fewest, threshold, largest)
         require_equal(found, expected, f"what becomes of points in cells of {edge} mm")
     return "growth over 2 grids equal"
 
@@ -184,11 +177,11 @@ def _bumpy_sheet(n: int) -> NDArray[np.float32]:
 
 def _check_normals(device: Device) -> str:
     points = _bumpy_sheet(9_000)
-    indices, _ = neighbours_twin.find_neighbours(points, K)
-    axes, eigenvalues = normals_twin.principal_axes(points, indices)
+    indices, _ = filter_twin.find_neighbours(points, K)
+    axes, eigenvalues = filter_twin.principal_axes(points, indices)
     clear = (eigenvalues[:, 1] - eigenvalues[:, 0]) / eigenvalues[:, 2] > 0.03
     viewpoint = np.array([30.0, 30.0, -90.0])
-    expected = normals_twin.orient_from(axes, points, viewpoint)
+    expected = filter_twin.orient_from(axes, points, viewpoint)
     found = estimate_normals(PointCloud(points), K, viewpoint=viewpoint, device=device).cloud.normals
     assert found is not None
     return f"9,000 normals within {require_close(found[clear], expected[clear], NORMAL, 'normals'):.1e}"
@@ -199,11 +192,11 @@ def _check_oriented(device: Device) -> str:
     volume = stack(random_integers((12, 40, 45), "int16", 100), np.eye(4), False)
     points = (_bumpy_sheet(2_500) + np.array([2.0, 2.0, 5.0], np.float32)).astype(np.float32)
     gradients = gradients_twin.find_gradients(volume, points, 0.0)
-    axes, eigenvalues = normals_twin.principal_axes(points, neighbours_twin.find_neighbours(points, K)[0])
-    expected, doubtful = normals_twin.orient_by_gradients(axes, gradients)
+    axes, eigenvalues = filter_twin.principal_axes(points, filter_twin.find_neighbours(points, K)[0])
+    expected, doubtful = filter_twin.orient_by_gradients(axes, gradients)
     cosines = np.abs(np.einsum("ni,ni->n", axes, gradients)) / np.linalg.norm(gradients, axis=1)
     clear = (eigenvalues[:, 1] - eigenvalues[:, 0]) / eigenvalues[:, 2] > 0.03
-    clear &= (cosines > 0.01) & (np.abs(cosines - normals_twin.DOUBTFUL_COSINE) > 1e-3)
+    clear &= (cosines > 0.01) & (np.abs(cosines - filter_twin.DOUBTFUL_COSINE) > 1e-3)
     step = estimate_normals(PointCloud(points), K, volume=volume, device=device)
     assert step.cloud.normals is not None
     require_share(step.facts["doubtful"], int(doubtful.sum()), 10.0, 0.0, "number of doubtful normals")
@@ -224,8 +217,8 @@ def _check_gradients(device: Device, types: tuple[str, ...], uneven: bool) -> st
 
 
 def _filtered(points: NDArray[np.float32], features: str | None, cells_edge: float = 0.0) -> NDArray[np.float64]:
-    indices, distances = neighbours_twin.find_neighbours(points, K)
-    axes, eigenvalues = normals_twin.principal_axes(points, indices)
+    indices, distances = filter_twin.find_neighbours(points, K)
+    axes, eigenvalues = filter_twin.principal_axes(points, indices)
     scales = filter_twin.filter_scales(points, axes, indices, 2.0)
     factors = filter_twin.bilateral_factors(points, axes, indices, *scales)
     if features is not None:
@@ -234,7 +227,7 @@ def _filtered(points: NDArray[np.float32], features: str | None, cells_edge: flo
         steps = ((points - corner) * (np.float32(1.0) / edge)).astype(np.int64)
         cells = np.unique(steps, axis=0, return_inverse=True)[1].ravel()
         if features == "paper":
-            ratios = distance_ratios(outliers_twin.mean_distances(distances), distances[:, 1], cells)
+            ratios = distance_ratios(filter_twin.mean_distances(distances), distances[:, 1], cells)
             kept = find_features(ratios, ratio_threshold(ratios))
         else:
             kept = eigenvalues[:, 0] / eigenvalues.sum(axis=1) > VARIATION_OF_FEATURES
@@ -256,9 +249,9 @@ def _check_filter(device: Device) -> str:
 
 def _check_outliers(device: Device) -> str:
     points = _bumpy_sheet(9_000)
-    _, distances = neighbours_twin.find_neighbours(points, K)
+    _, distances = filter_twin.find_neighbours(points, K)
     step = remove_outliers(PointCloud(points), K, 1.0, device=device)
-    require_share(step.removed, outliers_twin.find_outliers(distances, 1.0), 0.0, OTHER_SIDE, "outliers")
+    require_share(step.removed, filter_twin.find_outliers(distances, 1.0), 0.0, OTHER_SIDE, "outliers")
     require_equal(len(step.cloud), int(np.count_nonzero(step.removed == 0)), "points that are kept")
     return f"{int(step.removed.sum())} outliers of 9,000 points"
 

@@ -17,11 +17,19 @@ from clrecon.operators.points.voxel_clusters import ClusterSearch, pad_for
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points.cloud import VoxelNumbers
 from clrecon.points.stencil import Lattice, make_stencil
-from clrecon.proof.checking.check import Check, require_close, require_equal, require_whole
-from clrecon.proof.checking.scenes import OBLIQUE, WIDE, noise, random_integers, stack
+from clrecon.proof.checking import (
+    OBLIQUE,
+    WIDE,
+    Check,
+    noise,
+    random_integers,
+    require_close,
+    require_equal,
+    require_whole,
+    stack,
+)
 from clrecon.proof.points import clusters as cluster_twin
-from clrecon.proof.points import voxels as overlap_twin
-from clrecon.proof.points import voxels as voxel_twin
+from clrecon.proof.points import voxels as twin
 
 SHAPE = (26, 41, 70)
 """Voxels (k, j, i): more than 1,000 rows, and three words in each."""
@@ -88,7 +96,7 @@ def _check_overlaps(device: Device) -> str:
     with DeviceVolume(volume, device=device) as resident:
         counts = count_overlaps(device, mark_band(resident, (75.0, 110.0)))
     inside = (volume.voxels >= 75) & (volume.voxels <= 110)
-    require_equal(counts, overlap_twin.count_overlaps(inside), "voxels that neighbouring slices have in common")
+    require_equal(counts, twin.count_overlaps(inside), "voxels that neighbouring slices have in common")
     return f"{len(inside)} slices equal"
 
 
@@ -121,7 +129,7 @@ def _compare(device: Device, dtype: str, uneven: bool, kind: str, labels: str | 
     cloud = extract_points(
         volume, kind=kind, hu=BAND, labels=label_map, label=number or None, device=device
     )  # fmt: skip
-    points, hu, ijk = voxel_twin.extract_voxels(volume, *BAND, shell=kind == "shell", labels=chosen, label=number)
+    points, hu, ijk = twin.extract_voxels(volume, *BAND, shell=kind == "shell", labels=chosen, label=number)
     what = f"{kind} of {dtype} voxels{'' if labels is None else f' with labels of {labels}'}"
     require_whole(cloud.report)
     require_equal(cloud.ijk if cloud.ijk is not None else (), ijk, f"indices of {what}")

@@ -15,8 +15,17 @@ from clrecon.opencl import Device, download
 from clrecon.operators.rays.mesh_pictures import make_part
 from clrecon.operators.rays.picture_buffers import Between
 from clrecon.operators.rays.scene import LayeredPicture, ScenePictures, Still, draw_layers
-from clrecon.proof.checking.check import Check, require_close, require_equal, require_share, require_whole
-from clrecon.proof.checking.scenes import OBLIQUE, blobs, centre_of, look_at
+from clrecon.proof.checking import (
+    OBLIQUE,
+    Check,
+    blobs,
+    centre_of,
+    look_at,
+    require_close,
+    require_equal,
+    require_share,
+    require_whole,
+)
 from clrecon.proof.rays.objects import Meetings, find_meetings, nth_layer, shade_layer
 from clrecon.proof.rays.render import cast_rays
 from clrecon.proof.rays.surface import overlay_slices as overlay_twin

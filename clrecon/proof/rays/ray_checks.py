@@ -29,8 +29,18 @@ from clrecon.operators.rays.slices import overlay_slices
 from clrecon.operators.rays.surface_pictures import cast_surface
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import volume_box
-from clrecon.proof.checking.check import Check, require_close, require_equal, require_share, require_whole
-from clrecon.proof.checking.scenes import OBLIQUE, blobs, centre_of, look_at, stack
+from clrecon.proof.checking import (
+    OBLIQUE,
+    Check,
+    blobs,
+    centre_of,
+    look_at,
+    require_close,
+    require_equal,
+    require_share,
+    require_whole,
+    stack,
+)
 from clrecon.proof.rays.objects import find_splats, shade_splats
 from clrecon.proof.rays.render import cast_rays
 from clrecon.proof.rays.surface import cast_surface as surface_twin

@@ -9,7 +9,7 @@ from clrecon.mesh.compare.near_distances import NearDistance, triangle_distances
 from clrecon.mesh.refine.deviation import MIDDLES, SurfaceBounds
 from clrecon.opencl import Device
 from clrecon.operators.surface.decimation import DeviceBounds, mark_crossings, plan_crossings
-from clrecon.proof.checking.check import Check, require_close, require_equal
+from clrecon.proof.checking import Check, require_close, require_equal
 from clrecon.proof.surface import crossings as twin
 
 

@@ -23,11 +23,21 @@ from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurfa
 from clrecon.operators.surface.label_masks import extract_label_masks, prepare_label_masks, survey_labels
 from clrecon.operators.surface.labels import extract_labels
 from clrecon.operators.surface.seeds import AUTO, AUTO_SHARE
-from clrecon.proof.checking.check import Check, require_close, require_equal, require_whole
-from clrecon.proof.checking.scenes import MIRRORED, OBLIQUE, WIDE, noise, random_integers, stack, waves
+from clrecon.proof.checking import (
+    MIRRORED,
+    OBLIQUE,
+    WIDE,
+    Check,
+    noise,
+    random_integers,
+    require_close,
+    require_equal,
+    require_whole,
+    stack,
+    waves,
+)
 from clrecon.proof.surface import growing as growing_twin
-from clrecon.proof.surface import labels as label_twin
-from clrecon.proof.surface import labels as mask_twin
+from clrecon.proof.surface import labels as twin
 from clrecon.proof.surface.extract import Surface
 from clrecon.proof.surface.extract import extract_isosurface as extract_twin
 
@@ -252,11 +262,11 @@ def _check_labels(device: Device) -> str:
         numbers = _blocks(label_dtype, (big, big, big, big, big, big, 0))
         label_map = LabelMap(numbers, volume.affine)
         taken = resample_labels(label_map, volume).voxels
-        inside = label_twin.find_solid(volume, taken, 30.0, closed=closed, solid=(big,) if solid else ())
+        inside = twin.find_solid(volume, taken, 30.0, closed=closed, solid=(big,) if solid else ())
         made = extract_labels(volume, label_map, 30.0, device=device, closed=closed, solid=solid)
         if list(made) != [big]:
             raise DeviceError(f"labels {list(made)} have a surface in place of [{big}]")
-        expected = label_twin.extract_label(volume, inside, big, 30.0, closed=closed)
+        expected = twin.extract_label(volume, inside, big, 30.0, closed=closed)
         worst = max(worst, compare_mesh(volume, made[big], expected, f"label {big} in {dtype} voxels"))
     return f"2 labels: triangles equal, vertices within {worst:.1e} voxel"
 
@@ -282,7 +292,7 @@ def _check_masks(device: Device) -> str:
         numbers = np.where(wave, 3, np.where(noise(WIDE, "uint8", 9) == 0, 5, 0)).astype(dtype)
         mesh = extract_label_masks(LabelMap(numbers, OBLIQUE), device=device, numbers=[3], closed=False)[3]
         level = round(mesh.report["mask_level"] * FULL)
-        expected = mask_twin.extract_label_mask(numbers, OBLIQUE, 3, level, closed=False)
+        expected = twin.extract_label_mask(numbers, OBLIQUE, 3, level, closed=False)
         worst = max(worst, compare_mesh(stack(numbers, OBLIQUE), mesh, expected, f"a mask of type {dtype}"))
     return f"2 masks: triangles equal, vertices within {worst:.1e} voxel"
 

@@ -16,8 +16,7 @@ from clrecon.opencl import Stopwatch, download, list_devices
 from clrecon.operators.filters.bilateral import SlicesThere, _Run, list_mixed_groups, row_words, run_bilateral
 from clrecon.operators.filters.settings import BilateralSettings
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.proof.filters import filter_twins as near_twin
-from clrecon.proof.filters import filter_twins as twin
+from clrecon.proof.volumes import volume_twins as twin
 
 SHAPES = [(1, 1, 40), (3, 2, 1), (5, 4, 15), (4, 5, 16), (3, 6, 17), (2, 3, 31), (2, 3, 33), (7, 8, 70)]
 
@@ -232,7 +231,7 @@ def test_groups_near_a_level_equal_the_twin(device, reach):
         numbers = download(device, np.empty(listed.count, np.uint32), listed.positions_d)
         marked = np.zeros((nk * nj, -(-ni // 16)), np.bool_)
         marked[numbers // (32 * row_words(ni)), numbers % (32 * row_words(ni))] = True
-        expected = near_twin.mark_mixed_groups(volume.voxels, 100.0, reach)
+        expected = twin.mark_mixed_groups(volume.voxels, 100.0, reach)
         np.testing.assert_array_equal(marked.reshape(expected.shape), expected)
 
 

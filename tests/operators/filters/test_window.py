@@ -9,7 +9,7 @@ from uneven_volume import uneven
 
 from clrecon.geometry import Volume
 from clrecon.operators.filters.settings import LARGEST_REACH, choose_window
-from clrecon.proof.filters.filter_twins import spatial_weights
+from clrecon.proof.volumes.volume_twins import spatial_weights
 
 pytestmark = pytest.mark.unit
 

@@ -14,7 +14,7 @@ import clrecon
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.operators.masks.shapes import ball_of, whole_ball_of
-from clrecon.proof.masks import mask_twins as twin
+from clrecon.proof.volumes import volume_twins as twin
 
 FINE = np.diag((0.7, 0.6, 1.4, 1.0))
 TILTED = np.array([[0.6, 0.0, 0.9, -20.0], [0.0, 0.6, 0.7, 5.0], [0.0, 0.0, 2.0, 100.0], [0, 0, 0, 1.0]])

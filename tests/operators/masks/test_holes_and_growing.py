@@ -11,7 +11,7 @@ from uneven_volume import uneven
 import clrecon
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.proof.masks import mask_twins as twin
+from clrecon.proof.volumes import volume_twins as twin
 
 
 def noise(shape: tuple[int, int, int], density: float, seed: int = 3) -> np.ndarray:

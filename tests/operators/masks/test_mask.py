@@ -14,7 +14,7 @@ from uneven_volume import uneven
 import clrecon
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.proof.masks import mask_twins as twin
+from clrecon.proof.volumes import volume_twins as twin
 
 TILTED = np.array([[0.6, 0.0, 0.0, -20.0], [0.0, 0.6, 0.7, 5.0], [0.0, 0.0, 2.0, 100.0], [0, 0, 0, 1.0]])
 ROWS = [1, 31, 32, 33, 512, 513, 2049]

@@ -15,7 +15,6 @@ from clrecon.operators.points.clusters import cluster_points
 from clrecon.operators.points.free_clusters import ClusterSearch, cluster_free_points, find_clusters, plan_cells
 from clrecon.operators.points.grid import fill_grid
 from clrecon.points import PointCloud
-from clrecon.proof.points import clusters as passes_twin
 from clrecon.proof.points import clusters as twin
 from clrecon.proof.points import grid as grid_twin
 
@@ -88,18 +87,18 @@ def test_the_passes_equal_their_twins(device, form):
     plan = plan_cells(points, 0.9)
     grid = grid_twin.make_grid(points, float(plan.edge))
     search = ClusterSearch(device, fill_grid(device, plan), 0.9, 3, 64)
-    pairs = passes_twin.count_pairs(grid, float(plan.edge), 3)
+    pairs = twin.count_pairs(grid, float(plan.edge), 3)
     assert np.array_equal(search.count_pairs(), pairs)
     search.find_cores()
     search.join_within()
     search.note_words()
     cores = twin.cluster_points(points, 0.9, 3)[2][grid.order]
-    labels = passes_twin.join_chunks(grid, cores, 0.9 * (1 + 1e-6), 64)
+    labels = twin.join_chunks(grid, cores, 0.9 * (1 + 1e-6), 64)
     found = module.download(device, np.empty(len(labels), np.uint32), search.labels_d)
     assert np.array_equal(found, labels)
-    roots = passes_twin.note_words(grid, labels)
+    roots = twin.note_words(grid, labels)
     assert np.array_equal(module.download(device, np.empty(len(roots), np.uint32), search.roots_d), roots)
-    assert (roots == passes_twin.SEVERAL_ROOTS).any()
+    assert (roots == twin.SEVERAL_ROOTS).any()
 
 
 def test_a_lattice_at_its_own_spacing(device, form):

@@ -9,8 +9,7 @@ from clrecon.errors import UsageError
 from clrecon.opencl import download, upload
 from clrecon.opencl.device import GROUP_SIZE
 from clrecon.operators.primitives.scan import SCAN_PER_ITEM, compact, exclusive_scan
-from clrecon.proof.primitives import primitive_twins as compact_twin
-from clrecon.proof.primitives import primitive_twins as scan_twin
+from clrecon.proof.volumes import volume_twins as twin
 
 BLOCK = GROUP_SIZE * SCAN_PER_ITEM
 BORDERS = (SCAN_PER_ITEM, GROUP_SIZE, BLOCK, BLOCK * GROUP_SIZE)
@@ -22,7 +21,7 @@ SIZES = sorted({1, *(border + step for border in BORDERS for step in (-1, 0, 1))
 def test_scan_equals_its_twin(device, n):
     counts = np.random.default_rng(n).integers(0, 50, n).astype(np.uint32)
     scanned = exclusive_scan(device, upload(device, counts), n)
-    offsets, total = scan_twin.exclusive_scan(counts)
+    offsets, total = twin.exclusive_scan(counts)
     assert scanned.total == total == int(counts.sum())
     assert np.array_equal(download(device, np.empty(n, np.uint32), scanned.offsets_d), offsets)
 
@@ -33,7 +32,7 @@ def test_a_scan_may_take_the_place_of_its_counts(device, n):
     scanned = exclusive_scan(device, upload(device, counts), n)  # writable, and counts as good as any
     again = exclusive_scan(device, scanned.offsets_d, n, in_place=True)
     assert again.offsets_d is scanned.offsets_d
-    expected = scan_twin.exclusive_scan(scan_twin.exclusive_scan(counts)[0])[0]
+    expected = twin.exclusive_scan(twin.exclusive_scan(counts)[0])[0]
     assert np.array_equal(download(device, np.empty(n, np.uint32), again.offsets_d), expected)
 
 
@@ -43,7 +42,7 @@ def test_devices_with_small_work_groups_get_the_same(device, group, monkeypatch)
     monkeypatch.setattr(device, "max_work_group_size", group)
     counts = np.random.default_rng(group).integers(0, 50, 5000).astype(np.uint32)
     scanned = exclusive_scan(device, upload(device, counts), counts.size)
-    offsets, total = scan_twin.exclusive_scan(counts)
+    offsets, total = twin.exclusive_scan(counts)
     assert scanned.total == total
     assert np.array_equal(download(device, np.empty(counts.size, np.uint32), scanned.offsets_d), offsets)
 
@@ -55,7 +54,7 @@ def test_a_total_beyond_32_bits_is_exact(device):
     scanned = exclusive_scan(device, upload(device, counts), n)
     assert scanned.total == n * (2**21 - 1) > 2**32
     offsets = download(device, np.empty(n, np.uint32), scanned.offsets_d)
-    assert np.array_equal(offsets, scan_twin.exclusive_scan(counts)[0])
+    assert np.array_equal(offsets, twin.exclusive_scan(counts)[0])
 
 
 @pytest.mark.oclgrind
@@ -65,7 +64,7 @@ def test_more_blocks_than_a_group_has_items(device, monkeypatch):
     counts = np.random.default_rng(4).integers(0, 50, 4 * SCAN_PER_ITEM * 5 + 3).astype(np.uint32)
     scanned = exclusive_scan(device, upload(device, counts), counts.size)
     offsets = download(device, np.empty(counts.size, np.uint32), scanned.offsets_d)
-    assert np.array_equal(offsets, scan_twin.exclusive_scan(counts)[0])
+    assert np.array_equal(offsets, twin.exclusive_scan(counts)[0])
 
 
 def test_sizes_that_do_not_fit_are_refused(device):
@@ -78,10 +77,10 @@ def test_sizes_that_do_not_fit_are_refused(device):
 
 
 def test_the_twin_is_what_it_says():
-    offsets, total = scan_twin.exclusive_scan(np.array([3, 0, 2, 7], np.uint32))
+    offsets, total = twin.exclusive_scan(np.array([3, 0, 2, 7], np.uint32))
     assert offsets.tolist() == [0, 3, 3, 5]
     assert total == 12
-    assert compact_twin.compact(np.array([0b101, 0, 1 << 31], np.uint32)).tolist() == [0, 2, 95]
+    assert twin.compact(np.array([0b101, 0, 1 << 31], np.uint32)).tolist() == [0, 2, 95]
 
 
 @pytest.mark.every_device
@@ -93,4 +92,4 @@ def test_compact_equals_its_twin(device, words, density):
     compacted = compact(device, upload(device, mask), words)
     assert compacted.count == bits.sum()
     positions = download(device, np.empty(compacted.count, np.uint32), compacted.positions_d)
-    assert np.array_equal(positions, compact_twin.compact(mask))
+    assert np.array_equal(positions, twin.compact(mask))

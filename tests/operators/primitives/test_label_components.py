@@ -11,7 +11,7 @@ from clrecon.geometry import Volume
 from clrecon.mesh import connectivity
 from clrecon.operators.primitives import union_find as components
 from clrecon.operators.primitives.union_find import label_components
-from clrecon.proof.primitives import primitive_twins as twin
+from clrecon.proof.volumes import volume_twins as twin
 
 AFFINE = np.diag((0.5, 0.7, 2.5, 1.0))
 

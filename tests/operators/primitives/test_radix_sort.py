@@ -9,7 +9,7 @@ from clrecon.errors import UsageError
 from clrecon.opencl import download, upload
 from clrecon.operators.primitives import scan as module
 from clrecon.operators.primitives.scan import FEWEST_PER_CHUNK, RADIX_BITS, exclusive_scan, radix_sort, sort_bytes
-from clrecon.proof.primitives import primitive_twins as twin
+from clrecon.proof.volumes import volume_twins as twin
 
 CHUNK = FEWEST_PER_CHUNK
 SIZES = sorted({1, 2, *(border + step for border in (64, 1024, CHUNK, 2 * CHUNK) for step in (-1, 0, 1)), 90_001})

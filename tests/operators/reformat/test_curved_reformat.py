@@ -9,7 +9,7 @@ import tolerances
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.operators.reformat.cut import reformat_curve
-from clrecon.proof.reformat.sheets import reformat_sheet
+from clrecon.proof.volumes.volume_twins import reformat_sheet
 from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.reformation import slab_samples, straightened_sheet
 

@@ -16,7 +16,7 @@ from clrecon.operators.rays.render import render
 from clrecon.operators.reformat.cut import cut_slice, reformat_curve
 from clrecon.operators.reformat.sheets import prepare_reformat, sample_sheet
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.proof.reformat.sheets import reformat_sheet
+from clrecon.proof.volumes.volume_twins import reformat_sheet
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.reformation import find_plane, plane_sheet, slab_samples
 

@@ -11,7 +11,7 @@ from clrecon.geometry import Volume
 from clrecon.opencl import download, upload
 from clrecon.operators.resident.tables import compare_bricks, measure_bricks
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
-from clrecon.proof.resident import bricks as twin
+from clrecon.proof.volumes import volume_twins as twin
 
 SHAPES = [(1, 1, 1), (3, 9, 7), (8, 8, 8), (9, 7, 8), (17, 16, 33), (8, 9, 100)]
 

@@ -13,11 +13,11 @@ from surface_volumes import smooth_volume
 from uneven_volume import uneven
 
 from clrecon.geometry import Volume
-from clrecon.mesh.compare.cells import find_mesh_cells, measure_cells
-from clrecon.mesh.compare.mesh_slices import measure_slices
-from clrecon.mesh.compare.truth import measure_truth
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.methods import extract_by_method
+from clrecon.proof.compare.mesh_cells import find_mesh_cells, measure_cells
+from clrecon.proof.compare.mesh_slices import measure_slices
+from clrecon.proof.compare.mesh_truth import measure_truth
 from clrecon.proof.phantom import PhantomSettings, phantom_truth
 from clrecon.reading import read_volume
 

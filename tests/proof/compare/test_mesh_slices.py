@@ -9,7 +9,7 @@ import sample_meshes as samples
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
-from clrecon.mesh.compare.mesh_slices import measure_slices
+from clrecon.proof.compare.mesh_slices import measure_slices
 
 pytestmark = pytest.mark.unit
 

@@ -11,7 +11,7 @@ import sample_meshes as samples
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
-from clrecon.mesh.compare.cells import GridCells, find_mesh_cells, measure_cells, meets_box
+from clrecon.proof.compare.mesh_cells import GridCells, find_mesh_cells, measure_cells, meets_box
 
 pytestmark = pytest.mark.unit
 

@@ -12,8 +12,8 @@ import tolerances
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
-from clrecon.mesh.compare.cells import find_mesh_cells, measure_cells
-from clrecon.mesh.compare.truth import find_cut_cells, measure_truth
+from clrecon.proof.compare.mesh_cells import find_mesh_cells, measure_cells
+from clrecon.proof.compare.mesh_truth import find_cut_cells, measure_truth
 from clrecon.proof.phantom import PhantomSettings, phantom_truth
 
 pytestmark = pytest.mark.unit

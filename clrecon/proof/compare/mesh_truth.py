@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry.grid import Grid
-from clrecon.mesh.compare.cells import GridCells
 from clrecon.mesh.compare.distances import sample_surface_points
 from clrecon.mesh.mesh import Mesh
+from clrecon.proof.compare.mesh_cells import GridCells
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record

@@ -12,9 +12,9 @@ from clrecon.exchange.vtp import make_polydata
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
-from clrecon.mesh.compare import mesh_slices as lattices
 from clrecon.mesh.compare.iso_distance import trilinear_values
-from clrecon.mesh.compare.mesh_slices import Lattice, count_points, exclusive_or, find_level_runs, find_piercings
+from clrecon.proof.compare import mesh_slices as lattices
+from clrecon.proof.compare.mesh_slices import Lattice, count_points, exclusive_or, find_level_runs, find_piercings
 
 pytestmark = pytest.mark.unit
 

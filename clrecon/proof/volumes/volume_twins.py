@@ -1,0 +1,354 @@
+"""Twins of `clrecon.operators` in plain numpy: primitives, bricks of resident volumes, masks (boxes and tubes, where
+every voxel is asked; balls, one nearest voxel at a time), the bilateral filter in float64, and slices in float64.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.geometry import Volume
+from clrecon.geometry.affine import Float64Array
+from clrecon.rendering.views.reformation import Sheet, SlabSamples
+
+
+def exclusive_scan(counts: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], int]:
+    """Return the sum of all counts before each element, (n,) uint32, and the total."""
+    sums = np.cumsum(counts, dtype=np.uint64)
+    total = int(sums[-1]) if sums.size else 0
+    return (sums - counts).astype(np.uint32), total
+
+
+def compact(mask: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Return the positions of the set bits of a bit mask in ascending order; bit b of word w is position 32 w + b."""
+    bits = mask[:, None] >> np.arange(32, dtype=np.uint32) & 1
+    return np.flatnonzero(bits).astype(np.uint32)
+
+
+def radix_sort(keys: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+    """Sort keys, equal ones in the order of the input.
+
+    Returns:
+    keys: ndarray, shape (n,), uint32, ascending
+    values: ndarray, shape (n,), uint32. Number of each of them in the input.
+    """
+    order = np.argsort(keys, kind="stable")
+    return keys[order], order.astype(np.uint32)
+
+
+def label_components(triangles: NDArray[np.uint32], vertex_count: int) -> tuple[int, NDArray[np.int64]]:
+    """Number the components of a mesh by label propagation.
+
+    Every vertex takes the smallest label in any of its triangles, until no label changes: the label of a component
+    is then its smallest vertex.
+
+    triangles: ndarray, shape (m, 3), uint32
+
+    Returns:
+    count: Number of components, not counting vertices that no triangle uses.
+    labels: ndarray, shape (vertex_count,), int64. Component of each vertex, numbered in order of the first vertex; -1
+        for unused vertices.
+    """
+    roots = np.arange(vertex_count)
+    while True:
+        before = roots.copy()
+        least = roots[triangles].min(axis=1)
+        for corner in range(3):
+            np.minimum.at(roots, triangles[:, corner], least)
+        if np.array_equal(roots, before):
+            break
+    used = np.zeros(vertex_count, dtype=bool)
+    used[triangles.reshape(-1)] = True
+    is_root = used & (roots == np.arange(vertex_count))
+    number = np.cumsum(is_root) - 1
+    return int(np.count_nonzero(is_root)), np.where(used, number[roots], -1).astype(np.int64)
+
+
+def measure_bricks(voxels: NDArray[Any], brick: int = 8) -> NDArray[Any]:
+    """Return the lowest and highest value of each brick.
+
+    voxels: ndarray, shape (nk, nj, ni)
+    brick: Voxels along each side.
+
+    Returns: ndarray, shape (bk, bj, bi, 2), of the voxels' type
+    """
+    shape = [-(-n // brick) for n in voxels.shape]
+    ranges = np.empty((*shape, 2), voxels.dtype)
+    for at in np.ndindex(*shape):
+        part = voxels[tuple(slice(brick * n, brick * (n + 1)) for n in at)]
+        ranges[at] = part.min(), part.max()
+    return ranges
+
+
+def compare_bricks(
+    ranges: NDArray[Any], level: float, ni: int, border: int, brick: int = 8
+) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+    """Return the state of each word of samples and the extent of each row of bricks, as the device operator does."""
+    words = -(-(ni + 2 * border) // 32)
+    states = np.zeros((*ranges.shape[:2], words), np.uint8)
+    extents = np.zeros((*ranges.shape[:2], 2), np.uint16)
+    for k, j in np.ndindex(*ranges.shape[:2]):
+        for word in range(words):
+            first, end = max(32 * word - border, 0), min(32 * word - border + 32, ni)
+            if first < end:
+                low, high = ranges[k, j, first // brick : (end - 1) // brick + 1].T
+                states[k, j, word] = 0 if high.max() < level else 1 if low.min() >= level else 2
+        used = np.flatnonzero(states[k, j])
+        if len(used):
+            extents[k, j] = used[0], used[-1] + 1
+    return states, extents
+
+
+def fill_holes(chosen: ArrayLike, by_slice: bool = False) -> NDArray[np.bool_]:
+    """Return the chosen voxels and those that they enclose, (nk, nj, ni): what a flood from beyond never meets."""
+    bits = np.asarray(chosen, dtype=bool)
+    if by_slice:
+        return np.stack([fill_holes(layer) for layer in bits])
+    beyond = np.pad(~bits, 1, constant_values=True)
+    return ~_flood(beyond, (0,) * bits.ndim)[(slice(1, -1),) * bits.ndim]
+
+
+def grow(chosen: ArrayLike, voxels: ArrayLike) -> NDArray[np.bool_]:
+    """Return the components of the chosen voxels that hold a voxel (k, j, i) of a list."""
+    bits = np.asarray(chosen, dtype=bool)
+    found = np.zeros_like(bits)
+    for voxel in np.asarray(voxels).tolist():
+        if not found[tuple(voxel)]:
+            found |= _flood(bits, tuple(voxel))
+    return found
+
+
+def _flood(bits: NDArray[np.bool_], start: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return the component that holds `start`, one element at a time."""
+    met = np.zeros_like(bits)
+    met[start] = bits[start]
+    open_ends = [start] if bits[start] else []
+    while open_ends:
+        place = open_ends.pop()
+        for axis, size in enumerate(bits.shape):
+            for step in (-1, 1):
+                near = (*place[:axis], place[axis] + step, *place[axis + 1 :])
+                if 0 <= near[axis] < size and bits[near] and not met[near]:
+                    met[near] = True
+                    open_ends.append(near)
+    return met
+
+
+def find_places(volume: Volume, border: tuple[int, int, int] = (0, 0, 0)) -> NDArray[np.float64]:
+    """Return LPS mm of all voxels, and of as many beyond them along i, j and k as `border` says, (nk, nj, ni, 3)."""
+    shape = [n + 2 * more for n, more in zip(volume.voxels.shape, border[::-1], strict=True)]
+    ijk = np.indices(shape)[::-1].reshape(3, -1).T - border
+    return volume.ijk_to_lps(ijk).reshape(*shape, 3)
+
+
+def find_in_box(volume: Volume, sides: ArrayLike) -> NDArray[np.bool_]:
+    """Return the voxels in a box, its sides included, shape (nk, nj, ni).
+
+    sides: array_like, shape (3, 2). Lower and upper side in x, y and z, LPS mm; infinity leaves a side open.  Voxels up
+        to 1e-6 mm beyond are in.
+    """
+    low, high = np.asarray(sides, dtype=np.float64).T
+    places = find_places(volume)
+    found: NDArray[np.bool_] = ((places >= low - 1e-6) & (places <= high + 1e-6)).all(axis=-1)
+    return found
+
+
+def find_in_tube(volume: Volume, points: ArrayLike, radius_mm: float) -> NDArray[np.bool_]:
+    """Return the voxels within ``radius_mm * (1 + 1e-6)`` of a line through points, shape (nk, nj, ni)."""
+    line: NDArray[Any] = np.asarray(points, dtype=np.float64)
+    places = find_places(volume)
+    nearest = np.linalg.norm(places - line[0], axis=-1)
+    for begin, end in zip(line[:-1], line[1:], strict=True):
+        along = end - begin
+        square = float(along @ along)
+        part = np.clip(((places - begin) @ along) / square, 0.0, 1.0) if square else np.zeros(places.shape[:-1])
+        nearest = np.minimum(nearest, np.linalg.norm(places - begin - part[..., None] * along, axis=-1))
+    found: NDArray[np.bool_] = nearest <= radius_mm * (1.0 + 1e-6)
+    return found
+
+
+Bits = NDArray[np.bool_]
+
+
+def dilate(volume: Volume, chosen: ArrayLike, mm: float, by_slice: bool = False) -> Bits:
+    """Return the voxels within ``mm * (1 + 1e-6)`` of a chosen one, shape (nk, nj, ni)."""
+    return _spread(find_places(volume), np.asarray(chosen, dtype=bool), mm, by_slice)
+
+
+def erode(volume: Volume, chosen: ArrayLike, mm: float, by_slice: bool = False, beyond: bool = False) -> Bits:
+    """Return the voxels without one within ``mm * (1 + 1e-6)`` that is not chosen; `beyond`: those beyond are."""
+    bits = np.asarray(chosen, dtype=bool)
+    if beyond:
+        return ~_spread(find_places(volume), ~bits, mm, by_slice)
+    border = _border(volume, mm)
+    padded = np.pad(~bits, [(n, n) for n in border[::-1]], constant_values=True)
+    inner = tuple(slice(n, n + size) for n, size in zip(border[::-1], bits.shape, strict=True))
+    return ~_spread(find_places(volume, border), padded, mm, by_slice, inner)
+
+
+def _border(volume: Volume, mm: float) -> tuple[int, int, int]:
+    """Return enough voxels along i, j and k that those beyond them are farther than `mm` from the volume."""
+    steps = volume.affine[:3, :3].copy()
+    ends = np.diff(volume.slice_origins(1), axis=0)[[0, -1]]
+    borders = []
+    for end in ends:
+        steps[:, 2] = end
+        borders.append(2 + np.ceil(mm * np.linalg.norm(np.linalg.inv(steps), axis=1)).astype(int))
+    i, j, k = np.max(borders, axis=0).tolist()
+    return i, j, k
+
+
+def close(volume: Volume, chosen: ArrayLike, mm: float, by_slice: bool = False) -> Bits:
+    """Return a dilation, eroded as if all beyond the volume were chosen."""
+    return erode(volume, dilate(volume, chosen, mm, by_slice), mm, by_slice, beyond=True)
+
+
+def _spread(
+    places: NDArray[np.float64], chosen: Bits, mm: float, by_slice: bool, inner: tuple[slice, ...] = (slice(None),) * 3
+) -> Bits:
+    """Return the voxels of the part `inner` that are near chosen ones."""
+    from scipy.spatial import cKDTree
+
+    wanted, k = places[inner], np.arange(len(places))[inner[0]]
+    found = np.zeros(wanted.shape[:-1], bool)
+    layers = [(slice(n, n + 1), slice(at, at + 1)) for n, at in enumerate(k)] if by_slice else [(slice(None),) * 2]
+    for own, layer in layers:
+        if chosen[layer].any():
+            tree = cKDTree(places[layer][chosen[layer]])
+            distances = tree.query(wanted[own].reshape(-1, 3), distance_upper_bound=2.0 * mm)[0]
+            found[own] = (distances <= mm * (1.0 + 1e-6)).reshape(found[own].shape)
+    return found
+
+
+GROUP = 16
+"""Voxels of a group, along i."""
+
+
+def mark_mixed_groups(voxels: NDArray[Any], level: float, reach: tuple[int, int, int]) -> NDArray[np.bool_]:
+    """Mark the groups of which some voxel has both sides of a level in the box around it.
+
+    voxels: ndarray, shape (nk, nj, ni)
+    level: Inside are values from here on; NaN is not.
+    reach: Half the size of the box along i, j, k, without the voxel in its middle.
+
+    Returns: ndarray, shape (nk, nj, groups), bool. Group g is the voxels 16 g to 16 g + 15 of a row; the last one may
+        be shorter.
+    """
+    from scipy import ndimage
+
+    inside = voxels >= level
+    size = tuple(2 * n + 1 for n in reversed(reach))
+    some = ndimage.maximum_filter(inside, size, mode="nearest")
+    every = ndimage.minimum_filter(inside, size, mode="nearest")
+    mixed = some & ~every
+    ni = voxels.shape[2]
+    padded = np.zeros((*voxels.shape[:2], -(-ni // GROUP) * GROUP), np.bool_)
+    padded[:, :, :ni] = mixed
+    return np.asarray(padded.reshape(*voxels.shape[:2], -1, GROUP).any(axis=3))
+
+
+def spatial_weights(volume: Volume, offsets: NDArray[np.integer[Any]], sigma_mm: float) -> NDArray[np.float64]:
+    """Return the weights of neighbours by their true distance, exp(-|t|^2 / (2 sigma^2)).
+
+    offsets: ndarray, shape (n, 3). Steps along i, j, k.
+
+    Returns: ndarray, shape (nk, n), float64. For the voxels of each slice; beyond the ends the slices go on in the
+        steps of the ends.
+    """
+    weights = np.empty((volume.shape_ijk[2], len(offsets)))
+    for k, of_slice in enumerate(weights):
+        here = np.array([3.0, 4.0, float(k)])
+        steps = volume.ijk_to_lps(here + offsets) - volume.ijk_to_lps(here[None])
+        of_slice[:] = np.exp(-np.einsum("ni,ni->n", steps, steps) / (2.0 * sigma_mm**2))
+    return weights
+
+
+def filter_bilateral(
+    voxels: NDArray[Any], offsets: NDArray[np.integer[Any]], weights: NDArray[np.float64], sigma_hu: float
+) -> NDArray[np.float64]:
+    """Filter voxels: the weighted mean of the window, before it is rounded.
+
+    voxels: ndarray, shape (nk, nj, ni). Beyond the border lies the value of the nearest voxel.  NaN and infinite ones
+        stay, and count nowhere.
+    offsets: ndarray, shape (n, 3). Steps along i, j, k to the voxels of the window, the voxel itself among them.
+    weights: ndarray, shape (nk, n), float64. See `spatial_weights`.
+
+    Returns: ndarray, shape (nk, nj, ni), float64
+    """
+    values = voxels.astype(np.float64)
+    centre = np.where(np.isfinite(values), values, 0.0)
+    sizes = values.shape[::-1]
+    total, moved = np.zeros_like(values), np.zeros_like(values)
+    for (i, j, k), of_slices in zip(offsets.tolist(), weights.T, strict=True):
+        places = [np.clip(np.arange(n) + step, 0, n - 1) for n, step in zip(sizes, (i, j, k), strict=True)]
+        near = values[np.ix_(*places[::-1])]
+        counts = np.isfinite(near)
+        away = np.where(counts, near, 0.0) - centre
+        with np.errstate(over="ignore", under="ignore"):
+            weight = of_slices[:, None, None] * np.exp(-0.5 * (away / sigma_hu) ** 2) * counts
+        total += weight
+        moved += weight * away
+    with np.errstate(invalid="ignore"):
+        filtered = centre + moved / total
+    result: NDArray[np.float64] = np.where(np.isfinite(values), filtered, values)
+    return result
+
+
+EDGE = 2.0**-20
+"""Index steps beyond the box of a volume that still count as inside: the rounding error of a pixel on a face."""
+
+
+def is_inside(volume: Volume, points: Float64Array) -> NDArray[np.bool_]:
+    """True for points (..., 3) in LPS mm within the box of a volume, half a voxel beyond the outer voxel centres."""
+    ijk = volume.lps_to_ijk(points.reshape(-1, 3))
+    last = np.array(volume.shape_ijk) - 1
+    inside = ((ijk >= -0.5 - EDGE) & (ijk <= last + 0.5 + EDGE)).all(axis=1)
+    return np.asarray(inside.reshape(points.shape[:-1]))
+
+
+def sample_field(volume: Volume, points: Float64Array) -> Float64Array:
+    """Interpolate trilinearly between voxel centres.
+
+    points: ndarray, shape (n, 3), float64. LPS mm, all of them within the box of the volume.
+
+    Returns: ndarray, shape (n,), float64. HU; between the outer voxel centres and the faces of the box the nearest
+        value.
+    """
+    last = np.array(volume.shape_ijk) - 1
+    at = np.clip(volume.lps_to_ijk(points), 0.0, last)
+    low = np.floor(at).astype(np.intp)
+    part = at - low
+    high = np.minimum(low + (part > 0.0), last)
+    values = np.zeros(len(at))
+    for corner in np.ndindex(2, 2, 2):
+        i, j, k = (np.where(upper, high[:, axis], low[:, axis]) for axis, upper in enumerate(corner))
+        weight = np.prod(np.where(corner, part, 1.0 - part), axis=1)
+        # Voxels with weight 0 are ignored: they may be NaN.
+        values += np.where(weight > 0.0, weight * volume.voxels[k, j, i].astype(np.float64), 0.0)
+    return values
+
+
+def reformat_sheet(volume: Volume, sheet: Sheet, samples: SlabSamples, combine: str = "mean") -> Float64Array:
+    """Compute the values of all pixels of a sheet.
+
+    combine: {"mean", "max", "min"}. How the samples of a pixel that lie within the volume are combined.
+
+    Returns: ndarray, shape (h, w), float64. HU; NaN where no sample lies within the volume.
+    """
+    shape = sheet.height, sheet.width
+    values = np.full(shape, 0.0 if combine == "mean" else np.nan)
+    weights = np.zeros(shape)
+    for offset, weight in zip(samples.offsets, samples.weights, strict=True):
+        points = sheet.points(depth=offset)
+        inside = is_inside(volume, points)
+        sampled = sample_field(volume, points[inside])
+        weights[inside] += weight
+        if combine == "mean":
+            values[inside] += weight * sampled
+        else:
+            values[inside] = (np.fmax if combine == "max" else np.fmin)(values[inside], sampled)
+    if combine == "mean":
+        values = values / np.where(weights > 0.0, weights, 1.0)
+    return np.asarray(np.where(weights > 0.0, values, np.nan))
