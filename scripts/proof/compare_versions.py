@@ -229,9 +229,9 @@ def _run(command: list[str], folder: Path) -> tuple[int, str, str]:
 
 
 def _still(text: str) -> str:
-    """Return `text` without the line of times, the time of a frame and the lines of progress."""
+    """Return `text` without the line of times, the times of a frame and of a step, and the lines of progress."""
     text = re.sub(r"(?m)^time +\d.*\n", "", re.sub(r"[^\n]*\r", "", text))
-    return re.sub(r"\b[\d.]+ s each\b", "N s each", text)
+    return re.sub(r"\b[\d.]+ s each\b", "N s each", re.sub(r"(?m), [\d.]+ s$", ", N s", text))
 
 
 def _differing_lines(old: tuple[int, str, str], new: tuple[int, str, str]) -> Iterator[str]:

@@ -52,9 +52,9 @@ def test_a_changed_byte_and_a_missing_file_are_found(tmp_path: Path) -> None:
 
 
 def test_only_times_are_left_out_of_the_console() -> None:
-    times = "time     1.9 s (read 0.72, write 0.03)\n3 frames, 0.041 s each\n"
+    times = "time     1.9 s (read 0.72, write 0.03)\n3 frames, 0.041 s each\nsteps    9 points, 0.07 s\n"
     text = f"read 1/9\rread 9/9\rvertices 12\n{times}warning: 3 s\n"
-    assert _still(text) == "vertices 12\n3 frames, N s each\nwarning: 3 s\n"
+    assert _still(text) == "vertices 12\n3 frames, N s each\nsteps    9 points, N s\nwarning: 3 s\n"
 
 
 def test_every_command_is_compared_or_left_out_by_name(tmp_path: Path) -> None:

@@ -315,7 +315,7 @@ class Mask(MaskComponents):
         volume, n = resident.volume, len(spans.columns)
         check_shape(volume.shape_ijk)
         if not n:
-            low, high = _bounds(volume)
+            low, high = volume.bounds
             raise UsageError(
                 f"no voxel lies in the {name}: the volume runs from ({', '.join(f'{x:.1f}' for x in low)}) to"
                 f" ({', '.join(f'{x:.1f}' for x in high)}) mm"
@@ -345,11 +345,3 @@ def _checked_value(value: float, dtype: np.dtype[Any]) -> Any:
     if made is None or not np.isfinite(number) or (dtype.kind != "f" and float(made) != number):
         raise UsageError(f"the value outside is {value!r}: voxels of {dtype} hold no such HU")
     return made
-
-
-def _bounds(volume: Volume) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the lowest and highest place of the voxels, mm."""
-    last = np.array(volume.shape_ijk) - 1
-    corners = np.array([[a, b, c] for a in (0, last[0]) for b in (0, last[1]) for c in range(last[2] + 1)])
-    places = volume.ijk_to_lps(corners)
-    return places.min(axis=0), places.max(axis=0)

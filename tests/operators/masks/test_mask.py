@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+import re
 
 import numpy as np
 import pytest
@@ -131,6 +132,9 @@ def test_a_surface_of_what_is_chosen_is_that_of_the_part(device):
 def test_bad_input_is_refused(device):
     volume = random_volume((3, 4, 40))
     make = clrecon.Mask
+    places = volume.ijk_to_lps(np.argwhere(volume.voxels.T > -1))
+    low, high = places.min(axis=0), places.max(axis=0)
+    ends = "the volume runs from ({:.1f}, {:.1f}, {:.1f}) to ({:.1f}, {:.1f}, {:.1f}) mm".format(*low, *high)
     with pytest.raises(UsageError, match="a band is two numbers"):
         make.from_band(volume, (3, 1), device=device)
     with pytest.raises(NoSurfaceError, match="no voxel can have"):
@@ -153,7 +157,7 @@ def test_bad_input_is_refused(device):
         ([[0, 0]], 3.0, "points have shape"),
         ([[0, 0, 0]], 0.0, "the radius of the tube is 0.0"),
         ([[0, 0, 0]], math.nan, "the radius of the tube is nan"),
-        ([[9e3, 0, 0]], 3.0, "no voxel lies in the tube of 3 mm"),
+        ([[9e3, 0, 0]], 3.0, f"no voxel lies in the tube of 3 mm.*: {re.escape(ends)}"),
     ):
         with pytest.raises(UsageError, match=words):
             make.from_tube(volume, points, radius, device=device)
