@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import json
+import os
 import re
 import subprocess
 import sys
@@ -32,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from _environment import find_python  # noqa: E402
 
-VOLATILE = frozenset({"seconds", "seconds_a_frame", "peak_memory_bytes", "version"})
+VOLATILE = frozenset({"seconds", "kernel_seconds", "seconds_a_frame", "peak_memory_bytes", "version"})
 """Names in reports whose values differ between runs, or always differ between versions."""
 
 PHANTOMS = {
@@ -222,9 +223,14 @@ def _distance_of(folders: list[Path], commands: list[list[str]]) -> list[str]:
 
 
 def _run(command: list[str], folder: Path) -> tuple[int, str, str]:
-    """Run a command in `folder`; returns its exit code, stdout and stderr without times and progress."""
+    """Run a command in `folder`; returns its exit code, stdout and stderr without times and progress.
+
+    Each side keeps its own kernels: PoCL builds those of another environment anew, which reports would tell.
+    """
     folder.mkdir()
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, errors="replace")
+    cache = str(folder.with_name(f"{folder.name.partition('-')[0]}-cache"))
+    kept = {**os.environ, "XDG_CACHE_HOME": cache, "POCL_CACHE_DIR": os.path.join(cache, "pocl")}
+    done = subprocess.run(command, cwd=folder, env=kept, capture_output=True, text=True, errors="replace")
     return done.returncode, _still(done.stdout), _still(done.stderr)
 
 
