@@ -131,9 +131,11 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--labels", type=Path, help="label map of the last CT_FOLDER")
     parser.add_argument("--device", default="0")
     parser.add_argument("--only", default="", help="only commands whose words hold this text")
-    parser.add_argument("--vertebra", default="L3", help="name or number in the label map (default: %(default)s)")
+    parser.add_argument("--vertebra", default="L3", help="name or number in FILE (default: %(default)s)")
     parser.add_argument("--phantoms", default=",".join(PHANTOMS), metavar="NAMES", help="comma list, may be empty")
-    return parser.parse_args()
+    options = parser.parse_args()
+    options.labels = options.labels and options.labels.absolute()
+    return options
 
 
 def _program(checkout: Path) -> list[str]:
@@ -156,8 +158,10 @@ def _compare_all(options: argparse.Namespace, scratch: Path) -> Iterator[str]:
     for name, folder in [("none", scratch), *inputs.items()]:
         labels = next((path for path in (folder / file for file in LABEL_MAPS) if path.exists()), None)
         if options.labels is not None and options.inputs and folder.name == options.inputs[-1].name:
-            labels = options.labels.absolute()
-        commands = list(_commands_alone()) if name == "none" else list(_commands(folder, labels, options))
+            labels = options.labels
+        vertebra = options.vertebra if labels == options.labels else "L3"
+        given = (folder, labels, vertebra, options.device)
+        commands = list(_commands_alone()) if name == "none" else list(_commands(*given))
         if name != "none":
             commands.append(
                 _distance_of([scratch / f"new-{name}-{number}" for number in range(len(commands))], commands)
@@ -181,8 +185,7 @@ def _commands_alone() -> Iterator[list[str]]:
     yield ["devices", "--json"]
 
 
-def _commands(folder: Path, labels: Path | None, options: argparse.Namespace) -> Iterator[list[str]]:
-    device = options.device
+def _commands(folder: Path, labels: Path | None, vertebra: str, device: str) -> Iterator[list[str]]:
     yield ["info", str(folder), "--pixels", "--json"]
     yield ["info", str(folder), "--strict"]
     for name, arguments in CLOUDS.items():
@@ -195,7 +198,7 @@ def _commands(folder: Path, labels: Path | None, options: argparse.Namespace) ->
         own = ["--labels", str(labels)]
         yield ["stats", str(folder), *own, "--csv", "stats.csv", "--report", "stats.json"]
         yield ["cloud", str(folder), "-o", "labels.ply", *own, "--device", device, "--report", "labels.json"]
-        own += ["--label", options.vertebra]
+        own += ["--label", vertebra]
         for command, ways in OF_VERTEBRAE.items():
             for way in ways:
                 yield [command, str(folder), *own, *way, "--device", device, "--report", "report.json"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import pytest
@@ -58,8 +57,7 @@ def test_only_times_are_left_out_of_the_console() -> None:
 
 
 def test_every_command_is_compared_or_left_out_by_name(tmp_path: Path) -> None:
-    options = argparse.Namespace(device="0", vertebra="L3")
-    commands = list(_commands(tmp_path, tmp_path / "levels.nrrd", options))
+    commands = list(_commands(tmp_path, tmp_path / "levels.nrrd", "L3", "0"))
     folders = [tmp_path / str(number) for number in range(len(commands))]
     commands.append(_distance_of(folders, commands))
     assert set(COMMANDS) == {*OF_CLRECON, "help"}

@@ -77,6 +77,12 @@ def test_sides_may_move_by_half_a_voxel(shift_mm, found):
     assert is_rail(volume, make_bar(volume, shift_mm=shift_mm)) == found
 
 
+@pytest.mark.parametrize(("pixel_mm", "found"), [((4.0, 1.0), True), ((1.0, 4.0), False)])
+def test_half_a_voxel_is_that_of_the_side_that_moves(pixel_mm, found):
+    volume = Volume(np.zeros((LAST + 1, 4, 4), np.int16), np.diag((*pixel_mm, 2.0, 1.0)))
+    assert is_straight(make_bar(volume, shift_mm=1.9), volume) == found
+
+
 def test_components_are_told_apart_and_only_the_chosen_are_looked_at():
     volume = make_volume()
     bars = [make_bar(volume, **bar) for bar in ({"size": (30.0, 30.0)}, {}, {"shift_mm": 5.0}, {}, {})]
@@ -94,3 +100,13 @@ def test_slices_count_from_the_second_to_the_last_but_one(k):
     points = make_bar(volume)
     points[np.abs(volume.lps_to_ijk(points)[:, 2] - k) < 1e-6, 0] += 5.0
     assert is_straight(points, volume) == (k in (0.5, LAST - 0.5))
+
+
+@pytest.mark.parametrize(("share", "straight"), [(0.015, True), (0.03, False)])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_two_hundredths_of_the_points_may_stand_out_on_either_side(share, side, straight):
+    volume = make_volume()
+    k = np.repeat(np.arange(LAST + 1.0), 1000)
+    points = np.column_stack([np.full_like(k, 30.0), np.full_like(k, 40.0), k])
+    points[(k >= LAST / 2) & (np.arange(len(k)) % 1000 < 1000 * share), 0] += side * 20.0
+    assert is_straight(volume.ijk_to_lps(points), volume) == straight

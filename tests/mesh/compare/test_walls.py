@@ -124,6 +124,17 @@ def test_coarse_voxels_are_no_contrast_medium(kind, kept_before):
         assert whole["contrast_share"] < 0.025
 
 
+@pytest.mark.parametrize("depth", [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0])
+def test_a_wall_as_thin_as_a_voxel_is_seen_at_every_half_millimetre(depth):
+    values = np.full((3, 3, 21), 300.0, np.float32)
+    values[..., 8 + round(depth / 0.25)] = 900.0
+    volume = Volume(values, np.diag((0.25, 1.0, 1.0, 1.0)))
+    walls = sample_walls(
+        np.array([[2.0, 1.0, 1.0]]), np.array([[-1.0, 0.0, 0.0]]), volume, choose_iso_rule(volume, 200)
+    )
+    assert walls.wall == [900.0]
+
+
 def test_depths_are_in_voxels_along_the_normal():
     """One slab of even HU that ends 8 mm deep: in voxels of 1 mm that is flat beneath, in slices of 4 mm it is not."""
     for thick, is_flat in ((1.0, True), (4.0, False)):
@@ -142,6 +153,15 @@ def test_depths_are_in_voxels_along_the_normal():
 def test_where_bone_is_compact_and_where_metal_begins(wall_hu, compact, metal):
     found = judge_walls(Walls(np.zeros((3, 3)), np.full(3, wall_hu), np.zeros(3, bool)))
     assert (found["compact_share"], found["metal_share"], found["contrast_share"]) == (compact, metal, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("wall_hu", "looks_like"),
+    [((300, 300, 510), "faint bone"), ((550, 550, 560), "no bone"), ((100, 100, 450), "no bone")],
+)
+def test_faint_bone_has_both_dense_places_and_a_spread(wall_hu, looks_like):
+    walls = Walls(np.zeros((3, 3)), np.array(wall_hu, np.float64), np.zeros(3, bool))
+    assert judge_walls(walls)["looks_like"] == looks_like
 
 
 def test_figures_of_walls_have_one_digit_and_shares_four():

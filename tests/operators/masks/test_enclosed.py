@@ -111,6 +111,15 @@ def test_a_canal_that_the_ends_of_the_scan_cut_is_filled_and_one_that_ends_in_th
     assert clrecon.fill_enclosed(whole(half), 400, device=device).report["solid"]["filled_ml"] == 0.0
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2], ids="kji")
+@pytest.mark.parametrize("from_end", [False, True])
+def test_a_space_that_one_end_of_the_scan_cuts_is_at_an_end(device, axis, from_end):
+    half = np.moveaxis(body(distances((31, 31, 31)), 11.0, 8.0)[15:], 0, axis)
+    cut = np.flip(half, axis) if from_end else half
+    facts = clrecon.fill_enclosed(whole(cut), 400, device=device).report["solid"]
+    assert facts["at_ends"] == facts["spaces"] == 1
+
+
 def test_what_is_too_wide_for_marrow_stays_open_with_the_end_of_the_scan_as_its_lid_too(device):
     distance = distances((93, 93, 93))
     skull = whole(body(distance, 44.0, 40.0))
