@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.jobs.outputs import check_distinct, check_kept, check_outputs, name_outputs, refuse_files
-from clrecon.jobs.run import DeviceOpening, Run, RunReport
+from clrecon.jobs.run import DeviceOpening, Run, RunReport, trial_cube
 from clrecon.reading import Selection
 from clrecon.system.arguments import name_parameter
 from clrecon.system.log import get_logger
@@ -173,7 +173,7 @@ def make_inside(
         with run.keeping():
             _check_files(source, output, picture, report_path, settings)
         run.progress("device", 0, 0)
-        with DeviceOpening(settings.device, _prepare_kernels) as opening:
+        with DeviceOpening(settings.device, _try_masks) as opening:
             volume, labels = run.read_labelled(source)
             device = opening.wait()
         numbers = list(dict.fromkeys(labels.find(label) for label in settings.only))
@@ -250,10 +250,13 @@ def _check_files(
     check_kept(outputs, source, settings.labels)
 
 
-def _prepare_kernels(device: Device) -> None:
-    from clrecon.operators.surface.label_masks import prepare_label_masks
+def _try_masks(device: Device) -> None:
+    """Build the kernels by extracting the label of a small cube."""
+    from clrecon.labels import LabelMap
+    from clrecon.operators.surface.label_masks import extract_label_masks
 
-    prepare_label_masks(device)
+    cube = trial_cube()
+    extract_label_masks(LabelMap((cube.voxels >= 0).astype("uint8"), cube.affine), device=device)
 
 
 def name_part(suffix: str, part: str, *, several: bool) -> str:

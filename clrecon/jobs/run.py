@@ -19,7 +19,7 @@ from time import perf_counter
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar, TypeVar
 
-from clrecon.errors import Cancelled, ClreconError
+from clrecon.errors import Cancelled, ClreconError, DeviceError
 from clrecon.jobs.outputs import check_distinct, check_kept, commit_all
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.paths import keep_existing
@@ -76,12 +76,23 @@ def _choose_device(name: str | int | Device | None) -> Device:
     return take_device(name)
 
 
-def _prepare_device(chosen: Future[Device], prepare: Callable[[Device], None]) -> None:
-    from clrecon.opencl import with_fallback
+def _try_device(chosen: Future[Device], trial: Callable[[Device], object]) -> None:
+    try:
+        trial(chosen.result())
+    except DeviceError:
+        raise
+    except ClreconError:
+        pass  # a step that leaves nothing of the cube
 
-    for attempt in with_fallback(chosen.result()):
-        with attempt as (device, _):
-            prepare(device)
+
+def trial_cube() -> Volume:
+    """Return the volume of trial runs: a cube of 12 voxels a side, from -600 HU at its faces to 3000 in its middle."""
+    import numpy as np
+
+    from clrecon.geometry import Volume
+
+    k, j, i = np.indices((12, 12, 12))
+    return Volume((3000 - 600 * np.abs([i - 5, j - 5, k - 5]).max(axis=0)).astype(np.int16), np.eye(4))
 
 
 class DeviceOpening:
@@ -91,13 +102,14 @@ class DeviceOpening:
     error is raised.  Only a cancellation by the caller is passed on in any case.
 
     name: As `clrecon.device` takes it.
-    prepare: Function that builds the kernels on a device.
+    trial: Builds the kernels: it runs the steps of the job on something small, such as `trial_cube`, and its result is
+        dropped.  Its functions go on on the stand-in of a device by themselves.
     """
 
-    def __init__(self, name: str | int | Device | None, prepare: Callable[[Device], None]):
+    def __init__(self, name: str | int | Device | None, trial: Callable[[Device], object]):
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="device")
         self._chosen = self._pool.submit(_choose_device, name)
-        self._prepared = self._pool.submit(_prepare_device, self._chosen, prepare)
+        self._prepared = self._pool.submit(_try_device, self._chosen, trial)
 
     def wait(self) -> Device:
         """Return the device, ready to work; its stand-in may have taken over."""
@@ -310,10 +322,10 @@ class Run(Laps):
         assert labels is not None
         return volume, labels
 
-    def read_beside(self, prepare: Callable[[Device], None], read: Callable[[], Found]) -> tuple[Found, Device]:
-        """Read the input while the device opens and builds its kernels; return both."""
+    def read_beside(self, trial: Callable[[Device], object], read: Callable[[], Found]) -> tuple[Found, Device]:
+        """Read the input while the device opens and builds its kernels, see `DeviceOpening`; return both."""
         self.progress("device", 0, 0)
-        with DeviceOpening(self.settings.device, prepare) as opening:
+        with DeviceOpening(self.settings.device, trial) as opening:
             found = read()
             self.lap("read")
             device = opening.wait()

@@ -105,9 +105,9 @@ def test_preparing_a_device_for_a_cloud_loads_no_scipy(device: Any, hu: object) 
     subprocess.run([sys.executable, "-c", f"import clrecon; clrecon.device({device.index})"], check=True)
     code = f"""
 import sys, clrecon
-from clrecon.jobs.cloud.steps import prepare_chain
+from clrecon.jobs.cloud.steps import try_steps
 from clrecon.jobs.cloud.settings import CloudSettings, Clustering
-prepare_chain(clrecon.device({device.index}), CloudSettings(hu={hu}, clusters=Clustering()), is_cloud=False)
+try_steps(clrecon.device({device.index}), CloudSettings(hu={hu}, clusters=Clustering()), is_cloud=False)
 """
     done = subprocess.run([sys.executable, "-c", f"{code}\n{LOADED}"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from clrecon.errors import UsageError
 from clrecon.jobs.cloud.report import CloudReport, describe_file, report_of
 from clrecon.jobs.cloud.settings import OF_SCANS, CloudSettings
-from clrecon.jobs.cloud.steps import CloudSteps, find_ghosts, iso_value_of, prepare_chain, take_points
+from clrecon.jobs.cloud.steps import CloudSteps, find_ghosts, iso_value_of, take_points, try_steps
 from clrecon.jobs.inputs import is_cloud_file, refuse_other_clouds, refuse_scan_settings
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.run import Run
@@ -49,7 +49,7 @@ def make_cloud(source: str | Path, files: CloudFiles, settings: CloudSettings | 
         is_cloud = is_cloud_file(source)
         _check_kind(settings, is_cloud)
         (subject, labels), device = run.read_beside(
-            partial(prepare_chain, settings=settings, is_cloud=is_cloud), lambda: _read_input(source, is_cloud, run)
+            partial(try_steps, settings=settings, is_cloud=is_cloud), lambda: _read_input(source, is_cloud, run)
         )
         ghosts = None
         if not is_cloud and settings.masks:

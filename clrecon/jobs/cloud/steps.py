@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clrecon.errors import ClreconError, DeviceError, RefusedInputError
+from clrecon.errors import RefusedInputError
 from clrecon.jobs.cloud.settings import CloudSettings
 from clrecon.jobs.presets import DEFAULT_PRESET, find_iso_preset
+from clrecon.jobs.run import trial_cube
 from clrecon.points.cloud import count_numbers
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
@@ -85,22 +86,14 @@ def iso_value_of(settings: CloudSettings) -> float:
     return float(settings.hu)  # type: ignore[arg-type]
 
 
-def prepare_chain(device: Device, settings: CloudSettings, is_cloud: bool) -> None:
-    """Build the kernels by running all steps on a cube of a few voxels; the result is dropped."""
-    from clrecon.geometry import Volume
+def try_steps(device: Device, settings: CloudSettings, is_cloud: bool) -> None:
+    """Build the kernels by running all steps on a small cube."""
     from clrecon.points import PointCloud
 
-    k, j, i = np.indices((12, 12, 12))
-    voxels = (3000 - 600 * np.abs([i - 5, j - 5, k - 5]).max(axis=0)).astype(np.int16)
-    subject: Volume | PointCloud = Volume(voxels, np.eye(4))
+    subject: Volume | PointCloud = trial_cube()
     if is_cloud:
-        subject = PointCloud(np.argwhere(voxels >= 0).astype(np.float32))
-    try:
-        take_points(subject, None, device, settings.for_trial(), ignore_progress)
-    except DeviceError:
-        raise
-    except ClreconError:
-        pass  # a rule that leaves nothing of a cube
+        subject = PointCloud(np.argwhere(subject.voxels >= 0).astype(np.float32))
+    take_points(subject, None, device, settings.for_trial(), ignore_progress)
 
 
 def run_steps(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,9 +24,9 @@ from clrecon.jobs.mesh.surfaces import Part, Surface, check_known_values, choose
 from clrecon.jobs.outputs import MOST_FILES
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
-from clrecon.jobs.run import Run
+from clrecon.jobs.run import Run, trial_cube
 from clrecon.system.arguments import name_parameter
-from clrecon.system.progress import Progress, Steps
+from clrecon.system.progress import Progress, Steps, ignore_progress
 from clrecon.system.text import format_hu, format_ml
 
 if TYPE_CHECKING:
@@ -109,47 +110,46 @@ def _read_inputs(
             check_map(labels)
         return labels
 
-    prepare = partial(
-        prepare_surfaces, components=settings.selects, topology=settings.topology, inside=settings.inside,
-        vertex_rule=settings.vertex_rule, grows=settings.method_used == "i-mc",
-        decimates=settings.decimate_used is not None and settings.method != "g-mc" and settings.memory is None,
-        solid=settings.solid,
-    )  # fmt: skip
     path = None if settings.labels is None else settings.labels.path
-    return run.read_beside(prepare, lambda: read_with_labels(partial(run.read, source), path, read_map))
+    return run.read_beside(
+        partial(_try_steps, settings=settings),
+        lambda: read_with_labels(partial(run.read, source), path, read_map),
+    )
 
 
-def prepare_surfaces(
-    device: Device,
-    components: bool,
-    topology: str,
-    inside: str = "above",
-    vertex_rule: str = "linear",
-    grows: bool = False,
-    decimates: bool = False,
-    solid: bool = False,
-) -> None:
-    """Build the kernels for surfaces of this topology and, if wanted, for components, growing and so on."""
-    from clrecon.operators.primitives.union_find import prepare_components
-    from clrecon.operators.surface.extraction import prepare_isosurface
+def _try_steps(device: Device, settings: MeshSettings) -> None:
+    """Build the kernels by making the surface of a small cube, or of a label of it."""
+    from clrecon.labels import LabelMap
+    from clrecon.operators.primitives.union_find import label_components
+    from clrecon.operators.surface.decimation import decimate_mesh
+    from clrecon.operators.surface.label_masks import extract_label_masks
+    from clrecon.operators.surface.labels import extract_labels
+    from clrecon.operators.surface.methods import METHODS
 
-    prepare_isosurface(device, topology=topology, inside=inside, vertex_rule=vertex_rule, grown=grows)
-    if grows:
-        from clrecon.operators.surface.growing import prepare_growing
-
-        prepare_growing(device)
-    if decimates:
-        from clrecon.operators.surface.decimation import prepare_near_faces
-
-        prepare_near_faces(device)
-    if solid:
-        from clrecon.operators.masks.runs import prepare_runs
-        from clrecon.operators.masks.shapes import prepare_balls
-
-        prepare_balls(device)
-        prepare_runs(device)
-    if components:
-        prepare_components(device)
+    cube, choice = trial_cube(), settings.labels
+    surface = Surface("", (300.0, 2000.0) if settings.inside == "between" else 300.0, below=settings.below is not None)
+    if choice is not None and settings.labels_pick:
+        labels = LabelMap((cube.voxels >= 0).astype("uint8"), cube.affine)
+        if choice.surface == "mask":
+            meshes = [*extract_label_masks(labels, device=device).values()]
+        else:
+            meshes = [*extract_labels(cube, labels, 300.0, device=device, solid=choice.solid).values()]
+    elif METHODS[settings.method_used].on_device:
+        small = MeshSettings(
+            below=300.0 if surface.below else None, closed=settings.closed, topology=settings.topology,
+            method=settings.method, vertex_rule=settings.vertex_rule,
+            grow_from=("auto",) if settings.grow_from else (), seal_mm=settings.seal_mm, solid=settings.solid,
+        )  # fmt: skip
+        if settings.solid:
+            fill_solid(cube, [surface], small, device, ignore_progress)
+        meshes = extract_surfaces(cube, [surface], device, small, ignore_progress)
+    else:
+        return
+    if settings.selects:
+        with suppress(DeviceFailedError):  # the host does it then
+            label_components(device.current, meshes[0].triangles, meshes[0].vertex_count)
+    if settings.decimate_used is not None and settings.method != "g-mc" and settings.memory is None:
+        decimate_mesh(meshes[0], settings.decimate_used, device=device)
 
 
 def _bands_of(surfaces: Sequence[Surface]) -> list[Band]:

@@ -74,7 +74,7 @@ def make_pictures(
         meshes = [read_mesh(mesh.path, space=settings.mesh_space) for mesh in settings.meshes]
         _check_kind(source, settings)
         (subject, labels), device = run.read_beside(
-            partial(_prepare_kernels, settings=settings), lambda: _read_input(source, run)
+            partial(_try_picture, settings=settings), lambda: _read_input(source, run)
         )
         if settings.mode not in _OTHER_INPUTS:
             subject = _mask_scan(subject, settings, device, run.progress)  # type: ignore[arg-type]
@@ -152,27 +152,23 @@ def _leave_out_surroundings(volume: Volume, settings: RenderSettings, device: De
     return volume
 
 
-def _prepare_kernels(device: Device, settings: RenderSettings) -> None:
-    """Build the kernels for int16 by taking a small picture of an empty volume, or of one point."""
+def _try_picture(device: Device, settings: RenderSettings) -> None:
+    """Build the kernels, of volumes those for int16, by taking a small picture of an empty volume or of one point."""
     import numpy as np
 
     from clrecon.geometry import Volume
     from clrecon.points import PointCloud
 
-    if settings.mode == "mesh":
-        small = RenderSettings.of("mesh", size=(8, 8))
-        with PictureTaker(Mesh(np.eye(3), [(0, 1, 2)]), device, small, progress=ignore_progress) as taker:
-            taker.take_view("anterior")
-        return
-    if settings.mode == "points":
-        small = RenderSettings.of("points", size=(8, 8))
-        with PictureTaker(PointCloud([(0.0, 0.0, 0.0)]), device, small, progress=ignore_progress) as taker:
-            taker.take_view("anterior")
-        return
-    nothing = Volume(np.zeros((2, 2, 2), np.int16), np.eye(4))
     mode = "slice" if settings.mode == "cpr" else settings.mode  # the same kernel, and no curve is needed
+    subject: Volume | PointCloud | Mesh
+    if mode == "mesh":
+        subject = Mesh(np.eye(3), [(0, 1, 2)])
+    elif mode == "points":
+        subject = PointCloud([(0.0, 0.0, 0.0)])
+    else:
+        subject = Volume(np.zeros((2, 2, 2), np.int16), np.eye(4))
     small = RenderSettings.of(mode, size=(8, 8), iso_value=0.0 if mode == "surface" else None)
-    with PictureTaker(nothing, device, small, progress=ignore_progress) as taker:
+    with PictureTaker(subject, device, small, progress=ignore_progress) as taker:
         taker.take_view("anterior")
 
 
