@@ -56,19 +56,23 @@ print(json.dumps({"imported": len(modules), "visited": len(files), "frames": fra
 """
 
 
-def _modules() -> dict[str, tuple[str, ast.Module]]:
+COUNTED = (ast.ImportFrom, ast.FunctionDef, ast.ClassDef, ast.Call)
+
+
+def _modules() -> dict[str, tuple[str, list[ast.AST]]]:
+    """Texts of the modules by name, each with its nodes that something is counted of."""
     found = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
         text = path.read_text(encoding="utf-8")
-        found[name] = (text, ast.parse(text))
+        found[name] = (text, [node for node in ast.walk(ast.parse(text)) if isinstance(node, COUNTED)])
     return found
 
 
-def _readers(modules: dict[str, tuple[str, ast.Module]]) -> dict[str, set[str]]:
+def _readers(modules: dict[str, tuple[str, list[ast.AST]]]) -> dict[str, set[str]]:
     readers: dict[str, set[str]] = {name: set() for name in modules}
-    for name, (_, tree) in modules.items():
-        for node in ast.walk(tree):
+    for name, (_, nodes) in modules.items():
+        for node in nodes:
             if isinstance(node, ast.ImportFrom) and node.module:
                 for alias in node.names:
                     source = full if (full := f"{node.module}.{alias.name}") in modules else node.module
@@ -77,18 +81,16 @@ def _readers(modules: dict[str, tuple[str, ast.Module]]) -> dict[str, set[str]]:
     return readers
 
 
-def _docstrings(tree: ast.Module) -> list[str]:
+def _docstrings(nodes: list[ast.AST]) -> list[str]:
     kinds = (ast.FunctionDef, ast.ClassDef)
-    return [
-        text for node in ast.walk(tree) if isinstance(node, kinds) and (text := ast.get_docstring(node, clean=False))
-    ]
+    return [text for node in nodes if isinstance(node, kinds) and (text := ast.get_docstring(node, clean=False))]
 
 
-def _option_places(modules: dict[str, tuple[str, ast.Module]]) -> Counter[str]:
+def _option_places(modules: dict[str, tuple[str, list[ast.AST]]]) -> Counter[str]:
     """Count in how many files each option of the command line is declared, by ``add_argument`` or as a field."""
     places: set[tuple[str, str]] = set()
-    for name, (_, tree) in modules.items():
-        for node in ast.walk(tree):
+    for name, (_, nodes) in modules.items():
+        for node in nodes:
             called = getattr(node, "func", None)
             if "add_argument" == getattr(called, "attr", "") or "option" == getattr(called, "id", ""):
                 flags = [str(word.value) for word in getattr(node, "args", ()) if isinstance(word, ast.Constant)]
@@ -103,8 +105,8 @@ def count_grain() -> dict[str, int]:
     readers = _readers(modules)
     lines = {name: text.count("\n") for name, (text, _) in modules.items()}
     inner = [name for name in modules if (PACKAGE.parent / Path(*name.split("."))).with_suffix(".py").exists()]
-    functions = [node for _, tree in modules.values() for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
-    texts = [text for _, tree in modules.values() for text in _docstrings(tree)]
+    functions = [node for _, nodes in modules.values() for node in nodes if isinstance(node, ast.FunctionDef)]
+    texts = [text for _, nodes in modules.values() for text in _docstrings(nodes)]
     return {
         "lines": sum(lines.values()),
         "modules": len(modules),

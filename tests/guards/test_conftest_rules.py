@@ -102,11 +102,12 @@ WORKERS = ["-p", "xdist", "-n", "2", "--dist", "loadfile"]
 @pytest.mark.parametrize(
     ("options", "parameters", "mark", "lines", "branches"),
     [
-        (WORKERS, [1], "slow", "37.5", "25.0"),  # def, if, return
         (WORKERS, [1], "every_device", "62.5", "75.0"),  # a mark of those that are traced
-        ([], [1, 1, 2], "slow", "62.5", "75.0"),
         ([], [1, "long", 2], "untraced", "37.5", "25.0"),  # nothing new for a long time: the rest is not traced
-        ([], ["long", 2], "slow", "62.5", "75.0"),
+        # the coverage is measured for a release
+        pytest.param(WORKERS, [1], "slow", "37.5", "25.0", marks=pytest.mark.release),  # def, if, return
+        pytest.param([], [1, 1, 2], "slow", "62.5", "75.0", marks=pytest.mark.release),
+        pytest.param([], ["long", 2], "slow", "62.5", "75.0", marks=pytest.mark.release),
     ],
 )
 def test_the_coverage_is_said_before_the_last_line(

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import os
 import re
 import textwrap
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import pytest
 from house import ROOT
+from variants import but_seldom
 
 import clrecon
 from clrecon.proof.phantom.job import make_phantom
@@ -17,6 +21,8 @@ from clrecon.proof.phantom.job import make_phantom
 FENCED = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?:^ {4}\S.*\n(?:\n? {4,}\S.*\n)*)", re.MULTILINE)
 SHELL = re.compile(r"^(clrecon|python3?|pip) ", re.MULTILINE)
+FOR_A_RELEASE = {"clouds", "corridor", "inside", "measures", "transfer_functions"}
+"""Pages that take long; every day their calls are compared with the signatures, and jobs' own tests make the same."""
 ELSEWHERE = {"certificate", "python", "tour", "view"}
 """Pages with tests of their own, and without Python that begins by itself."""
 
@@ -75,7 +81,37 @@ def test_the_blocks_of_a_page_are_found() -> None:
     assert {"clouds", "export", "filters", "masks", "measures", "rendering", "slices", "solid"} <= set(PAGES)
 
 
+def find_wrong_calls(source: str) -> list[str]:
+    """Calls of public functions and classes that their signatures do not take."""
+    wrong = []
+    for call in (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)):
+        name = ast.unparse(call.func)
+        if not re.fullmatch(r"clrecon(\.\w+)+", name) or any(isinstance(each, ast.Starred) for each in call.args):
+            continue
+        try:
+            called = attrgetter(name.removeprefix("clrecon."))(clrecon)
+            words = {keyword.arg: None for keyword in call.keywords if keyword.arg}
+            inspect.signature(called).bind_partial(*call.args, **words)
+        except (AttributeError, TypeError) as error:
+            wrong.append(f"{name}: {error}")
+    return wrong
+
+
 @pytest.mark.parametrize("name", PAGES)
+def test_the_calls_of_a_page_are_those_of_the_signatures(name: str) -> None:
+    assert [wrong for block in PAGES[name] for wrong in find_wrong_calls(block)] == []
+
+
+def test_a_wrong_call_is_found() -> None:
+    assert find_wrong_calls(
+        "clrecon.Mesh.load(x)\nclrecon.cut_slice(v, size=(2, 2))\nf(clrecon.read_mesh('a', b=1))"
+    ) == [
+        "clrecon.Mesh.load: type object 'Mesh' has no attribute 'load'",
+        "clrecon.read_mesh: got an unexpected keyword argument 'b'",
+    ]
+
+
+@pytest.mark.parametrize("name", but_seldom(PAGES, FOR_A_RELEASE))
 def test_the_python_of_a_page_runs(name: str, series: Path, device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(series)
     monkeypatch.setenv("CLRECON_DEVICE", str(device.index))

@@ -9,7 +9,9 @@ import textwrap
 from pathlib import Path
 
 import pytest
+from command_lines import parse_command
 from house import ROOT
+from variants import but_seldom, daily
 
 from clrecon.cli.main import COMMANDS, main
 from clrecon.proof.phantom.job import make_phantom
@@ -20,6 +22,11 @@ COMMAND = re.compile(r"^ {4,}clrecon +([^#\n]+)", re.MULTILINE)
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 SMALLER = {"CT_FOLDER": "ct", "segmentation.nii.gz": "ct/levels.nrrd", "--size 200": "--size 64 --slices 24"}
 """What the machine of a test has not, or what takes long, and what stands for it."""
+
+WITH_COMMANDS = {name for name in PAGES if COMMAND.search((GUIDE / name).read_text(encoding="utf-8"))}
+FOR_A_RELEASE = {"quickstart.md", *(f"commands/{name}.md" for name in ("corridor", "demo", "distance", "render"))}
+"""Pages whose commands take long; every day they are parsed, and tests of these jobs run the same."""
+
 
 ENDS_WITH_A_GATE = ("--for print",)
 """Commands whose gates are those of a print: a phantom of voxels of 2 mm may fail one, and the file is there."""
@@ -47,8 +54,15 @@ def test_every_command_has_a_page_that_shows_it() -> None:
         assert text.startswith(f"# clrecon {name}\n") and f"clrecon {name}" in text.split("\n", 1)[1], name
 
 
+@pytest.mark.parametrize("name", sorted(WITH_COMMANDS))
+def test_the_commands_of_a_page_are_understood(name: str) -> None:
+    for line in COMMAND.findall((GUIDE / name).read_text(encoding="utf-8")):
+        parse_command(shlex.split(write_smaller(line)))
+    assert FOR_A_RELEASE < WITH_COMMANDS
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in PAGES if COMMAND.search((GUIDE / name).read_text(encoding="utf-8"))])
+@pytest.mark.parametrize("name", but_seldom(sorted(WITH_COMMANDS), FOR_A_RELEASE))
 def test_the_commands_of_a_page_run(name: str, series: Path, device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(series)
     monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
@@ -70,7 +84,7 @@ def test_the_python_of_a_page_runs(name: str, series: Path, device, monkeypatch:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [path.stem for path in sorted((GUIDE / "gallery").glob("*.py"))])
+@pytest.mark.parametrize("name", daily(2, [path.stem for path in sorted((GUIDE / "gallery").glob("*.py"))]))
 def test_a_script_of_the_gallery_makes_its_picture(
     name: str, tmp_path: Path, device, monkeypatch: pytest.MonkeyPatch
 ) -> None:

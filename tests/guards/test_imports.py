@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from variants import daily
 
 import clrecon
 
@@ -98,7 +99,7 @@ def test_surfaces_load_no_label_maps_and_no_dicom(tmp_path: Path) -> None:
 
 
 @pytest.mark.first_device
-@pytest.mark.parametrize("hu", [(200.0, 3000.0), 226.0])
+@pytest.mark.parametrize("hu", daily(1, [226.0, (200.0, 3000.0)]))
 def test_preparing_a_device_for_a_cloud_loads_no_scipy(device: Any, hu: object) -> None:
     """It takes as long to load as the scan takes to read, beside which the device is prepared."""
     # a device is checked at its first use, which needs more, and that is remembered

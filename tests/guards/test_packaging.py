@@ -127,7 +127,7 @@ sys.exit(main(["selftest"]))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.release  # every day: packages and kernel files are listed, and public names are found
 def test_the_wheel_works_from_another_folder(tmp_path: Path) -> None:
     wheel = build_wheel(tmp_path)
     names = set(zipfile.ZipFile(wheel).namelist())

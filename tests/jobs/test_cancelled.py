@@ -29,7 +29,7 @@ Calls = list[tuple[str, int, int]]
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("cancelled") / "ct"
-    write_phantom(folder, PhantomSettings(kind="sphere", size=(44, 60), slices=31, spacing=(0.5, 0.7, 1.0)))
+    write_phantom(folder, PhantomSettings(kind="sphere", size=(22, 30), slices=16, spacing=(1.0, 1.4, 2.0)))
     return folder
 
 
@@ -107,7 +107,7 @@ def test_reading(scan: Path) -> None:
         cancel(lambda progress: clrecon.read_volume(scan, progress=progress), moment)
         cancel(lambda progress: clrecon.list_series(scan, pixels=True, progress=progress), moment)
     assert [thread.name for thread in threading.enumerate() if thread.name.startswith("ThreadPool")] == []
-    assert clrecon.read_volume(scan).voxels.shape[0] == 31
+    assert clrecon.read_volume(scan).voxels.shape[0] == 16
 
 
 @pytest.mark.slow

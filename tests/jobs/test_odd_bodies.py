@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from odd_bodies import BODIES, OddBodies, OddBody
+from variants import but_seldom, daily
 
 from clrecon.cli.mesh_options import describe_purposes
 from clrecon.errors import ClreconError, NoSurfaceError, RefusedInputError
@@ -19,6 +20,8 @@ from clrecon.jobs.render.settings import RenderSettings
 from clrecon.system.text import format_ml
 
 BONY = [name for name in BODIES if name not in ("water", "empty")]
+SELDOM = ("skull-prone", "head", "pair", "contrast")
+"""Bodies whose tables or shapes others have too: the longest test of each is for a release."""
 SPINELESS = [name for name in BODIES if name != "contrast"]
 
 
@@ -41,7 +44,7 @@ def share_near(body: OddBody, vertices: np.ndarray, *materials: str) -> float:
     return float(near[k, j, i].mean())
 
 
-@pytest.mark.parametrize("name", BONY)
+@pytest.mark.parametrize("name", but_seldom(BONY, SELDOM))
 def test_the_mesh_without_the_table_is_that_of_the_bone(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     body = odd[name]
     report, vertices = mesh_of(odd, device, tmp_path, name, iso_value=300.0, remove_table=True, strict=True)
@@ -245,7 +248,7 @@ def test_a_range_takes_contrast_medium_and_leaves_metal(odd: OddBodies, device: 
     assert share_near(body, vertices, "metal") > 0.95
 
 
-@pytest.mark.parametrize("name", ("limb", "pair"))
+@pytest.mark.parametrize("name", daily(1, ("pair", "limb")))
 def test_a_print_is_of_the_body_closed_and_says_what_it_left_out(
     odd: OddBodies, device: Any, tmp_path: Path, name: str
 ) -> None:
@@ -259,7 +262,7 @@ def test_a_print_is_of_the_body_closed_and_says_what_it_left_out(
         assert left_out["pieces_ml"] > 0.0 and any("left out" in warning for warning in report["warnings"])
 
 
-@pytest.mark.parametrize("name", ("skull", "bones", "limb", "pair", "pelvis", "contrast"))
+@pytest.mark.parametrize("name", daily(3, ("skull", "pelvis", "contrast", "bones", "limb", "pair")))
 def test_a_print_is_of_bone_and_says_what_is_none(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     """Without --remove-table."""
     given = settings_for("print", {"iso_value": 300.0, "smooth": 5, "decimate": 0.3})

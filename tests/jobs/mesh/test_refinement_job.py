@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tolerances
+from variants import daily
 
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
@@ -157,7 +158,7 @@ def test_impossible_settings(options: dict[str, Any], complaint: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("folder", ["lumbar_4p25mm", "thoracolumbar_labels/ct_2mm_jpeg2000"])
+@pytest.mark.parametrize("folder", daily(1, ["thoracolumbar_labels/ct_2mm_jpeg2000", "lumbar_4p25mm"]))
 def test_real_surfaces_keep_every_gate(real_data: Path, device: Any, tmp_path: Path, folder: str) -> None:
     settings = MeshSettings(
         iso_value=226, keep_largest=1, smooth=20, decimate=0.9, strict=True, device=str(device.index)

@@ -73,10 +73,9 @@ def test_the_same_bits_on_every_device(device):
     others = [one for one in list_devices() if one.type == "cpu" and not one.is_simulator and not one.shortcoming]
     if len(others) < 2:
         pytest.skip("one device")
-    for volume in (ball(dtype="float32"), ball()):
-        first, *rest = (run(one, volume)[0].voxels for one in others)
-        for voxels in rest:
-            np.testing.assert_array_equal(voxels, first)
+    first, *rest = (run(one, ball(dtype="float32"))[0].voxels for one in others)
+    for voxels in rest:
+        np.testing.assert_array_equal(voxels, first)
 
 
 @pytest.mark.oclgrind

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tolerances
+from variants import VOXEL_TYPES
 
 from clrecon import LabelMap, Volume, extract_isosurface, extract_labels
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
@@ -65,10 +66,7 @@ def test_the_form_of_the_other_kind_of_device(device, monkeypatch):
     check_voxels(extract_points(volume, hu=BAND, device=device), volume)
 
 
-@pytest.mark.parametrize(
-    "dtype",
-    ["int16", *(pytest.param(name, marks=pytest.mark.first_device) for name in ("uint8", "int8", "uint16", "int32"))],
-)
+@pytest.mark.parametrize("dtype", [kind for kind in VOXEL_TYPES if kind != "float32"])
 def test_types_of_voxels(device, dtype):
     volume = make_volume((6, 11, 70), dtype)
     check_voxels(extract_points(volume, hu=BAND, device=device), volume)

@@ -206,7 +206,7 @@ def voxels_of(volume: Volume) -> PointCloud:
     return PointCloud(volume.ijk_to_lps(ijk), ijk=ijk, report={"affine_ijk_to_lps_mm": volume.affine.tolist()})
 
 
-@pytest.mark.first_device
+@pytest.mark.release  # every day: planted slices are found, and each step's own tests
 def test_the_made_case(device, made):
     """All means together leave bone; each of them switched off leaves its ghost."""
     folder, slices, bone = made
@@ -224,7 +224,7 @@ def test_the_made_case(device, made):
     assert score(drop_ghost_slices(voxels_of(volume), found).cloud, bone)[1] < 0.97
 
 
-@pytest.mark.first_device
+@pytest.mark.release
 def test_clusters_tell_the_table_of_the_made_case(device, made):
     _, slices, bone = made
     folder = made[0]
@@ -239,6 +239,7 @@ def test_clusters_tell_the_table_of_the_made_case(device, made):
     assert score(largest.cloud, bone)[1] == 1.0
 
 
+@pytest.mark.release
 def test_the_gate_drops_the_localizer(made):
     """Without it a stack of all images of the folder has one of another orientation in it."""
     folder, _, bone = made

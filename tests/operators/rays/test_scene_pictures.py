@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tolerances
 from sample_meshes import ball
+from variants import each_value
 
 import clrecon
 from clrecon import (
@@ -64,9 +65,7 @@ def ways(camera: Camera, y: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @pytest.mark.every_device
-@pytest.mark.parametrize("in_slabs", [False, True])
-@pytest.mark.parametrize("opacity", [1.0, 0.4])
-@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize(("name", "opacity", "in_slabs"), each_value(CAMERAS, [0.4, 1.0], [False, True]))
 def test_fog_before_and_behind_a_screen_is_a_closed_form(
     device: Any, name: str, opacity: float, in_slabs: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tolerances
+from variants import each_value
 
 import clrecon
 from clrecon.errors import DeviceError, UsageError
@@ -40,8 +41,7 @@ CAMERAS = {
 }
 
 
-@pytest.mark.parametrize("radius", [0.01, 0.4, 2.0])
-@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize(("name", "radius"), each_value(CAMERAS, [0.01, 0.4, 2.0]))
 def test_every_pixel_shows_the_point_of_the_twin(device: Any, name: str, radius: float) -> None:
     points, _ = ball(1000)
     camera = CAMERAS[name]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from device_work import WORK, mesh_arrays
 from surface_volumes import OBLIQUE, smooth_volume
+from variants import each_value
 
 import clrecon
 from clrecon.labels import LabelMap
@@ -48,8 +49,7 @@ SURFACES: dict[str, Callable] = {
 }
 
 
-@pytest.mark.parametrize("spacing", ["even", "uneven"])
-@pytest.mark.parametrize("work", SURFACES)
+@pytest.mark.parametrize(("work", "spacing"), each_value(SURFACES, ["uneven", "even"]))
 def test_row_53_small_memory_gives_the_same_bytes(device, volumes, labels, work, spacing):
     """The limit falls until not even one slice or label fits; before that there are slabs."""
     volume, make = volumes[spacing], SURFACES[work]
