@@ -35,6 +35,8 @@ def parser_of(command: str) -> Parser:
 def find_options(source: str) -> list[str]:
     """Options of a command line that stand in the texts of a module, docstrings and comments included, other than in
     the declarations of fields as options."""
+    if not OPTION.search(source):
+        return []
     declared = [
         str(ast.get_source_segment(source, node))
         for node in ast.walk(ast.parse(source))
@@ -47,6 +49,8 @@ def find_options(source: str) -> list[str]:
 
 def named_parameters(source: str) -> set[str]:
     """Parameters that a module names by `name_parameter` with a literal."""
+    if "name_parameter" not in source:
+        return set()
     return {
         str(node.args[0].value)
         for node in ast.walk(ast.parse(source))
