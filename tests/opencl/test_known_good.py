@@ -10,6 +10,7 @@ import subprocess
 import sys
 
 import pytest
+from variants import daily
 
 from clrecon.opencl import pocl
 from clrecon.opencl.pocl import DAMAGED, UNFINISHED, KnownGood
@@ -80,10 +81,7 @@ def swap(folder):
     second.write_bytes(content)
 
 
-@pytest.mark.every_device
-@pytest.mark.parametrize(
-    "damage", [overwrite, *(pytest.param(damage, marks=pytest.mark.first_device) for damage in (cut, empty, swap))]
-)
+@pytest.mark.parametrize("damage", daily(2, [overwrite, swap, cut, empty]))
 def test_row_59_damaged_kernels_are_built_anew(damage, device, built):
     damage(built)
     assert run_child(device, built) == [DAMAGED]

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from made_once import make_once
 from screens import need_screen, open_screen, open_view
+from variants import daily
 from view_scenes import ISO, make_cloud, make_labels, make_mesh, make_scan
 
 import clrecon
@@ -76,7 +77,7 @@ def test_a_distance_is_measured_between_two_clicks(display, tmp_path):
         assert window.finish()[0] == 0
 
 
-@pytest.mark.parametrize("how", ["interrupt", "window manager"])
+@pytest.mark.parametrize("how", daily(1, ["interrupt", "window manager"]))  # a session below is closed by the latter
 def test_it_ends_by_ctrl_c_and_by_the_window_manager(display, tmp_path, how):
     make_mesh().save(tmp_path / "ball.stl")
     with open_view(display, ["ball.stl", "--window"], tmp_path) as window:

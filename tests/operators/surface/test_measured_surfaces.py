@@ -85,6 +85,7 @@ def test_bias_is_of_the_level_and_scatter_of_the_rule(kind: str, device: Any) ->
         assert found[level, "linear"].outer_share == 1.0
 
 
+@pytest.mark.release  # figures of documents; every day: a phantom's, whose truth is known
 def test_a_real_scan_gives_the_figures_of_the_documents(real_data: Path, device: Any) -> None:
     scan = read_volume(real_data / "thoracic_0p8mm")
     volume = Volume(scan.voxels[55:], scan.affine)

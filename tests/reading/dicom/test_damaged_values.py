@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from damaged_series import MASKED, VALUES
 from value_series import make_body, radius_from, write_values
+from variants import daily
 
 from clrecon import read_volume
 from clrecon.cli.main import main
@@ -25,7 +26,9 @@ def test_what_is_said_of_a_damage(tmp_path, name):
     assert any(row.words in text for text in report["warnings"])
 
 
-@pytest.mark.parametrize("name", ["intercept off by 324", "slope and intercept of another scale", "sign made up"])
+@pytest.mark.parametrize(
+    "name", daily(1, ["intercept off by 324", "slope and intercept of another scale", "sign made up"])
+)
 def test_every_command_that_reads_says_it(tmp_path, device, capsys, name):
     row = VALUES[name]
     folder = str(damage(tmp_path / "ct", row))

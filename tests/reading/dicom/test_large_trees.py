@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from dicom_series import write_series
 from tolerances import HEADER_BYTES, SCAN_PEAK_BYTES_A_FILE
+from variants import FOR_RELEASE
 
 from clrecon.errors import RefusedInputError
 from clrecon.reading import list_series, read_volume
@@ -43,7 +44,10 @@ def copy_series(folder: Path, series: int, slices: int) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("series", "slices"), [(300, 10), (3, 1000)])
+@pytest.mark.parametrize(
+    ("series", "slices"),
+    [(300, 10), pytest.param(3, 1000, marks=FOR_RELEASE)],
+)
 def test_row_47_many_files_are_walked_once_and_stay_small(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, series: int, slices: int
 ) -> None:

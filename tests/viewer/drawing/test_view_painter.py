@@ -267,7 +267,7 @@ def test_a_scan_in_slabs_is_shown_too(device):
         assert np.array_equal(pictures[0].image, pictures[1].image)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_kernels_are_built_for_every_kind_of_voxels(device):
     objects = show_objects([scenes.make_scan(), scenes.make_scan(dtype=np.float32), scenes.make_mesh()])
     told = []
