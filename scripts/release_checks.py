@@ -34,8 +34,8 @@ CHECKS = {
     "tests": ReleaseCheck(
         "all that .ci/run checks, with the tests marked release: every check of the self-test on every device, where"
         " .ci/run leaves out on the second device and later what tests of operators ask there; all types of voxels,"
-        " products of parameters, odd bodies, real scans and pages of the Guide, of which .ci/run tries those that differ"
-        " most; the methods of the comparison in processes of their own; a wheel that is built and installed; and the"
+        " products of parameters, odd bodies, real scans and pages of the Guide, of which .ci/run tries a few that"
+        " differ; the methods of the comparison in processes of their own; a wheel that is built and installed; and the"
         " coverage",
         (".ci/run",),
         {"CLRECON_RELEASE_TESTS": "1", "CLRECON_COVERAGE": "1"},
