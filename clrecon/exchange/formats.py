@@ -54,7 +54,6 @@ class FileFormat:
 
     @property
     def code(self) -> Any:
-        """The module."""
         return import_module(f"clrecon.exchange.{self.module}")
 
 

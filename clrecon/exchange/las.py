@@ -31,7 +31,6 @@ _LONGEST_RECORD = 65535
 
 
 def import_laspy() -> Any:
-    """Import laspy."""
     try:
         import laspy
     except ImportError as error:

@@ -219,11 +219,7 @@ def _numbers(words: Sequence[bytes], before: Sequence[tuple[int, int]], which: i
 
 
 def _normals(
-    rows: Sequence[bytes],
-    corners: NDArray[np.int64],
-    of_normals: NDArray[np.int64] | None,
-    mesh: RawMesh,
-    name: str,
+    rows: Sequence[bytes], corners: NDArray[np.int64], of_normals: NDArray[np.int64] | None, mesh: RawMesh, name: str
 ) -> NDArray[np.float32] | None:
     """Return normals of vertices; None where a vertex has none, or several."""
     if of_normals is None or not rows:

@@ -174,7 +174,6 @@ def estimate(content: Content | Assembly) -> int:
 
 
 def write(stream: BinaryIO, content: Content | Assembly) -> None:
-    """Write the page."""
     stream.write(compose_page(content))
 
 

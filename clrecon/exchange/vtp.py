@@ -368,7 +368,6 @@ def read_numbers(document: Document, array: ElementTree.Element, count: int, wid
 
 
 def _bytes(document: Document, array: ElementTree.Element) -> bytes:
-    """Return the bytes of an array."""
     form = array.get("format")
     if form == "ascii":
         return bytes(int(word) for word in (array.text or "").split())
@@ -387,7 +386,6 @@ class _Raw:
         self._data, self._place = data, 0
 
     def take(self, count: int) -> bytes:
-        """Return the next bytes."""
         if count > len(self._data) - self._place:
             raise ValueError(f"an array has {count:,} bytes and {len(self._data) - self._place:,} are there")
         self._place += count

@@ -94,7 +94,7 @@ def read_cloud(path: Path) -> RawCloud:
             count = _numbers_in(first)
             if count < 3:
                 raise RefusedInputError(f"{name} has {count} numbers a line, a point has three at least")
-            mark = _delimiter(first)
+            mark = next((mark for mark in ";," if mark in first), None)
             rest = (line for part in ([first], stream) for line in part)
             table = np.loadtxt(rest, comments="#", delimiter=mark, ndmin=2, dtype=np.float64)
     except (ValueError, OSError, OverflowError, MemoryError) as error:
@@ -105,7 +105,9 @@ def read_cloud(path: Path) -> RawCloud:
         for number, line in enumerate(head, start=1)
         if not _is_comment(line) and any(map(_is_number, _words(line)))
     ][:_MOST_WARNINGS]
-    names = _column_names(head, count)
+    words = _words(head[-1].lstrip("#/% \t")) if head else []
+    fits = len(words) == count and [word.lower() for word in words[:3]] == ["x", "y", "z"]
+    names = words if fits and len({word.lower() for word in words}) == count else None
     if names is None and count > 3:
         warnings.append(f"columns 4 to {count} have no names in a line before the first point and are left out")
     rows = table[:, 3:] if names else table[:, :0]
@@ -133,10 +135,6 @@ def _is_comment(line: str) -> bool:
     return line.lstrip().startswith(_COMMENTS)
 
 
-def _delimiter(line: str) -> str | None:
-    return next((mark for mark in ";," if mark in line), None)
-
-
 def _words(line: str) -> list[str]:
     return [word for word in re.split(r"[;,\s]+", line.strip()) if word]
 
@@ -153,9 +151,3 @@ def _is_number(word: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _column_names(head: list[str], count: int) -> list[str] | None:
-    words = _words(head[-1].lstrip("#/% \t")) if head else []
-    fits = len(words) == count and [word.lower() for word in words[:3]] == ["x", "y", "z"]
-    return words if fits and len({word.lower() for word in words}) == count else None

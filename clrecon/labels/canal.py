@@ -106,7 +106,6 @@ class _Places:
         return np.asarray(self._y + self.origins[k, 1])
 
     def mean_y(self, voxels: Bits) -> float:
-        """Return the mean y of voxels."""
         k, j, i = np.nonzero(voxels)
         return float(np.mean(self._y[j, i] + self.origins[k, 1]))
 

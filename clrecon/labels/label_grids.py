@@ -252,7 +252,6 @@ CARET_CODE = 30
 
 
 def load_nibabel() -> Any:
-    """Import nibabel."""
     return import_extra("nibabel", LABEL_MAP)
 
 

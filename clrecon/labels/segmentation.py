@@ -206,10 +206,7 @@ class _Layout:
 
 
 def read_segmentation(
-    path: Path,
-    wanted: Wanted,
-    progress: Progress = ignore_progress,
-    check: Check | None = None,
+    path: Path, wanted: Wanted, progress: Progress = ignore_progress, check: Check | None = None
 ) -> LabelMap:
     """Read a DICOM SEG of binary segments or of a label map.
 
@@ -230,9 +227,7 @@ def tell_pixel_bytes(path: Path) -> int:
         with warnings.catch_warnings(), open_regular(path) as file:
             warnings.simplefilter("ignore")
             dataset = dcmread(
-                file,
-                stop_before_pixels=True,
-                specific_tags=["Rows", "Columns", "NumberOfFrames", "BitsAllocated"],
+                file, stop_before_pixels=True, specific_tags=["Rows", "Columns", "NumberOfFrames", "BitsAllocated"]
             )
             layout = _layout_of(dataset, "")
     except Exception:  # pydicom raises many error types; told by `read_segmentation`

@@ -107,7 +107,6 @@ class Painter:
         plane[mask] = number
 
     def finish(self, affine: Float64Array, **options: Any) -> LabelMap:
-        """Return the map."""
         if self._shared:
             (a, b), count = max(self._shared.items(), key=lambda item: item[1])
             raise RefusedInputError(

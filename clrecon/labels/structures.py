@@ -126,10 +126,7 @@ class _Structure:
 
 
 def read_structures(
-    path: Path,
-    volume: Volume | None,
-    wanted: Wanted,
-    progress: Progress = ignore_progress,
+    path: Path, volume: Volume | None, wanted: Wanted, progress: Progress = ignore_progress
 ) -> LabelMap:
     """Read the ROIs of an RTSTRUCT as labels on the slices of its scan.
 
@@ -365,14 +362,9 @@ def _collect(top: Item, name: str) -> dict[int, _Structure]:
         if number not in structures:
             raise RefusedInputError(f"{name} is corrupt: contours belong to ROI {number}, which it does not list")
         _take(structures[number], item.sequences.get(_CONTOURS, ()), name)
-    return _from_one(structures)
-
-
-def _from_one(structures: dict[int, _Structure]) -> dict[int, _Structure]:
-    """Return ROIs under numbers that labels can have: their own, or from 1 on where one of them is 0."""
     if 0 not in structures:
         return structures
-    return dict(enumerate(structures.values(), start=1))
+    return dict(enumerate(structures.values(), start=1))  # no label has the number 0
 
 
 def _take(structure: _Structure, contours: Iterable[Item], name: str) -> None:

@@ -90,7 +90,14 @@ def select_components(
     if chosen.keep.all():
         mesh.report.update(chosen.facts)
         return mesh
-    return _take_triangles(mesh, chosen.keep[chosen.label_of_triangle], {**mesh.report, **chosen.facts})
+    triangles = mesh.triangles[chosen.keep[chosen.label_of_triangle]]
+    keep_vertex = np.zeros(mesh.vertex_count, dtype=bool)
+    keep_vertex[triangles.reshape(-1)] = True
+    number = np.cumsum(keep_vertex, dtype=np.int64) - 1
+    normals = None if mesh.normals is None else mesh.normals[keep_vertex]
+    return type(mesh)(
+        mesh.vertices[keep_vertex], number[triangles].astype(np.uint32), normals, {**mesh.report, **chosen.facts}
+    )
 
 
 def split_components(
@@ -244,12 +251,3 @@ def _find_at_seeds(
         found[label_of_triangle[rows[row]]] = True
         distances.append(distance)
     return found, distances
-
-
-def _take_triangles(mesh: Own, keep_triangle: NDArray[np.bool_], report: dict[str, object]) -> Own:
-    triangles = mesh.triangles[keep_triangle]
-    keep_vertex = np.zeros(mesh.vertex_count, dtype=bool)
-    keep_vertex[triangles.reshape(-1)] = True
-    number = np.cumsum(keep_vertex, dtype=np.int64) - 1
-    normals = None if mesh.normals is None else mesh.normals[keep_vertex]
-    return type(mesh)(mesh.vertices[keep_vertex], number[triangles].astype(np.uint32), normals, report)

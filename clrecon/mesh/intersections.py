@@ -241,11 +241,7 @@ class _Planes:
         return cls(normal, np.einsum("am,am->m", normal, points[0]), slack)
 
     def not_apart(
-        self,
-        points: Sequence[Float64Array],
-        one: NDArray[np.int64],
-        other: NDArray[np.int64],
-        common: NDArray[np.int8],
+        self, points: Sequence[Float64Array], one: NDArray[np.int64], other: NDArray[np.int64], common: NDArray[np.int8]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Leave out pairs of which one, but for its common corners, lies surely on one side of the other's plane."""
         for _ in range(2):

@@ -88,11 +88,7 @@ def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
         with np.errstate(divide="ignore", invalid="ignore"):
             cross = np.where(twice_area > 0.0, cross / twice_area, 0.0)
         third = q - p
-        dots = (
-            np.einsum("ij,ij->j", p, q),
-            -np.einsum("ij,ij->j", p, third),
-            np.einsum("ij,ij->j", q, third),
-        )
+        dots = (np.einsum("ij,ij->j", p, q), -np.einsum("ij,ij->j", p, third), np.einsum("ij,ij->j", q, third))
         corners = triangles[where].T
         low = int(corners.min())
         size = int(corners.max()) - low + 1

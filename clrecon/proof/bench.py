@@ -68,16 +68,6 @@ class FlyingEdges:
 
         The output is freed before the return, unless a list is given to `keep` it.
         """
-        contour = self._make_filter(level)
-        start = perf_counter()
-        contour.Update()
-        seconds = perf_counter() - start
-        output = contour.GetOutput()
-        if keep is not None:
-            keep.append(output)
-        return PeerRun(seconds, output.GetNumberOfPoints(), output.GetNumberOfCells())
-
-    def _make_filter(self, level: float) -> Any:
         from vtkmodules.vtkCommonCore import vtkSMPTools
         from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D
 
@@ -89,7 +79,13 @@ class FlyingEdges:
         contour.ComputeNormalsOn()
         contour.ComputeScalarsOff()
         contour.ComputeGradientsOff()
-        return contour
+        start = perf_counter()
+        contour.Update()
+        seconds = perf_counter() - start
+        output = contour.GetOutput()
+        if keep is not None:
+            keep.append(output)
+        return PeerRun(seconds, output.GetNumberOfPoints(), output.GetNumberOfCells())
 
 
 ALL_DEVICES = "all"

@@ -295,12 +295,7 @@ def run_device_selftest(
     place = {check.name: n for n, check in enumerate(CHECKS)}
     results.sort(key=lambda result: place.get(result["operator"], len(place)))  # processes run side by side
     passed = bool(results) and all(result["passed"] for result in results)
-    return {
-        "device": device.describe(),
-        "passed": passed,
-        "operators": results,
-        "warnings": device.warnings,
-    }
+    return {"device": device.describe(), "passed": passed, "operators": results, "warnings": device.warnings}
 
 
 if __name__ == "__main__":

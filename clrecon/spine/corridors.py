@@ -526,12 +526,7 @@ def _distance(points: Float64Array, first: Float64Array, last: Float64Array) -> 
 
 
 def _walls(
-    bone: SolidBone,
-    frame: VertebraFrame,
-    surface: Float64Array,
-    first: Float64Array,
-    last: Float64Array,
-    radius: float,
+    bone: SolidBone, frame: VertebraFrame, surface: Float64Array, first: Float64Array, last: Float64Array, radius: float
 ) -> tuple[float, float, float]:
     """Return the distance of the nearest wall, the corridor's width in voxels across it, and the share of the walls'
     points that HU place.

@@ -267,11 +267,5 @@ def _measure(
             f" body {BODY_DEPTH_MM[0]:g} to {BODY_DEPTH_MM[1]:g} mm"
         )
     return VertebraFrame(
-        middle,
-        axes,
-        (float(x), float(y)),
-        (float(slope[0]), float(slope[1])),
-        radius,
-        (walls[0], walls[1]),
-        height,
+        middle, axes, (float(x), float(y)), (float(slope[0]), float(slope[1])), radius, (walls[0], walls[1]), height
     )

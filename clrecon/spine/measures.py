@@ -224,7 +224,6 @@ class ScrewGrade:
 
 
 def grade_breach(breach_mm: float) -> str:
-    """Return the grade of a breach in mm."""
     if breach_mm <= 0.0:
         return "A"
     return next((grade for grade, below in GRADES[1:] if breach_mm < below), "E")

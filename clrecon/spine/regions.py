@@ -98,7 +98,6 @@ class Part:
 
 
 def planes_of(bounds: list[Bound], course: Course, looks: Looks) -> Planes:
-    """Return the planes of bounds."""
     at = np.array([bound.at for bound in bounds])
     tilt = np.radians(TILTS_DEG[[bound.tilt for bound in bounds]])[:, None]
     centres = course.canal[at] + looks.middle_mm[at, None] * course.ahead[at]

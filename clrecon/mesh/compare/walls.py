@@ -232,7 +232,6 @@ def _measure_section(
 
 
 def normals_of(mesh: Mesh) -> NDArray[np.float32]:
-    """Return the normals of a mesh."""
     if mesh.normals is None:
         raise UsageError("walls are looked for along normals: the mesh has none")
     return mesh.normals

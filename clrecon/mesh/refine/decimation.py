@@ -256,11 +256,7 @@ def _mend_roughly(clusters: Clusters, deviation: Deviation) -> None:
 
 
 def _collapse(
-    clusters: Clusters,
-    left_share: float,
-    bound: float,
-    error: float = _ERROR,
-    aggressiveness: float = _AGGRESSIVENESS,
+    clusters: Clusters, left_share: float, bound: float, error: float = _ERROR, aggressiveness: float = _AGGRESSIVENESS
 ) -> None:
     """Make one round of fast-simplification on the present surface.
 

@@ -129,10 +129,7 @@ def _gates_of_topology(found: TopologyChange) -> list[Gate]:
 
 
 def measure_farthest(
-    mesh: Mesh,
-    vertices: NDArray[np.floating],
-    triangles: NDArray[np.uint32],
-    also: NDArray[np.integer] | None = None,
+    mesh: Mesh, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], also: NDArray[np.integer] | None = None
 ) -> float:
     """Return the largest distance found between a mesh and another surface, in mm.
 

@@ -399,7 +399,6 @@ class Figures:
         return self.reference in self.views and self.views[name].shape == self.views[self.reference].shape
 
     def slice_entries(self) -> list[dict[str, Any]]:
-        """Return the entries of the report on slices."""
         return [
             {
                 "name": plane.name,

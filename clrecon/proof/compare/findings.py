@@ -19,7 +19,6 @@ def seconds(value: float) -> str:
 
 
 def milliseconds(value: float) -> str:
-    """Write milliseconds."""
     return f"{value:.0f}" if value >= 100.0 else f"{value:.1f}"
 
 

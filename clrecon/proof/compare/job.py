@@ -74,12 +74,10 @@ class MadeFolder(StagedFolder):
         self._shown, self.path = path, made
 
     def write(self, name: str, text: str) -> None:
-        """Write a file of text."""
         with system_errors(self._shown), open(self.path / name, "x", encoding="utf-8", newline="\n") as stream:
             stream.write(text)
 
     def write_report(self, report: Mapping[str, Any]) -> None:
-        """Write the report as JSON."""
         self.write(REPORT, to_json(report) + "\n")
 
     def commit(self) -> None:

@@ -71,7 +71,6 @@ class Judge:
         return {**found, "reasons": reasons}
 
     def _measures(self, method: str, mesh: Mesh | None, points: Any) -> dict[str, Callable[[], Any]]:
-        """Return the measures that apply."""
         if points is not None:
             return {"points": lambda: self._measure_points(points)}
         if mesh is None:

@@ -299,7 +299,6 @@ class Lattice:
         return [(point + self.offsets[axis]) / self.finer for point in range(self.finer)]
 
     def row_of(self, keys: Keys) -> Keys:
-        """Return the number of the row of each key."""
         return keys // (self.shape_ijk[0] + 1)
 
 

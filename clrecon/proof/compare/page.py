@@ -245,11 +245,17 @@ def make_page(report: CompareReport, figures: Figures) -> str:
         _section("How each number is defined", _definitions(report)),
         _section("Settings", _settings(report)),
     )
+    done = sum(record.is_done for record in report.methods)
+    ni, nj, nk = report.shape_ijk
+    of = f"{done} of {len(report.methods)}" if done < len(report.methods) else f"{done}"
     return PAGE_TEMPLATE.substitute(
         version=escape(report.version),
         title="Surfaces and clouds of one scan, compared",
         style=read_style(),
-        lead=escape(_lead(report)),
+        lead=escape(
+            f"{of} methods on one scan of {ni} x {nj} x {nk} voxels at {report.iso_value_hu:g} HU, each in a process of"
+            f" its own, compared with {_title_of(report, report.reference)}."
+        ),
         facts="\n".join(f"<div><dt>{escape(name)}</dt><dd>{escape(said)}</dd></div>" for name, said in _facts(report)),
         body="\n".join(filter(None, parts)),
     )
@@ -261,16 +267,6 @@ def _section(title: str, content: str) -> str:
 
 def _title_of(report: CompareReport, name: str) -> str:
     return next((record.title for record in report.methods if record.name == name), name)
-
-
-def _lead(report: CompareReport) -> str:
-    done = sum(record.is_done for record in report.methods)
-    ni, nj, nk = report.shape_ijk
-    of = f"{done} of {len(report.methods)}" if done < len(report.methods) else f"{done}"
-    return (
-        f"{of} methods on one scan of {ni} x {nj} x {nk} voxels at {report.iso_value_hu:g} HU, each in a process of"
-        f" its own, compared with {_title_of(report, report.reference)}."
-    )
 
 
 def _facts(report: CompareReport) -> list[tuple[str, str]]:

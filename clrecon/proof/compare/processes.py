@@ -56,7 +56,6 @@ class Request:
     along: dict[str, Any] | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the request for JSON."""
         return asdict(self)
 
     def views(self) -> dict[str, tuple[Camera, tuple[int, int]]]:

@@ -125,7 +125,6 @@ COLUMNS = (
 
 
 def shown_columns(report: CompareReport) -> list[Column]:
-    """Return the columns that this report has."""
     return [column for column in COLUMNS if report.with_truth or not column.truth]
 
 

@@ -162,11 +162,6 @@ def _make(
     return voxels, truth, labels
 
 
-def _written(settings: PhantomSettings, voxels: NDArray[np.int16]) -> NDArray[np.int16]:
-    """Return the slices that are not missing."""
-    return voxels[[k for k in range(len(voxels)) if k + 1 not in settings.missing]] if settings.missing else voxels
-
-
 def _iso_value(settings: PhantomSettings, half_maximum: float | None) -> float:
     if half_maximum is not None:
         return half_maximum
@@ -193,7 +188,9 @@ def make_phantom(
     """
     placement = place_slices(settings)
     voxels, truth, _ = _make(settings, placement, progress)
-    return _written(settings, voxels), placement.affine, truth
+    if settings.missing:
+        voxels = voxels[[k for k in range(len(voxels)) if k + 1 not in settings.missing]]
+    return voxels, placement.affine, truth
 
 
 def label_materials(settings: PhantomSettings) -> LabelArray:

@@ -59,16 +59,6 @@ def _index_box(
     return ranges[2], ranges[1], ranges[0]
 
 
-def _slab_thickness(k: slice, j: slice, i: slice) -> int:
-    return max(1, _CHUNK // max(1, (j.stop - j.start) * (i.stop - i.start)))
-
-
-def _centres(affine: Float64Array, k: slice, j: slice, i: slice) -> Float64Array:
-    """Return LPS mm of the voxel centres in a box of indices, shape (nk * nj * ni, 3), i fastest."""
-    grid = np.meshgrid(*(np.arange(axis.start, axis.stop) for axis in (k, j, i)), indexing="ij")
-    return apply_affine(affine, np.stack([axis.ravel() for axis in reversed(grid)], axis=1))
-
-
 def _boundary_coverage(body: Body, points: Float64Array, steps: Float64Array, subsamples: int) -> Float64Array:
     """Return the share of each voxel's parallelepiped inside `body`, computed from subsamples**3 cells in a voxel.
 
@@ -115,10 +105,11 @@ def sample_occupancy(
     reach = max(float(np.linalg.norm(steps @ np.array(signs))) for signs in itertools.product((-0.5, 0.5), repeat=3))
     share = np.zeros(shape, dtype=np.float32)
     box_k, j, i = _index_box(body.bounds_mm, matrix, shape, reach)
-    step = _slab_thickness(box_k, j, i)
+    step = max(1, _CHUNK // max(1, (j.stop - j.start) * (i.stop - i.start)))
     for start in range(box_k.start, box_k.stop, step):
         k = slice(start, min(start + step, box_k.stop))
-        centres = _centres(matrix, k, j, i)
+        grid = np.meshgrid(*(np.arange(axis.start, axis.stop) for axis in (k, j, i)), indexing="ij")
+        centres = apply_affine(matrix, np.stack([axis.ravel() for axis in reversed(grid)], axis=1))
         distance = body.signed_distance(centres)
         coverage = (distance >= 0.0).astype(np.float32)
         near = np.flatnonzero(np.abs(distance) < reach)

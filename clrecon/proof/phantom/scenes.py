@@ -49,14 +49,6 @@ class Window:
         )
 
 
-def _local_affine(affine: Float64Array, center: Float64Array, axes: Float64Array) -> Float64Array:
-    """Return the affine from indices to the local frame of a part."""
-    local = np.eye(4)
-    local[:3, :3] = axes @ affine[:3, :3]
-    local[:3, 3] = axes @ (affine[:3, 3] - center)
-    return local
-
-
 class PlacedPiece:
     """A part with its box in indices and its local affine."""
 
@@ -70,7 +62,9 @@ class PlacedPiece:
             slice(min(max(self.low[1], 0), nj), max(min(self.high[1], nj), 0)),
             slice(min(max(self.low[0], 0), ni), max(min(self.high[0], ni), 0)),
         )
-        self.local = _local_affine(affine, part.center, part.axes)
+        self.local = np.eye(4)
+        self.local[:3, :3] = part.axes @ affine[:3, :3]
+        self.local[:3, 3] = part.axes @ (affine[:3, 3] - part.center)
 
     def meets(self, k: int) -> bool:
         """True where slice k can hold some of the part."""

@@ -71,15 +71,6 @@ class Placement:
     places: Float64Array
 
 
-def _slice_places(settings: PhantomSettings) -> Float64Array:
-    """Return where the slices lie along k: the first and the last of an uneven stack lie as in an even one."""
-    places = np.arange(settings.slices, dtype=np.float64)
-    if settings.uneven_mm > 0.0:
-        share = settings.uneven_mm / settings.spacing[2]
-        places[1:-1] += np.random.default_rng((settings.seed, 23)).uniform(-0.5, 0.5, len(places[1:-1])) * share
-    return places
-
-
 def place_slices(settings: PhantomSettings) -> Placement:
     """Compute orientation and positions of all slices, centred on `CENTRE_LPS_MM`."""
     dj, di, dk = settings.spacing
@@ -91,7 +82,10 @@ def place_slices(settings: PhantomSettings) -> Placement:
     i_step, j_step = cosines[:3] * float(pixel_spacing[1]), cosines[3:] * float(pixel_spacing[0])
     middle = np.array((*settings.size, settings.slices), dtype=np.float64) / 2.0 - 0.5
     first = np.array(CENTRE_LPS_MM) - middle @ np.array((i_step, j_step, step))
-    places = _slice_places(settings)
+    places = np.arange(settings.slices, dtype=np.float64)
+    if settings.uneven_mm > 0.0:  # the first and the last slice lie as in an even stack
+        share = settings.uneven_mm / settings.spacing[2]
+        places[1:-1] += np.random.default_rng((settings.seed, 23)).uniform(-0.5, 0.5, len(places[1:-1])) * share
     positions = [[format_decimal(value) for value in first + k * step] for k in places]
     written = np.array(positions, dtype=np.float64)
     k_step = (written[-1] - written[0]) / (settings.slices - 1) if settings.slices > 1 else step

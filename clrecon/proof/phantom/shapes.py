@@ -105,12 +105,10 @@ class Sphere:
 
     @property
     def area_mm2(self) -> float:
-        """Area in mm2."""
         return 4.0 * math.pi * self.radius**2
 
     @property
     def volume_ml(self) -> float:
-        """Volume in ml."""
         return 4.0 / 3.0 * math.pi * self.radius**3 / 1000.0
 
     @property
@@ -209,7 +207,6 @@ class Cylinder:
 
     @property
     def volume_ml(self) -> float:
-        """Volume in ml."""
         return math.pi * self.radius**2 * self.length / 1000.0
 
     @property
@@ -273,13 +270,11 @@ class Box:
 
     @property
     def area_mm2(self) -> float:
-        """Area in mm2."""
         width, height, thickness = self.size
         return float(2.0 * (width * height + height * thickness + thickness * width))
 
     @property
     def volume_ml(self) -> float:
-        """Volume in ml."""
         return float(np.prod(self.size)) / 1000.0
 
     @property

@@ -151,10 +151,7 @@ def _plan_ribs(vertebrae: list[Vertebra], moved: Float64Array, half_width: float
 
 
 def plan_anatomy(
-    field_of_view_mm: tuple[float, float, float],
-    steps_mm: Float64Array,
-    seed: int,
-    choice: SpineChoice | None = None,
+    field_of_view_mm: tuple[float, float, float], steps_mm: Float64Array, seed: int, choice: SpineChoice | None = None
 ) -> Anatomy:
     """Lay out the phantom for a field of view.
 

@@ -80,7 +80,6 @@ class _Shape:
         return [np.asarray(bone, dtype=np.float64), *(np.asarray(-cut, dtype=np.float64) for cut in cuts)]
 
     def part(self, number: int, local: Float64Array) -> Float64Array:
-        """Return one of the parts."""
         return self.parts(local)[number]
 
     def cover(self) -> Float64Array:

@@ -265,11 +265,7 @@ FILTER_CHECKS = (
         partial(_check_gradients, types=("int8", "uint8", "int16", "uint16", "int32", "float32"), uneven=False),
     ),
     Check("gradients in uneven stacks", ("find_gradients",), partial(_check_gradients, types=("int16",), uneven=True)),
-    Check(
-        "filter of points",
-        ("fit_planes", "filter_points", "filter_cells", "measure_distances"),
-        _check_filter,
-    ),
+    Check("filter of points", ("fit_planes", "filter_points", "filter_cells", "measure_distances"), _check_filter),
     Check("outliers of points", ("measure_distances",), _check_outliers),
 )
 

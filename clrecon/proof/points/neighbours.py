@@ -74,7 +74,6 @@ def find_neighbours(points: NDArray[np.float32], k: int) -> tuple[NDArray[np.int
 def _compare_all(
     points: NDArray[np.float32], rows: NDArray[np.intp], k: int
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Compare some points with all."""
     distances = float32_distances(points[None] - points[rows, None])
     return _order(distances, np.broadcast_to(np.arange(len(points)), distances.shape), k)
 

@@ -58,11 +58,7 @@ def box_of(volume: Volume, border: float = 0.5) -> Box:
 
 
 def find_interval(
-    origins: Float64Array,
-    directions: Float64Array,
-    box: Box,
-    clip: Planes | None = None,
-    nearest: float = -np.inf,
+    origins: Float64Array, directions: Float64Array, box: Box, clip: Planes | None = None, nearest: float = -np.inf
 ) -> tuple[Float64Array, Float64Array, NDArray[np.int64]]:
     """Find the part of rays that lies in a box and within clip planes.
 

@@ -45,7 +45,6 @@ LIMIT_MM = 0.16
 
 
 def _rough_sheet(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
-    """Return a rough sheet of triangles."""
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(SIZE), np.arange(SIZE)))
     corner = (x + SIZE * y)[(x < SIZE - 1) & (y < SIZE - 1)]
     lower = np.column_stack([corner, corner + 1, corner + SIZE + 1])

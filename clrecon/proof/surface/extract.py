@@ -69,7 +69,6 @@ def _find_cases(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _edge_vertices(numbers: NDArray[np.int64], cells: NDArray[np.int64], edge: int) -> NDArray[np.int64]:
-    """Return the vertices on an edge of cells (n, 3)."""
     axis, low, _ = EDGES[edge]
     k, j, i = (cells + CORNERS[low][::-1]).T
     return np.asarray(numbers[k, j, i, axis])
@@ -102,10 +101,7 @@ CellVertices = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]
 
 
 def _find_trilinear_triangles(
-    inside: NDArray[np.bool_],
-    numbers: NDArray[np.int64],
-    heights: NDArray[np.float32],
-    margins: NDArray[np.float64],
+    inside: NDArray[np.bool_], numbers: NDArray[np.int64], heights: NDArray[np.float32], margins: NDArray[np.float64]
 ) -> tuple[NDArray[np.uint32], CellVertices]:
     """Return the triangles of the trilinear field, and the vertices inside cells: cell (k, j, i), point, gradient.
 

@@ -146,7 +146,6 @@ def _find_tunnels(case: int, joined: int) -> list[Tunnel]:
 
 
 def _loop_between(loops: list[Loop], region: list[int], a: int, b: int) -> Loop:
-    """Return the loop that divides regions a and b."""
     found = [loop for loop in loops if {region[corner] for corner in EDGES[loop[0]][1:]} == {a, b}]
     (loop,) = found
     return loop
@@ -209,7 +208,6 @@ def _from_lowest(loop: list[int] | Loop) -> Loop:
 
 
 def _fill_discs(case: int, loops: list[Loop]) -> Row:
-    """Make one disc for each loop."""
     known = _known_discs(case)
     triangles: list[Triangle] = []
     cell_vertices = 0

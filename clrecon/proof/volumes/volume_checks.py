@@ -206,11 +206,7 @@ def _check_mask_components(device: Device) -> str:
 MASK_CHECKS = (
     Check("balls", ("spread_ball",), _check_balls),
     Check("holes and growing", ("mark_border_runs", "mark_voxel_runs", "write_runs"), _check_mask_components),
-    Check(
-        "logic of masks",
-        ("combine_masks", "invert_mask", "count_row_bits", "replace_outside"),
-        _check_logic,
-    ),
+    Check("logic of masks", ("combine_masks", "invert_mask", "count_row_bits", "replace_outside"), _check_logic),
     Check("boxes and tubes", ("write_runs",), _check_regions),
 )
 

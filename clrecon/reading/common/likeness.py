@@ -123,7 +123,7 @@ def measure_likeness(voxels: NDArray[Any], parts: bool = True) -> Likeness | Non
     cells = _average_cells(voxels)
     if cells.shape[1] * cells.shape[2] < FEWEST_CELLS:
         return None
-    differences = [_square_differences(cells, step) for step in range(1, max(PERIODS) + 1)]
+    differences = [np.square(cells[step:] - cells[:-step]) for step in range(1, max(PERIODS) + 1)]
     found = []
     for period in PERIODS:
         if len(voxels) < period + LEAST_ALIKE:
@@ -160,10 +160,6 @@ def _steadily(ratios: NDArray[np.float32], most: int = MOST_ALIKE) -> NDArray[np
     count = min(most, len(ratios))
     lowest = [np.min(ratios[first : first + count], axis=0) for first in range(len(ratios) - count + 1)]
     return np.asarray(np.max(lowest, axis=0))
-
-
-def _square_differences(cells: NDArray[np.float32], step: int) -> NDArray[np.float32]:
-    return np.square(cells[step:] - cells[:-step])
 
 
 def _average_cells(voxels: NDArray[Any]) -> NDArray[np.float32]:

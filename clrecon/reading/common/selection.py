@@ -36,11 +36,7 @@ class Selection:
         first=True,
     )
     phase: int | None = option(
-        "--phase",
-        "N",
-        "number of the phase, of a series with several volumes at one place",
-        group="reading",
-        parse=int,
+        "--phase", "N", "number of the phase, of a series with several volumes at one place", group="reading", parse=int
     )
     allow_gaps: bool = option(
         "--allow-gaps",

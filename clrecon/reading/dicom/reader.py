@@ -15,9 +15,8 @@ from clrecon.geometry import Volume, column_spacing
 from clrecon.geometry.certificate import Certificate
 from clrecon.reading.common.likeness import Likeness, judge_slices
 from clrecon.reading.common.plausibility import examine_voxels
-from clrecon.reading.common.selection import Rescale, Selection, check_rescale
+from clrecon.reading.common.selection import Selection, check_rescale
 from clrecon.reading.common.source_facts import SeriesEntry, SeriesListing
-from clrecon.reading.dicom.headers.slice_header import SliceHeader
 from clrecon.reading.dicom.parse.elements import describe_way_out
 from clrecon.reading.dicom.pixels.voxels import read_voxels
 from clrecon.reading.dicom.series.certificate import (
@@ -235,7 +234,19 @@ def _scan_and_group(
     rescale = check_rescale(selection.rescale)
     if rescale is not None:
         scan.rescale = rescale
-        scan.slices = [_rescaled(header, rescale) for header in scan.slices]
+        scan.slices = [
+            replace(
+                header,
+                slope=rescale.slope,
+                intercept=rescale.intercept,
+                has_slope=True,
+                has_intercept=True,
+                rescale_type="HU",
+                modality_lut=False,
+                warnings=(*header.warnings, str(rescale)),
+            )
+            for header in scan.slices
+        ]
     if not scan.slices and not scan.others:
         shown = escape_text(str(path), 256)
         if scan.skipped["corrupt"]:
@@ -253,20 +264,6 @@ def _scan_and_group(
     found = group_series(scan)
     log.debug("%d files: %d slices in %d series, skipped %s", scan.files, len(scan.slices), len(found), scan.skipped)
     return scan, found
-
-
-def _rescaled(header: SliceHeader, rescale: Rescale) -> SliceHeader:
-    """Return a header that says what the user says of its values."""
-    return replace(
-        header,
-        slope=rescale.slope,
-        intercept=rescale.intercept,
-        has_slope=True,
-        has_intercept=True,
-        rescale_type="HU",
-        modality_lut=False,
-        warnings=(*header.warnings, str(rescale)),
-    )
 
 
 def _describe_refusal(series: Series) -> str:

@@ -65,7 +65,6 @@ class VoxelBytes:
 
     @property
     def file_bytes(self) -> int:
-        """Size of the file."""
         return self.path.stat().st_size
 
     @contextmanager
@@ -90,7 +89,6 @@ class ZlibFile(io.RawIOBase):
         self._file, self._inflater = file, zlib.decompressobj()
 
     def readable(self) -> bool:
-        """Always True."""
         return True
 
     def readinto(self, buffer: Any) -> int:
@@ -255,7 +253,6 @@ _PACKAGES = {"nrrd": "pynrrd"}
 
 
 def import_extra(module: str, purpose: Purpose) -> Any:
-    """Import `module`."""
     return import_package(module, f"this {purpose.noun}", _PACKAGES.get(module))
 
 

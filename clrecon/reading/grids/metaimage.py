@@ -210,7 +210,6 @@ class _Header:
         return numbers
 
     def flag(self, key: str, default: bool) -> bool:
-        """Return True or False."""
         value = self.text(key, str(default)).lower()
         if value not in ("true", "t", "1", "false", "f", "0"):
             raise self.wrong(key, "True or False")
@@ -218,7 +217,6 @@ class _Header:
 
     @property
     def big_endian(self) -> bool:
-        """True where the voxels are big-endian."""
         return self.flag("ByteOrderMSB", False)
 
     def data_file(self, path: Path) -> Path:

@@ -139,7 +139,6 @@ class _Filling:
         self._holes, self._low, self._high = 0, np.inf, -np.inf
 
     def add(self, k: int, stored: NDArray[Any]) -> None:
-        """Add slice `k` as it is stored."""
         values = _scale(stored, self._grid)
         holes = np.isnan(values) if values.dtype.kind == "f" else None
         if holes is not None and holes.any():

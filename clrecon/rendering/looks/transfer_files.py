@@ -459,7 +459,6 @@ def take_number(value: Any, where: str) -> float:
 
 
 def take_text(value: Any, where: str) -> str:
-    """Return a text."""
     if not isinstance(value, str):
         raise RefusedInputError(f"{where} is {_show_value(value)}, not a text")
     return value

@@ -117,7 +117,6 @@ class _Lit(_Labelled):
 
     @property
     def light(self) -> Lighting:
-        """The lighting that is used."""
         return self.lighting or Lighting()
 
 

@@ -80,7 +80,6 @@ class Looks:
         return made
 
     def cloud(self, state: ViewState, part: ShownPart) -> PointLook:
-        """Return the style of a cloud."""
         key = ("cloud", part.color, state.clip)
         made = self._known(key) or self._keep(key, PointLook(color=part.color, clip=state.clip))
         assert isinstance(made, PointLook)
@@ -126,7 +125,6 @@ def _key(labelled: LabelledLook | None) -> Hashable:
 
 
 def _label_fields(labelled: LabelledLook | None, opacity: float) -> dict:
-    """Return the fields of a style for labels."""
     if labelled is None:
         return {}
     colors = {each.number: each.color for each in labelled.parts if each.number and each.color is not None}

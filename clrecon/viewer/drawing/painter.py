@@ -15,6 +15,7 @@ from clrecon.geometry import Volume
 from clrecon.labels.resample import ResampledLabels
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device
+from clrecon.operators.rays.mesh_pictures import box_around
 from clrecon.operators.rays.scene import ScenePictures
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
@@ -152,7 +153,7 @@ class Painter(Stage):
         if plane not in PLANES:
             raise UsageError(unknown_name("plane", plane, PLANES))
         found = self._sliced(state)
-        grid = found[0].volume if found is not None else _box_grid(self.objects)
+        grid = found[0].volume if found is not None else box_around([each.corners for each in self.objects])
         camera = find_plane(grid, plane, size)
         forward = camera.basis().forward
         shift = float(forward @ np.subtract(state.cross, camera.focal_point)) * forward
@@ -371,9 +372,3 @@ def _key_of(labelled: LabelledLook, number: int) -> str | None:
 def _stop(cancelled: Callable[[], bool]) -> None:
     if cancelled():
         raise Cancelled
-
-
-def _box_grid(objects: Sequence[ShownObject]) -> Any:
-    from clrecon.operators.rays.mesh_pictures import box_around
-
-    return box_around([each.corners for each in objects])

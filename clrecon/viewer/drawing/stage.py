@@ -254,7 +254,13 @@ class Stage(Closing):
         """Return the label map by which a scan is divided, None where its parts are not known."""
         scan = next(each for each in self.objects if each.number == number and isinstance(each, ShownScan))
         with self.lock:
-            return self._labelled(scan, state)
+            own = self._map_of(scan.number)
+            if own is not None:
+                return LabelledLook(own.labels, None, tuple(state.parts_of(own.number)))
+            found = self._found_for(scan, state)
+            if found is None:
+                return None
+            return LabelledLook(found.labels, found.placed, tuple(state.parts_of(scan.number)))
 
     def labels_on(self, resident: DeviceVolume, labelled: LabelledLook) -> NDArray[Any]:
         """Return the numbers of a label map on the grid of a scan; hold `lock`."""
@@ -288,13 +294,6 @@ class Stage(Closing):
         if state.parts_at is None:
             return None
         return self._found.get((scan.number, state.parts_at, state.parts_table))
-
-    def _labelled(self, scan: ShownScan, state: ViewState) -> LabelledLook | None:
-        own = self._map_of(scan.number)
-        if own is not None:
-            return LabelledLook(own.labels, None, tuple(state.parts_of(own.number)))
-        found = self._found_for(scan, state)
-        return None if found is None else LabelledLook(found.labels, found.placed, tuple(state.parts_of(scan.number)))
 
     def hu_at(self, point: Point) -> float | None:
         """Return the HU of the first scan, trilinear; None outside of it."""

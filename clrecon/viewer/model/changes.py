@@ -248,7 +248,6 @@ class ChangingView:
         self._change("only", f"the choice of {chosen.name}", parts=tuple(parts))
 
     def show_all(self) -> None:
-        """Show all parts."""
         self._change("show all", "the choice", parts=tuple(replace(each, visible=True) for each in self.state.parts))
 
     def set_color(self, key: str, rgb: Sequence[float] | None) -> None:

@@ -94,12 +94,10 @@ class ViewModel(ChangingView):
 
     @property
     def scans(self) -> list[ShownScan]:
-        """The scans."""
         return [each for each in self.objects if isinstance(each, ShownScan)]
 
     @property
     def label_maps(self) -> list[ShownLabels]:
-        """The label maps."""
         return [each for each in self.objects if isinstance(each, ShownLabels)]
 
     @property
@@ -112,7 +110,6 @@ class ViewModel(ChangingView):
 
     @property
     def mode(self) -> str:
-        """Name of the mode."""
         return self.state.mode
 
     @property
@@ -137,12 +134,10 @@ class ViewModel(ChangingView):
 
     @property
     def measures(self) -> list[Measure]:
-        """What was measured."""
         return list(self.state.measures)
 
     @property
     def clips(self) -> list[ClipPlane]:
-        """The clip planes."""
         return list(self.state.clips)
 
     @property
@@ -175,7 +170,6 @@ class ViewModel(ChangingView):
         self.set_iso(min(max(self.iso_value + step, low), high))
 
     def set_mode(self, name: str) -> None:
-        """Set the mode, one of `modes`."""
         if name not in self.modes:
             raise UsageError(unknown_name("mode", name, self.modes))
         self._change("mode", f"the mode {self.mode}", mode=name, picture_window=None)
@@ -262,7 +256,6 @@ class ViewModel(ChangingView):
         return made
 
     def clear_measures(self) -> None:
-        """Drop all measures."""
         self._change("clear measures", "the measures", measures=(), points=())
 
     @property

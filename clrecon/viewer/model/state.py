@@ -43,7 +43,6 @@ class Pick:
     hu: float | None = None
 
     def describe(self) -> dict[str, Any]:
-        """Return it for JSON."""
         return {
             "point": [round(value, 3) for value in self.point],
             "object": self.object,
@@ -70,7 +69,6 @@ class Measure:
     text: str
 
     def describe(self) -> dict[str, Any]:
-        """Return it for JSON."""
         points = [[round(value, 3) for value in point] for point in self.points]
         return {"kind": self.kind, "points": points, "value": self.value, "unit": self.unit, "text": self.text}
 
@@ -130,7 +128,6 @@ class ClipPlane:
         return x, y, z, sign * height
 
     def describe(self) -> dict[str, Any]:
-        """Return it for JSON."""
         at = self.low + self.share * (self.high - self.low)
         return {
             "name": self.name,
@@ -266,7 +263,6 @@ class ViewState:
         return next((each.points for each in reversed(self.measures) if each.kind == "curve"), ())
 
     def part(self, key: str) -> ShownPart | None:
-        """Return the part with this key."""
         return next((each for each in self.parts if each.key == key), None)
 
     def parts_of(self, number: int) -> list[ShownPart]:
@@ -274,5 +270,4 @@ class ViewState:
         return [each for each in self.parts if each.object == number and not each.is_whole]
 
     def whole(self, number: int) -> ShownPart | None:
-        """Return an object as a whole."""
         return next((each for each in self.parts if each.object == number and each.is_whole), None)

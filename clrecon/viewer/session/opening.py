@@ -40,12 +40,7 @@ class OpenedView(Closing):
     said: What has to be said of the inputs.
     """
 
-    def __init__(
-        self,
-        inputs: Sequence[str | Path],
-        settings: ViewSettings,
-        progress: Progress = ignore_progress,
-    ):
+    def __init__(self, inputs: Sequence[str | Path], settings: ViewSettings, progress: Progress = ignore_progress):
         scan = settings.scan
         self.objects = read_objects(inputs, settings, progress)
         self.said = list(dict.fromkeys(text for each in self.objects for text in each.said))

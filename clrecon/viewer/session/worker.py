@@ -48,12 +48,7 @@ class Worker:
     on_change: Called when work begins and when it ends.
     """
 
-    def __init__(
-        self,
-        name: str,
-        on_error: Callable[[str, str], None],
-        on_change: Callable[[], None] = lambda: None,
-    ):
+    def __init__(self, name: str, on_error: Callable[[str, str], None], on_change: Callable[[], None] = lambda: None):
         self._on_error, self._on_change = on_error, on_change
         self._wake = threading.Condition()
         self._waiting: dict[str, Job] = {}
@@ -87,7 +82,6 @@ class Worker:
         return job
 
     def cancel(self, kind: str) -> None:
-        """Drop the work of a kind."""
         with self._wake:
             waiting = self._waiting.pop(kind, None)
             for job in (waiting, self._running):

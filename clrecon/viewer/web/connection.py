@@ -45,7 +45,6 @@ class Download:
 
     @property
     def size(self) -> int:
-        """Bytes."""
         return self.path.stat().st_size
 
 
@@ -169,7 +168,8 @@ class Connection:
         """Serve the browser until it leaves."""
         from aiohttp import WSMsgType
 
-        fixed = {**page_words(), "formats": _formats(self._session.model), "save_as": self._save_as}
+        kinds = ("mesh", "cloud", "volume", "picture") if self._session.model.scans else ("mesh", "cloud", "picture")
+        fixed = {**page_words(), "formats": {kind: list(KINDS[kind]) for kind in kinds}, "save_as": self._save_as}
         await self._socket.send_str(json.dumps({"fixed": fixed}))
         tasks = [asyncio.ensure_future(work()) for work in (self._write, self._command)]
         try:
@@ -396,12 +396,6 @@ class Connection:
     def _if_open(self, function: Callable[..., None], *arguments: Any) -> None:
         if not self._closed:
             function(*arguments)
-
-
-def _formats(model: ViewModel) -> dict[str, list[str]]:
-    """Return the extensions that can be saved, by what they hold; meshes first."""
-    kinds = ("mesh", "cloud", "volume", "picture") if model.scans else ("mesh", "cloud", "picture")
-    return {kind: list(KINDS[kind]) for kind in kinds}
 
 
 def _fit(size: Any) -> tuple[int, int]:

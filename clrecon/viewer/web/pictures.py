@@ -106,10 +106,7 @@ def encode_picture(picture: Rendering, ground: tuple[int, int, int], sharp: bool
 
     stream = io.BytesIO()
     Image.fromarray(_lay_over(picture.image, ground)).save(
-        stream,
-        "JPEG",
-        quality=SHARP_QUALITY if sharp else MOVING_QUALITY,
-        subsampling=0 if sharp else 2,
+        stream, "JPEG", quality=SHARP_QUALITY if sharp else MOVING_QUALITY, subsampling=0 if sharp else 2
     )
     width, height = picture.size
     told = {**facts, "sharp": sharp, "size": [width, height], "camera": describe_camera(picture.camera)}

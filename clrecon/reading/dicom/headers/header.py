@@ -58,9 +58,7 @@ _share_identity = lru_cache(1024)(SeriesIdentity)
 
 
 @lru_cache(256)
-def _share_halves(
-    orientation: tuple[float, ...],
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+def _share_halves(orientation: tuple[float, ...]) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     return orientation[:3], orientation[3:]  # type: ignore[return-value]
 
 
@@ -181,7 +179,8 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
     if elements.encoding_differs:
         warnings.append("implicit and explicit VR are mixed up: parsed as found, not as the transfer syntax says")
     image_type = [word.strip() for word in values.text("ImageType").upper().split("\\")]
-    derived = _list_derived(image_type)
+    found = sorted(DERIVED_WORDS.intersection(re.split("[^A-Z]+", " ".join(image_type))))
+    derived = found if "DERIVED" in image_type else []
     if derived:
         warnings.append(f"derived images (ImageType has DERIVED and {' '.join(derived)}): maybe not measured HU")
 
@@ -237,12 +236,6 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
     )
     _check_pixel_room(header, elements.pixel_vr)
     return header
-
-
-def _list_derived(image_type: list[str]) -> list[str]:
-    """Return the `DERIVED_WORDS` of a derived image."""
-    found = sorted(DERIVED_WORDS.intersection(re.split("[^A-Z]+", " ".join(image_type))))
-    return found if "DERIVED" in image_type else []
 
 
 def _read_stated_lengths(values: Values, warnings: list[str]) -> dict[str, float | None]:

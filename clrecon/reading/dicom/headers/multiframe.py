@@ -414,7 +414,9 @@ def find_places(values: Values, sop_class: str, frames: int) -> FramePlaces:
             f"{image}: the places of its frames are not known, without {join_names(missing)}: export the series as "
             "single slices or as Enhanced CT"
         )
-    pointers = _read_pointers(values)
+    raw = values.elements.values.get(0x00280009, b"")
+    form = "<HH" if values.elements.little_endian else ">HH"
+    pointers = {group << 16 | element for group, element in struct.iter_unpack(form, raw[: len(raw) // 4 * 4])}
     if not pointers <= PLACE_POINTERS:
         raise ValueProblem(
             f"{image}: FrameIncrementPointer (0028,0009) does not say that its frames are slices, but names "
@@ -428,12 +430,6 @@ def find_places(values: Values, sop_class: str, frames: int) -> FramePlaces:
     return FramePlaces(spacing * np.arange(frames, dtype=np.float64), EXACT_DIGITS, "SpacingBetweenSlices")
 
 
-def _read_pointers(values: Values) -> set[int]:
-    raw = values.elements.values.get(0x00280009, b"")
-    form = "<HH" if values.elements.little_endian else ">HH"
-    return {group << 16 | element for group, element in struct.iter_unpack(form, raw[: len(raw) // 4 * 4])}
-
-
 def _name_tag(tag: int) -> str:
     from pydicom.datadict import keyword_for_tag
 
@@ -445,7 +441,8 @@ def _read_offsets(values: Values, frames: int) -> FramePlaces:
     offsets = np.array(values.decimals("GridFrameOffsetVector", frames))
     digits = max(values.decimal_places("GridFrameOffsetVector"))
     if offsets[0] != 0.0:
-        normal, z = _find_normal(values), values.decimals("ImagePositionPatient", 3)[2]
+        cosines = values.decimals("ImageOrientationPatient", 6)
+        normal, z = _cross(cosines[:3], cosines[3:]), values.decimals("ImagePositionPatient", 3)[2]
         if abs(offsets[0] - z) > SAME_PLACE_MM or abs(normal[2]) < 1.0 - 1e-6:
             raise ValueProblem(
                 f"GridFrameOffsetVector (3004,000C) begins with {offsets[0]:g}, expected 0, or in axial frames the z "
@@ -453,11 +450,6 @@ def _read_offsets(values: Values, frames: int) -> FramePlaces:
             )
         offsets = (offsets - offsets[0]) * round(normal[2])
     return FramePlaces(offsets, digits, "GridFrameOffsetVector")
-
-
-def _find_normal(values: Values) -> NDArray[np.float64]:
-    cosines = values.decimals("ImageOrientationPatient", 6)
-    return _cross(cosines[:3], cosines[3:])
 
 
 def _cross(row: tuple[float, ...], column: tuple[float, ...]) -> NDArray[np.float64]:

@@ -184,5 +184,4 @@ class SliceHeader:
 
     @property
     def pixel_bytes(self) -> int:
-        """Bytes of the uncompressed pixels of this slice."""
         return self.rows * self.columns * self.bits_allocated // 8

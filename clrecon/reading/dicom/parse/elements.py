@@ -169,7 +169,6 @@ class _MeteredFile:
         self._read, self._left = file.read, READ_LIMIT
 
     def read(self, count: int) -> bytes:
-        """Read as the file does."""
         self._left -= count
         if self._left < 0:
             raise CorruptFileError(f"its header takes more than {READ_LIMIT} bytes to read")

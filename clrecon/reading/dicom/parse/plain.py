@@ -76,7 +76,6 @@ class DicomElements(NamedTuple):
 
 @lru_cache(64)
 def decode_uid(value: bytes | None) -> str:
-    """Decode a UID without its padding."""
     return (value or b"").rstrip(b"\0 ").decode("ascii", "replace")
 
 

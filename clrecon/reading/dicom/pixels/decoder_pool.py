@@ -73,12 +73,7 @@ class DecoderPool(Closing):
     """
 
     def __init__(
-        self,
-        decoders: list[str],
-        frame_bytes: int,
-        *,
-        seconds: float | None = None,
-        memory_bytes: int | None = None,
+        self, decoders: list[str], frame_bytes: int, *, seconds: float | None = None, memory_bytes: int | None = None
     ):
         mebibytes = frame_bytes / 2**20
         self.seconds = FRAME_SECONDS + SECONDS_PER_MIB * mebibytes if seconds is None else seconds

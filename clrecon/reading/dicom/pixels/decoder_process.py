@@ -41,7 +41,6 @@ def decode_by_openjpeg(data: bytes, request: dict[str, Any]) -> Any:
 
 
 def decode_by_jpeg_ls(data: bytes, request: dict[str, Any]) -> Any:
-    """Decode JPEG-LS."""
     import numpy as np
     from jpeg_ls import decode_pixel_data
 
@@ -68,7 +67,6 @@ def decode_by_imagecodecs_jpeg(data: bytes, request: dict[str, Any]) -> Any:
 
 
 def decode_by_imagecodecs_jpeg_ls(data: bytes, request: dict[str, Any]) -> Any:
-    """Decode JPEG-LS, as `decode_by_jpeg_ls` does."""
     from imagecodecs import jpegls_decode
 
     return jpegls_decode(data)

@@ -240,10 +240,7 @@ def collect_series_warnings(series: Series) -> list[str]:
     for text in dict.fromkeys(text for header in headers for text in header.warnings):
         warnings.append(f"{text} ({_place(series.stack, lambda h, text=text: text in h.warnings)})")  # type: ignore[misc]
     checks: tuple[tuple[Callable[[SliceHeader], bool], str], ...] = (
-        (
-            lambda h: not h.has_slope,
-            "no RescaleSlope: slope 1, intercept {intercept} taken: maybe not HU",
-        ),
+        (lambda h: not h.has_slope, "no RescaleSlope: slope 1, intercept {intercept} taken: maybe not HU"),
         (
             lambda h: h.has_slope and not h.has_intercept,
             "no RescaleIntercept: slope {slope}, intercept 0 taken: maybe not HU",

@@ -42,16 +42,15 @@ def rank_series(series: Series) -> Rank:
     first = series.headers[0]
     words = dict(first.phase).get("ImageType", "").upper().replace("\\", " ").split()
     thickness = median_thickness(series.headers)
+    normal = [
+        abs(first.row_cosines[a] * first.column_cosines[b] - first.row_cosines[b] * first.column_cosines[a])
+        for a, b in ((1, 2), (2, 0), (0, 1))
+    ]
     return Rank(
         not any(word in _NOT_ORIGINAL for word in words),
-        _nearest_direction(first.row_cosines, first.column_cosines),
+        _DIRECTIONS[normal.index(max(normal))],
         None if thickness is None else round(thickness, 2),
     )
-
-
-def _nearest_direction(row: tuple[float, ...], column: tuple[float, ...]) -> str:
-    normal = [abs(row[a] * column[b] - row[b] * column[a]) for a, b in ((1, 2), (2, 0), (0, 1))]
-    return _DIRECTIONS[normal.index(max(normal))]
 
 
 SHORTEST_START = 4

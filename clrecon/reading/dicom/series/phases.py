@@ -369,7 +369,6 @@ def describe_spacing(phases: Sequence[Phase], chosen: Phase) -> str:
 
 
 def choose_phase(places: Places, wanted: int) -> Phase:
-    """Return the phase of that number."""
     for phase in places.phases:
         if phase.number == wanted:
             return phase

@@ -82,7 +82,6 @@ class DiskReader:
             self._jobs.put(None)
 
     def run(self, job: Callable[[], T]) -> T:
-        """Run one job and wait for it."""
         result: T = self._run_all([job])[0]
         return result
 

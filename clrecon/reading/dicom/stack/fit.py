@@ -56,7 +56,6 @@ class Directions:
 
     @property
     def deviation(self) -> float:
-        """The largest deviation."""
         return float(self.deviations.max())
 
     @property
@@ -258,11 +257,7 @@ def find_mixed_values(headers: Sequence[SliceHeader]) -> list[str]:
     """Describe values that must be equal over a stack but are not, naming the differing slices."""
     checks: tuple[tuple[str, Callable[[SliceHeader], object], Callable[[SliceHeader], str]], ...] = (
         ("Columns x Rows", lambda h: (h.columns, h.rows), lambda h: f"{h.columns} x {h.rows}"),
-        (
-            "FrameOfReferenceUID",
-            lambda h: h.frame_of_reference,
-            lambda h: "another" if h.frame_of_reference else "no",
-        ),
+        ("FrameOfReferenceUID", lambda h: h.frame_of_reference, lambda h: "another" if h.frame_of_reference else "no"),
         ("StudyInstanceUID", lambda h: h.series.study, lambda h: "another" if h.series.study else "no"),
     )
     found = []

@@ -74,7 +74,8 @@ class Holes:
                 f"{count} slice{'s' * (count > 1)} missing between {low:.2f} and {high:.2f} mm "
                 f"(gap {gap:.3f} mm, usual {usual:.3f} mm){between}"
             )
-        return _join_places(texts)
+        shown = "; ".join(texts[:PLACES_SHOWN])
+        return shown if len(texts) <= PLACES_SHOWN else f"{shown}; and {len(texts) - PLACES_SHOWN} more"
 
 
 def find_holes(distances: Float64Array) -> Holes:
@@ -113,11 +114,6 @@ def _find_runs(gaps: Float64Array) -> NDArray[np.bool_]:
             last += 1
         in_run[place] = last - first + 1 >= RUN_LENGTH
     return in_run
-
-
-def _join_places(places: list[str]) -> str:
-    shown = "; ".join(places[:PLACES_SHOWN])
-    return shown if len(places) <= PLACES_SHOWN else f"{shown}; and {len(places) - PLACES_SHOWN} more"
 
 
 SLACK = 1e-6
