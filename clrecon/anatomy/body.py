@@ -231,7 +231,6 @@ def _air_level(volume: Volume, outside: Callable[[int], Mask]) -> Any:
 def find_body(volume: Volume, *, steps: Steps | None = None) -> tuple[Mask, tuple[int, int, int]]:
     """Find the cells of the patient's body, with its margin.
 
-    volume: A scan in HU.
     steps: Counts the slices of `count_cells` and `BODY_STEPS`.
 
     Returns:

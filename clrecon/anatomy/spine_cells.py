@@ -79,7 +79,6 @@ def plan_cells(volume: Volume) -> Lattice:
 def average_cells(volume: Volume, lattice: Lattice, done: Callable[[slice], None]) -> SpineCells:
     """Average the voxels in blocks of about a cell, then interpolate at the cells.
 
-    volume: A scan in HU.
     lattice: From `plan_cells`.
     done: Called in the thread of the caller with the slices that are finished: of blocks, then of cells.
     """

@@ -44,7 +44,6 @@ OWN_STEPS = 6
 def leave_outside_air(volume: Volume, levels: Sequence[float], *, progress: Progress | None = None) -> Volume:
     """Raise the air around the patient above the iso values, so that no surface of air includes it.
 
-    volume: A scan in HU.
     levels: Iso values, HU.  What is denser than -300 HU is never left out.
     progress: Called as ``progress("mask", steps done, steps)``.
 

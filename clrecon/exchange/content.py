@@ -127,7 +127,6 @@ class PointContent:
     """Points as they go into a file: those of a cloud, or the vertices of a mesh.
 
     vertices: ndarray, shape (n, 3), float32, or float64 far from the origin. mm in `space`.
-    normals: ndarray, shape (n, 3), float32, or None
     space: ``LPS`` or ``RAS``.
     to_lps: ndarray, shape (3, 3), float64. Rotation from `space` to LPS.
     affine: ndarray, shape (4, 4), float64, or None. Index (i, j, k) of the volume to LPS mm, whatever `space` is.
@@ -189,7 +188,6 @@ class Pieces:
 class Content(PointContent):
     """A mesh as it goes into a file.
 
-    triangles: ndarray, shape (m, 3), uint32
     name: Name of the object, for formats that have names.
     color: Red, green and blue, 0 to 1, for formats that have colours; None: the colour of the format's writer.
     vertex_colors: ndarray, shape (n, 3), uint8, or None. A colour for each vertex, in PLY, in place of `color`.

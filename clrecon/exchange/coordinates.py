@@ -27,8 +27,6 @@ def as_stored(points: NDArray[Any]) -> NDArray[np.floating]:
 def rounding_step(vertices: NDArray[np.floating]) -> float:
     """Return the step, in mm, to which coordinates of vertices have been rounded.
 
-    vertices: ndarray, shape (n, 3), float32 or float64, mm
-
     Returns: The step of float32 at the largest coordinate.  float64 vertices were computed in float32 relative to a
         point near their centre: the step there.
     """
@@ -45,8 +43,6 @@ def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
     When a file without indices, such as STL, is read, these are joined: a surface that is closed by index can then be
     open.
 
-    vertices: ndarray, shape (n, 3), float32 or float64
-
     Returns: ndarray, shape (k,), int64. All vertices of each such place, in order of the place's coordinates.
     """
     mixed = _scramble(vertices)
@@ -62,8 +58,6 @@ def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
 
 def find_places(vertices: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Number the places at which vertices lie, in the order in which they occur first.
-
-    vertices: ndarray, shape (n, 3), float32 or float64
 
     Returns:
     first: ndarray, shape (p,), int64. The first vertex at each place.
@@ -92,8 +86,6 @@ def _scramble(vertices: NDArray[np.floating]) -> NDArray[np.uint64]:
 
 def rounded_apart(vertices: NDArray[np.floating]) -> NDArray[np.float32]:
     """Round vertices to float32 so that no two coincide unless they did before.
-
-    vertices: ndarray, shape (n, 3), float32 or float64, mm
 
     Returns: ndarray, shape (n, 3), float32. The nearest values; where several places round to one, all but the first
         are moved by steps of float32, each with all of its vertices.  That keeps about 1,000 places apart that round to

@@ -72,7 +72,6 @@ def encode_surface(
 ) -> CodedSurface:
     """Code a surface of at least one triangle.
 
-    vertices: ndarray, shape (n, 3). mm.
     normals: ndarray, shape (n, 3), float32. Unit vectors.
     triangles: ndarray, shape (m, 3), integer. Their order stays.
     """

@@ -27,7 +27,6 @@ class RawCloud:
     points: ndarray, shape (n, 3), of any real type. mm; perhaps not finite.
     columns: dict of str to ndarray, shape (n,). Further values of each point by the name that the file gives them, in
         the order of the file.
-    space: Frame that the file names.
     affine: ndarray, shape (4, 4), or None
     """
 
@@ -156,8 +155,6 @@ class RawMesh:
     kind: "STL", "PLY", "OBJ", "GLB", "3MF" or "VTP".
     vertices: ndarray, shape (n, 3), of any real type. mm, placed as the file says; perhaps not finite.
     triangles: ndarray, shape (m, 3), integer. Perhaps of vertices that are not there.
-    normals: ndarray, shape (n, 3), float32, or None
-    space: Frame that the file names.
     unit: Unit of the lengths in the file.
     parts: Empty where the file has no objects.
     """
@@ -191,9 +188,7 @@ _SNAP = 1e-12
 class Shape:
     """Triangles in a frame of their own.
 
-    vertices: ndarray, shape (n, 3), float32 or float64
     triangles: ndarray, shape (m, 3), integer. Perhaps of vertices that are not there.
-    normals: ndarray, shape (n, 3), float32, or None
     """
 
     vertices: NDArray[np.floating]

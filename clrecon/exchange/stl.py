@@ -144,7 +144,6 @@ def join_corners(corners: NDArray[np.floating]) -> tuple[NDArray[np.floating], N
 
     Returns:
     vertices: ndarray, shape (n, 3). In the order in which they occur first.
-    triangles: ndarray, shape (m, 3), int64
     """
     first, place = find_places(corners)
     return corners[first], place.reshape(-1, 3)

@@ -41,7 +41,6 @@ ROUNDS = 3
 class Canal:
     """The canal of one vertebra.
 
-    voxels: ndarray, shape (nk, nj, ni), bool
     closed_slices: Slices in which the arch is closed, alone or together with its neighbours.
     together: Slices that close the arch together; 1 where single ones do.
     height_mm: Height of the slices of the canal: that of the pedicles.

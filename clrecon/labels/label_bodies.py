@@ -196,7 +196,6 @@ def label_ml(labels: LabelMap, number: int) -> float:
 def count_ml(voxels: NDArray[Any], number: int, box: Box, voxel_ml: NDArray[np.float64]) -> float:
     """Return the volume of the voxels of a grid that carry `number`, ml.
 
-    voxels: ndarray, shape (nk, nj, ni)
     box: Slices along k, j, i, around all voxels of the label.
     voxel_ml: ndarray, shape (nk,). See `slice_voxel_ml`.
     """

@@ -49,7 +49,6 @@ def next_level(tried: Sequence[tuple[int, float]], wanted: float, rise: float) -
     """Return the level to try next: by Newton's method, then the secant method, then interpolation between two levels.
 
     tried: sequence of (int, float). Levels and their volumes, in the order of the trials.
-    wanted: The wanted volume.
     rise: Approximate change of the volume when the level rises by one: below 0.
 
     Returns: The next level; or the best of the tried levels, where no further trial is useful.

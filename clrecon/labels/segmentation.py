@@ -47,7 +47,6 @@ _UNSAID = "says neither SpacingBetweenSlices nor SliceThickness"
 class FrameStack:
     """The evenly spaced stack that frames form.
 
-    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm.
     places: Slice index k of each frame.
     warnings: What the header leaves open about the step between slices.
     """
@@ -77,7 +76,6 @@ def place_frames(shared: Any, groups: list[Any], name: str) -> FrameStack:
 
     shared: Shared functional groups.
     groups: Per-frame functional groups.
-    name: Name of the file, for messages.
     """
     directions = np.stack(
         [_numbers(_group(shared, g, "PlaneOrientationSequence").ImageOrientationPatient, 6) for g in groups]

@@ -74,7 +74,6 @@ class Painter:
     No two wanted segments may overlap.  A voxel of a wanted and another segment goes to the wanted one; a voxel of
     several others goes to the lowest number.
 
-    file: Name of the file, for messages.
     voxels: ndarray, shape (nk, nj, ni), uint16. Zeros, to be written.
     names: The segments.
     """

@@ -134,7 +134,6 @@ def read_structures(
     `clrecon.labels.contours`.  The label's number is the ROI's.  Of an uneven scan the map has thinner slices, see
     `clrecon.labels.structures`.
 
-    volume: The scan.
     wanted: Only the other ROIs may overlap, and only the wanted ones have to fit the scan.
     progress: Called as ``progress("read", ROIs done, all ROIs)``.
     """

@@ -131,7 +131,6 @@ class BaseMesh(Message):
 
         Returns:
         vertices: ndarray, shape (n, 3), mm, of the type of `vertices`
-        normals: ndarray, shape (n, 3), float32, or None
         """
         signs = np.diag(frame_from_lps(space)).astype(np.float32)
         if space.lower() == "lps":

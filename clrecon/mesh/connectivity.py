@@ -74,8 +74,6 @@ def order_by_number(numbers: IntArray, size: int) -> IntArray:
 class Fans:
     """The triangles around each vertex.
 
-    triangles: ndarray, shape (m, 3), uint32
-
     rows: ndarray, shape (3 * m,), int. Triangles, those around vertex v from ``begin[v]`` to ``begin[v + 1]``, in their
         order.
     begin: ndarray, shape (vertex_count + 1,), int64
@@ -148,7 +146,6 @@ def find_split_vertices(
 ) -> IntArray:
     """Find the vertices whose faces form several fans, for example the waist of an hourglass.
 
-    triangles: ndarray, shape (m, 3), uint32
     opposite: Result of `opposite_half_edges`; with it the faces around each vertex are counted by going round it once.
     """
     corners = triangles.reshape(-1)
@@ -199,7 +196,6 @@ def label_components(
 ) -> tuple[int, NDArray[np.int64]]:
     """Number the components: triangles that share a vertex belong to one component.
 
-    triangles: ndarray, shape (m, 3), uint32
     edges: If they are already known, labelling takes a third of the time.
 
     Returns:

@@ -47,8 +47,6 @@ def find_self_intersections(
     lie in one plane on the same side of it.  Corners at the same place are common; triangles with three common corners,
     without area, or with a corner that is not finite, are left out.  The signs of all volumes and areas are exact.
 
-    vertices: ndarray, shape (n, 3), mm
-    triangles: ndarray, shape (m, 3), uint32
     changed: ndarray, shape (m,), bool. Only pairs with one of these are examined.
     steps: Counts the triangles.
 
@@ -116,9 +114,6 @@ def find_changed_intersections(
 ) -> NDArray[np.int64]:
     """Find the pairs of triangles that cut each other and of which one has changed.
 
-    vertices: ndarray, shape (n, 3), mm
-    triangles: ndarray, shape (m, 3), uint32
-    changed: ndarray, shape (m,), bool
     find_crossings: `find_self_intersections`, or what finds the same elsewhere.  It is not needed where few have
         changed.
 
@@ -135,14 +130,7 @@ def find_changed_intersections(
 def find_beside(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], changed: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Find the changed triangles and those that can touch one of them: whose box shares a coarse cell with one.
-
-    vertices: ndarray, shape (n, 3), mm
-    triangles: ndarray, shape (m, 3), uint32
-    changed: ndarray, shape (m,), bool
-
-    Returns: ndarray, shape (m,), bool
-    """
+    """Find the changed triangles and those that can touch one of them: whose box shares a coarse cell with one."""
     if np.count_nonzero(changed) > _FEW * len(triangles):
         return np.ones(len(triangles), dtype=bool)
     if not changed.any():

@@ -78,7 +78,6 @@ class MeshQuality(Record):
 def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> MeshQuality:
     """Measure a triangle surface.
 
-    vertices: ndarray, shape (n, 3), float32 or float64. Millimetres.
     triangles: ndarray, shape (m, 3), uint32. Indices of vertices.
     """
     vertex_count, triangle_count = len(vertices), len(triangles)
@@ -159,8 +158,6 @@ def measure_triangles(
 def find_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32], most: int) -> Pieces:
     """Divide a surface into its components of largest area, and one part of all others.
 
-    vertices: ndarray, shape (n, 3). mm.
-    triangles: ndarray, shape (m, 3), uint32
     most: Components that are parts of their own.  1: the surface is one part, whatever its components.
 
     Returns: The largest area first.  The volume of an open component is measured as if its rim were joined to the mean

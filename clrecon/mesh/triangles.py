@@ -76,9 +76,6 @@ def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
 
     These normals do not depend on how the surface is divided into triangles (Thuermer and Wuethrich 1998).
 
-    vertices: ndarray, shape (n, 3), float32 or float64
-    triangles: ndarray, shape (m, 3), uint32
-
     Returns: ndarray, shape (n, 3), float32. Unit vectors; (0, 0, 1) where a vertex has no face or its faces cancel.
     """
     total = np.zeros((3, len(vertices)))
@@ -114,7 +111,6 @@ def find_nearest_triangle(
     The box around a triangle is never farther away than the triangle, and its nearest corner is never nearer.  So only
     triangles whose box is nearer than the nearest of all corners are measured exactly.
 
-    vertices: ndarray, shape (n, 3), float32 or float64. mm.
     triangles: ndarray, shape (m, 3), uint32. At least one, every index below n.
     point: ndarray, shape (3,), float64. mm.
 

@@ -44,7 +44,6 @@ def make_demo(
     """Write a phantom CT series, a picture of it, its bone mesh and the report; check a sphere of known volume.
 
     output: A new or empty folder, or one of an earlier demonstration, which is replaced.
-    device: Name or index of an OpenCL device.
     no_clobber: A folder that holds anything stays and is an `OutputError`.
 
     Returns: ``folder``, ``files``, ``affine_error_mm`` (largest difference between the affine of the report and that of

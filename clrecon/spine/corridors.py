@@ -415,7 +415,6 @@ def find_corridors(volume: Volume, labels: LabelMap, label: int | str, iso_value
 def measure_corridors(volume: Volume, labels: NDArray[Any], number: int, level: float, name: str) -> VertebraCorridors:
     """Find the corridors through the pedicles of a vertebra whose labels lie on the grid of the volume.
 
-    volume: HU.
     labels: ndarray, shape (nk, nj, ni). Labels on the grid of the volume, see `clrecon.labels.resample_labels`.
     number: Label of the vertebra.
     level: HU at which the bone's surface lies.

@@ -62,7 +62,6 @@ def follow_canal(points: Float64Array, volume: Grid) -> Course:
     """Follow the middle of the canal, and beyond the ends of its line as far as the scan goes.
 
     points: ndarray, shape (m, 3), float64. LPS mm from the head downwards, see `clrecon.anatomy.spine_line.SpineLine`.
-    volume: The scan.
     """
     from scipy.interpolate import PchipInterpolator
     from scipy.ndimage import gaussian_filter1d

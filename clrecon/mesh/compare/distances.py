@@ -31,9 +31,6 @@ Points = NDArray[np.float64]
 def sample_surface(vertices: NDArray[np.floating], triangles: NDArray[np.uint32], count: int = SAMPLES) -> Points:
     """Return points that cover a surface evenly by area, the same points at every call.
 
-    vertices: ndarray, shape (n, 3), mm
-    triangles: ndarray, shape (m, 3), uint32
-
     Returns: ndarray, shape (count, 3), float64, mm
     """
     return sample_surface_points(vertices, triangles, count)[0]
@@ -63,7 +60,6 @@ def sample_surface_points(
 class SurfaceDistance:
     """Exact distances from points to the nearest triangle of a surface.
 
-    vertices: ndarray, shape (n, 3), mm
     triangles: ndarray, shape (m, 3), uint32, at least one
     """
 
@@ -191,7 +187,6 @@ def wall_thickness(
 
     From each point a ray goes inward, against the normal of its triangle, to the first triangle that it meets.
 
-    vertices: ndarray, shape (n, 3), mm
     triangles: ndarray, shape (m, 3), uint32. Triangles of a closed surface, facing outward.
 
     Returns: ndarray, shape (samples,), float64, mm. NaN where the ray meets nothing: between triangles that do not

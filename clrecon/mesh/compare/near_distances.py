@@ -33,8 +33,6 @@ class NearDistance:
     If a triangle around that vertex is near enough, its distance is returned; it is never less than the distance to the
     surface.  For the other points all triangles are searched, and the result is exact.
 
-    vertices: ndarray, shape (n, 3), mm
-    triangles: ndarray, shape (m, 3), uint32
     fans: Fans of the triangles if they are known.
     """
 
@@ -237,7 +235,6 @@ class FaceFrames:
     """A frame in each triangle: a corner, two edges, and what gives the coordinates along them.
 
     vertices: ndarray, shape (n, 3), mm, near zero
-    triangles: ndarray, shape (m, 3), uint32
     """
 
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):

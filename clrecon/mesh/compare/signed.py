@@ -41,7 +41,6 @@ _PIECE = 1 << 14
 class SignedDistance:
     """Exact distances from points to the nearest triangle of a closed surface, below zero inside.
 
-    vertices: ndarray, shape (n, 3), mm
     triangles: ndarray, shape (m, 3), uint32. Every edge in two triangles, which run along it in opposite directions;
         triangles with a corner twice, which are no surface, are left out.
     outward: False: the triangles face inward, and the sign is turned.

@@ -183,8 +183,6 @@ def find_rails(
     volume: The mesh was extracted from it.
     label_of_vertex: ndarray, shape (n,), int64. The component of each vertex, below 0 for none.
     chosen: ndarray, shape (count,), bool. Components that are examined.
-
-    Returns: ndarray, shape (count,), bool
     """
     rails = np.zeros(len(chosen), dtype=bool)
     last = volume.shape_ijk[2] - 1

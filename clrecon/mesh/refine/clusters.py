@@ -37,7 +37,6 @@ class Clusters:
     undone from the last one on, and what it comes apart into gets places of its own.
 
     vertices: ndarray, shape (n, 3), float64, mm, relative to `origin`
-    triangles: ndarray, shape (m, 3), uint32
     origin: ndarray, shape (3,), float64, mm. Places are rounded as a `Mesh` stores them after this is added.
     find_crossings: `find_self_intersections`, or what finds the same elsewhere.
     """

@@ -25,8 +25,6 @@ def last_of_collapses(collapses: NDArray[np.integer], count: int) -> NDArray[np.
 
     collapses: ndarray, shape (c, 2), int. In each, the second vertex is merged into the first.
     count: Number of vertices.
-
-    Returns: ndarray, shape (count,), int64
     """
     into = np.arange(count)
     into[collapses[:, 1]] = collapses[:, 0]
@@ -106,7 +104,6 @@ class Quadrics:
     """Squared distances to the planes of the triangles around each vertex (Garland and Heckbert 1997).
 
     vertices: ndarray, shape (n, 3), float64, mm, near zero
-    triangles: ndarray, shape (m, 3), uint32
     """
 
     def __init__(self, vertices: Float64Array, triangles: NDArray[np.uint32]):

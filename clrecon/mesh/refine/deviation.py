@@ -40,7 +40,6 @@ class SurfaceBounds(NearDistance):
     `clrecon.operators.surface.decimation.DeviceBounds` does the same on a device.
 
     vertices: ndarray, shape (n, 3), mm, near zero
-    triangles: ndarray, shape (m, 3), uint32
     """
 
     def find_bounds(
@@ -202,8 +201,6 @@ MakeBounds = Callable[..., SurfaceBounds]
 class Deviation:
     """The original surface, and the bound.
 
-    vertices: ndarray, shape (n, 3), float64, mm
-    triangles: ndarray, shape (m, 3), uint32
     bound: mm.
     make_bounds: `SurfaceBounds`, or what does the same elsewhere.
     fans: Fans of the triangles if they are known.
@@ -238,8 +235,6 @@ class Deviation:
         In the others no point has moved farther than the corners.
 
         rows, names, places: As in `is_far_from`.
-
-        Returns: ndarray, shape (k,), bool
         """
         triangles = self._triangles[rows]
         a, b, c = names[triangles].T
@@ -268,7 +263,6 @@ class Deviation:
         faces: ndarray, shape (f, 3), uint32. The present surface, at least all faces around the names of the corners.
 
         Returns:
-        far: ndarray, shape (k,), bool
         witnesses: ndarray, shape (7, k), int. Rows of `faces` that show that a triangle is within the bound; it is so
             as long as these faces stay.  -1 where it is not.
         """
@@ -301,8 +295,6 @@ class Deviation:
 
         vertices: ndarray, shape (k,), int. Vertices to examine.
         names, places, faces: As in `is_far_from`.
-
-        Returns: ndarray, shape (k,), bool
         """
         length, _ = self._make(places, faces).find_surely_within(self._vertices[vertices], names[vertices], self._bound)
         return np.asarray(length > self._bound)
@@ -317,8 +309,6 @@ class Deviation:
         faces: ndarray, shape (f, 3), uint32. Their corners are numbers of vertices of the original surface too.
         rows: ndarray, shape (f,), int. The triangle of the original surface that each face came from: its corners are
             near the face.
-
-        Returns: ndarray, shape (f,), bool
         """
         far = np.zeros(len(faces), dtype=bool)
         if len(faces) == 0:

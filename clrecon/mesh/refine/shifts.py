@@ -61,7 +61,6 @@ def measure_volumes(
     """Measure the components of a surface.
 
     vertices: ndarray, shape (n, 3), float64, mm from a point near them
-    triangles: ndarray, shape (m, 3), uint32
     count, labels, border: int, ndarray, shape (n,), int64, and ndarray, shape (n,), bool. Number of components,
         component of each vertex, and vertices at edges of one triangle, if they are known.
     """
@@ -87,9 +86,7 @@ def restore_volumes(
     A small shift is a large share of the volume of a thin sheet: in a thin-walled bone at voxels of 3 mm, 6 % of the
     volume were 0.03 voxel.
 
-    vertices: ndarray, shape (n, 3), float64, mm
     step: ndarray, shape (n, 3), float64, mm. Changed in place; no step becomes longer than `longest`.
-    triangles: ndarray, shape (m, 3), uint32
     labels: ndarray, shape (n,), int64. Component of `wanted` that each vertex belongs to, -1 for none.
     longest: mm.
     """
@@ -140,8 +137,6 @@ def move_vertices(
 ) -> tuple[NDArray[np.floating], int]:
     """Move vertices, but by less or not at all where triangles would cut, lose their area or share a place.
 
-    vertices: ndarray, shape (n, 3), float32 or float64, mm
-    triangles: ndarray, shape (m, 3), uint32
     step: ndarray, shape (n, 3), float64, mm
     find_crossings: `find_self_intersections`, or what finds the same elsewhere.
 

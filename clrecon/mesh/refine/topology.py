@@ -64,7 +64,6 @@ def measure_topology(
 ) -> Topology:
     """Measure the Euler number of each component.
 
-    triangles: ndarray, shape (m, 3), uint32
     labels: ndarray, shape (n,), int64. Component of each vertex.
     count: Number of components.
     edges: Edges of the triangles if they are known.
@@ -112,7 +111,6 @@ def any_corner(flags: NDArray[np.bool_], triangles: IntArray) -> NDArray[np.bool
 def find_sheets(faces: NDArray[np.uint32], size: int, edges: Edges) -> list[IntArray]:
     """Find the vertices at edges with several sheets, of doubled faces and of several fans of faces.
 
-    faces: ndarray, shape (f, 3), uint32
     size: Number of vertices.
     edges: Edges of these faces.
     """
@@ -139,8 +137,6 @@ def find_faults_beside(faces: NDArray[np.uint32], new: NDArray[np.bool_]) -> Int
 
     faces: ndarray, shape (f, 3), uint32. The whole surface.
     new: ndarray, shape (n,), bool. Vertices that were not there, or elsewhere: every face that is new has one of them.
-
-    Returns: ndarray, shape (k,), int
     """
     touched = np.zeros(len(new), dtype=bool)
     touched[faces[any_corner(new, faces)]] = True
@@ -171,8 +167,6 @@ def find_torn(triangles: NDArray[np.uint32], names: IntArray) -> IntArray:
 
     triangles: ndarray, shape (m, 3), uint32. Triangles before vertices were merged.
     names: ndarray, shape (n,), int. For each vertex the one that it was merged into.
-
-    Returns: ndarray, shape (k,), int
     """
     size = len(names)
     edges = find_edges(triangles, size)

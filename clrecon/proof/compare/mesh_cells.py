@@ -37,8 +37,6 @@ def meets_box(corners: NDArray[np.float64], half: float) -> NDArray[np.bool_]:
     corners: ndarray, shape (n, 3, 3), float64. Triangle, corner, axis; each triangle relative to the middle of its
         cube.
     half: Half the length of the cube's edges.
-
-    Returns: ndarray, shape (n,), bool
     """
     x = np.ascontiguousarray(corners.transpose(1, 2, 0))  # corner, axis, triangle
     meets = ((x.min(axis=0) <= half) & (x.max(axis=0) >= -half)).all(axis=0)

@@ -207,7 +207,6 @@ def find_piercings(ijk: Float64Array, triangles: NDArray[np.uint32], lattice: La
     even number of times by every row, whatever the rounding.
 
     ijk: ndarray, shape (n, 3), float64. Vertices in index coordinates of the voxels.
-    triangles: ndarray, shape (m, 3), uint32
 
     Returns: ndarray, shape (p,), int64, ascending. Ends of runs of points inside, see the head of this file;
         those that would be there an even number of times are not.

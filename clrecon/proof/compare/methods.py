@@ -20,7 +20,6 @@ class Compared:
 
     name: As the user names it.
     title: In tables and plots.
-    what: In words.
     makes: {"mesh", "cloud", "picture"}
     on_device: True: its kernels run on the OpenCL device; False: on the CPU alone.
     peer: The library of somebody else that does the work; empty for clrecon's own.

@@ -35,7 +35,6 @@ class Request:
 
     method: Name in `COMPARED`.
     folder: Has the volume; gets the results.
-    device: Index of the OpenCL device.
     repeat: Warm runs.
     timeout: Seconds after which a device that finishes nothing hangs.
     camera: Parameters of the `Camera` of the picture.

@@ -144,7 +144,6 @@ def draw_scene(
     Every interface is a linear ramp of about one voxel.  Thick slices are averaged from thin ones.
 
     parts: In the order of painting.
-    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
     progress: Called as ``progress("draw", done, slices)``.
 
     Returns:

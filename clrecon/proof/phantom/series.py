@@ -106,7 +106,6 @@ def write_label_map(
     """Write labels that lie where `affine` says, oblique and sheared ones included.
 
     labels: ndarray, shape (nk, nj, ni), uint8
-    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
     names: Names of labels, in ASCII; they are written as segments, as 3D Slicer does.
     """
 

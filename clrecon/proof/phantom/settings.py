@@ -92,8 +92,6 @@ def make_localizer(
 ) -> tuple[FileDataset, NDArray[np.int16]]:
     """Return header and HU of a sagittal localizer of the stack, in the series of its slices.
 
-    voxels: ndarray, shape (nk, nj, ni), int16
-    affine: ndarray, shape (4, 4)
     number: InstanceNumber.
     instance: SOPInstanceUID.
     """

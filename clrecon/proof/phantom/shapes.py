@@ -315,7 +315,6 @@ def _sub_voxel_centre(affine: NDArray[np.float64], settings: PhantomSettings) ->
 def choose_body(affine: NDArray[np.float64], settings: PhantomSettings) -> Body:
     """Make the analytic body of `settings` for a volume with this affine.
 
-    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
     settings: Of an analytic kind.
 
     Returns: Wholly inside the volume, with at least one voxel of background on every side.

@@ -337,8 +337,6 @@ class _Scene:
 def plan_spine(settings: PhantomSettings, affine: Float64Array) -> tuple[Anatomy, Float64Array]:
     """Plan the spine of a phantom.
 
-    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
-
     Returns:
     anatomy: In mm about `CENTRE_LPS_MM`.
     grid: ndarray, shape (4, 4). Index to mm of the plan.
@@ -353,8 +351,6 @@ def plan_spine(settings: PhantomSettings, affine: Float64Array) -> tuple[Anatomy
 
 def label_levels(settings: PhantomSettings, affine: Float64Array) -> NDArray[np.uint8]:
     """Label each voxel of a spine phantom with the number of the vertebra that holds its centre.
-
-    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
 
     Returns: ndarray, shape (nk, nj, ni), uint8. 0 where no vertebra is, else
         `clrecon.proof.phantom.spine_parts.level_number`.
@@ -381,7 +377,6 @@ def draw_spine(
 ) -> tuple[Float32Array, Anatomy]:
     """Draw the spine phantom without point spread and noise.
 
-    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
     progress: Called as ``progress("draw", done, slices)``.
     places: ndarray, shape (nk,). k of each slice in the affine; default: 0, 1, 2 and so on.
     blood_hu: HU of heart and vessels.

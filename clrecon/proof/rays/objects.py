@@ -89,7 +89,6 @@ def shade_splats(
 
     depth, numbers: Result of `find_splats`.
     colors: ndarray, shape (n, 3), float64. 0 to 1.
-    normals: ndarray, shape (n, 3), floating
     lighting: One that does not shade leaves the colours as they are.
     apart: Pixels.
 
@@ -154,8 +153,6 @@ def find_meetings(
     All but the signs of areas is float32, product by product and sum by sum as the kernel does it; products of two
     float32 are exact in float64.
 
-    vertices: ndarray, shape (n, 3), floating. LPS mm.
-    triangles: ndarray, shape (m, 3), integer
     size: (width, height)
     """
     width, height = size

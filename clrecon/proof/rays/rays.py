@@ -28,7 +28,7 @@ class Box:
     exactly its voxels.  The functions are then i and j counted in the plane of slice 0, with bounds around all slices,
     and the height over slice 0. Samples in that box but beside their slice are ignored.
 
-    normals: ndarray, shape (3, 3), float64
+    normals: Rows are the functions' gradients.
     offsets, low, high: ndarray, shape (3,), float64. Bounds on ``normals @ p + offsets``.
     """
 
@@ -123,7 +123,6 @@ def voxel_gradients(voxels: NDArray, matrices: Float64Array) -> Float64Array:
 
     Central differences; at the border half a one-sided difference (the index beyond is clamped).
 
-    voxels: ndarray, shape (nk, nj, ni)
     matrices: ndarray, shape (nk, 3, 3), float64. Matrix of each slice, from
         `clrecon.geometry.iso_rule.slice_normal_matrices`.
 

@@ -131,7 +131,6 @@ def extract_label_mask(
     No vertex comes nearer to a sample than `KEEP` of its edge.
 
     labels: ndarray, shape (nk, nj, ni)
-    affine: ndarray, shape (4, 4)
     level: 1 to `FULL` - 1.
     closed: The surface is closed at the border of the map.
     enclosed: The levels of labels that others enclose, see `choose_enclosed`.

@@ -44,8 +44,6 @@ def label_components(triangles: NDArray[np.uint32], vertex_count: int) -> tuple[
     Every vertex takes the smallest label in any of its triangles, until no label changes: the label of a component
     is then its smallest vertex.
 
-    triangles: ndarray, shape (m, 3), uint32
-
     Returns:
     count: Number of components, not counting vertices that no triangle uses.
     labels: ndarray, shape (vertex_count,), int64. Component of each vertex, numbered in order of the first vertex; -1
@@ -69,7 +67,6 @@ def label_components(triangles: NDArray[np.uint32], vertex_count: int) -> tuple[
 def measure_bricks(voxels: NDArray[Any], brick: int = 8) -> NDArray[Any]:
     """Return the lowest and highest value of each brick.
 
-    voxels: ndarray, shape (nk, nj, ni)
     brick: Voxels along each side.
 
     Returns: ndarray, shape (bk, bj, bi, 2), of the voxels' type
@@ -229,7 +226,6 @@ GROUP = 16
 def mark_mixed_groups(voxels: NDArray[Any], level: float, reach: tuple[int, int, int]) -> NDArray[np.bool_]:
     """Mark the groups of which some voxel has both sides of a level in the box around it.
 
-    voxels: ndarray, shape (nk, nj, ni)
     level: Inside are values from here on; NaN is not.
     reach: Half the size of the box along i, j, k, without the voxel in its middle.
 

@@ -149,7 +149,6 @@ def examine_voxels(
 ) -> VoxelFindings:
     """Examine the values that were read.
 
-    voxels: ndarray, shape (nk, nj, ni). HU.
     slices: In the order of k; empty for files other than DICOM.
     known: False: the header does not say that the values are HU, or they surely are not.
     stored: As `slices`, for other files of whole numbers.

@@ -198,7 +198,6 @@ class GridFile:
     layers: Numbers of one voxel, side by side in the file; 1 except for layered label maps.
     dtype: Type as stored, with its byte order.
     slope, intercept: The value of a stored number is ``stored * slope + intercept``.
-    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm.
     voxel_bytes: Where the numbers are.
     warnings: Doubtful points of the header; they contain no names.
     extension: The bytes between the header and the voxels (NIfTI).
@@ -265,7 +264,6 @@ class VolumeContent:
     """What a volume file holds.
 
     voxels: ndarray, shape (nk, nj, ni). int16, int32 or float32.
-    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm.
     lines: The certificate, plain ASCII, one fact a line: name, blank, value.
     progress: ``progress("write", done, total)``.
     """

@@ -174,10 +174,8 @@ def nifti_affine(header: Any, shape: tuple[int, int, int], name: str) -> tuple[F
     """Return the affine of a NIfTI header, converted from RAS to LPS: the sform, else the qform.
 
     shape: (ni, nj, nk)
-    name: Name of the file, for messages.
 
     Returns:
-    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm.
     warnings: Disagreements of sform and qform, or of the affine and pixdim.
     """
     warnings = []

@@ -187,7 +187,6 @@ def nrrd_affine(header: dict[str, Any], name: str) -> Float64Array:
     """Return the affine of a NRRD header, converted from the frame that it names to LPS.
 
     header: As `nrrd.read_header` returns it.
-    name: Name of the file, for messages.
 
     Returns: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm, of the three axes that have a direction.
     """

@@ -74,7 +74,6 @@ class Painter(Stage):
 
     Use it as a context manager, or `close` it.
 
-    device: See `clrecon.device`; None is the best of the machine.
     memory: Bytes that may be taken on the device.  A scan that does not fit goes through in slabs, which is slow.
     """
 
@@ -110,7 +109,6 @@ class Painter(Stage):
         size: (width, height)
         sharp: False: coarse meshes, translucent ones opaque, longer steps in volume rendering.
         share: Of a coarse picture, its width as a share of `size`.
-        cancelled: True ends the work with `Cancelled`.
 
         Returns: With a transparent background; ``depth`` in mm, NaN where there is nothing.  A coarse one is smaller
             than `size`.  ``report["ms"]`` is the time it took, that of waiting for other views not counted.

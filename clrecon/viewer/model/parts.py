@@ -41,10 +41,7 @@ STEPS = 5
 
 
 class ClusterMap(LabelMap):
-    """Numbers of clusters on the grid of a scan, whose slices may be uneven: other label maps have even ones.
-
-    voxels: ndarray, shape (nk, nj, ni), uint8
-    """
+    """Numbers of clusters on the grid of a scan, whose slices may be uneven: other label maps have even ones."""
 
     def __init__(self, voxels: NDArray[np.uint8], volume: Volume):
         super().__init__(voxels, volume.affine.copy())

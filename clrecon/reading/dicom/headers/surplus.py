@@ -42,8 +42,6 @@ def check_surplus(elements: DicomElements, header: SliceHeader, force: bool = Fa
 
     header: The file's only or first slice; the file holds its pixels.
     force: Accept surplus bytes other than zeros as padding.
-
-    Returns: Warnings.
     """
     if is_encapsulated(header.transfer_syntax):
         return _check_encapsulated(elements, header, force)

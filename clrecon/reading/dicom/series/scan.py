@@ -191,7 +191,6 @@ class Scan:
     suspects: Files that are not DICOM by their content, but look like remains of a slice; links that are not followed
         or lead nowhere.
     strangers: All other files that are not DICOM.
-    files: Number of regular files examined.
     rescale: Slope and intercept that the user gave for all slices.
     is_file: The path names one file and no folder.
     """
