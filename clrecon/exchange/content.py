@@ -218,7 +218,7 @@ def parts_of(content: Content | Assembly) -> tuple[Content, ...]:
     return content.parts if isinstance(content, Assembly) else (content,)
 
 
-def describe_facts(report: Mapping[str, Any], space: str, *, keep_ids: bool = False) -> dict[str, Any]:
+def facts_for_file(report: Mapping[str, Any], space: str, *, keep_ids: bool = False) -> dict[str, Any]:
     """Return the entries of a `PointContent` that come from the report of a mesh or cloud and from the frame.
 
     Nothing else of the report is ever written.

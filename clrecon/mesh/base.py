@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.exchange.content import Content, describe_facts
+from clrecon.exchange.content import Content, facts_for_file
 from clrecon.exchange.coordinates import as_stored
 from clrecon.exchange.formats import write_mesh
 from clrecon.geometry import frame_from_lps
@@ -169,7 +169,7 @@ class BaseMesh(Message):
         Only with `keep_ids` they have the hash of the frame of reference.
         """
         vertices, normals = self.in_space(space)
-        facts = describe_facts(self.report, space, keep_ids=keep_ids)
+        facts = facts_for_file(self.report, space, keep_ids=keep_ids)
         name, color = self.report.get("part_name"), self.report.get("color")
         return Content(
             vertices=vertices,

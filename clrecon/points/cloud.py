@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.exchange.content import PointContent, describe_facts
+from clrecon.exchange.content import PointContent, facts_for_file
 from clrecon.exchange.coordinates import as_stored
 from clrecon.exchange.formats import write_cloud
 from clrecon.geometry import frame_from_lps
@@ -268,7 +268,7 @@ class PointCloud(Message):
         Only with ``keep_ids`` they have the hash of the frame of reference, and only with ``with_ijk`` voxel indices.
         """
         points, normals = self.in_space(space)
-        facts = describe_facts(self.report, space, keep_ids=keep_ids)
+        facts = facts_for_file(self.report, space, keep_ids=keep_ids)
         ijk = self.ijk if with_ijk else None
         return PointContent(vertices=points, normals=normals, hu=self._hu, labels=self._labels, ijk=ijk, **facts)
 

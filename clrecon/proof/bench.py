@@ -139,7 +139,7 @@ def run_bench(
     watch.lap("make" if source is None else "read")
     hu = suggested if iso_value is None else iso_value
     result = {
-        "input": _describe_input(volume, source is None),
+        "input": _facts_of_input(volume, source is None),
         "iso_value_hu": hu,
         "runs": runs,
         "processor": processor_name(),
@@ -193,7 +193,7 @@ def _get_volume(source: str | Path | None, series: str | None, progress: Progres
     return Volume(voxels, affine), float(truth["iso_value_hu"])
 
 
-def _describe_input(volume: Volume, is_phantom: bool) -> dict[str, Any]:
+def _facts_of_input(volume: Volume, is_phantom: bool) -> dict[str, Any]:
     return {
         "kind": "phantom" if is_phantom else "series",
         "shape_ijk": volume.shape_ijk,

@@ -77,7 +77,7 @@ class Judge:
             return {}
         reference, volume = self.reference, self._volume
         takers: dict[str, Callable[[], Any]] = {
-            "quality": lambda: _describe_quality(mesh),
+            "quality": lambda: _facts_of_quality(mesh),
             "slices": lambda: measure_slices(mesh, volume, self._level, closed=self._closed),
         }
         if reference is not None:
@@ -103,7 +103,7 @@ class Judge:
         return found
 
 
-def _describe_quality(mesh: Mesh) -> dict[str, Any]:
+def _facts_of_quality(mesh: Mesh) -> dict[str, Any]:
     quality = mesh.quality()
     names = ("closed", "manifold", "components", "euler_number", "area_mm2", "volume_ml", "outward")
     return {name: getattr(quality, name) for name in names}

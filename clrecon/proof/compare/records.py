@@ -83,7 +83,7 @@ def make_record(
         truth=measured.get("truth"),
         points_mm=measured.get("points"),
         reasons=measured.get("reasons", {}),
-        small=_describe_small(method, told),
+        small=_facts_of_small(method, told),
     )
 
 
@@ -92,7 +92,7 @@ def _work(parts: Mapping[str, float]) -> float:
     return sum(parts.values()) - parts.get("draw", 0.0)
 
 
-def _describe_small(method: Compared, told: Mapping[str, Any]) -> dict[str, Any] | None:
+def _facts_of_small(method: Compared, told: Mapping[str, Any]) -> dict[str, Any] | None:
     """Describe ray casting at the size of the twin; its time at the full size is reckoned from the pixels."""
     small = told.get("small")
     if not small:

@@ -17,7 +17,7 @@ from clrecon.errors import OutputError, UsageError
 from clrecon.geometry import column_spacing, signed_tilt
 from clrecon.proof.phantom.sampling import add_noise, apply_point_spread, sample_occupancy
 from clrecon.proof.phantom.scene_plans import plan_scene
-from clrecon.proof.phantom.scenes import CEILING_HU, DENSE_HU, LabelArray, describe_parts, draw_scene
+from clrecon.proof.phantom.scenes import CEILING_HU, DENSE_HU, LabelArray, draw_scene, facts_of_parts
 from clrecon.proof.phantom.series import RESCALE_INTERCEPT, Placement, place_slices, write_label_map, write_series
 from clrecon.proof.phantom.settings import CENTRE_LPS_MM, KINDS, PhantomSettings, draw_ghosts
 from clrecon.proof.phantom.shapes import choose_body
@@ -32,7 +32,7 @@ from clrecon.version import package_version
 Float64Array = NDArray[np.float64]
 
 
-def describe_spine(anatomy: Anatomy, affine: Float64Array, settings: PhantomSettings) -> dict[str, Any]:
+def facts_of_spine(anatomy: Anatomy, affine: Float64Array, settings: PhantomSettings) -> dict[str, Any]:
     """Describe where the parts are, LPS mm, and which of them lie in the volume."""
     inverse = np.linalg.inv(affine)
     extents = np.array(settings.shape_kji[::-1])
@@ -73,7 +73,7 @@ def _angle(across: float, up: float) -> float:
     return math.degrees(math.atan2(across, up))
 
 
-def describe_series(settings: PhantomSettings, placement: Placement) -> dict[str, Any] | None:
+def facts_of_series(settings: PhantomSettings, placement: Placement) -> dict[str, Any] | None:
     """Describe slices that are uneven, missing or of several phases; None for an even stack.
 
     Returns: ``uneven_mm``, ``missing`` (numbers from 1), ``phases``, and ``slice_positions_lps_mm`` of the first pixel
@@ -121,7 +121,7 @@ def _make(
     elif settings.kind == "spine":
         blood = BLOOD_HU + _PHASE_HU * phase
         field, anatomy = draw_spine(settings, affine, progress, places=places, blood_hu=blood)
-        spine = describe_spine(anatomy, affine, settings)
+        spine = facts_of_spine(anatomy, affine, settings)
     else:
         body = choose_body(affine, settings)
         field = sample_occupancy(body, affine, settings.shape_kji)
@@ -150,13 +150,13 @@ def _make(
         "surface": surface,
         "spine": spine,
         "ghosts": ghosts,
-        "parts": None if labels is None else describe_parts(voxels, labels, affine),
+        "parts": None if labels is None else facts_of_parts(voxels, labels, affine),
         "noise_hu": settings.noise,
         "point_spread_mm": settings.point_spread_mm,
         "seed": settings.seed,
         "settings": settings.as_dict(),
     }
-    if (series := describe_series(settings, placement)) is not None:
+    if (series := facts_of_series(settings, placement)) is not None:
         truth["series"] = series
         truth["shape_ijk"][2] = len(series["slice_positions_lps_mm"])
     return voxels, truth, labels

@@ -183,7 +183,7 @@ def _distance(part: Part, at: Window) -> Field:
     return np.asarray(part.distance(at.x, at.y, at.z), dtype=np.float32)
 
 
-def describe_parts(voxels: NDArray[np.int16], labels: LabelArray, affine: Float64Array) -> dict[str, dict[str, float]]:
+def facts_of_parts(voxels: NDArray[np.int16], labels: LabelArray, affine: Float64Array) -> dict[str, dict[str, float]]:
     """Describe each material that is present: its label, voxels, volume and number of dense voxels."""
     voxel_ml = abs(float(np.linalg.det(affine[:3, :3]))) / 1000.0
     found = {}

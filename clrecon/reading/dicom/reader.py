@@ -37,7 +37,7 @@ from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text, hash_uid, join_names
 
 
-def describe_series(series: Series, warnings: Iterable[str] = ()) -> SeriesEntry:
+def make_entry(series: Series, warnings: Iterable[str] = ()) -> SeriesEntry:
     """Make the listing entry of a series."""
     stack = series.stack
     affine = stack.affine if stack is not None and not series.problems else None
@@ -177,7 +177,7 @@ def list_scan(
             judged = chosen.choose(phase, selection.allow_gaps)
             found = [judged if one is chosen else one for one in found]
             certificate = _certify_chosen(judged, scan, warnings, pixels, progress)
-        entries = [describe_series(one, collect_series_warnings(one)) for one in found]
+        entries = [make_entry(one, collect_series_warnings(one)) for one in found]
         if certificate is not None:  # its pixels may show more than its headers
             own = [text for text in certificate.warnings if text not in warnings]
             entries = [replace(entry, warnings=own) if entry.number == number else entry for entry in entries]

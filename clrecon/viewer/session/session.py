@@ -270,14 +270,14 @@ class ViewSession(Closing):
     def pick(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Return what is seen at a pixel of the picture, or of a slice."""
         found = self._pick(x, y, size, plane)
-        return {"pick": self._describe_pick(found)}
+        return {"pick": self._facts_of_pick(found)}
 
     def cross_at(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Move the slices to what is seen at a pixel."""
         found = self._pick(x, y, size, plane)
         if found is not None:
             self.model.set_cross(found.point)
-        return {"pick": self._describe_pick(found)}
+        return {"pick": self._facts_of_pick(found)}
 
     def add_point(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Add what is seen at a pixel to the tool that is used."""
@@ -285,14 +285,14 @@ class ViewSession(Closing):
         if found is None:
             return {"pick": None, "measure": None}
         made = self.model.add_point(found)
-        return {"pick": self._describe_pick(found), "measure": None if made is None else made.describe()}
+        return {"pick": self._facts_of_pick(found), "measure": None if made is None else made.describe()}
 
     def mark_at(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Keep what is seen at a pixel as a seed, without a tool."""
         found = self._pick(x, y, size, plane)
         if found is not None:
             self.model.add_seed(found)
-        return {"pick": self._describe_pick(found)}
+        return {"pick": self._facts_of_pick(found)}
 
     def hide_at(self, x: float, y: float, size: tuple[int, int], plane: str | None = None) -> dict[str, Any]:
         """Hide the part at a pixel; parts that are not known yet are found first, in the background."""
@@ -372,7 +372,7 @@ class ViewSession(Closing):
         found = self._pick(x, y, size, plane)
         if found is None:
             return {"pick": None}
-        state, described = self.model.state, self._describe_pick(found)
+        state, described = self.model.state, self._facts_of_pick(found)
         part = None if found.part is None else state.part(found.part)
         divided = self.model.parts_known and self.painter.has_parts(state)
         if divided or (part is not None and part.kind in ("mesh", "cloud", "label")):
@@ -388,7 +388,7 @@ class ViewSession(Closing):
         self.find_parts(again)
         return {"pick": described}
 
-    def _describe_pick(self, found: Pick | None) -> dict[str, Any] | None:
+    def _facts_of_pick(self, found: Pick | None) -> dict[str, Any] | None:
         """Return a pick for JSON, with words that say what it is and where."""
         if found is None:
             return None

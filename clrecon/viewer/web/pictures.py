@@ -109,12 +109,12 @@ def encode_picture(picture: Rendering, ground: tuple[int, int, int], sharp: bool
         stream, "JPEG", quality=SHARP_QUALITY if sharp else MOVING_QUALITY, subsampling=0 if sharp else 2
     )
     width, height = picture.size
-    told = {**facts, "sharp": sharp, "size": [width, height], "camera": describe_camera(picture.camera)}
+    told = {**facts, "sharp": sharp, "size": [width, height], "camera": facts_of_camera(picture.camera)}
     head = json.dumps(told, separators=(",", ":"), allow_nan=False).encode()
     return len(head).to_bytes(4, "little") + head + stream.getvalue()
 
 
-def describe_camera(camera: Camera | None) -> dict[str, Any] | None:
+def facts_of_camera(camera: Camera | None) -> dict[str, Any] | None:
     """Return what a page needs to draw points of the patient over a picture; None for a picture without a camera.
 
     ``half_height`` is that of the picture in mm, of a perspective one in mm per mm of distance along the view.

@@ -11,7 +11,7 @@ import tolerances
 from clrecon.errors import UsageError
 from clrecon.labels import read_labels
 from clrecon.proof.phantom import PhantomSettings, make_phantom, phantom_truth, write_phantom
-from clrecon.proof.phantom.build import describe_spine
+from clrecon.proof.phantom.build import facts_of_spine
 from clrecon.proof.phantom.job import make_phantom as make_phantom_job
 from clrecon.proof.phantom.series import place_slices
 from clrecon.proof.phantom.spine import plan_spine
@@ -192,7 +192,7 @@ def test_a_bent_spine_has_the_angles_asked_and_rigid_vertebrae() -> None:
     for bend in ({}, {"kyphosis_deg": 20.0, "scoliosis_deg": -35.0}):
         settings = PhantomSettings(**COARSE, levels="T1-L5", **bend)
         affine = place_slices(settings).affine
-        described.append(describe_spine(plan_spine(settings, affine)[0], affine, settings))
+        described.append(facts_of_spine(plan_spine(settings, affine)[0], affine, settings))
     plain, bent = described
     assert bent["coronal_angle_deg"] - plain["coronal_angle_deg"] == pytest.approx(-35.0)
     assert bent["sagittal_angle_deg"] - plain["sagittal_angle_deg"] == pytest.approx(20.0)

@@ -25,7 +25,7 @@ from clrecon.reading.dicom.series.phases import SAME_POSITION_MM, Phase, _are_pa
 from clrecon.reading.dicom.series.scan import DiskReader
 from clrecon.reading.dicom.series.series import describe_missing_parts
 from clrecon.reading.dicom.stack import mixtures
-from clrecon.reading.dicom.stack.fit import _cross, describe_thickness, measure_line, measure_stated_gap, summarise_gaps
+from clrecon.reading.dicom.stack.fit import _cross, facts_of_thickness, measure_line, measure_stated_gap, summarise_gaps
 from clrecon.reading.dicom.stack.mixtures import (
     Alternation,
     _is_compared,
@@ -83,7 +83,7 @@ def test_a_run_begins_and_ends_anywhere():
 
 
 def test_thickness_and_overlap():
-    found = describe_thickness(thick(3.0, 3.0, 5.0), np.array([0.0, 2.0, 5.0]))
+    found = facts_of_thickness(thick(3.0, 3.0, 5.0), np.array([0.0, 2.0, 5.0]))
     assert found == {
         "min_mm": 3.0,
         "max_mm": 5.0,
@@ -91,9 +91,9 @@ def test_thickness_and_overlap():
         "overlap_mm": {"min": 1.0, "max": 1.0, "median": 1.0},
         "overlap_percent": 40.0,
     }
-    assert describe_thickness(thick(3.0, None, 3.0), np.array([0.0, 2.0, 4.0])) is None
-    assert describe_thickness(thick(3.0, 0.0, 3.0), np.array([0.0, 2.0, 4.0])) is None
-    assert describe_thickness(thick(3.0), np.array([0.0])) is None
+    assert facts_of_thickness(thick(3.0, None, 3.0), np.array([0.0, 2.0, 4.0])) is None
+    assert facts_of_thickness(thick(3.0, 0.0, 3.0), np.array([0.0, 2.0, 4.0])) is None
+    assert facts_of_thickness(thick(3.0), np.array([0.0])) is None
 
 
 def test_the_worst_gap_is_that_of_the_largest_multiple_of_its_own_thickness():

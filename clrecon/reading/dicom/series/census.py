@@ -103,7 +103,7 @@ def judge_numbers(census: Census, stack: Stack, copies: int) -> Gate:
     return none_of("complete_series", max((count for count, _ in reasons), default=0), what + shown)
 
 
-def describe_numbers(census: Census, stack: Stack) -> dict[str, Any]:
+def facts_of_numbers(census: Census, stack: Stack) -> dict[str, Any]:
     """Return the numbers and counts for the certificate, None where the files do not tell."""
     numbers = _ordered_numbers(stack)
     first, last, step = None, None, None

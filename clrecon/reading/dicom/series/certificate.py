@@ -32,7 +32,7 @@ from clrecon.reading.common.plausibility import (
 from clrecon.reading.common.source_facts import PixelFacts
 from clrecon.reading.dicom.headers.slice_header import SliceHeader
 from clrecon.reading.dicom.parse.transfer_syntaxes import SYNTAX_NAMES
-from clrecon.reading.dicom.series.census import describe_numbers, judge_numbers
+from clrecon.reading.dicom.series.census import facts_of_numbers, judge_numbers
 from clrecon.reading.dicom.series.phases import choose_phase, describe_spacing
 from clrecon.reading.dicom.series.scan import Scan
 from clrecon.reading.dicom.series.series import Series
@@ -42,7 +42,7 @@ from clrecon.reading.dicom.stack.fit import (
     ORIENTATION_SPREAD_RAD,
     STATED_GAP_TOLERANCE,
     Stack,
-    describe_thickness,
+    facts_of_thickness,
     group_places,
     measure_directions,
     measure_extent,
@@ -299,12 +299,12 @@ def _describe_what_was_left(series: Series) -> list[str]:
     return warnings
 
 
-def _describe_identity(series: Series) -> dict[str, Any]:
+def _facts_of_identity(series: Series) -> dict[str, Any]:
     identity = series.identity
     return {"number": series.number, "uid_hash": hash_uid(identity.uid), "modality": identity.modality}
 
 
-def _describe_phase(series: Series) -> dict[str, Any] | None:
+def _facts_of_phase(series: Series) -> dict[str, Any] | None:
     if series.phase is None or not series.places.phases:
         return None
     chosen = choose_phase(series.places, series.phase)
@@ -320,7 +320,7 @@ def _place(stack: Stack, is_so: Callable[[SliceHeader], bool]) -> str:
     return f"{len(positions)} of {len(stack.slices)} slices, {first}at {positions[0]:.2f} mm"
 
 
-def _describe_rescale(headers: Sequence[SliceHeader], scan: Scan, findings: VoxelFindings | None) -> dict[str, Any]:
+def _facts_of_rescale(headers: Sequence[SliceHeader], scan: Scan, findings: VoxelFindings | None) -> dict[str, Any]:
     slopes, intercepts = [h.slope for h in headers], [h.intercept for h in headers]
     return {
         "slope": [min(slopes), max(slopes)],
@@ -356,8 +356,8 @@ def certify(
     unsaid = [gate.text for gate in gates if gate.name in SAID_BY_GATES and gate.ok is False]
     return Certificate(
         format="DICOM",
-        series=_describe_identity(series),
-        phase=_describe_phase(series),
+        series=_facts_of_identity(series),
+        phase=_facts_of_phase(series),
         slices=len(headers),
         slices_missing=stack.missing,
         shape_ijk=[first.columns, first.rows, len(headers)],
@@ -376,16 +376,16 @@ def certify(
         gap_runs=summarise_gaps(stack.distances_mm) if line.uneven else None,
         slice_positions_mm=stack.positions_mm.tolist() if line.uneven else None,
         slice_thickness_mm=median_thickness(headers),
-        thickness=describe_thickness(headers, stack.distances_mm),
+        thickness=facts_of_thickness(headers, stack.distances_mm),
         stated_gap_mm=stated,
-        numbering=describe_numbers(series.census, stack),
+        numbering=facts_of_numbers(series.census, stack),
         frame_of_reference_hash=hash_uid(first.frame_of_reference),
         padding_share=None if facts is None else facts.padding_share,
         padding_hu=None if facts is None else facts.padding_hu,
         transfer_syntaxes=sorted({h.transfer_syntax for h in headers}),
         transfer_syntax_names=sorted({SYNTAX_NAMES[h.transfer_syntax] for h in headers}),
         lossy=any(h.lossy for h in headers),
-        rescale=_describe_rescale(headers, scan, findings),
+        rescale=_facts_of_rescale(headers, scan, findings),
         hu_range=None if facts is None else [facts.hu_min, facts.hu_max],
         files={"found": scan.files, "used": len({h.file for h in headers}), "skipped": dict(scan.skipped)},
         dropped=series.dropped,

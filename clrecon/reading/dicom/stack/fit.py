@@ -393,7 +393,7 @@ def _thicknesses(headers: Sequence[SliceHeader]) -> list[float]:
     return [h.slice_thickness_mm for h in headers if h.slice_thickness_mm is not None and h.slice_thickness_mm > 0.0]
 
 
-def describe_thickness(headers: Sequence[SliceHeader], distances: Float64Array) -> dict[str, Any] | None:
+def facts_of_thickness(headers: Sequence[SliceHeader], distances: Float64Array) -> dict[str, Any] | None:
     """Compare SliceThickness with the distances of the slices along the normal.
 
     Returns: ``min_mm``, ``max_mm``, ``median_mm`` of the thickness; ``overlap_mm``: ``min``, ``max`` and ``median`` of
