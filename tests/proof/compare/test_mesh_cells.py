@@ -7,11 +7,12 @@ import itertools
 import numpy as np
 import pytest
 import sample_meshes as samples
+from uneven_volume import uneven
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
-from clrecon.proof.compare.mesh_cells import GridCells, find_mesh_cells, measure_cells, meets_box
+from clrecon.proof.compare.mesh_cells import GridCells, _steps_per_mm, find_mesh_cells, measure_cells, meets_box
 
 pytestmark = pytest.mark.unit
 
@@ -144,3 +145,10 @@ def test_progress_is_told():
     on = grid()
     find_mesh_cells(placed(samples.box(), on), on, progress=lambda *what: told.append(what))
     assert told == [("cells", 0, 12), ("cells", 12, 12)]
+
+
+def test_index_steps_of_a_millimetre_are_those_of_the_narrowest_slices():
+    assert _steps_per_mm(grid(affine=np.diag((0.5, 2.0, 0.8, 1.0)))) == pytest.approx(2.0)
+    narrow = uneven()  # 0.25 mm, where the mean step is 1.8 and a pixel 0.5
+    assert _steps_per_mm(narrow) == pytest.approx(1 / 0.25)
+    assert _steps_per_mm(narrow[:3]) == pytest.approx(2.0, rel=0.1)

@@ -153,3 +153,14 @@ def test_cells_of_a_mesh_against_those_of_its_truth():
     assert found.reference == "truth"
     assert found.recall > 0.99 and found.precision > 0.97  # corners between the 27 points of a cell
     assert measure_cells(mesh, find_mesh_cells(mesh, grid, name="t-mc"), grid).dice == 1.0
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("at", [-0.5, 4.5, 5.5])
+def test_a_wall_between_the_border_and_the_voxels_is_in_cells_to_the_last(axis, at):
+    class Wall:
+        def signed_distance(self, points_mm):
+            return np.asarray(points_mm)[:, axis] - at
+
+    found = find_cut_cells(Wall(), Volume(np.zeros((6, 6, 6), np.int16), np.eye(4))).ijk
+    assert set(found[:, axis].tolist()) == {int(np.floor(at))} and len(found) == 7 * 7
