@@ -13,7 +13,8 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import Volume
 from clrecon.proof.phantom import PhantomSettings, make_phantom, phantom_truth
 from clrecon.proof.phantom.spine import label_levels
-from clrecon.spine.regions import CONFIDENT
+from clrecon.spine.discs import Course, Looks
+from clrecon.spine.regions import CONFIDENT, cut_part
 
 COARSE: dict[str, Any] = {"size": (112, 112), "spacing": (2.0, 2.0, 2.5)}
 LEAST_RIGHT = 0.95
@@ -250,6 +251,21 @@ def test_uneven_slices_are_refused() -> None:
     uneven = Volume(volume.voxels, volume.affine, slice_positions=places)
     with pytest.raises(RefusedInputError, match="unevenly spaced"):
         clrecon.split_vertebrae(uneven)
+
+
+def test_voxels_without_a_value_are_air_and_places_are_told_from_the_canal() -> None:
+    hu = np.full((12, 60, 60), 100.0, np.float32)
+    hu[5, 30, 20] = np.nan
+    volume = Volume(hu, np.diag((2.0, 2.0, 1.0, 1.0)))
+    ways = [np.tile(way, (10, 1)) for way in ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0))]
+    canal = np.column_stack([np.full(10, 60.0), np.full(10, 80.0), np.arange(10.0, 0.0, -1.0)])
+    none, mm = np.zeros((10, 1), np.float32), np.full(10, 20.0)
+    part = cut_part(
+        volume, Course(canal, *ways, np.ones(10, bool), (False, False)), Looks(none, none, none, mm, mm, mm)
+    )
+    at = tuple(np.array((5, 30, 20)) - part.first)
+    assert part.values[at] == part.values.min() == -1024.0 and (part.values == 100.0).sum() == part.values.size - 1
+    assert (part.ahead[at], part.aside[at], part.place[at]) == (20.0, -20.0, 5.0)
 
 
 def test_the_order_of_the_axes_does_not_matter() -> None:
