@@ -90,9 +90,8 @@ def try_steps(device: Device, settings: CloudSettings, is_cloud: bool) -> None:
     """Build the kernels by running all steps on a small cube."""
     from clrecon.points import PointCloud
 
-    subject: Volume | PointCloud = trial_cube()
-    if is_cloud:
-        subject = PointCloud(np.argwhere(subject.voxels >= 0).astype(np.float32))
+    cube = trial_cube()
+    subject: Volume | PointCloud = PointCloud(np.argwhere(cube.voxels >= 0).astype(np.float32)) if is_cloud else cube
     take_points(subject, None, device, settings.for_trial(), ignore_progress)
 
 
