@@ -68,6 +68,7 @@ def test_real_series_mesh_like_vtk_in_the_true_place(real_data, device, tmp_path
     assert report["volume_ml"] == pytest.approx(enclosed_ml(points, faces), rel=tolerances.VTK_VOLUME)
 
 
+@pytest.mark.release
 def test_real_ct_stays_sound_with_the_topology_of_the_trilinear_field(real_data, device):
     """Few cells differ: the two surfaces have nearly the same triangles and volume."""
     volume = read_volume(real_data / "thoracic_0p8mm")

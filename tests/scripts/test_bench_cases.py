@@ -181,6 +181,7 @@ def test_surfaces_in_one_process_are_measured(device: Any, tmp_path: Path, monke
     assert {"voxels", "triangles"} == set(kept["scaling"]["fits"])
 
 
+@pytest.mark.release
 def test_pictures_are_measured(device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from PIL import Image
 
@@ -206,6 +207,7 @@ def test_pictures_are_measured(device: Any, tmp_path: Path, monkeypatch: pytest.
     assert np.asarray(Image.open(tmp_path / "seen" / seen[1])).mean() > 1.0
 
 
+@pytest.mark.release
 def test_the_mapper_on_opengl_is_measured(device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from peers.vtk_gpu import GpuPeer
 

@@ -36,6 +36,7 @@ def test_a_tree_holds_series_that_can_be_read(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.release
 def test_all_readers_of_the_bench_read_the_same(tmp_path: Path) -> None:
     pytest.importorskip("SimpleITK")
     from peers.read_series import READERS
@@ -47,7 +48,7 @@ def test_all_readers_of_the_bench_read_the_same(tmp_path: Path) -> None:
         assert np.array_equal(read(str(tmp_path / "ct")), expected)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_reading_is_measured(tmp_path: Path) -> None:
     pytest.importorskip("SimpleITK")
     write_series(tmp_path / "ct", PLAN)
@@ -57,7 +58,7 @@ def test_reading_is_measured(tmp_path: Path) -> None:
     assert 0 < figures["scan_seconds_a_file"]["median"] < 1
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_scans_of_trees_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reading, "TREES", ((2, 3), (4, 5)))
     monkeypatch.setattr(reading, "RUNS", 1)

@@ -82,7 +82,7 @@ def pages(site: Path) -> dict[str, Page]:
     return {path.relative_to(site).as_posix(): Page(path.read_text(encoding="utf-8")) for path in files}
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_no_page_asks_another_server_for_anything(site: Path) -> None:
     files = [path for kind in ("*.html", "*.css") for path in sorted(site.rglob(kind))]
     assert len(files) > 80
@@ -105,7 +105,7 @@ def test_a_resource_of_another_server_is_found(name: str, text: str) -> None:
     assert find_outside(name, text.replace("https://x.org/", "").replace("//x.org/", "").replace("HTTP:", "")) == []
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_every_link_within_the_site_leads_somewhere(site: Path, pages: dict[str, Page]) -> None:
     wrong = []
     for name, page in pages.items():
@@ -120,7 +120,7 @@ def test_every_link_within_the_site_leads_somewhere(site: Path, pages: dict[str,
     assert wrong == []
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_every_document_and_every_picture_of_a_page_is_in_the_site(site: Path) -> None:
     for page in site_pages(ROOT).values():
         if page.endswith(".md"):
@@ -134,13 +134,13 @@ def test_every_public_name_stands_on_one_page() -> None:
     assert all(names_by_subject().values())
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_every_public_name_has_its_entry(pages: dict[str, Page]) -> None:
     entries = Counter(anchor for name, page in pages.items() if name.startswith("api/") for anchor in page.anchors)
     assert {name: entries[f"clrecon.{name}"] for name in clrecon.__all__[1:] if entries[f"clrecon.{name}"] != 1} == {}
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_every_command_has_a_page_with_its_options(site: Path) -> None:
     for command in COMMANDS:
         text = (site / "commands" / f"{command}.html").read_text(encoding="utf-8")

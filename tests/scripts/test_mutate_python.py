@@ -136,7 +136,7 @@ def names(trace: Trace, changed: Change) -> set[str]:
     return {test.partition("::test_")[2] for test in trace.tests_of(changed.file, lines)}
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_tests_of_a_line_are_found_through_fixtures_and_caches(trace: Trace) -> None:
     runs = {line: {test.partition("::test_")[2] for test in tests} for line, tests in trace.lines[TIMES.file].items()}
     assert runs[TIMES.line] == {"area", "square_is_positive", "small"}
@@ -185,7 +185,7 @@ def test_tests_that_import_the_changed_file_come_first(tmp_path: Path) -> None:
     assert trace.tests_of("toy/deep.py", [1]) == [near, far, apart, f"{near}_too", f"{far}_too"]
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_trace_is_kept_while_nothing_but_tests_changes(
     copy: Copy, trace: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -235,6 +235,7 @@ def test_caches_are_emptied_though_they_are_frozen(tmp_path: Path) -> None:
         gc.unfreeze()
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     ("changed", "outcome"),
     [
@@ -250,27 +251,32 @@ def test_a_change_is_noticed_or_not(copy: Copy, trace: Trace, changed: Change, o
     assert room_texts(copy.root, "toy", "flat")["toy/flat/shapes.py"] == ROOM
 
 
+@pytest.mark.release
 def test_a_change_that_never_ends_is_caught(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Trace, "limit_s", lambda self, tests: 3.0)
     assert copy.try_change(change("n -= 1", "n += 1"), trace) == ("time", 6)
 
 
+@pytest.mark.release
 def test_a_change_that_waits_for_ever_is_not_known(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mutate_python, "TIMES_WALL", 0.0)
     monkeypatch.setattr(mutate_python, "AND_WALL_SECONDS", 1.0)
     assert copy.try_change(change("n -= 1", "__import__('time').sleep(60.0)"), trace) == ("late", 6)
 
 
+@pytest.mark.release
 def test_a_change_that_ends_the_process_is_caught(copy: Copy, trace: Trace) -> None:
     assert copy.try_change(change("n -= 1", "__import__('os').abort()"), trace) == ("crash", 6)
 
 
+@pytest.mark.release
 def test_later_tests_are_tried_when_the_first_pass(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mutate_python, "FIRST_TESTS", 1)
     assert copy.try_change(change("width * height", "width + height"), trace) == ("caught", 6)
     assert copy.try_change(TIMES, trace) == ("survived", 6)
 
 
+@pytest.mark.release
 def test_the_process_that_forks_has_imported_what_lies_outside(copy: Copy, trace: Trace, tmp_path: Path) -> None:
     assert "pytest" in trace.modules and not any(name.startswith(("toy", "test_shapes")) for name in trace.modules)
     (copy.root / "tests" / "flat" / "test_warm.py").write_text(
@@ -291,6 +297,7 @@ def test_the_process_that_forks_has_imported_what_lies_outside(copy: Copy, trace
         (copy.root / "tests" / "flat" / "test_warm.py").unlink()
 
 
+@pytest.mark.release
 def test_rows_are_kept_and_equivalent_changes_are_named(
     copy: Copy, trace: Trace, project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -319,6 +326,7 @@ def test_more_than_one_in_twenty_is_too_much() -> None:
     assert "40 changes, 38 caught (1 by time, 0 by a crash), 1 equivalent, 1 survive (0 of them" in result.sentence()
 
 
+@pytest.mark.release
 def test_a_room_that_fails_without_a_change_is_refused(project: Path, tmp_path: Path) -> None:
     copy = Copy.make(project, tmp_path, "toy")
     (copy.root / "tests" / "flat" / "test_shapes.py").write_text("def test_it():\n    assert 1 == 2\n")

@@ -35,6 +35,7 @@ def check_outputs(notebook) -> None:
     assert said == []  # no warning of a library, no traceback
 
 
+@pytest.mark.release
 def test_it_runs_and_shows_what_the_kept_one_shows(device):
     nbformat = pytest.importorskip("nbformat")
     nbclient = pytest.importorskip("nbclient")

@@ -38,6 +38,7 @@ def filtered():
     return get
 
 
+@pytest.mark.release  # every day the device reaches these truths, and equals the twin
 @pytest.mark.parametrize(("shape", "region", "figure", "expected"), TRUTHS)
 def test_noise_falls_as_known(shape, region, figure, expected, filtered):
     truth = shape()
@@ -46,6 +47,7 @@ def test_noise_falls_as_known(shape, region, figure, expected, filtered):
         assert truth.rms(filtered(shape, *run), region) == pytest.approx(wanted, rel=FILTER_TRUTH_SHARE), run
 
 
+@pytest.mark.release
 def test_the_sign_that_is_printed_makes_noise_worse(filtered):
     for shape, region in ((plane, "inner"), (sphere, "everywhere"), (cube, "faces")):
         truth = shape()
@@ -54,6 +56,7 @@ def test_the_sign_that_is_printed_makes_noise_worse(filtered):
         assert truth.rms(filtered(shape, 16, 1.0, -1.0), region) < 0.8 * before
 
 
+@pytest.mark.release
 def test_a_ball_shrinks_a_little_more_with_a_wider_range(filtered):
     truth = sphere()
     once, wide = (truth.mean(filtered(sphere, 16, factor, -1.0), "everywhere") for factor in (1.0, 2.0))

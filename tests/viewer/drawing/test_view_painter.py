@@ -27,7 +27,7 @@ def view(device):
         yield make
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_every_mode_makes_a_picture_sharp_and_coarse(view):
     model, painter = view(scenes.make_scan(), scenes.make_mesh(), scenes.make_cloud(), scenes.make_labels())
     for mode in model.modes:
