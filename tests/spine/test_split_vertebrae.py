@@ -13,7 +13,7 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import Volume
 from clrecon.proof.phantom import PhantomSettings, make_phantom, phantom_truth
 from clrecon.proof.phantom.spine import label_levels
-from clrecon.spine.discs import Course, Looks
+from clrecon.spine.discs import ASIDE_MM, CORE_ASIDE_MM, WALL_MARGIN_MM, Course, Looks, _highest
 from clrecon.spine.regions import CONFIDENT, cut_part
 
 COARSE: dict[str, Any] = {"size": (112, 112), "spacing": (2.0, 2.0, 2.5)}
@@ -266,6 +266,15 @@ def test_voxels_without_a_value_are_air_and_places_are_told_from_the_canal() -> 
     at = tuple(np.array((5, 30, 20)) - part.first)
     assert part.values[at] == part.values.min() == -1024.0 and (part.values == 100.0).sum() == part.values.size - 1
     assert (part.ahead[at], part.aside[at], part.place[at]) == (20.0, -20.0, 5.0)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_side_wall_is_looked_for_from_the_core_to_behind_it(sign: int) -> None:
+    values = np.tile(np.float32(ASIDE_MM), (2, 1, 1))  # each HU is its own place
+    values[1, :, np.abs(ASIDE_MM) < 10.0] = np.nan
+    found = _highest(values, sign, np.array([15.0, 9.0 - WALL_MARGIN_MM]))
+    inner = [-CORE_ASIDE_MM, -200.0] if sign < 0 else [15.0 + WALL_MARGIN_MM, -200.0]
+    assert found[:, 0].tolist() == inner
 
 
 def test_the_order_of_the_axes_does_not_matter() -> None:
