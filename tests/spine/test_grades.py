@@ -79,6 +79,12 @@ def test_screws_that_cannot_be_graded_are_refused(placed: tuple[SolidBone, Verte
     there = put(1.0, 0.0, 0.0, 5.0)
     with pytest.raises(UsageError, match="screw runs from front to back in L3"):
         grade_screw(*placed, Screw(there.tip, there.entry, 5.0), "L3")
+    for up in (-40.0, 40.0):  # the way along the vertebra's height does not matter
+        shift = np.array((0.0, 0.0, up))
+        with pytest.raises(UsageError, match="screw runs from front to back in L3"):
+            grade_screw(*placed, Screw(there.tip + shift, there.entry + shift, 5.0), "L3")
+        with pytest.raises(UsageError, match="screw lies"):
+            grade_screw(*placed, Screw(there.entry + 5 * shift, there.tip + 5 * shift, 5.0), "L3")
     with pytest.raises(UsageError, match=r"screw lies \d+ mm or more from L3"):
         grade_screw(*placed, Screw(there.entry + 300.0, there.tip + 300.0, 5.0), "L3")
     with pytest.raises(UsageError, match="the tip of screw lies behind the body of L3"):

@@ -15,6 +15,7 @@ from clrecon.proof.phantom import PhantomSettings, make_phantom, phantom_truth
 from clrecon.proof.phantom.spine import label_levels
 from clrecon.spine.discs import ASIDE_MM, CORE_ASIDE_MM, WALL_MARGIN_MM, Course, Looks, _highest
 from clrecon.spine.regions import CONFIDENT, cut_part
+from clrecon.spine.split import _describe_refusal
 
 COARSE: dict[str, Any] = {"size": (112, 112), "spacing": (2.0, 2.0, 2.5)}
 LEAST_RIGHT = 0.95
@@ -216,6 +217,11 @@ def test_one_vertebra_between_its_two_ends_is_found() -> None:
     volume, truth, names = phantom("L3")
     found = shares(clrecon.split_vertebrae(volume).labels.voxels, truth, names)
     assert found["L3"][1] > 0.7
+
+
+def test_a_scan_without_a_vertebra_says_what_was_left_out() -> None:
+    assert _describe_refusal([], []) == "no vertebra was found: nothing lies between two discs"
+    assert _describe_refusal([], ["a", "b"]) == "no vertebra was found: a; b"
 
 
 def test_a_spine_with_a_gap_is_refused() -> None:

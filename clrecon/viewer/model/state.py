@@ -116,7 +116,7 @@ class ClipPlane:
     name: str
     low: float
     high: float
-    share: float = 1.0
+    share: float
     flipped: bool = False
 
     @property

@@ -40,6 +40,13 @@ def test_histogram_has_air_soft_tissue_and_bone(spine: tuple) -> None:
     assert voxels[0, :3, :3].std() < 40.0 and voxels.min() > -1100
 
 
+@pytest.mark.parametrize("dk", [3.0, 8.0])
+def test_tissues_of_one_value_have_it_in_thin_and_thick_slices(dk: float) -> None:
+    voxels, _, _ = make_phantom(PhantomSettings(size=(96, 80), slices=12, spacing=(3.0, 3.0, dk), **CLEAN))
+    values, counts = np.unique(voxels, return_counts=True)
+    assert {-1000, -930, -860, -105, 54} == set(values[np.argsort(-counts)[:5]].tolist())
+
+
 def test_bodies_are_trabecular_inside_and_discs_lie_between(spine: tuple) -> None:
     levels = [level for level in spine[2]["spine"]["vertebrae"] if level["inside"]]
     assert [level["name"] for level in levels] == ["T10", "T11", "T12", "L1", "L2"]
