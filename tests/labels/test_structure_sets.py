@@ -58,6 +58,8 @@ def test_rectangles_have_their_pixels(volume, tmp_path):
     assert labels.names == {1: "L3", 2: "Leber & Milz ä"} and labels.warnings == ()
     assert np.array_equal(labels.affine, volume.affine)
     assert resample_labels(labels, volume).exact
+    unsaid = read_labels(write_structures(tmp_path / "unsaid.dcm", rois, counts=False), volume=volume)
+    assert np.array_equal(unsaid.voxels, expected)
 
 
 def test_a_contour_within_another_is_a_hole(volume, tmp_path):
@@ -292,7 +294,7 @@ def test_other_objects_are_no_label_maps(volume, tmp_path):
         read_labels(path, volume=volume)
 
 
-@pytest.mark.parametrize("harm", ["half a point", "nan", "cut", "none", "words", "twice"])
+@pytest.mark.parametrize("harm", ["half a point", "nan", "cut", "none", "words", "twice", "count"])
 def test_corrupt_files_are_one_line(volume, tmp_path, harm):
     kind, points = rectangle(volume, 2, (2, 2), (4, 4))
     rois = {"x": [(kind, points.ravel()[:-1] if harm == "half a point" else points)]}
@@ -305,6 +307,9 @@ def test_corrupt_files_are_one_line(volume, tmp_path, harm):
         path.write_bytes(data.replace(number, b"x" * len(number)))
     elif harm == "cut":
         path.write_bytes(data[:-20])
+    elif harm == "count":
+        at = data.index((0x3006).to_bytes(2, "little") + (0x0046).to_bytes(2, "little"))
+        path.write_bytes(data[: at + 8] + b"5 " + data[at + 10 :])  # of 4 points
     elif harm == "twice":
         write_structures(path, {"x": rois["x"], "y": rois["x"]}, numbers=[4, 4])
     with pytest.raises(RefusedInputError) as found:

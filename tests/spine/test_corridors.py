@@ -11,7 +11,14 @@ from box_vertebra import BODY_HALF, CANAL_Y, HALF_HU, PLATE_HALF, PLATE_Y, BoxVe
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.labels import LabelMap
-from clrecon.spine.corridors import BODY_SHARE, find_corridors, measure_corridors, screw_diameter, segment_distances
+from clrecon.spine.corridors import (
+    BODY_SHARE,
+    _walls,
+    find_corridors,
+    measure_corridors,
+    screw_diameter,
+    segment_distances,
+)
 from clrecon.spine.measures import canal_wall
 
 pytestmark = pytest.mark.untraced
@@ -187,3 +194,20 @@ def test_the_canal_wall_ends_three_quarters_of_a_body_from_its_middle() -> None:
     assert heights[canal_wall(bone, frame)].tolist() == [-30.0, -29.9, 0.0, 29.9, 30.0]
     bone.is_solid = lambda points: points[:, 2] > 29.95  # what stands before the wall hides it
     assert heights[canal_wall(bone, frame)].tolist() == [-30.0, -29.9, 0.0, 29.9]
+
+
+def test_the_nearest_wall_lies_beside_the_line_or_beyond_its_ends() -> None:
+    surface = np.array([(5.0, 3.0, 0.0), (-4.0, 0.0, 0.0), (14.0, 3.0, 0.0), (5.0, 0.0, 40.0)])
+    by_hu, steps, frame = (
+        np.array((True, False, False, True)),
+        np.diag((0.5, 1.5, 2.0)),
+        SimpleNamespace(axes=np.eye(3)),
+    )
+
+    def walls(begin: int, radius: float) -> tuple[float, float, float]:
+        bone = SimpleNamespace(steps=steps, by_hu=by_hu[begin:])
+        return _walls(bone, frame, surface[begin:], np.zeros(3), np.array((10.0, 0.0, 0.0)), radius)
+
+    assert walls(0, 3.0) == pytest.approx((3.0, 6.0 / 1.5, 0.5))
+    assert walls(1, 4.0) == pytest.approx((4.0, 8.0 / 0.5, 0.0))
+    assert walls(2, 5.0)[0] == pytest.approx(5.0)

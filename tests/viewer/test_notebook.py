@@ -19,6 +19,7 @@ from clrecon.mesh import Mesh
 from clrecon.points import PointCloud
 from clrecon.reading.common.source_facts import SeriesEntry, SeriesListing
 from clrecon.viewer import notebook
+from clrecon.viewer.notebook import _MOST_ROWS, _table
 
 VOLUME = Volume(np.arange(6 * 8 * 10, dtype=np.int16).reshape(6, 8, 10) * 4 - 900, np.diag([1.0, 1.0, 2.0, 1.0]))
 ENTRY = SeriesEntry(
@@ -95,3 +96,8 @@ def test_without_a_device_nothing_is_raised(monkeypatch):
 def test_what_is_empty_and_what_is_not_ours():
     assert "0 triangles" in Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))._repr_html_()
     assert clrecon.to_html("text") is None  # type: ignore[arg-type]
+
+
+def test_a_table_says_how_many_rows_it_leaves_out() -> None:
+    assert "more" not in _table(["n"], [(n,) for n in range(_MOST_ROWS)])
+    assert _table(["n"], [(n,) for n in range(_MOST_ROWS + 1234)]).endswith("</table><p>and 1,234 more</p>")

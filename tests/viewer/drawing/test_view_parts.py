@@ -11,7 +11,7 @@ from clrecon.geometry import Volume
 from clrecon.operators.rays.render import render
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.rendering.pictures.object_looks import MeshLook
-from clrecon.viewer.model.parts import grow_labels
+from clrecon.viewer.model.parts import _box_of, grow_labels
 
 pytestmark = pytest.mark.opencl
 
@@ -180,3 +180,8 @@ def test_labels_grow_by_one_voxel_to_all_sides():
     grow_labels(voxels)
     assert (voxels[1:4, 1:4, 1:4] == 3).all() and (voxels == 3).sum() == 27
     assert (voxels[3:, 4:, 5:] == 9).all() and (voxels == 9).sum() == 8
+
+
+def test_the_box_of_a_part_ends_with_its_voxels() -> None:
+    volume = Volume(np.zeros((9, 9, 9), np.int16), np.diag((0.5, -1.0, 2.0, 1.0)))
+    assert _box_of(volume, (1, 2, 3), (4, 6, 5)) == ((0.25, -6.5, 5.0), (2.25, -1.5, 11.0))

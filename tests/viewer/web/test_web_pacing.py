@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from clrecon.viewer.session.picture_facts import SCENE
-from clrecon.viewer.web.pictures import Asked, Pace
+from clrecon.viewer.web.pictures import Asked, Pace, _lay_over
 
 pytestmark = pytest.mark.unit
 
@@ -74,3 +75,12 @@ def test_a_sharp_picture_gives_way_to_a_moving_one_of_the_same_view(pace: Pace) 
     assert pace.instead(slow) is None  # one that moves is finished
     assert pace.instead(sharp) == slow
     assert [asked.view for asked in drain(pace)] == ["axial"]
+
+
+@pytest.mark.parametrize("ground", [(0, 0, 0), (255, 255, 255), (13, 140, 201)])
+def test_pictures_lie_over_their_ground_rounded_to_whole_numbers(ground: tuple[int, int, int]) -> None:
+    image = np.random.default_rng(4).integers(0, 256, (20, 256, 4)).astype(np.uint8)
+    image[..., 3] = np.arange(256)
+    share = image[..., 3:] / 255.0
+    exact = image[..., :3] * share + np.array(ground) * (1.0 - share)
+    assert np.abs(_lay_over(image, ground) - exact).max() <= 0.5 + 1e-9

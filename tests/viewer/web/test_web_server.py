@@ -35,10 +35,10 @@ def served(views: Views):
         yield running
 
 
-def get(running: WebServer, path: str, **headers: str) -> tuple[int, dict[str, str], str]:
+def get(running: WebServer, path: str, method: str = "GET", **headers: str) -> tuple[int, dict[str, str], str]:
     """Ask for a path; headers take the place of those of a browser."""
     connection = http.client.HTTPConnection("127.0.0.1", running.port, timeout=PATIENCE)
-    connection.putrequest("GET", path, skip_host=True)
+    connection.putrequest(method, path, skip_host=True)
     for name, value in {"Host": f"127.0.0.1:{running.port}", **headers}.items():
         connection.putheader(name.replace("_", "-"), value)
     connection.endheaders()
@@ -50,6 +50,12 @@ def get(running: WebServer, path: str, **headers: str) -> tuple[int, dict[str, s
 
 def secret_of(running: WebServer) -> str:
     return running.address.partition("secret=")[2]
+
+
+@pytest.mark.parametrize("path", ["/?secret={}", "/saved/x?secret={}"])
+def test_nothing_but_get_is_answered(served: WebServer, path: str) -> None:
+    asked = path.format(secret_of(served))
+    assert [get(served, asked, method)[0] for method in ("HEAD", "POST")] == [405, 405]
 
 
 def grey(picture: tuple[dict[str, Any], Any]) -> int:
