@@ -40,6 +40,16 @@ def test_what_is_shown_is_saved_to_every_mesh_format(session, tmp_path, name):
 
 
 @pytest.mark.opencl
+def test_what_comes_behind_a_hidden_object_is_saved(session):
+    view = session()
+    before = view.painter.mesh_of_shown(view.model.snapshot())
+    assert len(before) == 2
+    view.do({"do": "show", "key": "1", "visible": False})
+    (left,) = view.painter.mesh_of_shown(view.model.snapshot())
+    assert np.array_equal(left.vertices, before[1].vertices)
+
+
+@pytest.mark.opencl
 @pytest.mark.parametrize("name", ["a.ply", "a.npz", "a.xyz", "a.vtp"])
 def test_clouds_are_saved_to_every_cloud_format(session, tmp_path, name):
     view = session(scenes.make_cloud())
