@@ -103,23 +103,6 @@ INLINED float inlined_ceil(const float a) { return __builtin_ceilf(a); }
 INLINED float inlined_floor(const float a) { return floor(a); }
 INLINED float inlined_ceil(const float a) { return ceil(a); }
 #endif
-INLINED float inlined_dot(const float a, const float b) { return a * b; }
-INLINED float inlined_dot(const float2 a, const float2 b)
-{
-#pragma OPENCL FP_CONTRACT OFF
-    return a.x * b.x + a.y * b.y;
-}
-INLINED float inlined_dot(const float3 a, const float3 b)
-{
-#pragma OPENCL FP_CONTRACT OFF
-    return a.x * b.x + a.y * b.y + a.z * b.z;
-}
-INLINED float inlined_dot(const float4 a, const float4 b)
-{
-#pragma OPENCL FP_CONTRACT OFF
-    return (a.x * b.x + a.y * b.y) + (a.z * b.z + a.w * b.w);
-}
-
 #undef popcount
 #undef isnan
 #undef fabs
@@ -127,7 +110,6 @@ INLINED float inlined_dot(const float4 a, const float4 b)
 #undef fma
 #undef floor
 #undef ceil
-#undef dot
 #define popcount(bits) inlined_popcount(bits)
 #define isnan(a) inlined_isnan(a)
 #define fabs(a) inlined_fabs(a)
@@ -135,7 +117,6 @@ INLINED float inlined_dot(const float4 a, const float4 b)
 #define fma(a, b, c) inlined_fma(a, b, c)
 #define floor(a) inlined_floor(a)
 #define ceil(a) inlined_ceil(a)
-#define dot(a, b) inlined_dot(a, b)
 
 /* ---- conversions of vectors ---- */
 #undef convert_float2

@@ -13,7 +13,6 @@
  * Passes
  *   1. filter_points    for each part of the points, after list_neighbours and fit_planes
  *   2. filter_cells     where points that are no features take the mean over their whole cell */
-#pragma OPENCL FP_CONTRACT OFF
 
 #include "points/near_cells.h"
 #include "points/near_rows.h"

@@ -16,7 +16,6 @@
 #include "include/label_type.h"
 #include "include/volume.h"
 
-#pragma OPENCL FP_CONTRACT OFF
 
 #define ROWS_AHEAD 2 /* rows between the one whose points are written and the one whose voxels are asked for */
 

@@ -22,7 +22,6 @@
  * The points of a node are added in the order of the grid, and those without weight add 0: f does not depend on the bricks
  * or on the slabs.  LANES 8: an item takes a brick, and gathers its points in private arrays first.  LANES 1: an item takes
  * a row of a brick, and reads the points where they are. */
-#pragma OPENCL FP_CONTRACT OFF
 
 #include "points/grid.h"
 

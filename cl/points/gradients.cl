@@ -14,6 +14,8 @@
  *   1. find_gradients    once for each part of the volume that the device holds */
 #include "include/volume.h"
 
+static inline float between(const float a, const float b, const float share) { return a + (b - a) * share; }
+
 /* Value of the trilinear field at (x, y, z) in index coordinates. */
 static inline float trilinear_value(const volume_part *volume, const float x, const float y, const float z)
 {
@@ -25,9 +27,9 @@ static inline float trilinear_value(const volume_part *volume, const float x, co
         const float v00 = (float)sample_volume(volume, i, j, k + s), v10 = (float)sample_volume(volume, i + 1, j, k + s);
         const float v01 = (float)sample_volume(volume, i, j + 1, k + s);
         const float v11 = (float)sample_volume(volume, i + 1, j + 1, k + s);
-        of_slice[s] = mix(mix(v00, v10, fx), mix(v01, v11, fx), fy);
+        of_slice[s] = between(between(v00, v10, fx), between(v01, v11, fx), fy);
     }
-    return mix(of_slice[0], of_slice[1], fz);
+    return between(of_slice[0], of_slice[1], fz);
 }
 
 /* Place of voxel (0, 0, k), mm; `origins` begins with slice -1. */
@@ -35,7 +37,8 @@ static inline float3 origin_at(__global const float *restrict origins, const flo
 {
     const float within = clamp(k, -1.0f, (float)nk);
     const int layer = min((int)floor(within), nk - 1);
-    return mix(vload3(layer + 1, origins), vload3(layer + 2, origins), (float3)(within - (float)layer));
+    const float3 origin = vload3(layer + 1, origins);
+    return origin + (vload3(layer + 2, origins) - origin) * (within - (float)layer);
 }
 
 /* Parameters  voxels     in   the slices first_k and following of a volume of (nk, nj, ni)
@@ -72,8 +75,8 @@ __kernel void find_gradients(
         - trilinear_value(&volume, at.x, at.y, at.z - 0.5f);
     const float3 a = step_i.xyz, b = step_j.xyz;
     const float3 c = origin_at(origins, at.z + 0.5f, nk) - origin_at(origins, at.z - 0.5f, nk);
-    const float volume_of_steps = dot(a, cross(b, c));
-    const float3 gradient = along_i * cross(b, c) + along_j * cross(c, a) + along_k * cross(a, b);
+    const float volume_of_steps = dot3(a, cross3(b, c));
+    const float3 gradient = along_i * cross3(b, c) + along_j * cross3(c, a) + along_k * cross3(a, b);
     const float3 known = volume_of_steps != 0.0f ? gradient / volume_of_steps : (float3)(0.0f);
     vstore3(known, point, gradients);
 }

@@ -16,7 +16,6 @@
  *
  * Passes
  *   1. list_neighbours    once for each part of the cells */
-#pragma OPENCL FP_CONTRACT OFF
 
 #include "include/lanes.h"
 #include "points/near_cells.h"

@@ -11,7 +11,6 @@
  * Passes
  *   1. fit_planes       for each part of the points, after list_neighbours
  *   2. orient_normals   for the same part */
-#pragma OPENCL FP_CONTRACT OFF
 
 #include "points/near_rows.h"
 
@@ -145,19 +144,19 @@ __kernel void orient_normals(
         return;
     const size_t place = first_place + row, number = order[place];
     float3 normal = (float3)(normals[row], normals[place_count + row], normals[2 * (size_t)place_count + row]);
-    const int has_plane = dot(normal, normal) > 0.0f;
+    const int has_plane = dot3(normal, normal) > 0.0f;
     uchar state = has_plane ? STATE_UNORIENTED : STATE_NO_PLANE;
     if (how == ORIENT_DOWN) {
         const float3 down = -vload3(number, gradients);
-        const float steepness = length(down);
+        const float steepness = sqrt(dot3(down, down));
         if (steepness > 0.0f && isfinite(steepness)) {
-            const float cosine = dot(normal, down) / steepness;
+            const float cosine = dot3(normal, down) / steepness;
             const int doubtful = fabs(cosine) < DOUBTFUL_COSINE;
             normal = doubtful ? down / steepness : cosine < 0.0f ? -normal : normal;
             state = has_plane ? (doubtful ? STATE_DOUBTFUL : STATE_SURE) : STATE_DOUBTFUL;
         }
     } else if (how == ORIENT_AWAY && has_plane) {
-        const float cosine = dot(normal, (float3)(x[place], y[place], z[place]) - viewpoint.xyz);
+        const float cosine = dot3(normal, (float3)(x[place], y[place], z[place]) - viewpoint.xyz);
         normal = cosine < 0.0f ? -normal : normal;
         state = STATE_SURE;
     }

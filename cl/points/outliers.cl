@@ -5,7 +5,6 @@
  *
  * Passes
  *   1. measure_distances    for each part of the points, after list_neighbours */
-#pragma OPENCL FP_CONTRACT OFF
 
 #include "points/near_rows.h"
 

@@ -11,8 +11,6 @@
 
 #include "include/lanes.h"
 
-#pragma OPENCL FP_CONTRACT OFF
-
 /* x + y is the exact difference a - b. */
 static inline float2 exact_difference(const float a, const float b)
 {

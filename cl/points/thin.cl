@@ -4,8 +4,6 @@
  * differently.  Coordinates are relative to the cell's first point. */
 #include "points/grid.h"
 
-#pragma OPENCL FP_CONTRACT OFF
-
 /* Parameters  x y z   in   (n,) sorted coordinates
  *             starts  in   (cells + 1,)
  *             order   in   (n,) number of the point at each place, ascending within a cell

@@ -56,8 +56,8 @@ static inline float find_differences(const field *f, const float3 place, float4 
     const float2 high_j = near_j * (middle[3].yz - side[2]) + far_j * (side[3] - middle[2].yz);
     const float2 low_k = high.yz - (near_j * beyond[0] + far_j * beyond[1]);
     const float2 high_k = near_j * beyond[2] + far_j * beyond[3] - low.yz;
-    *below = 0.5f * (float4)(dot(low_i, near_i), dot(low_j, near_i), dot(low_k, near_i), 0.0f);
-    *above = 0.5f * (float4)(dot(high_i, near_i), dot(high_j, near_i), dot(high_k, near_i), 0.0f);
+    *below = 0.5f * (float4)(dot2(low_i, near_i), dot2(low_j, near_i), dot2(low_k, near_i), 0.0f);
+    *above = 0.5f * (float4)(dot2(high_i, near_i), dot2(high_j, near_i), dot2(high_k, near_i), 0.0f);
     return at_k - (float)k;
 }
 

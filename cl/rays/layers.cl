@@ -20,8 +20,6 @@
 #include "rays/eye.h"
 #include "rays/view.h"
 
-#pragma OPENCL FP_CONTRACT OFF
-
 #define FIRST_SEEN (1.0f / 255.0f) /* opacity that makes a first hit */
 #define NO_HIT (-MAXFLOAT)
 #define COUNTED 32 /* pixels that a work-item counts */
@@ -68,7 +66,7 @@ __kernel void begin_layer(__global const float *restrict still_depths, __global 
     uint key = EMPTY;
     if (has_still && !isnan(still_depths[at])) {
         const float3 ray = find_ray(view, (int)(at % (uint)width), (int)(at / (uint)width));
-        const uint own = key_of(still_depths[at] / sqrt(dot(ray, ray)));
+        const uint own = key_of(still_depths[at] / sqrt(dot3(ray, ray)));
         /* The still comes after the triangles at its depth, and once. */
         const uint below = floor_keys[at];
         key = own > below || (own == below && floor_numbers[at] != EMPTY) ? own : EMPTY;
@@ -122,7 +120,7 @@ __kernel void blend_layer(__global const float4 *restrict layer, __global const 
     const float volume_hit = states[2 * at + 1].x, depth = layer_depths[at];
     if (mark.x == NO_HIT && volume_hit >= 0.0f) {
         const float3 ray = find_ray(view, (int)(at % (uint)width), (int)(at / (uint)width));
-        mark.x = volume_hit + near_mm * sqrt(dot(ray, ray));
+        mark.x = volume_hit + near_mm * sqrt(dot3(ray, ray));
     }
     const float weight = (1.0f - seen.w) * own.w;
     seen.xyz += weight * own.xyz;
@@ -162,7 +160,7 @@ __kernel void finish_rays(__global const float4 *restrict states, __global const
         return;
     const float4 seen = states[2 * at], volume = states[2 * at + 1], mark = marks[at];
     const float3 ray = find_ray(view, (int)(at % (uint)width), (int)(at / (uint)width));
-    const float offset = near_mm * sqrt(dot(ray, ray));
+    const float offset = near_mm * sqrt(dot3(ray, ray));
     const float first = mark.x != NO_HIT ? mark.x : volume.x >= 0.0f ? volume.x + offset : NAN;
     image[at] = finish_color(seen, background);
     depths[at] = first;

@@ -48,7 +48,7 @@ static inline void find_gradients(__global const float4 *view, const slice_stack
         const float4 above = (float4)(part[3][lane], part[4][lane], part[5][lane], 0.0f);
         __global const float4 *low = stack->slices + 4 * layer + 1, *high = low + 4;
         for (int axis = 0; axis < 3; ++axis) {
-            const float from = dot(low[axis], below), to = dot(high[axis], above);
+            const float from = dot4(low[axis], below), to = dot4(high[axis], above);
             gradient[axis][lane] = from + part[6][lane] * (to - from);
         }
     }

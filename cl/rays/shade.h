@@ -11,19 +11,19 @@
 static inline float3 shade_place(const float4 phong, const float4 fixed_light, __global const float *highlights,
     const float3 color, const float3 gradient, const float3 direction)
 {
-    const float size = dot(gradient, gradient);
+    const float size = dot3(gradient, gradient);
     if (size < 1e-12f)
         return min(color * (phong.x + phong.y), 1.0f);
     const float3 normal = gradient * (1.0f / sqrt(size));
     const float3 light = fixed_light.w > 0.0f ? fixed_light.xyz : -direction;
-    const float along = dot(normal, light);
-    if (along * dot(normal, direction) >= 0.0f)
+    const float along = dot3(normal, light);
+    if (along * dot3(normal, direction) >= 0.0f)
         return min(color * phong.x, 1.0f); /* light and viewer on different sides */
     float highlight_angle = fabs(along);
     const float diffuse = phong.y * highlight_angle;
     if (fixed_light.w > 0.0f) {
         const float3 middle = light - direction;
-        highlight_angle = fabs(dot(normal, middle)) / sqrt(max(dot(middle, middle), 1e-12f));
+        highlight_angle = fabs(dot3(normal, middle)) / sqrt(max(dot3(middle, middle), 1e-12f));
     }
     const float entry = min(highlight_angle, 1.0f) * (HIGHLIGHTS - 1);
     const int at = min((int)entry, HIGHLIGHTS - 2);

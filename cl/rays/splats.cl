@@ -23,8 +23,6 @@
 #include "rays/shade.h"
 #include "rays/view.h"
 
-#pragma OPENCL FP_CONTRACT OFF
-
 #define LEAST_PIXELS 0.7072f /* least radius of a disc: it reaches the centre of the pixel that its point falls in */
 #define MOST_PIXELS 128.0f /* and its largest */
 
@@ -192,7 +190,7 @@ __kernel void shade_splats(
     const float4 pixel = view[EYE_PIXEL];
     const int column = (int)(at % (uint)width), row = (int)(at / (uint)width);
     const float3 ray = find_ray(view, column, row);
-    const float length_of_ray = sqrt(dot(ray, ray)), depth = depth_of(keys[at]);
+    const float length_of_ray = sqrt(dot3(ray, ray)), depth = depth_of(keys[at]);
     float3 color = convert_float3(colors[number - first].xyz) / 255.0f;
     if (shading == SHADED_BY_NORMALS)
         color = shade_place(view[EYE_PHONG], view[EYE_LIGHT], highlights, color,

@@ -29,7 +29,7 @@ static inline float3 to_lps(const scene *s, __global const float4 *view, const f
 #else
     __global const float4 *rows = view + VIEW_NORMAL_X;
 #endif
-    return (float3)(dot(rows[0], step), dot(rows[1], step), dot(rows[2], step));
+    return (float3)(dot4(rows[0], step), dot4(rows[1], step), dot4(rows[2], step));
 }
 
 /* LPS gradient at a place in field coordinates. */

@@ -22,7 +22,7 @@ static inline uint find_surface_label(
     for (int corner = 0; corner < 8; ++corner) {
         const float3 at = base + (float3)((float)(corner & 1), (float)(corner >> 1 & 1), (float)(corner >> 2));
         const float3 away = at - place;
-        const float distance = dot(away, away);
+        const float distance = dot3(away, away);
         if (distance >= nearest || read_closed(f, (int)at.x, (int)at.y, (int)at.z) < f->level)
             continue;
         nearest = distance;

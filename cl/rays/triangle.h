@@ -15,8 +15,6 @@
 
 #include "rays/eye.h"
 
-#pragma OPENCL FP_CONTRACT OFF
-
 #define NOTHING_MM 1e-12f /* what is smaller counts as 0, so that no product of two is lost by float32 */
 
 /* Corners as the camera sees them: mm to the right, up, and the depth. */

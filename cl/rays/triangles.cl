@@ -253,25 +253,25 @@ __kernel void shade_triangles(__global const float *restrict placed, __global co
         rgb = (share.x * convert_float3(colors[a].xyz) + share.y * convert_float3(colors[b].xyz)
                   + share.z * convert_float3(colors[last].xyz)) / 255.0f;
     const float3 ray = find_ray(view, column, row);
-    const float length_of_ray = sqrt(dot(ray, ray));
+    const float length_of_ray = sqrt(dot3(ray, ray));
     if (shaded) {
         const float3 direction = ray / length_of_ray;
         /* The face's normal, by its corners as the camera sees them, then in LPS. */
         const float3 p = (float3)(c.x[1] - c.x[0], c.y[1] - c.y[0], c.depth[1] - c.depth[0]);
         const float3 q = (float3)(c.x[2] - c.x[0], c.y[2] - c.y[0], c.depth[2] - c.depth[0]);
         /* Right, up and into the picture are a left-handed triple. */
-        const float3 own = cross(q, p);
+        const float3 own = cross3(q, p);
         float3 face = own.x * view[EYE_RIGHT].xyz + own.y * view[EYE_UP].xyz + own.z * view[EYE_FORWARD].xyz;
-        const float size = dot(face, face);
+        const float size = dot3(face, face);
         face = size > 0.0f ? face / sqrt(size) : -direction;
         float3 normal = face;
         if (has_normals) {
             normal = share.x * vload3(a, normals) + share.y * vload3(b, normals) + share.z * vload3(last, normals);
-            normal = dot(normal, face) < 0.0f ? -normal : normal;
+            normal = dot3(normal, face) < 0.0f ? -normal : normal;
         }
         /* Normals between corners may look away from the camera where the face does not: they end at its rim. */
-        const float away = dot(normal, direction);
-        if (away * dot(face, direction) < 0.0f)
+        const float away = dot3(normal, direction);
+        if (away * dot3(face, direction) < 0.0f)
             normal -= 1.001f * away * direction;
         rgb = shade_place(view[EYE_PHONG], view[EYE_LIGHT], highlights, rgb, normal, direction);
     }

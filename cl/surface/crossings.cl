@@ -22,7 +22,6 @@
 /* What boxes and rows are taken longer by, in edges: more than the rounding of coordinates in float32. */
 #define SLACK 1e-3f
 
-#pragma OPENCL FP_CONTRACT OFF
 
 /* The plane of a triangle: one corner, the normal, and for each of its parts the sum of its absolute terms. */
 typedef struct { float3 corner, normal, terms; } plane;
@@ -59,7 +58,7 @@ static inline int apart(const int3 sides, const int common)
 /* Axis along which the triangle a, b, c looks largest. */
 static inline int steepest(const float3 a, const float3 b, const float3 c)
 {
-    const float3 normal = fabs(cross(b - a, c - a));
+    const float3 normal = fabs(cross3(b - a, c - a));
     return normal.x >= normal.y && normal.x >= normal.z ? 0 : normal.y >= normal.z ? 1 : 2;
 }
 

@@ -222,7 +222,7 @@ __kernel void sum_volumes(
     for (uint n = (uint)begin; n < end; ++n) {
         const uint3 corners = vload3(n, triangles);
         const float3 a = vload3(corners.x, positions), b = vload3(corners.y, positions), c = vload3(corners.z, positions);
-        sum += dot(a - centre.xyz, cross(b - a, c - a));
+        sum += dot3(a - centre.xyz, cross3(b - a, c - a));
     }
     sums[item] = sum;
 }

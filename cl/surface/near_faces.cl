@@ -13,7 +13,6 @@
  * Passes
  *   1. find_near_faces   points to a surface
  *   2. find_witnesses    triangles of another surface: faces that show that all of a triangle is near enough */
-#pragma OPENCL FP_CONTRACT OFF
 
 #include "surface/near_faces.h"
 
@@ -55,7 +54,7 @@ __kernel void find_near_faces(
         const uint3 face = vload3((uint)nearest, faces);
         const float3 a = place_of(places, face.x) - point, b = place_of(places, face.y) - point,
                      c = place_of(places, face.z) - point;
-        const float one = dot(a, a), two = dot(b, b), three = dot(c, c);
+        const float one = dot3(a, a), two = dot3(b, b), three = dot3(c, c);
         const int next = (int)(one <= two && one <= three ? face.x : two <= three ? face.y : face.z);
         if (next == vertex)
             break;

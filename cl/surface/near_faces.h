@@ -27,36 +27,36 @@ static inline float3 place_of(__global const float *restrict places, const uint 
 static inline float square_to_face(const float3 point, const float3 one, const float3 two, const float3 three)
 {
     const float3 p = two - one, q = three - one, away = point - one;
-    const float d1 = dot(p, away), d2 = dot(q, away);
+    const float d1 = dot3(p, away), d2 = dot3(q, away);
     if (d1 <= 0.0f && d2 <= 0.0f)
-        return dot(away, away);
+        return dot3(away, away);
     const float3 from_two = point - two;
-    const float d3 = dot(p, from_two), d4 = dot(q, from_two);
+    const float d3 = dot3(p, from_two), d4 = dot3(q, from_two);
     if (d3 >= 0.0f && d4 <= d3)
-        return dot(from_two, from_two);
+        return dot3(from_two, from_two);
     float3 left;
     const float vc = d1 * d4 - d3 * d2;
     if (vc <= 0.0f && d1 >= 0.0f && d3 <= 0.0f) {
         left = away - p * (d1 / (d1 - d3));
-        return dot(left, left);
+        return dot3(left, left);
     }
     const float3 from_three = point - three;
-    const float d5 = dot(p, from_three), d6 = dot(q, from_three);
+    const float d5 = dot3(p, from_three), d6 = dot3(q, from_three);
     if (d6 >= 0.0f && d5 <= d6)
-        return dot(from_three, from_three);
+        return dot3(from_three, from_three);
     const float vb = d5 * d2 - d1 * d6;
     if (vb <= 0.0f && d2 >= 0.0f && d6 <= 0.0f) {
         left = away - q * (d2 / (d2 - d6));
-        return dot(left, left);
+        return dot3(left, left);
     }
     const float va = d3 * d6 - d5 * d4;
     if (va <= 0.0f && d4 >= d3 && d5 >= d6) {
         left = from_two - (three - two) * ((d4 - d3) / ((d4 - d3) + (d5 - d6)));
-        return dot(left, left);
+        return dot3(left, left);
     }
     const float v = max(vb / (va + vb + vc), 0.0f), w = max(vc / (va + vb + vc), 0.0f), both = max(v + w, 1.0f);
     left = away - p * (v / both) - q * (w / both);
-    return dot(left, left);
+    return dot3(left, left);
 }
 
 static inline float square_to_row(

@@ -229,10 +229,10 @@ static inline void write_cell_vertex(
 #undef PLACE
     vstore3(place, vertex, positions);
     field_at(values, point, &slope);
-    if (dot(slope, slope) == 0.0f)
+    if (dot3(slope, slope) == 0.0f)
         slope = (float3)(1.0f);
-    up = (float3)(dot(frame->normal_x, slope), dot(frame->normal_y, slope), dot(frame->normal_z, slope));
-    vstore3(-up / sqrt(dot(up, up)), vertex, normals);
+    up = (float3)(dot3(frame->normal_x, slope), dot3(frame->normal_y, slope), dot3(frame->normal_z, slope));
+    vstore3(-up / sqrt(dot3(up, up)), vertex, normals);
 }
 
 /* Parameters  voxels ... word_cell_vertices   in   as above

@@ -49,7 +49,7 @@ static inline float3 place_centre(uint row, const long values[8], float3 margin)
     for (int n = 0; n < NEWTON_STEPS; ++n) {
         float3 gradient;
         const float value = field_at(values, point, &gradient);
-        const float square = dot(gradient, gradient);
+        const float square = dot3(gradient, gradient);
         if (square >= FLAT_SQUARE)
             point = clamp(point - gradient * (value / square), margin, 1.0f - margin);
     }

@@ -12,7 +12,7 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from clrecon.errors import DeviceError, DeviceFailedError, DeviceLostError, DeviceMemoryError
 from clrecon.opencl import quirks
@@ -21,6 +21,8 @@ from clrecon.opencl.pocl import KnownGood, NameOfCpu, has_unknown_cpu, known_goo
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.system.log import get_logger
 from clrecon.system.packages import install_command
+
+Kept = TypeVar("Kept")
 
 
 class CommandFailedError(Exception):
@@ -64,9 +66,11 @@ class Commands:
         self._given_up: list[Command] = []
         _all.append(self)
 
-    def add(self, what: str, event: Any, queue: Any, *held: Any) -> None:
-        """Add a command that was enqueued."""
-        self._waiting.append(Command(what, event, queue, held))
+    def add(self, what: str, event: Any, queue: Any, *held: Any) -> Command:
+        """Add a command that was enqueued, and return it."""
+        command = Command(what, event, queue, held)
+        self._waiting.append(command)
+        return command
 
     @property
     def last(self) -> Command | None:
@@ -191,10 +195,12 @@ def _find_shortcoming(cl_device: Any) -> str:
 
 
 class _Opened:
-    """Context and queue of a device, None before its first use."""
+    """Context and queue of a device, None before its first use, and what is kept as long as they are."""
 
-    context: Any = None
-    queue: Any = None
+    def __init__(self) -> None:
+        self.context: Any = None
+        self.queue: Any = None
+        self.kept: dict[Any, Any] = {}
 
 
 class Device:
@@ -213,8 +219,8 @@ class Device:
     known_good: The check of the programs that PoCL keeps; None for other drivers, and where nothing is kept.
     kernel_variants: ``-D`` definitions for kernels that are written for vectors, see `quirks.kernel_variants`.
     first_header: Header that stands before every kernel file, see `quirks.first_header`; empty for none.
-    build_options: Options for every program.  In caches that several computers share, they distinguish CPUs that the
-        driver does not.
+    build_options: Options for every program: see `quirks.rounding_options`; and in caches that several computers share,
+        one that distinguishes CPUs that the driver does not.
     lock: Held while a kernel gets its arguments and is enqueued: kernels are shared between threads.
     stand_in: The CPU device that takes over if this one fails, see `clrecon.opencl.select`; None for a device that
         was named.
@@ -252,7 +258,7 @@ class Device:
         self.kernel_variants: dict[str, str] = quirks.kernel_variants(self.platform, self.type)
         self.first_header: str = quirks.first_header(self.platform, _version_numbers(self.driver))
         self.shortcoming: str = _find_shortcoming(cl_device)
-        self.build_options: tuple[str, ...] = ()
+        self.build_options: tuple[str, ...] = quirks.rounding_options(cl_device)
         self._cpu: NameOfCpu | None = None
         if has_unknown_cpu(self.platform, self.version) and not self.shortcoming:
             self._name_cpu()
@@ -276,7 +282,7 @@ class Device:
                 f" `{install_command('intel-opencl-rt')}`"
             )
         else:
-            self.build_options = (f"-DCPU_NAME={self._cpu.name}",)
+            self.build_options += (f"-DCPU_NAME={self._cpu.name}",)
 
     @property
     def warnings(self) -> list[str]:
@@ -346,6 +352,14 @@ class Device:
                     raise DeviceFailedError(f"device {self.label} gives no queue: {describe_error(error)}") from error
             return self._opened.queue
 
+    def of_context(self, make: Callable[[Device], Kept]) -> Kept:
+        """Return what `make` makes of the device, once for each context."""
+        with self.lock:
+            if make not in self._opened.kept:
+                self._opened.kept[make] = make(self)
+            kept: Kept = self._opened.kept[make]
+            return kept
+
     def _refuse_fork(self) -> None:
         """Refuse to work in a forked process: the driver's threads do not exist there, so it would wait for ever."""
         if self._process != os.getpid():
@@ -373,8 +387,9 @@ class Device:
     def give_up(self) -> None:
         """Drop context and queue, so that the next use makes new ones; running commands keep what they use."""
         with self.lock:
-            self.commands.give_up(self._opened.context, self._opened.queue, dict(self.programs))
+            self.commands.give_up(self._opened.context, self._opened.queue, self._opened.kept, dict(self.programs))
             self._opened.context = self._opened.queue = None
+            self._opened.kept = {}
             self.programs.clear()
 
     def fail(self, what: str, error: Exception, *, is_late: bool = False) -> DeviceError:

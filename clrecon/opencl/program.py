@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import DeviceError
+from clrecon.opencl.buffers import raw
 from clrecon.opencl.cache import binary_key, read_binary, refuse_short_files, store_binary
 from clrecon.opencl.device import Device, describe_error
 from clrecon.opencl.quirks import import_pyopencl
@@ -31,8 +32,9 @@ wait for."""
 
 
 def _take_buffer(value: Any) -> Any:
-    if isinstance(value, import_pyopencl().Buffer):
-        return value
+    buffer = raw(value)
+    if isinstance(buffer, import_pyopencl().Buffer):
+        return buffer
     raise TypeError(f"{value!r} is no buffer")
 
 

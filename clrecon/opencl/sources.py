@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 _REINSTALL = "its installation is damaged, remove it and install it again (pip uninstall clrecon; pip install clrecon)"
 _KNOWN_HEADER = "include/volume.h"
+EXACT_HEADER = "include/exact.h"
 _NUMBER = re.compile(r"(?m)^#define (\w+) +\(?(-?[0-9.]+)f?\)?(?= |$)")
 _INCLUDE = re.compile(r'^\s*#\s*include\s+"([^"]+)"\s*$')
 
@@ -81,8 +82,12 @@ def _inline(name: str, seen: set[str]) -> list[str]:
 
 @cache
 def read_kernel_source(name: str) -> str:
-    """Return the text of kernel file `name` (such as ``"primitives/scan.cl"``) with its includes inlined."""
-    return "\n".join(_inline(name, {name})) + "\n"
+    """Return the text of kernel file `name` (such as ``"primitives/scan.cl"``) with its includes inlined.
+
+    What all compilers have to compute with the same bits stands before every kernel file: ``include/exact.h``.
+    """
+    first = _inline(EXACT_HEADER, {EXACT_HEADER}) if name.endswith(".cl") else []
+    return "\n".join([*first, *_inline(name, {name})]) + "\n"
 
 
 @cache

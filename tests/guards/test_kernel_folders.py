@@ -9,12 +9,13 @@ from house import PACKAGE, ROOT
 
 from clrecon.opencl import kernel_files
 from clrecon.opencl.quirks import first_header
+from clrecon.opencl.sources import EXACT_HEADER
 
 KERNELS = ROOT / "cl"
 OPERATORS = PACKAGE / "operators"
 
-FIRST_HEADERS = {first_header("Portable Computing Language", (3, 0))}
-"""Headers that the host puts before every kernel file of some drivers, which no file includes."""
+FIRST_HEADERS = {EXACT_HEADER, first_header("Portable Computing Language", (3, 0))}
+"""Headers that the host puts before every kernel file, always or for some drivers, which no file includes."""
 
 _INCLUDE = re.compile(r'(?m)^\s*#\s*include\s+"([^"]+)"')
 
