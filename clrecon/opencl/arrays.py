@@ -20,9 +20,12 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import DeviceError, DeviceFailedError, DeviceLostError, DeviceMemoryError, UsageError
+from clrecon.opencl import buffers
+from clrecon.opencl.buffers import raw
 from clrecon.opencl.device import Device, describe_error, kind_of_error
 from clrecon.opencl.launching import wait
 from clrecon.opencl.quirks import import_pyopencl
+from clrecon.opencl.transfers import LEAST_BYTES, read_buffers, write_buffer
 from clrecon.system.arguments import name_parameter
 
 
@@ -212,9 +215,10 @@ SHARED_BYTES = 1 << 20
 def _make_buffer(device: Device, flags: Any, size: int, host: NDArray[Any] | None = None) -> Any:
     cl = import_pyopencl()
     try:
-        if host is None:
-            return cl.Buffer(device.context, flags, size)
-        return cl.Buffer(device.context, flags, hostbuf=host)
+        if host is not None or device.shares_host_memory or device.is_simulator:
+            return buffers.ask_driver(device, flags, size, host)
+        pool = device.of_context(buffers.BufferPool)
+        return pool.take(size) if size <= buffers.POOLED_BYTES else pool.ask(size)
     except cl.Error as error:
         if kind_of_error(error) is DeviceLostError:
             raise device.fail(f"{size:,} bytes were not given", error) from error
@@ -237,7 +241,14 @@ def upload(device: Device, array: NDArray[Any]) -> Any:
     # float4 and similar types need an alignment that numpy does not guarantee: small tables are copied.
     if device.shares_host_memory and array.nbytes >= SHARED_BYTES:
         return _make_buffer(device, flags | cl.mem_flags.USE_HOST_PTR, array.nbytes, array)
-    return _make_buffer(device, flags | cl.mem_flags.COPY_HOST_PTR, array.nbytes, array)
+    if device.shares_host_memory or device.is_simulator:
+        return _make_buffer(device, flags | cl.mem_flags.COPY_HOST_PTR, array.nbytes, array)
+    array_d = _make_buffer(device, flags, array.nbytes)
+    try:
+        write_buffer(device, array, array_d)
+    except cl.Error as error:
+        raise device.fail("writing failed", error) from error
+    return array_d
 
 
 def copy_buffer(
@@ -249,7 +260,7 @@ def copy_buffer(
         with device.lock:
             queue = device.queue
             event = cl.enqueue_copy(
-                queue, target_d, source_d, byte_count=size, src_offset=source_offset, dst_offset=offset
+                queue, raw(target_d), raw(source_d), byte_count=size, src_offset=source_offset, dst_offset=offset
             )
             device.commands.add(f"the copy of {size:,} bytes", event, queue, source_d, target_d)
     except cl.Error as error:
@@ -270,25 +281,43 @@ def empty_output(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> tu
 
 def download(device: Device, array: NDArray[Any], array_d: Any, offset: int = 0) -> NDArray[Any]:
     """Wait for the device and return `array` with the contents of `array_d` from byte `offset` on."""
-    cl = import_pyopencl()
-    if not array.nbytes:
-        return array
-    what, queue = f"the transfer of {array.nbytes:,} bytes to the computer", device.queue
+    download_all(device, (array, array_d, offset))
+    return array
+
+
+def download_all(device: Device, *wanted: tuple[NDArray[Any], Any, int]) -> None:
+    """Wait once for the device, and fill each array from its buffer, from a byte on."""
+    wanted = tuple(each for each in wanted if each[0].nbytes)
+    if not wanted:
+        return
     try:
+        _fill_all(device, wanted)
+    except import_pyopencl().Error as error:
+        raise device.fail("reading failed", error) from error
+
+
+def _fill_all(device: Device, wanted: Sequence[tuple[NDArray[Any], Any, int]]) -> None:
+    cl = import_pyopencl()
+    mapped: list[tuple[NDArray[Any], NDArray[Any]]] = []
+    large: list[tuple[NDArray[Any], Any, int]] = []
+    for array, array_d, offset in wanted:
+        what, queue, host = f"the transfer of {array.nbytes:,} bytes to the computer", device.queue, None
         if array_d.flags & cl.mem_flags.USE_HOST_PTR:
             # Mapping makes the host memory current; on CPU drivers it moves no data.
-            mapped, event = cl.enqueue_map_buffer(
+            host, event = cl.enqueue_map_buffer(
                 queue, array_d, cl.map_flags.READ, offset, array.shape, array.dtype, is_blocking=False
             )
-            device.commands.add(what, event, queue, array, array_d, mapped)
-            wait(device)
-            if mapped.ctypes.data != array.ctypes.data:
-                array[...] = mapped
-            mapped.base.release(queue)
+            mapped.append((array, host))
+        elif array.nbytes >= LEAST_BYTES and not device.is_simulator:
+            large.append((array, array_d, offset))
+            continue
         else:
-            event = cl.enqueue_copy(queue, array, array_d, src_offset=offset, is_blocking=False)
-            device.commands.add(what, event, queue, array, array_d)
-            wait(device)
-    except cl.Error as error:
-        raise device.fail("reading failed", error) from error
-    return array
+            event = cl.enqueue_copy(queue, array, raw(array_d), src_offset=offset, is_blocking=False)
+        device.commands.add(what, event, queue, array, array_d, host)
+    if large:
+        read_buffers(device, large)
+    wait(device)
+    for array, host in mapped:
+        if host.ctypes.data != array.ctypes.data:
+            array[...] = host
+        host.base.release(device.queue)

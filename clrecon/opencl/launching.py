@@ -82,8 +82,12 @@ def _take_helper() -> _Helper:
 def wait(device: Device) -> None:
     """Wait until the device has finished all commands."""
     last = device.commands.last
-    if last is None:
-        return
+    if last is not None:
+        wait_for(device, last)
+
+
+def wait_for(device: Device, last: Command) -> None:
+    """Wait until the device has finished the commands up to `last`."""
     try:
         last.queue.flush()
         if not _ends_soon(last):
@@ -252,7 +256,7 @@ def launch(
         with device.lock:
             queue = device.queue
             event = kernel.enqueue(queue, rounded, group, values)
-            device.commands.add(f"kernel {kernel.name}", event, queue, values)
+            device.commands.add(f"kernel {kernel.name}", event, queue, values, arguments)
     except cl.Error as error:
         what = f"kernel {kernel.name} ({rounded:,} items in groups of {group}) failed"
         raise device.fail(what, error) from error

@@ -20,7 +20,7 @@ from clrecon.opencl import (
     Program,
     Stopwatch,
     allocate,
-    download,
+    download_all,
     empty_output,
     launch,
     load_program,
@@ -214,8 +214,7 @@ class VoxelEmission:
                     words_per_item=words_per_item, **where,
                 )  # fmt: skip
             with stopwatch.timed("download"):
-                for array, array_d in ((positions, positions_d), (hu, hu_d), (numbers, numbers_d)):
-                    download(device, array, array_d)
+                download_all(device, (positions, positions_d, 0), (hu, hu_d, 0), (numbers, numbers_d, 0))
         self.volume.release_slices(begin, stop)
         return (positions, hu, numbers if is_small else numbers + np.int64(first * nj * ni)), marked or total
 

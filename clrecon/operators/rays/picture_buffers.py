@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume, normal_matrix
 from clrecon.geometry.affine import Float64Array
-from clrecon.opencl import Device, Stopwatch, allocate, download, empty_output, kernel_constant
+from clrecon.opencl import Device, Stopwatch, allocate, download_all, empty_output, kernel_constant
 from clrecon.operators.resident.tables import FieldFrame
 from clrecon.rendering import Lighting
 from clrecon.rendering.looks.colors import find_color
@@ -250,9 +250,7 @@ class PictureBuffers:
 
     def download(self) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
         """Wait for the device and return image, depths and means."""
-        device = self.device
-        return (
-            download(device, self.image, self.image_d),
-            download(device, self.depths, self.depths_d),
-            download(device, self.means, self.means_d),
+        download_all(
+            self.device, (self.image, self.image_d, 0), (self.depths, self.depths_d, 0), (self.means, self.means_d, 0)
         )
+        return self.image, self.depths, self.means

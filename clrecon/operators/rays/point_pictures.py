@@ -18,7 +18,7 @@ from clrecon.opencl import (
     allocate,
     check_budget,
     check_memory,
-    download,
+    download_all,
     empty_output,
     kernel_constant,
     kernel_number,
@@ -228,7 +228,7 @@ class _Splats:
             del normals_d, colors_d
             tell(2 * n + first + held)
         with stopwatch.timed("download"):
-            image, depth = download(device, image, image_d), download(device, depth, depths_d)
+            download_all(device, (image, image_d, 0), (depth, depths_d, 0))
         return SplatPicture(image, depth, self.shading, len(starts))
 
     @property

@@ -24,6 +24,7 @@ from clrecon.opencl import (
     check_budget,
     check_memory,
     download,
+    download_all,
     empty_output,
     kernel_constant,
     launch,
@@ -194,8 +195,7 @@ class _Layers:
                 **self._rays, **self._place,
             )  # fmt: skip
         with self.stopwatch.timed("download"):
-            image, depths = download(device, image, image_d), download(device, depths, first_d)
-            means = download(device, means, means_d)
+            download_all(device, (image, image_d, 0), (depths, first_d, 0), (means, means_d, 0))
         return LayeredPicture(image, depths, means, drawn, open_pixels)
 
     def _draw_layer(self) -> None:

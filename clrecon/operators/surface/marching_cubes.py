@@ -21,14 +21,14 @@ from clrecon.opencl import (
     Program,
     Stopwatch,
     allocate,
-    download,
+    download_all,
     empty_output,
     launch,
     load_program,
     upload,
 )
 from clrecon.operators.masks.voxel_mask import prepare_classify
-from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
+from clrecon.operators.primitives.scan import enqueue_scan, prepare_scan
 from clrecon.operators.resident.tables import BrickStates, label_variants, voxel_variants
 from clrecon.operators.surface.slabs import Slab
 from clrecon.operators.surface.trilinear import CellVertices, count_cells, emit_cells
@@ -118,25 +118,26 @@ def count(
         cells = count_cells(
             device, slab, voxels_d, classified.mask_d, flags_d, row_counts_d, word_triangles_d, stopwatch
         )
-    scanned = exclusive_scan(device, row_counts_d, 3 * rows, in_place=True, stopwatch=stopwatch)
-    if scanned.total >= 2**32:
-        raise DeviceMemoryError(
-            f"a slab of {slab.slices} slices has {scanned.total:,} vertices and triangles: more than 32 bits can number"
-        )
+    total_d = enqueue_scan(device, row_counts_d, row_counts_d, 3 * rows, stopwatch=stopwatch)
     totals_d = allocate(device, 12)
     launch(
         device, program["total_counts"], 1, stopwatch=stopwatch,
-        row_offsets=scanned.offsets_d, total=scanned.total_d, totals=totals_d, rows=slab.rows, rows_to_count=rows,
+        row_offsets=row_counts_d, total=total_d, totals=totals_d, rows=slab.rows, rows_to_count=rows,
     )  # fmt: skip
-    vertices, triangles, active = (int(n) for n in download(device, np.empty(3, np.uint32), totals_d))
+    totals, total = np.empty(3, np.uint32), np.empty(1, np.uint64)
+    download_all(device, (totals, totals_d, 0), (total, total_d, 0))
+    if total[0] >= 2**32:
+        raise DeviceMemoryError(
+            f"a slab of {slab.slices} slices has {total[0]:,} vertices and triangles: more than 32 bits can number"
+        )
+    vertices, triangles, active = (int(n) for n in totals)
     active_words_d = allocate(device, 4 * active)
     launch(
         device, program["list_words"], slab.rows, stopwatch=stopwatch,
-        words_with_work=flags_d, row_offsets=scanned.offsets_d, active_words=active_words_d, rows=slab.rows,
+        words_with_work=flags_d, row_offsets=row_counts_d, active_words=active_words_d, rows=slab.rows,
         rows_to_count=rows, flag_words=grid.flag_words, row_shift=grid.row_shift,
     )  # fmt: skip
-    offsets_d = scanned.offsets_d
-    return Counted(offsets_d, word_vertices_d, word_triangles_d, active_words_d, vertices, triangles, active, cells)
+    return Counted(row_counts_d, word_vertices_d, word_triangles_d, active_words_d, vertices, triangles, active, cells)
 
 
 LONGEST_ROW = 13_000
@@ -343,12 +344,10 @@ class Emission:
     def download(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
         """Download positions, normals and triangles."""
         with self._stopwatch.timed("download"):
-            for array, array_d in (
-                (self._positions, self.positions_d),
-                (self._normals, self.normals_d),
-                (self._triangles, self.triangles_d),
-            ):
-                download(self._device, array, array_d)
+            download_all(
+                self._device, (self._positions, self.positions_d, 0), (self._normals, self.normals_d, 0),
+                (self._triangles, self.triangles_d, 0),
+            )  # fmt: skip
         if self._slab.grid.rule.inside == "below":
             np.negative(self._normals, out=self._normals)
         return self._positions, self._normals, self._triangles
