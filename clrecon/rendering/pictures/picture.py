@@ -68,11 +68,15 @@ class Rendering(PictureData):
         """
         from clrecon.rendering.looks.colors import find_color
 
-        opacity = self.image[..., 3:].astype(np.float32) / np.float32(255.0)
         behind = (255.0 * find_color(color)).astype(np.float32)
-        mixed = opacity * self.image[..., :3] + (np.float32(1.0) - opacity) * behind
-        image = np.full_like(self.image, 255)
-        image[..., :3] = np.rint(mixed)
+        alone = np.array([*np.rint(behind), 255], np.uint8).view(np.uint32)
+        opacity = self.image[..., 3]
+        pixels = np.ascontiguousarray(self.image).view(np.uint32)[..., 0]
+        image = np.where(opacity == 0, alone, pixels).view(np.uint8).reshape(self.image.shape)
+        mixed = (opacity > 0) & (opacity < 255)
+        share = self.image[mixed, 3:].astype(np.float32) / np.float32(255.0)
+        image[mixed, :3] = np.rint(share * self.image[mixed, :3] + (np.float32(1.0) - share) * behind)
+        image[..., 3] = 255
         return replace(self, image=image)
 
     @explains_arguments
