@@ -143,7 +143,7 @@ def step_results(device: Any, folder: Path, keep: Keep) -> dict[str, Any]:
             keep(told)
             continue
         file = f"{len(told)}.npz"
-        np.savez(folder / file, **made)
+        np.savez(folder / file, **made)  # type: ignore[arg-type]
         digest = hashlib.sha256(b"".join(value.tobytes() for value in made.values())).hexdigest()
         told[name] = {"file": file, "sha256": digest, "seconds": round(time.perf_counter() - start, 3)}
         keep(told)
@@ -213,6 +213,12 @@ def timed(run: Callable[[], Any], runs: int = RUNS) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def turning(renderer: Any, style: Any, size: int) -> Callable[[], Any]:
+    """Return a function that makes a picture, each time from another side."""
+    angles = iter(range(0, 10000, 7))
+    return lambda: renderer.render(style, view=(next(angles), 10), size=(size, size))
+
+
 def step_times(device: Any, slices: int, keep: Keep) -> dict[str, Any]:
     """Time surfaces, pictures and clouds."""
     import clrecon
@@ -241,13 +247,7 @@ def step_times(device: Any, slices: int, keep: Keep) -> dict[str, Any]:
                 "bone": VolumeLook("bone"), "spine": VolumeLook("spine"), "mip": Projection("mip"),
                 "surface": SurfaceLook(LEVEL),
             }.items():  # fmt: skip
-                angles = iter(range(0, 10000, 7))
-                attempt(
-                    f"frame of {mode}, {size} x {size}",
-                    lambda style=style, size=size, angles=angles: renderer.render(
-                        style, view=(next(angles), 10), size=(size, size)
-                    ),
-                )
+                attempt(f"frame of {mode}, {size} x {size}", turning(renderer, style, size))
     attempt("picture, cold", lambda: clrecon.render(volume, VolumeLook("bone"), size=(1024, 1024), device=device), 3)
     with DeviceVolume(volume, device=device) as resident:
         attempt("cloud of voxels", lambda: clrecon.extract_points(resident, hu=(LEVEL, None)), 3)

@@ -79,9 +79,9 @@ def check_memory(memory: int | None) -> None:
 
 def memory_limits(device: Device, memory: int | None = None) -> MemoryLimits:
     """Return the device's own limits, or `memory` bytes if that is less."""
-    asked = int(memory) if memory is not None and memory < device.memory_bytes else None
-    largest = min(device.max_allocation_bytes, device.memory_bytes)
-    return MemoryLimits(device.label, device.memory_bytes, largest, asked)
+    usable = device.usable_bytes
+    asked = int(memory) if memory is not None and memory < usable else None
+    return MemoryLimits(device.label, usable, min(device.max_allocation_bytes, usable), asked)
 
 
 def describe_shortage(limits: MemoryLimits, buffers: Mapping[str, int]) -> str:
@@ -298,10 +298,11 @@ def download_all(device: Device, *wanted: tuple[NDArray[Any], Any, int]) -> None
 
 def _fill_all(device: Device, wanted: Sequence[tuple[NDArray[Any], Any, int]]) -> None:
     cl = import_pyopencl()
-    mapped: list[tuple[NDArray[Any], NDArray[Any]]] = []
+    mapped: list[tuple[NDArray[Any], Any]] = []
     large: list[tuple[NDArray[Any], Any, int]] = []
     for array, array_d, offset in wanted:
-        what, queue, host = f"the transfer of {array.nbytes:,} bytes to the computer", device.queue, None
+        what, queue = f"the transfer of {array.nbytes:,} bytes to the computer", device.queue
+        host: Any = None
         if array_d.flags & cl.mem_flags.USE_HOST_PTR:
             # Mapping makes the host memory current; on CPU drivers it moves no data.
             host, event = cl.enqueue_map_buffer(

@@ -61,7 +61,7 @@ COUNTED = (ast.ImportFrom, ast.FunctionDef, ast.ClassDef, ast.Call)
 
 def _modules() -> dict[str, tuple[str, list[ast.AST]]]:
     """Texts of the modules by name, each with its nodes that something is counted of."""
-    found = {}
+    found: dict[str, tuple[str, list[ast.AST]]] = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
         text = path.read_text(encoding="utf-8")

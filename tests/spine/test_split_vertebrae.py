@@ -263,11 +263,13 @@ def test_voxels_without_a_value_are_air_and_places_are_told_from_the_canal() -> 
     hu = np.full((12, 60, 60), 100.0, np.float32)
     hu[5, 30, 20] = np.nan
     volume = Volume(hu, np.diag((2.0, 2.0, 1.0, 1.0)))
-    ways = [np.tile(way, (10, 1)) for way in ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0))]
+    down, ahead, aside = (np.tile(way, (10, 1)) for way in ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0)))
     canal = np.column_stack([np.full(10, 60.0), np.full(10, 80.0), np.arange(10.0, 0.0, -1.0)])
     none, mm = np.zeros((10, 1), np.float32), np.full(10, 20.0)
     part = cut_part(
-        volume, Course(canal, *ways, np.ones(10, bool), (False, False)), Looks(none, none, none, mm, mm, mm)
+        volume,
+        Course(canal, down, ahead, aside, np.ones(10, bool), (False, False)),
+        Looks(none, none, none, mm, mm, mm),
     )
     at = tuple(np.array((5, 30, 20)) - part.first)
     assert part.values[at] == part.values.min() == -1024.0 and (part.values == 100.0).sum() == part.values.size - 1
