@@ -12,8 +12,9 @@ from clrecon.cli.console import Console, printable
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = (
-        "The device marked * is the one that would be used. One that failed the check at its first use, and a\n"
-        "simulator (Oclgrind), are used only when they are named."
+        "The device marked * is the one that would be used: GPUs before CPUs, cards with memory of their own before\n"
+        "others, then the most compute units. One that failed the check at its first use, and a simulator (Oclgrind),\n"
+        "are used only when they are named."
     )
     add_device(parser, computes=False)
 
@@ -38,7 +39,8 @@ def _describe_survey(survey: dict[str, Any]) -> list[str]:
     for device in survey["devices"]:
         mark = "*" if device["chosen"] else " "
         kind = "simulator" if device["simulator"] else device["type"]
-        memory = f"{megabytes(device['memory_bytes'])}, largest buffer {megabytes(device['max_allocation_bytes'])}"
+        own = " of its own" if device["has_own_memory"] else ""
+        memory = f"{megabytes(device['memory_bytes'])}{own}, largest buffer {megabytes(device['max_allocation_bytes'])}"
         lines.append(f"{mark} {device['index']}  {kind:<11}  {printable(device['name'])}")
         lines.append(f"{'':18}{device['compute_units']} compute units, {memory}")
         driver = f"{device['platform']}, {device['version']}, driver {device['driver']}"

@@ -142,6 +142,8 @@ def keep_for_hung_commands(*objects: Any) -> None:
 
 log = get_logger(__name__)
 
+HEADROOM_BYTES = 1 << 29
+
 GROUP_SIZE = 64
 """Work-group size: a whole wavefront of every GPU, and small enough to give a CPU's cores equal shares."""
 
@@ -210,6 +212,7 @@ class Device:
     name, platform, type, version, driver: `type` is "gpu", "accelerator", "cpu" or "custom"; `platform` is the
         platform's name.
     memory_bytes, max_allocation_bytes: All memory of the device, and the largest single buffer.
+    has_own_memory: A graphics card, not a part of the processor that shares its memory.
     most_steps: Steps after which the loops of a work-item end whatever they have done, see `quirks.most_steps`.
     is_simulator: A checking simulator such as Oclgrind: used only when it is named.
     shortcoming: Why the device cannot be used; empty if it can.
@@ -219,8 +222,8 @@ class Device:
     known_good: The check of the programs that PoCL keeps; None for other drivers, and where nothing is kept.
     kernel_variants: ``-D`` definitions for kernels that are written for vectors, see `quirks.kernel_variants`.
     first_header: Header that stands before every kernel file, see `quirks.first_header`; empty for none.
-    build_options: Options for every program: see `quirks.rounding_options`; and in caches that several computers share,
-        one that distinguishes CPUs that the driver does not.
+    build_options: Options for every program: the language, exact rounding, and in caches that several computers share
+        one that distinguishes CPUs that the driver does not; see `clrecon.opencl.quirks`.
     lock: Held while a kernel gets its arguments and is enqueued: kernels are shared between threads.
     stand_in: The CPU device that takes over if this one fails, see `clrecon.opencl.select`; None for a device that
         was named.
@@ -246,6 +249,7 @@ class Device:
         self.memory_bytes: int = min(cl_device.global_mem_size, reach)
         self.max_allocation_bytes: int = min(cl_device.max_mem_alloc_size, reach)
         self.compute_units: int = cl_device.max_compute_units
+        self.has_own_memory: bool = quirks.has_own_memory(cl_device, self.type)
         self.max_work_group_size: int = min(cl_device.max_work_group_size, cl_device.max_work_item_sizes[0])
         self.is_simulator: bool = quirks.is_simulator(self.platform)
         self.shares_host_memory: bool = quirks.shares_host_memory(self.platform, self.type)
@@ -258,7 +262,8 @@ class Device:
         self.kernel_variants: dict[str, str] = quirks.kernel_variants(self.platform, self.type)
         self.first_header: str = quirks.first_header(self.platform, _version_numbers(self.driver))
         self.shortcoming: str = _find_shortcoming(cl_device)
-        self.build_options: tuple[str, ...] = quirks.rounding_options(cl_device)
+        language = quirks.language_option(self.platform, self.type, _version_numbers(self.driver))
+        self.build_options: tuple[str, ...] = (language, *quirks.rounding_options(cl_device))
         self._cpu: NameOfCpu | None = None
         if has_unknown_cpu(self.platform, self.version) and not self.shortcoming:
             self._name_cpu()
@@ -300,12 +305,18 @@ class Device:
         return nullcontext() if self.known_good is None else self.known_good.building(key)
 
     @property
-    def score(self) -> tuple[int, int, tuple[int, ...], int]:
-        """Sort key of the automatic choice: type, then memory, then driver version, then the order found."""
+    def score(self) -> tuple[int, bool, int, tuple[int, ...], int, int]:
+        """Sort key of the automatic choice, see `choose_device`."""
         rank = {"gpu": 3, "accelerator": 2, "cpu": 1}.get(self.type, 0)
         if quirks.is_software_gpu(self.name):
             rank = 0
-        return rank, self.memory_bytes, _version_numbers(self.driver), -self.index
+        version = _version_numbers(self.driver)
+        return rank, self.has_own_memory, self.compute_units, version, self.memory_bytes, -self.index
+
+    @property
+    def usable_bytes(self) -> int:
+        """Memory that may be taken: a graphics card keeps a tenth, at least 512 MiB, for screens and other programs."""
+        return self.memory_bytes - max(self.memory_bytes // 10, HEADROOM_BYTES) * self.has_own_memory
 
     @property
     def group_size(self) -> int:
@@ -416,6 +427,7 @@ class Device:
             "memory_bytes": self.memory_bytes,
             "max_allocation_bytes": self.max_allocation_bytes,
             "compute_units": self.compute_units,
+            "has_own_memory": self.has_own_memory,
             "simulator": self.is_simulator,
             "shortcoming": self.shortcoming,
         }

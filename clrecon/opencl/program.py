@@ -183,9 +183,6 @@ def _build(device: Device, name: str, options: tuple[str, ...]) -> Program:
     return program
 
 
-_STANDARD = ("-cl-std=CL1.2",)
-
-
 def _complete(device: Device, source: str) -> str:
     """Return the text of a kernel file with the header that the device needs before it."""
     return read_kernel_source(device.first_header) + source if device.first_header else source
@@ -193,14 +190,14 @@ def _complete(device: Device, source: str) -> str:
 
 def _key(device: Device, source: str, options: tuple[str, ...]) -> str:
     driver = (device.platform, device.platform_version, device.driver, device.version, device.name)
-    return binary_key(*driver, *_STANDARD, *options, source)
+    return binary_key(*driver, *options, source)
 
 
 def _build_from_source(device: Device, source: str, options: tuple[str, ...]) -> Any:
     cl = import_pyopencl()
     # A program without its source: pyopencl keeps binaries beside pickles, and leaves a source that does not build in
     # the temporary folder.
-    built = cl.Program(cl._cl._Program(device.context, source)).build([*_STANDARD, *options])
+    built = cl.Program(cl._cl._Program(device.context, source)).build(list(options))
     if device.keeps_binaries:
         with suppress(cl.Error):
             store_binary(_key(device, source, options), built.binaries[0])
@@ -216,7 +213,7 @@ def _build_from_binary(device: Device, source: str, options: tuple[str, ...]) ->
     if binary is None:
         return None
     try:
-        return cl.Program(device.context, [device.cl_device], [binary]).build([*_STANDARD, *options])
+        return cl.Program(device.context, [device.cl_device], [binary]).build(list(options))
     except (cl.Error, RuntimeError) as error:
         log.info("a kept binary is refused by the driver (%s): it is built anew and replaced", describe_error(error))
         return None

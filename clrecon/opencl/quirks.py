@@ -113,9 +113,27 @@ def rounding_options(cl_device: Any) -> tuple[str, ...]:
     return ("-cl-fp32-correctly-rounded-divide-sqrt",) if rounds else ()
 
 
+def language_option(platform_name: str, device_type: str, driver: tuple[int, ...]) -> str:
+    """Return the option for the version of OpenCL C: 2.0 for Intel's GPU drivers before 23.
+
+    The compiler of driver 22.43 crashes, and the process with it, when it builds rays/surface.cl as version 1.2.
+    """
+    is_old = "intel" in platform_name.lower() and device_type == "gpu" and driver[:1] < (23,)
+    return f"-cl-std=CL{'2.0' if is_old else '1.2'}"
+
+
+def has_own_memory(cl_device: Any, device_type: str) -> bool:
+    """True for graphics cards; GPUs that are parts of a processor, and Mesa's llvmpipe, use the computer's memory."""
+    is_unified = bool(getattr(cl_device, "host_unified_memory", False))
+    return device_type == "gpu" and not is_unified and not is_software_gpu(cl_device.name)
+
+
 def has_event_times(platform_name: str) -> bool:
-    """False where profiling events are useless: rusticl of Mesa 22 reports some nanoseconds for any kernel."""
-    return "rusticl" not in platform_name.lower()
+    """False where profiling events are useless.
+
+    Rusticl of Mesa 22 reports some nanoseconds for any kernel, Apple's drivers a unit of their own.
+    """
+    return not any(name in platform_name.lower() for name in ("rusticl", "apple"))
 
 
 def most_steps(device_name: str) -> int | None:

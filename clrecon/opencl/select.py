@@ -279,7 +279,8 @@ def choose_device(name: str | int | Device | None = None) -> Device:
     name : str, int or Device, optional
         Index as ``clrecon.devices()`` counts, "cpu" or "gpu", or a part of the name of a device or platform; if several
         match, the best is used.  None or "auto": the device named by CLRECON_DEVICE, else by PYOPENCL_CTX, else the
-        best of all: GPUs before accelerators before CPUs before software rasterisers, then by memory.  A simulator is
+        best of all: GPUs before accelerators before CPUs before software rasterisers, then those with memory of their
+        own, then by compute units, version of the driver, and memory.  A simulator is
         used only when it is named.
 
     Returns

@@ -13,6 +13,7 @@ from surface_volumes import smooth_volume
 
 from clrecon.cli.main import main
 from clrecon.opencl import Device, choose_device, kernel_files, memory_limits, read_kernel_source
+from clrecon.opencl.quirks import has_event_times, import_pyopencl, language_option
 from clrecon.operators.resident.device_volume import DeviceVolume
 
 BEYOND = {
@@ -114,3 +115,47 @@ def test_row_51_a_kernel_whose_groups_the_driver_refuses_is_an_error_in_a_line(d
     monkeypatch.setattr(device, "max_work_group_size", 1 << 20)
     with pytest.raises(Exception, match=r"kernel \w+ \(.* in groups of .*\) failed on .*INVALID_WORK_GROUP_SIZE"):
         WORK["mip"](DeviceVolume(volume, device=choose_device(device)), None)
+
+
+def graphics(device: Device, name: str, units: int, gib: int, unified: bool) -> Device:
+    return lacking(
+        device, name=name, type=import_pyopencl().device_type.GPU, max_compute_units=units, address_bits=64,
+        global_mem_size=gib << 30, host_unified_memory=unified,
+    )  # fmt: skip
+
+
+def test_cards_come_before_parts_of_a_processor_and_units_before_memory(device):
+    card = graphics(device, "a card", 40, 12, unified=False)
+    larger = graphics(device, "a larger card", 80, 8, unified=False)
+    part = graphics(device, "a part of the processor", 96, 32, unified=True)
+    rasteriser = graphics(device, "llvmpipe (LLVM 15)", 128, 64, unified=False)
+    ranked = sorted([rasteriser, device, card, part, larger], key=lambda each: each.score, reverse=True)
+    assert ranked == [larger, card, part, device, rasteriser]
+    assert [each.has_own_memory for each in ranked] == [True, True, False, False, False]
+
+
+def test_a_card_leaves_memory_to_screens_and_a_part_of_the_processor_does_not(device):
+    assert graphics(device, "a card", 40, 40, unified=False).usable_bytes == 36 << 30
+    small = graphics(device, "a card", 4, 2, unified=False)
+    assert small.usable_bytes == (2 << 30) - (512 << 20)
+    assert memory_limits(small, 2 << 30).total_bytes == small.usable_bytes
+    assert graphics(device, "a part", 96, 32, unified=True).usable_bytes == 32 << 30
+    assert device.usable_bytes == device.memory_bytes
+
+
+@pytest.mark.parametrize(
+    ("platform", "kind", "driver", "language"),
+    [
+        ("Intel(R) OpenCL HD Graphics", "gpu", (22, 43, 24595), "-cl-std=CL2.0"),
+        ("Intel(R) OpenCL Graphics", "gpu", (23, 0), "-cl-std=CL1.2"),
+        ("Intel(R) OpenCL", "cpu", (2022, 2), "-cl-std=CL1.2"),
+        ("Intel(R) OpenCL", "cpu", (18, 1), "-cl-std=CL1.2"),
+        ("NVIDIA CUDA", "gpu", (580, 159), "-cl-std=CL1.2"),
+    ],
+)
+def test_old_drivers_of_intel_build_what_their_compiler_survives(platform, kind, driver, language):
+    assert language_option(platform, kind, driver) == language
+
+
+def test_times_of_apples_drivers_are_not_believed():
+    assert [has_event_times(name) for name in ("Apple", "rusticl", "NVIDIA CUDA")] == [False, False, True]

@@ -18,7 +18,7 @@ class FakeDevice:
 
     def __init__(self, index, name, platform, kind, memory=2**30, simulator=False, software=False):
         self.index, self.name, self.platform, self.type = index, name, platform, kind
-        self.memory_bytes, self.is_simulator = memory, simulator
+        self.usable_bytes, self.is_simulator = memory, simulator
         self.max_allocation_bytes = memory // 4
         self.label = f"{name} ({platform})"
         self.shortcoming = self.fault = ""

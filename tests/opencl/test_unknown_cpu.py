@@ -138,7 +138,7 @@ def test_a_device_names_its_cpu_when_it_is_opened_and_not_before(device, monkeyp
     made = Structure(b"x86_64-unknown-linux-gnu", UNKNOWN)
     found = make_device(device, made.address)
     assert found.shortcoming == "" and made.texts[1] == UNKNOWN
-    [option] = found.build_options
+    [option] = [option for option in found.build_options if "CPU_NAME" in option]
     opened = []
     monkeypatch.setattr("pyopencl.Context", lambda devices: opened.append(made.texts[1].decode()))
     assert found.context is None
@@ -157,4 +157,5 @@ def test_programs_get_what_tells_caches_apart(device, monkeypatch):
     fresh = SimpleNamespace(build_options=("-DCPU_NAME=haswell",), lock=device.lock, programs={})
     load_program(fresh, "primitives/compact.cl", {"B": "2", "A": "1"})
     assert seen == [("-DCPU_NAME=haswell", "-DA=1", "-DB=2")]
-    assert bool(device.build_options) == has_unknown_cpu(device.platform, device.version)
+    names_cpu = any("CPU_NAME" in option for option in device.build_options)
+    assert names_cpu == has_unknown_cpu(device.platform, device.version)
