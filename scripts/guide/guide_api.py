@@ -15,7 +15,7 @@ SUBJECTS = {
         "clrecon.reading clrecon.geometry clrecon.operators.resident",
     ),
     "surfaces": ("Surfaces", "clrecon.operators.surface clrecon.anatomy.iso_choice"),
-    "meshes": ("Meshes: files, smoothing, decimation", "clrecon.mesh"),
+    "meshes": ("Meshes: files, smoothing, decimation", "clrecon.mesh clrecon.proof.compare"),
     "measures": ("Measures of meshes", "clrecon.mesh.compare clrecon.proof.phantom"),
     "anatomy": ("Body, table, noise, spine", "clrecon.anatomy"),
     "labels": ("Label maps", "clrecon.labels"),
