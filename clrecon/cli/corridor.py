@@ -79,11 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     screws.add_argument("--screws", metavar="FILE", help="screws as JSON or CSV, see docs/corridor.md")
     output = parser.add_argument_group("files")
     output.add_argument(
-        "-o",
-        "--output",
-        metavar="OUT",
-        help=f"meshes: OUT_L3, OUT_L3_left and OUT_L3_right; {MESH_FILES}",
-        first=True,
+        "-o", "--output", metavar="OUT", help=f"meshes: OUT_L3, OUT_L3_left and OUT_L3_right; {MESH_FILES}", first=True
     )
     output.add_argument(
         "--picture", metavar="FILE", help="slices through each corridor: .png, .jpg or .tif", first=True

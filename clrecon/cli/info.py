@@ -261,10 +261,7 @@ def _columns(entries: Sequence[dict[str, Any]], chosen: int | None) -> Iterator[
     yield _Column("thick", ["-" if t is None else f"{t:.4g}" for t in thickness], left_out=2, right=True)
     tilts = [None if (tilt := entry["tilt_deg"]) is None else round(tilt, 2) for entry in entries]
     yield _Column(
-        "tilt",
-        ["-" if tilt is None else f"{tilt:+.2f}" if tilt else "0" for tilt in tilts],
-        left_out=4,
-        right=True,
+        "tilt", ["-" if tilt is None else f"{tilt:+.2f}" if tilt else "0" for tilt in tilts], left_out=4, right=True
     )
     yield _Column("description", [printable(entry["description"] or "") for entry in entries], folds=True)
 

@@ -82,10 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         first=True,
     )
     parts.add_argument(
-        "--dense",
-        type=_parse_band,
-        metavar="A[:B]",
-        help="HU of dense bone, from A on or from A to B (default: 450)",
+        "--dense", type=_parse_band, metavar="A[:B]", help="HU of dense bone, from A on or from A to B (default: 450)"
     )
     parts.add_argument(
         "--close", dest="close_mm", type=float, metavar="MM", help="pores that close by balls (default: 1.5)"

@@ -186,10 +186,7 @@ _PLACED_BY_LABEL = 0.5
 
 
 def make_corridors(
-    source: str | Path,
-    settings: CorridorSettings,
-    files: CorridorFiles | None = None,
-    **how: Any,
+    source: str | Path, settings: CorridorSettings, files: CorridorFiles | None = None, **how: Any
 ) -> CorridorReport:
     """Find the corridors through the pedicles of labelled vertebrae, and grade given screws.
 

@@ -77,11 +77,7 @@ def _round_numbers(value: Any, digits: int = 3) -> Any:
 
 
 def describe_vertebra(
-    found: VertebraCorridors,
-    label: int,
-    margin: float,
-    space: str,
-    screws: list[tuple[Screw, ScrewGrade]],
+    found: VertebraCorridors, label: int, margin: float, space: str, screws: list[tuple[Screw, ScrewGrade]]
 ) -> dict[str, Any]:
     """Return the entries of a vertebra."""
     place, frame, turn = _point_placer(space), found.frame, frame_from_lps(space)

@@ -229,13 +229,7 @@ class Stopwatch:
 
 
 def launch(
-    device: Device,
-    kernel: Kernel,
-    items: int,
-    /,
-    *,
-    stopwatch: Stopwatch | None = None,
-    **arguments: Any,
+    device: Device, kernel: Kernel, items: int, /, *, stopwatch: Stopwatch | None = None, **arguments: Any
 ) -> None:
     """Enqueue `kernel` over at least `items` work-items.
 

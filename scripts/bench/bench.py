@@ -138,12 +138,7 @@ def complete(case: Case, job: Job, machine: dict[str, Any], figures: dict[str, A
         "input": {"name": job.input.name, "made_up": job.input.folder is None},
         "device": job.device.describe(),
         "machine": machine,
-        "parameters": {
-            "hu": job.hu,
-            "pairs": job.pairs,
-            "peer_threads": job.peer_threads,
-            "limit_s": job.limit_s,
-        },
+        "parameters": {"hu": job.hu, "pairs": job.pairs, "peer_threads": job.peer_threads, "limit_s": job.limit_s},
         **figures,
     }
 

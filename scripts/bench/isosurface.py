@@ -7,14 +7,7 @@ from collections.abc import Callable, Iterator
 from itertools import islice, repeat
 from typing import Any
 
-from floors import (
-    active_brick_share,
-    copy_bandwidth,
-    floor_bytes,
-    kernel_bytes,
-    share_of_floor,
-    usable_bandwidth,
-)
+from floors import active_brick_share, copy_bandwidth, floor_bytes, kernel_bytes, share_of_floor, usable_bandwidth
 from measure import Costs, alternate, medians, spread, summarise
 from registry import Job, case
 
@@ -215,8 +208,4 @@ def measure_resident(job: Job) -> dict[str, Any]:
     ]
     seconds = spread(first or side["ours"])["median"]
     share = active_brick_share(volume.voxels, job.hu)
-    return {
-        **figures,
-        **describe_surface(job, volume, side, side["counts"][0], seconds, share),
-        "levels_hu": levels,
-    }
+    return {**figures, **describe_surface(job, volume, side, side["counts"][0], seconds, share), "levels_hu": levels}

@@ -41,11 +41,7 @@ def measure_triangles(job: Job) -> dict[str, Any]:
                 sides = alternate(partial(_time, draw), partial(_time, peer.draw), job.pairs, limit_s=job.limit_s)
             keep_pictures(job.pictures, f"{name}-{size}", clrecon=ours[..., :3], vtk=theirs)
             found[f"{name}-{size}"] = {**summarise(*sides), "likeness": likeness(ours[..., :3], theirs)}
-    return {
-        "ratios": {name: own["ratio"] for name, own in found.items()},
-        "triangles": mesh.triangle_count,
-        **found,
-    }
+    return {"ratios": {name: own["ratio"] for name, own in found.items()}, "triangles": mesh.triangle_count, **found}
 
 
 def _time(draw: Callable[[], object]) -> float:

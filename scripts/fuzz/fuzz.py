@@ -75,11 +75,7 @@ class Worker:
         environment = {**os.environ, "CLRECON_REQUIRE_TESTS": "", "OPENBLAS_NUM_THREADS": "1"}
         errors = tempfile.TemporaryFile()
         process = subprocess.Popen(
-            [sys.executable, str(WORKER)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            env=environment,
+            [sys.executable, str(WORKER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, env=environment
         )
         worker = cls(process, errors, case, time.monotonic())
         worker.give(case, seed)

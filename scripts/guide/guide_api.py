@@ -10,10 +10,7 @@ import clrecon
 __all__ = ["SUBJECTS", "names_by_subject", "write_api"]
 
 SUBJECTS = {
-    "volumes": (
-        "Volumes: read, cut, write",
-        "clrecon.reading clrecon.geometry clrecon.operators.resident",
-    ),
+    "volumes": ("Volumes: read, cut, write", "clrecon.reading clrecon.geometry clrecon.operators.resident"),
     "surfaces": ("Surfaces", "clrecon.operators.surface clrecon.anatomy.iso_choice"),
     "meshes": ("Meshes: files, smoothing, decimation", "clrecon.mesh clrecon.proof.compare"),
     "measures": ("Measures of meshes", "clrecon.mesh.compare clrecon.proof.phantom"),

@@ -68,11 +68,7 @@ MESHES = {
     "nothing.stl": ["--hu", "5000"],
 }
 
-LABEL_MESHES = {
-    "labels.ply": [],
-    "solid.ply": ["--solid"],
-    "masks.ply": ["--surface", "mask"],
-}
+LABEL_MESHES = {"labels.ply": [], "solid.ply": ["--solid"], "masks.ply": ["--surface", "mask"]}
 
 CLOUDS = {
     "surface.ply": ["--normals"],

@@ -16,10 +16,7 @@ from clrecon.opencl.sources import kernel_files, read_kernel_source
 
 __all__ = ["EQUIVALENT", "INVERSIONS", "Mutation", "all_mutations", "find_kernels"]
 
-SKIPS = {
-    "every 7th item": "get_global_id(0) % 7u == 3u",
-    "items beyond 500": "get_global_id(0) > 500u",
-}
+SKIPS = {"every 7th item": "get_global_id(0) % 7u == 3u", "items beyond 500": "get_global_id(0) > 500u"}
 
 ONE_GROUP = "it is launched over one work-group of 64 items, whatever the data"
 ONE_ITEM = "its only work-item with something to do is the first"

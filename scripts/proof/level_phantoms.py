@@ -77,12 +77,7 @@ def _trunk(**changes: Any) -> dict[str, Any]:
     return {**_TRUNK, **changes}
 
 
-SCANNING, BODIES, DRY, NOTHING = (
-    "one body, scanned in ten ways",
-    "other bodies",
-    "dry specimens",
-    "no bone",
-)
+SCANNING, BODIES, DRY, NOTHING = ("one body, scanned in ten ways", "other bodies", "dry specimens", "no bone")
 
 NOT_IN_TISSUE = (DRY, NOTHING)
 

@@ -43,7 +43,7 @@ ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("mesh", "geometry", "labels", "reading", "operators")
 EQUIVALENTS = Path(__file__).with_name("equivalent_changes.json")
 ROOM_TESTS = {
-    "labels": ("tests/operators/surface/test_label_masks.py", "tests/operators/surface/test_label_surfaces.py"),
+    "labels": ("tests/operators/surface/test_label_masks.py", "tests/operators/surface/test_label_surfaces.py")
 }
 """Further tests of a room: those of the only code that uses a part of it."""
 MOST_SURVIVORS = 0.05

@@ -135,8 +135,7 @@ def test_row_70_surfaces_of_labels_say_so(
 
 
 @pytest.mark.parametrize(
-    ("name", "found"),
-    [("head_tilt_gaps", True), ("lumbar_4p25mm", False), ("thoracic_0p8mm", False)],
+    ("name", "found"), [("head_tilt_gaps", True), ("lumbar_4p25mm", False), ("thoracic_0p8mm", False)]
 )
 def test_row_70_real_scans(name: str, found: bool, real_data: Path) -> None:
     volume = clrecon.read_volume(real_data / name, allow_gaps=True)

@@ -226,12 +226,7 @@ def test_wrong_commands(arguments: list[str], words: str, capsys: pytest.Capture
 
 @pytest.mark.parametrize(
     ("make", "code", "words"),
-    [
-        (make_empty, 2, "no DICOM"),
-        (make_mr, 2, "MR"),
-        (make_one_slice, 4, "slice"),
-        (make_truncated, 4, "s1_0"),
-    ],
+    [(make_empty, 2, "no DICOM"), (make_mr, 2, "MR"), (make_one_slice, 4, "slice"), (make_truncated, 4, "s1_0")],
 )
 def test_info_refuses_input(
     make: Any, code: int, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -246,10 +246,7 @@ def test_a_transfer_function_from_a_file(render: Renders) -> None:
     content = {
         "format": "clrecon transfer function",
         "version": 1,
-        "points": [
-            {"hu": 0, "color": [0, 1, 0], "opacity": 0},
-            {"hu": 200, "color": [0, 1, 0], "opacity": 1},
-        ],
+        "points": [{"hu": 0, "color": [0, 1, 0], "opacity": 0}, {"hu": 200, "color": [0, 1, 0], "opacity": 1}],
         "lighting": {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0},
     }
     path = render.folder / "green.json"

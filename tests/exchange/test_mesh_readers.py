@@ -237,10 +237,7 @@ def test_hostile_3mf_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
 
 GLB: dict[str, tuple[dict[str, Any], str]] = {
     "node in itself": ({"nodes": [{"children": [0]}]}, "nodes within themselves"),
-    "doubled 31 times": (
-        {"nodes": [*({"children": [n + 1, n + 1]} for n in range(30)), {"mesh": 0}]},
-        "more than",
-    ),
+    "doubled 31 times": ({"nodes": [*({"children": [n + 1, n + 1]} for n in range(30)), {"mesh": 0}]}, "more than"),
     "missing node": ({"scenes": [{"nodes": [3]}]}, "nodes has no number 3"),
     "beyond the end": (
         {"accessors": [{"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 13}]},

@@ -115,8 +115,7 @@ def test_opacity_and_colour_of_a_part(page):
 
 
 @pytest.mark.parametrize(
-    ("letter", "sides"),
-    [("A", "SIRL"), ("P", "SILR"), ("L", "SIAP"), ("R", "SIPA"), ("S", "APLR"), ("I", "APRL")],
+    ("letter", "sides"), [("A", "SIRL"), ("P", "SILR"), ("L", "SIAP"), ("R", "SIPA"), ("S", "APLR"), ("I", "APRL")]
 )
 def test_the_six_views_show_their_sides(page, letter, sides):
     """Up, down, left and right of each view, by where points of the patient come to lie."""

@@ -175,10 +175,7 @@ def test_release():
 @pytest.mark.parametrize(
     ("variables", "passed"),
     [
-        (
-            {},
-            "6 passed, 1 deselected",
-        ),  # one parameter and what a simulator watches on both, the rest on the first
+        ({}, "6 passed, 1 deselected"),  # one parameter and what a simulator watches on both, the rest on the first
         ({"CLRECON_TEST_EVERY_DEVICE": "1"}, "1 failed, 7 passed, 1 deselected"),
         ({"CLRECON_RELEASE_TESTS": "1"}, "7 passed"),
         ({"CLRECON_FAST_TESTS": "1"}, "3 passed, 5 deselected"),

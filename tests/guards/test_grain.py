@@ -11,7 +11,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 94_850,
+    "lines": 94_750,
     "modules": 425,
     "small_modules_with_one_reader": 21,
     "docstrings_with_raises": 124,

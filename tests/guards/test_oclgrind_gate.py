@@ -46,13 +46,7 @@ def oclgrind() -> str:
     return path
 
 
-@pytest.mark.parametrize(
-    ("statement", "fault"),
-    [
-        ("out[i + 1] = i", "Invalid write"),
-        ("out[0] = i", "data race"),
-    ],
-)
+@pytest.mark.parametrize(("statement", "fault"), [("out[i + 1] = i", "Invalid write"), ("out[0] = i", "data race")])
 def test_a_faulty_kernel_is_red(oclgrind: str, statement: str, fault: str) -> None:
     done = check(statement)
     assert done.returncode == 1

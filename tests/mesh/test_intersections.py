@@ -9,11 +9,7 @@ import pytest
 import sample_meshes as samples
 
 from clrecon.mesh import Mesh, intersections
-from clrecon.mesh.intersections import (
-    find_beside,
-    find_changed_intersections,
-    find_self_intersections,
-)
+from clrecon.mesh.intersections import find_beside, find_changed_intersections, find_self_intersections
 
 pytestmark = pytest.mark.unit
 

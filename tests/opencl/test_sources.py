@@ -8,12 +8,7 @@ import shutil
 import pytest
 
 from clrecon.errors import DeviceError
-from clrecon.opencl import (
-    kernel_files,
-    load_program,
-    read_kernel_source,
-    sources,
-)
+from clrecon.opencl import kernel_files, load_program, read_kernel_source, sources
 
 
 def test_every_theme_is_found():

@@ -65,8 +65,7 @@ PLACES = {
     ),
     "position of two numbers": refused("expected 3 finite numbers", ImagePositionPatient=lambda k: position(k)[:2]),
     "position of another slice": refused(
-        "duplicate slices with different pixels at 1 place",
-        ImagePositionPatient=lambda k: position(4 if k == 5 else k),
+        "duplicate slices with different pixels at 1 place", ImagePositionPatient=lambda k: position(4 if k == 5 else k)
     ),
     "one position for all": refused("all 12 images lie in one plane", ImagePositionPatient=position(0)),
     "position with x and z swapped": refused(
@@ -101,8 +100,7 @@ PLACES = {
     ),
     "orientation of zeros": refused("off unit length or right angle", ImageOrientationPatient=[0] * 6),
     "orientation of one slice is another": refused(
-        "1 slice missing between",
-        ImageOrientationPatient=at_one(5, [0, 1, 0, 0, 0, -1], [1, 0, 0, 0, 1, 0]),
+        "1 slice missing between", ImageOrientationPatient=at_one(5, [0, 1, 0, 0, 0, -1], [1, 0, 0, 0, 1, 0])
     ),
     "orientation of another plane": refused(
         "all 12 images lie in one plane", ImageOrientationPatient=[0, 1, 0, 0, 0, -1]

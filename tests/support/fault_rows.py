@@ -149,10 +149,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     ),
     42: (
         "big endian; implicit under explicit: right, told",
-        (
-            PIXELS + "test_native_syntaxes_give_the_same_hu",
-            HOSTILE + "test_implicit_elements_under_an_explicit_syntax",
-        ),
+        (PIXELS + "test_native_syntaxes_give_the_same_hu", HOSTILE + "test_implicit_elements_under_an_explicit_syntax"),
     ),
     43: (
         "DICOMDIR, links, loops, pipes, devices, sockets, folders with names of files: nothing outside is opened",

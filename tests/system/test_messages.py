@@ -29,14 +29,7 @@ from clrecon.reading.common.source_facts import SeriesEntry, SeriesListing
 from clrecon.rendering import Lighting, Rendering, TransferFunction
 from clrecon.rendering.pictures.label_style import LabelStyle
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
-from clrecon.rendering.pictures.styles import (
-    CurveCut,
-    PlaneCut,
-    Projection,
-    SlicesInSpace,
-    SurfaceLook,
-    VolumeLook,
-)
+from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, Projection, SlicesInSpace, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.clip import Clip

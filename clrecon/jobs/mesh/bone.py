@@ -31,13 +31,7 @@ SPINE_MM = 20.0
 
 
 def find_bone(
-    mesh: Mesh,
-    volume: Volume,
-    surface: Surface,
-    labelled: Labelled,
-    *,
-    without_table: bool = False,
-    advice: str,
+    mesh: Mesh, volume: Volume, surface: Surface, labelled: Labelled, *, without_table: bool = False, advice: str
 ) -> NDArray[np.bool_]:
     """Find the components that look like bone or, if none does, the one that holds the spinal canal.
 

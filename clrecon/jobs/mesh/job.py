@@ -16,14 +16,7 @@ from clrecon.jobs.mesh.refinement import judge_parts, measure_parts, refine_surf
 from clrecon.jobs.mesh.report import MeshReport, describe_part, report_of
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface, plan_surfaces
-from clrecon.jobs.outputs import (
-    check_kept,
-    check_outputs,
-    count_leftovers,
-    name_outputs,
-    refuse_files,
-    refuse_numbered,
-)
+from clrecon.jobs.outputs import check_kept, check_outputs, count_leftovers, name_outputs, refuse_files, refuse_numbered
 from clrecon.jobs.run import Run
 from clrecon.system.log import get_logger
 from clrecon.system.text import count_of

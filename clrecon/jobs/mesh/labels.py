@@ -117,12 +117,7 @@ def _extract_masks(
         labels = crop_labels(labels, settings.crop, settings.space)
         numbers = None if numbers is None else [number for number in numbers if number in labels.counts]
     meshes = extract_label_masks(
-        labels,
-        device=device,
-        numbers=numbers,
-        closed=settings.closed,
-        memory=settings.memory,
-        progress=progress,
+        labels, device=device, numbers=numbers, closed=settings.closed, memory=settings.memory, progress=progress
     )
     for number, mesh in meshes.items():
         mesh.report |= {

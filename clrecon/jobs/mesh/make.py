@@ -112,8 +112,7 @@ def _read_inputs(
 
     path = None if settings.labels is None else settings.labels.path
     return run.read_beside(
-        partial(_try_steps, settings=settings),
-        lambda: read_with_labels(partial(run.read, source), path, read_map),
+        partial(_try_steps, settings=settings), lambda: read_with_labels(partial(run.read, source), path, read_map)
     )
 
 

@@ -148,11 +148,7 @@ _DEVICE_PARTS = ("upload", "build", "kernels", "download")
 
 
 def report_of(
-    run: Run,
-    made: MadeParts,
-    meshes: Sequence[dict[str, Any]],
-    gates: list[dict[str, Any]],
-    warnings: Sequence[str],
+    run: Run, made: MadeParts, meshes: Sequence[dict[str, Any]], gates: list[dict[str, Any]], warnings: Sequence[str]
 ) -> MeshReport:
     """Make the report of a job.
 

@@ -18,13 +18,7 @@ from clrecon.jobs.inputs import is_cloud_file, is_only_mesh, read_with_labels, r
 from clrecon.jobs.outputs import check_distinct, check_kept
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.render.picture_taker import PictureTaker, read_curve, read_function, read_look
-from clrecon.jobs.render.report import (
-    PictureReport,
-    describe_picture,
-    find_emptiness,
-    report_of,
-    warn_of_picture,
-)
+from clrecon.jobs.render.report import PictureReport, describe_picture, find_emptiness, report_of, warn_of_picture
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.jobs.run import Run
 from clrecon.mesh import Mesh

@@ -12,14 +12,7 @@ from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.looks.presets import find_preset
 from clrecon.rendering.pictures.label_style import NO_LABEL
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
-from clrecon.rendering.pictures.styles import (
-    SPINE,
-    CurveCut,
-    SlicesInSpace,
-    Style,
-    SurfaceLook,
-    VolumeLook,
-)
+from clrecon.rendering.pictures.styles import SPINE, CurveCut, SlicesInSpace, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.clip import check_center
 from clrecon.rendering.views.directions import default_view
 from clrecon.system.base_classes import Closing

@@ -28,15 +28,7 @@ from clrecon.rendering.pictures.object_looks import POINT_COLORS as POINT_COLORS
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.sheets import SHEET_SIZE
 from clrecon.rendering.pictures.style_checks import SHEET_SLICES as SHEET_SLICES
-from clrecon.rendering.pictures.styles import (
-    SPINE,
-    CurveCut,
-    PlaneCut,
-    SlicesInSpace,
-    Style,
-    SurfaceLook,
-    VolumeLook,
-)
+from clrecon.rendering.pictures.styles import SPINE, CurveCut, PlaneCut, SlicesInSpace, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import ANTERIOR, DEFAULT_SIZE, DIRECTIONS, SLICES_VIEWS, checked_size

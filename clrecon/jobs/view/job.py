@@ -44,10 +44,7 @@ class _ShownInput:
 
 
 def write_view(
-    inputs: Sequence[str | Path],
-    output: str | Path,
-    settings: ViewSettings | None = None,
-    **how: Any,
+    inputs: Sequence[str | Path], output: str | Path, settings: ViewSettings | None = None, **how: Any
 ) -> ViewReport:
     """Write a page that shows scans and meshes together, each in its place.
 

@@ -21,14 +21,7 @@ from clrecon.opencl import (
     memory_limits,
     upload,
 )
-from clrecon.operators.masks.runs import (
-    PARTS_PER_CORE,
-    StencilTable,
-    count_runs,
-    join_runs,
-    list_runs,
-    prepare_runs,
-)
+from clrecon.operators.masks.runs import PARTS_PER_CORE, StencilTable, count_runs, join_runs, list_runs, prepare_runs
 from clrecon.operators.masks.voxel_mask import VoxelMask
 from clrecon.points.stencil import Stencil
 

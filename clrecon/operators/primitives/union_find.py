@@ -67,14 +67,7 @@ def label_components(
 
 
 def join_parts(
-    device: Device,
-    labels_d: Any,
-    spare_d: Any,
-    n: int,
-    links_d: Any,
-    links: int,
-    *,
-    stopwatch: Stopwatch | None = None,
+    device: Device, labels_d: Any, spare_d: Any, n: int, links_d: Any, links: int, *, stopwatch: Stopwatch | None = None
 ) -> tuple[int, Any]:
     """Number the components of nodes that are joined within parts already, once the parts are joined by pairs.
 

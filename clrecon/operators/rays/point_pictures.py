@@ -459,9 +459,7 @@ def _color_by_label(cloud: PointCloud, labels: NDArray[np.int32], removed: bool)
     return _Colors(table[places], "removed" if removed else "label", legend, len(numbers) - len(order), None)
 
 
-def _count_labels(
-    labels: NDArray[np.int32],
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+def _count_labels(labels: NDArray[np.int32]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return the labels that occur, ascending, the place of each point's label among them, and their counts."""
     low, high = int(labels.min()), int(labels.max())
     if high - low > 1 << 24:

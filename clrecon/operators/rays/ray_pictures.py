@@ -249,12 +249,7 @@ def composite_slab(
 
 
 def enter_tiles(
-    resident: DeviceVolume,
-    slab: RaySlab,
-    view: RayView,
-    leaps: LeapMap,
-    output: PictureBuffers,
-    stopwatch: Stopwatch,
+    resident: DeviceVolume, slab: RaySlab, view: RayView, leaps: LeapMap, output: PictureBuffers, stopwatch: Stopwatch
 ) -> Any:
     """Return for each tile the distance in mm before which its rays meet nothing visible, on the device."""
     device = resident.device
@@ -295,12 +290,7 @@ PROJECTIONS = {
 
 
 def project_slab(
-    resident: DeviceVolume,
-    slab: RaySlab,
-    view: RayView,
-    mode: str,
-    output: PictureBuffers,
-    stopwatch: Stopwatch,
+    resident: DeviceVolume, slab: RaySlab, view: RayView, mode: str, output: PictureBuffers, stopwatch: Stopwatch
 ) -> None:
     """Add one slab to a projection; `output.means_d` receives the values.
 

@@ -214,13 +214,7 @@ def measure_bricks(
 
 
 def compare_bricks(
-    device: Device,
-    ranges: BrickRanges,
-    level: Any,
-    ni: int,
-    border: int,
-    *,
-    stopwatch: Stopwatch | None = None,
+    device: Device, ranges: BrickRanges, level: Any, ni: int, border: int, *, stopwatch: Stopwatch | None = None
 ) -> BrickStates:
     """Classify each word of 32 samples by its bricks: all outside (0), all inside (1) or mixed (2).
 

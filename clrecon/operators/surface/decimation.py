@@ -225,11 +225,7 @@ class DeviceBounds(SurfaceBounds):
     """
 
     def __init__(
-        self,
-        device: Device,
-        vertices: NDArray[np.floating],
-        triangles: NDArray[np.uint32],
-        fans: Fans | None = None,
+        self, device: Device, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], fans: Fans | None = None
     ):
         super().__init__(vertices, triangles, fans)
         self._device = device

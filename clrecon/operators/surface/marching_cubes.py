@@ -89,13 +89,7 @@ class Counted:
         return {"vertices": 24 * self.vertices, "triangles": 12 * self.triangles}
 
 
-def count(
-    device: Device,
-    slab: Slab,
-    classified: Classified,
-    stopwatch: Stopwatch,
-    voxels_d: Any = None,
-) -> Counted:
+def count(device: Device, slab: Slab, classified: Classified, stopwatch: Stopwatch, voxels_d: Any = None) -> Counted:
     """Passes 2 to 4: count vertices and triangles, find where those of each word begin, and which words have any.
 
     voxels_d: Slices ``slab.voxel_slices`` of the volume; needed for the topology of the trilinear field.

@@ -144,12 +144,7 @@ METHODS = {
 
 
 def check_method(
-    method: str,
-    *,
-    grows: bool = False,
-    vertex_rule: str = "linear",
-    topology: str = "separated",
-    plain: bool = True,
+    method: str, *, grows: bool = False, vertex_rule: str = "linear", topology: str = "separated", plain: bool = True
 ) -> Method:
     """Return a method of the table.
 

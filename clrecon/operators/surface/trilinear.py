@@ -11,14 +11,7 @@ from numpy.typing import DTypeLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.opencl import (
-    Device,
-    Program,
-    Stopwatch,
-    allocate,
-    launch,
-    load_program,
-)
+from clrecon.opencl import Device, Program, Stopwatch, allocate, launch, load_program
 from clrecon.operators.primitives.scan import exclusive_scan
 from clrecon.operators.resident.tables import voxel_variants
 from clrecon.operators.surface.slabs import Slab

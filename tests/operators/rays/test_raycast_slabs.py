@@ -8,14 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tolerances
-from raycast_scenes import (
-    DeviceCaster,
-    blobs,
-    even_volume,
-    look,
-    premultiplied,
-    uneven_volume,
-)
+from raycast_scenes import DeviceCaster, blobs, even_volume, look, premultiplied, uneven_volume
 from soft_function import SOFT
 
 from clrecon.geometry import Volume

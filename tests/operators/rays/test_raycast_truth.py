@@ -280,11 +280,7 @@ def test_uneven_and_even_samplings_of_one_field_look_alike(cast):
     even = Volume(even.voxels, affine)
     soft = TransferFunction([(100, 1, 0.5, 0.3, 0.0), (800, 1, 1, 0.9, 0.3)])
     camera = look(uneven, (0.4, 1.0, 0.5), 14.0)
-    settings = {
-        "camera": camera,
-        "size": (40, 40),
-        "ray_step": 0.4,
-    }
+    settings = {"camera": camera, "size": (40, 40), "ray_step": 0.4}
     images = [cast(volume, "dvr", soft, **settings).image for volume in (uneven, even)]
     assert np.abs(images[0][..., 3].astype(int) - images[1][..., 3]).max() <= tolerances.RAY_RESAMPLED_255
     assert images[0][..., 3].max() > 150

@@ -207,10 +207,7 @@ def test_values_that_cannot_be_used_are_refused(device):
 
 
 def test_only_volumes_have_surfaces(device):
-    with pytest.raises(
-        UsageError,
-        match=r"needs a Volume, not ndarray: clrecon.Volume\(voxels, affine\)",
-    ):
+    with pytest.raises(UsageError, match=r"needs a Volume, not ndarray: clrecon.Volume\(voxels, affine\)"):
         extract_isosurface(np.zeros((3, 4, 5)), 1, device=device)
 
 

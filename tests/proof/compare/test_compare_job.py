@@ -266,8 +266,7 @@ def test_measures_of_a_crashed_process_are_missing_with_a_reason(
 
 
 @pytest.mark.parametrize(
-    ("hu", "words"),
-    [(5000.0, "no surface at 5000 HU: the volume runs from"), (-3000.0, "every voxel is inside")],
+    ("hu", "words"), [(5000.0, "no surface at 5000 HU: the volume runs from"), (-3000.0, "every voxel is inside")]
 )
 def test_no_surface_is_said_before_any_method_runs(
     hu: float, words: str, device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -33,11 +33,7 @@ def read_back(folder: Path) -> tuple[np.ndarray, np.ndarray, list[pydicom.Datase
 
 @pytest.mark.parametrize(
     "extra",
-    [
-        {},
-        {"tilt": 18.5},
-        {"tilt": -12.0, "oblique": (10.0, -5.0, 33.0), "transfer_syntax": "implicit"},
-    ],
+    [{}, {"tilt": 18.5}, {"tilt": -12.0, "oblique": (10.0, -5.0, 33.0), "transfer_syntax": "implicit"}],
     ids=["straight", "tilted", "tilted-oblique-implicit"],
 )
 @pytest.mark.parametrize("kind", ["sphere", "spine"])

@@ -271,11 +271,7 @@ def test_headers_longer_than_what_is_read_first(tmp_path: Path, large: int) -> N
 
 @pytest.mark.parametrize(
     ("syntax", "careful"),
-    [
-        (plain.IMPLICIT_LITTLE, False),
-        ("1.2.840.10008.1.2.1", False),
-        (DeflatedExplicitVRLittleEndian, True),
-    ],
+    [(plain.IMPLICIT_LITTLE, False), ("1.2.840.10008.1.2.1", False), (DeflatedExplicitVRLittleEndian, True)],
 )
 def test_what_takes_long_to_load_is_loaded_only_where_it_is_needed(tmp_path: Path, syntax: str, careful: bool) -> None:
     write_series(tmp_path, Plan(syntax=syntax))

@@ -90,14 +90,8 @@ def test_row_32_all_nan(tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (
-            set_pixels(lambda array, k: array * 0 + 7),
-            "all 210 voxels are -1017 HU: the volume is constant",
-        ),
-        (
-            set_pixels(lambda array, k: array * 0 - 2000, PixelPaddingValue=-2000),
-            "all 210 voxels are padding",
-        ),
+        (set_pixels(lambda array, k: array * 0 + 7), "all 210 voxels are -1017 HU: the volume is constant"),
+        (set_pixels(lambda array, k: array * 0 - 2000, PixelPaddingValue=-2000), "all 210 voxels are padding"),
         (set_floats(lambda array, k: array * 0 + 3.5), "all 210 voxels are 3.5 HU"),
     ],
 )

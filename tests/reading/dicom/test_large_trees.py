@@ -44,10 +44,7 @@ def copy_series(folder: Path, series: int, slices: int) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("series", "slices"),
-    [(300, 10), pytest.param(3, 1000, marks=FOR_RELEASE)],
-)
+@pytest.mark.parametrize(("series", "slices"), [(300, 10), pytest.param(3, 1000, marks=FOR_RELEASE)])
 def test_row_47_many_files_are_walked_once_and_stay_small(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, series: int, slices: int
 ) -> None:

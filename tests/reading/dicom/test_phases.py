@@ -262,10 +262,7 @@ def test_slices_with_equal_pixels_and_another_geometry_are_no_copies(tmp_path, e
             {"ContentTime": lambda k: f"1010{10 + 2 * k + k % 2}"},
             {"ContentTime": lambda k: f"1010{10 + 2 * k + 1 - k % 2}"},
         ),
-        (
-            {"AcquisitionTime": lambda k: f"1010{10 + 3 * k}"},
-            {"AcquisitionTime": lambda k: f"1010{14 + 3 * k}"},
-        ),
+        ({"AcquisitionTime": lambda k: f"1010{10 + 3 * k}"}, {"AcquisitionTime": lambda k: f"1010{14 + 3 * k}"}),
     ],
     ids=["midnight", "order of reconstruction", "neither passes nor stops"],
 )

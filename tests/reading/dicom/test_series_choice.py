@@ -66,10 +66,7 @@ def test_the_largest_series_is_taken_and_the_rest_said(two_series):
     assert list_series(two_series).warnings == volume.report["warnings"]
 
 
-@pytest.mark.parametrize(
-    "wanted",
-    [2, "2", "series 5", "SERIES 5", "es 5", f"{ROOT}.5", hash_of(5)],
-)
+@pytest.mark.parametrize("wanted", [2, "2", "series 5", "SERIES 5", "es 5", f"{ROOT}.5", hash_of(5)])
 def test_a_series_is_named_in_many_ways(two_series, wanted):
     assert read_volume(two_series, wanted).report["series"]["number"] == 2
 

@@ -47,11 +47,7 @@ DRAWN: Wrong = {
     "label_colors": [({1: "red"}, "give the labels too"), ("red", "colours of labels are a mapping")],
     "label_opacity": [({1: 0.5}, "give the labels too"), (0.5, "opacities of labels are a mapping")],
 }
-LABELLED: Wrong = {
-    **RAYS,
-    **DRAWN,
-    "lighting": [("head", "the lighting of a picture is a Lighting or None, not str")],
-}
+LABELLED: Wrong = {**RAYS, **DRAWN, "lighting": [("head", "the lighting of a picture is a Lighting or None, not str")]}
 CUTS: Wrong = {
     **DRAWN,
     "thickness": [(-1.0, "thickness of a slice"), (np.inf, "thickness"), (None, "thickness"), ("5 mm", "'5 mm'")],

@@ -112,10 +112,7 @@ def test_a_pick_takes_the_nearest_object_and_none_beside(view):
     model, painter = view(scenes.make_scan(), scenes.make_mesh())
     spots = {
         number: model.camera.project([point], SIZE)[0][0]
-        for number, point in (
-            (1, scenes.middle(2)),
-            (2, scenes.middle(0) + (0.0, -25.0, 0.0)),
-        )
+        for number, point in ((1, scenes.middle(2)), (2, scenes.middle(0) + (0.0, -25.0, 0.0)))
     }
     for number, (x, y) in spots.items():
         pick = painter.pick(model.snapshot(), SIZE, x, y)
