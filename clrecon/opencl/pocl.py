@@ -112,8 +112,20 @@ class KnownGood:
             for key, names in self._used.items():
                 before = self._read(key)
                 now = {name: self._describe(name, before.get(name, {})) for name in sorted(names)}
-                if now and now != before:
+                now |= self._of_others(key, before.keys() - names, before)
+                if names and now != before:
                     self._write(key, now)
+
+    def _of_others(self, key: str, names: set[str], before: dict[str, _Files]) -> dict[str, _Files]:
+        """Return the files of programs that stay in a record although this process did not use them.
+
+        Another environment's PoCL keeps what it builds of the same text in another program.  What has a record of its
+        own was only built at the same time.
+        """
+        names = {name for name in names if self._list(name)}
+        if names:
+            names -= {name for path in self._records.iterdir() if path.name != key for name in self._read(path.name)}
+        return {name: before[name] for name in sorted(names)}
 
     def record_when_due(self) -> None:
         """Write the files down when kernels have been at work for some seconds."""

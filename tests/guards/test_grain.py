@@ -11,9 +11,9 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 94_750,
-    "modules": 425,
-    "small_modules_with_one_reader": 21,
+    "lines": 94_760,
+    "modules": 414,
+    "small_modules_with_one_reader": 12,
     "docstrings_with_raises": 124,
     "options_in_several_files": 22,
     "modules_with_own_all": 0,

@@ -75,7 +75,7 @@ def overwrite(folder):
 
 
 def swap(folder):
-    first, second = (path for path in files_of(folder, ".bc") if path.name == "program.bc")
+    first, second, *_ = (path for path in files_of(folder, ".bc") if path.name == "program.bc")
     content = first.read_bytes()
     first.write_bytes(second.read_bytes())
     second.write_bytes(content)
@@ -184,6 +184,20 @@ def test_files_that_were_added_later_are_recorded_by_the_process_that_made_them(
     assert not build(store, tmp_path) and store.warnings == [UNFINISHED]
 
 
+def test_two_environments_keep_their_programs_of_the_same_text(records, tmp_path, monkeypatch):
+    for program in (PROGRAM, "AB/OF_ANOTHER", PROGRAM, "AB/OF_ANOTHER"):
+        monkeypatch.setitem(globals(), "PROGRAM", program)
+        for path in tmp_path.rglob("*.bc"):
+            os.utime(path, (1, 1))
+        for path in tmp_path.rglob("last_accessed"):
+            os.utime(path, (1, 1))
+        store = records()
+        build(store, tmp_path)
+        store.record()
+        assert store.warnings == []
+    assert json.loads((tmp_path / "records" / KEY).read_bytes()).keys() == {PROGRAM, "AB/OF_ANOTHER", "AB/CDEFG"}
+
+
 def test_programs_built_beside_by_another_process_do_not_stay_in_a_record(records, tmp_path, monkeypatch):
     store = records()
     with store.building(KEY):
@@ -192,6 +206,7 @@ def test_programs_built_beside_by_another_process_do_not_stay_in_a_record(record
         (tmp_path / "AB" / "OTHER" / "program.bc").write_bytes(b"of another process")
     store.record()
     assert json.loads((tmp_path / "records" / KEY).read_bytes()).keys() == {PROGRAM, "AB/OTHER"}
+    (tmp_path / "records" / ("b" * 64)).write_text(json.dumps({"AB/OTHER": {"program.bc": [1, 1, "of its own"]}}))
     os.utime(tmp_path / "AB" / "OTHER" / "program.bc", (1, 1))
     store = records()
     monkeypatch.setattr(store, "_programs", lambda: pytest.fail("all programs of the folder are looked at"))
