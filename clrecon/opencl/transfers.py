@@ -105,10 +105,11 @@ def _ranges(size: int) -> Iterator[tuple[int, int]]:
 
 
 def write_buffer(device: Device, array: NDArray[Any], array_d: Any) -> None:
-    """Copy a C-contiguous array into a buffer, for all later commands; a small array must not change meanwhile."""
+    """Copy a C-contiguous array into a buffer, for all later commands; the array may change afterwards."""
     cl = import_pyopencl()
     source, what = _bytes_of(array), f"the transfer of {array.nbytes:,} bytes to the device"
     if array.nbytes < LEAST_BYTES:
+        source = source.copy()
         with device.lock:
             event = cl.enqueue_copy(device.queue, raw(array_d), source, is_blocking=False)
             device.commands.add(what, event, device.queue, array_d, source)

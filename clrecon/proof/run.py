@@ -233,7 +233,7 @@ def run_check(device: Device, check: Check) -> dict[str, Any]:
     start = time.perf_counter()
     try:
         passed, detail = True, check.run(device)
-    except (ClreconError, ArithmeticError, LookupError, ValueError, MemoryError) as error:
+    except (ClreconError, ArithmeticError, LookupError, ValueError, MemoryError, ImportError) as error:
         # A device that computes wrongly hands sizes and places to the host that lead to any of these.
         words = str(error) if isinstance(error, ClreconError) else f"{type(error).__name__}: {error}"
         passed, detail = False, words

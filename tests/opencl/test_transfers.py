@@ -50,8 +50,9 @@ def test_arrays_come_back_as_they_went(apart, size):
     assert np.array_equal(download(apart, tail, array_d, size // 3), array[size // 3 :])
 
 
-def test_a_large_array_may_change_after_its_upload(apart):
-    array = numbers(3 * PIECE_BYTES)
+@pytest.mark.parametrize("size", [1000, 3 * PIECE_BYTES])
+def test_an_array_may_change_after_its_upload(apart, size):
+    array = numbers(size)
     kept = array.copy()
     array_d = upload(apart, array)
     array[:] = 0

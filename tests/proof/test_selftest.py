@@ -214,6 +214,15 @@ def storied(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     return device
 
 
+@pytest.mark.parametrize("error", [ModuleNotFoundError("No module named 'scipy'"), IndexError("9 is out of bounds")])
+def test_what_a_check_raises_is_its_failure_in_words(device: Device, error: Exception) -> None:
+    def fail(device: Device) -> str:
+        raise error
+
+    outcome = run_check(device, Check("a check", (), fail))
+    assert not outcome["passed"] and outcome["detail"] == f"{type(error).__name__}: {error}"
+
+
 def test_row_57_a_driver_that_crashes_or_hangs_becomes_words(storied: Device) -> None:
     names = ["first", "crash", "second", "exit", "third", "hang", "last"]
     outcomes = list(run_selftest(storied, [check_named(name) for name in names], silent_seconds=1.5, processes=1))
