@@ -315,8 +315,9 @@ class Device:
 
     @property
     def usable_bytes(self) -> int:
-        """Memory that may be taken: a graphics card keeps a tenth, at least 512 MiB, for screens and other programs."""
-        return self.memory_bytes - max(self.memory_bytes // 10, HEADROOM_BYTES) * self.has_own_memory
+        """Memory that may be taken: a card keeps a tenth, 512 MiB or else a quarter, for screens and other programs."""
+        kept = max(self.memory_bytes // 10, min(HEADROOM_BYTES, self.memory_bytes // 4))
+        return self.memory_bytes - kept * self.has_own_memory
 
     @property
     def group_size(self) -> int:

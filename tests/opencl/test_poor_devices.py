@@ -138,6 +138,7 @@ def test_a_card_leaves_memory_to_screens_and_a_part_of_the_processor_does_not(de
     assert graphics(device, "a card", 40, 40, unified=False).usable_bytes == 36 << 30
     small = graphics(device, "a card", 4, 2, unified=False)
     assert small.usable_bytes == (2 << 30) - (512 << 20)
+    assert graphics(device, "a tiny card", 1, 1, unified=False).usable_bytes == 3 << 28
     assert memory_limits(small, 2 << 30).total_bytes == small.usable_bytes
     assert graphics(device, "a part", 96, 32, unified=True).usable_bytes == 32 << 30
     assert device.usable_bytes == device.memory_bytes
