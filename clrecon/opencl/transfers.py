@@ -56,12 +56,13 @@ class _Piece:
         self.memory, _ = cl.enqueue_map_buffer(device.queue, self.buffer, mode, 0, (PIECE_BYTES,), np.uint8)
         self.command: Command | None = None
         self.copying: Future[None] | None = None
+        self.is_taken = False  # its contents are still to be sent, or to be copied out
 
     @property
     def is_free(self) -> bool:
         """True where `free` would not wait."""
         is_copied = self.copying is None or self.copying.done()
-        return is_copied and (self.command is None or not self.command.is_running)
+        return is_copied and not self.is_taken and (self.command is None or not self.command.is_running)
 
     def free(self, device: Device) -> _Piece:
         """Wait until nothing uses the piece, and return it."""
@@ -87,7 +88,9 @@ class PinnedPieces:
             self._pieces.rotate(-1)
         else:
             self._pieces.append(_Piece(self._device))
-        return self._pieces[-1].free(self._device)
+        piece = self._pieces[-1].free(self._device)
+        piece.is_taken = True
+        return piece
 
     def finish(self) -> None:
         """Wait until nothing uses any of them."""
@@ -127,6 +130,7 @@ def write_buffer(device: Device, array: NDArray[Any], array_d: Any) -> None:
                 queue, raw(array_d), piece.memory[: end - start], dst_offset=start, is_blocking=False
             )
             piece.command = device.commands.add(what, event, queue, array_d, piece)
+        piece.is_taken = False
         queue.flush()
 
     with pinned.lock:
@@ -153,6 +157,7 @@ def read_buffers(device: Device, wanted: Sequence[tuple[NDArray[Any], Any, int]]
         assert piece.command is not None
         wait_for(device, piece.command)
         piece.copying = _threads().submit(np.copyto, target, piece.memory[: target.nbytes])
+        piece.is_taken = False
 
     with pinned.lock:
         for array, array_d, offset in wanted:

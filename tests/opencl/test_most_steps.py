@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from clrecon.opencl import allocate, download
+from clrecon.opencl.buffers import raw
 from clrecon.opencl.quirks import import_pyopencl
 
 SOURCE = """
@@ -23,9 +24,9 @@ def count_steps(device, steps):
     """Return how often a work-item of count_steps goes round, for odd and even steps together."""
     cl = import_pyopencl()
     counts_d = allocate(device, 8)
-    cl.enqueue_copy(device.queue, counts_d, np.array([0, 0], np.uint32))
+    cl.enqueue_copy(device.queue, raw(counts_d), np.array([0, 0], np.uint32))
     kernel = cl.Program(device.context, SOURCE).build().count_steps
-    kernel(device.queue, (1,), (1,), counts_d, np.uint32(steps))
+    kernel(device.queue, (1,), (1,), raw(counts_d), np.uint32(steps))
     return 2 * int(download(device, np.empty(2, np.uint32), counts_d)[1])
 
 

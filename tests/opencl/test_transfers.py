@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import clrecon
-from clrecon.opencl import allocate, buffers, copy_buffer, download, download_all, upload
+from clrecon.opencl import allocate, buffers, copy_buffer, download, download_all, transfers, upload
 from clrecon.opencl.quirks import import_pyopencl
-from clrecon.opencl.transfers import LEAST_BYTES, PIECE_BYTES, PIECES
+from clrecon.opencl.transfers import LEAST_BYTES, PIECE_BYTES, PIECES, PinnedPieces
 from clrecon.proof.calls import counting_calls
 from clrecon.rendering.pictures.styles import VolumeLook
 
@@ -67,6 +67,57 @@ def test_several_arrays_are_read_at_once(apart):
     assert counts["blocking reads"] == 1
     for (read, _, _), array in zip(wanted, arrays, strict=True):
         assert np.array_equal(read, array)
+
+
+@pytest.mark.parametrize("count", [2, 5, 20])
+def test_a_piece_is_used_again_only_when_it_was_emptied(apart, monkeypatch, count):
+    """Each transfer ends before the next one begins, and copying out begins late: what is in a piece has to stay."""
+    cl = import_pyopencl()
+    arrays = [numbers(LEAST_BYTES + 7 * n, n) for n in range(count)]
+    there = [upload(apart, array) for array in arrays]
+    copy = cl.enqueue_copy
+
+    def copy_and_wait(*arguments, **options):
+        event = copy(*arguments, **options)
+        event.wait()
+        return event
+
+    monkeypatch.setattr(cl, "enqueue_copy", copy_and_wait)
+    apart.of_context(PinnedPieces)._pieces.clear()
+    wanted = [(np.empty_like(array), array_d, 0) for array, array_d in zip(arrays, there, strict=True)]
+    download_all(apart, *wanted)
+    for (read, _, _), array in zip(wanted, arrays, strict=True):
+        assert np.array_equal(read, array)
+
+
+def test_a_piece_that_is_filled_stays_until_it_is_sent(apart, monkeypatch):
+    """Threads end as soon as nobody looks: a piece that is full is not filled again before it is sent."""
+
+    class Hidden:
+        """A copy that has ended, which is seen at every other look alone."""
+
+        def __init__(self):
+            self.looks = 0
+
+        def done(self):
+            self.looks += 1
+            return self.looks % 2 == 0
+
+        def result(self):
+            return None
+
+    class Now:
+        """Copies at once."""
+
+        def submit(self, copy, *arguments):
+            copy(*arguments)
+            return Hidden()
+
+    monkeypatch.setattr(transfers, "_threads", Now)
+    apart.of_context(PinnedPieces)._pieces.clear()
+    array = numbers(9 * PIECE_BYTES + 5)
+    array_d = upload(apart, array)
+    assert np.array_equal(download(apart, np.empty_like(array), array_d), array)
 
 
 def test_threads_share_the_pieces_and_the_pool(apart):

@@ -9,6 +9,7 @@ from tolerances import TWIN_FIELD_MM
 
 from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.opencl import memory_limits, upload
+from clrecon.opencl.buffers import raw
 from clrecon.operators.points.field import MOST_NODES, FieldSettings, Masks, NodeField, decide_signs, plan_nodes
 from clrecon.operators.points.grid import plan_grid
 from clrecon.points import PointCloud
@@ -122,7 +123,7 @@ def put_masks(device, *arrays):
 def write(device, to_d, from_d, size):
     import pyopencl
 
-    pyopencl.enqueue_copy(device.queue, to_d, from_d, byte_count=size).wait()
+    pyopencl.enqueue_copy(device.queue, raw(to_d), raw(from_d), byte_count=size).wait()
 
 
 def test_slabs_give_the_same_field_bit_for_bit(device):

@@ -13,6 +13,7 @@ from variants import each_value
 
 from clrecon.geometry import Volume
 from clrecon.opencl.arrays import download, empty_output, upload
+from clrecon.opencl.buffers import raw
 from clrecon.opencl.sources import read_kernel_source
 from clrecon.operators.rays import ray_pictures
 from clrecon.operators.resident import device_volume as resident
@@ -52,7 +53,7 @@ def build_checks(device):
 
 def makes_windows(device) -> bool:
     found, found_d = empty_output(device, (1,), np.int32)
-    build_checks(device).has_windows(device.queue, (1,), None, found_d)
+    build_checks(device).has_windows(device.queue, (1,), None, raw(found_d))
     return bool(download(device, found, found_d)[0])
 
 
@@ -72,8 +73,8 @@ def test_compilers_for_avx2_make_windows(device):
     source = "__kernel void has_avx2(__global int *found) {\n#ifdef __AVX2__\nfound[0] = 1;\n#endif\n}"
     found, found_d = empty_output(device, (1,), np.int32)
     found[0] = 0
-    pyopencl.enqueue_copy(device.queue, found_d, found)
-    pyopencl.Program(device.context, source).build().has_avx2(device.queue, (1,), None, found_d)
+    pyopencl.enqueue_copy(device.queue, raw(found_d), found)
+    pyopencl.Program(device.context, source).build().has_avx2(device.queue, (1,), None, raw(found_d))
     assert makes_windows(device) == bool(download(device, found, found_d)[0])
 
 
@@ -85,8 +86,9 @@ def test_a_window_shows_every_pair_of_its_row(windows):
     part = rng.random(at.shape).astype(np.float32)
     part[0], part[1] = 0.0, np.nextafter(np.float32(1.0), np.float32(0.0))
     values, values_d = empty_output(windows, at.shape, np.float32)
-    arrays_d = [upload(windows, array) for array in (row, at, part)]
-    build_checks(windows).look_at_rows(windows.queue, (len(at),), None, *arrays_d, values_d)
+    kept = [upload(windows, array) for array in (row, at, part)]
+    arrays_d = [raw(lent) for lent in kept]
+    build_checks(windows).look_at_rows(windows.queue, (len(at),), None, *arrays_d, raw(values_d))
     low, high = row[at].astype(np.float64), row[at + 1].astype(np.float64)
     error = np.abs(download(windows, values, values_d) - (low + part * (high - low)))
     assert (error <= tolerances.WINDOW_SHARE * np.abs(high - low) + 0.01).all()
