@@ -11,7 +11,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 94_760,
+    "lines": 94_770,
     "modules": 414,
     "small_modules_with_one_reader": 12,
     "docstrings_with_raises": 124,
