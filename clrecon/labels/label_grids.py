@@ -17,7 +17,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import escape
 
 import numpy as np
 from numpy.typing import NDArray
@@ -264,7 +263,7 @@ def encode_nifti(labels: LabelMap, *, packed: bool) -> bytes:
     image = nibabel.Nifti1Image(np.asarray(labels.voxels).transpose(2, 1, 0), None)
     place_in_header(image.header, labels.affine)
     table = "".join(
-        f'<Label Key="{number}" Red="1" Green="1" Blue="1" Alpha="1">{escape(name)}</Label>'
+        f'<Label Key="{number}" Red="1" Green="1" Blue="1" Alpha="1">{html.escape(name, quote=False)}</Label>'
         for number, name in labels.names.items()
     )
     text = f'<?xml version="1.0" encoding="UTF-8"?><CaretExtension><VolumeInformation Index="0"><LabelTable>{table}'
