@@ -2,8 +2,8 @@
 
     python scripts/gpu_check.py [--device NAME] [--reference NAME] [--out gpu-check.json]
 
-It needs numpy, pyopencl and pydicom, and a CPU device such as PoCL to compare with.  Each step runs in a process of its
-own with a limit of time, and the next one goes on whatever became of it:
+It needs numpy, scipy, pyopencl and pydicom, and a CPU device such as PoCL to compare with.  Each step runs in a process
+of its own with a limit of time, and the next one goes on whatever became of it:
 
 - devices: what the drivers say of themselves;
 - results: surfaces, clouds, clusters and pictures, byte for byte against the CPU device;
@@ -41,26 +41,29 @@ RUNS = 7
 LIMITS = {"devices": 60, "results": 120, "times": 200, "copies": 60, "selftest": 300}
 """Seconds that a step may take."""
 
+MOST_SECONDS = 360
+"""Seconds of all steps together: those that are left then have one second each."""
+
+VOLUME = "volume.npz"
+"""File beside the JSON of a step, made once for all of them."""
 
 Keep = Callable[[dict[str, Any]], object]
 """Writes what a step has so far: its process may be ended."""
 
 
-def make_volume(slices: int) -> Any:
+def make_volume(folder: Path, slices: int) -> Any:
     """Make a spine, 512 x 512 in each slice; more than 149 slices are the same ones mirrored."""
     import numpy as np
 
     from clrecon import Volume
     from clrecon.proof.phantom import PhantomSettings, make_phantom
 
-    kept = Path(tempfile.gettempdir()) / f"clrecon-gpu-check-{os.getuid() if hasattr(os, 'getuid') else 0}.npz"
-    try:
-        with np.load(kept) as arrays:
-            voxels, affine = arrays["voxels"], arrays["affine"]
-    except (OSError, ValueError, KeyError):
+    if not (folder / VOLUME).exists():
         settings = PhantomSettings(kind="spine", size=(512, 512), slices=149, spacing=(0.7, 0.7, 1.0))
         voxels, affine, _ = make_phantom(settings)
-        np.savez(kept, voxels=voxels, affine=affine)
+        np.savez(folder / VOLUME, voxels=voxels, affine=affine)
+    with np.load(folder / VOLUME) as arrays:
+        voxels, affine = arrays["voxels"], arrays["affine"]
     repeats = -(-slices // len(voxels))
     turned = [voxels if n % 2 == 0 else voxels[::-1] for n in range(repeats)]
     return Volume(np.concatenate(turned)[:slices], affine)
@@ -69,14 +72,13 @@ def make_volume(slices: int) -> Any:
 # --- what is compared -------------------------------------------------------------------------------------------------
 
 
-def results(device: Any) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+def results(device: Any, volume: Any) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
     """Yield the name of each result that two devices are compared in, and a function that makes its arrays."""
     import numpy as np
 
     import clrecon
     from clrecon.rendering.pictures.styles import Projection, SurfaceLook, VolumeLook
 
-    volume = make_volume(60)
     band = {"hu": (LEVEL, None), "device": device}
 
     def surface(level: Any = LEVEL, **options: Any) -> dict[str, Any]:
@@ -134,7 +136,7 @@ def step_results(device: Any, folder: Path, keep: Keep) -> dict[str, Any]:
     import numpy as np
 
     told: dict[str, Any] = {}
-    for name, make in results(device):
+    for name, make in results(device, make_volume(folder.parent, 60)):
         start = time.perf_counter()
         try:
             made = {key: np.ascontiguousarray(value) for key, value in make().items() if value is not None}
@@ -155,10 +157,11 @@ def compare(ours: dict[str, Any], theirs: dict[str, Any], folders: tuple[Path, P
     import numpy as np
 
     told: dict[str, Any] = {}
-    for name, one in ours.items():
-        other = theirs.get(name)
-        if "sha256" not in one or other is None:
-            told[name] = one.get("error", "missing on the other device")
+    names = [name for name, each in {**ours, **theirs}.items() if isinstance(each, dict)]
+    for name in names:
+        one, other = ours.get(name, {}), theirs.get(name, {})
+        if "sha256" not in one or "sha256" not in other:
+            told[name] = one.get("error") or other.get("error") or "not reached on one of the devices"
         elif one["sha256"] == other["sha256"]:
             told[name] = "equal"
         else:
@@ -219,13 +222,13 @@ def turning(renderer: Any, style: Any, size: int) -> Callable[[], Any]:
     return lambda: renderer.render(style, view=(next(angles), 10), size=(size, size))
 
 
-def step_times(device: Any, slices: int, keep: Keep) -> dict[str, Any]:
+def step_times(device: Any, folder: Path, slices: int, keep: Keep) -> dict[str, Any]:
     """Time surfaces, pictures and clouds."""
     import clrecon
     from clrecon.operators.resident.device_volume import DeviceVolume
     from clrecon.rendering.pictures.styles import Projection, SurfaceLook, VolumeLook
 
-    volume = make_volume(slices)
+    volume = make_volume(folder, slices)
     told: dict[str, Any] = {"voxels": list(volume.shape_ijk)}
 
     def attempt(name: str, run: Callable[[], Any], runs: int = RUNS) -> None:
@@ -253,7 +256,7 @@ def step_times(device: Any, slices: int, keep: Keep) -> dict[str, Any]:
         attempt("cloud of voxels", lambda: clrecon.extract_points(resident, hu=(LEVEL, None)), 3)
         attempt("cloud of a shell", lambda: clrecon.extract_points(resident, kind="shell", hu=(LEVEL, None)), 3)
         attempt("clusters of voxels", lambda: clrecon.cluster_points(resident, hu=(LEVEL, None)), 3)
-    part = make_volume(149)
+    part = make_volume(folder, 149)
     attempt("bilateral filter, 149 slices", lambda: clrecon.filter_bilateral(part, device=device), 2)
     attempt("decimation to a half", lambda: clrecon.decimate_mesh(mesh, 0.5, device=device), 1)
     return told
@@ -388,40 +391,28 @@ def work(step: str, name: str, out: Path, slices: int) -> None:
         out.with_suffix("").mkdir()
         keep(step_results(device, out.with_suffix(""), keep))
     elif step == "times":
-        keep(step_times(device, slices, keep))
+        keep(step_times(device, out.parent, slices, keep))
     else:
         keep({"devices": step_devices, "copies": step_copies, "selftest": step_selftest}[step](device))
 
 
 def start(step: str, name: str, out: Path, slices: int) -> subprocess.Popen[bytes]:
     """Start a process for a step; what it prints goes beside its JSON."""
-    command = [
-        sys.executable,
-        "-X",
-        "faulthandler",
-        __file__,
-        "--step",
-        step,
-        "--device",
-        name,
-        "--out",
-        str(out),
-        "--slices",
-        str(slices),
-    ]
+    options = [f"--step={step}", f"--device={name}", f"--out={out}", f"--slices={slices}"]
+    command = [sys.executable, "-X", "faulthandler", __file__, *options]
     with open(out.with_suffix(".log"), "wb") as log:
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
 
 
-def finish(process: subprocess.Popen[bytes], step: str, out: Path, since: float) -> dict[str, Any]:
+def finish(process: subprocess.Popen[bytes], out: Path, since: float, limit: float) -> dict[str, Any]:
     """Wait for a step, and return its JSON or what became of it."""
     how = ""
     try:
-        process.wait(max(1.0, since + LIMITS[step] - time.perf_counter()))
+        process.wait(limit)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-        how = f"not done within {LIMITS[step]} s"
+        how = f"not done within {limit:.0f} s"
     told: dict[str, Any]
     try:
         told = json.loads(out.read_text())
@@ -443,19 +434,18 @@ def check(device: str, reference: str, slices: int) -> dict[str, Any]:
 
         def run(step: str, name: str, key: str) -> dict[str, Any]:
             out, since = folder / f"{len(steps)}.json", time.perf_counter()
-            steps[key] = finish(start(step, name, out, slices), step, out, since)
+            limit = max(1.0, min(LIMITS[step], begin + MOST_SECONDS - since))
+            steps[key] = finish(start(step, name, out, slices), out, since, limit)
             print(f"{time.perf_counter() - begin:6.1f} s  {key}: {steps[key].get('error', 'done')}", flush=True)
             return {**steps[key], "folder": out.with_suffix("")}
 
         run("devices", device, "device")
         run("devices", reference, "reference")
-        make_volume(1)
+        make_volume(folder, 1)
         run("copies", device, "copies")
         run("times", device, "times")
         ours, theirs = run("results", device, "results"), run("results", reference, "results of the reference")
-        known = {key: {name: each for name, each in made.items() if isinstance(each, dict)} for key, made in
-                 (("ours", ours), ("theirs", theirs))}  # fmt: skip
-        told["comparison"] = compare(known["ours"], known["theirs"], (ours["folder"], theirs["folder"]))
+        told["comparison"] = compare(ours, theirs, (ours["folder"], theirs["folder"]))
         run("selftest", device, "selftest")
         run("times", reference, "times of the reference")
     told["seconds"] = round(time.perf_counter() - begin, 1)

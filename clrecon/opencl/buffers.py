@@ -78,6 +78,7 @@ class BufferPool:
 
 
 def ask_driver(device: Device, flags: Any, size: int, host: NDArray[Any] | None) -> Any:
+    """Return a new buffer: of a size, or with or in the memory of a host array."""
     cl = import_pyopencl()
     return cl.Buffer(device.context, flags, 0 if host is not None else size, hostbuf=host)
 

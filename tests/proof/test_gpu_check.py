@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,11 +28,17 @@ def test_results_are_equal_or_differ_by_numbers(script, tmp_path):
         folder.mkdir()
         np.savez(folder / "0.npz", points=np.array([0.0, number, np.nan]), hu=np.zeros(2))
     ours = {"cloud": {"sha256": "a", "file": "0.npz"}, "slice": {"sha256": "b"}, "mesh": {"error": "no room"}}
-    theirs = {"cloud": {"sha256": "c", "file": "0.npz"}, "slice": {"sha256": "b"}, "mesh": {"sha256": "d"}}
+    theirs: dict[str, Any] = {
+        "cloud": {"sha256": "c", "file": "0.npz"},
+        "slice": {"sha256": "b"},
+        "mesh": {"sha256": "d"},
+    }
+    theirs |= {"normals": {"sha256": "e"}, "device": "a name", "folder": folders[1]}
     assert script.compare(ours, theirs, folders) == {
         "cloud": {"points": "1 of 3 differ, by at most 0.5", "hu": "equal"},
         "slice": "equal",
         "mesh": "no room",
+        "normals": "not reached on one of the devices",
     }
 
 
