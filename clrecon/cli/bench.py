@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_device, add_no_clobber, table
+from clrecon.cli.common import add_device, add_no_clobber, add_report, table
 from clrecon.cli.console import Console, printable
 from clrecon.system.text import format_digits
 
@@ -26,12 +26,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("input", metavar="INPUT", nargs="?", help="DICOM folder or file (default: a made-up spine)")
     parser.add_argument("--hu", type=float, metavar="N", help="iso value in HU (default: the preset bone)", first=True)
     parser.add_argument("--series", metavar="S", help='number or hash of the series, see "clrecon info"')
-    add_device(parser)
+    add_device(parser, memory=False)
     parser.add_argument(
         "--runs", type=int, default=_RUNS, metavar="N", help=f"timed pairs (default: {_RUNS})", first=True
     )
-    parser.add_argument("--report", metavar="FILE", help="write the figures as JSON", first=True)
-    add_no_clobber(parser)
+    add_report(parser, "the figures")
+    add_no_clobber(parser, with_ids=False)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:

@@ -4,61 +4,30 @@ from __future__ import annotations
 
 import argparse
 import math
-from dataclasses import fields
 from typing import Any
 
 from clrecon.cli.common import (
+    GRID_FILE,
+    SCAN_FOLDER,
     add_cropping,
     add_device,
-    add_keep_ids,
+    add_fields,
+    add_input,
     add_masking,
-    add_memory,
     add_no_clobber,
+    add_output,
     add_reading,
+    add_report,
     describe_times,
+    make_settings,
     megabytes,
-    parse_point,
-    pick,
+    show_report,
 )
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
-from clrecon.jobs.cloud.settings import DENOISERS, GHOSTS, POINT_KINDS, STEPS, CloudSettings
+from clrecon.jobs.cloud.settings import STEPS, CloudSettings, Clustering
 from clrecon.jobs.inputs import CLOUD_INPUTS
 from clrecon.system.text import count_of, format_band
-
-
-def parse_level(text: str) -> float | tuple[float, ...]:
-    """Read ``N`` as an iso value, and ``LO,HI`` or ``LO:HI`` as a band of HU."""
-    try:
-        numbers = tuple(float(part) for part in text.replace(":", ",").split(","))
-    except ValueError:
-        numbers = ()
-    if len(numbers) not in (1, 2):
-        raise argparse.ArgumentTypeError(f"{text!r} is no iso value N and no band LO,HI of HU")
-    return numbers[0] if len(numbers) == 1 else numbers
-
-
-def parse_clusters(text: str) -> dict[str, Any]:
-    """Read ``eps=MM,min=N`` (either may be missing) as parameters of `clrecon.jobs.cloud.settings.Clustering`."""
-    known = {"eps": "eps", "min": "min_samples"}
-    found: dict[str, Any] = {}
-    for part in text.split(","):
-        name, equals, value = (word.strip() for word in part.partition("="))
-        if not equals or name not in known or known[name] in found:
-            raise argparse.ArgumentTypeError(f"{text!r} is not eps=MM,min=N, such as eps=1.2,min=6")
-        try:
-            found[known[name]] = (
-                value if value == "plane+1" and name == "min" else (float if name == "eps" else int)(value)
-            )
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"{text!r}: {name} is no number: {value!r}") from None
-    return found
-
-
-def parse_denoisers(text: str) -> tuple[str, ...]:
-    """Read names with commas between them; what is not known is refused with the settings."""
-    return tuple(part.strip().lower() for part in text.split(","))
-
 
 _EXAMPLES = """\
 examples:
@@ -89,36 +58,20 @@ def _epilog() -> str:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = _epilog()
-    parser.add_argument(
-        "input",
-        metavar="INPUT",
-        help="DICOM folder (subfolders and any file names are fine) or file; a NIfTI, NRRD or MetaImage file; or a"
-        f" cloud of points ({', '.join(CLOUD_INPUTS)})",
-    )
-    parser.add_argument(
-        "-o", "--output", metavar="OUT", required=True, help="cloud file: .ply .vtp .npz .xyz or .las", first=True
-    )
-    parser.add_argument(
-        "--space",
-        type=str.lower,
-        default="lps",
-        metavar="lps|ras",
-        help="patient frame of the written files and of seeds (default: lps)",
-    )
-    parser.add_argument(
-        "--input-space",
-        type=str.lower,
-        metavar="lps|ras",
-        help="patient frame of a cloud file that does not say its own (default: lps)",
-    )
+    kinds = ", ".join(CLOUD_INPUTS)
+    add_input(parser, f"{SCAN_FOLDER}; {GRID_FILE}; or a cloud of points ({kinds})")
+    add_output(parser, "cloud file: .ply .vtp .npz .xyz or .las")
+    add_fields(parser, CloudSettings)
     add_reading(parser)
     add_masking(parser)
     add_cropping(parser)
-    _add_points(parser)
-    _add_steps(parser)
-    device = parser.add_argument_group("device")
-    add_device(device)
-    add_memory(device)
+    add_fields(parser.add_argument_group("points"), CloudSettings, "points")
+    steps = parser.add_argument_group("steps")
+    add_fields(steps, CloudSettings, "steps")
+    steps.add_argument(
+        "--surface", metavar="FILE", help="write a closed mesh around the points too, which need normals for it"
+    )
+    add_device(parser.add_argument_group("device"))
     checks = parser.add_argument_group("files and checks")
     checks.add_argument(
         "--removed",
@@ -126,139 +79,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write the points before any of them went, each with the number of the reason why it went as label (0:"
         " kept)",
     )
-    checks.add_argument(
-        "--allow-point-loss",
-        action="store_true",
-        help="go on where a step that should take noise alone takes more than half of the points, which else is"
-        " refused",
-    )
+    add_fields(checks, CloudSettings, "checks")
     add_no_clobber(checks)
-    add_keep_ids(checks)
-    checks.add_argument(
-        "--report", metavar="FILE", help="write the figures of each step, device and times as JSON", first=True
-    )
-
-
-def _add_points(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("points")
-    group.add_argument(
-        "--points",
-        type=str.lower,
-        metavar="|".join(POINT_KINDS),
-        help="surface: where the HU cross the iso value, between the voxels; voxels: the centres of those within;"
-        " shell: of these the outer ones (default: surface, with a band voxels)",
-        first=True,
-    )
-    group.add_argument(
-        "--hu",
-        type=parse_level,
-        metavar="N|LO,HI",
-        help="iso value, inside is N and above; or a band, both ends included (default: that of bone)",
-        first=True,
-    )
-    group.add_argument(
-        "--labels",
-        metavar="FILE|FOLDER",
-        help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
-        first=True,
-    )
-    group.add_argument("--label", metavar="NAME|N", help="points of this label only (default: of all)")
-    group.add_argument(
-        "--paper",
-        action="store_true",
-        help="place and filter voxels as the papers print it, and say by how much that is wrong",
-    )
-
-
-def _add_steps(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("steps")
-    group.add_argument(
-        "--ghost-slices",
-        type=str.lower,
-        default=GHOSTS[0],
-        metavar="|".join(GHOSTS),
-        help="slices inside the stack that are unlike both neighbours, as screen captures and localizers are: drop"
-        f" takes their points away, keep warns of them (default: {GHOSTS[0]})",
-    )
-    group.add_argument(
-        "--cluster",
-        dest="clusters",
-        type=parse_clusters,
-        nargs="?",
-        const={},
-        metavar="eps=MM,min=N",
-        help="density clusters (DBSCAN) without noise: neighbours are within eps, and a core point has min of them,"
-        " itself included; min=plane+1 makes noise of lone slices (default: 1.5 times the largest voxel step, 6)",
-        first=True,
-    )
-    group.add_argument(
-        "--keep",
-        metavar="RULE",
-        action="append",
-        default=[],
-        help="clusters that stay: largest, largest:N, min:POINTS, seed:X,Y,Z (the nearest), no-sheets (tables and image"
-        " planes go); may be given again",
-        first=True,
-    )
-    group.add_argument(
-        "--outliers",
-        type=float,
-        nargs="?",
-        const=2.0,
-        metavar="SD",
-        help="points go whose mean distance to 16 neighbours is SD standard deviations over the mean (without a number:"
-        " 2)",
-    )
-    group.add_argument(
-        "--denoise",
-        type=parse_denoisers,
-        default=(),
-        metavar=",".join(DENOISERS),
-        help="grid: points alone in a cell of a grid go; bilateral: points move along their normals to the weighted"
-        " mean height of their neighbours, edges stay",
-        first=True,
-    )
-    group.add_argument(
-        "--normals",
-        action="store_true",
-        help="unit normals that point out of bone; points of a surface have those of the scan until they are moved",
-        first=True,
-    )
-    group.add_argument(
-        "--viewpoint",
-        type=parse_point,
-        metavar="X,Y,Z",
-        help="a point inside of the object, mm in the frame of --space: normals of a cloud that was read point away"
-        " from it (a scan turns its own by HU)",
-    )
-    group.add_argument("--spacing", type=float, metavar="MM", help="keep one point for each cell of that size")
-    group.add_argument(
-        "--surface", metavar="FILE", help="write a closed mesh around the points too, which need normals for it"
-    )
+    add_report(checks, "the figures of each step, device and times")
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
     from clrecon.jobs.cloud.job import CloudFiles, make_cloud
-    from clrecon.jobs.cloud.settings import Clustering
 
-    given = pick(options, {own.name for own in fields(CloudSettings)})
     clusters = None if options.clusters is None else Clustering(**options.clusters)
-    settings = CloudSettings(**{**given, "clusters": clusters, "keep": tuple(options.keep)})
+    settings = make_settings(CloudSettings, options, clusters=clusters)
     files = CloudFiles(options.output, options.removed, options.surface, options.report)
     report = make_cloud(options.input, files, settings, no_clobber=options.no_clobber, progress=console.progress)
-    console.result(report)
-    for line in describe_cloud_job(report):
-        console.say(line)
-    paths = {"cloud": options.output, "removed": options.removed, "surface": options.surface}
-    for entry in report["outputs"]:
-        console.say(
-            f"wrote    {printable(paths[entry['what']])}, {megabytes(entry['bytes'])}, {report['space'].upper()} mm"
-        )
-    if options.report:
-        console.say(f"report   {printable(options.report)}")
-    for warning in report["warnings"]:
-        console.warn(warning)
+    paths, space = {"cloud": options.output, "removed": options.removed, "surface": options.surface}, report["space"]
+    written = [
+        f"wrote    {printable(paths[entry['what']])}, {megabytes(entry['bytes'])}, {space.upper()} mm"
+        for entry in report["outputs"]
+    ]
+    show_report(report, describe_cloud_job(report) + written, options, console)
     return 0
 
 

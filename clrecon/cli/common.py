@@ -8,17 +8,20 @@ import re
 import sys
 import textwrap
 import traceback
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Any, NoReturn, cast
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields
+from typing import Any, NoReturn, TypeVar, cast
 
-from clrecon.cli.console import STREAMED, Console, fit_help
+from clrecon.cli.console import STREAMED, Console, fit_help, printable
 from clrecon.errors import ClreconError, OutputError, UsageError
-from clrecon.jobs.options import InputSettings
+from clrecon.jobs.options import DeviceSettings, InputSettings, ScanSettings
 from clrecon.system.options import options_of
 from clrecon.system.progress import DEFAULT_SECONDS, check_time_limit
 from clrecon.system.text import guess_word
 
 INTERRUPTED = 130
+
+Settings = TypeVar("Settings")
 
 _LONG_WORD = re.compile(r"[^\s/\\]{300,}")
 
@@ -49,13 +52,15 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
 class Parser(argparse.ArgumentParser):
     """An argparse parser whose errors are `UsageError`: one line, exit code 3.
 
-    Options declared with ``first=True`` are those that most people need: ``-h`` shows these alone.
+    Options declared with ``first=True`` are those that most people need: ``-h`` shows these alone.  With ``words`` a
+    shell completes the value.
     """
 
     def __init__(self, **options: object):
         options.setdefault("formatter_class", _Formatter)
         super().__init__(allow_abbrev=False, **options)  # type: ignore[arg-type]
-        for kind in (None, "store_true", "store_false", "append", argparse.BooleanOptionalAction):
+        self.register("action", "yes-no", argparse.BooleanOptionalAction)
+        for kind in (None, "store_true", "store_false", "append", "yes-no"):
             self.register("action", kind, _make_markable(self._registry_get("action", kind, kind)))
 
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
@@ -94,15 +99,19 @@ class Parser(argparse.ArgumentParser):
         return super()._get_values(action, arg_strings)
 
     def _get_value(self, action: argparse.Action, arg_string: str) -> Any:  # type: ignore[override]
-        """Read a value; what is no number is said in words, with the unit that must not stand there."""
-        if action.type not in (int, float):
-            return super()._get_value(action, arg_string)
+        """Read a value; a ValueError is the refusal.  What is no number is said with the unit that must not follow."""
+        read: Any = action.type or str
         try:
-            return action.type(arg_string)  # type: ignore[operator]
-        except ValueError:
-            number = "whole number" if action.type is int else "number"
-            unit = ": write the length in mm, without a unit" if action.metavar == "MM" else ""
-            raise argparse.ArgumentError(action, f"{arg_string!r:.80} is no {number}{unit}") from None
+            return read(arg_string)
+        except UsageError:  # it says all by itself
+            raise
+        except ValueError as error:
+            text = str(error)
+            if read in (int, float):
+                number = "whole number" if read is int else "number"
+                unit = ": write the length in mm, without a unit" if action.metavar == "MM" else ""
+                text = f"{arg_string!r:.80} is no {number}{unit}"
+            raise argparse.ArgumentError(action, text) from None
 
     def format_help(self) -> str:
         """Return the help text; where all options do not fit one screen, those that most people need."""
@@ -132,11 +141,11 @@ class Parser(argparse.ArgumentParser):
 
 
 def _make_markable(kind: Any) -> Callable[..., argparse.Action]:
-    """Return the maker of a kind of action that takes `first` too: an option that most people need."""
+    """Return the maker of a kind of action that takes `first` too: an option that most people need, and its `words`."""
 
-    def make(*given: Any, first: bool = False, **how: Any) -> argparse.Action:
+    def make(*given: Any, first: bool = False, words: Iterable[str] = (), **how: Any) -> argparse.Action:
         action: Any = kind(*given, **how)
-        action.is_first = first
+        action.is_first, action.words = first, words
         return cast("argparse.Action", action)
 
     return make
@@ -205,8 +214,9 @@ def add_common(parser: argparse.ArgumentParser) -> None:
     streams = [option for option in ("-o", "--report") if option in parser._option_string_actions]
     if "-o" in streams and parser.prog.split()[-1] not in STREAMED:
         streams.remove("-o")
-    told = f"{' and '.join(f'{option} -' for option in streams)} write{'s' * (len(streams) == 1)} to standard output"
-    group = parser.add_argument_group("output", told if streams else None)
+    names = " and ".join(f"{option} -" for option in streams)
+    writes = f"{names} write{'s' * (len(streams) == 1)} to standard output"
+    group = parser.add_argument_group("output", writes if streams else None)
     group.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
     loudness = group.add_mutually_exclusive_group()
     loudness.add_argument("-q", "--quiet", action="store_true", help="print errors only")
@@ -214,71 +224,74 @@ def add_common(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--debug", action="store_true", help="print the traceback of an error")
 
 
-def pick(options: argparse.Namespace, names: Collection[str]) -> dict[str, Any]:
-    """Pick the options with the given names, which are those of settings."""
-    return {name: value for name, value in vars(options).items() if name in names}
+def pick(options: argparse.Namespace, settings: type) -> dict[str, Any]:
+    """Pick the options that are fields of settings and that are given; those that may be given again make a tuple."""
+    given = {own.name: getattr(options, own.name, None) for own in fields(settings)}
+    return {
+        name: tuple(value) if isinstance(value, list) else value for name, value in given.items() if value is not None
+    }
 
 
-def add_fields(container: argparse._ActionsContainer, settings: type, group: str) -> None:
-    """Add the options of a group that are fields of settings."""
-    for name, default, own in options_of(settings, group):
-        how: dict[str, Any] = {"metavar": own.metavar, "default": default, "type": _as_argument(own.parse), **own.how}
-        if own.metavar is None:
-            how = {"action": "store_true", **own.how}
-        container.add_argument(own.flag, dest=name, help=own.help, first=own.first, **how)
+def make_settings(settings: type[Settings], options: argparse.Namespace, **more: Any) -> Settings:
+    """Make settings from the options that are their fields, and more fields, which win."""
+    return settings(**pick(options, settings) | more)
 
 
-def _as_argument(parse: Callable[[str], Any] | None) -> Callable[[str], Any] | None:
-    """Return a reader of a value whose ValueError is told in its own words, which argparse would replace."""
-    if parse in (None, int, float, str.lower):
-        return parse
+def make_part(part: type[Settings], options: argparse.Namespace, owner: str | None, needs: str) -> Settings | None:
+    """Make settings that mean nothing without one option; None where that has no value.
 
-    def read(text: str) -> Any:
-        assert parse is not None
-        try:
-            return parse(text)
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
-
-    return read
-
-
-def add_keep_ids(parser: argparse._ActionsContainer) -> None:
-    """Add --keep-ids."""
-    parser.add_argument(
-        "--keep-ids",
-        action="store_true",
-        help="write hashes of the UIDs of series and frame of reference into what is written and printed, by which"
-        " outputs of one scan are told; never the UIDs",
-    )
+    owner: The value of that option.
+    needs: What a refusal of the others says behind their names: what they are about, and which option they need.
+    """
+    if owner is not None:
+        return make_settings(part, options)
+    for own in options_of(part):
+        if getattr(options, own.name):
+            raise UsageError(f"{own.flag} {needs}")
+    return None
 
 
-def add_no_clobber(parser: argparse._ActionsContainer) -> None:
-    """Add --no-clobber."""
-    parser.add_argument(
+def add_fields(container: argparse._ActionsContainer, settings: type, *groups: str) -> None:
+    """Add the options of groups that are fields of settings; without a group those that have none."""
+    for group in groups or ("",):
+        for own in options_of(settings, group):
+            container.add_argument(own.flag, dest=own.name, **own.how)
+
+
+def add_output(parser: argparse._ActionsContainer, text: str, metavar: str = "OUT", required: bool = True) -> None:
+    """Add -o."""
+    parser.add_argument("-o", "--output", metavar=metavar, required=required, help=text, first=True)
+
+
+def add_report(container: argparse._ActionsContainer, what: str, first: bool = True) -> None:
+    """Add --report, which writes `what` as JSON."""
+    container.add_argument("--report", metavar="FILE", help=f"write {what} as JSON", first=first)
+
+
+def add_no_clobber(container: argparse._ActionsContainer, with_ids: bool = True) -> None:
+    """Add --no-clobber, and --keep-ids where something of a scan is written."""
+    container.add_argument(
         "--no-clobber",
         action="store_true",
         help="replace nothing: what exists of the files and folders to be written is an error, before any work",
     )
+    if with_ids:
+        add_fields(container, ScanSettings, "ids")
 
 
-def add_device(parser: argparse._ActionsContainer, computes: bool = True) -> None:
-    """Add --device, and --timeout where the command computes on it."""
-    parser.add_argument(
-        "--device",
-        metavar="D",
-        help='OpenCL device: an index of "clrecon devices", "cpu", "gpu" or a part of its name'
-        " (default: CLRECON_DEVICE, else the best)",
-        first=True,
-    )
+def add_device(container: argparse._ActionsContainer, computes: bool = True, memory: bool = True) -> None:
+    """Add --device, --timeout where the command computes on it, and --memory where that is limited."""
+    add_fields(container, DeviceSettings, "device")
     if computes:
-        parser.add_argument(
+        container.add_argument(
             "--timeout",
             type=_parse_seconds,
             metavar="SECONDS",
             help="give up (exit code 5) when the device has finished nothing for so long: a kernel has hung"
             f" (default: {DEFAULT_SECONDS:g}; 0: never)",
         )
+    if memory:
+        add_fields(container, DeviceSettings, "memory")
 
 
 def _parse_seconds(text: str) -> float:
@@ -286,71 +299,18 @@ def _parse_seconds(text: str) -> float:
     try:
         check_time_limit(float(text))
     except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of seconds from 0 on") from error
+        raise ValueError(f"{text!r} is no number of seconds from 0 on") from error
     return float(text)
 
 
-def add_memory(parser: argparse._ActionsContainer) -> None:
-    """Add --memory."""
-    add_fields(parser, InputSettings, "memory")
+GRID_FILE = "a NIfTI, NRRD or MetaImage file"
+SCAN_FOLDER = "DICOM folder (subfolders and any file names are fine) or file"
+SCAN = f"DICOM folder or file, or {GRID_FILE}"
 
 
-def parse_point(text: str) -> tuple[float, ...]:
-    """Read ``X,Y,Z``, three numbers in mm."""
-    try:
-        point = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        point = ()
-    if len(point) != 3:
-        raise argparse.ArgumentTypeError(f"{text!r} is no point: three numbers in mm with commas, X,Y,Z")
-    return point
-
-
-LEVELS_HELP = (
-    "iso value in HU, inside is N and above; A:B is a range, inside is from A to B; several with commas make one mesh"
-    " each;"
-    " auto: half way between bone and the tissue beside it, measured in the scan;"
-    " half:BONE,TISSUE: half way between these two"
-)
-_HALF = "half:"
-
-
-def parse_hu(text: str) -> dict[str, Any]:
-    """Read the value of ``--hu``: numbers, ranges, ``auto`` or ``half:BONE,TISSUE`` as entries of `MeshSettings`."""
-    if text == "auto":
-        return {"half_way": "auto"}
-    if not text.startswith(_HALF):
-        return {"iso_value": tuple(_parse_level(part, text) for part in text.split(","))}
-    materials = parse_levels(text.removeprefix(_HALF))
-    if len(materials) != 2:
-        raise argparse.ArgumentTypeError(f"{text!r} does not name two materials in HU, as half:1200,40 does")
-    return {"half_way": materials}
-
-
-def _parse_level(part: str, text: str) -> float | tuple[float, float]:
-    """Read a number, or the two ends of a range A:B."""
-    if ":" not in part:
-        return parse_levels(part, text)[0]
-    ends = part.split(":")
-    if len(ends) != 2 or not all(ends):
-        where = f" in {text!r}" if part != text else ""
-        raise argparse.ArgumentTypeError(
-            f"{part!r}{where} is no range A:B of two numbers of HU; from A on is --hu A, below B is --below B"
-        )
-    low, high = (parse_levels(end, text)[0] for end in ends)
-    return low, high
-
-
-def parse_levels(text: str, whole: str | None = None) -> tuple[float, ...]:
-    """Read one number, or several with commas between them; `whole` is the full text of which `text` is a part."""
-    levels = []
-    for part in text.split(","):
-        try:
-            levels.append(float(part))
-        except ValueError:
-            where = f" in {whole or text!r}" if part != (whole or text) else ""
-            raise argparse.ArgumentTypeError(f"{part!r}{where} is no number of HU") from None
-    return tuple(levels)
+def add_input(parser: argparse.ArgumentParser, text: str = SCAN, nargs: str | None = None) -> None:
+    """Add the input."""
+    parser.add_argument("input", metavar="INPUT", nargs=nargs, help=text)
 
 
 def add_reading(parser: argparse.ArgumentParser) -> None:
@@ -364,7 +324,7 @@ Surfaces end there as at the ends of a scan. Of several boxes, what is in all of
 
 
 def add_cropping(parser: argparse.ArgumentParser, frame: str = "of the frame of --space") -> None:
-    """Declare ``--clip-box``, ``--between`` and ``--around``.
+    """Add ``--clip-box``, ``--between`` and ``--around``.
 
     frame: The frame of the numbers, for the help.
     """
@@ -372,8 +332,21 @@ def add_cropping(parser: argparse.ArgumentParser, frame: str = "of the frame of 
 
 
 def add_masking(parser: argparse.ArgumentParser) -> None:
-    """Declare the options that turn parts of the scan into air or work on its voxels."""
+    """Add the options that turn parts of the scan into air or work on its voxels."""
     add_fields(parser.add_argument_group("masking"), InputSettings, "masking")
+
+
+def show_report(
+    report: dict[str, Any], lines: Iterable[str], options: argparse.Namespace, console: Console, *more: str
+) -> None:
+    """Print a report as JSON, its lines for people, more of what was written, and the warnings."""
+    console.result(report)
+    for line in (*lines, *more):
+        console.say(line)
+    if getattr(options, "report", None):
+        console.say(f"report   {printable(options.report)}")
+    for warning in report["warnings"]:
+        console.warn(warning)
 
 
 def guard(action: Callable[[], int], console: Console, debug: bool) -> int:

@@ -10,7 +10,6 @@ from importlib import import_module
 from clrecon.cli.common import Parser, add_common
 from clrecon.cli.console import Console
 from clrecon.errors import UsageError
-from clrecon.jobs.presets import list_words
 from clrecon.system.text import guess_word
 
 SHELLS = ("bash", "zsh", "fish")
@@ -76,31 +75,28 @@ def _survey() -> dict[str, _Words]:
         parser = Parser(prog=name)
         import_module(command.module).add_arguments(parser)
         add_common(parser)
-        found[name] = _Words(
-            command.help, [_describe(name, action) for action in parser._actions if action.option_strings]
-        )
+        found[name] = _Words(command.help, [_describe(action) for action in parser._actions if action.option_strings])
     found["completion"].first = list(SHELLS)
     found[HELP] = _Words("show all options of a command", first=list(COMMANDS))
     return found
 
 
-def _describe(command: str, action: argparse.Action) -> _Option:
+def _describe(action: argparse.Action) -> _Option:
     said = (action.help or "").replace("%%", "%")
-    words = _find_words(command, action)
-    return _Option(list(action.option_strings), re.split(r"[;:(]", said)[0].strip(), action.nargs != 0, words)
+    takes_value = action.nargs != 0
+    return _Option(
+        list(action.option_strings),
+        re.split(r"[;:(]", said)[0].strip(),
+        takes_value,
+        _find_words(action) if takes_value else [],
+    )
 
 
-def _find_words(command: str, action: argparse.Action) -> list[str]:
-    """Return the words that an option knows; empty where it takes something else."""
-    if action.nargs == 0:
-        return []
+def _find_words(action: argparse.Action) -> list[str]:
+    """Return the words that a value can be; empty where it is something else."""
     if isinstance(action.metavar, str) and _WORDS.fullmatch(action.metavar):
         return action.metavar.split("|")
-    if command == "phantom":
-        from clrecon.proof.phantom.settings import KINDS, TABLE_NAMES
-
-        return {"kind": list(KINDS), "table": list(TABLE_NAMES)}.get(action.dest, [])
-    return list_words(command, action.dest)
+    return list(getattr(action, "words", ()))
 
 
 def _write_bash(commands: dict[str, _Words]) -> str:

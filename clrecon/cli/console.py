@@ -397,13 +397,13 @@ def _streamed_file(
 def _find_several(command: str, options: argparse.Namespace) -> str:
     """Name the options that make several files of ``-o``; empty where it is one."""
     if command == "render":
-        return "several views" if sum(map(len, options.view)) > 1 else ""
+        return "several views" if sum(map(len, options.views or ())) > 1 else ""
     if command != "mesh" or options.one_file:
         return ""
     if options.split:
         return "the components of --split"
-    levels = options.below or options.hu.get("iso_value", ())
+    levels = options.below or (options.iso_value or {}).get("iso_value")
     if isinstance(levels, tuple) and len(levels) > 1:
         return "several iso values"
-    picked = options.labels is not None and not any(str(seed).startswith("label:") for seed in options.grow_from)
-    return "labels (name one with --label)" if picked and len(options.label or ()) != 1 else ""
+    picked = options.path is not None and not any(str(seed).startswith("label:") for seed in options.grow_from or ())
+    return "labels (name one with --label)" if picked and len(options.only or ()) != 1 else ""

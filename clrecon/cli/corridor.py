@@ -7,17 +7,20 @@ from typing import Any
 
 from clrecon.cli.common import (
     add_device,
-    add_keep_ids,
-    add_memory,
+    add_fields,
+    add_input,
     add_no_clobber,
+    add_output,
     add_reading,
+    add_report,
+    make_settings,
     megabytes,
-    parse_levels,
+    show_report,
 )
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
-from clrecon.errors import UsageError
 from clrecon.jobs.outputs import MESH_FILES
+from clrecon.jobs.settings import CorridorSettings
 
 PARTLY_DONE = 8
 
@@ -36,37 +39,8 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = _EPILOG
-    parser.add_argument("input", metavar="INPUT", help="DICOM folder or file; or a NIfTI, NRRD or MetaImage file")
-    parser.add_argument(
-        "--labels",
-        metavar="FILE|FOLDER",
-        required=True,
-        help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
-        first=True,
-    )
-    parser.add_argument(
-        "--label",
-        metavar="NAME|N",
-        action="append",
-        help="a vertebra of the map; may be given again",
-        default=[],
-        first=True,
-    )
-    parser.add_argument(
-        "--hu",
-        metavar="auto|N",
-        default="auto",
-        help="HU at which the bone's surface lies (default: auto, half way between bone and the tissue beside it)",
-        first=True,
-    )
-    parser.add_argument(
-        "--margin",
-        type=float,
-        default=1.0,
-        metavar="MM",
-        help="distance that a screw of the largest diameter keeps from the surface (default: 1)",
-        first=True,
-    )
+    add_input(parser)
+    add_fields(parser, CorridorSettings)
     screws = parser.add_argument_group("given screws, which are graded (Gertzbein-Robbins, A to E)")
     screws.add_argument(
         "--screw",
@@ -76,81 +50,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="entry, tip and diameter in mm of the frame of --space; may be given again",
         first=True,
     )
-    screws.add_argument("--screws", metavar="FILE", help="screws as JSON or CSV, see docs/corridor.md")
+    screws.add_argument("--screws", dest="file", metavar="FILE", help="screws as JSON or CSV, see docs/corridor.md")
     output = parser.add_argument_group("files")
-    output.add_argument(
-        "-o", "--output", metavar="OUT", help=f"meshes: OUT_L3, OUT_L3_left and OUT_L3_right; {MESH_FILES}", first=True
-    )
+    add_output(output, f"meshes: OUT_L3, OUT_L3_left and OUT_L3_right; {MESH_FILES}", required=False)
     output.add_argument(
         "--picture", metavar="FILE", help="slices through each corridor: .png, .jpg or .tif", first=True
     )
-    output.add_argument("--report", metavar="FILE", help="write all figures as JSON", first=True)
-    output.add_argument(
-        "--space",
-        type=str.lower,
-        default="lps",
-        metavar="lps|ras",
-        help="patient frame of points and meshes (default: lps)",
-    )
+    add_report(output, "all figures")
+    add_fields(output, CorridorSettings, "space")
     add_no_clobber(output)
-    add_keep_ids(output)
     add_reading(parser)
-    device = parser.add_argument_group("device, for the mesh of the vertebra alone")
-    add_device(device)
-    add_memory(device)
-
-
-def _settings(options: argparse.Namespace) -> Any:
-    from clrecon.jobs.corridor import CorridorSettings, parse_screw, read_screws
-
-    level = None
-    if options.hu != "auto":
-        try:
-            levels = parse_levels(options.hu)
-        except argparse.ArgumentTypeError as error:
-            raise UsageError(f"--hu: {error}") from error
-        if len(levels) != 1:
-            raise UsageError(f"--hu is one level or auto, not {options.hu!r:.80}")
-        level = levels[0]
-    given = tuple(parse_screw(text, options.space, number) for number, text in enumerate(options.screw, start=1))
-    if options.screws is not None:
-        given += read_screws(options.screws, options.space)
-    return CorridorSettings(
-        labels=options.labels,
-        only=tuple(options.label),
-        iso_value=level,
-        margin=options.margin,
-        screws=given,
-        space=options.space,
-        keep_ids=options.keep_ids,
-        device=options.device,
-        memory=options.memory,
-        series=options.series,
-        phase=options.phase,
-        allow_gaps=options.allow_gaps,
-        force=options.force,
-        follow_links=options.follow_links,
-        rescale=options.rescale,
-    )
+    add_device(parser.add_argument_group("device, for the mesh of the vertebra alone"))
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.corridor import CorridorFiles, make_corridors
+    from clrecon.jobs.corridor import CorridorFiles, make_corridors, parse_screw, read_screws
 
-    files = CorridorFiles(options.output, options.picture, options.report)
+    space = options.space or "lps"
+    screws = tuple(parse_screw(text, space, number) for number, text in enumerate(options.screw, start=1))
+    if options.file is not None:
+        screws += read_screws(options.file, space)
     report = make_corridors(
-        options.input, _settings(options), files, no_clobber=options.no_clobber, progress=console.progress
+        options.input,
+        make_settings(CorridorSettings, options, screws=screws),
+        CorridorFiles(options.output, options.picture, options.report),
+        no_clobber=options.no_clobber,
+        progress=console.progress,
     )
-    console.result(report)
-    for line in describe_report(report):
-        console.say(line)
-    for path, size in _name_files(report, options.output, options.picture):
-        console.say(f"wrote    {printable(path)}, {megabytes(size)}")
-    if options.report:
-        console.say(f"report   {printable(options.report)}")
-    for warning in report["warnings"]:
-        console.warn(warning)
+    files = _name_files(report, options.output, options.picture)
+    written = [f"wrote    {printable(path)}, {megabytes(size)}" for path, size in files]
+    show_report(report, describe_report(report) + written, options, console)
     refused = [side for each in report["vertebrae"] for side in each["corridors"] if side["refused"]]
     return PARTLY_DONE if refused else 0
 

@@ -18,8 +18,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "A second run replaces the first."
     )
     parser.add_argument("output", metavar="OUT", nargs="?", help="folder (default: clrecon-demo)")
-    add_device(parser)
-    add_no_clobber(parser)
+    add_device(parser, memory=False)
+    add_no_clobber(parser, with_ids=False)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:

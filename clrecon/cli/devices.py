@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "others, then the most compute units. One that failed the check at its first use, and a simulator (Oclgrind),\n"
         "are used only when they are named."
     )
-    add_device(parser, computes=False)
+    add_device(parser, computes=False, memory=False)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:

@@ -5,9 +5,20 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_device, add_memory, add_no_clobber, megabytes, table
+from clrecon.cli.common import (
+    add_device,
+    add_fields,
+    add_no_clobber,
+    add_output,
+    add_report,
+    make_settings,
+    megabytes,
+    show_report,
+    table,
+)
 from clrecon.cli.console import Console, printable
 from clrecon.jobs.inputs import MESH_INPUTS
+from clrecon.jobs.settings import DistanceSettings
 from clrecon.system.text import format_volume
 
 _EPILOG = """\
@@ -26,74 +37,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("mesh", metavar="A", help=f"mesh: {', '.join(MESH_INPUTS)}")
     parser.add_argument("reference", metavar="B", help="mesh that it is measured against")
-    parser.add_argument(
-        "--mesh-space",
-        type=str.lower,
-        metavar="lps|ras",
-        help="patient frame of files that do not name theirs (default: lps, with a warning)",
-    )
-    parser.add_argument("--samples", type=int, metavar="N", help="points on each mesh, evenly by area (default: 50000)")
+    add_fields(parser, DistanceSettings)
     output = parser.add_argument_group("files")
-    output.add_argument(
-        "-o", "--output", metavar="PLY", help="write A coloured by its distance from B: .ply", first=True
-    )
+    add_output(output, "write A coloured by its distance from B: .ply", metavar="PLY", required=False)
     output.add_argument(
         "--picture", metavar="FILE", help="picture of it with its scale: .png, .jpg or .tif", first=True
     )
-    output.add_argument(
-        "--range",
-        dest="range_mm",
-        type=float,
-        metavar="MM",
-        help="distance at which the colours end (default: 1, 2 or 5 x 10^n mm that hold 95 %% of the distances)",
-        first=True,
-    )
-    output.add_argument(
-        "--view", default="anterior", metavar="V", help="view of the picture: anterior (default), left, AZ,EL ..."
-    )
-    output.add_argument(
-        "--space",
-        type=str.lower,
-        default="lps",
-        metavar="lps|ras",
-        help="patient frame of the coloured mesh (default: lps)",
-    )
-    output.add_argument("--report", metavar="FILE", help="write all figures as JSON", first=True)
-    add_no_clobber(output)
-    device = parser.add_argument_group("device, for the picture alone")
-    add_device(device)
-    add_memory(device)
+    add_fields(output, DistanceSettings, "picture")
+    add_report(output, "all figures")
+    add_no_clobber(output, with_ids=False)
+    add_device(parser.add_argument_group("device, for the picture alone"))
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.distance import DistanceFiles, DistanceSettings, measure_meshes
+    from clrecon.jobs.distance import DistanceFiles, measure_meshes
 
-    given = {} if options.samples is None else {"samples": options.samples}
-    settings = DistanceSettings(
-        mesh_space=options.mesh_space,
-        range_mm=options.range_mm,
-        view=options.view,
-        space=options.space,
-        device=options.device,
-        memory=options.memory,
-        **given,
-    )
     report = measure_meshes(
         options.mesh,
         options.reference,
         DistanceFiles(options.output, options.picture, options.report),
-        settings,
+        make_settings(DistanceSettings, options),
         no_clobber=options.no_clobber,
         progress=console.progress,
     )
-    console.result(report)
-    for line in _describe(report):
-        console.say(line)
-    if options.report:
-        console.say(f"report   {printable(options.report)}")
-    for warning in report["warnings"]:
-        console.warn(warning)
+    show_report(report, _describe(report), options, console)
     return 0
 
 

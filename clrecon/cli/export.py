@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import fields
 from typing import Any
 
 from clrecon.cli.common import (
     add_cropping,
     add_device,
-    add_keep_ids,
+    add_fields,
+    add_input,
     add_masking,
-    add_memory,
     add_no_clobber,
+    add_output,
     add_reading,
+    add_report,
+    make_settings,
     megabytes,
-    pick,
+    show_report,
 )
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
+from clrecon.jobs.settings import ExportSettings
 
 _PARTS = ("read", "mask", "resample", "write")
 _EPILOG = """\
@@ -40,61 +43,34 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = _EPILOG
-    parser.add_argument("input", metavar="INPUT", help="DICOM folder or file; or a NIfTI, NRRD or MetaImage file")
-    parser.add_argument(
-        "-o", "--output", metavar="OUT", required=True, help="volume file: .nii.gz, .nii, .nrrd or .mha", first=True
-    )
-    parser.add_argument(
-        "--resample",
-        type=float,
-        metavar="MM",
-        help="resample (trilinear) to a regular grid with this step along all axes; without it voxels stay as they are",
-        first=True,
-    )
-    parser.add_argument(
-        "--space",
-        type=str.lower,
-        default="lps",
-        metavar="lps|ras",
-        help="patient frame of the numbers of crop and region (default: lps); that of the file is its format's",
-    )
+    add_input(parser)
+    add_output(parser, "volume file: .nii.gz, .nii, .nrrd or .mha")
+    add_fields(parser, ExportSettings)
     add_reading(parser)
     add_masking(parser)
     add_cropping(parser)
-    device = parser.add_argument_group("device", "for --region and --preprocess only")
-    add_device(device)
-    add_memory(device)
+    add_device(parser.add_argument_group("device", "for --region and --preprocess only"))
     checks = parser.add_argument_group("checks")
     add_no_clobber(checks)
-    add_keep_ids(checks)
-    checks.add_argument("--report", metavar="FILE", help="write affine, crop, certificate, values and times as JSON")
+    add_report(checks, "affine, crop, certificate, values and times", first=False)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.export import ExportSettings, export_volume
+    from clrecon.jobs.export import export_volume
 
-    settings = ExportSettings(**pick(options, {own.name for own in fields(ExportSettings)}))
     report = export_volume(
         options.input,
         options.output,
-        settings,
+        make_settings(ExportSettings, options),
         report_path=options.report,
         no_clobber=options.no_clobber,
         progress=console.progress,
     )
-    console.result(report)
-    for line in _describe(report):
-        console.say(line)
     output = report["output"]
-    console.say(
-        f"wrote    {printable(options.output)}, {megabytes(output['bytes'])}, HU as {output['type']},"
-        f" {output['space'].upper()} mm"
-    )
-    if options.report:
-        console.say(f"report   {printable(options.report)}")
-    for warning in report["warnings"]:
-        console.warn(warning)
+    size, space = megabytes(output["bytes"]), output["space"].upper()
+    written = f"wrote    {printable(options.output)}, {size}, HU as {output['type']}, {space} mm"
+    show_report(report, [*_describe(report), written], options, console)
     return 0
 
 

@@ -12,11 +12,12 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from clrecon.cli.common import add_reading, pick
+from clrecon.cli.common import add_fields, add_input, add_reading, make_settings
 from clrecon.cli.console import Console, is_terminal, printable
+from clrecon.jobs.settings import InfoSettings
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -389,25 +390,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "there is a series that can be used, 4 when the series found are refused (their problems are listed) or a\n"
         "gate failed with --strict, 2 when there is no CT series."
     )
-    parser.add_argument("input", metavar="INPUT", help="DICOM folder or file, or a NIfTI, NRRD or MetaImage file")
-    parser.add_argument(
-        "--pixels",
-        action="store_true",
-        help="read the pixels of the series marked * too: share of padding, range of HU, saturated metal",
-        first=True,
-    )
-    parser.add_argument(
-        "--strict", action="store_true", help="exit with 4 when it fails a gate, see docs/certificate.md", first=True
-    )
+    add_input(parser)
+    add_fields(parser, InfoSettings)
     add_reading(parser)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.info import InfoSettings, describe_input
+    from clrecon.jobs.info import describe_input
 
-    settings = InfoSettings(**pick(options, {own.name for own in fields(InfoSettings)}))
-    found = describe_input(options.input, settings, progress=console.progress)
+    found = describe_input(options.input, make_settings(InfoSettings, options), progress=console.progress)
     console.result(found.listing)
     if not options.json and not options.quiet:
         lines = render_listing(found.listing, describe_certificate(found.listing["certificate"]), found.refused)

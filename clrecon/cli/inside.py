@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import argparse
-import math
 from typing import Any
 
 from clrecon.cli.common import (
     add_device,
-    add_keep_ids,
-    add_memory,
+    add_fields,
+    add_input,
     add_no_clobber,
+    add_output,
     add_reading,
+    add_report,
     describe_space,
+    make_settings,
     megabytes,
-    pick,
+    show_report,
 )
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
-from clrecon.jobs.inside import DEFAULT_VIEW
 from clrecon.jobs.outputs import MESH_FILES
+from clrecon.jobs.settings import InsideSettings
 from clrecon.system.text import format_volume
 
 _EPILOG = """\
@@ -40,24 +42,9 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = _EPILOG
-    parser.add_argument("input", metavar="INPUT", help="DICOM folder or file; or a NIfTI, NRRD or MetaImage file")
-    parser.add_argument("-o", "--output", metavar="OUT", required=True, help=f"mesh files: {MESH_FILES}", first=True)
-    parser.add_argument(
-        "--labels",
-        metavar="FILE|FOLDER",
-        required=True,
-        help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
-        first=True,
-    )
-    parser.add_argument(
-        "--label",
-        dest="only",
-        metavar="NAME|N",
-        action="append",
-        required=True,
-        help="label of a vertebra; may be given again",
-        first=True,
-    )
+    add_input(parser)
+    add_output(parser, f"mesh files: {MESH_FILES}")
+    add_fields(parser, InsideSettings)
     pictures = parser.add_argument_group("pictures")
     pictures.add_argument(
         "--picture",
@@ -66,89 +53,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " inside_canal.png and so on",
         first=True,
     )
-    pictures.add_argument(
-        "--view",
-        default=DEFAULT_VIEW,
-        metavar="V",
-        help=f"anterior, posterior, left, right, superior, inferior, or AZ,EL in degrees (default: {DEFAULT_VIEW})",
-    )
-    parts = parser.add_argument_group("parts")
-    parts.add_argument(
-        "--hu",
-        dest="iso_value",
-        type=float,
-        metavar="N",
-        help="level of the solid bone, within one voxel of the label (default: the label's own voxels)",
-        first=True,
-    )
-    parts.add_argument(
-        "--dense", type=_parse_band, metavar="A[:B]", help="HU of dense bone, from A on or from A to B (default: 450)"
-    )
-    parts.add_argument(
-        "--close", dest="close_mm", type=float, metavar="MM", help="pores that close by balls (default: 1.5)"
-    )
-    parts.add_argument(
-        "--grow",
-        dest="grow_mm",
-        type=float,
-        metavar="MM",
-        help="with --hu: dense voxels this near to the label are its own (default: one voxel each way)",
-    )
-    parts.add_argument(
-        "--space", type=str.lower, default="lps", metavar="lps|ras", help="patient frame of the meshes (default: lps)"
-    )
+    add_fields(pictures, InsideSettings, "pictures")
+    add_fields(parser.add_argument_group("parts"), InsideSettings, "parts")
     add_reading(parser)
     device = parser.add_argument_group("device")
     add_device(device)
-    add_memory(device)
     add_no_clobber(device)
-    add_keep_ids(device)
-    device.add_argument(
-        "--report", metavar="FILE", help="write volumes, thickness, certificate, device, times as JSON", first=True
-    )
-
-
-def _parse_band(text: str) -> tuple[float | None, float | None]:
-    """Read ``A``, ``A:`` or ``A:B``, numbers of HU; ``:B`` leaves the lower end open."""
-    low, colon, high = text.partition(":")
-    try:
-        ends = [float(end) if end else None for end in (low, high)]
-    except ValueError:
-        ends = [None, None]
-    if ends == [None, None] or any(end is not None and not math.isfinite(end) for end in ends):
-        raise argparse.ArgumentTypeError(f"{text!r} is no band of HU: write A for A and above, or A:B")
-    return ends[0], ends[1]
+    add_report(device, "volumes, thickness, certificate, device, times")
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from dataclasses import fields
+    from clrecon.jobs.inside import make_inside
 
-    from clrecon.jobs.inside import InsideSettings, make_inside
-
-    settings = InsideSettings(**pick(options, {own.name for own in fields(InsideSettings)}))
     report = make_inside(
         options.input,
         options.output,
-        settings,
+        make_settings(InsideSettings, options),
         picture=options.picture,
         report_path=options.report,
         no_clobber=options.no_clobber,
         progress=console.progress,
     )
-    console.result(report)
-    for line in describe_inside(report):
-        console.say(line)
     files = [mesh for vertebra in report["vertebrae"] for mesh in vertebra["meshes"]]
     size = megabytes(sum(mesh["bytes"] for mesh in files))
     space = describe_space(options.output, report["space"])
-    console.say(f"wrote    {_name_files(options.output, report, 'meshes')}, {size}, {space}")
+    written = [f"wrote    {_name_files(options.output, report, 'meshes')}, {size}, {space}"]
     if options.picture:
-        console.say(f"picture  {_name_files(options.picture, report, 'pictures')}")
-    if options.report:
-        console.say(f"report   {printable(options.report)}")
-    for warning in report["warnings"]:
-        console.warn(warning)
+        written.append(f"picture  {_name_files(options.picture, report, 'pictures')}")
+    show_report(report, describe_inside(report) + written, options, console)
     return 0
 
 

@@ -26,15 +26,15 @@ _DESTINATIONS = {
     "color_by": "color",
     "direction": "light",
     "eps": "clusters",
-    "grow_mm": "grow",
-    "half_way": "hu",
+    "half_way": "iso_value",
+    "labels": "path",
     "iso_value": "hu",
     "kind": "points",
     "min_samples": "clusters",
     "only": "label",
     "picture": "output",
 }
-"""Options of parameters by another name; used if the command has no option of the parameter's own name."""
+"""Other names of parameters, which count where a command has no option of the parameter's own name."""
 
 _PARTS = {"eps": "eps=", "min_samples": "min="}
 """Parameters that are a part of an option's value."""
@@ -45,9 +45,12 @@ def speaker_of(parser: argparse.ArgumentParser) -> Speaker:
     options = {action.dest: action.option_strings[0] for action in parser._actions if action.option_strings}
 
     def speak(parameter: str, value: object = None) -> str:
-        option = options.get(parameter) or options.get(_DESTINATIONS.get(parameter, ""))
-        if option is None:
-            return in_python(parameter, value)
+        name = parameter
+        while name not in options:
+            if name not in _DESTINATIONS:
+                return in_python(parameter, value)
+            name = _DESTINATIONS[name]
+        option = options[name]
         part = _PARTS.get(parameter, "")
         if part:
             return f"{option} {part}{'MM' if value is None and parameter == 'eps' else 'N' if value is None else value}"
@@ -161,8 +164,10 @@ def _dispatch(arguments: list[str], console: Console) -> int:
             common.add_common(subparser)
             subparser.epilog = "\n\n".join(filter(None, (subparser.epilog, EXIT_CODES)))
     commands.add_parser(HELP, help="show all options of a command: clrecon help COMMAND")
+    speaker = in_python if module is None or called is None else speaker_of(commands.choices[called])
     try:
-        options = parser.parse_args(arguments)
+        with spoken_by(speaker):
+            options = parser.parse_args(arguments)
     except SystemExit as stop:  # --help
         return int(stop.code or 0)
     if options.version:
@@ -176,7 +181,7 @@ def _dispatch(arguments: list[str], console: Console) -> int:
     console.set_loudness(quiet=options.quiet, verbose=options.verbose)
     limit = getattr(options, "timeout", None)
     with (
-        spoken_by(speaker_of(commands.choices[called])),
+        spoken_by(speaker),
         time_limit(DEFAULT_SECONDS if limit is None else limit),
         filled_streams(called, options, console),
     ):

@@ -1,47 +1,35 @@
-"""``clrecon mesh``: from a CT series to a calibrated mesh."""
+"""``clrecon mesh``: from a CT series to a calibrated mesh; its options and its results in words."""
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import fields
+from collections.abc import Mapping
 from typing import Any
 
 from clrecon.cli.common import (
-    LEVELS_HELP,
+    GRID_FILE,
+    SCAN_FOLDER,
     add_cropping,
     add_device,
     add_fields,
-    add_keep_ids,
+    add_input,
     add_masking,
-    add_memory,
     add_no_clobber,
+    add_output,
     add_reading,
+    add_report,
     describe_space,
     describe_times,
+    make_part,
     megabytes,
-    parse_hu,
-    parse_levels,
-    parse_point,
     pick,
 )
 from clrecon.cli.console import Console, printable
-from clrecon.cli.mesh_options import (
-    add_label_arguments,
-    add_methods,
-    add_purpose,
-    add_strict,
-    describe_cells,
-    describe_labels,
-    describe_purposes,
-    describe_refinement,
-    finish_with_gates,
-    label_choice,
-)
 from clrecon.jobs.mesh.purposes import settings_for
 from clrecon.jobs.mesh.seeds import is_label_seed
-from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.outputs import MESH_FILES, OBJECT_FILES
-from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
+from clrecon.jobs.mesh.settings import GATE_FAILED, SCAN_GATE_FAILED, LabelChoice, MeshSettings
+from clrecon.jobs.outputs import MESH_FILES
+from clrecon.jobs.presets import PRESETS
 from clrecon.system.text import count_of, format_digits, format_ml, format_volume
 
 _PARTS = (
@@ -85,132 +73,58 @@ def _epilog() -> str:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = _epilog()
-    parser.add_argument(
-        "input",
-        metavar="INPUT",
-        help="DICOM folder (subfolders and any file names are fine) or file; or a NIfTI, NRRD or MetaImage file",
-    )
-    parser.add_argument("-o", "--output", metavar="OUT", required=True, help=f"mesh file: {MESH_FILES}", first=True)
-    add_purpose(parser)
+    add_input(parser, f"{SCAN_FOLDER}; or {GRID_FILE}")
+    add_output(parser, f"mesh file: {MESH_FILES}")
+    add_fields(parser, MeshSettings, "purpose")
     add_reading(parser)
     add_masking(parser)
     add_cropping(parser)
-    surface = parser.add_argument_group("surface")
-    add_levels(surface)
-    add_solid(surface)
-    surface.add_argument(
-        "--space", type=str.lower, default="lps", metavar="lps|ras", help="patient frame of the mesh (default: lps)"
-    )
-    surface.add_argument(
-        "--topology",
-        type=str.lower,
-        default="separated",
-        metavar="T",
-        help="what is done where the voxels leave open which of them are joined: separated keeps them apart (default),"
-        " trilinear joins those that the trilinear interpolation joins",
-    )
-    surface.add_argument(
-        "--open", dest="closed", action="store_false", help="leave the surface open at the border of the volume"
-    )
-    add_methods(parser)
-    components = parser.add_argument_group("components")
-    add_selection(components)
-    components.add_argument(
-        "--all-parts",
-        action="store_true",
-        help="with --for print: keep all bones, not the largest alone; named objects of a .3mf, one mesh in other"
-        " formats",
-    )
-    components.add_argument("--split", action="store_true", help="write one file a component, the largest first")
-    components.add_argument(
-        "--one-file",
-        action="store_true",
-        help=f"labels, components of --split or several iso values in one file ({OBJECT_FILES}), each"
-        " an object with its name and a colour of its own",
-    )
-    add_label_arguments(parser)
+    add_fields(add_levels(parser, "surface"), MeshSettings, "surface")
+    method = parser.add_argument_group("method", "marching cubes as papers compare them: see docs/methods.md")
+    add_fields(method, MeshSettings, "method")
+    add_fields(parser.add_argument_group("components"), MeshSettings, "selection", "files")
+    add_labels(parser)
     add_fields(parser.add_argument_group("refinement"), MeshSettings, "refinement")
-    device = parser.add_argument_group("device")
-    add_device(device)
-    add_memory(device)
-    _add_checks(parser)
-
-
-def add_levels(surface: argparse._ArgumentGroup) -> None:
-    """Declare --hu, --below, --preset and --keep-outside: which values a surface encloses."""
-    level = surface.add_mutually_exclusive_group()
-    level.add_argument(
-        "--hu", type=parse_hu, default={}, metavar="N[,N...]|A:B|auto|half:B,T", help=LEVELS_HELP, first=True
-    )
-    level.add_argument(
-        "--below",
-        type=parse_levels,
-        metavar="N[,N...]",
-        help="in place of an iso value: inside is what lies below N HU, such as lungs, airways and sinuses (-400); the"
-        " air round the patient is left out",
-    )
-    level.add_argument(
-        "--preset",
-        type=str.lower,
-        metavar="NAME",
-        help=f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})",
-    )
-    surface.add_argument("--keep-outside", action="store_true", help="with --below: leave the air round the patient in")
-
-
-def add_solid(surface: argparse._ArgumentGroup) -> None:
-    """Declare --solid and --seal: whether what is enclosed is filled."""
-    surface.add_argument(
-        "--solid",
-        action=argparse.BooleanOptionalAction,
-        help="fill what the bone encloses: marrow, and canals that the ends of the scan cut; the brain, the chest and"
-        " air stay out; with --labels: what is less dense within a label",
-        first=True,
-    )
-    surface.add_argument(
-        "--seal",
-        dest="seal_mm",
-        type=float,
-        metavar="MM",
-        help="with --solid: close pores up to twice as wide, less one voxel (default: 2.5 to 3, by the voxels)",
-    )
-
-
-def add_selection(components: argparse._ArgumentGroup) -> None:
-    """Declare --keep, --keep-largest, --min-volume and --seed: which components stay."""
-    add_fields(components, MeshSettings, "selection")
-    components.add_argument(
-        "--seed",
-        dest="seeds",
-        type=parse_point,
-        metavar="X,Y,Z",
-        action="append",
-        default=[],
-        help="keep the component whose surface lies nearest to this point, in mm of the frame of --space;"
-        " repeat it for several",
-    )
-
-
-def _add_checks(parser: argparse.ArgumentParser) -> None:
+    add_device(parser.add_argument_group("device"))
     checks = parser.add_argument_group("checks")
-    add_strict(checks)
+    add_fields(checks, MeshSettings, "strict")
     add_no_clobber(checks)
-    add_keep_ids(checks)
-    checks.add_argument(
-        "--report", metavar="FILE", help="write affine, counts, quality, device and times as JSON", first=True
-    )
+    add_report(checks, "affine, counts, quality, device and times")
+
+
+def add_levels(parser: argparse.ArgumentParser, title: str) -> argparse._ArgumentGroup:
+    """Add the options of which values a surface encloses, and whether what is enclosed is filled."""
+    group = parser.add_argument_group(title)
+    add_fields(group.add_mutually_exclusive_group(), MeshSettings, "level")
+    add_fields(group, MeshSettings, "inside")
+    return group
+
+
+def add_labels(parser: argparse.ArgumentParser) -> None:
+    """Add the options for label maps."""
+    about = "one mesh a label: the label picks the cells, HU place the vertices"
+    add_fields(parser.add_argument_group("labels", about), LabelChoice)
+
+
+def mesh_fields(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the fields of `MeshSettings` that the options give."""
+    given = pick(options, MeshSettings)
+    given |= given.pop("iso_value", {})  # one of two fields
+    needs = "says how labels become meshes: give their file with --labels FILE"
+    labels = make_part(LabelChoice, options, options.path, needs)
+    if labels is not None:
+        given["labels"] = labels
+        if given.get("solid") and not any(map(is_label_seed, given.get("grow_from", ()))):
+            del given["solid"]  # it says how each label becomes a mesh
+    return given
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
     from clrecon.jobs.mesh.job import make_mesh, makes_objects
 
-    names = {own.name for own in fields(MeshSettings)} - {"purpose"}
-    given = {**pick(options, names), **options.hu, "labels": label_choice(options)}
-    given = {name: value for name, value in given.items() if value is not None}
-    if options.solid and options.labels is not None and not any(map(is_label_seed, options.grow_from)):
-        given.pop("solid")  # it says how each label becomes a mesh
-    settings = MeshSettings(**settings_for(options.purpose, given))
+    given = mesh_fields(options)
+    settings = MeshSettings(**settings_for(given.pop("purpose", None), given))
     report = make_mesh(
         options.input,
         options.output,
@@ -342,3 +256,164 @@ def _describe_quality(report: dict[str, Any]) -> list[str]:
     volume = "" if report["volume_ml"] is None else f", {format_volume(report['volume_ml'])}"
     parts = f"{report['components']:,} component{'s' * (report['components'] != 1)}"
     return [f"         {parts}, {closed}, {manifold}, {report['area_mm2']:,.0f} mm2{volume}"]
+
+
+def describe_labels(meshes: list[dict[str, Any]]) -> list[str]:
+    """Describe the surfaces of labels in a line; no line without labels."""
+    labels = [mesh for mesh in meshes if mesh["label"] is not None]
+    if not labels:
+        return []
+    count = len({mesh["label_number"] for mesh in labels})
+    if labels[0]["surface"] == "mask":
+        kinds = [f"labels   {count} label{'s' * (count > 1)}, by {'their' if count > 1 else 'its'} own mask"]
+        return kinds + _describe_volumes(labels)
+    shares = [100.0 * mesh["vertices_by_hu_share"] for mesh in labels]
+    low, high = min(shares), max(shares)
+    share = f"{low:.0f}" if round(low) == round(high) else f"{low:.0f} to {high:.0f}"
+    grow_mm = labels[0]["grow_mm"]
+    growth = "one voxel" if grow_mm is None else f"{grow_mm:.3g} mm"
+    kind = ", solid" if labels[0]["solid"] else ""
+    return [
+        f"labels   {count} label{'s' * (count > 1)}{kind}, grown by {growth}; HU place {share} % of the vertices",
+        *_describe_volumes(labels),
+    ]
+
+
+def _describe_volumes(labels: list[dict[str, Any]]) -> list[str]:
+    """Compare the total volume of the meshes with that of the voxels of their labels."""
+    surfaces = {(mesh["label_number"], mesh["iso_value_hu"]): mesh for mesh in labels}.values()
+    if any(mesh["label_mesh_ml"] is None for mesh in surfaces):
+        return []
+    label_ml = sum(mesh["label_compared_ml"] for mesh in surfaces)
+    mesh_ml = sum(mesh["label_mesh_ml"] for mesh in surfaces)
+    change = 100.0 * (mesh_ml / label_ml - 1.0)
+    return [f"         {format_volume(mesh_ml)} of mesh for {format_volume(label_ml)} of labels ({change:+.1f} %)"]
+
+
+def describe_cells(report: dict[str, Any]) -> list[str]:
+    """Describe the cells that each grown surface visited, and what was left out; no line for whole ones."""
+    lines: list[str] = []
+    for mesh in report["meshes"]:
+        cells, growing = mesh["cells"], mesh["growing"]
+        if not growing:
+            continue
+        share = cells["all"] / max(cells["visited"], 1)
+        told = [
+            f"cells    {cells['visited']:,} visited, {cells['active']:,} active, {cells['all']:,} in all (1 in"
+            f" {share:,.0f} visited)",
+            f"grown    from {', '.join(growing['from'])}: {growing['components_taken']:,} of"
+            f" {count_of(growing['components'], 'part')};"
+            f" {100 * growing['cells_left_out_share']:.1f} % of the active cells left"
+            f" out, the largest part of them {growing['largest_left_out_cells']:,}",
+        ]
+        lines += [line for line in told if line not in lines]
+    return lines
+
+
+def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
+    """Describe the changes by smoothing and decimation: those of one mesh, or the largest of several."""
+    found = [mesh["refinement"] for mesh in meshes if mesh["refinement"]]
+    if not found:
+        return []
+    worst = max(found, key=lambda each: each["deviation"]["hd95_mm"] / each["voxel_mm"])
+    parts = []
+    if "smooth" in worst:
+        parts.append(_describe_smoothing(worst["smooth"]))
+    if "decimate" in worst:
+        parts.append(_describe_decimation(worst["decimate"]))
+    deviation, voxel = worst["deviation"], worst["voxel_mm"]
+    if deviation["volume_change_percent"] is not None:
+        parts.append(f"volume {round(deviation['volume_change_percent'], 2) + 0.0:+.2f} %")
+    which = "refined " if len(found) == 1 else "refined (worst mesh)"
+    lengths = ", ".join(
+        f"{name} {deviation[key]:.3f} mm ({deviation[key] / voxel:.2f} voxel)"
+        for name, key in (("mean", "assd_mm"), ("95 % within", "hd95_mm"), ("largest", "max_mm"))
+    )
+    return [f"{which} {', '.join(parts)}", f"         from the surface before: {lengths}"]
+
+
+def _describe_smoothing(found: dict[str, Any]) -> str:
+    """Describe the iterations, and what was not smoothed."""
+    parts = [count_of(found["iterations"], "iteration")]
+    if found["components_left"]:
+        parts.append(f"{count_of(found['components_left'], 'component')} left unsmoothed to keep the volume")
+    if found["vertices_not_finite"]:
+        parts.append(f"{count_of(found['vertices_not_finite'], 'vertex', 'vertices')} without a finite step not moved")
+    return f"smoothed ({'; '.join(parts)})"
+
+
+def _describe_decimation(found: dict[str, Any]) -> str:
+    """Describe how many triangles were removed, how many were asked for, and why decimation ended."""
+    asked, reached = 100 * found["fraction"], 100 * found["reached"]
+    topology = _describe_topology(found["topology"])
+    if found["ended_by"] == "share":
+        return f"{reached:.1f} % of the triangles taken away, as asked, {topology}"
+    bound = f"the bound of {format_digits(found['max_deviation_mm'])} mm"
+    return f"{reached:.1f} % of the triangles taken away of {asked:g} % asked for: {bound} ended it, {topology}"
+
+
+def _describe_topology(found: Mapping[str, Any]) -> str:
+    """Describe the Euler number before and after, and in how many components it changed."""
+    before, after = found["euler_number_before"], found["euler_number_after"]
+    if not (found["components_changed"] or found["components_lost"]):
+        return f"Euler number {before} before and after"
+    parts = [f"changed in {found['components_changed']} of {count_of(found['components_before'], 'component')}"]
+    if found["components_lost"]:
+        parts.append(f"{found['components_lost']} lost")
+    return f"Euler number {before} before, {after} after ({', '.join(parts)})"
+
+
+def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
+    """Describe the facts that matter for printing the mesh; of several meshes only the first."""
+    found = [mesh["print"] for mesh in meshes if mesh.get("print")]
+    if not found:
+        return []
+    facts, wall, left_out = found[0], found[0]["wall"], found[0]["left_out"]
+    which = "print    " if len(found) == 1 else "print    (first mesh) "
+    lines = [f"{which}size {' x '.join(f'{length:.1f}' for length in facts['size_mm'])} mm"]
+    if wall["median_mm"] is not None:
+        lines[0] += (
+            f", walls {wall['median_mm']:.1f} mm (median), 5 % below {format_digits(wall['p5_mm'], 2)} mm,"
+            f" {100 * wall['thin_share']:.1f} % below {wall['thin_mm']:g} mm"
+        )
+    pieces = f"{count_of(left_out['pieces'], 'piece')} of {format_ml(left_out['pieces_ml'])} together"
+    cavities = (
+        f"{count_of(left_out['cavities'], 'closed cavity', 'closed cavities')} of {format_ml(left_out['cavities_ml'])}"
+    )
+    if left_out["pieces"] or left_out["cavities"]:
+        lines.append(f"         left out {pieces}, filled {cavities}")
+    if left_out["not_bone"] is not None:
+        bone = left_out["pieces"] + facts["pieces"] - left_out["not_bone"]
+        lines.append(
+            f"         kept {facts['pieces']:,} of {bone:,} pieces with walls like bone; {left_out['not_bone']:,} of"
+            f" {format_ml(left_out['not_bone_ml'])} are not, or are crumbs"
+        )
+    return lines
+
+
+GATES_OF_AFFINE = ("grid_residual",)
+"""Gates for the fit of the affine to the slices.  Meshes do not need it: they use the position of each slice."""
+
+
+def finish_with_gates(report: dict[str, Any], console: Console, strict: bool) -> int:
+    """Print the warnings of a report; returns the exit code.
+
+    With `strict` a failed gate of the volume or of a mesh is an error, which is printed even with ``--quiet`` and
+    ``--json``; that of a mesh decides the code.  Exception: a failed gate of `GATES_OF_AFFINE` (uneven slices) stays a
+    warning.
+    """
+    from clrecon.jobs.mesh.refinement import warn_of_gates
+
+    gates = [gate for gate in report["volume"].get("gates", ()) if gate["name"] not in GATES_OF_AFFINE]
+    of_volume = [{"mesh": "volume", **gate} for gate in gates]
+    failed_scan = warn_of_gates(of_volume) if strict else []
+    failed_mesh = warn_of_gates(report["gates"]) if strict else []
+    failed = failed_scan + failed_mesh
+    for warning in report["warnings"]:
+        if warning not in failed:
+            console.warn(warning)
+    for line in failed:
+        console.error(line)
+    if failed_mesh:
+        return GATE_FAILED
+    return SCAN_GATE_FAILED if failed_scan else 0

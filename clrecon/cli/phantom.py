@@ -5,15 +5,11 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_no_clobber
+from clrecon.cli.common import add_fields, add_no_clobber, make_settings
 from clrecon.cli.console import Console, printable
+from clrecon.proof.phantom.settings import KINDS, PhantomSettings
+from clrecon.system.paths import keep_existing
 from clrecon.system.text import format_ml
-
-_SETTINGS = (
-    "kind", "size", "slices", "spacing", "tilt", "oblique", "noise", "point_spread_mm", "seed", "radius_mm",
-    "table", "table_gap_mm", "prone", "ghosts", "levels", "facet_gap_mm", "kyphosis_deg", "scoliosis_deg", "uneven_mm",
-    "missing", "phases",
-)  # fmt: skip
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,93 +24,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  clrecon phantom phantom/ --levels C1-L5 --scoliosis 35 --facet-gap 0.3 --spacing 0.7 0.7 1"
     )
     parser.add_argument("output", metavar="OUT", help="folder for the series")
-    parser.add_argument(
-        "--kind", type=str.lower, metavar="K", help="what to make; see below (default: spine)", first=True
-    )
-    parser.add_argument("--size", metavar="N", help="columns and rows, like 256 or 256x192 (default: 256)", first=True)
-    parser.add_argument(
-        "--slices", type=int, metavar="N", help="default: as many as the levels need, 120 without levels", first=True
-    )
-    parser.add_argument(
-        "--spacing",
-        type=float,
-        nargs=3,
-        metavar=("DJ", "DI", "DK"),
-        help="mm between rows, columns, slices (default: by kind, of a spine 1 1 1.25)",
-        first=True,
-    )
-    parser.add_argument("--tilt", type=float, metavar="DEG", help="gantry tilt (default: 0)", first=True)
-    parser.add_argument(
-        "--oblique", type=float, nargs=3, metavar=("X", "Y", "Z"), help="degrees about the patient's axes"
-    )
-    parser.add_argument(
-        "--noise",
-        type=float,
-        metavar="HU",
-        help="standard deviation of the noise (default: 12, of an analytic shape 0)",
-        first=True,
-    )
-    parser.add_argument(
-        "--point-spread",
-        dest="point_spread_mm",
-        type=float,
-        metavar="MM",
-        help="standard deviation of the blur (default: 0.5, of an analytic shape 0)",
-    )
-    parser.add_argument("--radius", dest="radius_mm", type=float, metavar="MM", help="radius of an analytic shape")
-    parser.add_argument(
-        "--table", type=str.lower, metavar="T", help="what a body lies on: none, flat, curved or headrest", first=True
-    )
-    parser.add_argument(
-        "--table-gap",
-        dest="table_gap_mm",
-        type=float,
-        metavar="MM",
-        help="between body and table (default: 0, they touch)",
-    )
-    parser.add_argument("--prone", action="store_true", default=None, help="the patient lies on the face")
-    parser.add_argument(
-        "--ghosts", action="store_true", default=None, help="of a spine: two foreign slices, and a localizer"
-    )
-    _add_spine(parser)
-    parser.add_argument("--missing", metavar="N,M-O", help="numbers of slices that are left out, like 20-22,40")
-    parser.add_argument(
-        "--seed", type=int, metavar="N", help="place within a voxel, noise and texture (default: 0)", first=True
-    )
-    add_no_clobber(parser)
-
-
-def _add_spine(parser: argparse.ArgumentParser) -> None:
-    spine = parser.add_argument_group("of a spine")
-    spine.add_argument("--levels", metavar="C1-L5", help="vertebrae to show, like L4-L5 or C3-C7,T1-T5", first=True)
-    spine.add_argument(
-        "--facet-gap", dest="facet_gap_mm", type=float, metavar="MM", help="distance of neighbours in the facet joints"
-    )
-    for name, positive in (("kyphosis", "the back is round"), ("scoliosis", "the middle lies to the left")):
-        spine.add_argument(
-            f"--{name}", dest=f"{name}_deg", type=float, metavar="DEG",
-            help=f"angle between the first and the last level; positive: {positive}",
-        )  # fmt: skip
-    spine.add_argument(
-        "--uneven", dest="uneven_mm", type=float, metavar="MM", help="the gaps of the slices vary by up to this much"
-    )
-    spine.add_argument(
-        "--phases", type=int, metavar="N", help="series at the same places, with ever more contrast medium"
-    )
+    add_fields(parser, PhantomSettings)
+    add_fields(parser.add_argument_group("of a spine"), PhantomSettings, "spine")
+    add_fields(parser, PhantomSettings, "missing", "seed")
+    add_no_clobber(parser, with_ids=False)
 
 
 def _list_kinds() -> str:
-    from clrecon.proof.phantom.job import describe_kinds
-
-    return "\n".join(f"  {name:<9} {said}" for name, said in describe_kinds().items())
+    return "\n".join(f"  {name:<9} {kind.said}" for name, kind in KINDS.items())
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.proof.phantom.job import make_phantom
+    from clrecon.proof.phantom import write_phantom
 
-    given: dict[str, Any] = {name: getattr(options, name) for name in _SETTINGS}
-    truth = make_phantom(options.output, no_clobber=options.no_clobber, progress=console.progress, **given)
+    settings = make_settings(PhantomSettings, options)
+    with keep_existing(options.no_clobber):
+        truth = write_phantom(options.output, settings, progress=console.progress)
     console.result(truth)
     for line in _summary(truth, options.output):
         console.say(line)

@@ -6,15 +6,20 @@ import argparse
 from typing import Any
 
 from clrecon.cli.common import (
+    GRID_FILE,
+    SCAN_FOLDER,
     add_cropping,
     add_device,
-    add_keep_ids,
+    add_fields,
+    add_input,
     add_masking,
-    add_memory,
     add_no_clobber,
+    add_output,
     add_reading,
+    add_report,
     describe_times,
     megabytes,
+    show_report,
 )
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
@@ -22,7 +27,6 @@ from clrecon.cli.render_options import (
     add_camera,
     add_clipping,
     add_curve,
-    add_labels,
     add_looks,
     add_meshes,
     add_motion,
@@ -30,7 +34,7 @@ from clrecon.cli.render_options import (
 )
 from clrecon.errors import UsageError
 from clrecon.jobs.inputs import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file, is_only_mesh
-from clrecon.jobs.render.settings import MeshFile, color_apart, describe_modes, describe_presets
+from clrecon.jobs.render.settings import LabelLook, MeshFile, color_apart, describe_modes, describe_presets
 from clrecon.system.text import count_of
 
 _LABELS_LISTED = 24
@@ -73,37 +77,24 @@ def _epilog() -> str:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = _epilog()
-    parser.add_argument(
-        "input",
-        metavar="INPUT",
-        nargs="?",
-        help="DICOM folder (subfolders and any file names are fine) or file; a NIfTI, NRRD or MetaImage file; a"
-        f" cloud of points ({', '.join(CLOUD_INPUTS)}); or a mesh ({', '.join(MESH_INPUTS)}; of .ply and .vtp say"
-        " --mode mesh); may be left out with --mesh",
-    )
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="OUT",
-        help="picture: .png, .jpg or .tif; may be left out with --turntable",
-        first=True,
-    )
+    kinds = f"a cloud of points ({', '.join(CLOUD_INPUTS)}); or a mesh ({', '.join(MESH_INPUTS)}; of .ply and .vtp say"
+    more = f"{kinds} --mode mesh); may be left out with --mesh"
+    add_input(parser, f"{SCAN_FOLDER}; {GRID_FILE}; {more}", nargs="?")
+    add_output(parser, "picture: .png, .jpg or .tif; may be left out with --turntable", required=False)
     add_looks(parser)
     add_camera(parser)
     add_cropping(parser, "of the patient (LPS)")
     add_clipping(parser)
     add_curve(parser)
-    add_labels(parser)
+    add_fields(parser.add_argument_group("labels"), LabelLook)
     add_meshes(parser)
     add_motion(parser)
     add_reading(parser)
     add_masking(parser)
     device = parser.add_argument_group("device")
     add_device(device)
-    add_memory(device)
     add_no_clobber(device)
-    add_keep_ids(device)
-    device.add_argument("--report", metavar="FILE", help="write camera, settings, certificate, device, times as JSON")
+    add_report(device, "camera, settings, certificate, device, times", first=False)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -120,13 +111,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     report = make_pictures(
         options.input, files, render_settings(options), no_clobber=options.no_clobber, progress=console.progress
     )
-    console.result(report)
-    for line in describe_report(report):
-        console.say(line)
-    for line in _describe_files(report, files):
-        console.say(line)
-    for warning in report["warnings"]:
-        console.warn(warning)
+    show_report(report, describe_report(report) + _describe_files(report, files), options, console)
     return 0
 
 
@@ -247,6 +232,4 @@ def _describe_files(report: dict[str, Any], files: Any) -> list[str]:
                 lines.append(f"wrote    {printable(named)}, {megabytes(picture[what]['bytes'])}")
     if report["turntable"]:
         lines.append(f"wrote    {printable(files.turntable)}, {megabytes(report['turntable']['output']['bytes'])}")
-    if files.report:
-        lines.append(f"report   {printable(files.report)}")
     return lines

@@ -5,88 +5,36 @@ from __future__ import annotations
 import argparse
 import math
 import os
-from collections.abc import Callable
-from typing import Any
 
-from clrecon.cli.common import pick
-from clrecon.errors import UsageError
+from clrecon.cli.common import add_fields, make_part
 from clrecon.jobs.inputs import MESH_INPUTS
 from clrecon.jobs.render.settings import (
+    COLORS,
+    CURVED_KINDS,
     POINT_COLORS,
     SHEET_SLICES,
-    VIEWS,
     WINDOWS,
     LabelLook,
     MeshFile,
     RenderSettings,
     Turntable,
     describe_modes,
+    describe_presets,
+    parse_direction,
+    parse_numbers,
 )
-
-
-def _parse_numbers(text: str, count: int, form: str) -> tuple[float, ...]:
-    """Read a fixed number of numbers with commas between them."""
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != count:
-        raise argparse.ArgumentTypeError(f"{text!r} is not {form}")
-    return values
-
-
-def parse_center(text: str) -> tuple[float, ...]:
-    """Read ``X,Y,Z`` in LPS mm."""
-    return _parse_numbers(text, 3, "a place X,Y,Z in LPS mm, such as -12,40,310")
-
-
-def parse_picture_size(text: str) -> tuple[int, int]:
-    """Read ``512`` or ``512x384`` as width and height."""
-    parts = text.lower().split("x")
-    try:
-        width, height = (int(part) for part in (parts if len(parts) == 2 else (*parts, *parts)))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no size in pixels: write it as 1024 or 1024x768") from None
-    return width, height
-
-
-def parse_views(text: str) -> tuple[str, ...]:
-    """Read ``left``, ``anterior,left,posterior`` or ``AZ,EL``: names or one pair of angles."""
-    parts = tuple(part.strip().lower() for part in text.split(","))
-    if all(part[:1].isalpha() for part in parts):
-        return parts
-    try:
-        _azimuth, _elevation = (float(part) for part in parts)
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is neither names of views with commas between them ({', '.join(VIEWS)}; of slices axial,"
-            " coronal, sagittal), nor one AZ,EL in degrees, such as 30,15: give --view again for further ones"
-        ) from None
-    return (",".join(parts),)
-
-
-def parse_direction(text: str) -> str | tuple[float, ...]:
-    """Read a name, or ``X,Y,Z``."""
-    return (
-        _parse_numbers(text, 3, "a side of the patient, nor a direction X,Y,Z in LPS") if "," in text else text.lower()
-    )
-
-
-def parse_light(text: str) -> str | tuple[float, ...]:
-    """Read ``head``, ``none``, a side of the patient, or ``X,Y,Z``."""
-    return parse_direction(text)
 
 
 def parse_window(text: str) -> str | tuple[float, ...]:
     """Read ``LOW,HIGH`` in HU, or the name of a window."""
     if text[:1].isalpha() and "," not in text:
         return text
-    return _parse_numbers(text, 2, "a window: the HU that are black and white, LOW,HIGH, such as -450,1050")
+    return parse_numbers(text, 2, "a window: the HU that are black and white, LOW,HIGH, such as -450,1050")
 
 
 def parse_clip_plane(text: str) -> tuple[float, ...]:
     """Read ``PX,PY,PZ,NX,NY,NZ``: a point in LPS mm and a normal."""
-    return _parse_numbers(
+    return parse_numbers(
         text, 6, "a plane: a point in LPS mm and the direction of the side that stays, PX,PY,PZ,NX,NY,NZ"
     )
 
@@ -98,28 +46,8 @@ def parse_slices(text: str) -> int | tuple[int, ...]:
     except ValueError:
         numbers = ()
     if not numbers:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number N (every N-th slice) and no list of slices K,K,...")
+        raise ValueError(f"{text!r} is no number N (every N-th slice) and no list of slices K,K,...")
     return numbers if "," in text else numbers[0]
-
-
-def parse_label_color(text: str) -> tuple[str, str]:
-    """Read ``LABEL=COLOUR``."""
-    label, _, color = text.rpartition("=")
-    if not label or not color:
-        raise argparse.ArgumentTypeError(f"{text!r} is not LABEL=COLOUR, such as L2=red or 20=#ff8000")
-    return label, color
-
-
-def parse_label_opacity(text: str) -> tuple[str, float]:
-    """Read ``LABEL=OPACITY``."""
-    label, _, number = text.rpartition("=")
-    try:
-        opacity = float(number)
-    except ValueError:
-        opacity = math.nan
-    if not label or math.isnan(opacity):
-        raise argparse.ArgumentTypeError(f"{text!r} is not LABEL=OPACITY, such as L2=0.2")
-    return label, opacity
 
 
 def parse_mesh(text: str) -> tuple[str, str | None, float]:
@@ -133,36 +61,8 @@ def parse_mesh(text: str) -> tuple[str, str | None, float]:
     except ValueError:
         opacity = math.nan
     if not path or not (color or comma) or math.isnan(opacity):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not FILE[=COLOUR[,OPACITY]], such as l3.stl=orange,0.4 or l3.stl=,0.4"
-        )
+        raise ValueError(f"{text!r} is not FILE[=COLOUR[,OPACITY]], such as l3.stl=orange,0.4 or l3.stl=,0.4")
     return path, color or None, opacity
-
-
-_FRAMES, _FPS, _DEGREES, _ANGLE = 100, 25.0, 360.0, 30.0
-
-
-def _add_repeated(
-    group: argparse._ArgumentGroup,
-    option: str,
-    parse: Callable[[str], Any],
-    metavar: str,
-    text: str,
-    dest: str | None = None,
-    first: bool = False,
-) -> None:
-    """Add an option that can be repeated; its values make a list."""
-    dest = dest or option.removeprefix("--").replace("-", "_")
-    group.add_argument(
-        option,
-        dest=dest,
-        type=parse,
-        metavar=metavar,
-        action="append",
-        default=[],
-        help=f"{text}; may be given again",
-        first=first,
-    )
 
 
 def add_looks(parser: argparse.ArgumentParser) -> None:
@@ -172,6 +72,7 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
         "--mode",
         type=str.lower,
         metavar="M",
+        words=describe_modes(),
         help=f"one of: {', '.join(describe_modes())} (default: what the other options ask)",
         first=True,
     )
@@ -179,6 +80,7 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
         "--preset",
         type=str.lower,
         metavar="NAME",
+        words=describe_presets(),
         help="colours, opacities, light and mode by tissue (default: bone)",
         first=True,
     )
@@ -199,6 +101,7 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--color",
         metavar="C",
+        words=COLORS,
         help="colour of a surface or of points, such as orange or #ff8000 (default: bone); of points also"
         f" {', '.join(POINT_COLORS)} (default: label, else hu, where points have them)",
     )
@@ -227,7 +130,7 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--light",
-        type=parse_light,
+        type=parse_direction,
         metavar="L",
         help="head: a light at the camera; a side of the patient, or X,Y,Z in LPS: a light that stays where it is;"
         " none: colours as they are (default: what the preset says)",
@@ -247,44 +150,7 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
 def add_camera(parser: argparse.ArgumentParser) -> None:
     """Add the options for camera, size, background and annotations."""
     group = parser.add_argument_group("camera and picture")
-    _add_repeated(
-        group, "--view", parse_views, "V[,V...]|AZ,EL",
-        f"where the camera stands: {', '.join(VIEWS)}; or degrees from anterior to the patient's left and to the head;"
-        " of slices also axial, coronal, sagittal (default: anterior; of mode slice axial, of slices 30,30, of cpr"
-        " left); several make a picture each: out_left.png", first=True,
-    )  # fmt: skip
-    group.add_argument(
-        "--up", type=parse_direction, metavar="SIDE|X,Y,Z", help="what is at the top (default: superior, else anterior)"
-    )
-    group.add_argument("--zoom", type=float, default=1.0, metavar="F", help="2 shows everything twice as large")
-    group.add_argument(
-        "--center",
-        type=parse_center,
-        metavar="X,Y,Z",
-        help="LPS mm in the middle of the picture, of a slice too (default: the middle of what is shown)",
-    )
-    group.add_argument(
-        "--size",
-        type=parse_picture_size,
-        metavar="W[xH]",
-        help="pixels of the picture (default: 1024x1024)",
-        first=True,
-    )
-    group.add_argument(
-        "--perspective",
-        dest="view_angle",
-        type=float,
-        nargs="?",
-        const=_ANGLE,
-        metavar="DEGREES",
-        help=f"perspective of so many degrees from bottom to top ({_ANGLE:g} without a number; default: parallel)",
-    )
-    group.add_argument(
-        "--background", default="black", metavar="C", help="colour, such as white or #102030, or transparent"
-    )
-    group.add_argument("--letters", action="store_true", help="draw the sides of the patient: L, R, A, P, S, I")
-    group.add_argument("--scale-bar", action="store_true", help="draw a bar of a round length in mm")
-    group.add_argument("--caption", metavar="TEXT", help="draw a line of text at the top left")
+    add_fields(group, RenderSettings, "camera")
     group.add_argument("--depth", metavar="FILE", help="write mm along the ray to the first hit: .npy or .tif, float32")
     group.add_argument("--values", metavar="FILE", help="write the HU of modes that show HU: .npy or .tif, float32")
 
@@ -292,10 +158,15 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
 def add_clipping(parser: argparse.ArgumentParser) -> None:
     """Add the planes that limit the part of space that is shown."""
     group = parser.add_argument_group("clipping, in mm of the patient (LPS)")
-    _add_repeated(
-        group, "--clip", parse_clip_plane, "PX,PY,PZ,NX,NY,NZ",
-        "keep the side of a plane through a point that a normal points to", dest="clip_planes",
-    )  # fmt: skip
+    group.add_argument(
+        "--clip",
+        dest="clip_planes",
+        type=parse_clip_plane,
+        metavar="PX,PY,PZ,NX,NY,NZ",
+        action="append",
+        default=[],
+        help="keep the side of a plane through a point that a normal points to; may be given again",
+    )
 
 
 def add_curve(parser: argparse.ArgumentParser) -> None:
@@ -303,7 +174,11 @@ def add_curve(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("slices and curved reformations")
     group.add_argument("--thickness", type=float, metavar="MM", help="of a thick slice (default: 0, a plane)")
     group.add_argument(
-        "--combine", type=str.lower, metavar="HOW", help="mean, max or min of a thick slice (default: mean)"
+        "--combine",
+        type=str.lower,
+        metavar="HOW",
+        words=("mean", "max", "min"),
+        help="mean, max or min of a thick slice (default: mean)",
     )
     group.add_argument(
         "--offset", dest="offset_mm", type=float, metavar="MM", help="move the slice away from the camera by so much"
@@ -332,42 +207,28 @@ def add_curve(parser: argparse.ArgumentParser) -> None:
         " canal, found in the scan",
     )
     group.add_argument(
-        "--cpr", type=str.lower, metavar="KIND", help="straightened or stretched (default: straightened)"
-    )
-
-
-def add_labels(parser: argparse.ArgumentParser) -> None:
-    """Add the options for labels with a look of their own."""
-    group = parser.add_argument_group("labels")
-    group.add_argument(
-        "--labels",
-        metavar="FILE|FOLDER",
-        help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
-        first=True,
-    )
-    _add_repeated(group, "--label-color", parse_label_color, "LABEL=COLOUR", "colour of a label, by name or number")
-    _add_repeated(
-        group,
-        "--label-opacity",
-        parse_label_opacity,
-        "LABEL=SHARE",
-        "factor on the opacity of a label, 0 to 1, label 0 is all without a label; over slices the share of its colour"
-        " (default: 0.3)",
+        "--cpr",
+        type=str.lower,
+        metavar="KIND",
+        words=CURVED_KINDS,
+        help="straightened or stretched (default: straightened)",
     )
 
 
 def add_meshes(parser: argparse.ArgumentParser) -> None:
     """Add the options for meshes that are shown with the input."""
     group = parser.add_argument_group("meshes with the input")
-    _add_repeated(
-        group, "--mesh", parse_mesh, "FILE[=COLOUR[,OPACITY]]",
-        f"show a mesh too ({', '.join(MESH_INPUTS)}), in modes dvr, surface, slices, points and mesh", dest="meshes",
-    )  # fmt: skip
     group.add_argument(
-        "--mesh-space",
-        metavar="lps|ras",
-        help="patient frame of meshes whose files do not name theirs (default: lps, with a warning)",
+        "--mesh",
+        dest="meshes",
+        type=parse_mesh,
+        metavar="FILE[=COLOUR[,OPACITY]]",
+        action="append",
+        default=[],
+        help=f"show a mesh too ({', '.join(MESH_INPUTS)}), in modes dvr, surface, slices, points and mesh; may be given"
+        " again",
     )
+    add_fields(group, RenderSettings, "meshes")
 
 
 def add_motion(parser: argparse.ArgumentParser) -> None:
@@ -379,45 +240,22 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
         help="turn round the patient: .mp4, .gif, .apng, or a folder of PNG files",
         first=True,
     )
-    group.add_argument("--frames", type=int, metavar="N", help=f"frames of the turn (default: {_FRAMES})")
-    group.add_argument("--fps", type=float, metavar="N", help=f"frames a second (default: {_FPS:g})")
-    group.add_argument(
-        "--degrees", type=float, metavar="D", help=f"how far it turns, to the patient's left (default: {_DEGREES:g})"
-    )
+    add_fields(group, Turntable)
 
 
 def render_settings(options: argparse.Namespace) -> RenderSettings:
     """Make settings from the options of the command."""
     named = options.color in POINT_COLORS
-    given = pick(options, RenderSettings.keywords()) | {
+    look = "says how a label looks: give the label map with --labels FILE"
+    turn = "says how a picture moves: name it with --turntable OUT"
+    given = {name: getattr(options, name, None) for name in RenderSettings.keywords()} | {
         "color": None if named else options.color,
         "color_by": options.color if named else None,
-        "views": tuple(view for views in options.view for view in views),
+        "views": tuple(view for views in options.views or () for view in views),
         "thickness": options.thickness or None,  # 0 is the same as no thickness
         "offset_mm": options.offset_mm or None,
-        "labels": label_look(options),
+        "labels": make_part(LabelLook, options, options.path, look),
         "meshes": tuple(MeshFile(*given) for given in options.meshes),
-        "turntable": turntable(options),
+        "turntable": make_part(Turntable, options, options.turntable, turn),
     }
-    return RenderSettings.of(**given)
-
-
-def label_look(options: argparse.Namespace) -> LabelLook | None:
-    """Make the settings of labels from the options, None without a label map."""
-    if options.labels is not None:
-        return LabelLook(options.labels, dict(options.label_color), dict(options.label_opacity))
-    for option, given in (("--label-color", options.label_color), ("--label-opacity", options.label_opacity)):
-        if given:
-            raise UsageError(f"{option} says how a label looks: give the label map with --labels FILE")
-    return None
-
-
-def turntable(options: argparse.Namespace) -> Turntable | None:
-    """Make the settings of the turntable from the options, None without a turntable."""
-    given = {name: getattr(options, name) for name in ("frames", "fps", "degrees")}
-    given = {name: value for name, value in given.items() if value is not None}
-    if options.turntable is not None:
-        return Turntable(**given)
-    if given:
-        raise UsageError(f"--{next(iter(given))} says how a picture moves: name it with --turntable OUT")
-    return None
+    return RenderSettings.of(**{name: value for name, value in given.items() if value is not None})

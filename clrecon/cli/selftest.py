@@ -13,7 +13,7 @@ from clrecon.errors import DeviceError
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = "Runs every kernel on small volumes and compares with plain numpy. Exit code 5 when one differs."
-    add_device(parser)
+    add_device(parser, memory=False)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:

@@ -8,9 +8,19 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from clrecon.cli.common import add_keep_ids, add_no_clobber, add_reading, table
+from clrecon.cli.common import (
+    add_fields,
+    add_input,
+    add_no_clobber,
+    add_reading,
+    add_report,
+    make_settings,
+    show_report,
+    table,
+)
 from clrecon.cli.console import Console, is_terminal, printable
 from clrecon.cli.mesh import describe_volume
+from clrecon.jobs.settings import StatsSettings
 
 _EPILOG = """\
 Each voxel counts with its own volume: slices that lie unevenly are right. A label map on another grid is brought to
@@ -25,84 +35,40 @@ _LEAST_NAME = 8
 """Characters of a name that are shown in the narrowest window."""
 
 
-def _parse_numbers(text: str) -> tuple[float, ...]:
-    """Read numbers with commas between them."""
-    try:
-        return tuple(float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} are no percentiles: numbers with commas, 5,50,95") from None
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = _EPILOG
-    parser.add_argument("input", metavar="INPUT", help="DICOM folder or file; or a NIfTI, NRRD or MetaImage file")
-    parser.add_argument(
-        "--labels",
-        metavar="FILE|FOLDER",
-        required=True,
-        help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
-        first=True,
-    )
-    parser.add_argument(
-        "--label", metavar="NAME|N", action="append", default=[], help="this label only; may be given again", first=True
-    )
-    parser.add_argument(
-        "--percentiles",
-        type=_parse_numbers,
-        metavar="P,P",
-        help="percentiles of HU, from 0 to 100 (default: 5,25,50,75,95)",
-        first=True,
-    )
+    add_input(parser)
+    add_fields(parser, StatsSettings)
     output = parser.add_argument_group("files")
     output.add_argument("--csv", metavar="FILE", help="write the figures as a table, one line a label", first=True)
-    output.add_argument(
-        "--report", metavar="FILE", help="write figures, certificate of the scan and warnings as JSON", first=True
-    )
+    add_report(output, "figures, certificate of the scan and warnings")
     add_no_clobber(output)
-    add_keep_ids(output)
     add_reading(parser)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.stats import StatsSettings, measure_stats
+    from clrecon.jobs.stats import measure_stats
 
-    given = {} if options.percentiles is None else {"percentiles": options.percentiles}
-    settings = StatsSettings(
-        labels=options.labels,
-        only=tuple(options.label),
-        keep_ids=options.keep_ids,
-        series=options.series,
-        phase=options.phase,
-        allow_gaps=options.allow_gaps,
-        force=options.force,
-        follow_links=options.follow_links,
-        rescale=options.rescale,
-        **given,
-    )
     report = measure_stats(
         options.input,
-        settings,
+        make_settings(StatsSettings, options),
         report_path=options.report,
         csv_path=options.csv,
         no_clobber=options.no_clobber,
         progress=console.progress,
     )
-    console.result(report)
-    console.say(f"input    {describe_volume(report['volume'])}")
-    if report["resampled"]:
-        console.say("labels   brought to the grid of the scan: the nearest label in mm")
-    console.say("figures  volume in ml, the rest in HU: mean, standard deviation, least, percentiles, largest")
     width = shutil.get_terminal_size().columns if is_terminal(sys.stdout) else None
-    for line in _lay_out(report, width):
-        console.say(line)
-    console.say(f"time     {report['seconds']['total']:.2f} s")
-    for what, path in (("wrote", options.csv), ("report", options.report)):
-        if path is not None:
-            console.say(f"{what:<8} {printable(path)}")
-    for warning in report["warnings"]:
-        console.warn(warning)
+    lines = [
+        f"input    {describe_volume(report['volume'])}",
+        *(["labels   brought to the grid of the scan: the nearest label in mm"] if report["resampled"] else []),
+        "figures  volume in ml, the rest in HU: mean, standard deviation, least, percentiles, largest",
+        *_lay_out(report, width),
+        f"time     {report['seconds']['total']:.2f} s",
+        *([f"wrote    {printable(options.csv)}"] if options.csv is not None else []),
+    ]
+    show_report(report, lines, options, console)
     return 0
 
 

@@ -5,9 +5,21 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_keep_ids, add_no_clobber, add_reading, megabytes, parse_point, pick, table
+from clrecon.cli.common import (
+    add_fields,
+    add_input,
+    add_no_clobber,
+    add_output,
+    add_reading,
+    add_report,
+    make_settings,
+    megabytes,
+    show_report,
+    table,
+)
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
+from clrecon.jobs.settings import VertebraeSettings
 from clrecon.system.text import count_of
 
 PARTLY = 8
@@ -27,21 +39,11 @@ examples:
   (a label has the name of a level after --first or --name-at; without them it is --label vertebra_4)"""
 
 
-def _parse_name(text: str) -> tuple[tuple[float, ...], str]:
-    """Read ``X,Y,Z=L3``."""
-    point, equals, level = text.rpartition("=")
-    if not equals or not level.strip():
-        raise argparse.ArgumentTypeError(f"{text!r} is no named point: write it as X,Y,Z=L3")
-    return parse_point(point), level.strip()
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = _EPILOG
-    parser.add_argument("input", metavar="INPUT", help="DICOM folder or file, or a NIfTI, NRRD or MetaImage file")
-    parser.add_argument(
-        "-o", "--output", metavar="OUT", required=True, help="label map: .nii.gz, .nii, or .dcm (DICOM SEG)", first=True
-    )
+    add_input(parser)
+    add_output(parser, "label map: .nii.gz, .nii, or .dcm (DICOM SEG)")
     parser.add_argument(
         "--picture",
         metavar="PNG",
@@ -49,55 +51,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         first=True,
     )
     add_reading(parser)
-    group = parser.add_argument_group("vertebrae")
-    group.add_argument(
-        "--hu",
-        dest="level",
-        type=float,
-        metavar="N",
-        help="bone is N HU and more (default: half way between discs and marrow, 120 to 226)",
-        first=True,
-    )
-    group.add_argument(
-        "--seed",
-        dest="seeds",
-        type=parse_point,
-        metavar="X,Y,Z",
-        action="append",
-        default=[],
-        help="a point in the body of a vertebra, LPS mm; one for each vertebra, in place of the search for discs",
-        first=True,
-    )
-    group.add_argument(
-        "--name-at",
-        type=_parse_name,
-        metavar="X,Y,Z=L3",
-        help="name the level of the vertebra at this point (LPS mm), and from it all others",
-        first=True,
-    )
-    group.add_argument(
-        "--first",
-        metavar="LEVEL",
-        help="name the level of the uppermost vertebra that is found (T1), and from it all others; without --first and"
-        " --name-at they are numbered from the head",
-        first=True,
-    )
-    group.add_argument("--keep-unsure", action="store_true", help="write vertebrae of low confidence too")
+    add_fields(parser.add_argument_group("vertebrae"), VertebraeSettings, "vertebrae")
     checks = parser.add_argument_group("checks")
     add_no_clobber(checks)
-    add_keep_ids(checks)
-    checks.add_argument(
-        "--report", metavar="FILE", help="write vertebrae, confidence, discs and times as JSON", first=True
-    )
+    add_report(checks, "vertebrae, confidence, discs and times")
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.jobs.vertebrae import VertebraeSettings, make_vertebrae, picture_beside
+    from clrecon.jobs.vertebrae import make_vertebrae, picture_beside
 
-    reading = ("series", "phase", "allow_gaps", "force", "follow_links", "rescale")
-    names = ("level", "seeds", "name_at", "first", "keep_unsure", "keep_ids")
-    settings = VertebraeSettings(**pick(options, (*reading, *names)))
+    settings = make_settings(VertebraeSettings, options)
     with_picture = options.picture is not None or not getattr(options, "streams_output", False)  # beside what?
     report = make_vertebrae(
         options.input,
@@ -109,18 +73,13 @@ def run(options: argparse.Namespace, console: Console) -> int:
         no_clobber=options.no_clobber,
         progress=console.progress,
     )
-    console.result(report)
-    for line in _describe(report):
-        console.say(line)
+    lines = _describe(report)
     if settings.name_at is None and settings.first is None:
-        console.say(f"names    {_NAMING}")
-    console.say(f"wrote    {printable(options.output)}, {megabytes(report['output']['bytes'])}")
+        lines.append(f"names    {_NAMING}")
+    lines.append(f"wrote    {printable(options.output)}, {megabytes(report['output']['bytes'])}")
     if with_picture:
-        console.say(f"picture  {printable(options.picture or picture_beside(options.output))}: look at it")
-    if options.report:
-        console.say(f"report   {printable(options.report)}")
-    for warning in report["warnings"]:
-        console.warn(warning)
+        lines.append(f"picture  {printable(options.picture or picture_beside(options.output))}: look at it")
+    show_report(report, lines, options, console)
     return PARTLY if report["low_confidence"] else 0
 
 

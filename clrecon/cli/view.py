@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from clrecon.cli.common import (
     add_cropping,
     add_device,
-    add_keep_ids,
+    add_fields,
     add_masking,
-    add_memory,
     add_no_clobber,
     add_reading,
+    make_settings,
     megabytes,
-    pick,
+    show_report,
     table,
 )
 from clrecon.cli.console import Console, printable
-from clrecon.cli.mesh import add_levels, add_selection, add_solid, describe_volume
-from clrecon.cli.mesh_options import add_label_arguments, label_choice
+from clrecon.cli.mesh import add_labels, add_levels, describe_volume, mesh_fields
 from clrecon.errors import UsageError
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.view import ViewSettings
 from clrecon.system.text import format_volume
-
-if TYPE_CHECKING:
-    from clrecon.jobs.view.inputs import ViewSettings
 
 _EPILOG = """\
 Without --html and --window everything is shown in a browser of this computer, drawn on the OpenCL device: a slider for
@@ -74,36 +71,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " numbered where it exists; repeat it for several (default: a download)",
         first=True,
     )
-    shown.add_argument(
-        "--name",
-        dest="names",
-        action="append",
-        default=[],
-        metavar="TEXT",
-        help="name of an input on the page, in the order of the inputs; repeat it for several (default: surface 1 ...)",
-    )
-    shown.add_argument(
-        "--mesh-space",
-        type=str.lower,
-        metavar="lps|ras",
-        help="patient frame of mesh files that do not name theirs (default: lps, with a warning)",
-    )
-    shown.add_argument(
-        "--space", type=str.lower, default="lps", metavar="lps|ras", help="frame of picked points (default: lps)"
-    )
+    add_fields(shown, ViewSettings)
+    shown.add_argument("--space", type=str.lower, metavar="lps|ras", help="frame of picked points (default: lps)")
     add_no_clobber(shown)
-    add_keep_ids(shown)
     add_reading(parser)
     add_masking(parser)
     add_cropping(parser)
-    surface = parser.add_argument_group("surface of a scan")
-    add_levels(surface)
-    add_solid(surface)
-    add_selection(parser.add_argument_group("components of a scan"))
-    add_label_arguments(parser)
-    device = parser.add_argument_group("device, for scans")
-    add_device(device)
-    add_memory(device)
+    add_levels(parser, "surface of a scan")
+    add_fields(parser.add_argument_group("components of a scan"), MeshSettings, "selection")
+    add_labels(parser)
+    add_device(parser.add_argument_group("device, for scans"))
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -119,23 +96,12 @@ def run(options: argparse.Namespace, console: Console) -> int:
     report = write_view(
         options.inputs, options.html, settings, no_clobber=options.no_clobber, progress=console.progress
     )
-    console.result(report)
-    for line in _describe(report, options.html):
-        console.say(line)
-    for warning in report["warnings"]:
-        console.warn(warning)
+    show_report(report, _describe(report, options.html), options, console)
     return 0
 
 
 def _settings(options: argparse.Namespace) -> ViewSettings:
-    from clrecon.jobs.mesh.settings import MeshSettings
-    from clrecon.jobs.view.inputs import ViewSettings
-
-    given = {**pick(options, {own.name for own in fields(MeshSettings)}), **options.hu, "labels": label_choice(options)}
-    if options.labels is not None:
-        given.pop("solid", None)  # it says how each label becomes a mesh
-    scan = MeshSettings(**{name: value for name, value in given.items() if value is not None})
-    return ViewSettings(scan=scan, mesh_space=options.mesh_space, names=options.names)
+    return make_settings(ViewSettings, options, scan=MeshSettings(**mesh_fields(options)))
 
 
 def _check_faces(options: argparse.Namespace) -> None:

@@ -5,7 +5,6 @@ The files of both are read, and doubts are raised where they cannot lie in one f
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.geometry import frame_from_lps
 from clrecon.jobs.run import JobReport, Run
+from clrecon.jobs.settings import DistanceSettings
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SAMPLES, DistanceSummary
 from clrecon.mesh.compare.signed import MeshDeviation, SideDistance, measure_distance, measure_vertex_distances
 from clrecon.mesh.mesh_reader import read_mesh
-from clrecon.rendering.views.directions import find_view
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text, format_digits
 
@@ -31,41 +29,6 @@ if TYPE_CHECKING:
     from clrecon.rendering import Rendering
     from clrecon.rendering.looks.colors import ColorScale
     from clrecon.system.files import StagedFile
-
-
-MOST_SAMPLES = 10_000_000
-
-
-@dataclass(frozen=True, kw_only=True)
-class DistanceSettings:
-    """Settings of the job.
-
-    mesh_space: {"lps", "ras"}. Patient frame of files that do not name theirs; None: LPS, with a warning.
-    samples: Points on each surface.
-    range_mm: Distance at which the colours end; None: chosen from the distances.
-    view: View of the picture, see `clrecon.Camera.fit`.
-    space: {"lps", "ras"}. Patient frame of the coloured mesh.
-    device: Name or index of an OpenCL device, for the picture.
-    memory: Most bytes on the device.
-    """
-
-    mesh_space: str | None = None
-    samples: int = SAMPLES
-    range_mm: float | None = None
-    view: str = "anterior"
-    space: str = "lps"
-    device: str | None = None
-    memory: int | None = None
-
-    def __post_init__(self) -> None:
-        frame_from_lps(self.space)
-        if self.mesh_space is not None:
-            frame_from_lps(self.mesh_space)
-        if not 1 <= self.samples <= MOST_SAMPLES:
-            raise UsageError(f"distances need 1 to {MOST_SAMPLES:,} samples on each mesh, not {self.samples:,}")
-        if self.range_mm is not None and not (math.isfinite(self.range_mm) and self.range_mm > 0.0):
-            raise UsageError(f"the colours span a number of mm above 0, not {self.range_mm:g}")
-        find_view(self.view)
 
 
 _LEAST_RANGE_MM = 1e-3
@@ -141,7 +104,7 @@ def measure_meshes(
                 raise NoSurfaceError(f"{entry['name']} has no triangle with an area: there is nothing to measure")
         run.lap("read")
         names = (entries[0]["name"], entries[1]["name"])
-        found = measure_distance(meshes[0], meshes[1], settings.samples, names=names, progress=run.progress)
+        found = measure_distance(meshes[0], meshes[1], settings.samples or SAMPLES, names=names, progress=run.progress)
         colored = None
         if files.output is not None or files.picture is not None:
             colored = _color_mesh(meshes[0], meshes[1], found, settings, run.progress)

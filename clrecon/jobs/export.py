@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 from clrecon.geometry.blocks import find_extent
 from clrecon.geometry.resample import resample_volume
 from clrecon.jobs.inputs import crop_scan
-from clrecon.jobs.options import InputSettings
 from clrecon.jobs.preprocess import mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.run import Run, ScanReport
+from clrecon.jobs.settings import ExportSettings
 from clrecon.reading.grids.write_volume import (
     FORMATS,
     check_holds,
@@ -25,35 +25,6 @@ from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportSettings(InputSettings):
-    """Settings of the export job.
-
-    resample: Resample to a regular grid with this step in mm, see `clrecon.geometry.resample.resample_volume`; None:
-        voxels stay as they are.
-    space: {"lps", "ras"}. Patient frame of the numbers of crop and region.  The frame of the file is that of its
-        format.
-    **shared: See `clrecon.jobs.options.InputSettings`.
-    """
-
-    resample: float | None = None
-    space: str = "lps"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        from clrecon.geometry.affine import frame_from_lps
-        from clrecon.geometry.resample import check_step
-
-        frame_from_lps(self.space)
-        if self.resample is not None:
-            check_step(self.resample)
-
-    @property
-    def needs_device(self) -> bool:
-        """True where the region or a step of preprocessing runs on a device."""
-        return bool(self.region) or self.preprocess is not None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

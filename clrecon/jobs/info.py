@@ -2,26 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from clrecon.errors import ClreconError, NoDicomError, RefusedInputError
-from clrecon.reading import Selection, list_selected
+from clrecon.jobs.settings import InfoSettings
+from clrecon.reading import list_selected
 from clrecon.system.progress import Progress
-
-
-@dataclass(frozen=True, kw_only=True)
-class InfoSettings(Selection):
-    """What is judged: a series that is named, or the reader's choice; any usable series is enough then.
-
-    series, phase, allow_gaps, force, follow_links, rescale: See `clrecon.reading.Selection`.
-    pixels: Read the pixels of the series that is judged.
-    strict: A failed gate is a problem, and so is a listing without a chosen series.
-    """
-
-    pixels: bool = False
-    strict: bool = False
 
 
 class InputListing(NamedTuple):

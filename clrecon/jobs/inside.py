@@ -6,16 +6,14 @@ Pictures show one part opaque and others faded.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clrecon.errors import UsageError
 from clrecon.jobs.outputs import check_distinct, check_kept, check_outputs, name_outputs, refuse_files
 from clrecon.jobs.run import DeviceOpening, Run, RunReport, trial_cube
-from clrecon.reading import Selection
-from clrecon.system.arguments import name_parameter
+from clrecon.jobs.settings import InsideSettings
 from clrecon.system.log import get_logger
 
 if TYPE_CHECKING:
@@ -26,9 +24,6 @@ if TYPE_CHECKING:
     from clrecon.operators.vertebrae.inside import VertebraInside
     from clrecon.rendering import Rendering
 
-
-DEFAULT_VIEW = "130,20"
-"""From the left, behind and above: body, arch and canal are seen."""
 
 COLORS = {
     "solid": (0.93, 0.88, 0.76),
@@ -79,52 +74,6 @@ def draw_parts(
         with ScenePictures(shown, device=device, memory=memory) as scene:
             pictures[part] = scene.take(camera, DEFAULT_SIZE, "white")
     return pictures
-
-
-@dataclass(frozen=True, kw_only=True)
-class InsideSettings(Selection):
-    """Settings of the job.
-
-    series, phase, allow_gaps, force, follow_links, rescale: See `clrecon.reading.Selection`.
-    labels: Label map: NIfTI, NRRD, MetaImage, DICOM SEG or RTSTRUCT.
-    only: The vertebrae, by numbers or names of their labels.
-    iso_value: HU of the solid bone; None: the labels' own voxels.
-    dense: (low, high). Band of dense bone, HU; None leaves an end open.  Default:
-        `clrecon.operators.vertebrae.inside.DENSE_HU`.
-    close_mm: Radius that closes the solid bone.  Default: `clrecon.operators.vertebrae.solid.CLOSE_MM`.
-    grow_mm: Distance of growth with an iso value, see `clrecon.extract_labels`.
-    space: {"lps", "ras"}. Patient frame of the meshes.
-    view: View of the pictures, see `clrecon.Camera.fit`.
-    keep_ids: Write the hashes of the UIDs of series and frame of reference into the report and the mesh files.
-    device: Name or index of an OpenCL device.
-    memory: Most bytes on the device.
-    """
-
-    labels: str | Path
-    only: Sequence[str | int]
-    iso_value: float | None = None
-    dense: Sequence[float | None] | None = None
-    close_mm: float | None = None
-    grow_mm: float | None = None
-    space: str = "lps"
-    view: str = DEFAULT_VIEW
-    keep_ids: bool = False
-    device: str | None = None
-    memory: int | None = None
-
-    def __post_init__(self) -> None:
-        from clrecon.geometry import frame_from_lps
-
-        frame_from_lps(self.space)
-        if not self.only:
-            raise UsageError(f"choose the vertebrae by their labels: {name_parameter('only', 'L3')}")
-        if self.memory is not None and self.memory < 1:
-            raise UsageError(f"the memory that may be taken must be above 0 bytes, not {self.memory}")
-        if self.grow_mm is not None and self.iso_value is None:
-            raise UsageError(
-                f"the labels' own voxels do not grow: leave {name_parameter('grow_mm')} out, or give an iso value"
-                f" ({name_parameter('iso_value', 'N')})"
-            )
 
 
 log = get_logger(__name__)

@@ -10,11 +10,13 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
+from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 from clrecon.reading import Selection
-from clrecon.system.options import option
+from clrecon.system.arguments import name_parameter
+from clrecon.system.options import flag, option
 
 if TYPE_CHECKING:
     from clrecon.geometry.boxes import Box
@@ -56,6 +58,70 @@ def _parse_box_numbers(text: str, count: int, fault: str, *, ends: bool) -> tupl
     return values
 
 
+def parse_point(text: str) -> tuple[float, ...]:
+    """Read ``X,Y,Z``, three numbers in mm."""
+    point = _parse_region_numbers(text, ends=False)
+    if point is None or len(point) != 3:
+        raise ValueError(f"{text!r} is no point: three numbers in mm with commas, X,Y,Z")
+    return point
+
+
+LEVELS_HELP = (
+    "iso value in HU, inside is N and above; A:B is a range, inside is from A to B; several with commas make one mesh"
+    " each;"
+    " auto: half way between bone and the tissue beside it, measured in the scan;"
+    " half:BONE,TISSUE: half way between these two"
+)
+_HALF = "half:"
+
+
+def parse_hu(text: str) -> dict[str, Any]:
+    """Read numbers, ranges, ``auto`` or ``half:BONE,TISSUE`` as the fields `iso_value` or `half_way` of settings."""
+    if text == "auto":
+        return {"half_way": "auto"}
+    if not text.startswith(_HALF):
+        return {"iso_value": tuple(_parse_level(part, text) for part in text.split(","))}
+    materials = parse_levels(text.removeprefix(_HALF))
+    if len(materials) != 2:
+        raise ValueError(f"{text!r} does not name two materials in HU, as half:1200,40 does")
+    return {"half_way": materials}
+
+
+def _parse_level(part: str, text: str) -> float | tuple[float, float]:
+    """Read a number, or the two ends of a range A:B."""
+    if ":" not in part:
+        return parse_levels(part, text)[0]
+    ends = part.split(":")
+    if len(ends) != 2 or not all(ends):
+        where = f" in {text!r}" if part != text else ""
+        raise ValueError(
+            f"{part!r}{where} is no range A:B of two numbers of HU; from A on is {name_parameter('iso_value', 'A')},"
+            f" below B is {name_parameter('below', 'B')}"
+        )
+    low, high = (parse_levels(end, text)[0] for end in ends)
+    return low, high
+
+
+def parse_levels(text: str, whole: str | None = None) -> tuple[float, ...]:
+    """Read one number, or several with commas between them; `whole` is the full text of which `text` is a part."""
+    levels = []
+    for part in text.split(","):
+        try:
+            levels.append(float(part))
+        except ValueError:
+            where = f" in {whole or text!r}" if part != (whole or text) else ""
+            raise ValueError(f"{part!r}{where} is no number of HU") from None
+    return tuple(levels)
+
+
+def parse_label_color(text: str) -> tuple[str, str]:
+    """Read ``LABEL=COLOUR``."""
+    label, _, color = text.rpartition("=")
+    if not label or not color:
+        raise ValueError(f"{text!r} is not LABEL=COLOUR, such as L2=red or 20=#ff8000")
+    return label, color
+
+
 def _parse_radius(text: str) -> float | str:
     try:
         return text if text == "auto" else float(text)
@@ -80,7 +146,84 @@ def parse_bytes(text: str) -> int:
 
 
 @dataclass(frozen=True, kw_only=True)
-class InputSettings(Selection):
+class DeviceSettings:
+    """The device for the computation."""
+
+    device: str | None = option(
+        "--device",
+        "D",
+        'OpenCL device: an index of "clrecon devices", "cpu", "gpu" or a part of its name'
+        " (default: CLRECON_DEVICE, else the best)",
+        group="device",
+        first=True,
+        words=("cpu", "gpu"),
+    )
+    memory: int | None = option(
+        "--memory",
+        "SIZE",
+        "memory that may be taken on the device, such as 500MB or 2GiB (default: all of it);"
+        " what does not fit goes through in slabs, with the same result",
+        group="memory",
+        parse=parse_bytes,
+    )
+
+    def __post_init__(self) -> None:
+        if self.memory is not None and self.memory < 1:
+            raise UsageError(f"the memory that may be taken must be above 0 bytes, not {self.memory}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanSettings(Selection):
+    """The part of a scan that is read, and what of its origin is written."""
+
+    keep_ids: bool = flag(
+        "--keep-ids",
+        "write hashes of the UIDs of series and frame of reference into what is written and printed, by which outputs"
+        " of one scan are told; never the UIDs",
+        group="ids",
+    )
+
+
+def label_map_option(**how: Any) -> Any:
+    """Declare a field for the file of a label map."""
+    return option(
+        "--labels",
+        "FILE|FOLDER",
+        "label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
+        first=True,
+        **how,
+    )
+
+
+def space_option(text: str, **how: Any) -> Any:
+    """Declare a field for the patient frame of what is written."""
+    return option("--space", "lps|ras", f"{text} (default: lps)", default="lps", parse=str.lower, **how)
+
+
+def preset_option() -> Any:
+    """Declare a field for the iso value by tissue."""
+    return option(
+        "--preset",
+        "NAME",
+        f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})",
+        group="level",
+        parse=str.lower,
+        words=PRESETS,
+    )
+
+
+def closed_option() -> Any:
+    """Declare a field for surfaces that are closed where they meet the border of the volume: outside is air."""
+    return flag("--open", "leave the surface open at the border of the volume", group="surface", default=True)
+
+
+def mesh_space_option(text: str = "files that do not name theirs") -> Any:
+    """Declare a field for the patient frame of meshes that do not name theirs."""
+    return option("--mesh-space", "lps|ras", f"patient frame of {text} (default: lps, with a warning)", parse=str.lower)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputSettings(ScanSettings, DeviceSettings):
     """Settings of the input: what is read, which parts become air, and the device for the computation.
 
     Options say in their help what they do; beside that:
@@ -91,26 +234,19 @@ class InputSettings(Selection):
         open.  Whole voxels, see `clrecon.geometry.blocks.crop_volume`.
     region: mm as above, see `parse_region_rules`.
     preprocess: See `parse_preprocess`.
-    keep_ids: Write the hashes of the UIDs of series and frame of reference into reports and mesh files.
-    device: Name or index of an OpenCL device; None leaves the choice to `choose_device`.
-    memory: Bytes.
     """
 
-    remove_table: bool = option(
+    remove_table: bool = flag(
         "--remove-table",
-        None,
         "turn what is not the patient's body into air first: table, blankets, cables",
         group="masking",
-        default=False,
         first=True,
     )
-    allow_bone_loss: bool = option(
+    allow_bone_loss: bool = flag(
         "--allow-bone-loss",
-        None,
         "go on where --remove-table takes more than 2 %% of the bone, or a step of --preprocess more than half of"
         " what is at the level and above, which else is refused",
         group="masking",
-        default=False,
     )
     field_of_view: float | str | None = option(
         "--fov",
@@ -151,20 +287,9 @@ class InputSettings(Selection):
         " value and above, or at level:HU; region is the place of --region, which else comes first",
         group="masking",
     )
-    keep_ids: bool = False
-    device: str | None = None
-    memory: int | None = option(
-        "--memory",
-        "SIZE",
-        "memory that may be taken on the device, such as 500MB or 2GiB (default: all of it);"
-        " what does not fit goes through in slabs, with the same result",
-        group="memory",
-        parse=parse_bytes,
-    )
 
     def __post_init__(self) -> None:
-        if self.memory is not None and self.memory < 1:
-            raise UsageError(f"the memory that may be taken must be above 0 bytes, not {self.memory}")
+        super().__post_init__()
         if isinstance(self.field_of_view, str):
             if self.field_of_view != "auto":
                 raise UsageError(f"the field of view is a radius in mm or auto, not {self.field_of_view!r}")

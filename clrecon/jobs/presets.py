@@ -1,8 +1,7 @@
-"""Words that stand for settings: presets of iso values, purposes of meshes, and all words that a setting can be."""
+"""Words that stand for settings: presets of iso values, and purposes of meshes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -101,35 +100,3 @@ def find_purpose(name: str) -> Purpose:
     if name not in PURPOSES:
         raise UsageError(f"a mesh can be for {', '.join(PURPOSES)}, not for {name!r}{guess_word(name, PURPOSES)}")
     return PURPOSES[name]
-
-
-def list_words(command: str, setting: str) -> list[str]:
-    """Return the words that a setting can be; an empty list where it takes numbers, files or free text.
-
-    command: Name of a command: a preset of pictures is not one of meshes.
-    setting: Name of the option's value, such as ``preset``.
-    """
-    from clrecon.rendering.looks.colors import COLORS
-    from clrecon.rendering.looks.presets import PRESETS as LOOKS
-    from clrecon.rendering.pictures.modes import MODES
-    from clrecon.rendering.pictures.styles import CURVED_KINDS
-    from clrecon.rendering.views.directions import DIRECTIONS
-    from clrecon.rendering.views.reformation import PLANES
-
-    tables: dict[tuple[str, str], Iterable[str]] = {
-        ("render", "preset"): LOOKS,
-        ("render", "mode"): MODES,
-        ("render", "view"): [*DIRECTIONS, *PLANES],
-        ("render", "color"): COLORS,
-        ("render", "background"): COLORS,
-        ("render", "cpr"): CURVED_KINDS,
-        ("render", "combine"): ("mean", "max", "min"),
-        ("inside", "view"): DIRECTIONS,
-        ("mesh", "preset"): PRESETS,
-        ("compare", "preset"): PRESETS,
-        ("mesh", "purpose"): PURPOSES,
-        ("mesh", "topology"): ("separated", "trilinear"),
-    }
-    if setting == "device":
-        return ["cpu", "gpu"]
-    return list(tables.get((command, setting), ()))

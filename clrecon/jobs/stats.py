@@ -4,38 +4,17 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.run import Run, ScanReport
+from clrecon.jobs.settings import StatsSettings
 from clrecon.labels import resample_labels
 from clrecon.labels.statistics import PERCENTILES, check_percentiles, measure_resampled, name_percentile
-from clrecon.reading import Selection
 
 if TYPE_CHECKING:
     from clrecon.labels.statistics import LabelFigures
-
-
-@dataclass(frozen=True, kw_only=True)
-class StatsSettings(Selection):
-    """Settings of the job.
-
-    series, phase, allow_gaps, force, follow_links, rescale: See `clrecon.reading.Selection`.
-    labels: Label map: NIfTI, NRRD, MetaImage, DICOM SEG or RTSTRUCT.
-    only: Labels that are measured; none: all.
-    percentiles: From 0 to 100.
-    keep_ids: Write the hashes of the UIDs of series and frame of reference into the report.
-    """
-
-    labels: str | Path
-    only: Sequence[str | int] = ()
-    percentiles: Sequence[float] = PERCENTILES
-    keep_ids: bool = False
-
-    def __post_init__(self) -> None:
-        check_percentiles(self.percentiles)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -76,7 +55,7 @@ def measure_stats(
         volume, labels = run.read_labelled(source, only)
         run.lap("read")
         taken = resample_labels(labels, volume)
-        percentiles = check_percentiles(settings.percentiles)
+        percentiles = check_percentiles(PERCENTILES if settings.percentiles is None else settings.percentiles)
         figures = measure_resampled(volume, labels, taken, only, percentiles=percentiles, progress=run.progress)
         run.lap("measure")
         report = run.report(

@@ -5,9 +5,8 @@ The picture of every run is the straightened spine with planes and vertebrae dra
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.jobs.run import Run, ScanReport
-from clrecon.reading import Selection
+from clrecon.jobs.settings import VertebraeSettings
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.pictures.pillow import load_font, load_pillow
 
@@ -26,40 +25,6 @@ if TYPE_CHECKING:
     from clrecon.labels import LabelMap
     from clrecon.spine import VertebraSplit
     from clrecon.spine.split import Vertebra
-
-
-@dataclass(frozen=True, kw_only=True)
-class VertebraeSettings(Selection):
-    """Settings of the search for vertebrae.
-
-    series, phase, allow_gaps, force, follow_links, rescale: See `clrecon.reading.Selection`.
-    level: HU from which on a voxel is bone, see `clrecon.split_vertebrae`.
-    seeds: sequence of (x, y, z). Points in LPS mm, one in the body of each vertebra, in place of the search for discs.
-    name_at: ((x, y, z), str). A point in LPS mm and the level of the vertebra there.
-    first: Level of the uppermost vertebra that is found; not together with `name_at`.
-    keep_unsure: Write vertebrae of low confidence too.
-    keep_ids: Write the hashes of the UIDs of series and frame of reference into the report.
-    """
-
-    level: float | None = None
-    seeds: Sequence[Sequence[float]] = ()
-    name_at: tuple[Sequence[float], str] | None = None
-    first: str | None = None
-    keep_unsure: bool = False
-    keep_ids: bool = False
-
-    def __post_init__(self) -> None:
-        from clrecon.spine.split import check_landmark
-
-        if self.level is not None and not math.isfinite(self.level):
-            raise UsageError(f"the level of bone is a number of HU, not {self.level!r}")
-        points = [*self.seeds, *([] if self.name_at is None else [self.name_at[0]])]
-        for point in points:
-            if len(point) != 3 or not all(math.isfinite(value) for value in point):
-                raise UsageError(f"a point is three numbers in mm, not {list(point)!r}")
-        if len(self.seeds) == 1:
-            raise UsageError("one seed is too few: give a point in each vertebra, two at least")
-        check_landmark(self.name_at, self.first)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import NoSurfaceError
-from clrecon.jobs.view.inputs import ViewSettings, check_view_settings
+from clrecon.jobs.view import ViewSettings
+from clrecon.jobs.view.inputs import check_view_settings
 from clrecon.operators.surface.extract import SurfaceExtractor
 from clrecon.operators.surface.label_masks import extract_label_masks
 from clrecon.rendering.pictures.label_style import distinct_colors

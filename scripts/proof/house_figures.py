@@ -92,7 +92,7 @@ def _option_places(modules: dict[str, tuple[str, list[ast.AST]]]) -> Counter[str
     for name, (_, nodes) in modules.items():
         for node in nodes:
             called = getattr(node, "func", None)
-            if "add_argument" == getattr(called, "attr", "") or "option" == getattr(called, "id", ""):
+            if getattr(called, "attr", "") == "add_argument" or getattr(called, "id", "") in ("option", "flag"):
                 flags = [str(word.value) for word in getattr(node, "args", ()) if isinstance(word, ast.Constant)]
                 places |= {(flag, name) for flag in flags if flag.startswith("--")}
     return Counter(flag for flag, _ in places)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,8 @@ import ct_files
 import pytest
 import tolerances
 
-from clrecon.cli.common import parse_hu
 from clrecon.cli.main import main
+from clrecon.jobs.options import parse_hu
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +69,7 @@ def test_auto_without_bone_ends_with_2_and_the_modes(
     ],
 )
 def test_what_hu_does_not_understand(text: str, words: str) -> None:
-    with pytest.raises(argparse.ArgumentTypeError, match=words):
+    with pytest.raises(ValueError, match=words):
         parse_hu(text)
 
 

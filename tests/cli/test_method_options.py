@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from clrecon.cli.main import main
-from clrecon.cli.mesh_options import METHOD_NAMES
+from clrecon.jobs.mesh.settings import METHOD_NAMES
 from clrecon.operators.surface.methods import METHODS
 
 

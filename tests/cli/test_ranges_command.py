@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,10 @@ import ct_files
 import numpy as np
 import pytest
 
-from clrecon.cli.common import parse_hu
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
+from clrecon.jobs.options import parse_hu
 
 
 @pytest.fixture(scope="module")
@@ -60,14 +59,14 @@ def test_a_range_and_an_iso_value_together(
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("100:", "'100:' is no range A:B of two numbers of HU; from A on is --hu A, below B is --below B"),
+        ("100:", "'100:' is no range A:B of two numbers of HU; from A on is iso_value=A, below B is below=B"),
         (":300", "':300' is no range"),
         ("200,1:2:3", "'1:2:3' in '200,1:2:3' is no range"),
         ("100:b", "'b' in '100:b' is no number of HU"),
     ],
 )
 def test_what_is_no_range_is_said(text: str, said: str) -> None:
-    with pytest.raises(argparse.ArgumentTypeError) as caught:
+    with pytest.raises(ValueError, match="is no") as caught:
         parse_hu(text)
     assert said in str(caught.value)
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from clrecon.cli.console import Console
-from clrecon.cli.mesh_options import describe_refinement, finish_with_gates
+from clrecon.cli.mesh import describe_refinement, finish_with_gates
 
 pytestmark = pytest.mark.unit
 

@@ -16,7 +16,7 @@ from house import ROOT
 from variants import but_seldom
 
 import clrecon
-from clrecon.proof.phantom.job import make_phantom
+from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 FENCED = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?:^ {4}\S.*\n(?:\n? {4,}\S.*\n)*)", re.MULTILINE)
@@ -57,7 +57,7 @@ PAGES = {
 def series(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a small spine, and the meshes and the cloud that the pages read."""
     folder = tmp_path_factory.mktemp("docs")
-    make_phantom(folder / "ct", levels="L2-L4", size=(72, 72), spacing=(2.5, 2.5, 2.5))
+    write_phantom(folder / "ct", PhantomSettings(levels="L2-L4", size=(72, 72), spacing=(2.5, 2.5, 2.5)))
     volume = clrecon.read_volume(folder / "ct")
     mesh = clrecon.extract_isosurface(volume, 226)
     for name in ("a.stl", "b.stl", "bone.stl", "l3.stl", "l4.stl"):

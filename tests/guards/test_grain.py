@@ -11,11 +11,11 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 94_770,
-    "modules": 414,
+    "lines": 94_320,
+    "modules": 413,
     "small_modules_with_one_reader": 12,
     "docstrings_with_raises": 124,
-    "options_in_several_files": 22,
+    "options_in_several_files": 19,
     "modules_with_own_all": 0,
 }
 """Who takes something away lowers the figure in the same commit; who needs more says why in the commit."""

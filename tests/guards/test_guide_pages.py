@@ -14,7 +14,7 @@ from house import ROOT
 from variants import but_seldom, daily
 
 from clrecon.cli.main import COMMANDS, main
-from clrecon.proof.phantom.job import make_phantom
+from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 GUIDE = ROOT / "docs" / "guide"
 PAGES = [path.relative_to(GUIDE).as_posix() for path in sorted(GUIDE.rglob("*.md"))]
@@ -36,7 +36,7 @@ ENDS_WITH_A_GATE = ("--for print",)
 def series(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a small spine, whose label map has the names of levels."""
     folder = tmp_path_factory.mktemp("guide")
-    make_phantom(folder / "ct", levels="L2-L4", size=(80, 80), spacing=(2.2, 2.2, 2.0))
+    write_phantom(folder / "ct", PhantomSettings(levels="L2-L4", size=(80, 80), spacing=(2.2, 2.2, 2.0)))
     return folder
 
 

@@ -14,7 +14,7 @@ from label_files import write_nrrd
 
 import clrecon
 from clrecon.cli.main import main
-from clrecon.proof.phantom.job import make_phantom
+from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 SMALLER = {
     '"CT_FOLDER"': '"ct"',
@@ -29,7 +29,7 @@ SMALLER = {
 def folder(tmp_path_factory) -> Path:
     """A series, and a label map and a cloud with the names that the example asks for."""
     folder = tmp_path_factory.mktemp("examples")
-    make_phantom(folder / "ct", kind="spine", size=(64, 64), slices=48, spacing=(3.0, 3.0, 3.0))
+    write_phantom(folder / "ct", PhantomSettings(size=(64, 64), slices=48, spacing=(3.0, 3.0, 3.0)))
     volume = clrecon.read_volume(folder / "ct")
     bone = (volume.voxels >= 226).astype(np.uint8)
     header = {"Segment0_LabelValue": "1", "Segment0_Layer": "0", "Segment0_Name": "T12", "Segment0_ID": "a"}
@@ -57,7 +57,8 @@ def test_vertebrae_of_the_readme_are_named_so_that_the_next_command_finds_l3(fol
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     chain = re.search(r"^    (clrecon vertebrae .*)\n    (clrecon mesh .* --label L3)$", text, re.MULTILINE)
     assert chain is not None
-    make_phantom(folder / "loin", levels="T12-L3", facet_gap_mm=0.0, size="112", spacing=(2.0, 2.0, 2.5))
+    loin = PhantomSettings(levels="T12-L3", facet_gap_mm=0.0, size=(112, 112), spacing=(2.0, 2.0, 2.5))
+    write_phantom(folder / "loin", loin)
     monkeypatch.chdir(folder)
     monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
     for command in chain.groups():

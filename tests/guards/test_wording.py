@@ -40,7 +40,7 @@ def find_options(source: str) -> list[str]:
     declared = [
         str(ast.get_source_segment(source, node))
         for node in ast.walk(ast.parse(source))
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "option"
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("option", "flag")
     ]
     for text in declared:
         source = source.replace(text, "")
@@ -136,7 +136,7 @@ def test_the_command_line_says_all_that_pictures_may_be_told() -> None:
     of_python = {name for name in RenderSettings.keywords() if speak(name, None) == name}
     # Fields that other options make (--light, --clip-box and --clip), and those that only Python has.
     of_meshes = {"vertex_colors"}
-    assert of_python == {"style", "lighting", "clip", "views", "angle", "width_mm", "pixel_mm", "lowest_hu"} | of_meshes
+    assert of_python == {"style", "lighting", "clip", "angle", "width_mm", "pixel_mm", "lowest_hu"} | of_meshes
 
 
 def test_every_other_name_of_a_parameter_is_needed() -> None:
@@ -155,5 +155,7 @@ def test_no_option_is_named_outside_of_the_command_line() -> None:
 
 def test_a_named_option_and_a_named_parameter_are_found() -> None:
     assert find_options('raise UsageError("leave --open out, or -o; a--b, x - -y, ---")') == ["--open"]
-    assert find_options('a: int = option("--open", "N", "see --report")\nb = "--seed"') == ["--seed"]
+    assert find_options(
+        'a: int = option("--open", "N", "see --report")\nb: bool = flag("--all", "")\nb = "--seed"'
+    ) == ["--seed"]
     assert named_parameters("x = f\"{name_parameter('force', True)}\"\nname_parameter(setting)") == {"force"}

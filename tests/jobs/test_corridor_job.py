@@ -175,7 +175,7 @@ def test_a_cylinder_is_closed_and_as_large_as_it_should_be() -> None:
         ((), 3, "name the vertebrae: --label L3"),
         (("--label", "L5"), 3, "label 'L5' is not in the label map; there are: 20 L1, 21 L2"),
         (("--label", "L1", "--margin", "9"), 3, "the margin is a length from 0 to 5 mm, not 9"),
-        (("--label", "L1", "--hu", "150,300"), 3, "--hu is one level or auto"),
+        (("--label", "L1", "--hu", "150,300"), 3, "argument --hu: it is one level or auto"),
         (("--label", "L1", "--hu", "bone"), 3, "'bone' is no number of HU"),
         (("--label", "L1", "--screw", "1,2,3"), 3, "a screw is entry, tip and diameter in mm, X,Y,Z,X,Y,Z,D"),
         (("--label", "L1", "-o", "x.doc"), 3, ".doc"),

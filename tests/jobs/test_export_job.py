@@ -12,7 +12,8 @@ import pytest
 
 from clrecon import read_volume
 from clrecon.cli.main import main
-from clrecon.jobs.export import ExportSettings, export_volume
+from clrecon.jobs.export import export_volume
+from clrecon.jobs.settings import ExportSettings
 
 sitk = pytest.importorskip("SimpleITK")
 nibabel = pytest.importorskip("nibabel")

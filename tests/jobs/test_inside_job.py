@@ -14,7 +14,7 @@ import clrecon
 from clrecon.cli.inside import _describe_vertebra
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
-from clrecon.jobs.inside import InsideSettings
+from clrecon.jobs.settings import InsideSettings
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 pytestmark = pytest.mark.first_device

@@ -10,7 +10,7 @@ import pytest
 from odd_bodies import BODIES, OddBodies, OddBody
 from variants import but_seldom, daily
 
-from clrecon.cli.mesh_options import describe_purposes
+from clrecon.cli.mesh import describe_purposes
 from clrecon.errors import ClreconError, NoSurfaceError, RefusedInputError
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.purposes import LEFT_SHARE, settings_for

@@ -12,7 +12,7 @@ import pytest
 
 from clrecon.cli.main import main
 from clrecon.labels import read_labels, resample_labels
-from clrecon.proof.phantom.job import make_phantom
+from clrecon.proof.phantom import PhantomSettings, write_phantom
 from clrecon.reading import read_volume
 
 pytest.importorskip("nibabel")
@@ -21,7 +21,7 @@ pytest.importorskip("nibabel")
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("vertebrae") / "ct"
-    make_phantom(folder, levels="L1-L3", facet_gap_mm=0.0, size="96", spacing=(2.2, 2.2, 2.5))
+    write_phantom(folder, PhantomSettings(levels="L1-L3", facet_gap_mm=0.0, size=(96, 96), spacing=(2.2, 2.2, 2.5)))
     return folder
 
 

@@ -101,10 +101,10 @@ def test_row_59_reports_of_other_commands_and_pictures_have_the_warnings(device,
 
 @pytest.fixture(scope="module")
 def phantom_folder(shared_folder):
-    from clrecon.proof.phantom.job import make_phantom
+    from clrecon.proof.phantom import PhantomSettings, write_phantom
 
     def make(folder):
-        make_phantom(folder, kind="sphere", size=(24, 24), slices=24)
+        write_phantom(folder, PhantomSettings(kind="sphere", size=(24, 24), slices=24))
 
     return make_once(shared_folder, "phantom-of-caches", make)
 

@@ -6,11 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from clrecon.errors import UsageError
-from clrecon.jobs.options import InputSettings
+from clrecon.jobs.options import InputSettings, label_map_option, parse_point, space_option
 from clrecon.points import POINT_KINDS
 from clrecon.system.arguments import name_parameter
+from clrecon.system.options import flag, option
 
 DENOISERS = ("grid", "bilateral")
 
@@ -61,47 +63,149 @@ class Clustering:
             raise UsageError(f"the fewest points of a neighbourhood lie between 1 and 255, not at {self.min_samples}")
 
 
+def _parse_level(text: str) -> float | tuple[float, ...]:
+    """Read ``N`` as an iso value, and ``LO,HI`` or ``LO:HI`` as a band of HU."""
+    try:
+        numbers = tuple(float(part) for part in text.replace(":", ",").split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) not in (1, 2):
+        raise ValueError(f"{text!r} is no iso value N and no band LO,HI of HU")
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+def _parse_clusters(text: str) -> dict[str, Any]:
+    """Read ``eps=MM,min=N`` (either may be missing) as fields of `Clustering`, which is checked with the others."""
+    known = {"eps": "eps", "min": "min_samples"}
+    found: dict[str, Any] = {}
+    for part in text.split(","):
+        name, equals, value = (word.strip() for word in part.partition("="))
+        if not equals or name not in known or known[name] in found:
+            raise ValueError(f"{text!r} is not eps=MM,min=N, such as eps=1.2,min=6")
+        try:
+            found[known[name]] = (
+                value if value == "plane+1" and name == "min" else (float if name == "eps" else int)(value)
+            )
+        except ValueError:
+            raise ValueError(f"{text!r}: {name} is no number: {value!r}") from None
+    return found
+
+
+def _parse_denoisers(text: str) -> tuple[str, ...]:
+    """Read names with commas between them; what is not known is refused with the settings."""
+    return tuple(part.strip().lower() for part in text.split(","))
+
+
 @dataclass(frozen=True)
 class CloudSettings(InputSettings):
     """Settings of the cloud job.
 
-    points: {"surface", "shell", "voxels"}. Default: "voxels" where a band is given, else "surface".
-    hu: float or (low, high). One number is an iso value, inside is that and above; two are a band, both ends included.
-        Default: the iso value of the mesh job.
-    labels: Label map; only points of one label are taken.
-    label: Number or name of that label.
-    ghost_slices: {"keep", "drop"}. What becomes of the points of slices that are unlike both neighbours, see
-        `clrecon.find_ghost_slices`.  With "keep" there is a warning that names them.
-    keep: Keep rules, see `clrecon.keep_clusters`; they need clusters, which then have the default parameters.
-    outliers: Standard deviations of the mean distance to the neighbours beyond which a point goes.
-    denoise: sequence of {"grid", "bilateral"}
-    viewpoint: (x, y, z). A point inside of the object, mm in the frame of the output: normals of a cloud from a file
-        point away from it.
+    Options say in their help what they do; beside that:
+
+    hu: float or (low, high).
+    label: Number or name.
+    ghost_slices: See `clrecon.find_ghost_slices`.
+    keep: See `clrecon.keep_clusters`; they need clusters, which then have the default parameters.
     normals: Points without normals get them, and points that were moved new ones.
-    spacing: Mm; one point for each cell of that size stays.
-    paper: The formulas as the papers print them, with what that does.
-    allow_point_loss: Go on where a step that should take noise only takes more than half of its points.
-    space: {"lps", "ras"}. Patient frame of the written files, and of the seeds.
-    input_space: {"lps", "ras"}. Patient frame of a cloud file that does not say its own.
-    **shared: See `clrecon.jobs.options.InputSettings`.
     """
 
-    points: str | None = None
-    hu: float | Sequence[float] | None = None
-    labels: str | Path | None = None
-    label: str | None = None
-    ghost_slices: str = "keep"
-    clusters: Clustering | None = None
-    keep: Sequence[str] = ()
-    outliers: float | None = None
-    denoise: Sequence[str] = ()
-    normals: bool = False
-    viewpoint: Sequence[float] | None = None
-    spacing: float | None = None
-    paper: bool = False
-    allow_point_loss: bool = False
-    space: str = "lps"
-    input_space: str | None = None
+    space: str = space_option("patient frame of the written files and of seeds")
+    input_space: str | None = option(
+        "--input-space",
+        "lps|ras",
+        "patient frame of a cloud file that does not say its own (default: lps)",
+        parse=str.lower,
+    )
+    points: str | None = option(
+        "--points",
+        "|".join(POINT_KINDS),
+        "surface: where the HU cross the iso value, between the voxels; voxels: the centres of those within; shell: of"
+        " these the outer ones (default: surface, with a band voxels)",
+        group="points",
+        parse=str.lower,
+        first=True,
+    )
+    hu: float | Sequence[float] | None = option(
+        "--hu",
+        "N|LO,HI",
+        "iso value, inside is N and above; or a band, both ends included (default: that of bone)",
+        group="points",
+        parse=_parse_level,
+        first=True,
+    )
+    labels: str | Path | None = label_map_option(group="points")
+    label: str | None = option("--label", "NAME|N", "points of this label only (default: of all)", group="points")
+    paper: bool = flag(
+        "--paper", "place and filter voxels as the papers print it, and say by how much that is wrong", group="points"
+    )
+    ghost_slices: str = option(
+        "--ghost-slices",
+        "|".join(GHOSTS),
+        "slices inside the stack that are unlike both neighbours, as screen captures and localizers are: drop takes"
+        f" their points away, keep warns of them (default: {GHOSTS[0]})",
+        group="steps",
+        default=GHOSTS[0],
+        parse=str.lower,
+    )
+    clusters: Clustering | None = option(
+        "--cluster",
+        "eps=MM,min=N",
+        "density clusters (DBSCAN) without noise: neighbours are within eps, and a core point has min of them, itself"
+        " included; min=plane+1 makes noise of lone slices (default: 1.5 times the largest voxel step, 6)",
+        group="steps",
+        parse=_parse_clusters,
+        nargs="?",
+        const={},
+        first=True,
+    )
+    keep: Sequence[str] = option(
+        "--keep",
+        "RULE",
+        "clusters that stay: largest, largest:N, min:POINTS, seed:X,Y,Z (the nearest), no-sheets (tables and image"
+        " planes go); may be given again",
+        group="steps",
+        default=(),
+        action="append",
+        first=True,
+    )
+    outliers: float | None = option(
+        "--outliers",
+        "SD",
+        "points go whose mean distance to 16 neighbours is SD standard deviations over the mean (without a number: 2)",
+        group="steps",
+        nargs="?",
+        const=2.0,
+    )
+    denoise: Sequence[str] = option(
+        "--denoise",
+        ",".join(DENOISERS),
+        "grid: points alone in a cell of a grid go; bilateral: points move along their normals to the weighted mean"
+        " height of their neighbours, edges stay",
+        group="steps",
+        default=(),
+        parse=_parse_denoisers,
+        first=True,
+    )
+    normals: bool = flag(
+        "--normals",
+        "unit normals that point out of bone; points of a surface have those of the scan until they are moved",
+        group="steps",
+        first=True,
+    )
+    viewpoint: Sequence[float] | None = option(
+        "--viewpoint",
+        "X,Y,Z",
+        "a point inside of the object, mm in the frame of --space: normals of a cloud that was read point away from it"
+        " (a scan turns its own by HU)",
+        group="steps",
+        parse=parse_point,
+    )
+    spacing: float | None = option("--spacing", "MM", "keep one point for each cell of that size", group="steps")
+    allow_point_loss: bool = flag(
+        "--allow-point-loss",
+        "go on where a step that should take noise alone takes more than half of the points, which else is refused",
+        group="checks",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

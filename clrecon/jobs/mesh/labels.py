@@ -33,7 +33,7 @@ def open_labels(choice: LabelChoice | None, volume: Volume | None = None) -> Lab
         return None
     from clrecon.labels.reader import read_all_labels
 
-    return read_all_labels(choice.path, choice.wanted or None, volume=volume)
+    return read_all_labels(choice.path, choice.only or None, volume=volume)
 
 
 def name_label_files(labels: LabelMap, choice: LabelChoice, surfaces: Sequence[Surface]) -> list[str]:
@@ -69,7 +69,7 @@ def extract_label_surfaces(
     found: list[tuple[Surface, int, Mesh]] = []
     numbers = choice.numbers_of(labels)
     colors = choice.colors_of(labels, numbers, settings.one_file)
-    asked = numbers if choice.wanted or choice.hidden else None
+    asked = numbers if choice.only or choice.hidden else None
     suffixes = file_suffixes({number: labels.name(number) for number in numbers})  # reports contain no other names
     for surface in surfaces:
         if surface.iso_value is None:

@@ -4,22 +4,61 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.seeds import LABEL_SEED, check_growing, check_point, is_label_seed
-from clrecon.jobs.options import InputSettings
-from clrecon.jobs.presets import DEFAULT_PRESET, find_iso_preset, find_purpose
+from clrecon.jobs.options import (
+    LEVELS_HELP,
+    InputSettings,
+    closed_option,
+    label_map_option,
+    parse_hu,
+    parse_label_color,
+    parse_levels,
+    parse_point,
+    preset_option,
+    space_option,
+)
+from clrecon.jobs.outputs import OBJECT_FILES
+from clrecon.jobs.presets import DEFAULT_PRESET, PURPOSES, Purpose, find_iso_preset, find_purpose
 from clrecon.system.arguments import name_parameter
-from clrecon.system.options import option
+from clrecon.system.options import flag, option
 
 if TYPE_CHECKING:
     from clrecon.labels import LabelMap
 
 
 _ITERATIONS = 20
+
+METHOD_NAMES = ("t-mc", "i-mc", "g-mc", "s-mc", "t-mc-soup", "skimage")
+
+SCAN_GATE_FAILED, GATE_FAILED = 7, 8
+"""Exit codes for a failed gate where gates are strict; everything is written."""
+
+
+def _describe_purpose(purpose: Purpose) -> str:
+    """Describe a purpose by the options that it stands for."""
+    options = [
+        f"--{field.replace('_', '-')}"
+        + ("" if value is True else f" {' '.join(value)}" if isinstance(value, tuple) else f" {value}")
+        for field, value in purpose.settings.items()
+    ]
+    return f"{purpose.name}: {' '.join(options)}: {purpose.description}".replace("%", "%%")
+
+
+def _parse_seed(text: str) -> str | tuple[float, ...]:
+    """Read ``auto``, ``label:NAME`` or ``X,Y,Z``."""
+    if text.lower() == "auto":
+        return "auto"
+    if text.lower().startswith(LABEL_SEED):
+        return f"{LABEL_SEED}{text[len(LABEL_SEED) :]}"
+    try:
+        return parse_point(text)
+    except ValueError:
+        raise ValueError(f"{text!r} is neither auto nor X,Y,Z in mm nor label:NAME") from None
 
 
 def name_level(level: float | Sequence[float]) -> str:
@@ -31,55 +70,101 @@ def name_level(level: float | Sequence[float]) -> str:
 class MeshSettings(InputSettings):
     """Settings of the mesh job.
 
-    iso_value: float or sequence of float or (low, high). HU; inside is ``>= iso_value``.  Several make one mesh each.
-        A pair in the sequence is a range, both ends included: ``((100, 300),)``.
-    below: In place of an iso value: inside is ``< below``, HU.  The air around the patient is left out.
-    keep_outside: With `below`: keep the air around the patient.
-    preset: Name of an iso value, see `clrecon.jobs.presets`. If neither is given, the preset is "bone".
-    half_way: "auto" or (bone, tissue). In place of an iso value: half way between the two materials, measured in the
-        scan or given in HU.
-    space: {"lps", "ras"}. Patient frame of the written mesh.
-    closed: Close the surface where it meets the border of the volume (outside is air).
-    topology: {"separated", "trilinear"}. Rule where the voxels around a cell do not tell which of them are joined, see
-        `extract_isosurface`.
+    Options say in their help what they do; beside that:
+
+    iso_value: float or sequence of float or (low, high). A pair in the sequence is a range: ``((100, 300),)``.
+    half_way: "auto" or (bone, tissue), see `clrecon.jobs.options.parse_hu`.
+    preset: See `clrecon.jobs.presets`.  If no level is given, it is "bone".
+    topology, vertex_rule: See `clrecon.extract_isosurface`.
     method: One of `clrecon.operators.surface.methods.METHODS`; None: "i-mc" with seeds in `grow_from`, else "t-mc".
-    grow_from: sequence of str or (x, y, z). Seeds of the method "i-mc": "auto", points in mm of the frame `space`, and
-        ``label:NAME`` of the label map `labels`, which then makes no meshes of its own.
-    vertex_rule: {"linear", "golden", "golden-search"}. Where on an edge a vertex lies, see `extract_isosurface`.
-    keep: "bone". Keep only components that look like bone, see `clrecon.mesh.compare.walls`.  With `keep_largest`: of
-        these the largest.
-    keep_largest: Keep only this many components, the largest by area.
-    min_volume_ml: Keep only components of at least this volume.  With `keep_largest`: of these the largest.
-    seeds: sequence of (x, y, z). Keep only the components whose surface lies nearest to these points, in mm of the
-        frame `space`.
-    solid: Fill what the surface encloses, such as marrow, see `clrecon.fill_enclosed`.
-    seal_mm: With `solid`: radius of the balls that close pores, mm; None: 2.5 to 3, by the voxels.
-    all_parts: With the purpose ``"print"``: keep all components that look like bone, not the largest alone.  They are
-        named objects of a .3mf, and one mesh in other formats.
-    split: Write one mesh for each component, the largest first.
-    one_file: Write all meshes (labels, components, iso values) as named objects of one file, each in a colour of its
-        own.
-    labels: A label map: one mesh for each label, see `LabelChoice`.
-    smooth: Iterations of smoothing, see `clrecon.mesh.smooth_mesh`; None: none.
-    decimate: Share of the triangles to remove, see `clrecon.mesh.decimate_mesh`; None: none.
-    max_deviation_mm: Bound of smoothing and of decimation, mm; None: a quarter of the shortest voxel step.
-    purpose: Purpose of the mesh, for which more is measured.  It sets nothing here, see
-        `clrecon.jobs.mesh.purposes.settings_for`.
+    grow_from: With ``label:NAME`` the label map makes no meshes of its own.
+    keep: See `clrecon.mesh.compare.walls`.  With `keep_largest`: of these the largest, as with `min_volume_ml`.
+    solid: See `clrecon.fill_enclosed`.
+    seal_mm: Radius of the balls that close pores.
+    smooth, decimate: See `clrecon.mesh.smooth_mesh`, `clrecon.mesh.decimate_mesh`.
+    purpose: More is measured for it.  It sets nothing here, see `clrecon.jobs.mesh.purposes.settings_for`.
     strict: Measure everything that a gate needs, triangles that cut each other included.
-    **shared: See `clrecon.jobs.options.InputSettings`.
     """
 
-    iso_value: float | Sequence[float | Sequence[float]] | None = None
-    below: float | Sequence[float] | None = None
-    keep_outside: bool = False
-    preset: str | None = None
+    purpose: str | None = option(
+        "--for",
+        "PURPOSE",
+        "what the mesh is for, with the settings that this takes (others given beside it win); "
+        + "; ".join(map(_describe_purpose, PURPOSES.values())),
+        group="purpose",
+        parse=str.lower,
+        first=True,
+        words=PURPOSES,
+    )
+    iso_value: float | Sequence[float | Sequence[float]] | None = option(
+        "--hu", "N[,N...]|A:B|auto|half:B,T", LEVELS_HELP, group="level", parse=parse_hu, first=True
+    )
+    below: float | Sequence[float] | None = option(
+        "--below",
+        "N[,N...]",
+        "in place of an iso value: inside is what lies below N HU, such as lungs, airways and sinuses (-400); the air"
+        " round the patient is left out",
+        group="level",
+        parse=parse_levels,
+    )
+    preset: str | None = preset_option()
     half_way: str | Sequence[float] | None = None
-    space: str = "lps"
-    closed: bool = True
-    topology: str = "separated"
-    method: str | None = None
-    grow_from: Sequence[str | Sequence[float]] = ()
-    vertex_rule: str = "linear"
+    keep_outside: bool = flag(
+        "--keep-outside", "with --below: leave the air round the patient in", group="inside", default=False
+    )
+    solid: bool = flag(
+        "--solid",
+        "fill what the bone encloses: marrow, and canals that the ends of the scan cut; the brain, the chest and air"
+        " stay out; with --labels: what is less dense within a label",
+        group="inside",
+        action="yes-no",
+        first=True,
+    )
+    seal_mm: float | None = option(
+        "--seal",
+        "MM",
+        "with --solid: close pores up to twice as wide, less one voxel (default: 2.5 to 3, by the voxels)",
+        group="inside",
+    )
+    space: str = space_option("patient frame of the mesh", group="surface")
+    topology: str = option(
+        "--topology",
+        "T",
+        "what is done where the voxels leave open which of them are joined: separated keeps them apart (default),"
+        " trilinear joins those that the trilinear interpolation joins",
+        group="surface",
+        default="separated",
+        parse=str.lower,
+        words=("separated", "trilinear"),
+    )
+    closed: bool = closed_option()
+    method: str | None = option(
+        "--method",
+        "|".join(METHOD_NAMES),
+        "t-mc: every cell (default); i-mc: only what hangs together with seeds; g-mc: t-mc, then quadric collapse"
+        " without a bound; s-mc: t-mc, then decimation within a bound; t-mc-soup, skimage: on the CPU, to compare with",
+        group="method",
+        parse=str.lower,
+    )
+    grow_from: Sequence[str | Sequence[float]] = option(
+        "--grow-from",
+        "auto|X,Y,Z|label:NAME",
+        "seeds of i-mc: auto takes the parts with at least 1/20 of the cells of the largest; a point in mm of the"
+        " frame of --space, at most 10 mm from the surface; a label of --labels. May be given again",
+        group="method",
+        default=(),
+        parse=_parse_seed,
+        action="append",
+    )
+    vertex_rule: str = option(
+        "--vertex-rule",
+        "linear|golden|golden-search",
+        "where on an edge a vertex lies: linear (default); golden: at 0.618 whatever the HU, up to 0.6 voxels off;"
+        " golden-search: where a cubic crosses the iso value, no better than linear",
+        group="method",
+        default="linear",
+        parse=str.lower,
+    )
     keep: str | None = option(
         "--keep",
         "bone",
@@ -88,29 +173,39 @@ class MeshSettings(InputSettings):
         parse=str.lower,
     )
     keep_largest: int | None = option(
-        "--keep-largest", "N", "keep the N largest components only", group="selection", parse=int, first=True
+        "--keep-largest", "N", "keep the N largest components only", group="selection", first=True
     )
     min_volume_ml: float | None = option(
-        "--min-volume",
-        "ML",
-        "keep components of at least ML millilitres only",
-        group="selection",
-        parse=float,
-        first=True,
+        "--min-volume", "ML", "keep components of at least ML millilitres only", group="selection", first=True
     )
-    seeds: Sequence[Sequence[float]] = ()
-    solid: bool = False
-    seal_mm: float | None = None
-    all_parts: bool = False
-    split: bool = False
-    one_file: bool = False
+    seeds: Sequence[Sequence[float]] = option(
+        "--seed",
+        "X,Y,Z",
+        "keep the component whose surface lies nearest to this point, in mm of the frame of --space; repeat it for"
+        " several",
+        group="selection",
+        default=(),
+        parse=parse_point,
+        action="append",
+    )
+    all_parts: bool = flag(
+        "--all-parts",
+        "with --for print: keep all bones, not the largest alone; named objects of a .3mf, one mesh in other formats",
+        group="files",
+    )
+    split: bool = flag("--split", "write one file a component, the largest first", group="files", default=False)
+    one_file: bool = flag(
+        "--one-file",
+        f"labels, components of --split or several iso values in one file ({OBJECT_FILES}), each an object with its"
+        " name and a colour of its own",
+        group="files",
+    )
     labels: LabelChoice | None = None
     smooth: int | None = option(
         "--smooth",
         "N",
         f"smooth with N iterations of a windowed sinc filter (default: {_ITERATIONS})",
         group="refinement",
-        parse=int,
         nargs="?",
         const=_ITERATIONS,
     )
@@ -119,7 +214,6 @@ class MeshSettings(InputSettings):
         "SHARE",
         "take away this share of the triangles, such as 0.9, or as much as the largest deviation lets",
         group="refinement",
-        parse=float,
         first=True,
     )
     max_deviation_mm: float | None = option(
@@ -127,10 +221,13 @@ class MeshSettings(InputSettings):
         "MM",
         "smoothing and decimation each move nothing further (default: a quarter of the shortest voxel step)",
         group="refinement",
-        parse=float,
     )
-    purpose: str | None = None
-    strict: bool = False
+    strict: bool = flag(
+        "--strict",
+        f"exit with {GATE_FAILED} when a gate of a mesh fails (closed, manifold, no cuts, close to the scan ...), with"
+        f' {SCAN_GATE_FAILED} when only gates of the scan do (see "clrecon info")',
+        group="strict",
+    )
 
     def __post_init__(self) -> None:
         if self.iso_value is not None and self.preset is not None:
@@ -167,7 +264,7 @@ class MeshSettings(InputSettings):
         if self.grow_from or self.method_used != "t-mc" or self.vertex_rule != "linear":
             check_growing(
                 self.method_used, self.grow_from, self.vertex_rule, topology=self.topology, inside=self.inside,
-                has_labels=self.labels is not None, makes_labels=self.labels is not None and bool(self.labels.wanted),
+                has_labels=self.labels is not None, makes_labels=self.labels is not None and bool(self.labels.only),
             )  # fmt: skip
         if self.labels_pick and self.below is not None:
             raise UsageError("labels take what lies from one iso value on, not below it")
@@ -383,23 +480,40 @@ class MeshSettings(InputSettings):
 class LabelChoice:
     """The labels of a map that become meshes, and the kind of their surfaces.
 
-    path: NIfTI, NRRD, DICOM SEG or RTSTRUCT.
-    wanted: Numbers or names; empty means all that have a surface.
-    grow_mm: See `clrecon.operators.surface.labels.extract_labels`.
+    only: Numbers or names; empty means all that have a surface.
+    grow_mm, surface: See `clrecon.operators.surface.labels.extract_labels`, and of masks
+        `clrecon.operators.surface.label_masks.extract_label_masks`.
     solid: Fill less dense parts within a label.
-    surface: {"hu", "mask"}. HU place the vertices (`clrecon.operators.surface.labels.extract_labels`), or each label
-        has its own surface (`clrecon.operators.surface.label_masks.extract_label_masks`).
-    hidden: Labels that become no mesh.
-    colors: tuple of (str or int, str). Labels and their colours, for PLY, GLB and 3MF.
+    colors: tuple of (str or int, str).
     """
 
-    path: str | Path
-    wanted: tuple[str | int, ...] = ()
-    grow_mm: float | None = None
+    path: str | Path = label_map_option(default=MISSING)
+    only: tuple[str | int, ...] = option(
+        "--label", "NAME|N", "this label only; may be given again (default: all)", default=(), action="append"
+    )
+    hidden: tuple[str | int, ...] = option(
+        "--hide-label", "NAME|N", "not this label; may be given again", default=(), action="append"
+    )
+    colors: tuple[tuple[str | int, str], ...] = option(
+        "--label-color",
+        "LABEL=COLOUR",
+        "colour of a label in .ply and in the formats of several objects, such as L3=orange; may be given again",
+        default=(),
+        parse=parse_label_color,
+        action="append",
+    )
+    surface: str = option(
+        "--surface",
+        "hu|mask",
+        "hu: HU place the vertices (default); mask: the label's own surface, smoothed within its voxels and with their"
+        " volume, whatever the HU: organs, lungs, what HU do not show",
+        default="hu",
+        parse=str.lower,
+    )
+    grow_mm: float | None = option(
+        "--grow", "MM", "dense voxels this near to a label are its own (default: one voxel each way)"
+    )
     solid: bool = False
-    surface: str = "hu"
-    hidden: tuple[str | int, ...] = ()
-    colors: tuple[tuple[str | int, str], ...] = ()
 
     def __post_init__(self) -> None:
         from clrecon.rendering.looks.colors import find_color  # numpy: not loaded before a job starts
@@ -417,7 +531,7 @@ class LabelChoice:
     def numbers_of(self, labels: LabelMap) -> list[int]:
         """Return the numbers of the labels that become meshes."""
         hidden = {labels.find(label) for label in self.hidden}
-        wanted = [labels.find(label) for label in self.wanted] or list(labels.numbers)
+        wanted = [labels.find(label) for label in self.only] or list(labels.numbers)
         left = [number for number in wanted if number not in hidden]
         if not left:
             raise UsageError("all labels are hidden: there is no mesh to make")

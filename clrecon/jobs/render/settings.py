@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,9 @@ from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.boxes import CROPS, Box, crop_box
 from clrecon.geometry.grid import Grid
-from clrecon.jobs.options import InputSettings
+from clrecon.jobs.options import InputSettings, label_map_option, parse_label_color
 from clrecon.labels import LabelMap
+from clrecon.rendering.looks.colors import COLORS as COLORS
 from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.looks.lighting import UNSHADED, Lighting
 from clrecon.rendering.looks.presets import DEFAULT_PRESET, PRESETS, find_preset
@@ -28,12 +30,14 @@ from clrecon.rendering.pictures.object_looks import POINT_COLORS as POINT_COLORS
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.sheets import SHEET_SIZE
 from clrecon.rendering.pictures.style_checks import SHEET_SLICES as SHEET_SLICES
+from clrecon.rendering.pictures.styles import CURVED_KINDS as CURVED_KINDS
 from clrecon.rendering.pictures.styles import SPINE, CurveCut, PlaneCut, SlicesInSpace, Style, SurfaceLook, VolumeLook
-from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.camera import DEFAULT_VIEW_ANGLE, Camera
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import ANTERIOR, DEFAULT_SIZE, DIRECTIONS, SLICES_VIEWS, checked_size
-from clrecon.rendering.views.reformation import find_plane
+from clrecon.rendering.views.reformation import PLANES, find_plane
 from clrecon.system.arguments import name_parameter
+from clrecon.system.options import flag, option
 from clrecon.system.text import unknown_name
 
 DEFAULT_VIEWS = {"slice": "axial", "cpr": "left", "slices": SLICES_VIEWS[0]}
@@ -47,33 +51,106 @@ _CALLED = {"light": "lighting", "labels": "labels", "clip_planes": "clip"}
 """Settings that make a field of the style under another name: the name of the setting, and that of the field."""
 
 
+def parse_numbers(text: str, count: int, form: str) -> tuple[float, ...]:
+    """Read a fixed number of numbers with commas between them."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count:
+        raise ValueError(f"{text!r} is not {form}")
+    return values
+
+
+def _parse_center(text: str) -> tuple[float, ...]:
+    """Read ``X,Y,Z`` in LPS mm."""
+    return parse_numbers(text, 3, "a place X,Y,Z in LPS mm, such as -12,40,310")
+
+
+def _parse_size(text: str) -> tuple[int, int]:
+    """Read ``512`` or ``512x384`` as width and height."""
+    parts = text.lower().split("x")
+    try:
+        width, height = (int(part) for part in (parts if len(parts) == 2 else (*parts, *parts)))
+    except ValueError:
+        raise ValueError(f"{text!r} is no size in pixels: write it as 1024 or 1024x768") from None
+    return width, height
+
+
+def _parse_views(text: str) -> tuple[str, ...]:
+    """Read ``left``, ``anterior,left,posterior`` or ``AZ,EL``: names or one pair of angles."""
+    parts = tuple(part.strip().lower() for part in text.split(","))
+    if all(part[:1].isalpha() for part in parts):
+        return parts
+    try:
+        _azimuth, _elevation = (float(part) for part in parts)
+    except ValueError:
+        raise ValueError(
+            f"{text!r} is neither names of views with commas between them ({', '.join(VIEWS)}; of slices axial,"
+            " coronal, sagittal), nor one AZ,EL in degrees, such as 30,15: give"
+            f" {name_parameter('views')} again for further ones"
+        ) from None
+    return (",".join(parts),)
+
+
+def parse_direction(text: str) -> str | tuple[float, ...]:
+    """Read a name, or ``X,Y,Z``."""
+    return (
+        parse_numbers(text, 3, "a side of the patient, nor a direction X,Y,Z in LPS") if "," in text else text.lower()
+    )
+
+
+def _parse_label_opacity(text: str) -> tuple[str, float]:
+    """Read ``LABEL=OPACITY``."""
+    label, _, number = text.rpartition("=")
+    try:
+        opacity = float(number)
+    except ValueError:
+        opacity = math.nan
+    if not label or math.isnan(opacity):
+        raise ValueError(f"{text!r} is not LABEL=OPACITY, such as L2=0.2")
+    return label, opacity
+
+
 @dataclass(frozen=True)
 class Turntable:
-    """Settings of a turntable, a moving picture of a turning volume.
+    """Settings of a turntable, a moving picture of a turning volume."""
 
-    fps: Frames per second.
-    degrees: Angle from the first frame to the last, towards the patient's left.
-    """
-
-    frames: int = 100
-    fps: float = 25.0
-    degrees: float = 360.0
+    frames: int = option("--frames", "N", "frames of the turn (default: 100)", default=100)
+    fps: float = option("--fps", "N", "frames a second (default: 25)", default=25.0)
+    degrees: float = option("--degrees", "D", "how far it turns, to the patient's left (default: 360)", default=360.0)
 
 
 @dataclass(frozen=True)
 class LabelLook:
     """A label map and the look of its labels.
 
-    path: NIfTI, NRRD, MetaImage, DICOM SEG or RTSTRUCT.
-    colors: Colour by number or name of the label, see `clrecon.rendering.looks.colors.find_color`.
-    opacities: Factor on the opacity, by number or name of the label; "0" stands for all that has no label.
+    colors: Colour by number or name of the label, see `clrecon.rendering.looks.colors.find_color`; or pairs of both.
+    opacities: Factor on the opacity, in the same way; "0" stands for all that has no label.
     """
 
-    path: str
-    colors: Mapping[str, str] = field(default_factory=dict)
-    opacities: Mapping[str, float] = field(default_factory=dict)
+    path: str = label_map_option(default=MISSING)
+    colors: Mapping[str, str] = option(
+        "--label-color",
+        "LABEL=COLOUR",
+        "colour of a label, by name or number; may be given again",
+        default=(),
+        parse=parse_label_color,
+        action="append",
+    )
+    opacities: Mapping[str, float] = option(
+        "--label-opacity",
+        "LABEL=SHARE",
+        "factor on the opacity of a label, 0 to 1, label 0 is all without a label; over slices the share of its colour"
+        " (default: 0.3); may be given again",
+        default=(),
+        parse=_parse_label_opacity,
+        action="append",
+    )
 
     def __post_init__(self) -> None:
+        for name in ("colors", "opacities"):
+            object.__setattr__(self, name, dict(getattr(self, name)))
         for label, color in self.colors.items():
             find_color(color)
             if label.strip() == str(NO_LABEL):
@@ -117,21 +194,17 @@ def color_apart(meshes: Sequence[MeshFile]) -> list[MeshFile]:
 class RenderSettings(InputSettings):
     """Settings of the render job, which makes pictures from a CT series.
 
+    Options say in their help what they do; beside that:
+
     style: What the pictures show.  The files below add to it, see `style_with`.
     preset: The preset that the style was made from.
     transfer_function: ``FILE`` or ``FILE:NAME``, see `clrecon.rendering.looks.transfer_files.load_transfer_function`.
     curve: File with the centre line; "spine" (or "auto") and None mean the curve of the style.
     meshes: Shown with the input.
-    mesh_space: {"lps", "ras"}. Patient frame of meshes that do not name theirs; default: LPS, with a warning.
     light: "head", "none", side of the patient or (x, y, z). Origin of the light: the camera, nowhere (no shading), or a
         direction in LPS as seen from the patient.  Default: that of the style and its transfer function.
-    views: One picture is taken per view, see `clrecon.rendering.views.camera.Camera.fit`.  Slices also know axial,
-        coronal and sagittal.
-    up, zoom, size, view_angle, center: As in `Camera.fit`.  The default size is 1024 x 1024, of a contact sheet 1600 x
-        1200; for a curved reformation it depends on the curve.
-    background: Colour, or "transparent".
-    caption: Text that is drawn into the pictures.
-    **shared: See `clrecon.jobs.options.InputSettings`.
+    views, up, zoom, size, view_angle, center: See `clrecon.rendering.views.camera.Camera.fit`.  The default size of a
+        contact sheet is 1600 x 1200; for a curved reformation it depends on the curve.
     """
 
     style: Style = VolumeLook()
@@ -140,18 +213,64 @@ class RenderSettings(InputSettings):
     curve: str | None = None
     labels: LabelLook | None = None
     meshes: Sequence[MeshFile] = ()
-    mesh_space: str | None = None
+    mesh_space: str | None = option(
+        "--mesh-space",
+        "lps|ras",
+        "patient frame of meshes whose files do not name theirs (default: lps, with a warning)",
+        group="meshes",
+    )
     light: str | Sequence[float] | None = None
-    views: Sequence[str] = ()
-    up: str | Sequence[float] | None = None
-    zoom: float = 1.0
-    size: tuple[int, int] | None = None
-    view_angle: float | None = None
-    center: Sequence[float] | None = None
-    background: str = "black"
-    letters: bool = False
-    scale_bar: bool = False
-    caption: str | None = None
+    views: Sequence[str] = option(
+        "--view",
+        "V[,V...]|AZ,EL",
+        f"where the camera stands: {', '.join(VIEWS)}; or degrees from anterior to the patient's left and to the head;"
+        " of slices also axial, coronal, sagittal (default: anterior; of mode slice axial, of slices 30,30, of cpr"
+        " left); several make a picture each: out_left.png; may be given again",
+        group="camera",
+        default=(),
+        parse=_parse_views,
+        action="append",
+        first=True,
+        words=(*DIRECTIONS, *PLANES),
+    )
+    up: str | Sequence[float] | None = option(
+        "--up",
+        "SIDE|X,Y,Z",
+        "what is at the top (default: superior, else anterior)",
+        group="camera",
+        parse=parse_direction,
+    )
+    zoom: float = option("--zoom", "F", "2 shows everything twice as large", group="camera", default=1.0)
+    center: Sequence[float] | None = option(
+        "--center",
+        "X,Y,Z",
+        "LPS mm in the middle of the picture, of a slice too (default: the middle of what is shown)",
+        group="camera",
+        parse=_parse_center,
+    )
+    size: tuple[int, int] | None = option(
+        "--size", "W[xH]", "pixels of the picture (default: 1024x1024)", group="camera", parse=_parse_size, first=True
+    )
+    view_angle: float | None = option(
+        "--perspective",
+        "DEGREES",
+        f"perspective of so many degrees from bottom to top ({DEFAULT_VIEW_ANGLE:g} without a number; default:"
+        " parallel)",
+        group="camera",
+        nargs="?",
+        const=DEFAULT_VIEW_ANGLE,
+    )
+    background: str = option(
+        "--background",
+        "C",
+        "colour, such as white or #102030, or transparent",
+        group="camera",
+        default="black",
+        words=COLORS,
+    )
+    letters: bool = flag("--letters", "draw the sides of the patient: L, R, A, P, S, I", group="camera")
+    scale_bar: bool = flag("--scale-bar", "draw a bar of a round length in mm", group="camera")
+    caption: str | None = option("--caption", "TEXT", "draw a line of text at the top left", group="camera")
     turntable: Turntable | None = None
 
     @classmethod

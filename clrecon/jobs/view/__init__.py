@@ -1,1 +1,42 @@
-"""The job that shows scans and meshes together: as a page."""
+"""The job of the view: its settings here, its inputs and its page beside it.  The settings load no numpy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from clrecon.errors import UsageError
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.options import mesh_space_option
+from clrecon.jobs.settings import check_space
+from clrecon.system.options import option
+
+MOST_NAME = 80
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewSettings:
+    """Settings of the view.
+
+    scan: How surfaces are made of inputs that are scans; its `space` is the frame in which places are shown.
+    names: In the order of the inputs; those without one are numbered.  File names are not shown: they can hold the name
+        of a patient.
+    """
+
+    scan: MeshSettings = field(default_factory=MeshSettings)
+    names: Sequence[str] = option(
+        "--name",
+        "TEXT",
+        "name of an input on the page, in the order of the inputs; repeat it for several (default: surface 1 ...)",
+        default=(),
+        action="append",
+    )
+    mesh_space: str | None = mesh_space_option("mesh files that do not name theirs")
+
+    def __post_init__(self) -> None:
+        check_space(self.mesh_space)
+        for name in self.names:
+            if not name.strip() or len(name) > MOST_NAME or not name.isprintable():
+                raise UsageError(f"a name has 1 to {MOST_NAME} printable characters, not {name[:MOST_NAME]!r}")
+        if self.scan.labels_pick and not self.scan.one_file:  # each label with a colour of its own
+            object.__setattr__(self, "scan", replace(self.scan, one_file=True))

@@ -6,7 +6,7 @@ Settings of the job that shows are validated on construction; some of them mean 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,9 +16,9 @@ from clrecon.exchange.formats import MESH_INPUTS
 from clrecon.jobs.distance import read_side
 from clrecon.jobs.inputs import crop_labels, is_cloud_file, refuse_other_clouds
 from clrecon.jobs.mesh.labels import open_labels
-from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.options import InputSettings
 from clrecon.jobs.preprocess import mask_volume
+from clrecon.jobs.view import ViewSettings
 from clrecon.mesh import Mesh
 from clrecon.reading import read_selected, tell_format
 from clrecon.system.arguments import name_parameter
@@ -29,35 +29,6 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
     from clrecon.points import PointCloud
-
-
-MOST_NAME = 80
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewSettings:
-    """Settings of the job.
-
-    scan: How surfaces are made of inputs that are scans; its `space` is the frame in which places are shown.
-    mesh_space: {"lps", "ras"}. Patient frame of mesh files that do not name theirs; None: LPS, with a warning.
-    names: Names of the inputs, in their order, to be shown; those without one are numbered.  File names are not shown:
-        they can hold the name of a patient.
-    """
-
-    scan: MeshSettings = field(default_factory=MeshSettings)
-    mesh_space: str | None = None
-    names: Sequence[str] = ()
-
-    def __post_init__(self) -> None:
-        from clrecon.geometry import frame_from_lps
-
-        if self.mesh_space is not None:
-            frame_from_lps(self.mesh_space)
-        for name in self.names:
-            if not name.strip() or len(name) > MOST_NAME or not name.isprintable():
-                raise UsageError(f"a name has 1 to {MOST_NAME} printable characters, not {name[:MOST_NAME]!r}")
-        if self.scan.labels_pick and not self.scan.one_file:  # each label with a colour of its own
-            object.__setattr__(self, "scan", replace(self.scan, one_file=True))
 
 
 _OF_A_VIEW = {"iso_value", "preset", "half_way", "space", "labels", "one_file"}

@@ -16,7 +16,7 @@ from clrecon.jobs.mesh.make import make_parts
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.outputs import commit_all
 from clrecon.jobs.run import JobReport, Run
-from clrecon.jobs.view.inputs import ViewSettings
+from clrecon.jobs.view import ViewSettings
 from clrecon.mesh import Mesh
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.system.arguments import name_parameter

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.options import InputSettings
+from clrecon.jobs.options import InputSettings, closed_option, parse_hu, preset_option
 from clrecon.system.arguments import name_parameter
+from clrecon.system.options import flag, option
 
 MESH, CLOUD, PICTURE = "mesh", "cloud", "picture"
 
@@ -76,28 +77,76 @@ def choose_methods(names: Sequence[str], reference: str) -> tuple[Compared, ...]
 MOST_REPEATS = 100
 
 
+def _parse_names(text: str) -> tuple[str, ...]:
+    """Read names with commas between them."""
+    names = tuple(name.strip().lower() for name in text.split(","))
+    if not all(names):
+        raise ValueError(f"{text!r} has an empty name: write methods with single commas between them")
+    return names
+
+
 @dataclass(frozen=True)
 class CompareSettings(InputSettings):
     """Settings of the compare job.
 
-    methods: Names of `clrecon.proof.compare.methods.COMPARED`; empty: all of them.
-    reference: The method whose mesh the others are compared with; it always runs.
-    truth: ``truth.json`` of a phantom: what is made is compared with the true surface too.
-    paper: Also compare a picture of each method with the middle slice, as a paper does, beside controls.
-    repeat: Warm runs of each method, of which the median counts.
-    iso_value, preset, half_way, closed: See `MeshSettings`; one level, above which is inside.
-    **shared: See `clrecon.jobs.options.InputSettings`.
+    Options say in their help what they do; beside that:
+
+    methods: Names of `COMPARED`; empty: all of them.  The reference always runs.
+    iso_value: float or (float,). One level, above which is inside.
+    half_way: See `MeshSettings`.
     """
 
-    methods: Sequence[str] = ()
-    reference: str = "t-mc"
-    truth: str | Path | None = None
-    paper: bool = False
-    repeat: int = 3
-    iso_value: float | None = None
-    preset: str | None = None
+    methods: Sequence[str] = option(
+        "--methods",
+        "M[,M...]",
+        "methods to compare; see below (default: all)",
+        group="comparison",
+        default=(),
+        parse=_parse_names,
+        first=True,
+    )
+    reference: str = option(
+        "--reference",
+        "M",
+        "method to compare with (default: t-mc)",
+        group="comparison",
+        default="t-mc",
+        parse=str.lower,
+    )
+    truth: str | Path | None = option(
+        "--truth",
+        "FILE",
+        "truth.json of a phantom: errors against its true surface are measured too",
+        group="comparison",
+        first=True,
+    )
+    paper: bool = flag(
+        "--paper",
+        "also compare a picture of each method with the middle slice by SSIM and MSE, as a paper does, beside controls"
+        " that show what this is worth",
+        group="comparison",
+        first=True,
+    )
+    repeat: int = option(
+        "--repeat",
+        "N",
+        "warm runs of each method; the median counts (default: 3)",
+        group="comparison",
+        default=3,
+        first=True,
+    )
+    iso_value: float | None = option(
+        "--hu",
+        "N|auto|half:B,T",
+        "iso value in HU, inside is N and above; auto: half way between bone and the tissue beside it, measured in the"
+        " scan; half:BONE,TISSUE: half way between these two",
+        group="level",
+        parse=parse_hu,
+        first=True,
+    )
+    preset: str | None = preset_option()
     half_way: str | Sequence[float] | None = None
-    closed: bool = True
+    closed: bool = closed_option()
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -19,6 +19,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.proof.phantom.spine_parts import THORACOLUMBAR, SpineChoice, format_levels, parse_levels
 from clrecon.proof.phantom.spine_plan import fit_slices, spine_choice
 from clrecon.proof.phantom.vertebra import LARGEST_GAP_MM
+from clrecon.system.options import flag, option
 from clrecon.system.text import unknown_name
 
 if TYPE_CHECKING:
@@ -196,66 +197,125 @@ def parse_missing(text: str) -> tuple[int, ...]:
 class PhantomSettings:
     """What a phantom shows and how it is sampled.
 
+    Options say in their help what they do; beside that:
+
     kind: One of `KINDS`.  ``plane`` is an oblique slab with finite faces, so that it has an area and a volume.
-    size: (columns, rows). Extents of a slice in pixels.
-    slices: Number of slices; default: as many as whole vertebrae of `levels` need, 120 without levels.
+    size: (columns, rows).
+    slices: None: as many as whole vertebrae of `levels` need.
     spacing: (dj, di, dk). mm, in DICOM's order: distance between rows, between columns, and between neighbouring slices
         **along the slice normal**.  With a tilted gantry the slice step itself is longer: ``dk / cos(tilt)``.  Default:
         that of the kind, so that 256 x 256 pixels hold it whole.
-    tilt: Gantry tilt in degrees: slices rotated about the patient's x axis while the table still moves along z, so the
-        slice step is not parallel to the slice normal (a shear).  At most 45 either way.
+    tilt: Slices rotated about the patient's x axis while the table still moves along z, so the slice step is not
+        parallel to the slice normal (a shear).  At most 45 degrees either way.
     oblique: (about_x, about_y, about_z). Degrees by which the whole frame (slices and slice step) is then rotated
         rigidly about the patient's x, then y, then z axis.
-    noise: Standard deviation of white Gaussian noise in HU; default 12, 0 for an analytic shape.
-    point_spread_mm: Standard deviation of the Gaussian point spread in mm; default 0.5, 0 for an analytic shape.
-    seed: Same settings and seed give the same bytes; another seed moves the shape by part of a voxel, and gives other
-        noise and texture.
+    seed: Same settings and seed give the same bytes.
     inside_hu, outside_hu: HU of an analytic shape and of its surroundings (not used by other kinds).
     radius_mm: Sphere radius, torus centre-line radius, cylinder radius, or half the thickness of the plane's slab.
         Default: a part of the field of view.
-    table: {"none", "flat", "curved", "headrest"}. Table that the body lies on; default: nothing, the spine's own couch,
-        a curved table for the kind ``empty``. Not for analytic shapes.
-    table_gap_mm: Gap between body and table: at 0 they touch, below 0 the body sinks in.  The spine's own couch ignores
-        it.
-    prone: The patient lies on the face: the table is at the front, and the image's rows and columns are turned by half
-        a turn about z, as a scanner does it (PatientPosition HFP).
-    ghosts: Of a spine: two slices of the stack are foreign, a screen capture and a sagittal view, the folder has a
-        sagittal localizer, and the table is the curved one unless another is named.
-    levels: Of a spine: the vertebrae that it shows, from C1 to L5, like ``"C1-L5"``, ``"L4-L5"`` or ``"C3-C7,T1-T5"``,
-        in the middle of the stack.  Their joints are 2 mm wide or more.  Default: T1 to L5 with T12 in the middle, as
-        far as the slices show them.
-    facet_gap_mm: Of a spine: distance of neighbouring vertebrae in their facet joints, at most 1.5 mm.
-    kyphosis_deg, scoliosis_deg: Of a spine: angle between the first and the last of its levels that is added to the
-        natural curve, from -60 to 60; vertebrae stay rigid.  Positive: the back is round, the middle lies to the left.
-    uneven_mm: Of a spine: the gaps of the slices differ by up to this much from their mean, at most 0.4 of it.
-    missing: Numbers of slices, from 1 as in file names, that are not written; not the first and not the last.
-    phases: Of a spine: this many series of slices at the same places, with ever more contrast medium in the vessels.
+    table: Default: nothing, the spine's own couch, a curved table for the kind ``empty``. Not for analytic shapes.
+    table_gap_mm: Below 0 the body sinks in.  The spine's own couch ignores it.
+    prone: The table is at the front, and the image's rows and columns are turned by half a turn about z, as a scanner
+        does it (PatientPosition HFP).
+    ghosts: A screen capture and a sagittal view in the stack; the table is the curved one unless another is named.
+    levels: From C1 to L5, in the middle of the stack.  Their joints are 2 mm wide or more.  Default: T1 to L5 with T12
+        in the middle, as far as the slices show them.
+    facet_gap_mm: At most 1.5 mm.
+    kyphosis_deg, scoliosis_deg: Added to the natural curve, from -60 to 60; vertebrae stay rigid.
+    uneven_mm: At most 0.4 of the mean gap.
+    missing: From 1 as in file names; not the first and not the last.
     transfer_syntax: {"explicit", "implicit"}. Value representations in the files, both little endian and uncompressed.
     """
 
-    kind: str = "spine"
-    size: tuple[int, int] = (256, 256)
-    slices: int = None  # type: ignore[assignment]  # a number once constructed
-    spacing: tuple[float, float, float] = None  # type: ignore[assignment]  # three numbers once constructed
-    tilt: float = 0.0
-    oblique: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    noise: float = None  # type: ignore[assignment]  # a number once constructed
-    point_spread_mm: float = None  # type: ignore[assignment]  # a number once constructed
-    seed: int = 0
+    kind: str = option(
+        "--kind",
+        "K",
+        "what to make; see below (default: spine)",
+        default="spine",
+        parse=str.lower,
+        first=True,
+        words=KINDS,
+    )
+    size: tuple[int, int] = option(
+        "--size",
+        "N",
+        "columns and rows, like 256 or 256x192 (default: 256)",
+        default=(256, 256),
+        parse=parse_size,
+        first=True,
+    )
+    slices: int = option(  # a number once constructed
+        "--slices", "N", "default: as many as the levels need, 120 without levels", first=True
+    )
+    spacing: tuple[float, float, float] = option(  # three numbers once constructed
+        "--spacing",
+        ("DJ", "DI", "DK"),
+        "mm between rows, columns, slices (default: by kind, of a spine 1 1 1.25)",
+        parse=float,
+        nargs=3,
+        first=True,
+    )
+    tilt: float = option("--tilt", "DEG", "gantry tilt (default: 0)", default=0.0, first=True)
+    oblique: tuple[float, float, float] = option(
+        "--oblique", ("X", "Y", "Z"), "degrees about the patient's axes", default=(0.0, 0.0, 0.0), parse=float, nargs=3
+    )
+    noise: float = option(  # a number once constructed
+        "--noise", "HU", "standard deviation of the noise (default: 12, of an analytic shape 0)", first=True
+    )
+    point_spread_mm: float = option(  # a number once constructed
+        "--point-spread", "MM", "standard deviation of the blur (default: 0.5, of an analytic shape 0)"
+    )
+    seed: int = option(
+        "--seed", "N", "place within a voxel, noise and texture (default: 0)", group="seed", default=0, first=True
+    )
     inside_hu: float = 1000.0
     outside_hu: float = -1000.0
-    radius_mm: float | None = None
-    table: str | None = None
-    table_gap_mm: float = 0.0
-    prone: bool = False
-    ghosts: bool = False
-    levels: str | None = None
-    facet_gap_mm: float | None = None
-    kyphosis_deg: float = 0.0
-    scoliosis_deg: float = 0.0
-    uneven_mm: float = 0.0
-    missing: tuple[int, ...] = ()
-    phases: int = 1
+    radius_mm: float | None = option("--radius", "MM", "radius of an analytic shape")
+    table: str | None = option(
+        "--table",
+        "T",
+        "what a body lies on: none, flat, curved or headrest",
+        parse=str.lower,
+        first=True,
+        words=TABLE_NAMES,
+    )
+    table_gap_mm: float = option("--table-gap", "MM", "between body and table (default: 0, they touch)", default=0.0)
+    prone: bool = flag("--prone", "the patient lies on the face")
+    ghosts: bool = flag("--ghosts", "of a spine: two foreign slices, and a localizer")
+    levels: str | None = option(
+        "--levels", "C1-L5", "vertebrae to show, like L4-L5 or C3-C7,T1-T5", group="spine", first=True
+    )
+    facet_gap_mm: float | None = option(
+        "--facet-gap", "MM", "distance of neighbours in the facet joints", group="spine"
+    )
+    kyphosis_deg: float = option(
+        "--kyphosis",
+        "DEG",
+        "angle between the first and the last level; positive: the back is round",
+        group="spine",
+        default=0.0,
+    )
+    scoliosis_deg: float = option(
+        "--scoliosis",
+        "DEG",
+        "angle between the first and the last level; positive: the middle lies to the left",
+        group="spine",
+        default=0.0,
+    )
+    uneven_mm: float = option(
+        "--uneven", "MM", "the gaps of the slices vary by up to this much", group="spine", default=0.0
+    )
+    missing: tuple[int, ...] = option(
+        "--missing",
+        "N,M-O",
+        "numbers of slices that are left out, like 20-22,40",
+        group="missing",
+        default=(),
+        parse=parse_missing,
+    )
+    phases: int = option(
+        "--phases", "N", "series at the same places, with ever more contrast medium", group="spine", default=1
+    )
     transfer_syntax: str = "explicit"
 
     def __post_init__(self) -> None:

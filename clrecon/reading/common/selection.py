@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from clrecon.errors import UsageError
 from clrecon.system.arguments import name_parameter
-from clrecon.system.options import option
+from clrecon.system.options import flag, option
 
 LARGEST = 1e6
 
@@ -36,29 +36,23 @@ class Selection:
         first=True,
     )
     phase: int | None = option(
-        "--phase", "N", "number of the phase, of a series with several volumes at one place", group="reading", parse=int
+        "--phase", "N", "number of the phase, of a series with several volumes at one place", group="reading"
     )
-    allow_gaps: bool = option(
+    allow_gaps: bool = flag(
         "--allow-gaps",
-        None,
         "read a stack with missing slices: what is there is placed exactly, surfaces bridge the gap",
         group="reading",
-        default=False,
     )
-    force: bool = option(
+    force: bool = flag(
         "--force",
-        None,
         "read data sets without preamble or meta header too, their encoding guessed; leave out what is left"
         " over behind the pixels",
         group="reading",
-        default=False,
     )
-    follow_links: bool = option(
+    follow_links: bool = flag(
         "--follow-links",
-        None,
         "read the files and folders that symbolic links out of the folder lead to (git-annex, DataLad)",
         group="reading",
-        default=False,
     )
     rescale: tuple[float, float] | None = option(
         "--rescale",

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import choose_level
-from clrecon.jobs.view.inputs import ViewSettings, check_view_settings, open_inputs
+from clrecon.jobs.view import ViewSettings
+from clrecon.jobs.view.inputs import check_view_settings, open_inputs
 from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.viewer.drawing.painter import Painter

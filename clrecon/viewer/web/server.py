@@ -35,7 +35,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from clrecon.errors import ClreconError, UsageError
 from clrecon.exchange.page import hash_code, read_page_code
-from clrecon.jobs.view.inputs import ViewSettings, check_view_settings
+from clrecon.jobs.view import ViewSettings
+from clrecon.jobs.view.inputs import check_view_settings
 from clrecon.system.arguments import name_parameter
 from clrecon.system.log import get_logger
 from clrecon.system.progress import Progress

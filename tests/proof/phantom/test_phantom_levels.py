@@ -12,7 +12,6 @@ from clrecon.errors import UsageError
 from clrecon.labels import read_labels
 from clrecon.proof.phantom import PhantomSettings, make_phantom, phantom_truth, write_phantom
 from clrecon.proof.phantom.build import facts_of_spine
-from clrecon.proof.phantom.job import make_phantom as make_phantom_job
 from clrecon.proof.phantom.series import place_slices
 from clrecon.proof.phantom.spine import plan_spine
 from clrecon.proof.phantom.spine_parts import LEVELS, SpineChoice, Vertebra, format_levels, level_number, parse_levels
@@ -92,7 +91,7 @@ def test_levels_that_cannot_be_are_refused_with_their_numbers(given: dict, says:
 
 def test_nothing_is_written_where_levels_do_not_fit(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="do not fit"):
-        make_phantom_job(tmp_path / "ct", levels="C1-L5", slices=20)
+        write_phantom(tmp_path / "ct", PhantomSettings(levels="C1-L5", slices=20))
     assert list(tmp_path.iterdir()) == []
 
 

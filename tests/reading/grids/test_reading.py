@@ -16,7 +16,8 @@ from volume_files import WRITERS, make_ct, write_metaimage
 import clrecon
 from clrecon.cli.main import main
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
-from clrecon.jobs.info import InfoSettings, describe_input
+from clrecon.jobs.info import describe_input
+from clrecon.jobs.settings import InfoSettings
 
 pytest.importorskip("nibabel")
 pytest.importorskip("nrrd")

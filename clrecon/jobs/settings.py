@@ -1,0 +1,338 @@
+"""Settings of the jobs that are one file each, validated on construction: nothing here loads numpy, as help asks it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from clrecon.errors import UsageError
+from clrecon.jobs.options import (
+    DeviceSettings,
+    InputSettings,
+    ScanSettings,
+    label_map_option,
+    mesh_space_option,
+    parse_levels,
+    parse_point,
+    space_option,
+)
+from clrecon.reading import Selection
+from clrecon.system.arguments import name_parameter
+from clrecon.system.options import flag, option
+
+
+def check_space(space: str | None) -> None:
+    """Refuse an unknown patient frame; None is not given."""
+    from clrecon.geometry.affine import frame_from_lps  # numpy: not loaded before a job starts
+
+    if space is not None:
+        frame_from_lps(space)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InfoSettings(Selection):
+    """What is judged: a series that is named, or the reader's choice; any usable series is enough then.
+
+    strict: A listing without a chosen series is a problem too.
+    """
+
+    pixels: bool = flag(
+        "--pixels",
+        "read the pixels of the series marked * too: share of padding, range of HU, saturated metal",
+        first=True,
+    )
+    strict: bool = flag("--strict", "exit with 4 when it fails a gate, see docs/certificate.md", first=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportSettings(InputSettings):
+    """Settings of the export job; see `clrecon.geometry.resample.resample_volume`."""
+
+    resample: float | None = option(
+        "--resample",
+        "MM",
+        "resample (trilinear) to a regular grid with this step along all axes; without it voxels stay as they are",
+        first=True,
+    )
+    space: str = option(
+        "--space",
+        "lps|ras",
+        "patient frame of the numbers of crop and region (default: lps); that of the file is its format's",
+        default="lps",
+        parse=str.lower,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_space(self.space)
+        if self.resample is not None:
+            from clrecon.geometry.resample import check_step
+
+            check_step(self.resample)
+
+    @property
+    def needs_device(self) -> bool:
+        """True where the region or a step of preprocessing runs on a device."""
+        return bool(self.region) or self.preprocess is not None
+
+
+def _parse_percentiles(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"{text!r} are no percentiles: numbers with commas, 5,50,95") from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatsSettings(ScanSettings):
+    """Settings of the job of statistics.
+
+    only: None: all.
+    percentiles: None: `clrecon.labels.statistics.PERCENTILES`.
+    """
+
+    labels: str | Path = label_map_option(required=True)
+    only: Sequence[str | int] = option(
+        "--label", "NAME|N", "this label only; may be given again", default=(), action="append", first=True
+    )
+    percentiles: Sequence[float] | None = option(
+        "--percentiles",
+        "P,P",
+        "percentiles of HU, from 0 to 100 (default: 5,25,50,75,95)",
+        parse=_parse_percentiles,
+        first=True,
+    )
+
+    def __post_init__(self) -> None:
+        from clrecon.labels.statistics import check_percentiles  # numpy: not loaded before a job starts
+
+        if self.percentiles is not None:
+            check_percentiles(self.percentiles)
+
+
+MOST_SAMPLES = 10_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistanceSettings(DeviceSettings):
+    """Settings of the job of distances.
+
+    samples: None: `clrecon.mesh.compare.distances.SAMPLES`.
+    """
+
+    mesh_space: str | None = mesh_space_option("files that do not name theirs")
+    samples: int | None = option("--samples", "N", "points on each mesh, evenly by area (default: 50000)")
+    range_mm: float | None = option(
+        "--range",
+        "MM",
+        "distance at which the colours end (default: 1, 2 or 5 x 10^n mm that hold 95 %% of the distances)",
+        group="picture",
+        first=True,
+    )
+    view: str = option(
+        "--view", "V", "view of the picture: anterior (default), left, AZ,EL ...", group="picture", default="anterior"
+    )
+    space: str = space_option("patient frame of the coloured mesh", group="picture")
+
+    def __post_init__(self) -> None:
+        from clrecon.rendering.views.directions import find_view
+
+        check_space(self.space)
+        check_space(self.mesh_space)
+        if self.samples is not None and not 1 <= self.samples <= MOST_SAMPLES:
+            raise UsageError(f"distances need 1 to {MOST_SAMPLES:,} samples on each mesh, not {self.samples:,}")
+        if self.range_mm is not None and not (math.isfinite(self.range_mm) and self.range_mm > 0.0):
+            raise UsageError(f"the colours span a number of mm above 0, not {self.range_mm:g}")
+        find_view(self.view)
+        super().__post_init__()
+
+
+INSIDE_VIEW = "130,20"
+"""From the left, behind and above: body, arch and canal are seen."""
+
+
+def _parse_band(text: str) -> tuple[float | None, float | None]:
+    """Read ``A``, ``A:`` or ``A:B``, numbers of HU; ``:B`` leaves the lower end open."""
+    low, colon, high = text.partition(":")
+    try:
+        ends = [float(end) if end else None for end in (low, high)]
+    except ValueError:
+        ends = [None, None]
+    if ends == [None, None] or any(end is not None and not math.isfinite(end) for end in ends):
+        raise ValueError(f"{text!r} is no band of HU: write A for A and above, or A:B")
+    return ends[0], ends[1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class InsideSettings(ScanSettings, DeviceSettings):
+    """Settings of the job that looks into vertebrae.
+
+    only: Numbers or names of labels.
+    dense: (low, high). None leaves an end open.  Default: `clrecon.operators.vertebrae.inside.DENSE_HU`.
+    close_mm: Default: `clrecon.operators.vertebrae.solid.CLOSE_MM`.
+    grow_mm: See `clrecon.extract_labels`.
+    """
+
+    labels: str | Path = label_map_option(required=True)
+    only: Sequence[str | int] = option(
+        "--label", "NAME|N", "label of a vertebra; may be given again", action="append", required=True, first=True
+    )
+    view: str = option(
+        "--view",
+        "V",
+        f"anterior, posterior, left, right, superior, inferior, or AZ,EL in degrees (default: {INSIDE_VIEW})",
+        group="pictures",
+        default=INSIDE_VIEW,
+        words=("anterior", "posterior", "left", "right", "superior", "inferior"),
+    )
+    iso_value: float | None = option(
+        "--hu",
+        "N",
+        "level of the solid bone, within one voxel of the label (default: the label's own voxels)",
+        group="parts",
+        first=True,
+    )
+    dense: Sequence[float | None] | None = option(
+        "--dense",
+        "A[:B]",
+        "HU of dense bone, from A on or from A to B (default: 450)",
+        group="parts",
+        parse=_parse_band,
+    )
+    close_mm: float | None = option("--close", "MM", "pores that close by balls (default: 1.5)", group="parts")
+    grow_mm: float | None = option(
+        "--grow",
+        "MM",
+        "with --hu: dense voxels this near to the label are its own (default: one voxel each way)",
+        group="parts",
+    )
+    space: str = space_option("patient frame of the meshes", group="parts")
+
+    def __post_init__(self) -> None:
+        check_space(self.space)
+        if not self.only:
+            raise UsageError(f"choose the vertebrae by their labels: {name_parameter('only', 'L3')}")
+        super().__post_init__()
+        if self.grow_mm is not None and self.iso_value is None:
+            raise UsageError(
+                f"the labels' own voxels do not grow: leave {name_parameter('grow_mm')} out, or give an iso value"
+                f" ({name_parameter('iso_value', 'N')})"
+            )
+
+
+def _parse_name(text: str) -> tuple[tuple[float, ...], str]:
+    """Read ``X,Y,Z=L3``."""
+    point, equals, level = text.rpartition("=")
+    if not equals or not level.strip():
+        raise ValueError(f"{text!r} is no named point: write it as X,Y,Z=L3")
+    return parse_point(point), level.strip()
+
+
+@dataclass(frozen=True, kw_only=True)
+class VertebraeSettings(ScanSettings):
+    """Settings of the search for vertebrae; see `clrecon.split_vertebrae`."""
+
+    level: float | None = option(
+        "--hu",
+        "N",
+        "bone is N HU and more (default: half way between discs and marrow, 120 to 226)",
+        group="vertebrae",
+        first=True,
+    )
+    seeds: Sequence[Sequence[float]] = option(
+        "--seed",
+        "X,Y,Z",
+        "a point in the body of a vertebra, LPS mm; one for each vertebra, in place of the search for discs",
+        group="vertebrae",
+        default=(),
+        parse=parse_point,
+        action="append",
+        first=True,
+    )
+    name_at: tuple[Sequence[float], str] | None = option(
+        "--name-at",
+        "X,Y,Z=L3",
+        "name the level of the vertebra at this point (LPS mm), and from it all others",
+        group="vertebrae",
+        parse=_parse_name,
+        first=True,
+    )
+    first: str | None = option(
+        "--first",
+        "LEVEL",
+        "name the level of the uppermost vertebra that is found (T1), and from it all others; without --first and"
+        " --name-at they are numbered from the head",
+        group="vertebrae",
+        first=True,
+    )
+    keep_unsure: bool = flag("--keep-unsure", "write vertebrae of low confidence too", group="vertebrae")
+
+    def __post_init__(self) -> None:
+        from clrecon.spine.split import check_landmark
+
+        if self.level is not None and not math.isfinite(self.level):
+            raise UsageError(f"the level of bone is a number of HU, not {self.level!r}")
+        points = [*self.seeds, *([] if self.name_at is None else [self.name_at[0]])]
+        for point in points:
+            if len(point) != 3 or not all(math.isfinite(value) for value in point):
+                raise UsageError(f"a point is three numbers in mm, not {list(point)!r}")
+        if len(self.seeds) == 1:
+            raise UsageError("one seed is too few: give a point in each vertebra, two at least")
+        check_landmark(self.name_at, self.first)
+
+
+LARGEST_MARGIN_MM = 5.0
+
+
+def _parse_level(text: str) -> float | None:
+    """Read a level, or ``auto``."""
+    if text == "auto":
+        return None
+    levels = parse_levels(text)
+    if len(levels) != 1:
+        raise ValueError(f"it is one level or auto, not {text!r:.80}")
+    return levels[0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorridorSettings(ScanSettings, DeviceSettings):
+    """Settings of the corridor job.
+
+    only: At least one.
+    iso_value: None: half way, measured in the scan.
+    screws: See `clrecon.jobs.corridor.parse_screw`.
+    """
+
+    labels: str | Path = label_map_option(required=True)
+    only: Sequence[str | int] = option(
+        "--label", "NAME|N", "a vertebra of the map; may be given again", default=(), action="append", first=True
+    )
+    iso_value: float | None = option(
+        "--hu",
+        "auto|N",
+        "HU at which the bone's surface lies (default: auto, half way between bone and the tissue beside it)",
+        parse=_parse_level,
+        first=True,
+    )
+    margin: float = option(
+        "--margin",
+        "MM",
+        "distance that a screw of the largest diameter keeps from the surface (default: 1)",
+        default=1.0,
+        first=True,
+    )
+    screws: tuple[Any, ...] = ()
+    space: str = space_option("patient frame of points and meshes", group="space")
+
+    def __post_init__(self) -> None:
+        if not self.only:
+            raise UsageError(f"name the vertebrae: {name_parameter('only', 'L3')}, once for each")
+        if not (math.isfinite(self.margin) and 0.0 <= self.margin <= LARGEST_MARGIN_MM):
+            raise UsageError(f"the margin is a length from 0 to {LARGEST_MARGIN_MM:g} mm, not {self.margin:g}")
+        if self.iso_value is not None and not math.isfinite(self.iso_value):
+            raise UsageError(f"the level is a finite number of HU, not {self.iso_value}")
+        check_space(self.space)
+        super().__post_init__()
