@@ -35,6 +35,7 @@ CHECKS: tuple[Check, ...] = (
     *decimation_checks.CROSSING_CHECKS,
     *surface_checks.LABEL_CHECKS,
     *decimation_checks.DISTANCE_CHECKS,
+    *surface_checks.CORTEX_CHECKS,
     *ray_checks.LEAP_CHECKS,
     *ray_checks.PICTURE_CHECKS,
     *layer_checks.CHECKS,

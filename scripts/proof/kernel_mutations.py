@@ -155,6 +155,8 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         ),
         "left": (("left[number] = (uchar)undecided;", "left[number] = (uchar)~undecided;"),),
     },
+    "sample_profiles": {"profiles": (("? under + fk * (over - under) : NAN", "? -under - fk * (over - under) : NAN"),)},
+    "fit_profiles": {"fits": (("store_lanes(now.x0, fit);", "store_lanes(-now.x0, fit);"),)},
     "place_vertices": {"placed": (("placed[3 * vertex + axis] = (", "placed[3 * vertex + axis] = -("),)},
     "count_pieces": {"pieces": (("? 0 : count_across(b.left", "? 0 : ~count_across(b.left"),)},
     "draw_triangles": {

@@ -1,5 +1,5 @@
 """Checks of iso surfaces: every way to mark samples, uneven slices, ranges, the topology of the trilinear field,
-labels.
+labels, and walls of bone read from their profiles.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from clrecon.labels.label_bodies import find_boxes
 from clrecon.labels.label_levels import FULL, count_faces
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, Stopwatch, allocate, download, launch, upload
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.surface.cortex import CORTEX_SPREAD, SAMPLES, ProfileSampler, expected_precisions
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
 from clrecon.operators.surface.label_masks import extract_label_masks, prepare_label_masks, survey_labels
 from clrecon.operators.surface.labels import extract_labels
@@ -28,14 +30,18 @@ from clrecon.proof.checking import (
     OBLIQUE,
     WIDE,
     Check,
+    blobs,
+    centre_of,
     noise,
     random_integers,
     require_close,
     require_equal,
+    require_share,
     require_whole,
     stack,
     waves,
 )
+from clrecon.proof.surface import cortex as cortex_twin
 from clrecon.proof.surface import growing as growing_twin
 from clrecon.proof.surface import labels as twin
 from clrecon.proof.surface.extract import Surface
@@ -330,4 +336,101 @@ LABEL_CHECKS = (
         {"surface/marching_cubes.cl": ("MASKS",)},
     ),
     Check("volumes of masks", ("sum_volumes",), _check_volumes),
+)  # fmt: skip
+
+
+PLACES = 700
+"""Profiles that are sampled."""
+
+WALLS = 4200
+"""Walls that are fitted: more than 500 vectors of eight."""
+
+VALUE_TOLERANCE_HU = 0.25
+"""Places in float32, 2e-5 of a voxel off, where values change by 1000 HU within a voxel or two."""
+
+TOLERANCES = (
+    ("places", 1e-3, 0.01), ("thicknesses", 2e-3, 0.03), ("outer HU", 1.0, 0.01), ("cortex HU", 2.0, 0.03),
+    ("inner HU", 2.0, 0.03), ("residuals", 0.3, 0.01), ("variances", 0.01, 0.03), ("variances", 0.01, 0.03),
+)  # fmt: skip
+"""What the fit in float32 may differ from that in float64 (mm, HU), and the share of walls that may differ more: those
+where two walls are as good, or whose cost hardly changes along a valley of thicker and less dense ones."""
+
+
+def twin_scale(sampler: ProfileSampler) -> cortex_twin.Scale:
+    """Return the samples of profiles, for the twin."""
+    return cortex_twin.Scale(sampler.scale.first_mm, sampler.scale.step_mm, sampler.scale.weights)
+
+
+def scatter_profiles(volume: Volume, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return points about the middle of a volume, some of them near its border, and unit vectors at random."""
+    random = np.random.default_rng(seed)
+    extent = np.ptp(volume.ijk_to_lps(np.array([(0, 0, 0), volume.shape_ijk])), axis=0)
+    points = centre_of(volume) + random.uniform(-0.55, 0.55, (PLACES, 3)) * np.abs(extent)
+    normals = random.normal(size=(PLACES, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    return points.astype(np.float32), normals.astype(np.float32)
+
+
+def _check_profiles(device: Device, dtype: str, uneven: bool) -> str:
+    volume = blobs((30, 34, 38), OBLIQUE, dtype, uneven)
+    points, normals = scatter_profiles(volume, 31)
+    with DeviceVolume(volume, device=device) as resident:
+        sampler = ProfileSampler(resident, Stopwatch())
+        found = sampler.values(points, normals)
+    expected = cortex_twin.sample_profiles(volume, points, normals, twin_scale(sampler))
+    share = 0.002  # at the border a sample is in the volume or not
+    worst = require_share(found, expected, VALUE_TOLERANCE_HU, share, f"profiles of {dtype} voxels")
+    return f"{PLACES} profiles of {dtype} voxels within {worst:.1e} HU"
+
+
+def make_walls(count: int, seed: int) -> NDArray[np.float32]:
+    """Return profiles (SAMPLES + 2, count) of walls of all kinds with noise, some of them cut off or beside another."""
+    random = np.random.default_rng(seed)
+    x = 0.5 * (np.arange(SAMPLES) - 7.0)
+    place, thickness = random.uniform(-1.6, 0.2, count), random.uniform(0.2, 4.0, count)
+    blur = random.uniform(0.5, 0.9, count)
+    outer, cortex = random.choice([-1000.0, 50.0], count), random.uniform(600.0, 1400.0, count)
+    inner = random.uniform(-100.0, 400.0, count)
+    share = cortex_twin._normal_share
+    o = share((x[:, None] - place) / blur)
+    i = share(-(x[:, None] - place + thickness) / blur)
+    values = outer * o + inner * i + cortex * (1.0 - o - i) + random.normal(0.0, 15.0, o.shape)
+    other = random.random(count) < 0.2
+    values[-2:, other] += 600.0
+    values[:2, other] += 500.0
+    values[11:, ::17] = np.nan
+    values[:, 5::31] = np.nan
+    return np.vstack([values, random.random(count), random.choice([1.0, 2.3], count)]).astype(np.float32)
+
+
+def _check_fits(device: Device) -> str:
+    values = make_walls(WALLS, 32)
+    volume = blobs((8, 9, 10), np.eye(4), "int16")
+    with DeviceVolume(volume, device=device) as resident:
+        sampler = ProfileSampler(resident, Stopwatch())
+        found = np.stack(sampler.take(values).fit(0.66, 0.81, 980.0, 20.0).rows())
+    precisions = expected_precisions(980.0, 20.0, CORTEX_SPREAD, sampler.scale.independent)
+    expected = cortex_twin.fit_profiles(
+        values.astype(np.float64), twin_scale(sampler), 0.66, 0.81, 980.0, precisions, 100.0
+    )
+    known = np.isfinite(expected[8])
+    require_close(found[8:], expected[8:], 1e-2, "highest values and room of walls")
+    for row, (what, allowed, share) in enumerate(TOLERANCES):
+        one, other = found[row][known], expected[row][known]
+        if what == "variances":  # in units of their own
+            one, other = one / other, np.ones_like(other)
+        require_share(one, other, allowed, share, f"{what} of walls")
+    apart = np.abs(found[0] - expected[0])[known]
+    return f"{int(known.sum())} walls, 99 % of the places within {np.percentile(apart, 99.0):.1e} mm"
+
+
+CORTEX_CHECKS = (
+    *(
+        Check(
+            f"profiles across walls, {dtype}{', uneven slices' * uneven}", ("sample_profiles",),
+            partial(_check_profiles, dtype=dtype, uneven=uneven),
+        )
+        for dtype, uneven in (("int16", False), ("float32", True))
+    ),
+    Check("walls fitted to profiles", ("fit_profiles",), _check_fits),
 )  # fmt: skip

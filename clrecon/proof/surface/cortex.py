@@ -1,0 +1,184 @@
+"""Twin of cl/surface/cortex.cl in float64: profiles by trilinear interpolation, and walls fitted to them.
+
+The normal distribution is that of the C library, and plateaus come from numpy's solver.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry import Volume, slice_normal
+
+Float64Array = NDArray[np.float64]
+
+SAMPLES, CENTRE = 13, 7
+
+INNER_SHARE = 0.25
+"""Expected HU of marrow, as a share of those of cortex."""
+
+ROUNDS, SLACK = 6, 1.0003
+THINNEST = 0.05
+STARTS = ((-1.1, 0.9), (-0.8, 2.2), (-0.8, 5.0))
+"""Places and thicknesses where the search may begin, in blurs."""
+
+_normal_share = np.vectorize(lambda z: 0.5 * math.erfc(-z / math.sqrt(2.0)), otypes=[np.float64])
+
+
+@dataclass
+class Scale:
+    """Samples of a profile, at ``first_mm + n * step_mm``, and their weights."""
+
+    first_mm: float
+    step_mm: float
+    weights: NDArray[np.floating]
+
+
+def sample_profiles(
+    volume: Volume, points: NDArray[np.floating], normals: NDArray[np.floating], scale: Scale
+) -> Float64Array:
+    """Return the profiles, shape (SAMPLES + 2, n), as cl/surface/cortex.cl has them."""
+    last = np.array(volume.shape_ijk) - 1
+    profiles = np.empty((SAMPLES + 2, len(points)))
+    voxels = volume.voxels.astype(np.float64)
+    for n in range(SAMPLES):
+        ijk = volume.lps_to_ijk(points + (scale.first_mm + n * scale.step_mm) * normals)
+        inside = ((ijk >= -0.5) & (ijk <= last + 0.5)).all(axis=1)
+        clamped = np.clip(ijk, 0, last)
+        low = np.minimum(clamped.astype(int), np.maximum(last - 1, 0))
+        share, high = clamped - low, np.minimum(low + 1, last)
+        value = np.zeros(len(points))
+        for corner in range(8):
+            upper = [bool(corner >> axis & 1) for axis in range(3)]
+            i, j, k = (high[:, axis] if up else low[:, axis] for axis, up in enumerate(upper))
+            weight = np.prod([share[:, axis] if up else 1.0 - share[:, axis] for axis, up in enumerate(upper)], axis=0)
+            value += weight * voxels[k, j, i]
+        profiles[n] = np.where(inside, value, np.nan)
+    normal = slice_normal(volume.affine)
+    heights = np.abs(np.diff(volume.slice_origins() @ normal))
+    layers = np.clip(np.floor(volume.lps_to_ijk(points)[:, 2]).astype(int), 0, len(heights) - 1)
+    profiles[SAMPLES] = np.square(normals @ normal)
+    profiles[SAMPLES + 1] = np.square(heights[layers] / np.median(heights))
+    return profiles
+
+
+def find_wall(profiles: Float64Array, rise: float) -> tuple[NDArray[np.int64], NDArray[np.int64], Float64Array]:
+    """Return the first and the last sample that belong to the wall of each profile, and its highest value."""
+    count = profiles.shape[1]
+    first, last, peak = np.full(count, CENTRE), np.full(count, CENTRE), np.full(count, np.nan)
+    for row in range(count):
+        y = profiles[:SAMPLES, row]
+        if np.isnan(y[CENTRE]):
+            continue
+        most, lowest = y[CENTRE], CENTRE
+        for n in range(CENTRE + 1, SAMPLES):
+            if np.isnan(y[n]):
+                break
+            if y[n] > y[lowest] + rise:
+                last[row] = lowest
+                break
+            last[row], most = n, max(most, y[n])
+            lowest = n if y[n] < y[lowest] else lowest
+        fallen = -1
+        for n in range(CENTRE - 1, -1, -1):
+            if np.isnan(y[n]):
+                break
+            if fallen >= 0 and y[n] > y[fallen] + rise:
+                first[row] = fallen
+                break
+            first[row] = n
+            if (fallen >= 0 and y[n] < y[fallen]) or (fallen < 0 and y[n] < most - rise):
+                fallen = n
+            most = max(most, y[n])
+        peak[row] = most
+    return first, last, peak
+
+
+@dataclass
+class _Fit:
+    """Fits at given places and thicknesses, shape (n,), plateaus (n, 3): outer, cortex, inner from the cortex on."""
+
+    x0: Float64Array
+    t: Float64Array
+    plateaus: Float64Array
+    cost: Float64Array
+    samples: Float64Array
+    square: Float64Array
+    slope: Float64Array
+
+    def replaced(self, by: _Fit, slack: float = 1.0) -> _Fit:
+        """Return the better of both, place by place."""
+        take = by.cost < slack * self.cost
+        pairs = ((getattr(by, name), getattr(self, name)) for name in self.__dataclass_fields__)
+        return _Fit(*(np.where(take.reshape(-1, *[1] * (one.ndim - 1)), one, other) for one, other in pairs))
+
+
+def fit_profiles(
+    profiles: Float64Array,
+    scale: Scale,
+    blur_mm: float,
+    across_mm: float,
+    cortex_hu: float,
+    precisions: tuple[float, float, float],
+    rise: float,
+) -> Float64Array:
+    """Return the results of cl/surface/cortex.cl, shape (10, n), of profiles (SAMPLES + 2, n).
+
+    precisions: Of outer HU around the cortex, of cortex and inner HU, in units of a sample's weight.
+    """
+    steep, gap = profiles[SAMPLES], profiles[SAMPLES + 1]
+    over = np.maximum(blur_mm**2 + (across_mm**2 - blur_mm**2) * gap, 0.1 * blur_mm**2)
+    width = np.sqrt(blur_mm**2 * (1.0 - steep) + over * steep)
+    first, last, peak = find_wall(profiles, rise)
+    places = scale.first_mm + scale.step_mm * np.arange(SAMPLES)
+    counts = (np.arange(SAMPLES) >= first[:, None]) & (np.arange(SAMPLES) <= last[:, None])
+    weights = np.where(counts, scale.weights.astype(np.float64), 0.0)
+    values = np.where(counts, profiles[:SAMPLES].T / 1000.0 - cortex_hu / 1000.0, 0.0)
+    expected = np.array([0.0, 0.0, (INNER_SHARE - 1.0) * cortex_hu / 1000.0])
+    kept = np.array(precisions)
+
+    def fit(x0: Float64Array, t: Float64Array) -> _Fit:
+        z, behind = (places - x0[:, None]) / width[:, None], (places - x0[:, None] + t[:, None]) / width[:, None]
+        outer, inner = _normal_share(z), _normal_share(-behind)
+        shares = np.stack([outer, 1.0 - outer - inner, inner], axis=2)
+        rise_x = np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi) / width[:, None]
+        fall_x = np.exp(-0.5 * behind**2) / np.sqrt(2.0 * np.pi) / width[:, None]
+        square = np.einsum("ns,nsa,nsb->nab", weights, shares, shares) + np.diag(kept)
+        plateaus = np.linalg.solve(
+            square, (np.einsum("ns,nsa,ns->na", weights, shares, values) + kept * expected)[..., None]
+        )
+        plateaus = plateaus[..., 0]
+        left = values - np.einsum("nsa,na->ns", shares, plateaus)
+        out, ctx, mar = (plateaus[:, place, None] for place in range(3))
+        by_x = (ctx - out) * rise_x - (ctx - mar) * fall_x
+        changes = np.stack([by_x, (ctx - mar) * fall_x], axis=2)
+        mixed = np.einsum("ns,nsa,nsb->nab", weights, changes, shares)
+        own = np.einsum("ns,nsa,nsb->nab", weights, changes, changes)
+        own -= mixed @ np.linalg.solve(square, mixed.transpose(0, 2, 1))
+        samples = np.einsum("ns,ns->n", weights, left**2)
+        cost = samples + (kept * (plateaus - expected) ** 2).sum(axis=1)
+        return _Fit(x0, t, plateaus, cost, samples, own, np.einsum("ns,nsa,ns->na", weights, changes, left))
+
+    nearest, room = places[first], places[last]
+    thickest = scale.step_mm * SAMPLES
+    ease = np.array([1e-12, 3e-11]) * cortex_hu**2
+    begins = [fit(np.clip(x * width, nearest, room), t * width) for x, t in STARTS]
+    now = begins[0].replaced(begins[1]).replaced(begins[2])
+    damping = np.full(len(width), 0.01)
+    for _ in range(ROUNDS):
+        system = now.square.copy()
+        system[:, (0, 1), (0, 1)] *= 1.0 + damping[:, None]
+        system[:, (0, 1), (0, 1)] += ease
+        step = np.linalg.solve(system, now.slope[..., None])[..., 0]
+        x0 = np.clip(now.x0 + np.clip(step[:, 0], -width, width), nearest, room)
+        t = np.maximum(now.t + np.clip(step[:, 1], -1.5 * width, 1.5 * width), 0.5 * now.t)
+        following = fit(x0, np.clip(t, THINNEST * width, thickest))
+        damping = damping * np.where(following.cost < SLACK * now.cost, 0.2, 5.0)
+        now = now.replaced(following, SLACK)
+    now.square[:, (0, 1), (0, 1)] += ease
+    variances = 1e-6 * np.linalg.inv(now.square)[:, (0, 1), (0, 1)].T
+    residual = 1000.0 * np.sqrt(np.maximum(now.samples, 0.0) / (weights.sum(axis=1) + 1e-6))
+    return np.vstack([now.x0, now.t, 1000.0 * now.plateaus.T + cortex_hu, residual, variances, peak, room])

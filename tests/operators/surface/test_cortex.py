@@ -1,0 +1,128 @@
+"""Walls of bone read from their profiles: the twin, walls whose place and thickness are known, slabs, and refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from clrecon.errors import NoSurfaceError
+from clrecon.geometry import Volume
+from clrecon.opencl import Stopwatch
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.surface import cortex
+from clrecon.operators.surface.cortex import FITTED, METAL, NO_ROOM, NOT_BONE, ProfileSampler, fit_cortex
+from clrecon.operators.surface.extract import extract_isosurface
+from clrecon.proof.checking import OBLIQUE, stack
+from clrecon.proof.surface.surface_checks import CORTEX_CHECKS
+
+MIDDLE = np.array([19.5, 19.0, 18.0])
+
+
+def hollow_ball(radius=13.0, thickness=2.0, blur=0.7, cortex=1000.0, inner=200.0, spacing=(1.0, 1.0, 1.0)) -> Volume:
+    """A blurred shell of bone in tissue of 50 HU, its middle at `MIDDLE` mm."""
+    shape = [round(39.0 / step) + 1 for step in spacing]
+    i, j, k = (np.arange(n) * step for n, step in zip(shape, spacing, strict=True))
+    far = np.sqrt((i - MIDDLE[0]) ** 2 + ((j - MIDDLE[1]) ** 2)[:, None] + ((k - MIDDLE[2]) ** 2)[:, None, None])
+    outer, hollow = ndtr((far - radius) / blur), ndtr((radius - thickness - far) / blur)
+    values = 50.0 * outer + inner * hollow + cortex * (1.0 - outer - hollow)
+    return Volume(np.rint(values).astype(np.int16), np.diag([*spacing, 1.0]))
+
+
+def fit_surface(volume: Volume, device, level=200.0, constants=None):
+    mesh = extract_isosurface(volume, level, device=device)
+    with DeviceVolume(volume, device=device) as resident:
+        return mesh, fit_cortex(resident, mesh.vertices, mesh.normals, stopwatch=Stopwatch(), constants=constants)
+
+
+def outer_places(mesh, fit, radius):
+    """Distances of the fitted outer surface from its radius, mm, and the rows of its vertices."""
+    places = mesh.vertices + fit.shift_mm[:, None] * mesh.normals
+    far = np.linalg.norm(places - MIDDLE, axis=1)
+    rows = np.flatnonzero((np.linalg.norm(mesh.vertices - MIDDLE, axis=1) > radius - 0.6) & (fit.states == FITTED))
+    return far[rows] - radius, rows
+
+
+@pytest.mark.every_device
+@pytest.mark.parametrize("check", CORTEX_CHECKS, ids=lambda check: check.name)
+def test_profiles_and_walls_are_those_of_the_twin(device, check):
+    assert check.run(device)
+
+
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.7, 0.7, 1.5)])
+@pytest.mark.parametrize("thickness", [1.0, 2.0, 4.0])
+def test_a_shell_lies_where_it_is(device, thickness, spacing):
+    _, of_thick = fit_surface(hollow_ball(thickness=4.0, spacing=spacing), device)
+    volume = hollow_ball(thickness=thickness, spacing=spacing)
+    mesh, fit = fit_surface(volume, device, constants=of_thick.constants)
+    away, rows = outer_places(mesh, fit, 13.0)
+    level = np.linalg.norm(mesh.vertices[rows] - MIDDLE, axis=1) - 13.0
+    assert len(rows) > 1000
+    assert np.abs(level).mean() > 0.4  # what a level costs
+    assert np.abs(away).mean() < 0.12
+    assert abs(np.median(fit.thickness_mm[rows]) - thickness) < 0.35
+    assert (np.abs(away) < 1.96 * fit.error_mm[rows]).mean() > 0.9
+
+
+def test_constants_are_those_of_the_scan(device):
+    _, fit = fit_surface(hollow_ball(thickness=4.0, blur=0.8), device)
+    found = fit.constants
+    # Interpolation between voxels of 1 mm blurs further: by about 0.4 mm, in squares.
+    assert found.blur_mm == pytest.approx(0.88, abs=0.08) and found.blur_across_mm == pytest.approx(0.88, abs=0.08)
+    assert found.cortex_hu == pytest.approx(1000.0, rel=0.04)
+    assert found.places == cortex.MOST_WALLS and found.thick > 100
+
+
+@pytest.mark.parametrize("uneven", [False, True])
+def test_slabs_change_nothing(device, uneven):
+    even = hollow_ball(thickness=2.0)
+    volume = stack(even.voxels, OBLIQUE, uneven)
+    mesh, whole = fit_surface(volume, device)
+    limit = volume.voxels.nbytes // 2 + 4 * 25 * cortex.stride_of(mesh.vertex_count) + 40 * mesh.vertex_count
+    with DeviceVolume(volume, device=device, memory=limit) as resident:
+        sampler = ProfileSampler(resident, Stopwatch())
+        assert len(list(sampler.pieces(mesh.vertices, mesh.normals))) > 1
+        slabs = fit_cortex(resident, mesh.vertices, mesh.normals, stopwatch=Stopwatch(), constants=whole.constants)
+    for name in ("states", "shift_mm", "thickness_mm", "error_mm", "room_mm"):
+        assert np.array_equal(getattr(slabs, name), getattr(whole, name), equal_nan=True), name
+
+
+def test_what_is_no_wall_is_told(device):
+    volume = hollow_ball(thickness=2.0)
+    voxels = volume.voxels.copy()
+    k, j, i = np.indices(voxels.shape)
+    vessel = 50.0 + 270.0 * ndtr((3.0 - np.hypot(i - 4.0, j - 4.0)) / 0.7)  # contrast medium, from end to end
+    voxels = np.maximum(voxels, np.rint(vessel).astype(np.int16))
+    voxels[(np.abs(i - 35) < 2) & (np.abs(j - 35) < 2) & (np.abs(k - 20) < 4)] = 3000
+    mesh, fit = fit_surface(volume.with_voxels(voxels), device)
+    x, y, z = mesh.vertices.T
+    at_end = (z < 0.0) | (z > voxels.shape[0] - 1)
+    beside = (np.hypot(x - 4, y - 4) < 4) & (z > 3) & (z < 36)
+    near_metal = (x > 32) & (y > 32)
+    assert set(fit.states[at_end].tolist()) == {NO_ROOM}
+    assert (fit.states[beside] == NOT_BONE).mean() > 0.95
+    assert set(fit.states[near_metal].tolist()) == {METAL}
+    assert sum(fit.counts().values()) == mesh.vertex_count
+
+
+def test_thin_walls_alone_do_not_show_their_density(device):
+    mesh, fit = fit_surface(hollow_ball(thickness=0.8), device)
+    away, _ = outer_places(mesh, fit, 13.0)
+    assert fit.constants.cortex_hu < 800.0
+    assert 0.1 < np.mean(away) < 0.35  # the walls are taken for thicker, less dense ones
+
+
+def test_a_scan_without_bone_has_no_cortex(device):
+    volume = hollow_ball(cortex=260.0, inner=260.0)
+    with pytest.raises(NoSurfaceError, match="no walls of bone"):
+        fit_surface(volume, device, 150.0)
+
+
+@pytest.mark.oclgrind
+def test_a_few_places(device):
+    volume = hollow_ball()
+    points = MIDDLE + 13.5 * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
+    with DeviceVolume(volume, device=device) as resident:
+        sampler = ProfileSampler(resident, Stopwatch())
+        walls = sampler.take(sampler.values(points, (points - MIDDLE) / 13.5)).fit(0.75, 0.75, 1000.0, 10.0)
+    assert np.abs(walls.shift_mm + 0.5).max() < 0.15
