@@ -24,7 +24,6 @@ from clrecon.mesh.compare.distances import compare_meshes as compare_meshes
 from clrecon.mesh.compare.signed import measure_distance as measure_distance
 from clrecon.mesh.compare.signed import measure_vertex_distances as measure_vertex_distances
 from clrecon.mesh.mesh_reader import read_mesh as read_mesh
-from clrecon.mesh.refine.decimation import smooth_mesh as smooth_mesh
 from clrecon.mesh.refine.quadric import collapse_quadric as collapse_quadric
 from clrecon.opencl import list_devices
 from clrecon.operators import choose_device
@@ -56,6 +55,7 @@ from clrecon.operators.surface.extract import extract_isosurfaces as extract_iso
 from clrecon.operators.surface.label_masks import extract_label_masks as extract_label_masks
 from clrecon.operators.surface.labels import extract_labels as extract_labels
 from clrecon.operators.surface.methods import extract_by_method as extract_by_method
+from clrecon.operators.surface.smoothing import smooth_mesh as smooth_mesh
 from clrecon.operators.vertebrae.inside import VertebraInside as VertebraInside
 from clrecon.operators.vertebrae.inside import vertebra_inside as vertebra_inside
 from clrecon.operators.vertebrae.solid import vertebra_solid as vertebra_solid

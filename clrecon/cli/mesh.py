@@ -333,12 +333,11 @@ def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
 
 
 def _describe_smoothing(found: dict[str, Any]) -> str:
-    """Describe the iterations, and what was not smoothed."""
-    parts = [count_of(found["iterations"], "iteration")]
+    """Describe the iterations, how much smoother the surface is, and what was not smoothed."""
+    rough, smooth = found["roughness_before_mm"], found["roughness_after_mm"]
+    parts = [count_of(found["iterations"], "iteration"), f"roughness {rough:.3f} to {smooth:.3f} mm"]
     if found["components_left"]:
         parts.append(f"{count_of(found['components_left'], 'component')} left unsmoothed to keep the volume")
-    if found["vertices_not_finite"]:
-        parts.append(f"{count_of(found['vertices_not_finite'], 'vertex', 'vertices')} without a finite step not moved")
     return f"smoothed ({'; '.join(parts)})"
 
 

@@ -128,9 +128,12 @@ def find_changed_intersections(
 
 
 def find_beside(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], changed: NDArray[np.bool_]
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], changed: NDArray[np.bool_], margin: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Find the changed triangles and those that can touch one of them: whose box shares a coarse cell with one."""
+    """Find the changed triangles and those that can touch one of them: whose box shares a coarse cell with one.
+
+    margin: mm that boxes of changed triangles are longer by.
+    """
     if np.count_nonzero(changed) > _FEW * len(triangles):
         return np.ones(len(triangles), dtype=bool)
     if not changed.any():
@@ -139,6 +142,8 @@ def find_beside(
     # "clip" avoids checking each index, which takes longer than the look-up.
     one, two, three = (columns.take(corner, axis=1, mode="clip") for corner in triangles.T.astype(np.intp))
     low, high = np.minimum(np.minimum(one, two), three), np.maximum(np.maximum(one, two), three)
+    low[:, changed] -= margin
+    high[:, changed] += margin
     start = low.min(axis=1)[:, None]
     size = float((high.max(axis=1)[:, None] - start).max()) / _CELLS_A_SIDE or 1.0
     first, last = (((corner - start) / size).astype(np.int32) for corner in (low, high))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.exchange.coordinates import rounding_step
-from clrecon.system.pieces import CHUNK, chunks, local_origin
+from clrecon.system.pieces import CHUNK, chunks, in_threads, local_origin
 
 
 def corner_edges(
@@ -78,26 +78,46 @@ def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
 
     Returns: ndarray, shape (n, 3), float32. Unit vectors; (0, 0, 1) where a vertex has no face or its faces cancel.
     """
+    columns = np.ascontiguousarray(vertices.T.astype(np.float64))
     total = np.zeros((3, len(vertices)))
-    for where, _, p, q in corner_edges(vertices, triangles, np.zeros(3)):
-        cross = cross_product(p, q)
-        twice_area = np.sqrt(np.einsum("ij,ij->j", cross, cross))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            cross = np.where(twice_area > 0.0, cross / twice_area, 0.0)
-        third = q - p
-        dots = (np.einsum("ij,ij->j", p, q), -np.einsum("ij,ij->j", p, third), np.einsum("ij,ij->j", q, third))
+    parts: dict[int, tuple[int, NDArray[np.float64]]] = {}
+
+    def work(where: slice) -> None:
         corners = triangles[where].T
         low = int(corners.min())
-        size = int(corners.max()) - low + 1
-        for corner, dot in zip(corners, dots, strict=True):
-            angle = np.arctan2(twice_area, dot)
-            for axis in range(3):
-                total[axis, low : low + size] += np.bincount(corner - low, cross[axis] * angle, size)
+        parts[where.start] = low, _sum_normals(columns, corners, low)
+
+    def add(where: slice) -> None:
+        low, part = parts.pop(where.start)
+        total[:, low : low + part.shape[1]] += part
+
+    in_threads(work, len(triangles), CHUNK, add)
     length = np.sqrt(np.einsum("ij,ij->j", total, total))
     flat = length == 0.0
     total[:, flat] = np.array([[0.0], [0.0], [1.0]])
     length[flat] = 1.0
     return np.ascontiguousarray((total / length).T, dtype=np.float32)
+
+
+def _sum_normals(columns: NDArray[np.float64], corners: NDArray[np.uint32], low: int) -> NDArray[np.float64]:
+    """Sum the normals of triangles at their corners, weighted by angle, for vertices from `low` on, shape (3, k).
+
+    corners: ndarray, shape (3, m)
+    """
+    a, b, c = (columns.take(corner, axis=1, mode="clip") for corner in corners.astype(np.intp))
+    p, q = b - a, c - a
+    cross = cross_product(p, q)
+    twice_area = np.sqrt(np.einsum("ij,ij->j", cross, cross))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cross = np.where(twice_area > 0.0, cross / twice_area, 0.0)
+    third = q - p
+    dots = (np.einsum("ij,ij->j", p, q), -np.einsum("ij,ij->j", p, third), np.einsum("ij,ij->j", q, third))
+    part = np.zeros((3, int(corners.max()) - low + 1))
+    for corner, dot in zip(corners, dots, strict=True):
+        angle = np.arctan2(twice_area, dot)
+        for axis in range(3):
+            part[axis] += np.bincount(corner - low, cross[axis] * angle, part.shape[1])
+    return part
 
 
 Points = NDArray[np.float64]

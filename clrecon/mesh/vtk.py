@@ -1,4 +1,4 @@
-"""VTK's work on meshes: finding the nearest triangle, the first one on a line, smoothing; arrays in and out."""
+"""VTK's work on meshes: finding the nearest triangle, the first one on a line; arrays in and out."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.exchange.vtp import make_polydata
-from clrecon.system.foreign_words import hush
 
 Points = NDArray[np.float64]
 
@@ -74,26 +73,6 @@ class CellLocator:
             if intersect(start, end, LINE_TOLERANCE, *others):
                 found[row] = hit
         return found
-
-
-def smooth_windowed_sinc(
-    vertices: NDArray[np.float32], triangles: NDArray[np.uint32], iterations: int, pass_band: float
-) -> NDArray[np.float64]:
-    """Return vertices, shape (n, 3), float64, after `vtkWindowedSincPolyDataFilter` (Taubin, Zhang and Golub 1996)."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkFiltersCore import vtkWindowedSincPolyDataFilter
-
-    smoother = vtkWindowedSincPolyDataFilter()
-    smoother.SetInputData(make_polydata(vertices, triangles, None))
-    smoother.SetNumberOfIterations(iterations)
-    smoother.SetPassBand(pass_band)
-    smoother.NormalizeCoordinatesOn()
-    smoother.NonManifoldSmoothingOn()
-    smoother.BoundarySmoothingOff()
-    smoother.FeatureEdgeSmoothingOff()
-    with hush():  # it says so if few iterations leave it without its best offset
-        smoother.Update()
-    return np.asarray(vtk_to_numpy(smoother.GetOutput().GetPoints().GetData()), dtype=np.float64)
 
 
 def wrap_polydata(

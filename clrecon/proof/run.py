@@ -36,6 +36,7 @@ CHECKS: tuple[Check, ...] = (
     *surface_checks.LABEL_CHECKS,
     *decimation_checks.DISTANCE_CHECKS,
     *surface_checks.CORTEX_CHECKS,
+    *decimation_checks.SMOOTHING_CHECKS,
     *ray_checks.LEAP_CHECKS,
     *ray_checks.PICTURE_CHECKS,
     *layer_checks.CHECKS,

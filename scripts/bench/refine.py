@@ -29,7 +29,7 @@ def measure_refinement(job: Job) -> dict[str, Any]:
     reached = small.report["refinement"]["decimate"]["reached"]
     peer_small = _decimate(mesh, reached)
     times = {
-        "smooth": _in_turns(lambda: clrecon.smooth_mesh(mesh), lambda: _smooth(mesh), job),
+        "smooth": _in_turns(lambda: clrecon.smooth_mesh(mesh, device=job.device), lambda: _smooth(mesh), job),
         "decimate": _in_turns(
             lambda: clrecon.decimate_mesh(mesh, SHARE, device=job.device), lambda: _decimate(mesh, reached), job
         ),

@@ -145,6 +145,11 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "image": (("= finish_color((float4)(color", "= (uchar4)(255) - finish_color((float4)(color"),),
         "depths": (("? depth * length_of_ray : depth;", "? -depth * length_of_ray : -depth;"),),
     },
+    "measure_bends": {
+        "bends": (("bends[vertex] = weights", "bends[vertex] = -weights"),),
+        "normals": (("normals[vertex] = (float4)(normal", "normals[vertex] = (float4)(-normal"),),
+    },
+    "filter_bends": {"sums": (("* sum)) - sums[vertex];", "* sum)) + sums[vertex];"),)},
     "find_near_faces": {
         "squares": (("squares[number] = least;", "squares[number] = -least;"),),
         "rows": (("rows[number] = nearest;", "rows[number] = ~nearest;"),),

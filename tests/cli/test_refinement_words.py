@@ -58,17 +58,18 @@ def test_a_gate_of_the_scan_and_one_of_the_mesh_have_codes_of_their_own(
 
 
 @pytest.mark.parametrize(
-    ("left", "not_finite", "expected"),
+    ("left", "expected"),
     [
-        (0, 0, "smoothed (1 iteration)"),
-        (1200, 0, "smoothed (1 iteration; 1,200 components left unsmoothed to keep the volume)"),
-        (0, 1, "smoothed (1 iteration; 1 vertex without a finite step not moved)"),
-        (1, 2, "smoothed (1 iteration; 1 component left unsmoothed to keep the volume; 2 vertices without a finite step"
-         " not moved)"),
+        (0, "smoothed (1 iteration; roughness 0.200 to 0.050 mm)"),
+        (1, "smoothed (1 iteration; roughness 0.200 to 0.050 mm; 1 component left unsmoothed to keep the volume)"),
+        (
+            1200,
+            "smoothed (1 iteration; roughness 0.200 to 0.050 mm; 1,200 components left unsmoothed to keep the volume)",
+        ),
     ],
-)  # fmt: skip
-def test_what_was_not_smoothed_is_counted(left: int, not_finite: int, expected: str) -> None:
+)
+def test_how_much_was_smoothed_is_said(left: int, expected: str) -> None:
     deviation: dict[str, Any] = {"hd95_mm": 0.1, "assd_mm": 0.05, "max_mm": 0.2, "volume_change_percent": None}
-    found = {"iterations": 1, "components_left": left, "vertices_not_finite": not_finite}
+    found = {"iterations": 1, "components_left": left, "roughness_before_mm": 0.2, "roughness_after_mm": 0.05}
     line = describe_refinement([{"refinement": {"smooth": found, "deviation": deviation, "voxel_mm": 0.7}}])[0]
     assert line == f"refined  {expected}"

@@ -30,18 +30,18 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress:
     if not settings.refines:
         return mesh
     from clrecon.mesh.compare.distances import compare_meshes
-    from clrecon.mesh.refine.decimation import BOUND_VOXEL, default_deviation, smooth_mesh
+    from clrecon.mesh.refine.decimation import BOUND_VOXEL, default_deviation
     from clrecon.mesh.refine.quadric import collapse_quadric
     from clrecon.operators.surface.decimation import decimate_mesh
+    from clrecon.operators.surface.smoothing import smooth_mesh
 
-    raw = mesh
+    raw, where = mesh, device if settings.memory is None else None
     if settings.smooth is not None:
-        mesh = smooth_mesh(mesh, settings.smooth, settings.max_deviation_mm, progress=progress)
+        mesh = smooth_mesh(mesh, settings.smooth, settings.max_deviation_mm, device=where, progress=progress)
     share = settings.decimate_used
     if share is not None and settings.method == "g-mc":
         mesh = collapse_quadric(mesh, share, progress=progress)
     elif share is not None:
-        where = device if settings.memory is None else None
         mesh = decimate_mesh(mesh, share, settings.max_deviation_mm, device=where, progress=progress)
     mesh.report["refinement"] |= {
         "deviation": compare_meshes(mesh, raw, progress=progress),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,8 @@ from numpy.typing import NDArray
 
 from clrecon.exchange.coordinates import as_stored, find_coincident
 from clrecon.mesh.connectivity import find_edges, label_components
-from clrecon.mesh.intersections import FindCrossings, find_changed_intersections, find_self_intersections
+from clrecon.mesh.intersections import FindCrossings, find_beside, find_changed_intersections, find_self_intersections
+from clrecon.mesh.refine.topology import any_corner
 from clrecon.mesh.triangles import cross_products
 
 _VOLUME_STEPS = 4
@@ -27,6 +29,9 @@ _SMALLEST_SHARE = 0.2
 
 _ROUNDS_OF_ITS_OWN = 3
 """After this many rounds the vertices around an offending place are taken back too."""
+
+_RINGS = 4
+"""Rings of triangles around what was taken back that may be taken back in the next rounds."""
 
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]
@@ -134,11 +139,15 @@ def move_vertices(
     triangles: NDArray[np.uint32],
     step: Float64Array,
     find_crossings: FindCrossings = find_self_intersections,
+    find_changed: Callable[[NDArray[np.floating], Float64Array], IntArray] | None = None,
 ) -> tuple[NDArray[np.floating], int]:
     """Move vertices, but by less or not at all where triangles would cut, lose their area or share a place.
 
+    All triangles are looked at once, and then those around what is taken back.
+
     step: ndarray, shape (n, 3), float64, mm
     find_crossings: `find_self_intersections`, or what finds the same elsewhere.
+    find_changed: Given places and the share of each step that is made, finds vertices that are not to move at all.
 
     Returns:
     vertices: ndarray, shape (n, 3). Vertices as stored.  Faults that existed before may remain.
@@ -146,23 +155,58 @@ def move_vertices(
     """
     share = np.ones(len(vertices))
     moved = as_stored(vertices + step)
-    look_at = np.ones(len(triangles), dtype=bool)
+    near = _Near(moved, triangles, float(np.abs(step).max(initial=0.0)))
+    spoilt: IntArray = _find_spoilt(moved, triangles, np.ones(len(triangles), dtype=bool), find_crossings)
     for turn in range(_ROUNDS):
-        spoilt = _find_spoilt(moved, triangles, look_at, find_crossings)
         if turn >= _ROUNDS_OF_ITS_OWN:
-            beside = np.zeros(len(vertices), dtype=bool)
-            beside[spoilt] = True
-            spoilt = np.unique(triangles[beside[triangles].any(axis=1)])
+            spoilt = np.unique(triangles[_touching(spoilt, triangles, len(vertices))])
         spoilt = spoilt[share[spoilt] > 0.0]
+        if len(spoilt):
+            share[spoilt] *= 0.5
+            share[spoilt[share[spoilt] < _SMALLEST_SHARE]] = 0.0
+        elif find_changed is not None:
+            spoilt = find_changed(moved, share)
+            spoilt = spoilt[share[spoilt] > 0.0]
+            share[spoilt] = 0.0
         if len(spoilt) == 0:
             break
-        share[spoilt] *= 0.5
-        share[spoilt[share[spoilt] < _SMALLEST_SHARE]] = 0.0
         moved[spoilt] = vertices[spoilt] + share[spoilt, None] * step[spoilt]
-        changed = np.zeros(len(vertices), dtype=bool)
-        changed[spoilt] = True
-        look_at = np.asarray(changed[triangles].any(axis=1))
+        spoilt = near.find_spoilt(_touching(spoilt, triangles, len(vertices)))
     return moved, int(np.count_nonzero(share < 1.0))
+
+
+def _touching(vertices: IntArray, triangles: NDArray[np.uint32], size: int) -> NDArray[np.bool_]:
+    """Mark the triangles that have one of these vertices."""
+    flags = np.zeros(size, dtype=bool)
+    flags[vertices] = True
+    return any_corner(flags, triangles)
+
+
+class _Near:
+    """Search for what is spoilt around changed triangles, among those that come near them.
+
+    moved: ndarray, shape (n, 3), mm. Vertices, which change between two calls of `find_spoilt`.
+    longest: mm. No coordinate of a vertex changes by more.
+    """
+
+    def __init__(self, moved: NDArray[np.floating], triangles: NDArray[np.uint32], longest: float):
+        self._moved, self._triangles, self._longest = moved, triangles, longest
+        self._expected = np.zeros(len(triangles), dtype=bool)
+        self._rows = self._vertices = np.zeros(0, np.int64)
+        self._local = np.zeros((0, 3), np.uint32)
+
+    def find_spoilt(self, changed: NDArray[np.bool_]) -> IntArray:
+        """Find the vertices of spoilt triangles near those that have changed."""
+        if (changed & ~self._expected).any():
+            self._expected |= changed
+            for _ in range(_RINGS):
+                expected = self._triangles[self._expected].reshape(-1)
+                self._expected |= _touching(expected, self._triangles, len(self._moved))
+            self._rows = np.flatnonzero(find_beside(self._moved, self._triangles, self._expected, self._longest))
+            self._vertices, local = np.unique(self._triangles[self._rows], return_inverse=True)
+            self._local = local.reshape(-1, 3).astype(np.uint32)
+        places = self._moved[self._vertices]
+        return self._vertices[_find_spoilt(places, self._local, changed[self._rows], find_self_intersections)]
 
 
 def _find_spoilt(

@@ -119,12 +119,18 @@ def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> Cro
     row += ((low[:, 1] - origin[1]) / width).astype(np.int64)
     row += size[:, 0].take(level) * ((low[:, 2] - origin[2]) / width).astype(np.int64)
     bits = np.ascontiguousarray(low[:, 0]).view(np.int32)
-    along = np.where(bits < 0, bits ^ 0x7FFFFFFF, bits).astype(np.int64) + (1 << 31)  # in the order of the numbers
-    order = np.argsort(row << 32 | along)
+    along = np.where(bits < 0, bits ^ 0x7FFFFFFF, bits)  # in the order of the numbers
+    order = _order_by(along)
+    order = order.take(_order_by(row.take(order)))
     starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=first_row[-1]))]).astype(np.uint32)
     levels = np.column_stack([first_row[:-1], size, starts[first_row[1:]]]).astype(np.uint32)
     low, high = low.take(order, axis=0), high.take(order, axis=0)
     return CrossingPlan(scaled, order, triangles.take(order, axis=0), low, high, starts, levels, edges)
+
+
+def _order_by(numbers: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Return the stable order of numbers of 32 bits; sorting them with their places is far faster than `argsort`."""
+    return np.sort(numbers.astype(np.int64) << 32 | np.arange(len(numbers))) & 0xFFFFFFFF
 
 
 def _find_boxes(vertices: Float32Array, triangles: NDArray[np.uint32]) -> tuple[Float32Array, Float32Array]:

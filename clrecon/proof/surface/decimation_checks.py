@@ -1,4 +1,4 @@
-"""Checks of what decimation asks: which triangles cut each other, and upper bounds of distances to a surface."""
+"""Checks of smoothing, and of what decimation asks: which triangles cut each other, and bounds of distances."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from numpy.typing import NDArray
 
 from clrecon.mesh.compare.near_distances import NearDistance, triangle_distances
 from clrecon.mesh.refine.deviation import MIDDLES, SurfaceBounds
+from clrecon.mesh.refine.smoothing import Filter, Rings, sinc_terms
 from clrecon.opencl import Device
 from clrecon.operators.surface.decimation import DeviceBounds, mark_crossings, plan_crossings
+from clrecon.operators.surface.smoothing import DeviceFilter
 from clrecon.proof.checking import Check, require_close, require_equal
 from clrecon.proof.surface import crossings as twin
 
@@ -109,3 +111,22 @@ DISTANCE_CHECKS: tuple[Check, ...] = (
     Check("distances to a surface", ("find_near_faces",), _check_distances),
     Check("witnesses of triangles near a surface", ("find_witnesses",), _check_witnesses),
 )
+
+
+def _check_smoothing(device: Device) -> str:
+    """Compare bends, normals and the steps of the filter with those of the host, bit for bit."""
+    vertices, triangles = _rough_sheet(np.random.default_rng(14))
+    places, rings = vertices.astype(np.float32), Rings.of(triangles, len(vertices))
+    own, twin_filter = DeviceFilter(device, rings), Filter(rings)
+    bends, normals = own.measure_bends(places)
+    for found, expected, what in zip(
+        (bends, normals), twin_filter.measure_bends(places), ("bends", "normals"), strict=True
+    ):
+        require_equal(found, expected, what)
+    for iterations in (1, 20):
+        terms = sinc_terms(iterations)
+        require_equal(own.find_steps(bends, terms), twin_filter.find_steps(bends, terms), "steps of the filter")
+    return f"{len(places):,} vertices"
+
+
+SMOOTHING_CHECKS = (Check("smoothing of a surface", ("measure_bends", "filter_bends"), _check_smoothing),)

@@ -17,8 +17,9 @@ from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.intersections import find_self_intersections
 from clrecon.mesh.refine.clusters import Clusters, _find_flat
 from clrecon.mesh.refine.collapses import Quadrics
-from clrecon.mesh.refine.decimation import _collapse, _mend, check_refinement, decimate_mesh, smooth_mesh
+from clrecon.mesh.refine.decimation import _collapse, _mend, check_refinement, decimate_mesh
 from clrecon.mesh.refine.deviation import Deviation
+from clrecon.mesh.refine.smoothing import smooth_mesh
 from clrecon.proof.surface.extract import extract_isosurface
 
 pytestmark = pytest.mark.unit
