@@ -218,9 +218,9 @@ def render_listing(
     lines, left_out = _render_table(entries, listing["chosen"], width, terminal and not os.environ.get("NO_COLOR"))
     if left_out:
         lines += _wrap(f"({', '.join(left_out)} left out: a wider window or --json shows them)", width, "")
-    told = [entry for entry in entries if entry["number"] != refused]
-    stacks = [entry for entry in told if entry["kind"] == "stack"]
-    others = [entry for entry in told if entry["kind"] != "stack"]
+    shown = [entry for entry in entries if entry["number"] != refused]
+    stacks = [entry for entry in shown if entry["kind"] == "stack"]
+    others = [entry for entry in shown if entry["kind"] != "stack"]
     for group, what, place in (
         (others, "not read", "problems"),  # which is no fault of an RT object, a capture or a localizer
         (stacks, "problem", "problems"),

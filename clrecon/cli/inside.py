@@ -120,10 +120,10 @@ def _describe_vertebra(vertebra: dict[str, Any]) -> list[str]:
         f"{low:g} HU and above" if high is None else f"up to {high:g} HU" if low is None else f"{low:g} to {high:g} HU"
     )
     canal, height = volumes["canal"], vertebra["canal_height_mm"]
-    told = "no canal: arch not closed" if canal is None else f"canal {format_volume(canal)}, {height:.3g} mm high"
+    of_canal = "no canal: arch not closed" if canal is None else f"canal {format_volume(canal)}, {height:.3g} mm high"
     return [
         f"{printable(vertebra['name'])}",
-        f"         solid {format_volume(volumes['solid'])} ({of}), {told}",
+        f"         solid {format_volume(volumes['solid'])} ({of}), {of_canal}",
         f"         dense {format_volume(volumes['dense'])} ({band}), trabecular"
         f" {format_volume(volumes['trabecular'] or 0.0)}",
         f"         {_describe_thickness(vertebra['dense_thickness'])}",

@@ -298,7 +298,7 @@ def describe_cells(report: dict[str, Any]) -> list[str]:
         if not growing:
             continue
         share = cells["all"] / max(cells["visited"], 1)
-        told = [
+        said = [
             f"cells    {cells['visited']:,} visited, {cells['active']:,} active, {cells['all']:,} in all (1 in"
             f" {share:,.0f} visited)",
             f"grown    from {', '.join(growing['from'])}: {growing['components_taken']:,} of"
@@ -306,7 +306,7 @@ def describe_cells(report: dict[str, Any]) -> list[str]:
             f" {100 * growing['cells_left_out_share']:.1f} % of the active cells left"
             f" out, the largest part of them {growing['largest_left_out_cells']:,}",
         ]
-        lines += [line for line in told if line not in lines]
+        lines += [line for line in said if line not in lines]
     return lines
 
 

@@ -13,7 +13,7 @@ The same mesh or cloud gives the same bytes every time.  No file holds patient d
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from importlib import import_module
@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from clrecon.errors import NoSurfaceError, OutputError, RefusedInputError, UsageError
 from clrecon.system.files import StagedFile, stage_file
-from clrecon.system.paths import open_regular
-from clrecon.system.text import escape_text, guess_word
+from clrecon.system.paths import find_extension, open_regular
+from clrecon.system.text import escape_text
 
 if TYPE_CHECKING:
     from clrecon.exchange.content import Assembly, Content, PointContent, Writable
@@ -82,22 +82,6 @@ CLOUD_INPUTS = (*CLOUD_FORMATS, ".csv", ".txt")
 def list_extensions(extensions: Sequence[str]) -> str:
     """Name extensions in a sentence: ``.a, .b or .c``."""
     return f"{', '.join(extensions[:-1])} or {extensions[-1]}"
-
-
-def find_extension(path: str | os.PathLike[str], formats: Mapping[str, Any], noun: str) -> str:
-    """Return the extension of a file in lower case, such as ``.ply``.
-
-    formats: Its keys are the extensions that are written.
-    noun: What the file holds, "mesh" or "cloud".
-    """
-    try:
-        extension = os.path.splitext(os.fspath(path))[1].lower()
-    except TypeError as error:
-        raise UsageError(f"a {noun} file is named by a string or a path, not {type(path).__name__}") from error
-    if extension not in formats:
-        found = f"the extension {extension!r}{guess_word(extension, formats)}" if extension else "no extension"
-        raise UsageError(f"the name of the {noun} file has {found}: use one of {', '.join(formats)}")
-    return extension
 
 
 def stage_content(

@@ -26,7 +26,7 @@ from clrecon.jobs.corridor_results import (
     describe_vertebra,
     draw_corridors,
 )
-from clrecon.jobs.outputs import check_distinct, check_kept, name_outputs
+from clrecon.jobs.outputs import check_files, name_outputs
 from clrecon.jobs.run import Run
 from clrecon.jobs.settings import CorridorSettings
 from clrecon.labels.label_map import file_suffixes
@@ -154,8 +154,9 @@ def make_corridors(
     """
     files = files or CorridorFiles()
     with Run(settings, **how) as run:
-        with run.keeping():
-            _check_files(source, settings, files)
+        _check_formats(files)
+        named = [("the mesh", files.output), ("the picture", files.picture), ("the report", files.report)]
+        run.check(named, source, settings.labels)
         volume, labels = run.read_labelled(source)
         run.lap("read")
         numbers = list(dict.fromkeys(labels.find(label) for label in settings.only))
@@ -201,25 +202,14 @@ def make_corridors(
         return run.finish(report, files.report)
 
 
-def _check_files(source: str | Path, settings: CorridorSettings, files: CorridorFiles) -> None:
-    """Refuse outputs that cannot be written or would replace an input, as far as their names are known."""
+def _check_formats(files: CorridorFiles) -> None:
     from clrecon.exchange.formats import check_format
     from clrecon.rendering.pictures.picture import check_image_path
-    from clrecon.system.files import check_writable
 
     if files.output is not None:
         check_format(files.output)
     if files.picture is not None:
         check_image_path(files.picture)
-    named = [
-        (what, path)
-        for what, path in (("the mesh", files.output), ("the picture", files.picture), ("the report", files.report))
-        if path is not None
-    ]
-    check_distinct(named)
-    check_kept(named, source, settings.labels)
-    for _, path in named:
-        check_writable(path)
 
 
 def _picture_paths(files: CorridorFiles, names: Sequence[str]) -> list[str | Path]:
@@ -230,17 +220,13 @@ def _picture_paths(files: CorridorFiles, names: Sequence[str]) -> list[str | Pat
 
 def _name_files(files: CorridorFiles, names: Sequence[str]) -> None:
     """Refuse files that exist and stay, and those that two outputs would share, now that the labels are known."""
-    from clrecon.system.files import check_writable
-
     pictures = [("the picture", path) for path in _picture_paths(files, names)]
     meshes: list[tuple[str, str | Path]] = []
     if files.output is not None:
         ends = [f"{name}{end}" for name in names for end in ("", "_left", "_right")]
         meshes = [("the mesh", path) for path in name_outputs(files.output, ends)]
     report = [] if files.report is None else [("the report", files.report)]
-    check_distinct(pictures, meshes, report)
-    for _, path in (*pictures, *meshes):
-        check_writable(path)
+    check_files(pictures, meshes, report)
 
 
 def _choose_level(volume: Volume, settings: CorridorSettings, progress: Progress) -> tuple[float, IsoChoice | None]:

@@ -241,14 +241,14 @@ def _draw_row(
     ends: Float64Array
     if corridor.tip is not None and corridor.entry is not None and corridor.pass_point is not None:
         ends, centre = np.stack((corridor.entry, corridor.tip)), corridor.pass_point
-        told = [
+        lines = [
             f"{name}: radius {corridor.radius:.1f} mm",
             f"screw to {screw_diameter(corridor.radius or 0.0, margin):.1f} mm, margin {margin:g} mm",
         ]
     else:
         side = SIDES[corridor.side]
         centre = found.frame.to_lps(np.array([[found.frame.canal[0] + 14.0 * side, found.frame.body_y[1], 0.0]]))[0]
-        ends, told = np.stack((centre + 20.0 * axes[1], centre - 25.0 * axes[1])), [name, "no corridor"]
+        ends, lines = np.stack((centre + 20.0 * axes[1], centre - 25.0 * axes[1])), [name, "no corridor"]
     back = ends[0] - ends[1]
     back /= np.linalg.norm(back)
     left = axes[0] - (axes[0] @ back) * back
@@ -270,7 +270,7 @@ def _draw_row(
             Panel(
                 _sample_plane(volume, centre, right, down),
                 WIDTH_MM / PIXELS,
-                [*told, caption] if number == 0 else [caption],
+                [*lines, caption] if number == 0 else [caption],
                 strokes,
                 edges,  # type: ignore[arg-type]
             )

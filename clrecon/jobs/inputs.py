@@ -15,6 +15,7 @@ from clrecon.errors import UsageError
 from clrecon.exchange.formats import CLOUD_INPUTS, MESH_INPUTS
 from clrecon.jobs.options import InputSettings
 from clrecon.system.arguments import name_parameter
+from clrecon.system.paths import extension_of
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -32,23 +33,23 @@ _OF_BOTH = ("keep_ids", "device", "memory")
 
 def is_cloud_file(source: str | Path) -> bool:
     """True for a file, or the name of one, whose extension is that of a cloud; folders are scans."""
-    return os.path.splitext(os.fspath(source))[1].lower() in CLOUD_INPUTS and not os.path.isdir(source)
+    return extension_of(source) in CLOUD_INPUTS and not os.path.isdir(source)
 
 
 def is_only_mesh(source: str | Path) -> bool:
     """True for a file, or the name of one, whose extension only meshes have; that of PLY is one of clouds too."""
-    extension = os.path.splitext(os.fspath(source))[1].lower()
+    extension = extension_of(source)
     return extension in MESH_INPUTS and extension not in CLOUD_INPUTS and not os.path.isdir(source)
 
 
 def may_be_mesh(source: str | Path) -> bool:
     """True for a file that can be read as a mesh, by its extension, where clouds are no input."""
-    return os.path.splitext(os.fspath(source))[1].lower() in MESH_INPUTS
+    return extension_of(source) in MESH_INPUTS
 
 
 def refuse_other_clouds(source: str | Path) -> None:
     """Refuse a file whose extension is that of a cloud of another kind; it would be looked through for a scan."""
-    extension = os.path.splitext(os.fspath(source))[1].lower()
+    extension = extension_of(source)
     if extension in OTHER_CLOUDS and os.path.isfile(source):
         raise UsageError(
             f"clouds in files {extension} are not read: convert it to one of {', '.join(CLOUD_INPUTS)} first; text of"

@@ -5,16 +5,16 @@ Pictures show one part opaque and others faded.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clrecon.jobs.outputs import check_distinct, check_kept, check_outputs, name_outputs, refuse_files
+from clrecon.jobs.outputs import check_files, check_kept, check_outputs, name_outputs, refuse_files
 from clrecon.jobs.run import DeviceOpening, Run, RunReport, trial_cube
 from clrecon.jobs.settings import InsideSettings
 from clrecon.system.log import get_logger
+from clrecon.system.paths import extension_of
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -184,7 +184,6 @@ def _check_files(
 ) -> None:
     """Refuse outputs that cannot be written or would replace an input."""
     from clrecon.operators.vertebrae.inside import PARTS
-    from clrecon.system.files import check_writable
 
     # names of several vertebrae are those of the label map, which is not read yet: their number stands for them
     first = [part if len(settings.only) == 1 else f"{len(settings.only)}_{part}" for part in PARTS]
@@ -192,10 +191,8 @@ def _check_files(
     if picture is not None:
         check_pictures(picture, settings.view)
         drawn = [("the picture", path) for path in name_outputs(picture, first)]
-        check_distinct(outputs, drawn)
-        for _, path in drawn:
-            check_writable(path)
         outputs += drawn
+        check_files(outputs)
     check_kept(outputs, source, settings.labels)
 
 
@@ -235,15 +232,15 @@ def _write_vertebra(
     several: bool,
 ) -> dict[str, Any]:
     """Write meshes and pictures of a vertebra, and return its entries in the report."""
-    told: dict[str, Any] = {**one.inside.as_dict(), "name": one.suffix, "pictures": []}
+    entry: dict[str, Any] = {**one.inside.as_dict(), "name": one.suffix, "pictures": []}
     paths = name_outputs(output, [name_part(one.suffix, part, several=several) for part in one.meshes], report_path)
     written = run.write_meshes(list(one.meshes.values()), paths)
-    told["meshes"] = [
+    entry["meshes"] = [
         {
             "part": part,
             "vertices": mesh.vertex_count,
             "triangles": mesh.triangle_count,
-            "format": _format_of(path),
+            "format": extension_of(path)[1:],
             "bytes": file.size,
         }
         for (part, mesh), path, file in zip(one.meshes.items(), paths, written, strict=True)
@@ -252,11 +249,7 @@ def _write_vertebra(
         assert picture is not None
         (path,) = name_outputs(picture, [name_part(one.suffix, part, several=several)])
         size = run.write_picture(path, drawn).size
-        entry = {"part": part, "faded": list(FADED[part]), "size": list(drawn.size)}
-        told["pictures"].append(entry | {"format": _format_of(path), "bytes": size})
-        told["warnings"] += drawn.report["warnings"]
-    return told
-
-
-def _format_of(path: str | Path) -> str:
-    return os.path.splitext(os.fspath(path))[1].lower().lstrip(".")
+        of_picture = {"part": part, "faded": list(FADED[part]), "size": list(drawn.size)}
+        entry["pictures"].append(of_picture | {"format": extension_of(path)[1:], "bytes": size})
+        entry["warnings"] += drawn.report["warnings"]
+    return entry

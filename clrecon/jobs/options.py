@@ -16,7 +16,7 @@ from clrecon.errors import UsageError
 from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 from clrecon.reading import Selection
 from clrecon.system.arguments import name_parameter
-from clrecon.system.options import flag, option
+from clrecon.system.options import option
 
 if TYPE_CHECKING:
     from clrecon.geometry.boxes import Box
@@ -150,8 +150,7 @@ class DeviceSettings:
     """The device for the computation."""
 
     device: str | None = option(
-        "--device",
-        "D",
+        "--device D",
         'OpenCL device: an index of "clrecon devices", "cpu", "gpu" or a part of its name'
         " (default: CLRECON_DEVICE, else the best)",
         group="device",
@@ -159,8 +158,7 @@ class DeviceSettings:
         words=("cpu", "gpu"),
     )
     memory: int | None = option(
-        "--memory",
-        "SIZE",
+        "--memory SIZE",
         "memory that may be taken on the device, such as 500MB or 2GiB (default: all of it);"
         " what does not fit goes through in slabs, with the same result",
         group="memory",
@@ -176,7 +174,7 @@ class DeviceSettings:
 class ScanSettings(Selection):
     """The part of a scan that is read, and what of its origin is written."""
 
-    keep_ids: bool = flag(
+    keep_ids: bool = option(
         "--keep-ids",
         "write hashes of the UIDs of series and frame of reference into what is written and printed, by which outputs"
         " of one scan are told; never the UIDs",
@@ -187,8 +185,7 @@ class ScanSettings(Selection):
 def label_map_option(**how: Any) -> Any:
     """Declare a field for the file of a label map."""
     return option(
-        "--labels",
-        "FILE|FOLDER",
+        "--labels FILE|FOLDER",
         "label map: NIfTI, NRRD (.seg.nrrd too), MetaImage, DICOM SEG, RTSTRUCT, or a folder of masks",
         first=True,
         **how,
@@ -197,14 +194,13 @@ def label_map_option(**how: Any) -> Any:
 
 def space_option(text: str, **how: Any) -> Any:
     """Declare a field for the patient frame of what is written."""
-    return option("--space", "lps|ras", f"{text} (default: lps)", default="lps", parse=str.lower, **how)
+    return option("--space lps|ras", f"{text} (default: lps)", default="lps", parse=str.lower, **how)
 
 
 def preset_option() -> Any:
     """Declare a field for the iso value by tissue."""
     return option(
-        "--preset",
-        "NAME",
+        "--preset NAME",
         f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})",
         group="level",
         parse=str.lower,
@@ -214,12 +210,12 @@ def preset_option() -> Any:
 
 def closed_option() -> Any:
     """Declare a field for surfaces that are closed where they meet the border of the volume: outside is air."""
-    return flag("--open", "leave the surface open at the border of the volume", group="surface", default=True)
+    return option("--open", "leave the surface open at the border of the volume", group="surface", default=True)
 
 
 def mesh_space_option(text: str = "files that do not name theirs") -> Any:
     """Declare a field for the patient frame of meshes that do not name theirs."""
-    return option("--mesh-space", "lps|ras", f"patient frame of {text} (default: lps, with a warning)", parse=str.lower)
+    return option("--mesh-space lps|ras", f"patient frame of {text} (default: lps, with a warning)", parse=str.lower)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,21 +232,20 @@ class InputSettings(ScanSettings, DeviceSettings):
     preprocess: See `parse_preprocess`.
     """
 
-    remove_table: bool = flag(
+    remove_table: bool = option(
         "--remove-table",
         "turn what is not the patient's body into air first: table, blankets, cables",
         group="masking",
         first=True,
     )
-    allow_bone_loss: bool = flag(
+    allow_bone_loss: bool = option(
         "--allow-bone-loss",
         "go on where --remove-table takes more than 2 %% of the bone, or a step of --preprocess more than half of"
         " what is at the level and above, which else is refused",
         group="masking",
     )
     field_of_view: float | str | None = option(
-        "--fov",
-        "RADIUS_MM",
+        "--fov RADIUS_MM",
         "turn what lies further from the centre of the slices into air first (without a number: the largest circle"
         " that fits the slice)",
         group="masking",
@@ -259,21 +254,19 @@ class InputSettings(ScanSettings, DeviceSettings):
         const="auto",
     )
     clip_box: Sequence[float] | None = option(
-        "--clip-box",
-        "X0,X1,Y0,Y1,Z0,Z1",
+        "--clip-box X0,X1,Y0,Y1,Z0,Z1",
         "keep a box; a side that is left empty is open",
         group="crop",
         parse=_parse_clip_box,
     )
     between: Sequence[float] | None = option(
-        "--between", "Z0,Z1", "keep what lies between two heights", group="crop", parse=_parse_between
+        "--between Z0,Z1", "keep what lies between two heights", group="crop", parse=_parse_between
     )
     around: Sequence[float] | None = option(
-        "--around", "X,Y,Z,R", "keep a cube: R mm from a point to each side", group="crop", parse=_parse_around
+        "--around X,Y,Z,R", "keep a cube: R mm from a point to each side", group="crop", parse=_parse_around
     )
     region: Sequence[str] | None = option(
-        "--region",
-        "RULE",
+        "--region RULE",
         f"turn what lies outside of the region of interest into air first: {REGION_FORMS}; several of one kind add"
         " up, of different kinds cut each other; a seed grows within the others; a tube without a file goes along the"
         " spinal canal",
@@ -281,8 +274,7 @@ class InputSettings(ScanSettings, DeviceSettings):
         action="append",
     )
     preprocess: str | Sequence[str] | None = option(
-        "--preprocess",
-        "STEP[,STEP...]",
+        "--preprocess STEP[,STEP...]",
         f"steps before the surface, in this order: {PREPROCESS_FORMS}; morphology works on what is at the iso"
         " value and above, or at level:HU; region is the place of --region, which else comes first",
         group="masking",

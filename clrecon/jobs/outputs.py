@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from clrecon.errors import ClreconError, OutputError, UsageError
-from clrecon.exchange.formats import ASSEMBLIES, FORMATS, list_extensions
+from clrecon.exchange.formats import ASSEMBLIES, FORMATS, check_format, list_extensions
 from clrecon.system.arguments import name_parameter
+from clrecon.system.files import check_writable
 from clrecon.system.text import count_of
 
 if TYPE_CHECKING:
@@ -57,6 +58,13 @@ def check_distinct(*owned: Sequence[tuple[str, str | Path]]) -> None:
         if other is not None:
             raise UsageError(f"{own} and {other} cannot be the same file: {path}")
         owners[_identity(path)] = own
+
+
+def check_files(*owned: Sequence[tuple[str, str | Path]]) -> None:
+    """Refuse outputs that are the same file, or that cannot be written; see `check_distinct`."""
+    check_distinct(*owned)
+    for _, path in chain(*owned):
+        check_writable(path)
 
 
 def check_kept(outputs: Sequence[tuple[str, str | Path | None]], *inputs: str | Path | None) -> None:
@@ -152,9 +160,6 @@ def check_outputs(
 
     Returns: list of (str, path). Description and path of each output.
     """
-    from clrecon.exchange.formats import check_format
-    from clrecon.system.files import check_writable
-
     check_format(output)
     outputs = [("the mesh", path) for path in name_outputs(output, names, report_path)]
     if report_path is not None:

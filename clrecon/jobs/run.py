@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -20,9 +19,9 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar, TypeVar
 
 from clrecon.errors import Cancelled, ClreconError, DeviceError
-from clrecon.jobs.outputs import check_distinct, check_kept, commit_all
+from clrecon.jobs.outputs import check_files, check_kept, commit_all
 from clrecon.system.log import get_logger, log_warnings
-from clrecon.system.paths import keep_existing
+from clrecon.system.paths import extension_of, keep_existing
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
 from clrecon.version import package_version
@@ -295,13 +294,9 @@ class Run(Laps):
 
         outputs: Description and path of each file; None: it is not written.
         """
-        from clrecon.system.files import check_writable
-
         named = [(what, path) for what, path in outputs if path is not None]
-        check_distinct(named)
         with self.keeping():
-            for _, path in named:
-                check_writable(path)
+            check_files(named)
         check_kept(named, *inputs)
 
     def read(self, source: str | Path) -> Volume:
@@ -349,7 +344,7 @@ class Run(Laps):
         """Write a picture under a temporary name."""
         from clrecon.rendering.pictures.picture import encode_image
 
-        return self.write(path, encode_image(picture, os.path.splitext(os.fspath(path))[1].lower()))
+        return self.write(path, encode_image(picture, extension_of(path)))
 
     def write_meshes(self, meshes: Sequence[Mesh], paths: Sequence[str | Path]) -> list[StagedFile]:
         """Write each mesh under a temporary name."""

@@ -21,7 +21,7 @@ from clrecon.jobs.options import (
 )
 from clrecon.reading import Selection
 from clrecon.system.arguments import name_parameter
-from clrecon.system.options import flag, option
+from clrecon.system.options import option
 
 
 def check_space(space: str | None) -> None:
@@ -39,12 +39,12 @@ class InfoSettings(Selection):
     strict: A listing without a chosen series is a problem too.
     """
 
-    pixels: bool = flag(
+    pixels: bool = option(
         "--pixels",
         "read the pixels of the series marked * too: share of padding, range of HU, saturated metal",
         first=True,
     )
-    strict: bool = flag("--strict", "exit with 4 when it fails a gate, see docs/certificate.md", first=True)
+    strict: bool = option("--strict", "exit with 4 when it fails a gate, see docs/certificate.md", first=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,14 +52,12 @@ class ExportSettings(InputSettings):
     """Settings of the export job; see `clrecon.geometry.resample.resample_volume`."""
 
     resample: float | None = option(
-        "--resample",
-        "MM",
+        "--resample MM",
         "resample (trilinear) to a regular grid with this step along all axes; without it voxels stay as they are",
         first=True,
     )
     space: str = option(
-        "--space",
-        "lps|ras",
+        "--space lps|ras",
         "patient frame of the numbers of crop and region (default: lps); that of the file is its format's",
         default="lps",
         parse=str.lower,
@@ -96,11 +94,10 @@ class StatsSettings(ScanSettings):
 
     labels: str | Path = label_map_option(required=True)
     only: Sequence[str | int] = option(
-        "--label", "NAME|N", "this label only; may be given again", default=(), action="append", first=True
+        "--label NAME|N", "this label only; may be given again", default=(), action="append", first=True
     )
     percentiles: Sequence[float] | None = option(
-        "--percentiles",
-        "P,P",
+        "--percentiles P,P",
         "percentiles of HU, from 0 to 100 (default: 5,25,50,75,95)",
         parse=_parse_percentiles,
         first=True,
@@ -124,16 +121,15 @@ class DistanceSettings(DeviceSettings):
     """
 
     mesh_space: str | None = mesh_space_option("files that do not name theirs")
-    samples: int | None = option("--samples", "N", "points on each mesh, evenly by area (default: 50000)")
+    samples: int | None = option("--samples N", "points on each mesh, evenly by area (default: 50000)")
     range_mm: float | None = option(
-        "--range",
-        "MM",
+        "--range MM",
         "distance at which the colours end (default: 1, 2 or 5 x 10^n mm that hold 95 %% of the distances)",
         group="picture",
         first=True,
     )
     view: str = option(
-        "--view", "V", "view of the picture: anterior (default), left, AZ,EL ...", group="picture", default="anterior"
+        "--view V", "view of the picture: anterior (default), left, AZ,EL ...", group="picture", default="anterior"
     )
     space: str = space_option("patient frame of the coloured mesh", group="picture")
 
@@ -178,34 +174,27 @@ class InsideSettings(ScanSettings, DeviceSettings):
 
     labels: str | Path = label_map_option(required=True)
     only: Sequence[str | int] = option(
-        "--label", "NAME|N", "label of a vertebra; may be given again", action="append", required=True, first=True
+        "--label NAME|N", "label of a vertebra; may be given again", action="append", required=True, first=True
     )
     view: str = option(
-        "--view",
-        "V",
+        "--view V",
         f"anterior, posterior, left, right, superior, inferior, or AZ,EL in degrees (default: {INSIDE_VIEW})",
         group="pictures",
         default=INSIDE_VIEW,
         words=("anterior", "posterior", "left", "right", "superior", "inferior"),
     )
     iso_value: float | None = option(
-        "--hu",
-        "N",
+        "--hu N",
         "level of the solid bone, within one voxel of the label (default: the label's own voxels)",
         group="parts",
         first=True,
     )
     dense: Sequence[float | None] | None = option(
-        "--dense",
-        "A[:B]",
-        "HU of dense bone, from A on or from A to B (default: 450)",
-        group="parts",
-        parse=_parse_band,
+        "--dense A[:B]", "HU of dense bone, from A on or from A to B (default: 450)", group="parts", parse=_parse_band
     )
-    close_mm: float | None = option("--close", "MM", "pores that close by balls (default: 1.5)", group="parts")
+    close_mm: float | None = option("--close MM", "pores that close by balls (default: 1.5)", group="parts")
     grow_mm: float | None = option(
-        "--grow",
-        "MM",
+        "--grow MM",
         "with --hu: dense voxels this near to the label are its own (default: one voxel each way)",
         group="parts",
     )
@@ -236,15 +225,13 @@ class VertebraeSettings(ScanSettings):
     """Settings of the search for vertebrae; see `clrecon.split_vertebrae`."""
 
     level: float | None = option(
-        "--hu",
-        "N",
+        "--hu N",
         "bone is N HU and more (default: half way between discs and marrow, 120 to 226)",
         group="vertebrae",
         first=True,
     )
     seeds: Sequence[Sequence[float]] = option(
-        "--seed",
-        "X,Y,Z",
+        "--seed X,Y,Z",
         "a point in the body of a vertebra, LPS mm; one for each vertebra, in place of the search for discs",
         group="vertebrae",
         default=(),
@@ -253,22 +240,20 @@ class VertebraeSettings(ScanSettings):
         first=True,
     )
     name_at: tuple[Sequence[float], str] | None = option(
-        "--name-at",
-        "X,Y,Z=L3",
+        "--name-at X,Y,Z=L3",
         "name the level of the vertebra at this point (LPS mm), and from it all others",
         group="vertebrae",
         parse=_parse_name,
         first=True,
     )
     first: str | None = option(
-        "--first",
-        "LEVEL",
+        "--first LEVEL",
         "name the level of the uppermost vertebra that is found (T1), and from it all others; without --first and"
         " --name-at they are numbered from the head",
         group="vertebrae",
         first=True,
     )
-    keep_unsure: bool = flag("--keep-unsure", "write vertebrae of low confidence too", group="vertebrae")
+    keep_unsure: bool = option("--keep-unsure", "write vertebrae of low confidence too", group="vertebrae")
 
     def __post_init__(self) -> None:
         from clrecon.spine.split import check_landmark
@@ -308,18 +293,16 @@ class CorridorSettings(ScanSettings, DeviceSettings):
 
     labels: str | Path = label_map_option(required=True)
     only: Sequence[str | int] = option(
-        "--label", "NAME|N", "a vertebra of the map; may be given again", default=(), action="append", first=True
+        "--label NAME|N", "a vertebra of the map; may be given again", default=(), action="append", first=True
     )
     iso_value: float | None = option(
-        "--hu",
-        "auto|N",
+        "--hu auto|N",
         "HU at which the bone's surface lies (default: auto, half way between bone and the tissue beside it)",
         parse=_parse_level,
         first=True,
     )
     margin: float = option(
-        "--margin",
-        "MM",
+        "--margin MM",
         "distance that a screw of the largest diameter keeps from the surface (default: 1)",
         default=1.0,
         first=True,

@@ -104,10 +104,10 @@ def _read_segments(grid: GridFile) -> tuple[list[_Segment], list[str]]:
     values = _read_numbers(grid, names, "LabelValue")
     layers = _read_numbers(grid, names, "Layer")
     if names and not values and not layers and list(names) == list(range(grid.layers)):
-        told = (
+        warnings = (
             [] if grid.layers == 1 else [f"its {grid.layers} segments name no layer: segment n is taken from layer n"]
         )
-        return [_Segment(n + 1, name, n, 1) for n, name in names.items()], told
+        return [_Segment(n + 1, name, n, 1) for n, name in names.items()], warnings
     lost = {"LabelValue": len(names) - len(values), "Layer": len(names) - len(layers)}
     if grid.layers > 1 and any(lost.values()):
         what, count = max(lost.items(), key=lambda item: item[1])

@@ -62,21 +62,21 @@ class LabelFigures(Record):
         if not self.voxels:
             where = "outside of the scan" if self.inside_share == 0.0 else "smaller than the voxels of the scan"
             return [f"{self.name} has no voxel in the scan: its {format_digits(self.label_ml)} ml are {where}"]
-        told = []
+        warnings = []
         if self.inside_share < 1.0:
-            told.append(
+            warnings.append(
                 f"{100.0 * self.inside_share:.3g} % of {self.name} lie inside the scan, the rest is not measured"
             )
         wanted = self.label_ml * self.inside_share
         if abs(self.ml - wanted) > _ODD_VOLUME * wanted:
-            told.append(
+            warnings.append(
                 f"{self.name} has {format_digits(self.ml, 4)} ml on the grid of the scan and"
                 f" {format_digits(wanted, 4)} ml on its own:"
                 " look at the slices of both"
             )
         if self.unmeasured:
-            told.append(f"{self.name}: {self.unmeasured:,} of {self.voxels:,} voxels have no finite value")
-        return told
+            warnings.append(f"{self.name}: {self.unmeasured:,} of {self.voxels:,} voxels have no finite value")
+        return warnings
 
 
 def name_percentile(percent: float) -> str:

@@ -7,11 +7,8 @@ from dataclasses import MISSING, field, fields
 from typing import Any, NamedTuple
 
 _KEY = "option"
-_OF_KIND: dict[Any, dict[str, Any]] = {
-    **dict.fromkeys(("int", "int | None"), {"type": int}),
-    **dict.fromkeys(("float", "float | None"), {"type": float}),
-}
-"""How values of a field are read, by its annotation; of others the text is the value."""
+_READERS = {"int": int, "int | None": int, "float": float, "float | None": float}
+"""What reads the value of a field, by its annotation; of others the text is the value."""
 
 
 class Option(NamedTuple):
@@ -27,8 +24,7 @@ class Option(NamedTuple):
 
 
 def option(
-    flag: str,
-    metavar: str | tuple[str, ...],
+    usage: str,
     help: str,  # noqa: A002
     *,
     group: str = "",
@@ -38,22 +34,24 @@ def option(
 ) -> Any:
     """Declare a field of settings that is an option of the command line.
 
-    metavar: What stands for the value in the help.
+    usage: The flag, and what stands for its value in the help (for each of several values); a switch has none.
     group: Names those that stand together.
     default: Of the field; where the option is not given, the parser has None.
     parse: Reads the value from text; its ValueError is the refusal.  None: as the annotation of the field says.
     **how: More keywords of `clrecon.cli.common.Parser.add_argument`.
     """
+    flag, *values = usage.split()
+    if not values:
+        how = {"action": "store_false" if default else "store_true", **how}
+        default = bool(default)
+    elif len(values) == 1:
+        how["metavar"] = values[0]
+    else:
+        how |= {"metavar": tuple(values), "nargs": len(values)}
     if parse is not None:
         how["type"] = parse
     default = MISSING if how.get("required") else default
-    return field(default=default, metadata={_KEY: (flag, group, {"metavar": metavar, "help": help, **how})})
-
-
-def flag(name: str, help: str, *, group: str = "", default: bool = False, **how: Any) -> Any:  # noqa: A002
-    """Declare a field of settings that is an option without a value, see `option`."""
-    how = {"action": "store_false" if default else "store_true", "help": help, **how}
-    return field(default=default, metadata={_KEY: (name, group, how)})
+    return field(default=default, metadata={_KEY: (flag, group, {"help": help, **how})})
 
 
 def options_of(settings: type, group: str = "") -> Iterator[Option]:
@@ -61,4 +59,5 @@ def options_of(settings: type, group: str = "") -> Iterator[Option]:
     for own in fields(settings):
         flag, declared, how = own.metadata.get(_KEY, ("", None, {}))
         if declared == group:
-            yield Option(own.name, flag, {**_OF_KIND.get(own.type, {}), **how})
+            read = _READERS.get(str(own.type))
+            yield Option(own.name, flag, how if read is None else {"type": read, **how})

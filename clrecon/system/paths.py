@@ -14,16 +14,38 @@ import os
 import re
 import stat
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
 from typing import BinaryIO
 
-from clrecon.errors import OutputError
+from clrecon.errors import OutputError, UsageError
 from clrecon.system.arguments import name_parameter
+from clrecon.system.text import guess_word
 
 # A pipe or device put in the place of a file must not make the reader wait for a writer.
 _READ = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+
+
+def extension_of(path: str | os.PathLike[str]) -> str:
+    """Return the extension of a file in lower case, such as ``.ply``; empty for none."""
+    return os.path.splitext(os.fspath(path))[1].lower()
+
+
+def find_extension(path: str | os.PathLike[str], known: Iterable[str], noun: str, hint: str = "") -> str:
+    """Return the extension of a file to write, which is one of those that are known.
+
+    noun: What the file holds, such as "mesh".
+    hint: What a refusal says of the extension.
+    """
+    try:
+        extension = extension_of(path)
+    except TypeError as error:
+        raise UsageError(f"a {noun} file is named by a string or a path, not {type(path).__name__}") from error
+    if extension not in known:
+        found = f"the extension {extension!r}{hint or guess_word(extension, known)}" if extension else "no extension"
+        raise UsageError(f"the name of the {noun} file has {found}: use one of {', '.join(known)}")
+    return extension
 
 
 def open_regular(path: str | os.PathLike[str], buffering: int = -1) -> BinaryIO:

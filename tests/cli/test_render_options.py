@@ -8,7 +8,7 @@ import pytest
 
 from clrecon.cli.common import Parser, add_fields
 from clrecon.cli.main import main
-from clrecon.cli.render_options import add_camera, add_clipping
+from clrecon.cli.render import add_camera, add_clipping
 from clrecon.jobs.render.settings import LabelLook
 
 GIVEN_TWICE = {

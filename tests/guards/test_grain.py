@@ -11,8 +11,8 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 95_744,
-    "modules": 417,
+    "lines": 95_601,
+    "modules": 416,
     "small_modules_with_one_reader": 12,
     "docstrings_with_raises": 124,
     "options_in_several_files": 19,

@@ -40,7 +40,7 @@ def find_options(source: str) -> list[str]:
     declared = [
         str(ast.get_source_segment(source, node))
         for node in ast.walk(ast.parse(source))
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("option", "flag")
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "option"
     ]
     for text in declared:
         source = source.replace(text, "")
@@ -155,7 +155,5 @@ def test_no_option_is_named_outside_of_the_command_line() -> None:
 
 def test_a_named_option_and_a_named_parameter_are_found() -> None:
     assert find_options('raise UsageError("leave --open out, or -o; a--b, x - -y, ---")') == ["--open"]
-    assert find_options(
-        'a: int = option("--open", "N", "see --report")\nb: bool = flag("--all", "")\nb = "--seed"'
-    ) == ["--seed"]
+    assert find_options('a: int = option("--open N", "see --report")\nb = "--seed"') == ["--seed"]
     assert named_parameters("x = f\"{name_parameter('force', True)}\"\nname_parameter(setting)") == {"force"}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -11,6 +10,7 @@ from clrecon.jobs.cloud.settings import CloudSettings
 from clrecon.jobs.cloud.steps import CloudSteps, name_reasons
 from clrecon.jobs.inputs import describe_cloud
 from clrecon.jobs.run import Run, RunReport
+from clrecon.system.paths import extension_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,7 +67,7 @@ class CloudReport(RunReport):
 
 def describe_file(what: str, path: str | Path, file: Staged) -> dict[str, Any]:
     """Return one entry of ``outputs``."""
-    return {"what": what, "format": os.path.splitext(os.fspath(path))[1].lower().lstrip("."), "bytes": file.size}
+    return {"what": what, "format": extension_of(path)[1:], "bytes": file.size}
 
 
 def report_of(
@@ -125,8 +125,8 @@ def report_of(
 
 
 def _describe_surface(mesh: Mesh) -> dict[str, Any]:
-    told = ("spacing_mm", "bridge_mm", "votes_against_share", "wall_share", "lost_share", "open_cubes", "warnings")
-    facts = {name: mesh.report.get(name) for name in told}
+    names = ("spacing_mm", "bridge_mm", "votes_against_share", "wall_share", "lost_share", "open_cubes", "warnings")
+    facts = {name: mesh.report.get(name) for name in names}
     return {"vertices": mesh.vertex_count, "triangles": mesh.triangle_count, **facts}
 
 

@@ -12,7 +12,7 @@ from clrecon.errors import UsageError
 from clrecon.jobs.options import InputSettings, label_map_option, parse_point, space_option
 from clrecon.points import POINT_KINDS
 from clrecon.system.arguments import name_parameter
-from clrecon.system.options import flag, option
+from clrecon.system.options import option
 
 DENOISERS = ("grid", "bilateral")
 
@@ -111,14 +111,12 @@ class CloudSettings(InputSettings):
 
     space: str = space_option("patient frame of the written files and of seeds")
     input_space: str | None = option(
-        "--input-space",
-        "lps|ras",
+        "--input-space lps|ras",
         "patient frame of a cloud file that does not say its own (default: lps)",
         parse=str.lower,
     )
     points: str | None = option(
-        "--points",
-        "|".join(POINT_KINDS),
+        f"--points {'|'.join(POINT_KINDS)}",
         "surface: where the HU cross the iso value, between the voxels; voxels: the centres of those within; shell: of"
         " these the outer ones (default: surface, with a band voxels)",
         group="points",
@@ -126,21 +124,19 @@ class CloudSettings(InputSettings):
         first=True,
     )
     hu: float | Sequence[float] | None = option(
-        "--hu",
-        "N|LO,HI",
+        "--hu N|LO,HI",
         "iso value, inside is N and above; or a band, both ends included (default: that of bone)",
         group="points",
         parse=_parse_level,
         first=True,
     )
     labels: str | Path | None = label_map_option(group="points")
-    label: str | None = option("--label", "NAME|N", "points of this label only (default: of all)", group="points")
-    paper: bool = flag(
+    label: str | None = option("--label NAME|N", "points of this label only (default: of all)", group="points")
+    paper: bool = option(
         "--paper", "place and filter voxels as the papers print it, and say by how much that is wrong", group="points"
     )
     ghost_slices: str = option(
-        "--ghost-slices",
-        "|".join(GHOSTS),
+        f"--ghost-slices {'|'.join(GHOSTS)}",
         "slices inside the stack that are unlike both neighbours, as screen captures and localizers are: drop takes"
         f" their points away, keep warns of them (default: {GHOSTS[0]})",
         group="steps",
@@ -148,8 +144,7 @@ class CloudSettings(InputSettings):
         parse=str.lower,
     )
     clusters: Clustering | None = option(
-        "--cluster",
-        "eps=MM,min=N",
+        "--cluster eps=MM,min=N",
         "density clusters (DBSCAN) without noise: neighbours are within eps, and a core point has min of them, itself"
         " included; min=plane+1 makes noise of lone slices (default: 1.5 times the largest voxel step, 6)",
         group="steps",
@@ -159,8 +154,7 @@ class CloudSettings(InputSettings):
         first=True,
     )
     keep: Sequence[str] = option(
-        "--keep",
-        "RULE",
+        "--keep RULE",
         "clusters that stay: largest, largest:N, min:POINTS, seed:X,Y,Z (the nearest), no-sheets (tables and image"
         " planes go); may be given again",
         group="steps",
@@ -169,16 +163,14 @@ class CloudSettings(InputSettings):
         first=True,
     )
     outliers: float | None = option(
-        "--outliers",
-        "SD",
+        "--outliers SD",
         "points go whose mean distance to 16 neighbours is SD standard deviations over the mean (without a number: 2)",
         group="steps",
         nargs="?",
         const=2.0,
     )
     denoise: Sequence[str] = option(
-        "--denoise",
-        ",".join(DENOISERS),
+        f"--denoise {','.join(DENOISERS)}",
         "grid: points alone in a cell of a grid go; bilateral: points move along their normals to the weighted mean"
         " height of their neighbours, edges stay",
         group="steps",
@@ -186,22 +178,21 @@ class CloudSettings(InputSettings):
         parse=_parse_denoisers,
         first=True,
     )
-    normals: bool = flag(
+    normals: bool = option(
         "--normals",
         "unit normals that point out of bone; points of a surface have those of the scan until they are moved",
         group="steps",
         first=True,
     )
     viewpoint: Sequence[float] | None = option(
-        "--viewpoint",
-        "X,Y,Z",
+        "--viewpoint X,Y,Z",
         "a point inside of the object, mm in the frame of --space: normals of a cloud that was read point away from it"
         " (a scan turns its own by HU)",
         group="steps",
         parse=parse_point,
     )
-    spacing: float | None = option("--spacing", "MM", "keep one point for each cell of that size", group="steps")
-    allow_point_loss: bool = flag(
+    spacing: float | None = option("--spacing MM", "keep one point for each cell of that size", group="steps")
+    allow_point_loss: bool = option(
         "--allow-point-loss",
         "go on where a step that should take noise alone takes more than half of the points, which else is refused",
         group="checks",

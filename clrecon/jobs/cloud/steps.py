@@ -323,8 +323,7 @@ class CloudSteps:
             self.fate[gone if there is None else there[gone]] = np.array(numbers, np.uint8)[step.removed[gone]]
             self._there = left if there is None else there[left]
         self.cloud = step.cloud
-        told = step.as_dict()
-        self.entries.append({"step": name, **told, "seconds": self._seconds()})
+        self.entries.append({"step": name, **step.as_dict(), "seconds": self._seconds()})
         self.warnings += step.warnings
         if takes_noise:
             self._judge(name, len(step.removed), step.counts)

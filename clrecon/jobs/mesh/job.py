@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from clrecon.jobs.mesh.surfaces import Part, Surface, plan_surfaces
 from clrecon.jobs.outputs import check_kept, check_outputs, count_leftovers, name_outputs, refuse_files, refuse_numbered
 from clrecon.jobs.run import Run
 from clrecon.system.log import get_logger
+from clrecon.system.paths import extension_of
 from clrecon.system.text import count_of
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def make_mesh(
 
 def makes_objects(output: str | Path) -> bool:
     """Tell whether all parts of a print become objects of a file of this name."""
-    return os.path.splitext(output)[1].lower() == ".3mf"
+    return extension_of(output) == ".3mf"
 
 
 def _check_files(

@@ -12,6 +12,7 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, describe_level
 from clrecon.jobs.presets import find_iso_preset
 from clrecon.jobs.run import RunReport
+from clrecon.system.paths import extension_of
 
 if TYPE_CHECKING:
     from clrecon.jobs.mesh.make import MadeParts
@@ -53,7 +54,7 @@ def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], 
         "area_mm2": quality.get("area_mm2"),
         "volume_ml": quality.get("volume_ml") if quality.get("closed") else None,
         "bounds_mm": _bounds(part.mesh, space),
-        "output": {"format": os.path.splitext(output)[1].lower().lstrip("."), "bytes": file.size},
+        "output": {"format": extension_of(output)[1:], "bytes": file.size},
         "quality": {name: value for name, value in quality.items() if name not in _SAID_ABOVE} or None,
         "cells": origin.get("cells"),
         "growing": origin.get("growing"),

@@ -25,7 +25,7 @@ from clrecon.jobs.options import (
 from clrecon.jobs.outputs import OBJECT_FILES
 from clrecon.jobs.presets import DEFAULT_PRESET, PURPOSES, Purpose, find_iso_preset, find_purpose
 from clrecon.system.arguments import name_parameter
-from clrecon.system.options import flag, option
+from clrecon.system.options import option
 
 if TYPE_CHECKING:
     from clrecon.labels import LabelMap
@@ -87,8 +87,7 @@ class MeshSettings(InputSettings):
     """
 
     purpose: str | None = option(
-        "--for",
-        "PURPOSE",
+        "--for PURPOSE",
         "what the mesh is for, with the settings that this takes (others given beside it win); "
         + "; ".join(map(_describe_purpose, PURPOSES.values())),
         group="purpose",
@@ -97,11 +96,10 @@ class MeshSettings(InputSettings):
         words=PURPOSES,
     )
     iso_value: float | Sequence[float | Sequence[float]] | None = option(
-        "--hu", "N[,N...]|A:B|auto|half:B,T", LEVELS_HELP, group="level", parse=parse_hu, first=True
+        "--hu N[,N...]|A:B|auto|half:B,T", LEVELS_HELP, group="level", parse=parse_hu, first=True
     )
     below: float | Sequence[float] | None = option(
-        "--below",
-        "N[,N...]",
+        "--below N[,N...]",
         "in place of an iso value: inside is what lies below N HU, such as lungs, airways and sinuses (-400); the air"
         " round the patient is left out",
         group="level",
@@ -109,10 +107,8 @@ class MeshSettings(InputSettings):
     )
     preset: str | None = preset_option()
     half_way: str | Sequence[float] | None = None
-    keep_outside: bool = flag(
-        "--keep-outside", "with --below: leave the air round the patient in", group="inside", default=False
-    )
-    solid: bool = flag(
+    keep_outside: bool = option("--keep-outside", "with --below: leave the air round the patient in", group="inside")
+    solid: bool = option(
         "--solid",
         "fill what the bone encloses: marrow, and canals that the ends of the scan cut; the brain, the chest and air"
         " stay out; with --labels: what is less dense within a label",
@@ -121,15 +117,13 @@ class MeshSettings(InputSettings):
         first=True,
     )
     seal_mm: float | None = option(
-        "--seal",
-        "MM",
+        "--seal MM",
         "with --solid: close pores up to twice as wide, less one voxel (default: 2.5 to 3, by the voxels)",
         group="inside",
     )
     space: str = space_option("patient frame of the mesh", group="surface")
     topology: str = option(
-        "--topology",
-        "T",
+        "--topology T",
         "what is done where the voxels leave open which of them are joined: separated keeps them apart (default),"
         " trilinear joins those that the trilinear interpolation joins",
         group="surface",
@@ -139,16 +133,14 @@ class MeshSettings(InputSettings):
     )
     closed: bool = closed_option()
     method: str | None = option(
-        "--method",
-        "|".join(METHOD_NAMES),
+        f"--method {'|'.join(METHOD_NAMES)}",
         "t-mc: every cell (default); i-mc: only what hangs together with seeds; g-mc: t-mc, then quadric collapse"
         " without a bound; s-mc: t-mc, then decimation within a bound; t-mc-soup, skimage: on the CPU, to compare with",
         group="method",
         parse=str.lower,
     )
     grow_from: Sequence[str | Sequence[float]] = option(
-        "--grow-from",
-        "auto|X,Y,Z|label:NAME",
+        "--grow-from auto|X,Y,Z|label:NAME",
         "seeds of i-mc: auto takes the parts with at least 1/20 of the cells of the largest; a point in mm of the"
         " frame of --space, at most 10 mm from the surface; a label of --labels. May be given again",
         group="method",
@@ -157,8 +149,7 @@ class MeshSettings(InputSettings):
         action="append",
     )
     vertex_rule: str = option(
-        "--vertex-rule",
-        "linear|golden|golden-search",
+        "--vertex-rule linear|golden|golden-search",
         "where on an edge a vertex lies: linear (default); golden: at 0.618 whatever the HU, up to 0.6 voxels off;"
         " golden-search: where a cubic crosses the iso value, no better than linear",
         group="method",
@@ -166,21 +157,19 @@ class MeshSettings(InputSettings):
         parse=str.lower,
     )
     keep: str | None = option(
-        "--keep",
-        "bone",
+        "--keep bone",
         "bone: keep the components whose walls look like bone, not heart and vessels with contrast medium, nor a table",
         group="selection",
         parse=str.lower,
     )
     keep_largest: int | None = option(
-        "--keep-largest", "N", "keep the N largest components only", group="selection", first=True
+        "--keep-largest N", "keep the N largest components only", group="selection", first=True
     )
     min_volume_ml: float | None = option(
-        "--min-volume", "ML", "keep components of at least ML millilitres only", group="selection", first=True
+        "--min-volume ML", "keep components of at least ML millilitres only", group="selection", first=True
     )
     seeds: Sequence[Sequence[float]] = option(
-        "--seed",
-        "X,Y,Z",
+        "--seed X,Y,Z",
         "keep the component whose surface lies nearest to this point, in mm of the frame of --space; repeat it for"
         " several",
         group="selection",
@@ -188,13 +177,13 @@ class MeshSettings(InputSettings):
         parse=parse_point,
         action="append",
     )
-    all_parts: bool = flag(
+    all_parts: bool = option(
         "--all-parts",
         "with --for print: keep all bones, not the largest alone; named objects of a .3mf, one mesh in other formats",
         group="files",
     )
-    split: bool = flag("--split", "write one file a component, the largest first", group="files", default=False)
-    one_file: bool = flag(
+    split: bool = option("--split", "write one file a component, the largest first", group="files")
+    one_file: bool = option(
         "--one-file",
         f"labels, components of --split or several iso values in one file ({OBJECT_FILES}), each an object with its"
         " name and a colour of its own",
@@ -202,27 +191,24 @@ class MeshSettings(InputSettings):
     )
     labels: LabelChoice | None = None
     smooth: int | None = option(
-        "--smooth",
-        "N",
+        "--smooth N",
         f"smooth with N iterations of a windowed sinc filter (default: {_ITERATIONS})",
         group="refinement",
         nargs="?",
         const=_ITERATIONS,
     )
     decimate: float | None = option(
-        "--decimate",
-        "SHARE",
+        "--decimate SHARE",
         "take away this share of the triangles, such as 0.9, or as much as the largest deviation lets",
         group="refinement",
         first=True,
     )
     max_deviation_mm: float | None = option(
-        "--max-deviation",
-        "MM",
+        "--max-deviation MM",
         "smoothing and decimation each move nothing further (default: a quarter of the shortest voxel step)",
         group="refinement",
     )
-    strict: bool = flag(
+    strict: bool = option(
         "--strict",
         f"exit with {GATE_FAILED} when a gate of a mesh fails (closed, manifold, no cuts, close to the scan ...), with"
         f' {SCAN_GATE_FAILED} when only gates of the scan do (see "clrecon info")',
@@ -489,29 +475,27 @@ class LabelChoice:
 
     path: str | Path = label_map_option(default=MISSING)
     only: tuple[str | int, ...] = option(
-        "--label", "NAME|N", "this label only; may be given again (default: all)", default=(), action="append"
+        "--label NAME|N", "this label only; may be given again (default: all)", default=(), action="append"
     )
     hidden: tuple[str | int, ...] = option(
-        "--hide-label", "NAME|N", "not this label; may be given again", default=(), action="append"
+        "--hide-label NAME|N", "not this label; may be given again", default=(), action="append"
     )
     colors: tuple[tuple[str | int, str], ...] = option(
-        "--label-color",
-        "LABEL=COLOUR",
+        "--label-color LABEL=COLOUR",
         "colour of a label in .ply and in the formats of several objects, such as L3=orange; may be given again",
         default=(),
         parse=parse_label_color,
         action="append",
     )
     surface: str = option(
-        "--surface",
-        "hu|mask",
+        "--surface hu|mask",
         "hu: HU place the vertices (default); mask: the label's own surface, smoothed within its voxels and with their"
         " volume, whatever the HU: organs, lungs, what HU do not show",
         default="hu",
         parse=str.lower,
     )
     grow_mm: float | None = option(
-        "--grow", "MM", "dense voxels this near to a label are its own (default: one voxel each way)"
+        "--grow MM", "dense voxels this near to a label are its own (default: one voxel each way)"
     )
     solid: bool = False
 

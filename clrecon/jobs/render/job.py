@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.jobs.inputs import is_cloud_file, is_only_mesh, read_with_labels, refuse_scan_settings
-from clrecon.jobs.outputs import check_distinct, check_kept
+from clrecon.jobs.outputs import check_distinct, check_files, check_kept
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.render.picture_taker import PictureTaker, read_curve, read_function, read_look
 from clrecon.jobs.render.report import PictureReport, describe_picture, find_emptiness, report_of, warn_of_picture
@@ -28,6 +28,7 @@ from clrecon.rendering.pictures.styles import Projection, SurfaceLook
 from clrecon.system.arguments import name_parameter
 from clrecon.system.files import allow_open_files
 from clrecon.system.log import get_logger
+from clrecon.system.paths import extension_of
 from clrecon.system.progress import Progress, ignore_progress
 
 if TYPE_CHECKING:
@@ -263,11 +264,6 @@ def path_of(path: str | Path, name: str) -> str | Path:
     return f"{stem}_{name}{extension}" if name else path
 
 
-def format_of(path: str | Path) -> str:
-    """Return the extension of a file in lower case, without the dot; empty for a folder."""
-    return os.path.splitext(os.fspath(path))[1].lower().lstrip(".")
-
-
 def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[str, str | Path]]:
     """Refuse outputs that cannot be written, before any work is done.
 
@@ -277,7 +273,6 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[
     from clrecon.rendering.pictures.annotations import check_caption
     from clrecon.rendering.pictures.picture import check_float_path, check_image_path
     from clrecon.rendering.pictures.pillow import load_pillow
-    from clrecon.system.files import check_writable
 
     load_pillow()
     check_caption(settings.caption)
@@ -287,7 +282,7 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[
     if files.depth is not None and settings.is_sheet:
         raise UsageError("a contact sheet has no depths: its slices lie in planes of their own")
     if settings.background == "transparent":
-        picture = "" if files.picture is None else format_of(files.picture)
+        picture = "" if files.picture is None else extension_of(files.picture)[1:]
         turntable = "" if files.turntable is None else animation_kind(files.turntable)[1:]
         for kind in (picture, turntable):
             if f".{kind}" in OPAQUE_ONLY:
@@ -304,8 +299,7 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[
             owned += [(f"{what} {name}".rstrip(), path_of(path, name)) for name in names]
     moving = [] if files.turntable is None else [("the turntable", files.turntable)]
     check_distinct(owned, moving)
-    for _, path in owned:
-        check_writable(path)
+    check_files(owned)
     if files.turntable is not None and settings.turntable is not None:
         if check_animation(files.turntable, settings.turntable.fps) == "":
             _check_outside_frames(files.turntable, owned)
@@ -325,7 +319,7 @@ def _write_picture(run: Run, picture: Rendering, files: PictureFiles, name: str)
     from clrecon.rendering.pictures.picture import encode_floats
 
     def entry(path: str | Path, file: StagedFile) -> dict[str, Any]:
-        return {"format": format_of(path), "bytes": file.size}
+        return {"format": extension_of(path)[1:], "bytes": file.size}
 
     assert files.picture is not None
     path = path_of(files.picture, name)
@@ -333,6 +327,6 @@ def _write_picture(run: Run, picture: Rendering, files: PictureFiles, name: str)
     for what, named, floats in (("depth", files.depth, picture.depth), ("values", files.values, picture.values)):
         if named is not None and floats is not None:
             path = path_of(named, name)
-            content = encode_floats(floats, f".{format_of(path)}", picture.pixel_mm)
+            content = encode_floats(floats, extension_of(path), picture.pixel_mm)
             outputs[f"{what}_output"] = entry(path, run.write(path, content))
     return outputs

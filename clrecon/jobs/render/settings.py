@@ -37,7 +37,7 @@ from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import ANTERIOR, DEFAULT_SIZE, DIRECTIONS, SLICES_VIEWS, checked_size
 from clrecon.rendering.views.reformation import PLANES, find_plane
 from clrecon.system.arguments import name_parameter
-from clrecon.system.options import flag, option
+from clrecon.system.options import option
 from clrecon.system.text import unknown_name
 
 DEFAULT_VIEWS = {"slice": "axial", "cpr": "left", "slices": SLICES_VIEWS[0]}
@@ -116,9 +116,9 @@ def _parse_label_opacity(text: str) -> tuple[str, float]:
 class Turntable:
     """Settings of a turntable, a moving picture of a turning volume."""
 
-    frames: int = option("--frames", "N", "frames of the turn (default: 100)", default=100)
-    fps: float = option("--fps", "N", "frames a second (default: 25)", default=25.0)
-    degrees: float = option("--degrees", "D", "how far it turns, to the patient's left (default: 360)", default=360.0)
+    frames: int = option("--frames N", "frames of the turn (default: 100)", default=100)
+    fps: float = option("--fps N", "frames a second (default: 25)", default=25.0)
+    degrees: float = option("--degrees D", "how far it turns, to the patient's left (default: 360)", default=360.0)
 
 
 @dataclass(frozen=True)
@@ -131,16 +131,14 @@ class LabelLook:
 
     path: str = label_map_option(default=MISSING)
     colors: Mapping[str, str] = option(
-        "--label-color",
-        "LABEL=COLOUR",
+        "--label-color LABEL=COLOUR",
         "colour of a label, by name or number; may be given again",
         default=(),
         parse=parse_label_color,
         action="append",
     )
     opacities: Mapping[str, float] = option(
-        "--label-opacity",
-        "LABEL=SHARE",
+        "--label-opacity LABEL=SHARE",
         "factor on the opacity of a label, 0 to 1, label 0 is all without a label; over slices the share of its colour"
         " (default: 0.3); may be given again",
         default=(),
@@ -214,15 +212,13 @@ class RenderSettings(InputSettings):
     labels: LabelLook | None = None
     meshes: Sequence[MeshFile] = ()
     mesh_space: str | None = option(
-        "--mesh-space",
-        "lps|ras",
+        "--mesh-space lps|ras",
         "patient frame of meshes whose files do not name theirs (default: lps, with a warning)",
         group="meshes",
     )
     light: str | Sequence[float] | None = None
     views: Sequence[str] = option(
-        "--view",
-        "V[,V...]|AZ,EL",
+        "--view V[,V...]|AZ,EL",
         f"where the camera stands: {', '.join(VIEWS)}; or degrees from anterior to the patient's left and to the head;"
         " of slices also axial, coronal, sagittal (default: anterior; of mode slice axial, of slices 30,30, of cpr"
         " left); several make a picture each: out_left.png; may be given again",
@@ -234,26 +230,23 @@ class RenderSettings(InputSettings):
         words=(*DIRECTIONS, *PLANES),
     )
     up: str | Sequence[float] | None = option(
-        "--up",
-        "SIDE|X,Y,Z",
+        "--up SIDE|X,Y,Z",
         "what is at the top (default: superior, else anterior)",
         group="camera",
         parse=parse_direction,
     )
-    zoom: float = option("--zoom", "F", "2 shows everything twice as large", group="camera", default=1.0)
+    zoom: float = option("--zoom F", "2 shows everything twice as large", group="camera", default=1.0)
     center: Sequence[float] | None = option(
-        "--center",
-        "X,Y,Z",
+        "--center X,Y,Z",
         "LPS mm in the middle of the picture, of a slice too (default: the middle of what is shown)",
         group="camera",
         parse=_parse_center,
     )
     size: tuple[int, int] | None = option(
-        "--size", "W[xH]", "pixels of the picture (default: 1024x1024)", group="camera", parse=_parse_size, first=True
+        "--size W[xH]", "pixels of the picture (default: 1024x1024)", group="camera", parse=_parse_size, first=True
     )
     view_angle: float | None = option(
-        "--perspective",
-        "DEGREES",
+        "--perspective DEGREES",
         f"perspective of so many degrees from bottom to top ({DEFAULT_VIEW_ANGLE:g} without a number; default:"
         " parallel)",
         group="camera",
@@ -261,16 +254,15 @@ class RenderSettings(InputSettings):
         const=DEFAULT_VIEW_ANGLE,
     )
     background: str = option(
-        "--background",
-        "C",
+        "--background C",
         "colour, such as white or #102030, or transparent",
         group="camera",
         default="black",
         words=COLORS,
     )
-    letters: bool = flag("--letters", "draw the sides of the patient: L, R, A, P, S, I", group="camera")
-    scale_bar: bool = flag("--scale-bar", "draw a bar of a round length in mm", group="camera")
-    caption: str | None = option("--caption", "TEXT", "draw a line of text at the top left", group="camera")
+    letters: bool = option("--letters", "draw the sides of the patient: L, R, A, P, S, I", group="camera")
+    scale_bar: bool = option("--scale-bar", "draw a bar of a round length in mm", group="camera")
+    caption: str | None = option("--caption TEXT", "draw a line of text at the top left", group="camera")
     turntable: Turntable | None = None
 
     @classmethod

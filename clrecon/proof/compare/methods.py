@@ -10,7 +10,7 @@ from clrecon.errors import UsageError
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.options import InputSettings, closed_option, parse_hu, preset_option
 from clrecon.system.arguments import name_parameter
-from clrecon.system.options import flag, option
+from clrecon.system.options import option
 
 MESH, CLOUD, PICTURE = "mesh", "cloud", "picture"
 
@@ -97,8 +97,7 @@ class CompareSettings(InputSettings):
     """
 
     methods: Sequence[str] = option(
-        "--methods",
-        "M[,M...]",
+        "--methods M[,M...]",
         "methods to compare; see below (default: all)",
         group="comparison",
         default=(),
@@ -106,21 +105,15 @@ class CompareSettings(InputSettings):
         first=True,
     )
     reference: str = option(
-        "--reference",
-        "M",
-        "method to compare with (default: t-mc)",
-        group="comparison",
-        default="t-mc",
-        parse=str.lower,
+        "--reference M", "method to compare with (default: t-mc)", group="comparison", default="t-mc", parse=str.lower
     )
     truth: str | Path | None = option(
-        "--truth",
-        "FILE",
+        "--truth FILE",
         "truth.json of a phantom: errors against its true surface are measured too",
         group="comparison",
         first=True,
     )
-    paper: bool = flag(
+    paper: bool = option(
         "--paper",
         "also compare a picture of each method with the middle slice by SSIM and MSE, as a paper does, beside controls"
         " that show what this is worth",
@@ -128,16 +121,14 @@ class CompareSettings(InputSettings):
         first=True,
     )
     repeat: int = option(
-        "--repeat",
-        "N",
+        "--repeat N",
         "warm runs of each method; the median counts (default: 3)",
         group="comparison",
         default=3,
         first=True,
     )
     iso_value: float | None = option(
-        "--hu",
-        "N|auto|half:B,T",
+        "--hu N|auto|half:B,T",
         "iso value in HU, inside is N and above; auto: half way between bone and the tissue beside it, measured in the"
         " scan; half:BONE,TISSUE: half way between these two",
         group="level",

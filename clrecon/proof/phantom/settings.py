@@ -19,7 +19,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.proof.phantom.spine_parts import THORACOLUMBAR, SpineChoice, format_levels, parse_levels
 from clrecon.proof.phantom.spine_plan import fit_slices, spine_choice
 from clrecon.proof.phantom.vertebra import LARGEST_GAP_MM
-from clrecon.system.options import flag, option
+from clrecon.system.options import option
 from clrecon.system.text import unknown_name
 
 if TYPE_CHECKING:
@@ -228,8 +228,7 @@ class PhantomSettings:
     """
 
     kind: str = option(
-        "--kind",
-        "K",
+        "--kind K",
         "what to make; see below (default: spine)",
         default="spine",
         parse=str.lower,
@@ -237,84 +236,75 @@ class PhantomSettings:
         words=KINDS,
     )
     size: tuple[int, int] = option(
-        "--size",
-        "N",
+        "--size N",
         "columns and rows, like 256 or 256x192 (default: 256)",
         default=(256, 256),
         parse=parse_size,
         first=True,
     )
     slices: int = option(  # a number once constructed
-        "--slices", "N", "default: as many as the levels need, 120 without levels", first=True
+        "--slices N", "default: as many as the levels need, 120 without levels", first=True
     )
     spacing: tuple[float, float, float] = option(  # three numbers once constructed
-        "--spacing",
-        ("DJ", "DI", "DK"),
+        "--spacing DJ DI DK",
         "mm between rows, columns, slices (default: by kind, of a spine 1 1 1.25)",
         parse=float,
-        nargs=3,
         first=True,
     )
-    tilt: float = option("--tilt", "DEG", "gantry tilt (default: 0)", default=0.0, first=True)
+    tilt: float = option("--tilt DEG", "gantry tilt (default: 0)", default=0.0, first=True)
     oblique: tuple[float, float, float] = option(
-        "--oblique", ("X", "Y", "Z"), "degrees about the patient's axes", default=(0.0, 0.0, 0.0), parse=float, nargs=3
+        "--oblique X Y Z", "degrees about the patient's axes", default=(0.0, 0.0, 0.0), parse=float
     )
     noise: float = option(  # a number once constructed
-        "--noise", "HU", "standard deviation of the noise (default: 12, of an analytic shape 0)", first=True
+        "--noise HU", "standard deviation of the noise (default: 12, of an analytic shape 0)", first=True
     )
     point_spread_mm: float = option(  # a number once constructed
-        "--point-spread", "MM", "standard deviation of the blur (default: 0.5, of an analytic shape 0)"
+        "--point-spread MM", "standard deviation of the blur (default: 0.5, of an analytic shape 0)"
     )
     seed: int = option(
-        "--seed", "N", "place within a voxel, noise and texture (default: 0)", group="seed", default=0, first=True
+        "--seed N", "place within a voxel, noise and texture (default: 0)", group="seed", default=0, first=True
     )
     inside_hu: float = 1000.0
     outside_hu: float = -1000.0
-    radius_mm: float | None = option("--radius", "MM", "radius of an analytic shape")
+    radius_mm: float | None = option("--radius MM", "radius of an analytic shape")
     table: str | None = option(
-        "--table",
-        "T",
+        "--table T",
         "what a body lies on: none, flat, curved or headrest",
         parse=str.lower,
         first=True,
         words=TABLE_NAMES,
     )
-    table_gap_mm: float = option("--table-gap", "MM", "between body and table (default: 0, they touch)", default=0.0)
-    prone: bool = flag("--prone", "the patient lies on the face")
-    ghosts: bool = flag("--ghosts", "of a spine: two foreign slices, and a localizer")
+    table_gap_mm: float = option("--table-gap MM", "between body and table (default: 0, they touch)", default=0.0)
+    prone: bool = option("--prone", "the patient lies on the face")
+    ghosts: bool = option("--ghosts", "of a spine: two foreign slices, and a localizer")
     levels: str | None = option(
-        "--levels", "C1-L5", "vertebrae to show, like L4-L5 or C3-C7,T1-T5", group="spine", first=True
+        "--levels C1-L5", "vertebrae to show, like L4-L5 or C3-C7,T1-T5", group="spine", first=True
     )
-    facet_gap_mm: float | None = option(
-        "--facet-gap", "MM", "distance of neighbours in the facet joints", group="spine"
-    )
+    facet_gap_mm: float | None = option("--facet-gap MM", "distance of neighbours in the facet joints", group="spine")
     kyphosis_deg: float = option(
-        "--kyphosis",
-        "DEG",
+        "--kyphosis DEG",
         "angle between the first and the last level; positive: the back is round",
         group="spine",
         default=0.0,
     )
     scoliosis_deg: float = option(
-        "--scoliosis",
-        "DEG",
+        "--scoliosis DEG",
         "angle between the first and the last level; positive: the middle lies to the left",
         group="spine",
         default=0.0,
     )
     uneven_mm: float = option(
-        "--uneven", "MM", "the gaps of the slices vary by up to this much", group="spine", default=0.0
+        "--uneven MM", "the gaps of the slices vary by up to this much", group="spine", default=0.0
     )
     missing: tuple[int, ...] = option(
-        "--missing",
-        "N,M-O",
+        "--missing N,M-O",
         "numbers of slices that are left out, like 20-22,40",
         group="missing",
         default=(),
         parse=parse_missing,
     )
     phases: int = option(
-        "--phases", "N", "series at the same places, with ever more contrast medium", group="spine", default=1
+        "--phases N", "series at the same places, with ever more contrast medium", group="spine", default=1
     )
     transfer_syntax: str = "explicit"
 

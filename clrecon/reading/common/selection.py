@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from clrecon.errors import UsageError
 from clrecon.system.arguments import name_parameter
-from clrecon.system.options import flag, option
+from clrecon.system.options import option
 
 LARGEST = 1e6
 
@@ -28,35 +28,33 @@ class Selection:
     """The part of an input that is read."""
 
     series: int | str | None = option(
-        "--series",
-        "S",
+        "--series S",
         'number, hash, UID (or the start of one) or description of the series, see "clrecon info" (default: the CT'
         " series with most slices; of similar ones original before derived, then the thinnest)",
         group="reading",
         first=True,
     )
     phase: int | None = option(
-        "--phase", "N", "number of the phase, of a series with several volumes at one place", group="reading"
+        "--phase N", "number of the phase, of a series with several volumes at one place", group="reading"
     )
-    allow_gaps: bool = flag(
+    allow_gaps: bool = option(
         "--allow-gaps",
         "read a stack with missing slices: what is there is placed exactly, surfaces bridge the gap",
         group="reading",
     )
-    force: bool = flag(
+    force: bool = option(
         "--force",
         "read data sets without preamble or meta header too, their encoding guessed; leave out what is left"
         " over behind the pixels",
         group="reading",
     )
-    follow_links: bool = flag(
+    follow_links: bool = option(
         "--follow-links",
         "read the files and folders that symbolic links out of the folder lead to (git-annex, DataLad)",
         group="reading",
     )
     rescale: tuple[float, float] | None = option(
-        "--rescale",
-        "SLOPE,INTERCEPT",
+        "--rescale SLOPE,INTERCEPT",
         "compute HU as SLOPE x stored value + INTERCEPT, regardless of the files, like 1,-1024",
         group="reading",
         parse=_parse_rescale,

@@ -20,8 +20,7 @@ from clrecon.rendering.pictures.annotations import PictureData
 from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.files import replace_file
-from clrecon.system.paths import keep_existing
-from clrecon.system.text import guess_word
+from clrecon.system.paths import find_extension, keep_existing
 from clrecon.version import package_version
 
 
@@ -267,7 +266,9 @@ _MOST_PER_METRE = 2**31 - 1
 
 def check_image_path(path: str | os.PathLike[str]) -> str:
     """Return the extension of a picture file in lower case."""
-    return _extension(path, tuple(IMAGE_FORMATS), "picture")
+    moves = str(path).lower().endswith((".gif", ".apng", ".mp4"))
+    hint = f" of moving pictures, for which there is {name_parameter('turntable')}" if moves else ""
+    return find_extension(path, IMAGE_FORMATS, "picture", hint)
 
 
 def write_image(rendering: PictureData, path: str | os.PathLike[str], quality: int = 95) -> int:
@@ -320,7 +321,7 @@ def write_floats(array: NDArray[np.float32], path: str | os.PathLike[str], pixel
 
 def check_float_path(path: str | os.PathLike[str]) -> str:
     """Return the extension of a file of depths or values in lower case."""
-    return _extension(path, FLOAT_FORMATS, "depth or value")
+    return find_extension(path, FLOAT_FORMATS, "depth or value")
 
 
 def encode_floats(array: NDArray[np.float32], extension: str, pixel_mm: float | None = None) -> bytes:
@@ -335,20 +336,6 @@ def encode_floats(array: NDArray[np.float32], extension: str, pixel_mm: float | 
 
         Image.fromarray(floats).save(stream, "TIFF", **_resolution(pixel_mm))
     return stream.getvalue()
-
-
-def _extension(path: str | os.PathLike[str], known: tuple[str, ...], what: str) -> str:
-    try:
-        extension = os.path.splitext(os.fspath(path))[1].lower()
-    except TypeError as error:
-        raise UsageError(f"a {what} file is named by a string or a path, not {type(path).__name__}") from error
-    if extension not in known:
-        found = f"the extension {extension!r}{guess_word(extension, known)}" if extension else "no extension"
-        moving = what == "picture" and extension in (".gif", ".apng", ".mp4")
-        if moving:
-            found = f"the extension {extension!r} of moving pictures, for which there is {name_parameter('turntable')}"
-        raise UsageError(f"the name of the {what} file has {found}: use one of {', '.join(known)}")
-    return extension
 
 
 def _replace_image(path: str | os.PathLike[str], content: bytes) -> int:
