@@ -9,7 +9,6 @@ from typing import Any
 from clrecon.cli.common import (
     GRID_FILE,
     SCAN_FOLDER,
-    add_cropping,
     add_device,
     add_fields,
     add_input,
@@ -63,8 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output(parser, "cloud file: .ply .vtp .npz .xyz or .las")
     add_fields(parser, CloudSettings)
     add_reading(parser)
-    add_masking(parser)
-    add_cropping(parser)
+    add_masking(parser, crop=True)
     add_fields(parser.add_argument_group("points"), CloudSettings, "points")
     steps = parser.add_argument_group("steps")
     add_fields(steps, CloudSettings, "steps")

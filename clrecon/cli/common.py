@@ -318,22 +318,21 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     add_fields(parser.add_argument_group("reading"), InputSettings, "reading")
 
 
-_RULES = """\
+_CROP = """\
 Whole voxels outside of the box are left out, after --remove-table and --fov and before --region.
 Surfaces end there as at the ends of a scan. Of several boxes, what is in all of them stays."""
 
 
-def add_cropping(parser: argparse.ArgumentParser, frame: str = "of the frame of --space") -> None:
-    """Add ``--clip-box``, ``--between`` and ``--around``.
-
-    frame: The frame of the numbers, for the help.
-    """
-    add_fields(parser.add_argument_group(f"crop, in mm {frame}", _RULES), InputSettings, "crop")
-
-
-def add_masking(parser: argparse.ArgumentParser) -> None:
-    """Add the options that turn parts of the scan into air or work on its voxels."""
+def add_masking(parser: argparse.ArgumentParser, crop: bool = False) -> None:
+    """Add the options that turn parts of the scan into air or work on its voxels, and those that cut it."""
     add_fields(parser.add_argument_group("masking"), InputSettings, "masking")
+    if crop:
+        add_cropping(parser, "of the frame of --space")
+
+
+def add_cropping(parser: argparse.ArgumentParser, frame: str) -> None:
+    """Add the options that cut a scan; `frame` is that of their numbers, for the help."""
+    add_fields(parser.add_argument_group(f"crop, in mm {frame}", _CROP), InputSettings, "crop")
 
 
 def show_report(

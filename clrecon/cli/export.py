@@ -6,7 +6,6 @@ import argparse
 from typing import Any
 
 from clrecon.cli.common import (
-    add_cropping,
     add_device,
     add_fields,
     add_input,
@@ -47,8 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output(parser, "volume file: .nii.gz, .nii, .nrrd or .mha")
     add_fields(parser, ExportSettings)
     add_reading(parser)
-    add_masking(parser)
-    add_cropping(parser)
+    add_masking(parser, crop=True)
     add_device(parser.add_argument_group("device", "for --region and --preprocess only"))
     checks = parser.add_argument_group("checks")
     add_no_clobber(checks)

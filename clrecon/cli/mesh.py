@@ -9,7 +9,6 @@ from typing import Any
 from clrecon.cli.common import (
     GRID_FILE,
     SCAN_FOLDER,
-    add_cropping,
     add_device,
     add_fields,
     add_input,
@@ -77,8 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output(parser, f"mesh file: {MESH_FILES}")
     add_fields(parser, MeshSettings, "purpose")
     add_reading(parser)
-    add_masking(parser)
-    add_cropping(parser)
+    add_masking(parser, crop=True)
     add_fields(add_levels(parser, "surface"), MeshSettings, "surface")
     method = parser.add_argument_group("method", "marching cubes as papers compare them: see docs/methods.md")
     add_fields(method, MeshSettings, "method")

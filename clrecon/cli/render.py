@@ -42,8 +42,8 @@ from clrecon.jobs.render.settings import (
     describe_modes,
     describe_presets,
     parse_direction,
-    parse_numbers,
 )
+from clrecon.system.options import numbers_reader
 from clrecon.system.text import count_of
 
 _LABELS_LISTED = 24
@@ -83,18 +83,17 @@ def _epilog() -> str:
     )
 
 
+_parse_ends = numbers_reader(2, "is not a window: the HU that are black and white, LOW,HIGH, such as -450,1050")
+
+
 def parse_window(text: str) -> str | tuple[float, ...]:
     """Read ``LOW,HIGH`` in HU, or the name of a window."""
-    if text[:1].isalpha() and "," not in text:
-        return text
-    return parse_numbers(text, 2, "a window: the HU that are black and white, LOW,HIGH, such as -450,1050")
+    return text if text[:1].isalpha() and "," not in text else _parse_ends(text)
 
 
-def parse_clip_plane(text: str) -> tuple[float, ...]:
-    """Read ``PX,PY,PZ,NX,NY,NZ``: a point in LPS mm and a normal."""
-    return parse_numbers(
-        text, 6, "a plane: a point in LPS mm and the direction of the side that stays, PX,PY,PZ,NX,NY,NZ"
-    )
+parse_clip_plane = numbers_reader(
+    6, "is not a plane: a point in LPS mm and the direction of the side that stays, PX,PY,PZ,NX,NY,NZ"
+)
 
 
 def parse_slices(text: str) -> int | tuple[int, ...]:

@@ -6,7 +6,6 @@ import argparse
 from typing import Any
 
 from clrecon.cli.common import (
-    add_cropping,
     add_device,
     add_fields,
     add_masking,
@@ -75,8 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     shown.add_argument("--space", type=str.lower, metavar="lps|ras", help="frame of picked points (default: lps)")
     add_no_clobber(shown)
     add_reading(parser)
-    add_masking(parser)
-    add_cropping(parser)
+    add_masking(parser, crop=True)
     add_levels(parser, "surface of a scan")
     add_fields(parser.add_argument_group("components of a scan"), MeshSettings, "selection")
     add_labels(parser)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.exchange.formats import CLOUD_INPUTS, MESH_INPUTS
-from clrecon.jobs.options import InputSettings
+from clrecon.jobs.options import InputSettings, changed_fields
 from clrecon.system.arguments import name_parameter
 from clrecon.system.paths import extension_of
 
@@ -63,10 +63,9 @@ def refuse_scan_settings(settings: InputSettings, also: Sequence[str] = (), noun
     also: Further settings that are about a scan.
     noun: What the input is.
     """
-    defaults = {own.name: own.default for own in fields(settings)}
-    of_scans = [own.name for own in fields(InputSettings) if own.name not in _OF_BOTH]
-    for name in (*of_scans, *also):
-        if getattr(settings, name) != defaults[name]:
+    of_scans = {own.name for own in fields(InputSettings)} - {*_OF_BOTH}
+    for name in changed_fields(settings):
+        if name in of_scans or name in also:
             raise UsageError(f"the input is {noun}, and {name_parameter(name)} is about a scan: leave it out")
 
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 from clrecon.reading import Selection
 from clrecon.system.arguments import name_parameter
-from clrecon.system.options import option
+from clrecon.system.options import numbers_reader, option, parse_numbers
 
 if TYPE_CHECKING:
     from clrecon.geometry.boxes import Box
@@ -33,38 +33,7 @@ PREPROCESS_FORMS = (
 """The forms of a step, for messages and help."""
 
 
-def _parse_clip_box(text: str) -> tuple[float, ...]:
-    """Read ``X0,X1,Y0,Y1,Z0,Z1`` in mm; an empty number leaves that side open."""
-    return _parse_box_numbers(
-        text, 6, "is no box: X0,X1,Y0,Y1,Z0,Z1 in mm, a side that stays open empty, such as ,,-50,20,,", ends=True
-    )
-
-
-def _parse_between(text: str) -> tuple[float, ...]:
-    return _parse_box_numbers(
-        text, 2, "are no two heights: Z0,Z1 in mm, one of them may be empty, such as -450,-400", ends=True
-    )
-
-
-def _parse_around(text: str) -> tuple[float, ...]:
-    return _parse_box_numbers(text, 4, "is no point and length: X,Y,Z,R in mm, such as 10,-124,-424,30", ends=False)
-
-
-def _parse_box_numbers(text: str, count: int, fault: str, *, ends: bool) -> tuple[float, ...]:
-    """Read so many numbers between commas, see `_parse_region_numbers`."""
-    values = _parse_region_numbers(text, ends=ends)
-    if values is None or len(values) != count:
-        raise ValueError(f"{text!r} {fault}")
-    return values
-
-
-def parse_point(text: str) -> tuple[float, ...]:
-    """Read ``X,Y,Z``, three numbers in mm."""
-    point = _parse_region_numbers(text, ends=False)
-    if point is None or len(point) != 3:
-        raise ValueError(f"{text!r} is no point: three numbers in mm with commas, X,Y,Z")
-    return point
-
+parse_point = numbers_reader(3, "is no point: three numbers in mm with commas, X,Y,Z")
 
 LEVELS_HELP = (
     "iso value in HU, inside is N and above; A:B is a range, inside is from A to B; several with commas make one mesh"
@@ -182,6 +151,13 @@ class ScanSettings(Selection):
     )
 
 
+def changed_fields(settings: InputSettings) -> list[str]:
+    """Return the names of the fields that are not their defaults; an empty list is as good as an empty tuple."""
+    values = [(own.name, getattr(settings, own.name), own.default) for own in fields(settings)]
+    empty = ((), [])
+    return [name for name, value, default in values if value != default and value not in empty]
+
+
 def label_map_option(**how: Any) -> Any:
     """Declare a field for the file of a label map."""
     return option(
@@ -257,13 +233,23 @@ class InputSettings(ScanSettings, DeviceSettings):
         "--clip-box X0,X1,Y0,Y1,Z0,Z1",
         "keep a box; a side that is left empty is open",
         group="crop",
-        parse=_parse_clip_box,
+        parse=numbers_reader(
+            6, "is no box: X0,X1,Y0,Y1,Z0,Z1 in mm, a side that stays open empty, such as ,,-50,20,,", ends=True
+        ),
     )
     between: Sequence[float] | None = option(
-        "--between Z0,Z1", "keep what lies between two heights", group="crop", parse=_parse_between
+        "--between Z0,Z1",
+        "keep what lies between two heights",
+        group="crop",
+        parse=numbers_reader(
+            2, "are no two heights: Z0,Z1 in mm, one of them may be empty, such as -450,-400", ends=True
+        ),
     )
     around: Sequence[float] | None = option(
-        "--around X,Y,Z,R", "keep a cube: R mm from a point to each side", group="crop", parse=_parse_around
+        "--around X,Y,Z,R",
+        "keep a cube: R mm from a point to each side",
+        group="crop",
+        parse=numbers_reader(4, "is no point and length: X,Y,Z,R in mm, such as 10,-124,-424,30"),
     )
     region: Sequence[str] | None = option(
         "--region RULE",
@@ -380,26 +366,12 @@ def _parse_region_rule(rule: str) -> RegionRule:
         is_known = bool(path)
     else:
         words, _, path = rest.partition(":") if kind == "tube" else (rest, "", "")
-        numbers = _parse_region_numbers(words, ends=kind in ("box", "hu"))
+        numbers = parse_numbers(words, ends=kind in ("box", "hu"))
         is_known = numbers is not None and len(numbers) == _REGION_NUMBERS.get(kind)
     if numbers is None or not is_known:
         raise UsageError(f"the region rule {rule!r:.200} is not known: the rules are {REGION_FORMS}")
     _check_region_numbers(rule, kind, numbers)
     return RegionRule(kind, numbers, path or None, name.strip() or None)
-
-
-def _parse_region_numbers(text: str, *, ends: bool) -> tuple[float, ...] | None:
-    """Read numbers between commas, None where one is none.  With `ends` an empty one is an open side: an infinite
-    number, downward and upward in turns.
-    """
-    words = [word.strip() for word in text.split(",")]
-    try:
-        return tuple(
-            math.copysign(math.inf, place % 2 - 0.5) if ends and not word else float(word)
-            for place, word in enumerate(words)
-        )
-    except ValueError:
-        return None
 
 
 def _check_region_numbers(rule: str, kind: str, numbers: tuple[float, ...]) -> None:

@@ -21,7 +21,7 @@ from clrecon.jobs.options import (
 )
 from clrecon.reading import Selection
 from clrecon.system.arguments import name_parameter
-from clrecon.system.options import option
+from clrecon.system.options import numbers_reader, option
 
 
 def check_space(space: str | None) -> None:
@@ -77,13 +77,6 @@ class ExportSettings(InputSettings):
         return bool(self.region) or self.preprocess is not None
 
 
-def _parse_percentiles(text: str) -> tuple[float, ...]:
-    try:
-        return tuple(float(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f"{text!r} are no percentiles: numbers with commas, 5,50,95") from None
-
-
 @dataclass(frozen=True, kw_only=True)
 class StatsSettings(ScanSettings):
     """Settings of the job of statistics.
@@ -99,7 +92,7 @@ class StatsSettings(ScanSettings):
     percentiles: Sequence[float] | None = option(
         "--percentiles P,P",
         "percentiles of HU, from 0 to 100 (default: 5,25,50,75,95)",
-        parse=_parse_percentiles,
+        parse=numbers_reader(None, "are no percentiles: numbers with commas, 5,50,95"),
         first=True,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import MISSING, field, fields
 from typing import Any, NamedTuple
@@ -61,3 +62,33 @@ def options_of(settings: type, group: str = "") -> Iterator[Option]:
         if declared == group:
             read = _READERS.get(str(own.type))
             yield Option(own.name, flag, how if read is None else {"type": read, **how})
+
+
+def parse_numbers(text: str, *, ends: bool = False) -> tuple[float, ...] | None:
+    """Read numbers with commas between them, None where one is none.
+
+    ends: An empty one is an open side: an infinite number, downward and upward in turns.
+    """
+    words = [word.strip() for word in text.split(",")]
+    try:
+        return tuple(
+            math.copysign(math.inf, place % 2 - 0.5) if ends and not word else float(word)
+            for place, word in enumerate(words)
+        )
+    except ValueError:
+        return None
+
+
+def numbers_reader(count: int | None, fault: str, *, ends: bool = False) -> Callable[[str], tuple[float, ...]]:
+    """Return what reads so many numbers, or any count of them, see `parse_numbers`.
+
+    fault: What a refusal says behind the text.
+    """
+
+    def read(text: str) -> tuple[float, ...]:
+        found = parse_numbers(text, ends=ends)
+        if found is None or count not in (None, len(found)):
+            raise ValueError(f"{text!r} {fault}")
+        return found
+
+    return read

@@ -11,7 +11,7 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 95_601,
+    "lines": 95_547,
     "modules": 416,
     "small_modules_with_one_reader": 12,
     "docstrings_with_raises": 124,

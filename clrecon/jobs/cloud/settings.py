@@ -12,7 +12,7 @@ from clrecon.errors import UsageError
 from clrecon.jobs.options import InputSettings, label_map_option, parse_point, space_option
 from clrecon.points import POINT_KINDS
 from clrecon.system.arguments import name_parameter
-from clrecon.system.options import option
+from clrecon.system.options import option, parse_numbers
 
 DENOISERS = ("grid", "bilateral")
 
@@ -65,13 +65,10 @@ class Clustering:
 
 def _parse_level(text: str) -> float | tuple[float, ...]:
     """Read ``N`` as an iso value, and ``LO,HI`` or ``LO:HI`` as a band of HU."""
-    try:
-        numbers = tuple(float(part) for part in text.replace(":", ",").split(","))
-    except ValueError:
-        numbers = ()
-    if len(numbers) not in (1, 2):
+    values = parse_numbers(text.replace(":", ","))
+    if values is None or len(values) > 2:
         raise ValueError(f"{text!r} is no iso value N and no band LO,HI of HU")
-    return numbers[0] if len(numbers) == 1 else numbers
+    return values[0] if len(values) == 1 else values
 
 
 def _parse_clusters(text: str) -> dict[str, Any]:

@@ -37,7 +37,7 @@ from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import ANTERIOR, DEFAULT_SIZE, DIRECTIONS, SLICES_VIEWS, checked_size
 from clrecon.rendering.views.reformation import PLANES, find_plane
 from clrecon.system.arguments import name_parameter
-from clrecon.system.options import option
+from clrecon.system.options import numbers_reader, option
 from clrecon.system.text import unknown_name
 
 DEFAULT_VIEWS = {"slice": "axial", "cpr": "left", "slices": SLICES_VIEWS[0]}
@@ -49,22 +49,6 @@ LIGHTS = ("head", "none")
 
 _CALLED = {"light": "lighting", "labels": "labels", "clip_planes": "clip"}
 """Settings that make a field of the style under another name: the name of the setting, and that of the field."""
-
-
-def parse_numbers(text: str, count: int, form: str) -> tuple[float, ...]:
-    """Read a fixed number of numbers with commas between them."""
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != count:
-        raise ValueError(f"{text!r} is not {form}")
-    return values
-
-
-def _parse_center(text: str) -> tuple[float, ...]:
-    """Read ``X,Y,Z`` in LPS mm."""
-    return parse_numbers(text, 3, "a place X,Y,Z in LPS mm, such as -12,40,310")
 
 
 def _parse_size(text: str) -> tuple[int, int]:
@@ -93,11 +77,12 @@ def _parse_views(text: str) -> tuple[str, ...]:
     return (",".join(parts),)
 
 
+_parse_vector = numbers_reader(3, "is not a side of the patient, nor a direction X,Y,Z in LPS")
+
+
 def parse_direction(text: str) -> str | tuple[float, ...]:
     """Read a name, or ``X,Y,Z``."""
-    return (
-        parse_numbers(text, 3, "a side of the patient, nor a direction X,Y,Z in LPS") if "," in text else text.lower()
-    )
+    return _parse_vector(text) if "," in text else text.lower()
 
 
 def _parse_label_opacity(text: str) -> tuple[str, float]:
@@ -240,7 +225,7 @@ class RenderSettings(InputSettings):
         "--center X,Y,Z",
         "LPS mm in the middle of the picture, of a slice too (default: the middle of what is shown)",
         group="camera",
-        parse=_parse_center,
+        parse=numbers_reader(3, "is not a place X,Y,Z in LPS mm, such as -12,40,310"),
     )
     size: tuple[int, int] | None = option(
         "--size W[xH]", "pixels of the picture (default: 1024x1024)", group="camera", parse=_parse_size, first=True

@@ -6,7 +6,7 @@ Settings of the job that shows are validated on construction; some of them mean 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ from clrecon.exchange.formats import MESH_INPUTS
 from clrecon.jobs.distance import read_side
 from clrecon.jobs.inputs import crop_labels, is_cloud_file, refuse_other_clouds
 from clrecon.jobs.mesh.labels import open_labels
-from clrecon.jobs.options import InputSettings
+from clrecon.jobs.options import InputSettings, changed_fields
 from clrecon.jobs.preprocess import mask_volume
 from clrecon.jobs.view import ViewSettings
 from clrecon.mesh import Mesh
@@ -39,12 +39,10 @@ def check_view_settings(settings: ViewSettings) -> None:
     """Refuse settings that a view has no meaning for, before anything is read."""
     scan = settings.scan
     ignored = {own.name for own in fields(InputSettings)} | _OF_A_VIEW
-    for own in fields(scan):
-        default = own.default if own.default_factory is MISSING else own.default_factory()
-        value = getattr(scan, own.name)
-        if own.name not in ignored and value != default and not (isinstance(value, Sequence) and not value):
+    for name in changed_fields(scan):
+        if name not in ignored:
             raise UsageError(
-                f"{name_parameter(own.name)} says how a mesh is made, and a view makes none: leave it out, or write a"
+                f"{name_parameter(name)} says how a mesh is made, and a view makes none: leave it out, or write a"
                 " page instead"
             )
     if isinstance(scan.iso_value, Sequence) and (len(scan.levels) != 1 or isinstance(scan.levels[0], tuple)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ from clrecon.jobs.distance import doubt_frames, read_side
 from clrecon.jobs.inputs import may_be_mesh
 from clrecon.jobs.mesh.bone import judge_surfaces
 from clrecon.jobs.mesh.make import make_parts
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.options import changed_fields
 from clrecon.jobs.outputs import commit_all
 from clrecon.jobs.run import JobReport, Run
 from clrecon.jobs.view import ViewSettings
@@ -101,11 +101,7 @@ def _check_inputs(inputs: Sequence[str | Path], output: str | Path, settings: Vi
     for path in inputs:
         if may_be_mesh(path) and not Path(path).is_file():
             raise UsageError(f"{escape_text(str(path), 200)}: there is no file of that name")
-    changed = [
-        own.name
-        for own in fields(MeshSettings)
-        if own.name not in _OF_THE_MACHINE and _is_set(getattr(settings.scan, own.name), own.default)
-    ]
+    changed = [name for name in changed_fields(settings.scan) if name not in _OF_THE_MACHINE]
     if changed and not scans:
         raise UsageError(
             f"{name_parameter(changed[0])} says what is made of a scan, and all inputs are mesh files: leave it out, or"
@@ -113,11 +109,6 @@ def _check_inputs(inputs: Sequence[str | Path], output: str | Path, settings: Vi
         )
     if settings.scan.labels is not None and len(scans) > 1:
         raise UsageError(f"a label map belongs to one scan, {len(scans)} are given")
-
-
-def _is_set(value: object, default: object) -> bool:
-    """True for a value that is not the default; an empty list is as good as an empty tuple."""
-    return value != default and not (isinstance(value, Sequence) and not value)
 
 
 def _read_input(path: str | Path, settings: ViewSettings, run: Run) -> _ShownInput:

@@ -8,19 +8,9 @@ from typing import Any, NamedTuple
 
 from clrecon.errors import UsageError
 from clrecon.system.arguments import name_parameter
-from clrecon.system.options import option
+from clrecon.system.options import numbers_reader, option
 
 LARGEST = 1e6
-
-
-def _parse_rescale(text: str) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != 2:
-        raise ValueError(f"{text!r} is no slope and intercept: SLOPE,INTERCEPT, such as 1,-1024")
-    return numbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +47,7 @@ class Selection:
         "--rescale SLOPE,INTERCEPT",
         "compute HU as SLOPE x stored value + INTERCEPT, regardless of the files, like 1,-1024",
         group="reading",
-        parse=_parse_rescale,
+        parse=numbers_reader(2, "is no slope and intercept: SLOPE,INTERCEPT, such as 1,-1024"),
     )
 
 
