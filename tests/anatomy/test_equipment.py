@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from beside_bodies import METAL_HU, PLASTIC_HU, RAIL_HU, X, Y, Z, as_scan, box, make_legs
+from variants import daily
 
 from clrecon.anatomy.body import remove_table
 from clrecon.errors import RefusedInputError
@@ -20,7 +21,7 @@ EQUIPMENT = {
 }
 
 
-@pytest.mark.parametrize("name", EQUIPMENT)
+@pytest.mark.parametrize("name", daily(2, EQUIPMENT))
 def test_hard_equipment_is_removed_and_is_no_bone(name):
     hu, bone = make_legs()
     bar, metal = EQUIPMENT[name]

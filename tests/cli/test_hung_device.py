@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from ct_files import write_series
 from hung_kernels import start_command
+from variants import daily_rows
 
 
 def command_line(command: str, device, tmp_path: Path) -> tuple[str, ...]:
@@ -22,7 +23,7 @@ def command_line(command: str, device, tmp_path: Path) -> tuple[str, ...]:
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 @pytest.mark.parametrize(
     ("command", "kernel", "number"),
-    [("mesh", "emit_vertices", signal.SIGINT), ("render", "composite_rays", signal.SIGTERM)],
+    daily_rows(1, [("mesh", "emit_vertices", signal.SIGINT), ("render", "composite_rays", signal.SIGTERM)]),
 )
 def test_row_56_a_signal_ends_a_command_whose_kernel_hangs(device, tmp_path, command, kernel, number):
     process = start_command(kernel, *command_line(command, device, tmp_path))
@@ -38,7 +39,9 @@ def test_row_56_a_signal_ends_a_command_whose_kernel_hangs(device, tmp_path, com
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("command", "kernel"), [("mesh", "emit_triangles"), ("render", "composite_rays")])
+@pytest.mark.parametrize(
+    ("command", "kernel"), daily_rows(1, [("mesh", "emit_triangles"), ("render", "composite_rays")])
+)
 def test_row_56_the_time_limit_ends_a_command_whose_kernel_hangs(device, tmp_path, command, kernel):
     process = start_command(kernel, *command_line(command, device, tmp_path), "--timeout", "1")
     assert process.stderr is not None

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from variants import daily
 
 from clrecon.cli.main import main
 from clrecon.jobs.mesh.settings import METHOD_NAMES
@@ -69,7 +70,7 @@ def test_points_and_labels_choose_one(bones: Path, tmp_path: Path, device: Any) 
     assert by_point["components"] == 1 and by_point["cells"] == by_label["cells"]
 
 
-@pytest.mark.parametrize("method", ["t-mc-soup", "skimage", "s-mc", "g-mc"])
+@pytest.mark.parametrize("method", daily(2, ["t-mc-soup", "skimage", "s-mc", "g-mc"]))
 def test_other_methods_write_the_mesh(method: str, bones: Path, tmp_path: Path, device: Any) -> None:
     if method == "skimage":
         pytest.importorskip("skimage")

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from variants import daily
 
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
@@ -65,7 +66,7 @@ def made(target: Path) -> tuple[str, Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("extension", [".stl", ".vtp"])
+@pytest.mark.parametrize("extension", daily(1, [".stl", ".vtp"]))
 def test_rows_60_and_72_every_run_writes_the_same_bytes(device, ct: Path, tmp_path: Path, extension: str) -> None:
     plain, odd = make_targets(tmp_path, extension)
     finish(start(ct, plain, device))

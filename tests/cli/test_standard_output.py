@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import pytest
+from variants import daily_rows
 
 from clrecon.cli import console
 from clrecon.cli.main import main
@@ -25,7 +26,9 @@ def run(*arguments: object) -> int:
     return main([str(argument) for argument in arguments])
 
 
-@pytest.mark.parametrize(("name", "start"), [("-", None), ("-.ply", b"ply\n"), ("-.glb", b"glTF"), ("-.3mf", b"PK")])
+@pytest.mark.parametrize(
+    ("name", "start"), daily_rows(2, [("-", None), ("-.ply", b"ply\n"), ("-.glb", b"glTF"), ("-.3mf", b"PK")])
+)
 def test_a_mesh_goes_to_standard_output_as_the_file_has_it(device, ct, tmp_path, capfdbinary, name, start):
     common = ("mesh", ct, "--hu", 200, "--device", device.index)
     extension = ".stl" if name == "-" else name[1:]
@@ -107,16 +110,19 @@ def spine(tmp_path_factory):
 
 @pytest.mark.parametrize(
     ("arguments", "entry"),
-    [
-        (("stats", "{ct}", "--labels", "{ct}/levels.nrrd"), "labels"),
-        (("inside", "{ct}", "-o", "{out}.stl", "--labels", "{ct}/levels.nrrd", "--label", "L3"), "vertebrae"),
-        (("corridor", "{ct}", "--labels", "{ct}/levels.nrrd", "--label", "L3"), "vertebrae"),
-        (("vertebrae", "{ct}", "-o", "{out}.nii.gz"), "vertebrae"),
-        (("cloud", "{ct}", "-o", "{out}.ply", "--hu", "200"), "points"),
-        (("export", "{ct}", "-o", "{out}.nii.gz"), "volume"),
-        (("render", "{ct}", "-o", "{out}.png", "--size", "40"), "pictures"),
-        (("distance", "{out}_a.stl", "{out}_a.stl"), "hausdorff_mm"),
-    ],
+    daily_rows(
+        4,
+        [
+            (("stats", "{ct}", "--labels", "{ct}/levels.nrrd"), "labels"),
+            (("inside", "{ct}", "-o", "{out}.stl", "--labels", "{ct}/levels.nrrd", "--label", "L3"), "vertebrae"),
+            (("corridor", "{ct}", "--labels", "{ct}/levels.nrrd", "--label", "L3"), "vertebrae"),
+            (("vertebrae", "{ct}", "-o", "{out}.nii.gz"), "vertebrae"),
+            (("cloud", "{ct}", "-o", "{out}.ply", "--hu", "200"), "points"),
+            (("export", "{ct}", "-o", "{out}.nii.gz"), "volume"),
+            (("render", "{ct}", "-o", "{out}.png", "--size", "40"), "pictures"),
+            (("distance", "{out}_a.stl", "{out}_a.stl"), "hausdorff_mm"),
+        ],
+    ),
 )
 def test_the_report_of_each_command(device, spine, tmp_path, capsys, monkeypatch, arguments, entry):
     monkeypatch.setenv("CLRECON_DEVICE", str(device.index))

@@ -229,6 +229,7 @@ def test_two_fingers_zoom_and_move(page):
     assert page.execute_script(project) == pytest.approx(2.0 * before, rel=0.1)
 
 
+@pytest.mark.release
 def test_a_page_whose_surface_is_harmed_says_so(browser, path, tmp_path):
     """The browser logs the error, and the page says it in words."""
     text = path.read_text(encoding="utf-8")

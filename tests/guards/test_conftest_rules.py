@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import conftest
 import pytest
 from house import ROOT
+from variants import daily_rows
 
 POCL = SimpleNamespace(platform="Portable Computing Language", version="OpenCL 3.0 PoCL", driver="3.1")
 RUSTICL = SimpleNamespace(platform="rusticl", version="OpenCL 3.0", driver="22.3")
@@ -99,6 +100,7 @@ def test_marked(three):
 WORKERS = ["-p", "xdist", "-n", "2", "--dist", "loadfile"]
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     ("options", "parameters", "mark", "lines", "branches"),
     [
@@ -174,13 +176,16 @@ def test_release():
 
 @pytest.mark.parametrize(
     ("variables", "passed"),
-    [
-        ({}, "6 passed, 1 deselected"),  # one parameter and what a simulator watches on both, the rest on the first
-        ({"CLRECON_TEST_EVERY_DEVICE": "1"}, "1 failed, 7 passed, 1 deselected"),
-        ({"CLRECON_RELEASE_TESTS": "1"}, "7 passed"),
-        ({"CLRECON_FAST_TESTS": "1"}, "3 passed, 5 deselected"),
-        ({"CLRECON_TEST_DEVICE": "0"}, "4 passed"),  # the 0 in the name of the other is no index
-    ],
+    daily_rows(
+        2,
+        [
+            ({}, "6 passed, 1 deselected"),  # one parameter and what a simulator watches on both, the rest on the first
+            ({"CLRECON_TEST_EVERY_DEVICE": "1"}, "1 failed, 7 passed, 1 deselected"),
+            ({"CLRECON_RELEASE_TESTS": "1"}, "7 passed"),
+            ({"CLRECON_FAST_TESTS": "1"}, "3 passed, 5 deselected"),
+            ({"CLRECON_TEST_DEVICE": "0"}, "4 passed"),  # the 0 in the name of the other is no index
+        ],
+    ),
 )
 def test_what_is_for_every_device_runs_on_every_device(tmp_path: Path, variables: dict[str, str], passed: str) -> None:
     done = run_pytest(tmp_path, TWO_DEVICES, **variables)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from variants import daily
 
 import clrecon
 from clrecon.geometry import Volume
@@ -200,7 +201,7 @@ def test_labels(own: bool, device: Any, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["a.apng", "a.gif", "a.mp4", "frames"])
+@pytest.mark.parametrize("name", daily(2, ["a.apng", "a.gif", "a.mp4", "frames"]))
 def test_a_turntable(name: str, scan: Path, device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = RenderSettings.of(
         "mip", size=(32, 32), turntable=Turntable(frames=4), background="black", device=str(device.index)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import tolerances
 from made_once import make_once
+from variants import daily_rows
 
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
@@ -88,7 +89,7 @@ def run_in(folder: Path, *arguments: object) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("made", "bar"), [("whole", tolerances.CORRIDOR_HALF_MM), ("plain", tolerances.CORRIDOR_226_MM)]
+    ("made", "bar"), daily_rows(1, [("whole", tolerances.CORRIDOR_HALF_MM), ("plain", tolerances.CORRIDOR_226_MM)])
 )
 def test_the_line_keeps_its_distance_in_the_truth(
     device: Any, request: pytest.FixtureRequest, made: str, bar: float

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from odd_bodies import BODIES, OddBodies, OddBody
-from variants import but_seldom, daily
+from variants import but_seldom, daily, daily_rows
 
 from clrecon.cli.mesh import describe_purposes
 from clrecon.errors import ClreconError, NoSurfaceError, RefusedInputError
@@ -90,7 +90,7 @@ def test_water_without_its_table_has_no_surface_at_the_level_of_bone(
     assert share_near(odd["water"], vertices, "water") > 0.7
 
 
-@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("name", daily(4, BODIES))
 def test_a_circle_says_what_it_cuts(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     body = odd[name]
     report, vertices = mesh_of(odd, device, tmp_path, name, iso_value=-300.0, field_of_view=60.0)
@@ -103,7 +103,7 @@ def test_a_circle_says_what_it_cuts(odd: OddBodies, device: Any, tmp_path: Path,
         assert cuts and facts["bone_kept"] < 0.98
 
 
-@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("name", daily(5, BODIES))
 def test_a_level_that_the_scan_gives_fits_its_bone_or_is_refused(
     odd: OddBodies, device: Any, tmp_path: Path, name: str
 ) -> None:
@@ -124,7 +124,7 @@ def test_a_level_that_the_scan_gives_fits_its_bone_or_is_refused(
         assert share_near(body, vertices, "bone", "metal", "table") > 0.9
 
 
-@pytest.mark.parametrize("name", BONY)
+@pytest.mark.parametrize("name", daily(3, BONY))
 def test_the_largest_piece_is_of_the_body(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     body = odd[name]
     report, vertices = mesh_of(odd, device, tmp_path, name, iso_value=300.0, remove_table=True, keep_largest=1)
@@ -132,7 +132,7 @@ def test_the_largest_piece_is_of_the_body(odd: OddBodies, device: Any, tmp_path:
     assert share_near(body, vertices, "bone", "metal", "contrast") > 0.9
 
 
-@pytest.mark.parametrize("name", BONY)
+@pytest.mark.parametrize("name", daily(3, BONY))
 def test_a_seed_in_bone_keeps_bone(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     body = odd[name]
     dense = np.argwhere(body.of("bone") & (body.volume.voxels > 500))
@@ -143,7 +143,7 @@ def test_a_seed_in_bone_keeps_bone(odd: OddBodies, device: Any, tmp_path: Path, 
     assert nearest < 10.0 and share_near(body, vertices, "bone", "metal", "table") > 0.9
 
 
-@pytest.mark.parametrize("name", SPINELESS)
+@pytest.mark.parametrize("name", daily(4, SPINELESS))
 def test_no_spine_is_found_where_there_is_none(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     settings = RenderSettings.of(curve="auto", device=str(device.index), size=(40, 40))
     with pytest.raises(RefusedInputError, match="spine|canal"):
@@ -158,7 +158,7 @@ def test_a_trunk_has_a_spine(odd: OddBodies, device: Any, tmp_path: Path) -> Non
     assert picture["curve"] and (tmp_path / "spine.png").stat().st_size > 200
 
 
-@pytest.mark.parametrize("name", BONY)
+@pytest.mark.parametrize("name", daily(3, BONY))
 def test_pictures_say_what_was_left_out(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     settings = RenderSettings.of(preset="bone", remove_table=True, device=str(device.index), size=(48, 40))
     report = make_pictures(odd.series(name), PictureFiles(picture=str(tmp_path / "bone.png")), settings)
@@ -182,8 +182,8 @@ def test_what_holds_no_bone_says_so_once(odd: OddBodies, device: Any, tmp_path: 
 
 @pytest.mark.parametrize(
     ("name", "least"),  # walls of cavities are pieces of their own, and loose pieces of dry bone go
-    [("skull", 0.9), ("skull-prone", 0.9), ("head", 0.95), ("bones", 0.7), ("limb", 0.95), ("pair", 0.95),
-     ("pelvis", 0.95)],
+    daily_rows(3, [("skull", 0.9), ("skull-prone", 0.9), ("head", 0.95), ("bones", 0.7), ("limb", 0.95), ("pair", 0.95),
+     ("pelvis", 0.95)]),
 )  # fmt: skip
 def test_bone_is_kept_and_no_alarm_is_false(
     odd: OddBodies, device: Any, tmp_path: Path, name: str, least: float
@@ -209,13 +209,16 @@ def test_contrast_medium_goes_where_bone_is_kept(odd: OddBodies, device: Any, tm
 
 @pytest.mark.parametrize(
     ("name", "kept_ml"),
-    [
-        ("skull", (1000.0, 1600.0)),  # the hollow of the brain
-        ("skull-prone", (1000.0, 1600.0)),
-        ("head", (20.0, 400.0)),
-        ("bones", (5.0, 40.0)),
-        ("contrast", (200.0, 6000.0)),
-    ],
+    daily_rows(
+        2,
+        [
+            ("skull", (1000.0, 1600.0)),  # the hollow of the brain
+            ("skull-prone", (1000.0, 1600.0)),
+            ("head", (20.0, 400.0)),
+            ("bones", (5.0, 40.0)),
+            ("contrast", (200.0, 6000.0)),
+        ],
+    ),
 )
 def test_air_within_a_body_is_told_from_the_air_around_it(
     odd: OddBodies, device: Any, tmp_path: Path, name: str, kept_ml: tuple[float, float]

@@ -46,6 +46,7 @@ def enclosed_ml(points: np.ndarray, faces: np.ndarray) -> float:
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6000.0)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(("folder", "origin", "spacing"), SERIES, ids=["lumbar_4p25mm", "thoracic_0p8mm"])
 def test_real_series_mesh_like_vtk_in_the_true_place(real_data, device, tmp_path, folder, origin, spacing):
     trimesh = pytest.importorskip("trimesh")

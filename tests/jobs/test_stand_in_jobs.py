@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from ct_files import write_series
 from failing_devices import Failing, lost_error, pretended_gpu
+from variants import daily
 
 from clrecon.cli.main import main
 
@@ -30,7 +31,7 @@ def gpu(device, monkeypatch):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize("first", [1, 2])
+@pytest.mark.parametrize("first", daily(1, [1, 2]))
 def test_row_54_a_job_goes_on_on_the_cpu_device(device, gpu, tmp_path, capsys, monkeypatch, command, first):
     output, options = COMMANDS[command]
     write_series(tmp_path / "ct")
@@ -49,7 +50,7 @@ def test_row_54_a_job_goes_on_on_the_cpu_device(device, gpu, tmp_path, capsys, m
     assert (tmp_path / output).read_bytes() == (tmp_path / "alone" / output).read_bytes()
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", daily(1, COMMANDS))
 def test_row_54_a_named_device_fails_with_the_number_of_the_cpu_device(
     device, gpu, tmp_path, capsys, monkeypatch, command
 ):

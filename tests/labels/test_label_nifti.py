@@ -210,6 +210,7 @@ def test_without_nibabel_the_command_is_named(tmp_path, monkeypatch):
         read_labels(path)
 
 
+@pytest.mark.release
 def test_real_labels_lie_on_their_ct(real_data):
     from clrecon.labels import resample_labels
     from clrecon.reading import read_volume

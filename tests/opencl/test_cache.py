@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from made_once import make_once
+from variants import FOR_RELEASE, daily, daily_rows
 
 from clrecon.errors import DeviceError
 from clrecon.opencl import cache, quirks
@@ -44,7 +45,7 @@ def environment_of(tmp_path, **variables):
     [
         ({"HOME": "/proc/nowhere"}, "~/.cache cannot be written"),
         *(
-            pytest.param(variables, fault, marks=pytest.mark.first_device)  # what is wrong is found without a device
+            pytest.param(variables, fault, marks=[pytest.mark.first_device, FOR_RELEASE])  # found without a device
             for variables, fault in (
                 ({"HOME": "/dev/null", "XDG_CACHE_HOME": "relative"}, "XDG_CACHE_HOME is no absolute path"),
                 ({"POCL_CACHE_DIR": "/proc/nowhere"}, "POCL_CACHE_DIR cannot be written"),
@@ -65,7 +66,7 @@ def test_row_59_no_place_for_built_kernels(device, variables, fault, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("command", ["devices", "render", "mesh"])
+@pytest.mark.parametrize("command", daily(2, ["devices", "render", "mesh"]))
 def test_row_59_every_command_with_a_device_warns_once(command, device, tmp_path, phantom_folder):
     """The folder of pickles is refused; kernels are found as ever, so that nothing is built for this test."""
     spoil(tmp_path / "home" / "pytools", "others")
@@ -254,7 +255,9 @@ def test_row_59_no_room_anywhere_is_an_error(fresh, monkeypatch):
         refuse_short_files()
 
 
-@pytest.mark.parametrize("limit, says", [("-f 100", "files may have 0.10 MB here"), ("-v 500000", "want of memory")])
+@pytest.mark.parametrize(
+    "limit, says", daily_rows(1, [("-f 100", "files may have 0.10 MB here"), ("-v 500000", "want of memory")])
+)
 def test_row_59_limits_of_the_process_are_named(limit, says, device, tmp_path):
     command = ["bash", "-c", f'ulimit {limit}; exec "$@"', "bash", sys.executable, "-c", CODE, str(device.index)]
     done = subprocess.run(command, env=environment_of(tmp_path), capture_output=True, text=True)
@@ -280,7 +283,9 @@ def test_a_folder_that_a_driver_still_writes_to_is_removed(tmp_path):
     assert len(removed) == 3 and not folder.exists()
 
 
-@pytest.mark.parametrize(("told", "says"), [("", ""), (" ", ""), ("1", ""), ("maybe", "PYOPENCL_NO_CACHE is 'maybe'")])
+@pytest.mark.parametrize(
+    ("told", "says"), daily_rows(2, [("", ""), (" ", ""), ("1", ""), ("maybe", "PYOPENCL_NO_CACHE is 'maybe'")])
+)
 def test_the_switch_of_pyopencl_for_its_cache(told, says, tmp_path):
     code = "from clrecon.opencl.quirks import import_pyopencl; import_pyopencl()"
     environment = environment_of(tmp_path, PYOPENCL_NO_CACHE=told)

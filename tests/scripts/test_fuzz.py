@@ -21,11 +21,12 @@ import pytest
 import slices
 from fuzz import Campaign, Case, NamedCases, Schedule, run_campaign
 from trials import FAULTS, MEMORY_LIMIT_BYTES, Answer, Judge, Outcome, Trial, WrongOutcome
+from variants import daily_rows
 
 from clrecon.errors import RefusedInputError
 
 CASES = {
-    "values": 16, "bytes": 12, "ends": 4, "volumes": 6, "labels": 4, "clouds": 6, "options": 9, "environment": 1,
+    "values": 8, "bytes": 6, "ends": 2, "volumes": 3, "labels": 2, "clouds": 3, "options": 4, "environment": 1,
 }  # fmt: skip
 """The first cases of each family, about as the time of a campaign is shared."""
 UNHARMED = Answer({"voxels": "a"}, ("known",))
@@ -104,12 +105,15 @@ def test_time_on_a_busy_machine_is_no_fault() -> None:
 
 @pytest.mark.parametrize(
     ("program", "kind", "words"),
-    [
-        ("import os; os.abort()", "crash", "SIGABRT"),
-        ("raise SystemExit('no such thing')", "crash", "no such thing"),
-        ("import time; time.sleep(60)", "hang", "no answer in 1 s"),
-        ("while True: pass", "hang", "over 1 s of processor time"),
-    ],
+    daily_rows(
+        2,
+        [
+            ("import os; os.abort()", "crash", "SIGABRT"),
+            ("raise SystemExit('no such thing')", "crash", "no such thing"),
+            ("import time; time.sleep(60)", "hang", "no answer in 1 s"),
+            ("while True: pass", "hang", "over 1 s of processor time"),
+        ],
+    ),
 )
 def test_a_worker_that_dies_or_hangs_is_a_fault(tmp_path, monkeypatch, program, kind, words) -> None:
     (tmp_path / "worker.py").write_text(program)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tolerances
 from box_vertebra import BODY_HALF, CANAL_Y, HALF_HU, PLATE_HALF, PLATE_Y, BoxVertebra, grid_around, turned
+from variants import daily
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.labels import LabelMap
@@ -33,7 +34,7 @@ POSES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", POSES)
+@pytest.mark.parametrize("name", daily(2, POSES))
 def test_the_cylinder_is_the_corridor(name: str) -> None:
     vertebra, options = POSES[name]
     off_mm = tolerances.CORRIDOR_RADIUS_MM * (2.0 if name == "thick slices" else 1.0)
@@ -168,6 +169,7 @@ def test_the_largest_screw_keeps_the_margin(radius: float, margin: float, diamet
     assert screw_diameter(radius, margin) == pytest.approx(diameter)
 
 
+@pytest.mark.release
 def test_a_label_map_by_name_gives_the_same() -> None:
     vertebra = BoxVertebra()
     volume, labels = vertebra.scan(*grid_around(vertebra))

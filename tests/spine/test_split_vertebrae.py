@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from variants import daily_rows
 
 import clrecon
 from clrecon.errors import RefusedInputError, UsageError
@@ -51,7 +52,7 @@ def shares(labels: np.ndarray, truth: np.ndarray, names: dict[int, str]) -> dict
 CASES = [("T12-L3", {}), ("L1-L4", {"tilt": 12.0, "oblique": (5.0, -8.0, 4.0)}), ("T9-T12", {"scoliosis_deg": 20.0})]
 
 
-@pytest.mark.parametrize(("levels", "choice"), CASES, ids=["straight", "tilted", "scoliosis"])
+@pytest.mark.parametrize(("levels", "choice"), daily_rows(1, CASES), ids=["straight", "tilted", "scoliosis"])
 def test_all_levels_with_touching_facets_are_told_apart(levels: str, choice: dict[str, Any]) -> None:
     _, truth, names = phantom(levels, **choice)
     result = split(levels, **choice)
@@ -174,12 +175,15 @@ def test_vertebrae_of_low_confidence_are_kept_only_on_request(monkeypatch: pytes
 
 @pytest.mark.parametrize(
     ("levels", "choice", "least"),
-    [
-        ("C1-T1", {"size": (140, 140), "spacing": (1.6, 1.6, 2.0)}, 0.7),
-        ("C3-T2", {"size": (140, 140), "spacing": (1.6, 1.6, 2.5), "tilt": 15.0}, 0.7),
-        ("T1-T12", {"size": (150, 150), "spacing": (2.4, 2.4, 2.4)}, 0.7),
-        pytest.param("C1-L5", {"size": (150, 150), "spacing": (2.4, 2.4, 2.5)}, 0.65, marks=pytest.mark.slow),
-    ],
+    daily_rows(
+        1,
+        [
+            ("C1-T1", {"size": (140, 140), "spacing": (1.6, 1.6, 2.0)}, 0.7),
+            ("C3-T2", {"size": (140, 140), "spacing": (1.6, 1.6, 2.5), "tilt": 15.0}, 0.7),
+            ("T1-T12", {"size": (150, 150), "spacing": (2.4, 2.4, 2.4)}, 0.7),
+            ("C1-L5", {"size": (150, 150), "spacing": (2.4, 2.4, 2.5)}, 0.65),
+        ],
+    ),
     ids=["neck", "tilted neck", "chest with ribs", "whole spine"],
 )
 def test_all_levels_are_found_and_confidence_is_near_the_overlap_with_the_truth(
@@ -202,6 +206,7 @@ def test_all_levels_are_found_and_confidence_is_near_the_overlap_with_the_truth(
     assert min(dice) >= least and off.mean() <= 0.08 and off.max() <= 0.2, (dice, off)
 
 
+@pytest.mark.release
 def test_a_kyphotic_upper_chest_is_never_wrong_without_a_word() -> None:
     _, truth, names = phantom("C7-T6", kyphosis_deg=60.0)
     result = split("C7-T6", kyphosis_deg=60.0)

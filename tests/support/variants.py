@@ -26,6 +26,11 @@ def daily(number: int, values: Iterable[Any]) -> list[Any]:
     return [value if place < number else pytest.param(value, marks=FOR_RELEASE) for place, value in enumerate(values)]
 
 
+def daily_rows(number: int, rows: Iterable[Any]) -> list[Any]:
+    """Rows of several parameters of which the first `number` run every day, and the others for a release."""
+    return [row if place < number else pytest.param(*row, marks=FOR_RELEASE) for place, row in enumerate(rows)]
+
+
 def but_seldom(values: Iterable[Any], seldom: Container[Any]) -> list[Any]:
     """Values of one parameter; those of `seldom` are for a release."""
     return [pytest.param(value, marks=FOR_RELEASE) if value in seldom else value for value in values]

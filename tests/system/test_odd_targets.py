@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from variants import daily
 
 from clrecon.errors import OutputError
 from clrecon.system.paths import resolve_target
@@ -24,14 +25,17 @@ sys.exit(main(sys.argv[1:]))
 
 @pytest.mark.parametrize(
     "command",
-    [
-        "mesh ../ct -o a.stl",
-        "render ../ct -o a.png",
-        "render ../ct --turntable a",
-        "phantom a",
-        "demo a",
-        "bench --report a",
-    ],
+    daily(
+        2,
+        [
+            "mesh ../ct -o a.stl",
+            "render ../ct -o a.png",
+            "render ../ct --turntable a",
+            "phantom a",
+            "demo a",
+            "bench --report a",
+        ],
+    ),
 )
 def test_a_deleted_current_folder(command: str, tmp_path: Path) -> None:
     call = [sys.executable, "-c", IN_A_DELETED_FOLDER, *command.split()]

@@ -51,6 +51,7 @@ def test_it_runs_and_shows_what_the_kept_one_shows(device):
     assert os.path.getsize(NOTEBOOK) < 2_000_000
 
 
+@pytest.mark.release
 def test_its_page_is_drawn_in_what_nbconvert_writes(tmp_path):
     nbconvert = pytest.importorskip("nbconvert")
     text, _ = nbconvert.HTMLExporter().from_filename(str(NOTEBOOK))

@@ -64,6 +64,7 @@ def test_a_session_at_the_window(display, scan, tmp_path):
     assert (code, said, "Traceback" in complained) == (0, "", False)
 
 
+@pytest.mark.release
 def test_a_distance_is_measured_between_two_clicks(display, tmp_path):
     make_mesh().save(tmp_path / "ball.stl")
     with open_view(display, ["ball.stl", "--window"], tmp_path) as window:

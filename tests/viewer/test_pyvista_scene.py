@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import tolerances
 from drawn_balls import CAMERAS, CENTRE, RADIUS, need_off_screen
+from variants import daily
 
 from clrecon.errors import UsageError
 from clrecon.rendering import Rendering
@@ -35,7 +36,7 @@ def ball(camera: Camera, center=CENTRE, radius=RADIUS, color=(250, 40, 10)) -> R
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("form", ["points", "plane"])
+@pytest.mark.parametrize("form", daily(1, ["points", "plane"]))
 def test_seen_by_its_own_camera_a_picture_in_a_scene_is_the_picture(plotter, camera, form):
     made = ball(camera)
     made.image[..., 1] = np.arange(SIZE[1], dtype=np.uint8)[:, None]

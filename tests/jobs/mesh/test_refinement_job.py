@@ -157,6 +157,7 @@ def test_impossible_settings(options: dict[str, Any], complaint: str) -> None:
         MeshSettings(**options)
 
 
+@pytest.mark.release
 @pytest.mark.slow
 @pytest.mark.parametrize("folder", daily(1, ["thoracolumbar_labels/ct_2mm_jpeg2000", "lumbar_4p25mm"]))
 def test_real_surfaces_keep_every_gate(real_data: Path, device: Any, tmp_path: Path, folder: str) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from odd_bodies import BODIES, OddBodies
 from scipy import ndimage
-from variants import but_seldom
+from variants import but_seldom, daily
 
 from clrecon.anatomy.body import remove_table
 from clrecon.geometry import Volume
@@ -58,7 +58,7 @@ def check_area(volume: Volume, picture: Rendering, mask: np.ndarray, alike: floa
     assert len(k) * picture.pixel_mm**2 / 100.0 == pytest.approx(area_cm2(volume, mask), rel=alike)
 
 
-@pytest.mark.parametrize("name", but_seldom(BODIES, BODIES.keys() - EVERY_DAY))
+@pytest.mark.parametrize("name", daily(2, but_seldom(BODIES, BODIES.keys() - EVERY_DAY)))
 def test_each_preset_shows_what_it_is_for(odd: OddBodies, device: Any, name: str) -> None:
     body = odd[name]
     own = ("table",) if name == "empty" else ("tissue", "bone", "contrast", "metal", "water")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from variants import daily_rows
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
@@ -101,7 +102,9 @@ def test_walls_are_looked_for_along_normals():
         normals_of(Mesh(vertices, triangles))
 
 
-@pytest.mark.parametrize(("kind", "kept_before"), [("spine", 0.31), ("contrast", 0.21), ("pelvis", 0.54)])
+@pytest.mark.parametrize(
+    ("kind", "kept_before"), daily_rows(1, [("spine", 0.31), ("contrast", 0.21), ("pelvis", 0.54)])
+)
 def test_coarse_voxels_are_no_contrast_medium(kind, kept_before):
     """In voxels of 4 mm all is even from 1.5 to 4 mm: `kept_before` of the bone counted as contrast medium."""
     dj, _, dk = KINDS[kind].spacing

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from made_once import make_once
 from pydicom import dcmread
+from variants import daily
 
 import clrecon
 from clrecon.errors import UsageError
@@ -93,7 +94,7 @@ def find_in(voxels: np.ndarray):
     return judge_slices(twin.count_overlaps(voxels >= 200), 120 * 120, (200.0, np.inf))
 
 
-@pytest.mark.parametrize("slices", [24, 30, 40])
+@pytest.mark.parametrize("slices", daily(1, [24, 30, 40]))
 def test_discs_between_vertebrae_are_no_ghosts(slices):
     """They are unlike both neighbours, which are alike, but lie within one of them."""
     found = find_in(thick_slices(slices=slices))
@@ -102,7 +103,7 @@ def test_discs_between_vertebrae_are_no_ghosts(slices):
     assert found.slices == () and found.as_dict()["within_share"] == 0.45
 
 
-@pytest.mark.parametrize("at", [1, 4, 12, 17, 28])
+@pytest.mark.parametrize("at", daily(2, [1, 4, 12, 17, 28]))
 def test_a_slice_of_another_scan_is_found_among_thick_slices(at):
     voxels = thick_slices()
     voxels[at] = thick_slices("skull")[15]
@@ -164,6 +165,7 @@ def test_points_of_ghosts_are_dropped():
         fill_ghost_slices(Volume(rods(3), np.eye(4)), found)
 
 
+@pytest.mark.release
 @pytest.mark.first_device
 @pytest.mark.parametrize("hu", [200, -300])
 def test_no_false_alarm_on_real_scans(device, real_data, hu):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from surface_volumes import OBLIQUE
 from uneven_volume import uneven
-from variants import VOXEL_TYPES, daily
+from variants import VOXEL_TYPES, daily, daily_rows
 
 import clrecon
 from clrecon.errors import DeviceError, DeviceMemoryError, NoSurfaceError, UsageError
@@ -156,7 +156,7 @@ def voxel_cloud(volume: Volume) -> PointCloud:
     return PointCloud(volume.ijk_to_lps(ijk), ijk=ijk, report=report)
 
 
-@pytest.mark.parametrize(("eps", "samples"), [(1.2, 6), (0.85, 1), (1.6, 20)])
+@pytest.mark.parametrize(("eps", "samples"), daily_rows(1, [(1.2, 6), (0.85, 1), (1.6, 20)]))
 def test_scikit_learn_says_the_same(device, eps, samples):
     sklearn = pytest.importorskip("sklearn.cluster")
     volume = Volume(noise((10, 30, 40), 0.25), np.diag((0.644531, 0.644531, 0.8, 1.0)))
@@ -386,6 +386,7 @@ def test_work_of_hours_is_refused(device):
         cluster_points(volume, 10.0, hu=(1, 1), device=device)
 
 
+@pytest.mark.release
 @pytest.mark.first_device
 def test_real_ct_equals_scikit_learn(device, real_data):
     sklearn = pytest.importorskip("sklearn.cluster")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from variants import daily
 
 import clrecon
 from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
@@ -113,7 +114,7 @@ def test_sheets_of_one_cell_stay_apart(device):
 
 
 @pytest.mark.every_device
-@pytest.mark.parametrize("group", [1, 16])
+@pytest.mark.parametrize("group", daily(1, [1, 16]))
 def test_devices_with_small_work_groups_get_the_same(device, group, monkeypatch):
     monkeypatch.setattr(device, "max_work_group_size", group)
     check_equal(device, soup(500, 200), 500)
@@ -154,6 +155,7 @@ def test_too_little_memory_is_said_before_it_is_taken(device, monkeypatch):
         label_components(device, soup(1000, 10), 1000, memory=15_000)
 
 
+@pytest.mark.release
 def test_real_ct_equals_scipy(device, real_data):
     volume = clrecon.read_volume(real_data / "thoracic_0p8mm")
     mesh = clrecon.extract_isosurface(volume, 226, device=device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from variants import daily
 
 from clrecon.errors import UsageError
 from clrecon.opencl import download, upload
@@ -64,7 +65,7 @@ def test_several_small_chunks(device, form, monkeypatch):
     check_sorted(device, np.random.default_rng(6).integers(0, 2**13, 633, dtype=np.uint32), 13)
 
 
-@pytest.mark.parametrize("group", [1, 16])
+@pytest.mark.parametrize("group", daily(1, [1, 16]))
 def test_devices_with_small_work_groups(device, form, group, monkeypatch):
     monkeypatch.setattr(device, "max_work_group_size", group)
     check_sorted(device, np.random.default_rng(group).integers(0, 500, 5000, dtype=np.uint32), 9)

@@ -29,7 +29,7 @@ from clrecon.rendering import UNSHADED, Lighting, TransferFunction
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 
-SIZE = (64, 48)
+SIZE = (48, 36)
 STEEP = TransferFunction([(-200, 0.8, 0.1, 0.1, 0), (100, 1, 0.6, 0.3, 0), (130, 1, 0.9, 0.7, 0.9), (800, 1, 1, 1, 1)])
 LEVOY = TransferFunction(SOFT.points, unit_distance=2.0, gradient_opacity=[(20.0, 0.0), (150.0, 1.0), (600.0, 0.3)])
 LIT = Lighting()

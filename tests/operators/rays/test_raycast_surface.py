@@ -18,6 +18,7 @@ from raycast_scenes import (
     look,
     uneven_volume,
 )
+from variants import daily
 
 from clrecon.geometry import Volume
 from clrecon.operators.surface.extract import extract_isosurface
@@ -40,7 +41,7 @@ def make(field, steps: str, extent: float) -> Volume:
     return uneven_volume(field, (34, 30), GAPS[10:30]) if steps == "uneven" else even_volume(field, steps, extent)
 
 
-@pytest.mark.parametrize("perspective", [False, True])
+@pytest.mark.parametrize("perspective", daily(1, [False, True]))
 @pytest.mark.parametrize("steps", [*STEPS, "uneven"])
 def test_a_plane_is_where_it_is_and_lit_as_it_lies(cast, steps, perspective):
     volume, size = make(lambda p: 200.0 - 40.0 * (p @ SLOPE), steps, 24.0), (32, 32)
@@ -92,7 +93,7 @@ def mesh_depths(cast, volume: Volume, iso_value: float, camera: Camera, size) ->
     return depth, cosine
 
 
-@pytest.mark.parametrize("dtype", [np.int16, np.float32])
+@pytest.mark.parametrize("dtype", daily(1, [np.int16, np.float32]))
 @pytest.mark.parametrize("steps", ["anisotropic", "sheared", "mirrored", "uneven"])
 def test_depths_are_those_of_the_extracted_mesh_caps_included(cast, steps, dtype):
     volume, size = make(blobs, steps, 12.0), (32, 32)

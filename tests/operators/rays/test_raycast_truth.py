@@ -19,6 +19,7 @@ from raycast_scenes import (
     uneven_volume,
     ways_through,
 )
+from variants import daily
 
 from clrecon.geometry import Volume
 from clrecon.rendering import Lighting, TransferFunction
@@ -87,6 +88,7 @@ def test_a_fixed_light_lights_only_the_side_that_faces_it(cast, mode, rise):
             assert np.abs(image[..., :3] - truth).max() <= tolerances.RAY_SAME_255 + 0.5
 
 
+@pytest.mark.release
 def test_a_smaller_step_brings_a_picture_nearer(cast):
     volume = even_volume(blobs, "anisotropic", 18.0)
     soft = TransferFunction([(200, 1, 1, 1, 0.0), (300, 1, 1, 1, 0.5), (400, 1, 1, 1, 0.0)])
@@ -286,7 +288,7 @@ def test_uneven_and_even_samplings_of_one_field_look_alike(cast):
     assert images[0][..., 3].max() > 150
 
 
-@pytest.mark.parametrize("dtype", ["int8", "uint8", "int16", "uint16", "int32", "float32"])
+@pytest.mark.parametrize("dtype", daily(2, ["int8", "uint8", "int16", "uint16", "int32", "float32"]))
 def test_every_voxel_type_gives_the_same_picture(cast, dtype):
     field = lambda p: np.rint(60.0 + 50.0 * np.sin(p[:, 0] / 2.0) * np.cos(p[:, 1] / 3.0))  # noqa: E731
     soft = TransferFunction([(40, 1, 0.5, 0.3, 0.0), (110, 1, 1, 0.9, 0.3)])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tolerances
 from dicom_series import rotation
+from variants import daily
 
 import clrecon
 from clrecon.geometry import Volume
@@ -82,7 +83,7 @@ def draw(volume: Volume, camera: Camera, shaded: bool, device: Any) -> tuple[np.
     return ours.image, peer.picture()
 
 
-@pytest.mark.parametrize("view_angle", [None, 30.0])
+@pytest.mark.parametrize("view_angle", daily(1, [None, 30.0]))
 @pytest.mark.parametrize("shaded", [True, False])
 @pytest.mark.parametrize("axes", AXES)
 def test_smooth_bodies_look_as_vtk_draws_them(device, axes, shaded, view_angle):
@@ -94,6 +95,7 @@ def test_smooth_bodies_look_as_vtk_draws_them(device, axes, shaded, view_angle):
     assert likeness(np.roll(ours, 2, axis=1), theirs) < tolerances.VTK_LIKENESS_SMOOTH  # so small a shift is seen
 
 
+@pytest.mark.release
 def test_a_spine_looks_as_vtk_draws_it(device):
     volume = spine()
     camera = Camera.fit(volume, "30,20", size=SIZE)

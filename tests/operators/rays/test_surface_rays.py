@@ -103,6 +103,7 @@ def test_the_kernel_is_its_twin(device, name):
     assert_alike(cast(device, volume, 100.0, **settings), truth)
 
 
+@pytest.mark.release
 @pytest.mark.usefixtures("users_kernels")
 @pytest.mark.parametrize("name", daily(1, ["soft", "clipped", "uneven"]))
 def test_one_sample_at_a_time_gives_the_same(device, name, monkeypatch):
@@ -132,7 +133,7 @@ def test_long_steps_are_shortened_for_slabs(device):
     assert "in slabs: the ray step is 0.9 mm in place of 5" in parts.report["warnings"][0]
 
 
-@pytest.mark.parametrize("grid", ["sheared", "uneven"])
+@pytest.mark.parametrize("grid", daily(1, ["sheared", "uneven"]))
 def test_depths_are_those_of_the_extracted_mesh_caps_included(device, grid):
     import pyvista
 

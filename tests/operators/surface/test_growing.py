@@ -10,6 +10,7 @@ from slab_surfaces import assert_same
 from surface_volumes import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
 from tolerances import float32_unit
 from uneven_volume import uneven
+from variants import daily
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
@@ -82,7 +83,7 @@ def test_both_borders_and_both_sides_equal_the_twin(closed: bool, below: bool, d
         assert_twin(random_volume((6, 9, 40), high=9, affine=affine), device, 2, closed=closed, below=below)
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "float32"])
+@pytest.mark.parametrize("dtype", daily(1, ["uint8", "float32"]))
 def test_types_ranges_and_uneven_slices_equal_the_twin(dtype: str, device: Any) -> None:
     volume = random_volume((6, 9, 40), dtype, high=9)
     assert_twin(volume, device, (2, 4))
@@ -90,6 +91,7 @@ def test_types_ranges_and_uneven_slices_equal_the_twin(dtype: str, device: Any) 
     assert_twin(smooth_volume((9, 10, 40)), device, 100, vertex_rule="golden-search")
 
 
+@pytest.mark.release
 def test_the_identity_holds_on_a_spine(device: Any) -> None:
     """The cells are those that the paper's frontier enters, one by one: the twin asserts that beside the mesh."""
     voxels, affine, _ = make_phantom(PhantomSettings(size=(64, 64), slices=24, spacing=(2.4, 2.4, 3.3), noise=40.0))
@@ -241,6 +243,7 @@ def test_memory_for_the_bits_of_the_volume_is_asked_for_first(device: Any) -> No
         extract_isosurface(smooth_volume((40, 64, 64)), 300, device=device, grow_from="auto", memory=150_000)
 
 
+@pytest.mark.release
 def test_the_golden_constant_is_off_and_the_search_is_not(device: Any) -> None:
     k, j, i = np.indices((31, 31, 31)) - 15.2
     volume = Volume((100.0 * (10.0 - np.sqrt(i**2 + j**2 + k**2))).astype(np.float32), np.eye(4))

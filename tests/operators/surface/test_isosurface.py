@@ -7,7 +7,7 @@ import pytest
 import tolerances
 from scipy.spatial import cKDTree
 from surface_volumes import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
-from variants import VOXEL_TYPES, daily
+from variants import VOXEL_TYPES, daily, daily_rows
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume, compose_affine, iso_rule
@@ -227,7 +227,7 @@ def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
     assert not outcome["passed"] and "it computes wrongly" in outcome["detail"]
 
 
-@pytest.mark.parametrize(("lanes", "words"), [("1", "1"), ("8", "3")])
+@pytest.mark.parametrize(("lanes", "words"), daily_rows(1, [("1", "1"), ("8", "3")]))
 def test_every_variant_of_the_kernels_gives_the_same_mesh(device, lanes, words, monkeypatch):
     """What runs on GPUs is tested where there is none."""
     volume = smooth_volume((23, 27, 75), affine=MIRRORED)

@@ -7,7 +7,7 @@ import pytest
 import tolerances
 from slab_surfaces import extract_in_slabs
 from surface_volumes import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
-from variants import VOXEL_TYPES, daily
+from variants import VOXEL_TYPES, daily, daily_rows
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume, compose_affine
@@ -29,7 +29,7 @@ def assert_equals_twin(volume, iso_value, device, closed=True) -> None:
     assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_CELL_NORMAL
 
 
-@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("closed", daily(1, [True, False]))
 @pytest.mark.parametrize("shape", SHAPES)
 def test_device_equals_twin_at_word_borders(device, shape, closed):
     assert_equals_twin(random_volume(shape, high=50), 25, device, closed)
@@ -43,8 +43,8 @@ def test_device_equals_twin_for_every_voxel_type(device, dtype, affine):
         assert_equals_twin(volume, iso_value, device)
 
 
-@pytest.mark.parametrize(("dtype", "low", "high"), [("int16", -32768, 32767), ("uint16", 0, 65535),
-                                                    ("int32", -(2**23) + 1, 2**23 - 1)])  # fmt: skip
+@pytest.mark.parametrize(("dtype", "low", "high"), daily_rows(1, [("int16", -32768, 32767), ("uint16", 0, 65535),
+                                                    ("int32", -(2**23) + 1, 2**23 - 1)]))  # fmt: skip
 def test_device_equals_twin_over_the_whole_range_of_integers(device, dtype, low, high):
     voxels = np.random.default_rng(4).integers(low, high, (4, 6, 33), endpoint=True).astype(dtype)
     for iso_value in (0.5 * (low + high) + 0.5, low / 2 + high / 2 + high / 5):

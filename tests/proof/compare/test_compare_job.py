@@ -182,6 +182,7 @@ def without_time(value: Any) -> Any:
     return [without_time(own) for own in value] if isinstance(value, list) else value
 
 
+@pytest.mark.release
 @pytest.mark.long
 def test_only_times_and_memory_differ_between_runs(
     device: Any, ball: Path, tmp_path: Path, request: pytest.FixtureRequest

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tolerances
+from variants import daily, daily_rows
 
 from clrecon.errors import UsageError
 from clrecon.labels import read_labels
@@ -175,12 +176,12 @@ def test_boxes_hold_whole_vertebrae() -> None:
         assert (vertebra_distance(vertebra, *lattice[outside].T) < 0.0).all(), vertebra.name
 
 
-@pytest.mark.parametrize("levels", ["C1-C3", "C7-T1", "L4-L5"])
+@pytest.mark.parametrize("levels", daily(1, ["C1-C3", "C7-T1", "L4-L5"]))
 def test_levels_lie_apart(levels: str) -> None:
     assert min(gaps(planned(levels))) > 2.0
 
 
-@pytest.mark.parametrize(("levels", "gap"), [("C1-C3", 0.3), ("T6-T7", 0.0), ("L4-L5", 0.8)])
+@pytest.mark.parametrize(("levels", "gap"), daily_rows(1, [("C1-C3", 0.3), ("T6-T7", 0.0), ("L4-L5", 0.8)]))
 def test_facets_come_as_near_as_asked(levels: str, gap: float) -> None:
     found = gaps(planned(levels, facet_gap_mm=gap, scoliosis_deg=10.0))
     assert found == pytest.approx([gap] * len(found), abs=tolerances.PHANTOM_FACET_MM)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from variants import daily
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.proof.phantom import PhantomSettings, apply_point_spread, make_phantom, parse_missing, write_phantom
@@ -18,7 +19,9 @@ SMALL = {"size": (24, 20), "slices": 20, "spacing": (11.0, 10.0, 2.5)}
 CLEAN = {"noise": 0.0, "point_spread_mm": 0.0}
 
 
-@pytest.mark.parametrize("extra", [{}, {"tilt": 12.0, "oblique": (5.0, 0.0, 10.0)}], ids=["straight", "tilted"])
+@pytest.mark.parametrize(
+    "extra", daily(1, [{}, {"tilt": 12.0, "oblique": (5.0, 0.0, 10.0)}]), ids=["straight", "tilted"]
+)
 def test_uneven_slices_lie_where_the_truth_says(tmp_path: Path, extra: dict) -> None:
     settings = PhantomSettings(**SMALL, **extra, uneven_mm=0.8)
     truth = write_phantom(tmp_path / "ct", settings)

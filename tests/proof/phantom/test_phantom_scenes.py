@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pydicom
 import pytest
+from variants import daily, daily_rows
 
 from clrecon.errors import UsageError
 from clrecon.geometry import apply_affine
@@ -32,7 +33,7 @@ def test_the_tables_name_the_same_things() -> None:
     assert tuple(TABLES) == TABLE_NAMES
 
 
-@pytest.mark.parametrize("kind", SCENES)
+@pytest.mark.parametrize("kind", daily(3, SCENES))
 def test_voxels_are_of_what_the_labels_say(kind: str) -> None:
     settings = settings_of(kind, **CLEAN)
     voxels, affine, truth = make_phantom(settings)
@@ -72,7 +73,7 @@ def test_contrast_is_larger_and_brighter_than_the_marrow_of_the_spine() -> None:
 
 
 @pytest.mark.parametrize("table", ["flat", "curved", "headrest"])
-@pytest.mark.parametrize("prone", [False, True])
+@pytest.mark.parametrize("prone", daily(1, [False, True]))
 def test_a_table_lies_under_the_body_at_its_gap(table: str, prone: bool) -> None:
     places = []
     for gap in (0.0, 12.0):
@@ -100,7 +101,7 @@ def test_prone_turns_the_image_and_not_the_patient(tmp_path: Path) -> None:
     assert [float(value) for value in header.ImageOrientationPatient] == [-1.0, 0.0, 0.0, 0.0, -1.0, 0.0]
 
 
-@pytest.mark.parametrize(("table", "changed"), [("none", True), ("flat", True), (None, False)])
+@pytest.mark.parametrize(("table", "changed"), daily_rows(1, [("none", True), ("flat", True), (None, False)]))
 def test_a_spine_may_lie_on_another_table(table: str | None, changed: bool) -> None:
     size = {"size": (80, 72), "slices": 6, "spacing": (4.5, 4.0, 5.0)}
     own = make_phantom(PhantomSettings(**size))[0]

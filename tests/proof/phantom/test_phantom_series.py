@@ -9,6 +9,7 @@ import numpy as np
 import pydicom
 import pytest
 import tolerances
+from variants import daily
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.proof.phantom import PhantomSettings, build, make_phantom, write_phantom
@@ -36,7 +37,7 @@ def read_back(folder: Path) -> tuple[np.ndarray, np.ndarray, list[pydicom.Datase
     [{}, {"tilt": 18.5}, {"tilt": -12.0, "oblique": (10.0, -5.0, 33.0), "transfer_syntax": "implicit"}],
     ids=["straight", "tilted", "tilted-oblique-implicit"],
 )
-@pytest.mark.parametrize("kind", ["sphere", "spine"])
+@pytest.mark.parametrize("kind", daily(1, ["sphere", "spine"]))
 def test_files_hold_the_affine_and_voxels_of_the_truth(tmp_path: Path, kind: str, extra: dict) -> None:
     settings = PhantomSettings(kind=kind, **AWKWARD, **extra)
     truth = write_phantom(tmp_path / "ct", settings)

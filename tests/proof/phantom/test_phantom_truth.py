@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tolerances
+from variants import daily
 
 import clrecon
 from clrecon.errors import UsageError
@@ -43,7 +44,7 @@ def cover_centre() -> tuple[float, float, float]:
     return CENTRE_LPS_MM
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", daily(1, CASES))
 def test_distances_are_those_of_a_dense_cover_of_the_surface(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     truth = truth_of(case)
     near = points_near(truth, 1500, 0.6)
@@ -65,7 +66,7 @@ def test_distances_are_those_of_a_dense_cover_of_the_surface(case: str, monkeypa
     assert np.abs(off).max() < tolerances.PHANTOM_TRUTH_MM
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", daily(1, CASES))
 def test_distances_change_by_no_more_than_the_way_and_point_along_the_normal(case: str) -> None:
     truth = truth_of(case)
     points = points_near(truth, 800, 0.3)

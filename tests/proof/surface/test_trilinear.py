@@ -110,6 +110,7 @@ def test_random_cells_have_the_topology_of_their_trilinear_field():
     assert found["right"] >= 140 and found["tunnels"] >= 45
 
 
+@pytest.mark.release
 @pytest.mark.slow
 def test_a_thousand_random_cells_have_the_topology_of_their_trilinear_field():
     found = compare_cells(2, 1000)
@@ -294,6 +295,7 @@ def test_surfaces_of_random_fields_have_the_topology_of_the_field():
     assert found["separated"] < found["clear"] / 4
 
 
+@pytest.mark.release
 @pytest.mark.slow
 def test_a_hundred_surfaces_have_the_topology_of_the_field():
     found = compare_volumes(range(100, 200))

@@ -248,6 +248,7 @@ def test_a_scanner_that_pads_in_silence():
     assert len(said) == 1 and said[0].startswith("21.5 % of the voxels are at -2000 HU")
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     "folder", ["lumbar_4p25mm", "thoracic_0p8mm", "head_tilt_gaps", "thoracolumbar_labels/ct_2mm_jpeg2000"]
 )

@@ -214,6 +214,7 @@ def test_a_grid_file_on_another_scale(tmp_path):
     assert gates_of(list_series(path, pixels=True).certificate) == gates_of(report)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     "folder",
     [

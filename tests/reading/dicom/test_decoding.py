@@ -37,6 +37,7 @@ from dicom_series import Plan, make_dataset, save_dataset
 from pydicom.data import get_testdata_file
 from pydicom.encaps import encapsulate, encapsulate_extended
 from pydicom.uid import ExplicitVRBigEndian
+from variants import daily
 
 from clrecon.errors import RefusedInputError
 from clrecon.reading import read_volume
@@ -249,7 +250,7 @@ def drop_unused_bits(pixels, ds):
     return pixels << unused >> unused
 
 
-@pytest.mark.parametrize("name", [*COMPRESSED, *PLAIN])
+@pytest.mark.parametrize("name", daily(5, [*COMPRESSED, *PLAIN]))
 def test_pydicoms_files_give_pydicoms_pixels(tmp_path, name):
     found = get_testdata_file(name, download=False)
     if found is None:

@@ -158,6 +158,7 @@ def test_overlays_count_where_the_header_says_where_they_are(tmp_path, signed):
     assert np.array_equal(*same) and np.array_equal(same[0], plan.hu() - 1000 * signed)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     "folder", ["lumbar_4p25mm", "thoracic_0p8mm", "head_tilt_gaps", "thoracolumbar_labels/ct_2mm_jpeg2000"]
 )

@@ -302,6 +302,7 @@ def test_too_few_slices_or_pixels_say_nothing():
     assert measure_likeness(body(24)[:, :7, :7].astype(np.int16)) is None
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     "folder", ["lumbar_4p25mm", "thoracic_0p8mm", "head_tilt_gaps", "thoracolumbar_labels/ct_2mm_jpeg2000"]
 )

@@ -180,6 +180,7 @@ def test_masks_hold_nothing_of_the_volume_when_they_are_dropped():
         gc.enable()
 
 
+@pytest.mark.release
 def test_real_scans_have_no_tube(real_data):
     """Air of the scan, not -1024, where it touches the circle; a scan whose rim is clipped has its own rim."""
     volume = read_volume(real_data / "thoracic_0p8mm")

@@ -9,6 +9,7 @@ import pytest
 import tolerances
 from dicom_series import Plan, write_series
 from label_files import OBLIQUE, RAS, write_nifti, write_nrrd
+from variants import daily
 from volume_files import LEFT_HANDED, ROTATED, WRITERS, make_ct, write_metaimage
 
 import clrecon
@@ -39,7 +40,7 @@ def test_values_and_places_are_those_of_the_file(tmp_path, name, place):
 
 
 @pytest.mark.parametrize("name", WRITERS)
-@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("order", daily(1, "<>"))
 @pytest.mark.parametrize("stored", TYPES)
 def test_whole_numbers_are_whole_hu_whatever_they_are_stored_as(tmp_path, name, order, stored):
     low, high = {"u1": (0, 256), "i1": (-128, 128)}.get(stored, (0 if stored[0] == "u" else -1024, 3000))
@@ -220,7 +221,7 @@ def test_labels_of_the_same_kind_of_file_lie_on_their_volume_exactly(tmp_path, n
 
 
 @pytest.mark.parametrize("name", ["a.nii.gz", "gzip.nrrd", "packed.mha", "a.mha"])
-@pytest.mark.parametrize("kind", ["whole", "fractions", "a fraction at the end"])
+@pytest.mark.parametrize("kind", daily(1, ["whole", "fractions", "a fraction at the end"]))
 def test_no_more_than_two_volumes_of_memory(tmp_path, name, kind):
     voxels = np.repeat(make_ct((50, 150, 100)), 3, axis=2).astype(np.float32)
     if kind == "fractions":
@@ -282,6 +283,7 @@ def test_real_labels_lie_on_their_nifti_ct(real_data):
     assert resample_labels(labels, volume).exact
 
 
+@pytest.mark.release
 def test_a_real_series_through_each_format_is_the_same_volume(real_data, tmp_path):
     truth = clrecon.read_volume(real_data / "thoracolumbar_labels" / "ct_2mm_jpeg2000")
     for name in ("a.nii.gz", "gzip.nrrd", "packed.mha", "a.mhd"):

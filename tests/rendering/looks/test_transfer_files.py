@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tolerances import FLOAT64_SHARE, STEP_SIDE
+from variants import daily
 
 from clrecon.errors import OutputError, RefusedInputError, UsageError
 from clrecon.rendering import PRESETS, UNSHADED, Lighting, TransferFunction, load_transfer_function
@@ -369,7 +370,9 @@ def test_paraview(tmp_path: Path) -> None:
 
 
 @pytest.mark.fuzz
-@pytest.mark.parametrize("sample", [OWN, TEXT, XML, SLICER, PARAVIEW], ids=["own", "vp", "xml", "vp.json", "paraview"])
+@pytest.mark.parametrize(
+    "sample", daily(2, [OWN, TEXT, XML, SLICER, PARAVIEW]), ids=["own", "vp", "xml", "vp.json", "paraview"]
+)
 def test_mutated_files_are_read_or_refused_in_one_line(tmp_path: Path, sample: Any) -> None:
     rng = np.random.default_rng(5)
     words = (b"-1", b"1e999", b"nan", b"null", b"[]", b"{}", b'""', b"9" * 40, b"\xff", b"\x00", b"<", b"-1e308", b"\n")
