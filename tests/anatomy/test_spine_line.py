@@ -128,6 +128,7 @@ def test_where_there_is_none_points_are_asked_for(phantom, name):
         find_spine_line(made_up(name, phantom))
 
 
+@pytest.mark.release
 @pytest.mark.slow
 def test_real_spines_against_their_labels(real_data):
     """The cord, as a network drew it at 2 mm; and the holes that vertebrae enclose at 3 mm."""
@@ -159,6 +160,7 @@ def test_real_scans_are_found_or_refused(real_data):
         find_spine_line(read_volume(real_data / "head_tilt_gaps"))
 
 
+@pytest.mark.release
 @pytest.mark.slow
 def test_a_long_real_spine_is_found(real_data):
     line = find_spine_line(read_volume(real_data / "lumbar_4p25mm"))

@@ -135,16 +135,19 @@ SKIPPED = "import pytest\ndef test_it():\n    pytest.skip('no')\n"
 
 @pytest.mark.parametrize(
     ("test", "variables", "code"),
-    [
-        ("def test_it():\n    assert 1 + 1 == 2\n", {"CLRECON_REQUIRE_TESTS": "1"}, 0),
-        (SKIPPED, {}, 0),
-        (SKIPPED, {"CLRECON_REQUIRE_TESTS": "1"}, 5),
-        (NO_DRIVER + USES_DEVICE, {}, 0),
-        (NO_DRIVER + USES_DEVICE, {"CLRECON_REQUIRE_DEVICE": "1"}, 1),
-        (NO_DRIVER + USES_DEVICE, {"CLRECON_REQUIRE_PLATFORMS": "Intel"}, 2),
-        (USES_DEVICE, {"CLRECON_TEST_DEVICE": "no such device"}, 2),
-        ("def test_it(real_data):\n    assert real_data.is_dir()\n", {"CLRECON_TEST_DATA": "no-such-folder"}, 1),
-    ],
+    daily_rows(
+        4,
+        [
+            ("def test_it():\n    assert 1 + 1 == 2\n", {"CLRECON_REQUIRE_TESTS": "1"}, 0),
+            (SKIPPED, {}, 0),
+            (SKIPPED, {"CLRECON_REQUIRE_TESTS": "1"}, 5),
+            (NO_DRIVER + USES_DEVICE, {}, 0),
+            (NO_DRIVER + USES_DEVICE, {"CLRECON_REQUIRE_DEVICE": "1"}, 1),
+            (NO_DRIVER + USES_DEVICE, {"CLRECON_REQUIRE_PLATFORMS": "Intel"}, 2),
+            (USES_DEVICE, {"CLRECON_TEST_DEVICE": "no such device"}, 2),
+            ("def test_it(real_data):\n    assert real_data.is_dir()\n", {"CLRECON_TEST_DATA": "no-such-folder"}, 1),
+        ],
+    ),
 )
 def test_exit_status_of_a_session(tmp_path: Path, test: str, variables: dict[str, str], code: int) -> None:
     done = run_pytest(tmp_path, test, **variables)

@@ -148,6 +148,7 @@ def program_path(_, name): return sys.executable if name == "python" else "true"
 """
 
 
+@pytest.mark.release
 @posix_only
 def test_a_test_that_ends_its_process_ends_the_run(tmp_path: Path) -> None:
     """Two processes on a file of tests each, one of which is killed: no waiting for it, and no success."""

@@ -13,6 +13,7 @@ import ct_files
 import pydicom
 import pytest
 from ct_files import write_series
+from variants import but_seldom
 
 from clrecon.cli.main import main
 
@@ -71,7 +72,7 @@ COMMANDS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", COMMANDS)
+@pytest.mark.parametrize("what", but_seldom(COMMANDS, ("mesh .obj", "mesh .glb", "mesh .vtp", "bench", "compare")))
 def test_row_69_no_file_and_no_word_names_the_patient(
     what: str,
     device: Any,

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from label_files import make_labels, write_nifti
 from sample_meshes import torus
+from variants import daily
 
 import clrecon
 from clrecon.geometry import Volume
@@ -47,7 +48,7 @@ NAMES = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", daily(4, NAMES))
 def test_progress_is_told_and_changes_nothing(works: dict[str, tuple[str, Work]], name: str) -> None:
     stage, work = works[name]
     calls: list[tuple[str, int, int]] = []

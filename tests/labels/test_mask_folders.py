@@ -118,6 +118,7 @@ def test_one_mask_is_named_by_its_file(tmp_path):
     assert read_labels(write_nifti(tmp_path / "b.nii", mask((1, 2)), extension=table)).names == {1: "spleen"}
 
 
+@pytest.mark.release
 @pytest.mark.first_device
 def test_commands_take_a_folder(tmp_path, capsys):
     dicom_series.write_series(tmp_path / "ct", dicom_series.Plan(shape=(4, 6, 7)))

@@ -81,6 +81,7 @@ def swap(folder):
     second.write_bytes(content)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("damage", daily(2, [overwrite, swap, cut, empty]))
 def test_row_59_damaged_kernels_are_built_anew(damage, device, built):
     damage(built)

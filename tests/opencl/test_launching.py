@@ -112,6 +112,7 @@ def test_every_argument_can_be_named_in_python(name):
             assert not [name for name in names if keyword.iskeyword(name) or name in PASSED_BY_NAME_ALREADY], kernel
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("options", daily(1, VARIANTS), ids=lambda options: " ".join(options) or "plain")
 def test_names_and_types_are_those_that_the_compiler_knows(options, device):
     cl = import_pyopencl()

@@ -10,6 +10,7 @@ import pytest
 from ct_files import write_series
 from device_work import WORK, label_boxes
 from surface_volumes import smooth_volume
+from variants import daily_rows
 
 from clrecon.cli.main import main
 from clrecon.opencl import Device, choose_device, kernel_files, memory_limits, read_kernel_source
@@ -85,7 +86,7 @@ def labels(volume):
     return label_boxes(volume, np.s_[3:7, 4:12, 3:10], np.s_[7:10, 4:12, 3:10])
 
 
-@pytest.mark.parametrize(("size", "works"), [(1, ("surface",)), (7, ("labels", "slice"))])
+@pytest.mark.parametrize(("size", "works"), daily_rows(1, [(1, ("surface",)), (7, ("labels", "slice"))]))
 def test_row_51_small_groups_give_the_same_bytes(device, volume, labels, monkeypatch, size, works):
     """Drivers build a kernel anew for each size of its groups, so not all kinds of work are tried with all."""
     with DeviceVolume(volume, device=device) as resident:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from variants import daily_rows
 
 from clrecon.errors import DeviceError
 from clrecon.geometry import Volume
@@ -32,11 +33,14 @@ def test_row_57_a_device_that_computes_rightly_passes(device: Device) -> None:
 
 @pytest.mark.parametrize(
     ("kernel", "name", "words"),
-    [
-        ("emit_vertices", "inverted positions", "vertices of a ball lie beside it"),
-        ("emit_vertices", "inverted normals", "normals of a ball point elsewhere"),
-        ("emit_triangles", "inverted winding", "encloses -0.999 of its volume"),
-    ],
+    daily_rows(
+        1,
+        [
+            ("emit_vertices", "inverted positions", "vertices of a ball lie beside it"),
+            ("emit_vertices", "inverted normals", "normals of a ball point elsewhere"),
+            ("emit_triangles", "inverted winding", "encloses -0.999 of its volume"),
+        ],
+    ),
 )
 def test_row_57_a_device_that_computes_wrongly_does_not(
     device: Device, monkeypatch: pytest.MonkeyPatch, kernel: str, name: str, words: str

@@ -56,6 +56,7 @@ def test_two_frames_have_no_distance():
     assert cell.text() == "0 S, two frames as one" and cell.is_silent_fault()
 
 
+@pytest.mark.release
 def test_a_row_of_the_table(tmp_path, capsys):
     """highdicom takes a tilt of 1 degree for none: 23 gaps of 1.25 mm, 0.50 mm off at both ends together."""
     arguments = ["--small", "--only", "tilt 1 deg", "--readers", "clrecon,highdicom", "--markdown"]

@@ -46,6 +46,7 @@ def shows_bone(seen: np.ndarray) -> bool:
     return bool(((picture[..., 0] > 90) & (picture[..., 0] > picture[..., 2] + 8)).mean() > 0.01)
 
 
+@pytest.mark.release
 def test_a_session_at_the_window(display, scan, tmp_path):
     with open_view(display, [scan, "--window", "--hu", f"{ISO:g}"], tmp_path) as window:
         before = window.wait(shows_bone, "the surface")
@@ -78,6 +79,7 @@ def test_a_distance_is_measured_between_two_clicks(display, tmp_path):
         assert window.finish()[0] == 0
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("how", daily(1, ["interrupt", "window manager"]))  # a session below is closed by the latter
 def test_it_ends_by_ctrl_c_and_by_the_window_manager(display, tmp_path, how):
     make_mesh().save(tmp_path / "ball.stl")

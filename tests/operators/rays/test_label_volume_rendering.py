@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tolerances
+from variants import daily
 
 from clrecon import Camera, LabelMap, TransferFunction, UsageError, Volume, render
 from clrecon.rendering.looks.lighting import UNSHADED
@@ -34,7 +35,7 @@ def ahead(volume: Volume) -> Camera:
 
 
 @pytest.mark.oclgrind
-@pytest.mark.parametrize("memory", [None, 12_000])
+@pytest.mark.parametrize("memory", daily(1, [None, 12_000]))
 def test_labels_change_opacity_and_colour_as_they_say(device, memory):
     volume, labels = block()
     options = {"label_colors": {3: "red"}, "label_opacity": {1: 0.25, 3: 0.5}}

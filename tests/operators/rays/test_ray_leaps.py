@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import tolerances
 from dicom_series import rotation
+from variants import daily
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
@@ -92,7 +93,7 @@ def scattered(rng, uneven: bool) -> Volume:
     return Volume(voxels, affine, slice_positions=table)
 
 
-@pytest.mark.parametrize("uneven", [False, True])
+@pytest.mark.parametrize("uneven", daily(1, [False, True]))
 def test_scattered_voxels_from_anywhere(device, monkeypatch, uneven):
     """The last sample of a ray lies before its place in the row: with few samples a brick alone may hold it."""
     shown = 0

@@ -101,7 +101,7 @@ def test_a_smaller_step_brings_a_picture_nearer(cast):
     assert errors[2] <= 0.5 * errors[1] + tolerances.RAY_ROUNDING
 
 
-@pytest.mark.parametrize("ramp", [0.7, 1.2])
+@pytest.mark.parametrize("ramp", daily(1, [0.7, 1.2]))
 def test_skin_has_no_rings_at_the_default_step(cast, ramp):
     """A ball of soft tissue with a sharp edge, lit: of samples alone 0.59 and 0.76 alike, grained like wood."""
     from skimage.metrics import structural_similarity
@@ -254,6 +254,7 @@ def test_a_camera_inside_sees_what_lies_ahead_of_it_alone(cast):
     assert (shot.depth >= 0.0).all() and (shot.depth < 1.0).all()
 
 
+@pytest.mark.release
 def test_a_ball_in_an_uneven_stack_is_round(cast):
     radius, size = 12.0, (40, 40)
     field = lambda p: 300.0 + 50.0 * (radius - np.linalg.norm(p, axis=1))  # noqa: E731
@@ -272,6 +273,7 @@ def test_a_ball_in_an_uneven_stack_is_round(cast):
     assert (np.isfinite(shot.depth) != (passing < radius))[~edge].sum() > 20
 
 
+@pytest.mark.release
 def test_uneven_and_even_samplings_of_one_field_look_alike(cast):
     field = lambda p: 900.0 * np.exp(-(p[:, 0] ** 2 + 2 * p[:, 1] ** 2 + p[:, 2] ** 2) / 120.0)  # noqa: E731
     uneven, even = uneven_volume(field), even_volume(field, "even", 60.0)

@@ -83,6 +83,7 @@ def test_both_borders_and_both_sides_equal_the_twin(closed: bool, below: bool, d
         assert_twin(random_volume((6, 9, 40), high=9, affine=affine), device, 2, closed=closed, below=below)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("dtype", daily(1, ["uint8", "float32"]))
 def test_types_ranges_and_uneven_slices_equal_the_twin(dtype: str, device: Any) -> None:
     volume = random_volume((6, 9, 40), dtype, high=9)

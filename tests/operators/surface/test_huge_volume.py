@@ -33,6 +33,7 @@ print(json.dumps({"grown_mib": (peak_kib() - before) / 1024, "slabs": mesh.repor
 """
 
 
+@pytest.mark.release
 @pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="peak memory is read from /proc")
 def test_a_file_of_a_gigabyte_goes_through_a_small_budget(device, tmp_path):

@@ -227,6 +227,7 @@ def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
     assert not outcome["passed"] and "it computes wrongly" in outcome["detail"]
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(("lanes", "words"), daily_rows(1, [("1", "1"), ("8", "3")]))
 def test_every_variant_of_the_kernels_gives_the_same_mesh(device, lanes, words, monkeypatch):
     """What runs on GPUs is tested where there is none."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tolerances
 from scipy.spatial import cKDTree
-from variants import daily_rows
+from variants import daily, daily_rows
 
 from clrecon.errors import DeviceError, RefusedInputError, UsageError
 from clrecon.geometry import apply_affine
@@ -58,7 +58,7 @@ def assert_sound(mesh) -> dict:
 
 
 @pytest.mark.every_device
-@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("closed", daily(1, [True, False]))
 @pytest.mark.parametrize("shape", SHAPES)
 def test_device_equals_twin(device, shape, closed):
     if not closed and min(shape) < 2:
@@ -373,6 +373,7 @@ def test_labels_that_do_not_fit_together_go_through_one_by_one(device):
         extract_label_masks(LabelMap(labels, OBLIQUE), device=device, memory=50_000)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(("lanes", "words"), daily_rows(1, [("1", "1"), ("8", "3")]))
 def test_every_variant_of_the_kernels_gives_the_same_meshes(device, lanes, words, monkeypatch):
     labels = random_labels((6, 7, 75), numbers=(0, 0, 3, 7)).astype(np.uint8)

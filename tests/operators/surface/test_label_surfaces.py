@@ -58,7 +58,7 @@ def count_half_way(volume, inside, number, iso_value) -> int:
 
 
 @pytest.mark.every_device
-@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("closed", daily(1, [True, False]))
 @pytest.mark.parametrize("solid", [False, True])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_device_equals_twin(device, shape, solid, closed):
@@ -86,6 +86,7 @@ def test_device_equals_twin_for_every_voxel_type(device, dtype):
             assert_equals_twin(mesh, volume, inside, number, iso_value)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(("lanes", "words"), [("1", "1"), ("8", "3")])
 @pytest.mark.parametrize("numbers", daily(1, [(0, 0, 3, 7), (0, 0, 3, 300)]), ids=["one-byte", "two-bytes"])
 def test_every_variant_of_the_kernels_gives_the_same_meshes(device, lanes, words, numbers, monkeypatch):

@@ -7,7 +7,7 @@ import pytest
 import tolerances
 from slab_surfaces import assert_same, extract_in_slabs
 from surface_volumes import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
-from variants import FOR_RELEASE
+from variants import FOR_RELEASE, daily
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
@@ -58,7 +58,7 @@ def test_device_equals_twin_for_voxel_types(device, dtype, affine):
 
 
 @pytest.mark.every_device
-@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("closed", daily(1, [True, False]))
 @pytest.mark.parametrize("shape", SHAPES)
 def test_device_equals_twin_at_word_borders(device, shape, closed):
     volume = random_volume(shape)
@@ -172,6 +172,7 @@ def test_a_resident_volume_gives_the_same_in_any_order(device):
             )
 
 
+@pytest.mark.release
 def test_the_variant_of_gpus_gives_the_same_mesh(device, monkeypatch):
     volume = smooth_volume((9, 11, 75), affine=MIRRORED)
     monkeypatch.setattr(device, "kernel_variants", {**device.kernel_variants, "LANES": "1", "WORDS_PER_ITEM": "1"})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from variants import daily_rows
 
 import clrecon
 from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
@@ -52,7 +53,15 @@ def test_the_label_alone_is_closed_and_filled_and_its_canal_stays_open(device):
 
 @pytest.mark.parametrize(
     ("level", "more_ml", "dice"),
-    [(None, (-0.005, 0.005), 0.995), (226, (0.10, 0.16), 0.93), (300, (0.06, 0.12), 0.95), (400, (0.0, 0.05), 0.975)],
+    daily_rows(
+        1,
+        [
+            (None, (-0.005, 0.005), 0.995),
+            (226, (0.10, 0.16), 0.93),
+            (300, (0.06, 0.12), 0.95),
+            (400, (0.0, 0.05), 0.975),
+        ],
+    ),
 )
 def test_volumes_of_a_phantom_are_those_of_its_truth_and_what_the_level_adds(spine, device, level, more_ml, dice):
     # half of 850 HU of the cortex and 50 HU around is 450 HU: lower levels lie farther out

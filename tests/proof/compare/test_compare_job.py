@@ -235,6 +235,7 @@ def test_a_crash_and_a_missing_library_are_rows(
     assert "scikit-image and VTK MC did not run" in capsys.readouterr().out
 
 
+@pytest.mark.release
 def test_without_its_reference_the_page_says_what_is_left(
     device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -256,6 +257,7 @@ def test_where_no_method_works_there_is_no_folder(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.release
 def test_measures_of_a_crashed_process_are_missing_with_a_reason(
     device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -75,6 +75,7 @@ def test_missing_slices_are_told_and_read_when_allowed(tmp_path: Path) -> None:
     assert np.array_equal(volume.voxels, whole[kept])
 
 
+@pytest.mark.release
 def test_phases_are_listed_and_differ_in_their_vessels(tmp_path: Path) -> None:
     settings = PhantomSettings(**SMALL, **CLEAN, phases=3)
     write_phantom(tmp_path / "ct", settings)

@@ -242,6 +242,7 @@ def count_crossings(triangles, points) -> int:
     )
 
 
+@pytest.mark.release
 @pytest.mark.untraced
 def test_the_triangles_of_a_cell_do_not_cross_each_other():
     for case, heights in draw_cells(8, 150):

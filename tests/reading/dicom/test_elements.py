@@ -170,6 +170,7 @@ def element_bytes(draw: st.DrawFn, implicit: bool, depth: int = 3) -> bytes:
     return encode(tag, vr, items + draw(st.sampled_from([end] * 6 + [b""])), implicit, 0xFFFFFFFF)
 
 
+@pytest.mark.release
 @pytest.mark.fuzz
 @settings(max_examples=300, deadline=None)
 @given(data=st.data(), implicit=st.booleans())

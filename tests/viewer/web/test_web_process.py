@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 import view_scenes as scenes
+from variants import daily
 from web_views import browsing
 
 from clrecon.cli.main import main
@@ -64,7 +65,7 @@ def running(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, 
 
 @pytest.mark.opencl
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", daily(1, [signal.SIGINT, signal.SIGTERM]))
 def test_a_signal_ends_it_while_pictures_are_drawn(device, scan: Path, number: int) -> None:
     with running(str(scan), "--device", str(device.index), "--hu", "321") as (process, said):
         server = SimpleNamespace(port=said["port"], address=said["address"])
