@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from variants import daily
 
 from clrecon.anatomy import spine_cells
 from clrecon.anatomy.spine_cells import (
@@ -99,7 +100,7 @@ def plain_likeness(values):
     return worth + mirror, {"wall": wall, "mirror": mirror, "body": body, "soft": soft}
 
 
-@pytest.mark.parametrize("border", [0, 14])
+@pytest.mark.parametrize("border", daily(1, [0, 14]))
 def test_the_worth_of_every_cell(border):
     cells = some_cells(border=border)
     seen: list[slice] = []

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from variants import daily
 
 
 def run_shell(arguments: str, redirect: str) -> subprocess.CompletedProcess[str]:
@@ -27,7 +28,9 @@ def test_closed_streams_keep_the_exit_code(redirect: str, tmp_path: Path) -> Non
         assert len(done.stderr.splitlines()) == int("2>&-" not in redirect)
 
 
-@pytest.mark.parametrize("arguments", ["--version", "info '{scan}'", "info '{scan}' --json", "completion bash"])
+@pytest.mark.parametrize(
+    "arguments", daily(2, ["--version", "info '{scan}'", "info '{scan}' --json", "completion bash"])
+)
 def test_a_result_that_nobody_can_get_is_exit_code_6(arguments: str, tmp_path: Path) -> None:
     scan = tmp_path / "scan"
     if "scan" in arguments:

@@ -39,7 +39,6 @@ def environment_of(tmp_path, **variables):
     return {**environment, "TMPDIR": str(tmp_path), **variables}
 
 
-@pytest.mark.every_device
 @pytest.mark.parametrize(
     ("variables", "fault"),
     [

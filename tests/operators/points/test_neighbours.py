@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from point_grids import scattered_points
 from tolerances import TREE_DISTANCE_STEPS
+from variants import daily
 
 from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.opencl import download
@@ -46,7 +47,7 @@ def test_scattered_points(device, n, k):
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("cloud", CLOUDS)
-@pytest.mark.parametrize("k", [1, 16])
+@pytest.mark.parametrize("k", daily(1, [1, 16]))
 def test_awkward_clouds(device, cloud, k):
     check_equal(device, CLOUDS[cloud], k)
 

@@ -237,7 +237,7 @@ def test_a_light_has_a_direction_and_no_length(device):
 
 
 @pytest.mark.oclgrind
-@pytest.mark.parametrize("grid", ["sheared", "uneven"])
+@pytest.mark.parametrize("grid", daily(1, ["sheared", "uneven"]))
 def test_a_small_picture_under_the_simulator(device, grid):
     volume = make_volume(blobs, grid, 6.0, np.int16)
     camera = look(volume, (0.4, 1.0, -0.3), 4.0, perspective=True)

@@ -19,7 +19,7 @@ from clrecon.proof.surface import extract as twin
 
 
 @pytest.mark.every_device
-@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("closed", daily(1, [True, False]))
 @pytest.mark.parametrize("shape", SHAPES)
 def test_device_equals_twin_at_word_borders(device, shape, closed):
     volume = random_volume(shape)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from variants import daily
 import view_scenes as scenes
 from open_views import find, open_painters, shown_pixels
+from variants import daily
 
 from clrecon.geometry import Volume
 from clrecon.operators.rays.render import render
