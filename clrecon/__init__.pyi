@@ -48,6 +48,7 @@ from clrecon.operators.rays.render import render as render
 from clrecon.operators.reformat.cut import cut_slice as cut_slice
 from clrecon.operators.reformat.cut import reformat_curve as reformat_curve
 from clrecon.operators.resident.device_volume import DeviceVolume as DeviceVolume
+from clrecon.operators.surface.cortex_mesh import fit_cortex as fit_cortex
 from clrecon.operators.surface.decimation import decimate_mesh as decimate_mesh
 from clrecon.operators.surface.extract import SurfaceExtractor as SurfaceExtractor
 from clrecon.operators.surface.extract import extract_isosurface as extract_isosurface

@@ -33,7 +33,7 @@ from clrecon.system.text import count_of, format_digits, format_ml, format_volum
 
 _PARTS = (
     *("device", "read", "mask", "choose", "solid", "upload", "build", "kernels", "download"),
-    *("select", "refine", "measure", "write", "other"),
+    *("select", "cortex", "refine", "measure", "write", "other"),
 )
 _SHOWN_PARTS = 12
 
@@ -109,6 +109,8 @@ def mesh_fields(options: argparse.Namespace) -> dict[str, Any]:
     given = pick(options, MeshSettings)
     given |= given.pop("iso_value", {})  # one of two fields
     needs = "says how labels become meshes: give their file with --labels FILE"
+    if given.get("surface") == "cortex":  # labels pick the cells, as with hu
+        options = argparse.Namespace(**{**vars(options), "surface": "hu"})
     labels = make_part(LabelChoice, options, options.path, needs)
     if labels is not None:
         given["labels"] = labels
@@ -152,6 +154,7 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
         *_describe_solid(report["volume"].get("solid")),
         f"mesh     {report['vertices']:,} vertices, {report['triangles']:,} triangles",
         *_describe_quality(report),
+        *describe_cortex(report["meshes"]),
         *describe_cells(report),
         *describe_labels(report["meshes"]),
         *_describe_parts(report["meshes"]),
@@ -254,6 +257,25 @@ def _describe_quality(report: dict[str, Any]) -> list[str]:
     volume = "" if report["volume_ml"] is None else f", {format_volume(report['volume_ml'])}"
     parts = f"{report['components']:,} component{'s' * (report['components'] != 1)}"
     return [f"         {parts}, {closed}, {manifold}, {report['area_mm2']:,.0f} mm2{volume}"]
+
+
+def describe_cortex(meshes: list[dict[str, Any]]) -> list[str]:
+    """Describe how far the largest mesh lies or lay from the bone, in a line; no line where it was not measured."""
+    found = [mesh["cortex"] for mesh in meshes if (mesh["cortex"] or {}).get("constants")]
+    if not found:
+        return []
+    cortex = max(found, key=lambda each: each["vertices"])
+    outside, error, walls = cortex["outside_mm"], cortex["error_mm"], cortex["thickness_mm"]
+    share = 100.0 * cortex["fitted"] / cortex["vertices"]
+    ends = f"5 % to 95 %: {outside['p5']:+.2f} to {outside['p95']:+.2f}"
+    if not cortex["moved"]:
+        side = "outside" if outside["mean"] >= 0.0 else "inside"
+        return [f"cortex   lies {abs(outside['mean']):.2f} mm {side} of the bone ({ends}), told at {share:.0f} % of it"]
+    return [
+        f"cortex   {share:.0f} % of the vertices lie on the bone, {outside['mean']:.2f} mm inside of the level"
+        f" ({ends}); error {error['p50']:.2f} mm (95 %: {error['p95']:.2f}), of all {cortex['bias_mm']:.2f}; walls"
+        f" {walls['p50']:.1f} mm ({walls['p5']:.1f} to {walls['p95']:.1f})"
+    ]
 
 
 def describe_labels(meshes: list[dict[str, Any]]) -> list[str]:

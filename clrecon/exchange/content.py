@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, Protocol
 
@@ -191,7 +191,7 @@ class Content(PointContent):
     name: Name of the object, for formats that have names.
     color: Red, green and blue, 0 to 1, for formats that have colours; None: the colour of the format's writer.
     vertex_colors: ndarray, shape (n, 3), uint8, or None. A colour for each vertex, in PLY, in place of `color`.
-    distances: ndarray, shape (n,), float32, or None. mm from another surface at each vertex, in PLY.
+    values: Numbers at the vertices by name, shape (n,), float32, in PLY, VTP and GLB; NaN where there is none.
     pieces: For pages.
     """
 
@@ -199,8 +199,8 @@ class Content(PointContent):
     name: str | None = None
     color: tuple[float, float, float] | None = None
     vertex_colors: NDArray[np.uint8] | None = None
-    distances: NDArray[np.float32] | None = None
     pieces: Pieces | None = None
+    values: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

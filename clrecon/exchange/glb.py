@@ -139,6 +139,11 @@ def _describe_part(
         views.append({"buffer": 0, "byteOffset": start, "byteLength": 12 * count, "target": _VERTEX_DATA})
         accessors.append({"bufferView": len(views) - 1, "componentType": _FLOAT, "count": count, "type": "VEC3"})
         start += 12 * count
+    for name in content.values:
+        attributes[f"_{name.upper()}"] = len(views)
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": 4 * count, "target": _VERTEX_DATA})
+        accessors.append({"bufferView": len(views) - 1, "componentType": _FLOAT, "count": count, "type": "SCALAR"})
+        start += 4 * count
     views.append({"buffer": 0, "byteOffset": start, "byteLength": 4 * indices, "target": _INDEX_DATA})
     accessors.append({"bufferView": len(views) - 1, "componentType": _UINT32, "count": indices, "type": "SCALAR"})
     primitive = {"attributes": attributes, "indices": len(views) - 1, "material": number, "mode": 4}
@@ -152,7 +157,9 @@ def _json_chunk(content: Content | Assembly) -> bytes:
 
 def _binary_length(content: Content | Assembly) -> int:
     return sum(
-        12 * len(part.vertices) + (0 if part.normals is None else part.normals.nbytes) + part.triangles.nbytes
+        (12 + 4 * len(part.values)) * len(part.vertices)
+        + (0 if part.normals is None else part.normals.nbytes)
+        + part.triangles.nbytes
         for part in parts_of(content)
     )
 
@@ -172,6 +179,9 @@ def write(stream: BinaryIO, content: Content | Assembly) -> None:
         stream.write(_positions(part).data)
         if part.normals is not None:
             stream.write(np.ascontiguousarray(part.normals, dtype="<f4").data)
+        for values in part.values.values():
+            # glTF knows no NaN: a vertex without a number has -1.
+            stream.write(np.ascontiguousarray(np.where(np.isfinite(values), values, -1.0), dtype="<f4").data)
         stream.write(np.ascontiguousarray(part.triangles, dtype="<u4").data)
 
 

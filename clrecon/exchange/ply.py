@@ -4,8 +4,8 @@ Own code because vtkPLYWriter reports success on a full disk, and trimesh has no
 and not ``uint``, because every reader knows ``int``: at most 2**31 vertices.
 
 A cloud has vertices alone and no element ``face``: readers were seen that take a file with an empty one for a mesh of
-nothing.  HU is the property ``scalar_HU`` of type ``float`` and a distance ``scalar_distance_mm``: CloudCompare takes
-only names with ``scalar_`` by itself, and Open3D skips ``short``.
+nothing.  HU is the property ``scalar_HU`` of type ``float``, other numbers at vertices are ``scalar_distance_mm`` or
+``scalar_thickness_mm``: CloudCompare takes only names with ``scalar_`` by itself, and Open3D skips ``short``.
 
 The readers take ASCII and binary of either byte order, the element ``vertex`` with properties of any number, and of
 meshes ``face`` with lists of three corners.
@@ -49,7 +49,7 @@ def _header(content: PointContent) -> bytes:
         *(f"property float {name}" for name in ("nx", "ny", "nz") if content.normals is not None),
         *(["property float scalar_HU"] if content.hu is not None else []),
         *(["property int label"] if content.labels is not None else []),
-        *(["property float scalar_distance_mm"] if _distances(content) is not None else []),
+        *(f"property float scalar_{name}" for name in _values(content)),
         *(f"property uchar {name}" for name in ("red", "green", "blue") if _color(content) is not None),
     ]
     if isinstance(content, Content):
@@ -57,8 +57,8 @@ def _header(content: PointContent) -> bytes:
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 
-def _distances(content: PointContent) -> NDArray[np.float32] | None:
-    return content.distances if isinstance(content, Content) else None
+def _values(content: PointContent) -> Mapping[str, NDArray[np.float32]]:
+    return content.values if isinstance(content, Content) else {}
 
 
 def _color(content: PointContent) -> NDArray[np.uint8] | None:
@@ -81,8 +81,8 @@ def _columns(content: PointContent) -> dict[str, tuple[NDArray[Any], str, tuple[
         columns["hu"] = (content.hu, "<f4", ())
     if content.labels is not None:
         columns["label"] = (content.labels, "<i4", ())
-    if (distances := _distances(content)) is not None:
-        columns["distance"] = (distances, "<f4", ())
+    for name, values in _values(content).items():
+        columns[f"scalar_{name}"] = (values, "<f4", ())
     if (color := _color(content)) is not None:
         columns["color"] = (np.broadcast_to(color, (len(content.vertices), 3)), "u1", (3,))
     return columns

@@ -17,9 +17,10 @@ from __future__ import annotations
 import binascii
 import re
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, BinaryIO
 from xml.etree import ElementTree
 
@@ -39,6 +40,7 @@ def make_polydata(
     normals: NDArray[np.float32] | None,
     hu: NDArray[np.float32] | None = None,
     labels: NDArray[np.int32] | None = None,
+    values: Mapping[str, NDArray[np.float32]] = MappingProxyType({}),
 ) -> Any:
     """Build a ``vtkPolyData`` that shares the memory of the arrays.
 
@@ -51,6 +53,7 @@ def make_polydata(
     normals: ndarray, shape (n, 3), float32, C-contiguous, or None. They become the active normals, named ``Normals``.
     hu, labels: ndarray, shape (n,), float32 and int32. The point arrays ``HU``, which becomes the active scalars, and
         ``label``.
+    values: Further point arrays by name, (n,) each.
     """
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkPoints
@@ -75,13 +78,14 @@ def make_polydata(
     else:
         polydata.SetPolys(cells)
     data = polydata.GetPointData()
-    for name, values, put in (
+    for name, numbers, put in (
         ("Normals", normals, data.SetNormals),
         ("HU", hu, data.SetScalars),
         ("label", labels, data.AddArray),
+        *((name, each, data.AddArray) for name, each in values.items()),
     ):
-        if values is not None:
-            array = numpy_to_vtk(values)
+        if numbers is not None:
+            array = numpy_to_vtk(numbers)
             array.SetName(name)
             put(array)
     return polydata
@@ -97,11 +101,13 @@ def _join(content: PointContent | Assembly) -> PointContent:
     parts = content.parts
     begins = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
     normals = [part.normals for part in parts if part.normals is not None]
+    common = [name for name in parts[0].values if all(name in part.values for part in parts)]
     return replace(
         parts[0],
         vertices=np.concatenate([part.vertices for part in parts]),
         triangles=np.concatenate([part.triangles + np.uint32(at) for part, at in zip(parts, begins, strict=True)]),
         normals=np.concatenate(normals) if len(normals) == len(parts) else None,
+        values={name: np.concatenate([part.values[name] for part in parts]) for name in common},
     )
 
 
@@ -109,7 +115,7 @@ def estimate(content: PointContent | Assembly) -> int:
     """Return the size of the data in bytes, without the XML: the indices and an offset for each triangle or point."""
     if isinstance(content, Assembly):
         return sum(estimate(part) + 7 * len(part.triangles) for part in content.parts)
-    arrays = (content.vertices, content.normals, content.hu, content.labels)
+    arrays = (content.vertices, content.normals, content.hu, content.labels, *_values(content).values())
     cells = 16 * len(content.triangles) if isinstance(content, Content) else 8 * len(content.vertices)
     return sum(array.nbytes for array in arrays if array is not None) + cells
 
@@ -123,7 +129,9 @@ def write(stream: BinaryIO, content: PointContent | Assembly) -> None:
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
     assembly, content = content, _join(content)
-    polydata = make_polydata(content.vertices, _triangles(content), content.normals, content.hu, content.labels)
+    polydata = make_polydata(
+        content.vertices, _triangles(content), content.normals, content.hu, content.labels, _values(content)
+    )
     for array in _field_arrays(content):
         polydata.GetFieldData().AddArray(array)
     if isinstance(assembly, Assembly):
@@ -168,6 +176,10 @@ def _strings(name: str, texts: Sequence[str]) -> Any:
     for text in texts:
         strings.InsertNextValue(text)
     return strings
+
+
+def _values(content: PointContent) -> Mapping[str, NDArray[np.float32]]:
+    return content.values if isinstance(content, Content) else {}
 
 
 def _triangles(content: PointContent) -> NDArray[np.uint32] | None:

@@ -205,7 +205,9 @@ def _write_files(
     written: list[tuple[str, str | Path, StagedFile]] = []
     if files.output is not None and colored is not None:
         content = replace(
-            mesh.describe(settings.space), vertex_colors=colored.colors, distances=colored.distances.astype(np.float32)
+            mesh.describe(settings.space),
+            vertex_colors=colored.colors,
+            values={"distance_mm": colored.distances.astype(np.float32)},
         )
         counted = f"{mesh.triangle_count} triangles"
         file = run.stage(stage_content(content, files.output, FORMATS[".ply"], counted, "fewer triangles"))

@@ -79,6 +79,9 @@ class BaseMesh(Message):
         if self._normals is not None and len(self._normals) != len(self._vertices):
             raise UsageError(f"{len(self._normals)} normals for {len(self._vertices)} vertices: one a vertex is needed")
         self.report: dict[str, Any] = {} if report is None else report
+        self.values: dict[str, NDArray[np.float32]] = {}
+        """Numbers at the vertices by name, (n,) each, such as ``thickness_mm``; written to the formats that hold
+        some."""
         if not trusted:
             self.check()
 
@@ -177,6 +180,7 @@ class BaseMesh(Message):
             normals=normals,
             name=None if name is None else str(name),
             color=None if color is None else (float(color[0]), float(color[1]), float(color[2])),
+            values=dict(self.values),
             **facts,
         )
 

@@ -95,9 +95,11 @@ def select_components(
     keep_vertex[triangles.reshape(-1)] = True
     number = np.cumsum(keep_vertex, dtype=np.int64) - 1
     normals = None if mesh.normals is None else mesh.normals[keep_vertex]
-    return type(mesh)(
+    kept = type(mesh)(
         mesh.vertices[keep_vertex], number[triangles].astype(np.uint32), normals, {**mesh.report, **chosen.facts}
     )
+    kept.values = {name: values[keep_vertex] for name, values in mesh.values.items()}
+    return kept
 
 
 def split_components(
@@ -145,6 +147,7 @@ def split_components(
         triangles = (number[faces] - vertex_ends[part]).astype(np.uint32)
         normals = None if mesh.normals is None else mesh.normals[own]
         parts.append(type(mesh)(mesh.vertices[own], triangles, normals, {**mesh.report, **chosen.facts}))
+        parts[-1].values = {name: values[own] for name, values in mesh.values.items()}
     return parts
 
 

@@ -7,6 +7,7 @@ number.  Two half-edges are opposite when they run along one edge in opposite di
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,6 +98,22 @@ class Fans:
         found = np.zeros(len(self.rows) // 3, dtype=bool)
         found[self.around(vertices)[0]] = True
         return np.flatnonzero(found)
+
+
+class Rings:
+    """Sums over the neighbours of vertices, from the triangles that they share."""
+
+    def __init__(self, triangles: NDArray[np.uint32], count: int):
+        from scipy.sparse import csr_array
+
+        corners = triangles.astype(np.int32)
+        one = np.concatenate([corners[:, 0], corners[:, 1], corners[:, 2]])
+        other = np.concatenate([corners[:, 1], corners[:, 2], corners[:, 0]])
+        self._next = csr_array((np.ones(len(one), np.float32), (one, other)), shape=(count, count))
+
+    def sums(self, values: NDArray[np.floating]) -> NDArray[Any]:
+        """Return the sum over each vertex and its neighbours, shape (n, ...) as given."""
+        return np.asarray(values + self._next @ values)
 
 
 def find_edges(triangles: NDArray[np.uint32], vertex_count: int) -> Edges:

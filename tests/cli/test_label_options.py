@@ -298,7 +298,7 @@ def test_what_cannot_be_is_said_in_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("options", [["--label", "1"], ["--grow", "1"], ["--surface", "hu"]])
+@pytest.mark.parametrize("options", [["--label", "1"], ["--grow", "1"]])
 def test_label_options_without_labels_are_refused(
     options: list[str], ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

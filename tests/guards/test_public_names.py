@@ -24,6 +24,7 @@ TAKE_PROGRESS = {
     "compare_meshes", "extract_by_method",
     "cut_slice", "decimate_mesh", "denoise_points", "estimate_normals", "extract_isosurface", "extract_isosurfaces",
     "extract_label_masks", "extract_labels", "fill_enclosed", "filter_bilateral", "filter_volume",
+    "fit_cortex",
     "find_cut_cells", "find_ghost_slices", "find_mesh_cells", "find_neighbours", "find_spine_line",
     "list_series", "mask_field_of_view", "measure_cells", "measure_distance", "measure_labels", "measure_slices",
     "measure_truth", "measure_vertex_distances",

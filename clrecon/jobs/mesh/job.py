@@ -11,7 +11,7 @@ from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import judge_label_volumes, name_label_files
 from clrecon.jobs.mesh.make import MadeParts, first_names, make_parts, warn_of_crumbs
 from clrecon.jobs.mesh.purposes import describe_purposes
-from clrecon.jobs.mesh.refinement import judge_parts, measure_parts, refine_surface, warn_of_gates
+from clrecon.jobs.mesh.refinement import judge_parts, measure_parts, place_on_cortex, refine_surface, warn_of_gates
 from clrecon.jobs.mesh.report import MeshReport, describe_part, report_of
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface, plan_surfaces
@@ -129,6 +129,8 @@ def _name_objects(parts: Sequence[Part]) -> None:
 def _refine_and_measure(run: Run, made: MadeParts, measure: bool) -> list[dict[str, Any]]:
     """Refine and measure each part as far as wanted; return the gates."""
     settings: MeshSettings = run.settings
+    place_on_cortex(made, settings, measure, run.progress)
+    run.lap("cortex")
     if settings.refines:
         for part in made.parts:
             part.mesh = refine_surface(part.mesh, settings, made.device, run.progress)

@@ -1,18 +1,22 @@
-"""Smoothing and decimation of the surfaces of a job, and the gates of its meshes."""
+"""The surfaces of a job moved onto the bone, smoothed and decimated, and the gates of its meshes."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from clrecon.errors import NoSurfaceError
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part
+from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
 from clrecon.system.pieces import side_by_side
 from clrecon.system.progress import Progress, Steps, ignore_progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
+    from clrecon.jobs.mesh.make import MadeParts
     from clrecon.mesh import Mesh
     from clrecon.mesh.compare.iso_distance import IsoDistance
     from clrecon.mesh.quality import MeshQuality
@@ -48,6 +52,48 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress:
         "voxel_mm": default_deviation(raw) / BOUND_VOXEL,
     }
     return mesh
+
+
+def place_on_cortex(
+    made: MadeParts, settings: MeshSettings, measure: bool, progress: Progress = ignore_progress
+) -> None:
+    """Move the meshes onto the bone, if the settings ask for it, or with `measure` say how far they lie from it.
+
+    The constants of the scan are measured once, in its largest mesh.  A mesh at a level of bone that shows none gets
+    ``{"reason": words}`` in place of figures; where the cortex was asked for, that is an error.
+    """
+    moves = settings.surface == "cortex"
+    parts = sorted(made.parts, key=lambda part: -part.mesh.vertex_count)
+    if not moves:
+        parts = [part for part in parts if measure and _may_be_bone(part)]
+    if not parts:
+        return
+    from clrecon.operators.resident.device_volume import DeviceVolume
+    from clrecon.operators.surface.cortex_mesh import fit_mesh, measure_outside
+
+    with DeviceVolume(made.volume, device=made.device, memory=settings.memory) as resident:
+        constants = None
+        for number, part in enumerate(parts):
+            if moves:
+                part.mesh = fit_mesh(part.mesh, resident, constants=constants, progress=progress)
+                constants = part.mesh.report["cortex"].constants
+                continue
+            try:
+                found = measure_outside(part.mesh, resident, constants=constants)
+            except NoSurfaceError as error:
+                part.mesh.report["cortex"] = {"reason": str(error)}
+                if number == 0:
+                    break
+            else:
+                part.mesh.report["cortex"], constants = found, found.constants
+
+
+def _may_be_bone(part: Part) -> bool:
+    """Tell whether a mesh lies at a level of bone, which HU have placed."""
+    level = part.mesh.report.get("iso_value_hu")
+    if part.mesh.report.get("inside") != "above" or level is None or part.mesh.triangle_count == 0:
+        return False
+    return math.isfinite(level) and LOWEST_BONE_HU <= level <= HIGHEST_BONE_HU
 
 
 def measure_parts(
@@ -87,10 +133,11 @@ def _measure_on_host(part: Part, volume: Volume) -> tuple[MeshQuality, IsoDistan
 
 
 def _measure_distance(part: Part, volume: Volume) -> IsoDistance | None:
-    """Measure how far a part lies from the scan, None where HU do not place it."""
+    """Measure how far a part lies from the scan, None where no level of HU places it."""
     from clrecon.mesh.compare.iso_distance import measure_iso_distance, rule_of_report
 
-    rule = None if part.surface.label is not None else rule_of_report(part.mesh.report)
+    moved = (part.mesh.report.get("cortex") or {}).get("moved", False)
+    rule = None if moved or part.surface.label is not None else rule_of_report(part.mesh.report)
     return None if rule is None else measure_iso_distance(part.mesh, volume, rule)
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.system.files import StagedFile
 
-_OF_ONE = ("quality", "walls", "iso_distance", "refinement", "print", "cells", "growing")
+_OF_ONE = ("quality", "walls", "iso_distance", "cortex", "refinement", "print", "cells", "growing")
 """Entries of a mesh that are also at the top of the report if there is only one mesh."""
 
 _SAID_ABOVE = ("vertices", "triangles", "closed", "manifold", "components", "area_mm2", "volume_ml", "bounds_mm")
@@ -56,6 +56,7 @@ def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], 
         "bounds_mm": _bounds(part.mesh, space),
         "output": {"format": extension_of(output)[1:], "bytes": file.size},
         "quality": {name: value for name, value in quality.items() if name not in _SAID_ABOVE} or None,
+        "cortex": origin.get("cortex"),
         "cells": origin.get("cells"),
         "growing": origin.get("growing"),
         **({} if part.surface.label is None else describe_label(origin)),
@@ -80,7 +81,7 @@ class MeshReport(RunReport):
     keep, keep_largest, min_volume_ml, seeds_mm, all_parts, split, purpose: The settings.
     slabs: Largest number for a surface.
     device_bytes: Most bytes taken on the device, by purpose.
-    quality, walls, iso_distance, refinement, print, cells, growing: Entries of the only mesh.
+    quality, walls, iso_distance, cortex, refinement, print, cells, growing: Entries of the only mesh.
     meshes: One for each file, see `describe_part`.
     output: ``format`` and ``bytes`` of all files.
     gates: `Gate`, each with ``mesh``, the name of its part or None.
@@ -93,7 +94,7 @@ class MeshReport(RunReport):
     )
     PARTS = (
         *("device", "read", "upload", "build", "kernels", "download"),
-        *("mask", "choose", "solid", "select", "refine", "measure", "write"),
+        *("mask", "choose", "solid", "select", "cortex", "refine", "measure", "write"),
     )
 
     iso_value_hu: float | None
@@ -134,6 +135,7 @@ class MeshReport(RunReport):
     quality: Mapping[str, Any] | None
     walls: Mapping[str, Any] | None
     iso_distance: Mapping[str, Any] | None
+    cortex: Mapping[str, Any] | None
     refinement: Mapping[str, Any] | None
     print: Mapping[str, Any] | None
     cells: Mapping[str, int] | None

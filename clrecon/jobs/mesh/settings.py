@@ -75,6 +75,7 @@ class MeshSettings(InputSettings):
     iso_value: float or sequence of float or (low, high). A pair in the sequence is a range: ``((100, 300),)``.
     half_way: "auto" or (bone, tissue), see `clrecon.jobs.options.parse_hu`.
     preset: See `clrecon.jobs.presets`.  If no level is given, it is "bone".
+    surface: "cortex": see `clrecon.fit_cortex`; "mask" is that of the labels, `LabelChoice.surface`.
     topology, vertex_rule: See `clrecon.extract_isosurface`.
     method: One of `clrecon.operators.surface.methods.METHODS`; None: "i-mc" with seeds in `grow_from`, else "t-mc".
     grow_from: With ``label:NAME`` the label map makes no meshes of its own.
@@ -120,6 +121,15 @@ class MeshSettings(InputSettings):
         "--seal MM",
         "with --solid: close pores up to twice as wide, less one voxel (default: 2.5 to 3, by the voxels)",
         group="inside",
+    )
+    surface: str = option(
+        "--surface hu|cortex|mask",
+        "hu: vertices lie at the level (default); cortex: each is moved onto the bone, whose place is read from the"
+        " whole profile of HU across its wall (docs/iso_value.md); mask: with --labels the label's own surface,"
+        " whatever the HU: organs, lungs, what HU do not show",
+        group="surface",
+        default="hu",
+        parse=str.lower,
     )
     space: str = space_option("patient frame of the mesh", group="surface")
     topology: str = option(
@@ -219,6 +229,7 @@ class MeshSettings(InputSettings):
         if self.iso_value is not None and self.preset is not None:
             raise UsageError("give either an iso value in HU or a preset, not both")
         self._check_masks()
+        self._check_surface()
         self._check_below()
         if self.purpose is not None:
             find_purpose(self.purpose)
@@ -256,6 +267,27 @@ class MeshSettings(InputSettings):
             raise UsageError("labels take what lies from one iso value on, not below it")
         if self.labels_pick and self.topology != "separated":
             raise UsageError(f"the topology {self.topology} follows HU: leave it out with labels, which pick the cells")
+
+    def _check_surface(self) -> None:
+        """Refuse a surface that is none, and a cortex where no outer wall of bone is asked for."""
+        if self.surface == "hu":
+            return
+        name = name_parameter("surface", self.surface)
+        if self.surface == "mask":
+            if self.labels is None:
+                raise UsageError(f"{name} is that of labels: give their file with {name_parameter('labels')}")
+            return
+        if self.surface != "cortex":
+            raise UsageError(f"there is no surface {self.surface!r}: it is hu, cortex or mask")
+        if not self.follows_hu:
+            raise UsageError(f"{name} is read from the HU: the surface of a mask does not depend on them")
+        if self.inside != "above":
+            raise UsageError(
+                f"{name} is the outer surface of bone, which lies above an iso value: leave ranges and"
+                f" {name_parameter('below')} out"
+            )
+        if self.method_used in ("t-mc-soup", "skimage"):
+            raise UsageError(f"{name} moves the vertices of one mesh: leave {name_parameter('method')} out")
 
     def _check_masks(self) -> None:
         """Refuse settings that have no effect on labels' own surfaces, which do not depend on HU."""
@@ -487,13 +519,7 @@ class LabelChoice:
         parse=parse_label_color,
         action="append",
     )
-    surface: str = option(
-        "--surface hu|mask",
-        "hu: HU place the vertices (default); mask: the label's own surface, smoothed within its voxels and with their"
-        " volume, whatever the HU: organs, lungs, what HU do not show",
-        default="hu",
-        parse=str.lower,
-    )
+    surface: str = "hu"
     grow_mm: float | None = option(
         "--grow MM", "dense voxels this near to a label are its own (default: one voxel each way)"
     )

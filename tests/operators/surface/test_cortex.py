@@ -11,7 +11,7 @@ from clrecon.geometry import Volume
 from clrecon.opencl import Stopwatch
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import cortex
-from clrecon.operators.surface.cortex import FITTED, METAL, NO_ROOM, NOT_BONE, ProfileSampler, fit_cortex
+from clrecon.operators.surface.cortex import FITTED, METAL, NO_ROOM, NOT_BONE, ProfileSampler, fit_walls
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.proof.checking import OBLIQUE, stack
 from clrecon.proof.surface.surface_checks import CORTEX_CHECKS
@@ -32,7 +32,7 @@ def hollow_ball(radius=13.0, thickness=2.0, blur=0.7, cortex=1000.0, inner=200.0
 def fit_surface(volume: Volume, device, level=200.0, constants=None):
     mesh = extract_isosurface(volume, level, device=device)
     with DeviceVolume(volume, device=device) as resident:
-        return mesh, fit_cortex(resident, mesh.vertices, mesh.normals, stopwatch=Stopwatch(), constants=constants)
+        return mesh, fit_walls(resident, mesh.vertices, mesh.normals, stopwatch=Stopwatch(), constants=constants)
 
 
 def outer_places(mesh, fit, radius):
@@ -82,7 +82,7 @@ def test_slabs_change_nothing(device, uneven):
     with DeviceVolume(volume, device=device, memory=limit) as resident:
         sampler = ProfileSampler(resident, Stopwatch())
         assert len(list(sampler.pieces(mesh.vertices, mesh.normals))) > 1
-        slabs = fit_cortex(resident, mesh.vertices, mesh.normals, stopwatch=Stopwatch(), constants=whole.constants)
+        slabs = fit_walls(resident, mesh.vertices, mesh.normals, stopwatch=Stopwatch(), constants=whole.constants)
     for name in ("states", "shift_mm", "thickness_mm", "error_mm", "room_mm"):
         assert np.array_equal(getattr(slabs, name), getattr(whole, name), equal_nan=True), name
 

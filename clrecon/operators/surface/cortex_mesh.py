@@ -1,0 +1,319 @@
+"""A surface at a low level moved onto the outer surface of bone, and how far any surface lies from it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.mesh import Mesh
+from clrecon.mesh.connectivity import Rings
+from clrecon.mesh.refine.shifts import move_vertices
+from clrecon.mesh.triangles import vertex_normals
+from clrecon.opencl import Device, Stopwatch
+from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
+from clrecon.operators.surface.cortex import (
+    BADLY_FITTED,
+    FITTED,
+    MOST_SHIFT_MM,
+    CortexConstants,
+    CortexFit,
+    ProfileSampler,
+    fit_walls,
+)
+from clrecon.operators.surface.decimation import find_crossings
+from clrecon.system.arguments import explains_arguments
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.records import Record
+
+Float64Array = NDArray[np.float64]
+
+MOST_LOOKED_AT = 20_000
+"""Vertices of a surface at a level whose distance from the bone is measured."""
+
+FEWEST_FITTED = 100
+"""Fitted vertices below which nothing is said about a surface."""
+
+KEPT_MM = 1e-3
+"""A vertex farther than this from where its wall is was not moved by all of its shift."""
+
+LEAST_TURN = 0.2
+"""Least cosine between a triangle before and after it was moved."""
+
+CALM_ROUNDS, SHORT_ROUNDS = 12, 8
+"""Rounds in which corners of triangles that would turn over go to the mean of their neighbours, and then half back."""
+
+BIAS_ROWS = 2000
+"""Vertices by which the effect of the constants on the whole surface is measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class CortexReport(Record):
+    """What was found of a surface's distance from the bone, in mm.
+
+    moved: The surface was moved onto the bone; else it lies at its level, and `vertices` are those looked at.
+    constants: `CortexConstants`.
+    vertices, fitted, not_bone, metal, badly_fitted, no_room: All vertices, and how many are in which state.
+    kept: Fitted vertices that were not moved by all of their shift, because the mesh would have broken.
+    outside_mm: ``mean``, ``p5``, ``p50``, ``p95`` of the way from the bone to the level's surface, outwards positive.
+    error_mm: ``p50`` and ``p95`` of the standard errors of the fitted vertices.
+    bias_mm: How far the whole fitted surface may lie off, because the constants are not known better.
+    thickness_mm: ``p5``, ``p50``, ``p95`` of the walls, and ``thin_share`` of those thinner than the blur.
+    seconds: Time that it took.
+    """
+
+    moved: bool
+    constants: CortexConstants
+    vertices: int
+    fitted: int
+    not_bone: int
+    metal: int
+    badly_fitted: int
+    no_room: int
+    kept: int
+    outside_mm: dict[str, float]
+    error_mm: dict[str, float]
+    bias_mm: float
+    thickness_mm: dict[str, float]
+    seconds: float
+
+
+def choose_shifts(fit: CortexFit, rings: Rings) -> NDArray[np.float32]:
+    """Return the shift of each vertex, mm: that of the fit; 0 where there is no wall.
+
+    What is badly fitted lies where its neighbours say, with the weights 1 / error^2.  Others are not smoothed: shifts
+    undo the waves of the level's surface, and means of them keep these (0.15 mm became 0.17 at a noise of 50 HU).
+    """
+    fitted, doubtful = fit.states == FITTED, fit.states == BADLY_FITTED
+    shifts = np.where(fitted, fit.shift_mm, 0.0).astype(np.float32)
+    if doubtful.any():
+        weights = np.where(fitted, 1.0 / np.square(np.maximum(fit.error_mm, 1e-3)), 0.0).astype(np.float32)
+        summed = rings.sums(np.column_stack([weights, weights * shifts]))
+        known = doubtful & (summed[:, 0] > 0.0)
+        shifts[known] = summed[known, 1] / summed[known, 0]
+    return np.clip(shifts, -MOST_SHIFT_MM, MOST_SHIFT_MM)
+
+
+def calm_vertices(
+    vertices: NDArray[np.floating], moved: NDArray[np.floating], triangles: NDArray[np.uint32], rings: Rings
+) -> NDArray[np.float64]:
+    """Return moved vertices with no triangle turned over: the corners of such go to the mean of their neighbours, and
+    after some rounds back half the way, and at last all of it.
+    """
+    places = moved.astype(np.float64)
+    before = _crosses(vertices, triangles)
+    counts = rings.sums(np.ones(len(vertices), np.float32))[:, None]
+    rows = np.arange(len(triangles))
+    for turn in range(CALM_ROUNDS + SHORT_ROUNDS + 1):
+        turned = _turned(places, triangles[rows], before[rows])
+        if not turned.any():
+            break
+        bad = np.zeros(len(vertices), bool)
+        bad[triangles[rows[turned]].reshape(-1)] = True
+        if turn >= CALM_ROUNDS + SHORT_ROUNDS:
+            bad = rings.sums(bad.astype(np.float32)) > 0.0
+            places[bad] = vertices[bad]
+        elif turn >= CALM_ROUNDS:
+            places[bad] = 0.5 * (places[bad] + vertices[bad])
+        else:
+            places[bad] = (rings.sums(places) / counts)[bad]
+        rows = np.flatnonzero(bad[triangles].any(axis=1))
+    return places
+
+
+def _crosses(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> NDArray[np.float32]:
+    a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
+    return np.asarray(np.cross(b - a, c - a), np.float32)
+
+
+def _moved(
+    vertices: NDArray[np.floating], normals: NDArray[np.floating], shifts: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    return np.asarray(vertices + shifts[:, None] * normals, np.float32)
+
+
+def _turned(
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], before: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Mark the triangles that turned by more than `LEAST_TURN` lets."""
+    after = _crosses(vertices, triangles)
+    along = np.einsum("na,na->n", after, before)
+    lengths = np.sqrt(np.einsum("na,na->n", after, after) * np.einsum("na,na->n", before, before))
+    return np.asarray(along <= LEAST_TURN * lengths)
+
+
+@explains_arguments
+def fit_cortex(
+    mesh: Mesh,
+    volume: Volume | DeviceVolume,
+    *,
+    device: Device | str | int | None = None,
+    memory: int | None = None,
+    progress: Progress | None = None,
+) -> Mesh:
+    """Move a surface at a low level onto the outer surface of bone, vertex by vertex.
+
+    Three blurred plateaus (tissue, cortex, marrow) are fitted to the profile of HU along each vertex's normal; the
+    blur within and across the slices and the HU of the cortex are measured in the scan.  A vertex without a wall of
+    bone (vessel, marrow, metal, another wall or the border just outside of it) stays where it is.  Triangles, their
+    order and components stay as they are; no triangle is turned over, and no two cut each other that did not before.
+    See ``docs/iso_value.md``.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        A surface of bone at a low level, such as ``extract_isosurface(volume, 200)``: walls that are not in it are not
+        found.
+    volume : Volume or DeviceVolume
+        The scan that the mesh was made from.
+    device : Device, str or int, optional
+        See `clrecon.device`; None is the best of the machine.
+    memory : int, optional
+        Most bytes taken on the device.
+    progress : callable, optional
+        Called as ``progress("cortex", done, total)`` in steps.
+
+    Returns
+    -------
+    Mesh
+        ``values["thickness_mm"]`` and ``values["error_mm"]`` have the thickness of the wall and the standard error of
+        its place at each vertex, NaN where none was fitted.  Thicknesses below the blur say "thinner than that"; from
+        half of the profile on they stand for solid bone.  ``report["cortex"]`` says what was measured and counts the
+        vertices.
+
+    Raises
+    ------
+    UsageError
+        ``volume`` is not a Volume, or the mesh encloses values below a level.
+    NoSurfaceError
+        The surface has no walls of bone.
+    DeviceError
+        The device does not exist, has too little memory, or fails.
+    """
+    progress = progress or ignore_progress
+    with open_volume(volume, device, memory, "the cortex") as resident:
+        for attempt in resident.with_fallback():
+            with attempt:
+                fitted = fit_mesh(mesh, resident, progress=progress)
+    return fitted
+
+
+def fit_mesh(
+    mesh: Mesh,
+    resident: DeviceVolume,
+    *,
+    constants: CortexConstants | None = None,
+    progress: Progress = ignore_progress,
+) -> Mesh:
+    """Do what `fit_cortex` does, with constants of the scan that are known."""
+    start, steps = time.perf_counter(), 5
+    progress("cortex", 0, steps)
+    normals = _normals_of(mesh)
+    fit = fit_walls(resident, mesh.vertices, normals, stopwatch=Stopwatch(), constants=constants)
+    _refuse_few(fit)
+    progress("cortex", 1, steps)
+    rings = Rings(mesh.triangles, mesh.vertex_count)
+    shifts = choose_shifts(fit, rings)
+    progress("cortex", 2, steps)
+    wanted = mesh.vertices + shifts[:, None] * normals.astype(np.float64)
+    calm = calm_vertices(mesh.vertices, wanted, mesh.triangles, rings)
+    progress("cortex", 3, steps)
+    vertices, _ = move_vertices(
+        mesh.vertices, mesh.triangles, calm - mesh.vertices, partial(find_crossings, resident.device)
+    )
+    progress("cortex", 4, steps)
+    fitted = fit.states == FITTED
+    kept = int(np.count_nonzero(fitted & (np.abs(vertices - wanted).max(axis=1) > KEPT_MM)))
+    known = np.isin(fit.states, (FITTED, BADLY_FITTED))
+    report = _describe(fit, resident, mesh.vertices, normals, True, kept, start)
+    made = Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), {**mesh.report, "cortex": report})
+    made.values = {
+        "thickness_mm": np.where(known, fit.thickness_mm, np.float32(np.nan)),
+        "error_mm": np.where(fitted, fit.error_mm, np.float32(np.nan)),
+    }
+    progress("cortex", steps, steps)
+    return made
+
+
+def measure_outside(mesh: Mesh, resident: DeviceVolume, *, constants: CortexConstants | None = None) -> CortexReport:
+    """Measure how far a surface at a level lies outside of the bone, at up to `MOST_LOOKED_AT` of its vertices."""
+    start = time.perf_counter()
+    rows = np.unique(np.linspace(0, mesh.vertex_count - 1, min(mesh.vertex_count, MOST_LOOKED_AT)).astype(np.int64))
+    points, normals = mesh.vertices[rows], _normals_of(mesh)[rows]
+    fit = fit_walls(resident, points, normals, stopwatch=Stopwatch(), constants=constants)
+    _refuse_few(fit)
+    return _describe(fit, resident, points, normals, False, 0, start)
+
+
+def _normals_of(mesh: Mesh) -> NDArray[np.float32]:
+    """Return the normals of a mesh outwards; of extracted surfaces those of the field."""
+    if mesh.report.get("inside") == "below":
+        raise UsageError("the cortex is the outer surface of dense walls: this mesh encloses what lies below a level")
+    return vertex_normals(mesh.vertices, mesh.triangles) if mesh.normals is None else mesh.normals
+
+
+def _refuse_few(fit: CortexFit) -> None:
+    count = int(np.count_nonzero(fit.states == FITTED))
+    if count < FEWEST_FITTED:
+        raise NoSurfaceError(
+            f"the surface has no walls of bone to be fitted: {count} of {len(fit.states):,} vertices, at least"
+            f" {FEWEST_FITTED} are needed"
+        )
+
+
+def _describe(
+    fit: CortexFit,
+    resident: DeviceVolume,
+    points: NDArray[np.floating],
+    normals: NDArray[np.floating],
+    moved: bool,
+    kept: int,
+    start: float,
+) -> CortexReport:
+    fitted = fit.states == FITTED
+    shift, thickness = fit.shift_mm[fitted].astype(np.float64), fit.thickness_mm[fitted]
+    bias = _measure_bias(fit, resident, points, normals)
+    counts = fit.counts()
+    return CortexReport(
+        moved=moved,
+        constants=fit.constants,
+        vertices=len(fit.states),
+        **{name.replace(" ", "_"): count for name, count in counts.items()},
+        kept=kept,
+        outside_mm={"mean": float(-shift.mean()), **_percentiles(-shift, 5, 50, 95)},
+        error_mm=_percentiles(fit.error_mm[fitted], 50, 95),
+        bias_mm=bias,
+        thickness_mm={
+            **_percentiles(thickness, 5, 50, 95),
+            "thin_share": float(np.mean(thickness < fit.constants.blur_mm)),
+        },
+        seconds=time.perf_counter() - start,
+    )
+
+
+def _percentiles(values: NDArray[np.floating], *which: int) -> dict[str, float]:
+    return {f"p{each}": float(value) for each, value in zip(which, np.percentile(values, which), strict=True)}
+
+
+def _measure_bias(
+    fit: CortexFit, resident: DeviceVolume, points: NDArray[np.floating], normals: NDArray[np.floating]
+) -> float:
+    """Return the root of the squares of what each constant's uncertainty moves the surface by, on average."""
+    fitted = np.flatnonzero(fit.states == FITTED)
+    rows = fitted[np.unique(np.linspace(0, len(fitted) - 1, min(len(fitted), BIAS_ROWS)).astype(np.int64))]
+    sampler = ProfileSampler(resident, Stopwatch())
+    walls, known = sampler.take(sampler.values(points[rows], normals[rows])), fit.constants
+    changes = []
+    for name in ("blur_mm", "blur_across_mm", "cortex_hu"):
+        error = getattr(known, f"{name.removesuffix('_mm').removesuffix('_hu')}_error_{name[-2:]}")
+        ends = []
+        for sign in (-1.0, 1.0):
+            other = known.changed(**{name: getattr(known, name) + sign * error})
+            ends.append(walls.fit_with(other).shift_mm.astype(np.float64).mean())
+        changes.append(0.5 * (ends[1] - ends[0]))
+    return float(np.linalg.norm(changes))

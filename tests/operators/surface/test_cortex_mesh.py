@@ -1,0 +1,167 @@
+"""Surfaces moved onto the bone: where they lie, that nothing breaks, what is said and written of them."""
+
+from __future__ import annotations
+
+import json
+import struct
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+import clrecon
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.mesh.intersections import find_self_intersections
+from clrecon.operators.surface import cortex_mesh
+from clrecon.operators.surface.cortex_mesh import Rings, calm_vertices
+from clrecon.operators.surface.extract import extract_isosurface
+
+MIDDLE = np.array([19.5, 19.0, 18.0])
+
+
+@pytest.fixture(scope="module")
+def shell() -> Volume:
+    """A shell of bone 3 mm thick with its outer surface at 13 mm, blurred by 0.7 mm, with noise of 20 HU."""
+    k, j, i = np.indices((38, 40, 41))
+    far = np.sqrt((i - MIDDLE[0]) ** 2 + (j - MIDDLE[1]) ** 2 + (k - MIDDLE[2]) ** 2)
+    outer, inner = ndtr((far - 13.0) / 0.7), ndtr((10.0 - far) / 0.7)
+    values = 50.0 * outer + 200.0 * inner + 1000.0 * (1.0 - outer - inner)
+    values += np.random.default_rng(3).normal(0.0, 20.0, far.shape)
+    return Volume(np.rint(values).astype(np.int16), np.eye(4))
+
+
+@pytest.fixture(scope="module")
+def level(shell, device):
+    return extract_isosurface(shell, 300.0, device=device).keep_largest()
+
+
+@pytest.fixture(scope="module")
+def fitted(level, shell, device):
+    return clrecon.fit_cortex(level, shell, device=device)
+
+
+def test_the_surface_lies_on_the_bone(level, fitted):
+    before, after = (np.linalg.norm(mesh.vertices - MIDDLE, axis=1) - 13.0 for mesh in (level, fitted))
+    assert before.mean() > 0.3
+    # Blur moves the edge of a ball inwards, by 0.04 mm here: the square of its width over the radius.
+    assert -0.08 < after.mean() < 0.02 and np.abs(after).mean() < 0.1
+    assert np.median(fitted.values["thickness_mm"]) == pytest.approx(3.0, abs=0.3)
+    error = fitted.values["error_mm"]
+    assert (np.abs(after) < 1.96 * error).mean() > 0.93
+
+
+def test_nothing_breaks(level, fitted):
+    assert np.array_equal(fitted.triangles, level.triangles)
+    quality, old = fitted.quality(), level.quality()
+    assert all(quality[name] == old[name] for name in ("closed", "manifold", "components", "euler_number"))
+    assert len(find_self_intersections(fitted.vertices, fitted.triangles)) == 0
+
+
+def test_what_is_said(fitted, level):
+    found = fitted.report["cortex"]
+    assert found["moved"] and found["vertices"] == level.vertex_count
+    assert sum(found[name] for name in ("fitted", "not_bone", "metal", "badly_fitted", "no_room")) == found["vertices"]
+    assert found["fitted"] > 0.97 * found["vertices"]
+    assert found["outside_mm"]["p5"] < found["outside_mm"]["mean"] < found["outside_mm"]["p95"]
+    assert found["constants"]["cortex_hu"] == pytest.approx(1000.0, rel=0.05)
+    assert 0.0 < found["bias_mm"] < 0.05
+    json.dumps(found.as_dict(), allow_nan=False)
+    assert "cortex" not in level.report
+
+
+def test_triangles_that_would_turn_over_are_calmed(level):
+    random = np.random.default_rng(4)
+    wild = level.vertices + random.normal(0.0, 0.4, level.vertices.shape)
+    calm = calm_vertices(level.vertices, wild, level.triangles, Rings(level.triangles, level.vertex_count))
+    before = cortex_mesh._crosses(level.vertices, level.triangles)
+    assert cortex_mesh._turned(wild, level.triangles, before).mean() > 0.05
+    assert not cortex_mesh._turned(calm, level.triangles, before).any()
+    same = calm_vertices(level.vertices, level.vertices, level.triangles, Rings(level.triangles, level.vertex_count))
+    assert np.array_equal(same, level.vertices)
+
+
+def test_values_go_with_their_vertices_into_parts_and_files(fitted, tmp_path):
+    assert clrecon.Mesh(fitted.vertices, fitted.triangles).values == {}
+    part = fitted.split()[0]
+    assert np.array_equal(part.values["thickness_mm"], fitted.values["thickness_mm"])
+    ply = tmp_path / "a.ply"
+    fitted.save(ply)
+    head, _, data = ply.read_bytes().partition(b"end_header\n")
+    names = [line.split()[-1].decode() for line in head.splitlines() if line.startswith(b"property float")]
+    assert names[-2:] == ["scalar_thickness_mm", "scalar_error_mm"]
+    rows = np.frombuffer(data, "<f4", fitted.vertex_count * len(names)).reshape(-1, len(names))
+    assert np.array_equal(rows[:, -2], fitted.values["thickness_mm"], equal_nan=True)
+    assert np.array_equal(clrecon.read_mesh(ply).vertices, fitted.vertices)
+    vtp = tmp_path / "a.vtp"
+    fitted.save(vtp)
+    assert b'Name="thickness_mm"' in vtp.read_bytes() and b'Name="error_mm"' in vtp.read_bytes()
+    assert np.array_equal(clrecon.read_mesh(vtp).vertices, fitted.vertices)
+
+
+def test_glb_holds_values_without_nan(fitted, tmp_path):
+    glb = tmp_path / "a.glb"
+    fitted.values["error_mm"][:3] = np.nan
+    fitted.save(glb)
+    raw = glb.read_bytes()
+    length = struct.unpack("<I", raw[12:16])[0]
+    document = json.loads(raw[20 : 20 + length])
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    view = document["bufferViews"][document["accessors"][attributes["_ERROR_MM"]]["bufferView"]]
+    begin = 28 + length + view["byteOffset"]
+    found = np.frombuffer(raw, "<f4", fitted.vertex_count, begin)
+    assert (found[:3] == -1.0).all() and np.array_equal(found[3:], fitted.values["error_mm"][3:])
+    assert np.allclose(clrecon.read_mesh(glb).vertices, fitted.vertices, atol=1e-4)
+
+
+def test_refusals(shell, level, device):
+    soft = shell.with_voxels(np.full(shell.shape, 40, np.int16))
+    with pytest.raises(NoSurfaceError, match="no walls of bone"):
+        clrecon.fit_cortex(level, soft, device=device)
+    below = extract_isosurface(shell, 300.0, below=True, device=device)
+    with pytest.raises(UsageError, match="below a level"):
+        clrecon.fit_cortex(below, shell, device=device)
+
+
+def run(*arguments) -> int:
+    from clrecon.cli.main import main
+
+    return main(["mesh", *map(str, arguments)])
+
+
+def test_the_command(shell, tmp_path, capsys):
+    shell.save(tmp_path / "ct.nii.gz")
+    given = (tmp_path / "ct.nii.gz", "-o", tmp_path / "a.ply", "--report", tmp_path / "a.json")
+    assert run(*given, "--surface", "cortex") == 0
+    assert "vertices lie on the bone" in capsys.readouterr().out
+    report = json.loads((tmp_path / "a.json").read_text("utf-8"))
+    assert report["cortex"]["moved"] and report["iso_distance"] is None and report["seconds"]["cortex"] > 0.0
+    assert run(*given) == 0
+    assert "outside of the bone" in capsys.readouterr().out
+    report = json.loads((tmp_path / "a.json").read_text("utf-8"))
+    assert not report["cortex"]["moved"] and report["cortex"]["outside_mm"]["mean"] > 0.2
+
+
+def test_a_label_lies_on_the_bone(shell, tmp_path):
+    ct, labels = tmp_path / "ct.nii.gz", tmp_path / "labels.nii.gz"
+    shell.save(ct)
+    shell.with_voxels((shell.voxels > 300).astype(np.uint8)).save(labels)
+    given = (ct, "-o", tmp_path / "a.stl", "--labels", labels, "--surface", "cortex", "--report", tmp_path / "a.json")
+    assert run(*given) == 0
+    report = json.loads((tmp_path / "a.json").read_text("utf-8"))
+    assert report["meshes"][0]["label_number"] == 1 and report["cortex"]["moved"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--surface", "nets"], "it is hu, cortex or mask"),
+        (["--surface", "mask"], "that of labels"),
+        (["--surface", "cortex", "--below", "-400"], "outer surface of bone"),
+        (["--surface", "cortex", "--hu", "100:300"], "outer surface of bone"),
+        (["--surface", "cortex", "--method", "skimage"], "vertices of one mesh"),
+    ],
+)
+def test_the_command_refuses(options, words, tmp_path, capsys):
+    assert run(tmp_path, "-o", tmp_path / "a.stl", *options) == 3
+    assert words in capsys.readouterr().err
