@@ -17,7 +17,8 @@ CLRECON_REQUIRE_PLATFORMS
 CLRECON_RELEASE_TESTS=1
     Tests marked ``release`` too.
 CLRECON_FAST_TESTS=1
-    All guards, and of other tests the first parameter on the first device, but for those marked slow, long or fuzz.
+    All guards, and of other tests the first parameter on the first device, but for those marked seconds, slow, long or
+    fuzz.
 CLRECON_COVERAGE=1
     Lines and branches of clrecon that the tests run are counted, see `coverage_figure`.
 CLRECON_REQUIRE_TESTS=1
@@ -153,7 +154,7 @@ def is_left_out(item: pytest.Item, seen: set[str]) -> bool:
     name = item.nodeid.partition("[")[0]
     is_new = name not in seen
     seen.add(name)
-    return not is_new or any(item.get_closest_marker(mark) for mark in ("slow", "long", "fuzz"))
+    return not is_new or any(item.get_closest_marker(mark) for mark in ("seconds", "slow", "long", "fuzz"))
 
 
 @pytest.hookimpl(wrapper=True)

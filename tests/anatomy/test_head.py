@@ -63,6 +63,7 @@ def test_row_70_every_level_below_bone_is_warned_of() -> None:
     assert warn_of_face(head, [None, 400.0], "surface") == [] and warn_of_face(head, [None, 40.0], "surface") == [SAID]
 
 
+@pytest.mark.seconds
 def test_row_70_meshes_of_python_say_so(device: Any) -> None:
     head = phantom("head")
 

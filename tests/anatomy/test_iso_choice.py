@@ -81,6 +81,7 @@ def test_a_specimen_in_air_is_cut_half_way_to_air() -> None:
     assert chosen.background == "air" and "between air" in chosen.reason
 
 
+@pytest.mark.seconds
 def test_the_spine_is_cut_where_its_surface_is_nearest(comparison) -> None:
     volume, distance = comparison.make_spine(SPINE, {})
     error = comparison.SpineError(volume, distance)

@@ -48,6 +48,7 @@ def check_canal(line, canal) -> None:
     assert away.mean() <= tolerances.CANAL_MEAN_MM and away.max() <= tolerances.CANAL_MAX_MM
 
 
+@pytest.mark.seconds
 def test_the_canal_of_the_phantom_is_found_over_its_whole_height(phantom):
     volume, canal = phantom
     line = find_spine_line(volume)

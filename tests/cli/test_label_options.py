@@ -46,6 +46,7 @@ def run(*arguments: object, device: Any = None) -> int:
     return main([str(argument) for argument in ("mesh", *arguments, *chosen)])
 
 
+@pytest.mark.seconds
 def test_each_label_gets_a_file_of_its_name(
     device: Any, ct: Path, labels: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -240,6 +241,7 @@ def test_what_cannot_be_with_masks_is_said_in_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.seconds
 def test_labels_that_miss_their_volume_fail_the_gate(
     device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -106,6 +106,7 @@ def test_an_interrupt_leaves_nothing(number: signal.Signals, tmp_path: Path) -> 
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.seconds
 def test_pillow_is_hidden_from_all_but_what_makes_pictures(tmp_path: Path) -> None:
     write_series(tmp_path / "ct")
     told = "import sys; print(sys.modules.get('PIL') is not None)"

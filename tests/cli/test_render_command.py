@@ -264,6 +264,7 @@ def test_slices_in_space(render: Renders) -> None:
     assert not lit(render("--mode", "slices", "--slices", "1,2", "--view", "superior")[0]).any()
 
 
+@pytest.mark.seconds
 def test_labels_have_colours(render: Renders) -> None:
     pytest.importorskip("nibabel")
     voxels = np.zeros(SHAPE_KJI, np.uint8)

@@ -179,6 +179,7 @@ def test_text_stl_of_odd_programs(tmp_path: Path, text: str) -> None:
     assert mesh.vertices.tolist() == [[1, 2, 3], [4, 2, 3], [1, 6, 3]] and mesh.triangle_count == 1
 
 
+@pytest.mark.seconds
 def test_a_facet_without_area_is_no_hindrance_to_distances(tmp_path: Path) -> None:
     vertices, triangles = ball(8.0, 12)
     Mesh(vertices, np.vstack([triangles, [(0, 0, 0)]])).save(tmp_path / "a.stl")

@@ -40,6 +40,7 @@ def inside(device: Any, spine: Path, tmp_path: Path) -> Any:
     return run
 
 
+@pytest.mark.seconds
 def test_files_report_and_words_agree(inside: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert inside("--label", "L1", "--report", str(tmp_path / "r.json")) == 0
     said = capsys.readouterr()
@@ -123,6 +124,7 @@ def test_wrong_files_are_one_line_and_leave_nothing(
         InsideSettings(labels="x.nrrd", only=["L1"], memory=0)
 
 
+@pytest.mark.seconds
 def test_pictures_show_each_part(inside: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image = pytest.importorskip("PIL.Image")
     assert inside("--label", "L1", "--picture", str(tmp_path / "p.png"), "--view", "left", "--json") == 0

@@ -44,6 +44,7 @@ def share_near(body: OddBody, vertices: np.ndarray, *materials: str) -> float:
     return float(near[k, j, i].mean())
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize("name", but_seldom(BONY, SELDOM))
 def test_the_mesh_without_the_table_is_that_of_the_bone(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     body = odd[name]
@@ -265,6 +266,7 @@ def test_a_print_is_of_the_body_closed_and_says_what_it_left_out(
         assert left_out["pieces_ml"] > 0.0 and any("left out" in warning for warning in report["warnings"])
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize("name", daily(3, ("skull", "pelvis", "contrast", "bones", "limb", "pair")))
 def test_a_print_is_of_bone_and_says_what_is_none(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     """Without --remove-table."""

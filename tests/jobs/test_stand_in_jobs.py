@@ -30,6 +30,7 @@ def gpu(device, monkeypatch):
     return gpu
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("first", daily(1, [1, 2]))
 def test_row_54_a_job_goes_on_on_the_cpu_device(device, gpu, tmp_path, capsys, monkeypatch, command, first):

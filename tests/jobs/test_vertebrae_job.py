@@ -35,6 +35,7 @@ def written(scan: Path) -> Path:
     return folder
 
 
+@pytest.mark.seconds
 def test_a_run_writes_map_picture_and_report(written: Path) -> None:
     from PIL import Image
 
@@ -104,6 +105,7 @@ def test_the_segmentation_is_the_same_map(scan: Path, written: Path, tmp_path: P
     assert str(pydicom.dcmread(path).PatientName) == "" and b"PHANTOM" not in path.read_bytes()
 
 
+@pytest.mark.seconds
 def test_vertebrae_of_low_confidence_are_left_out_with_exit_code_8(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

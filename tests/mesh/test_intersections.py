@@ -114,6 +114,7 @@ def test_two_triangles():
     assert count((np.array(flat + flat, float), [[0, 1, 2], [3, 4, 5]])) == 0  # the same: counted as such elsewhere
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize("shift", [(3.1, 0.2, 0.3), (11.0, 4.0, -3.0), (19.5, 0.1, 0.2), (21.0, 0.0, 0.0)])
 def test_spheres_that_cut_each_other(shift):
     vertices, triangles = samples.join(samples.sphere(rounds=2), samples.sphere(shift, 10.0, 1))

@@ -95,6 +95,7 @@ def of_pocl(device):
     return device
 
 
+@pytest.mark.seconds
 @pytest.mark.every_device
 def test_all_give_the_same_bits(of_pocl):
     theirs, ours = (

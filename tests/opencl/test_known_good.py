@@ -89,6 +89,7 @@ def test_row_59_damaged_kernels_are_built_anew(damage, device, built):
     assert run_child(device, built) == []
 
 
+@pytest.mark.seconds
 def test_row_59_what_a_dead_process_built_is_built_anew(device, built):
     """The process before died: PoCL's files are there, cut by a full disk, and nobody has seen them work."""
     shutil.rmtree(built / "records")
@@ -97,6 +98,7 @@ def test_row_59_what_a_dead_process_built_is_built_anew(device, built):
     assert run_child(device, built) == []
 
 
+@pytest.mark.seconds
 def test_row_59_a_process_that_dies_leaves_no_record(device, tmp_path):
     if not is_pocl(device.platform):
         pytest.skip("this driver does not end the process")

@@ -97,6 +97,7 @@ def test_a_level_farther_out_is_told() -> None:
         assert corridor.bias.half_hu == pytest.approx(HALF_HU, abs=30.0)
 
 
+@pytest.mark.seconds
 def test_a_pedicle_below_two_voxels_is_refused() -> None:
     vertebra = BoxVertebra(left_radius=4.5, right_radius=2.0)
     affine, shape = grid_around(vertebra, spacing=(2.5, 2.5, 2.5))
@@ -123,6 +124,7 @@ def test_what_is_no_vertebra_is_refused() -> None:
         measure_corridors(volume, few, 3, HALF_HU, "L3")
 
 
+@pytest.mark.seconds
 def test_a_cut_body_is_refused_and_a_cut_process_is_told() -> None:
     vertebra = BoxVertebra()
     affine, (nk, nj, ni) = grid_around(vertebra)
@@ -141,6 +143,7 @@ def test_a_cut_body_is_refused_and_a_cut_process_is_told() -> None:
         measure_corridors(shorter, labels[:, first + 4 :], 3, HALF_HU, "L3")
 
 
+@pytest.mark.seconds
 def test_distances_of_segments_are_those_of_their_nearest_points() -> None:
     generator = np.random.default_rng(4)
     points = generator.uniform(-20.0, 20.0, (500, 3))

@@ -33,6 +33,7 @@ def put(side: float, outward: float, up: float, diameter: float, front: float = 
     return Screw(ends[0], ends[1], diameter)
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize("side", daily(1, [1.0, -1.0]))
 @pytest.mark.parametrize("direction", OFFSETS)
 def test_the_breach_is_what_lies_outside(placed: tuple[SolidBone, VertebraFrame], side: float, direction: str) -> None:

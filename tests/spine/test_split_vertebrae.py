@@ -52,6 +52,7 @@ def shares(labels: np.ndarray, truth: np.ndarray, names: dict[int, str]) -> dict
 CASES = [("T12-L3", {}), ("L1-L4", {"tilt": 12.0, "oblique": (5.0, -8.0, 4.0)}), ("T9-T12", {"scoliosis_deg": 20.0})]
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize(("levels", "choice"), daily_rows(1, CASES), ids=["straight", "tilted", "scoliosis"])
 def test_all_levels_with_touching_facets_are_told_apart(levels: str, choice: dict[str, Any]) -> None:
     _, truth, names = phantom(levels, **choice)
@@ -78,6 +79,7 @@ def test_discs_lie_between_the_true_centres_and_normals_point_down() -> None:
     assert np.abs(np.array(heights) - centres[:, 2]).max() < 6.0
 
 
+@pytest.mark.seconds
 def test_a_named_point_names_all_and_numbers_them_as_verse_does() -> None:
     volume, truth, _ = phantom("T12-L3")
     point = volume.ijk_to_lps(np.argwhere(truth == 20)[:, ::-1]).mean(axis=0)  # L1; its middle may be in the canal
@@ -118,6 +120,7 @@ def test_impossible_parameters_are_refused(choice: dict[str, Any], words: str) -
         clrecon.split_vertebrae(phantom("T12-L3")[0], **choice)
 
 
+@pytest.mark.seconds
 def test_seeds_are_the_vertebrae_and_need_no_canal(monkeypatch: pytest.MonkeyPatch) -> None:
     volume, truth, names = phantom("T12-L3")
     seeds = [one.centre_mm for one in split("T12-L3").vertebrae]
@@ -151,6 +154,7 @@ def test_a_disc_that_bone_fills_lowers_the_confidence_of_the_vertebrae_beside_it
     assert min(share for _, share in shares(result.labels.voxels, truth, names).values()) >= LEAST_RIGHT
 
 
+@pytest.mark.seconds
 def test_vertebrae_of_low_confidence_are_kept_only_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
     """A disc that is not seen makes one vertebra of two, of twice the height, with a disc within it."""
     from clrecon.spine import split as module
@@ -173,6 +177,7 @@ def test_vertebrae_of_low_confidence_are_kept_only_on_request(monkeypatch: pytes
     assert set(kept.labels.numbers) == set(result.labels.numbers) - {low[0].number}
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize(
     ("levels", "choice", "least"),
     daily_rows(
@@ -229,6 +234,7 @@ def test_a_scan_without_a_vertebra_says_what_was_left_out() -> None:
     assert _describe_refusal([], ["a", "b"]) == "no vertebra was found: a; b"
 
 
+@pytest.mark.seconds
 def test_a_spine_with_a_gap_is_refused() -> None:
     with pytest.raises(RefusedInputError, match="no spine|disc|none of the"):
         clrecon.split_vertebrae(phantom("C1,L5")[0])

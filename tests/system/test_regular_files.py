@@ -134,6 +134,7 @@ def find_openings(text: str) -> int:
     return count
 
 
+@pytest.mark.seconds
 def test_files_that_are_read_go_through_one_helper():
     folder = ROOT / "clrecon"
     found = {str(path.relative_to(folder)) for path in folder.rglob("*.py") if find_openings(path.read_text())}

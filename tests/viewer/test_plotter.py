@@ -147,6 +147,7 @@ def test_a_display_that_does_not_answer_is_said(tmp_path, monkeypatch):
     check_refusal(refusal([tmp_path], tmp_path, dict(os.environ)), "the display :4711 does not answer")
 
 
+@pytest.mark.seconds
 def test_without_opengl_no_process_dies_of_a_signal(display, tmp_path, monkeypatch):
     """The libraries of OpenGL are hidden in a mount namespace of the child."""
     need_screen()

@@ -35,6 +35,7 @@ def ball(camera: Camera, center=CENTRE, radius=RADIUS, color=(250, 40, 10)) -> R
     return drawn_balls.ball(camera, SIZE, center, radius, color)
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("form", daily(1, ["points", "plane"]))
 def test_seen_by_its_own_camera_a_picture_in_a_scene_is_the_picture(plotter, camera, form):

@@ -53,6 +53,7 @@ def run(bones, output, device, *options):
 TRUE_ML = [4 / 3 * np.pi * radius**3 / 1000 for radius in RADII]
 
 
+@pytest.mark.seconds
 def test_all_bones_are_named_objects_of_a_3mf(device, bones, tmp_path, capsys):
     code, report = run(bones, tmp_path / "a.3mf", device, "--for", "print", "--all-parts")
     said = capsys.readouterr()

@@ -139,6 +139,7 @@ def test_samples_cover_the_area_evenly():
     np.testing.assert_array_equal(points, sample_surface(vertices, triangles, 4000))
 
 
+@pytest.mark.seconds
 def test_nothing_to_measure_is_refused():
     plane = Mesh(*rectangle(0.0))
     with pytest.raises(NoSurfaceError, match="without area"):

@@ -69,6 +69,7 @@ def test_equals_the_twin_in_uneven_stacks(device, sign):
     assert np.abs(found.voxels - expected_of(volume, settings)).max() <= FILTER_FLOAT_HU
 
 
+@pytest.mark.seconds
 def test_the_same_bits_on_every_device(device):
     others = [one for one in list_devices() if one.type == "cpu" and not one.is_simulator and not one.shortcoming]
     if len(others) < 2:

@@ -34,6 +34,7 @@ def ahead(volume: Volume) -> Camera:
     return Camera(middle - (0, 50, 0), middle, (0, 0, 1), parallel_scale=2 * SPACING[0])
 
 
+@pytest.mark.seconds
 @pytest.mark.oclgrind
 @pytest.mark.parametrize("memory", daily(1, [None, 12_000]))
 def test_labels_change_opacity_and_colour_as_they_say(device, memory):

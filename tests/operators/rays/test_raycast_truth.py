@@ -101,6 +101,7 @@ def test_a_smaller_step_brings_a_picture_nearer(cast):
     assert errors[2] <= 0.5 * errors[1] + tolerances.RAY_ROUNDING
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize("ramp", daily(1, [0.7, 1.2]))
 def test_skin_has_no_rings_at_the_default_step(cast, ramp):
     """A ball of soft tissue with a sharp edge, lit: of samples alone 0.59 and 0.76 alike, grained like wood."""
@@ -290,6 +291,7 @@ def test_uneven_and_even_samplings_of_one_field_look_alike(cast):
     assert images[0][..., 3].max() > 150
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize("dtype", daily(2, ["int8", "uint8", "int16", "uint16", "int32", "float32"]))
 def test_every_voxel_type_gives_the_same_picture(cast, dtype):
     field = lambda p: np.rint(60.0 + 50.0 * np.sin(p[:, 0] / 2.0) * np.cos(p[:, 1] / 3.0))  # noqa: E731

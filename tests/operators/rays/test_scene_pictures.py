@@ -64,6 +64,7 @@ def ways(camera: Camera, y: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.clip(plane, enter, leave) - enter, leave - np.clip(plane, enter, leave), plane
 
 
+@pytest.mark.seconds
 @pytest.mark.every_device
 @pytest.mark.parametrize(("name", "opacity", "in_slabs"), each_value(CAMERAS, [0.4, 1.0], [False, True]))
 def test_fog_before_and_behind_a_screen_is_a_closed_form(

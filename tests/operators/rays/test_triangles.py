@@ -205,6 +205,7 @@ def test_what_is_beside_behind_or_as_small_as_a_pixel(device: Any) -> None:
     assert one.image.tolist() == [[[255, 255, 255, 255]]] and one.depth[0, 0] == 53.0
 
 
+@pytest.mark.seconds
 def test_clipped_meshes_are_open(device: Any) -> None:
     mesh = Mesh(*ball(8.0, 30))
     for name in ("parallel", "perspective"):

@@ -94,6 +94,7 @@ def test_a_window_shows_every_pair_of_its_row(windows):
     assert (error <= tolerances.WINDOW_SHARE * np.abs(high - low) + 0.01).all()
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize(
     ("columns", "towards", "perspective"), each_value([14, 16, 17, 40], [ALONG_J, ALONG_K, NEARLY_J], [False, True])
 )
@@ -171,6 +172,7 @@ import os; os._exit(0)
 """
 
 
+@pytest.mark.seconds
 @pytest.mark.skipif(sys.platform != "linux", reason="guards of memory are made with Linux's calls")
 def test_no_voxel_beyond_the_volume_is_read(windows):
     shapes = ["128,128,32", "512,64,16", "64,64,128", "2,512,512", "512,2,512"]

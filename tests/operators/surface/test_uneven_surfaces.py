@@ -142,6 +142,7 @@ def test_distances_to_the_surface_are_right_in_every_layer():
     assert np.abs(distances - np.abs(away[near])).max() <= tolerances.LINEAR_FIELD_MM
 
 
+@pytest.mark.seconds
 def test_labels_lie_where_the_slices_lie(device):
     radius = 7.0
     volume = make_volume(lambda p: 40.0 * (radius - np.linalg.norm(p, axis=1)), (60, 50), dtype=np.int16)

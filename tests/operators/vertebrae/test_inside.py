@@ -43,6 +43,7 @@ def truth_of(volume, affine, name):
     return cortex.reshape(volume.voxels.shape), canal.reshape(volume.voxels.shape)
 
 
+@pytest.mark.seconds
 def test_volumes_are_those_of_the_phantom(spine, device):
     volume, labels = spine
     inside = clrecon.vertebra_inside(volume, labels, "L1", 400, device=device)
@@ -197,6 +198,7 @@ def test_real_vertebrae(real_data, device):
     assert cut.canal is None
 
 
+@pytest.mark.seconds
 def test_a_real_label_with_gaps_is_warned_of(real_data, device):
     folder = real_data / "thoracolumbar_labels"
     volume, labels = (

@@ -219,6 +219,7 @@ def test_a_refusal_is_no_failure(error: Exception, state: str, monkeypatch: pyte
     assert child.run_method(SimpleNamespace(timeout=10.0, method="t-mc"))["state"] == state  # type: ignore[arg-type]
 
 
+@pytest.mark.seconds
 def test_a_crash_and_a_missing_library_are_rows(
     device: Any, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -323,6 +324,7 @@ def test_a_folder_with_other_things_is_refused(tmp_path: Path, monkeypatch: pyte
     assert (tmp_path / "r" / "t-mc.png").read_text() == "mine"
 
 
+@pytest.mark.seconds
 @pytest.mark.usefixtures("in_this_process")
 def test_an_earlier_comparison_is_replaced_as_a_whole(device: Any, ball: Path, tmp_path: Path) -> None:
     folder = tmp_path / "r"

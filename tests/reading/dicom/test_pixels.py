@@ -320,6 +320,7 @@ def test_a_compressed_frame_of_another_size_is_refused_before_decoding(tmp_path,
     assert len(list(tmp_path.iterdir())) == 3
 
 
+@pytest.mark.seconds
 def test_damaged_compressed_frames_are_refused(tmp_path, real_data):
     sources = sorted((real_data / SYNTAXES).glob("*Lossless*.dcm"))
     assert len(sources) == 3

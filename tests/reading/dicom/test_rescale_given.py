@@ -68,6 +68,7 @@ def test_the_command_line(tmp_path, capsys):
     assert "--rescale needs a slope other than 0" in capsys.readouterr().err
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize(
     ("values", "level"),
     [

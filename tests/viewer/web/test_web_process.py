@@ -63,6 +63,7 @@ def running(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, 
         process.communicate()
 
 
+@pytest.mark.seconds
 @pytest.mark.opencl
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize("number", daily(1, [signal.SIGINT, signal.SIGTERM]))
@@ -84,6 +85,7 @@ def test_a_signal_ends_it_while_pictures_are_drawn(device, scan: Path, number: i
         assert process.stderr.read() == ""
 
 
+@pytest.mark.seconds
 @pytest.mark.opencl
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 def test_it_leaves_no_file_behind_and_opens_no_browser_without_a_screen(device, scan: Path, tmp_path: Path) -> None:
