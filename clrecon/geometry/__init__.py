@@ -13,6 +13,7 @@ from clrecon.geometry.affine import (
     slice_normal,
     tilt_degrees,
 )
+from clrecon.geometry.blocks import slice_voxel_ml
 from clrecon.geometry.grid import AIR_HU, METAL_HU, Grid
 from clrecon.geometry.volume import Volume
 
@@ -31,5 +32,6 @@ __all__ = [
     "normal_matrix",
     "slice_normal",
     "signed_tilt",
+    "slice_voxel_ml",
     "tilt_degrees",
 ]

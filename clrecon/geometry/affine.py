@@ -14,6 +14,7 @@ Source: DICOM PS3.3 C.7.6.2.1.1 (Image Position and Image Orientation), with the
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -87,6 +88,15 @@ def checked_points(points: ArrayLike) -> Float64Array:
     if checked.ndim != 2 or checked.shape[1] != 3:
         raise UsageError(f"points have shape (n, 3), these have {checked.shape}")
     return checked
+
+
+def map_points(mapping: Callable[[Float64Array], Float64Array], points: ArrayLike) -> Any:
+    """Apply what takes points (n, 3) to points, or to one point (3,), whose result then stands alone."""
+    try:
+        is_one = np.ndim(points) == 1  # type: ignore[arg-type]
+    except ValueError:  # rows of several lengths: they are refused below
+        is_one = False
+    return mapping(checked_points(np.asarray(points)[None]))[0] if is_one else mapping(checked_points(points))
 
 
 def column_spacing(affine: Float64Array) -> tuple[float, float, float]:

@@ -203,6 +203,20 @@ def find_extent(volume: BaseVolume) -> tuple[Float64Array, Float64Array]:
     return corners.min(axis=0), corners.max(axis=0)
 
 
+MM3_PER_ML = 1000.0
+
+
+def slice_voxel_ml(volume: BaseVolume) -> Float64Array:
+    """Return the volume of one voxel of each slice, shape (nk,), ml.
+
+    A slice reaches half way to both of its neighbours along the normal, the end slices as far outward as inward.  Shear
+    moves slices within their planes and changes no volume.
+    """
+    area = float(np.linalg.norm(np.cross(volume.affine[:3, 0], volume.affine[:3, 1])))
+    heights = volume.slice_origins(border=1) @ slice_normal(volume.affine)
+    return area * np.abs(heights[2:] - heights[:-2]) / 2.0 / MM3_PER_ML
+
+
 def describe_extent(volume: BaseVolume, space: str) -> str:
     """Describe the box of the voxels' centres, mm of the frame `space`, and their HU."""
     low, high = np.sort(np.array(find_extent(volume)) * np.diag(frame_from_lps(space)), axis=0)

@@ -22,6 +22,7 @@ from clrecon.geometry.affine import (
     checked_affine,
     checked_points,
     column_spacing,
+    map_points,
     slice_normal,
 )
 from clrecon.geometry.certificate import Certificate, amend
@@ -96,12 +97,14 @@ class Grid(Message):
         return ni, nj, nk
 
     def ijk_to_lps(self, points: ArrayLike) -> Float64Array:
-        """Map index coordinates (n, 3), fractions allowed, to LPS mm (n, 3), float64."""
-        return apply_affine(self._affine, points)
+        """Map index coordinates (n, 3) or (3,), fractions allowed, to LPS mm of that shape, float64."""
+        placed: Float64Array = map_points(lambda ijk: apply_affine(self._affine, ijk), points)
+        return placed
 
     def lps_to_ijk(self, points: ArrayLike) -> Float64Array:
-        """Map LPS mm (n, 3) to index coordinates (n, 3), float64; the inverse of `ijk_to_lps`."""
-        return apply_affine(self._inverse, points)
+        """Map LPS mm (n, 3) or (3,) to index coordinates of that shape, float64; the inverse of `ijk_to_lps`."""
+        placed: Float64Array = map_points(lambda lps: apply_affine(self._inverse, lps), points)
+        return placed
 
 
 POSITION_TOLERANCE_MM = 0.01
@@ -296,15 +299,17 @@ class BaseVolume(Grid):
         return self._stack is not None
 
     def ijk_to_lps(self, points: ArrayLike) -> Float64Array:
-        """Map index coordinates (n, 3), fractions allowed, to LPS mm (n, 3), float64; exact for uneven slices too."""
+        """Map index coordinates (n, 3) or (3,), fractions allowed, to LPS mm, float64; exact for uneven slices too."""
         if self._stack is not None:
-            return self._stack.ijk_to_lps(checked_points(points))
+            placed: Float64Array = map_points(self._stack.ijk_to_lps, points)
+            return placed
         return super().ijk_to_lps(points)
 
     def lps_to_ijk(self, points: ArrayLike) -> Float64Array:
-        """Map LPS mm (n, 3) to index coordinates (n, 3), float64; the inverse of `ijk_to_lps`."""
+        """Map LPS mm (n, 3) or (3,) to index coordinates of that shape, float64; the inverse of `ijk_to_lps`."""
         if self._stack is not None:
-            return self._stack.lps_to_ijk(checked_points(points))
+            placed: Float64Array = map_points(self._stack.lps_to_ijk, points)
+            return placed
         return super().lps_to_ijk(points)
 
     def slice_origins(self, border: int = 0) -> Float64Array:

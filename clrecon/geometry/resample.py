@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import product
 from typing import Any, NamedTuple, TypeVar
 
@@ -11,9 +12,10 @@ from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.affine import Float64Array, apply_affine
-from clrecon.geometry.blocks import facts_of_place
+from clrecon.geometry.blocks import facts_of_place, find_extent
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.grid import AIR_HU, BaseVolume, Grid
+from clrecon.geometry.sampling import sample_onto
 from clrecon.system.progress import Progress, ignore_progress
 
 LARGEST_SHEAR_DEGREES = 0.01
@@ -47,15 +49,15 @@ def describe_unevenness(origins: Float64Array) -> str:
     return f"the slices of this volume are uneven ({gaps.min():.4g} to {gaps.max():.4g} mm apart)"
 
 
-def regular_grid(grid: Grid, origins: Float64Array, step_mm: float | None = None) -> RegularGrid:
+def regular_grid(grid: Grid, origins: Float64Array, steps_mm: float | Sequence[float] | None = None) -> RegularGrid:
     """Return the smallest regular grid that encloses all voxel centres of a grid.
 
-    i runs as in the grid, j within the plane of the slices, k along their normal.  Without `step_mm`, i and j have the
+    i runs as in the grid, j within the plane of the slices, k along their normal.  Without `steps_mm`, i and j have the
     steps of the grid and k the smallest distance of slices along the normal: where a volume is sheared but even, the
     planes are those of its slices.
 
     origins: ndarray, shape (nk, 3). LPS mm of voxel (0, 0, k) of each slice.
-    step_mm: Step along all three axes.
+    steps_mm: Step along all three axes, or one for each.
     """
     di, dj, _ = grid.spacing
     first = grid.affine[:3, 0] / di
@@ -67,7 +69,7 @@ def regular_grid(grid: Grid, origins: Float64Array, step_mm: float | None = None
     places = (origins[:, None, :] + in_plane).reshape(-1, 3) @ axes
     heights = origins @ axes[:, 2]
     dk = np.abs(np.diff(heights)).min() if nk > 1 else abs(grid.affine[:3, 2] @ axes[:, 2])
-    spacing = np.array([di, dj, dk]) if step_mm is None else np.full(3, step_mm)
+    spacing = np.array([di, dj, dk]) if steps_mm is None else np.broadcast_to(steps_mm, 3).astype(float)
     low, high = places.min(axis=0), places.max(axis=0)
     counts = np.ceil((high - low) / spacing - ON_GRID).astype(int) + 1
     affine = np.eye(4)
@@ -161,28 +163,44 @@ def air_of(dtype: np.dtype[Any]) -> float:
     return AIR_HU if dtype.kind == "f" else max(AIR_HU, int(np.iinfo(dtype).min))
 
 
-def resample_volume(volume: Own, step_mm: float, *, progress: Progress | None = None) -> Own:
-    """Resample a volume (trilinear) to a regular grid with the same step along all axes, at right angles.
-
-    i runs as in the volume, j within the plane of its slices, k along their normal.  The grid encloses all voxel
-    centres; points beyond the voxels are air (`AIR_HU`).  Whole numbers are rounded.  Steps longer than those of the
-    volume take single values and no means: smooth the volume first where that matters.
-
-    progress: ``progress("resample", done, total)`` in slices.
-
-    Returns: ``report["resampled"]`` says so, with ``step_mm`` and ``method``.
-    """
-    check_step(step_mm)
-    regular = regular_grid(volume, volume.slice_origins(), step_mm)
-    check_count(regular, f"in steps of {step_mm:g} mm")
-    voxels = resample_grid(volume, regular, air_of(volume.dtype), progress or ignore_progress)
-    made = type(volume)(voxels, regular.affine)
+def resample_volume(volume: Own, to: float | Sequence[float] | BaseVolume, *, progress: Progress | None = None) -> Own:
+    """See `Volume.resample`."""
+    report, air = progress or ignore_progress, air_of(volume.dtype)
+    figures: dict[str, Any] = {"method": "trilinear"}
+    if isinstance(to, BaseVolume):
+        _check_overlap(volume, to)
+        positions = to.slice_origins() if to.uneven else None
+        made = type(volume)(sample_onto(volume, to, air, report), to.affine, None, positions)
+        what = "the voxels of another volume"
+        figures["step_mm"] = list(to.spacing)
+    else:
+        steps = np.atleast_1d(np.asarray(to, object)).tolist()
+        for step in steps:
+            check_step(step)
+        if len(steps) not in (1, 3):
+            raise UsageError(f"a resampled volume has one step, or one each along i, j and k, not {len(steps)}")
+        figures["step_mm"] = to = float(steps[0]) if len(steps) == 1 else [float(step) for step in steps]
+        what = " x ".join(f"{step:g}" for step in steps) + " mm"
+        regular = regular_grid(volume, volume.slice_origins(), to)
+        check_count(regular, f"in steps of {what}")
+        made = type(volume)(resample_grid(volume, regular, air, report), regular.affine)
     before = " x ".join(f"{step:.4g}" for step in volume.spacing)
-    said = f"resampled (trilinear) from {'uneven slices' if volume.uneven else f'{before} mm'} to {step_mm:g} mm"
+    said = f"resampled (trilinear) from {'uneven slices' if volume.uneven else f'{before} mm'} to {what}"
     made.report = amend(
         volume.report,
-        resampled={"step_mm": float(step_mm), "method": "trilinear"},
+        resampled=figures,
         warnings=[*volume.report.get("warnings", ()), said],
         **facts_of_place(volume.report, made),
     )
     return made
+
+
+def _check_overlap(volume: BaseVolume, target: BaseVolume) -> None:
+    """Refuse volumes whose boxes round the voxel centres have nothing in common."""
+    (low, high), (first, last) = find_extent(volume), find_extent(target)
+    away = np.maximum(first - high, low - last)
+    if (away > 0.0).any():
+        axis = int(np.argmax(away))
+        raise UsageError(
+            f"the two volumes have no place in common: along {'xyz'[axis]} they lie {away[axis]:.1f} mm apart"
+        )

@@ -7,14 +7,16 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
+from clrecon.geometry.affine import map_points
 from clrecon.geometry.blocks import crop_volume, find_extent, slice_volume
 from clrecon.geometry.boxes import CROPS, crop_box
 from clrecon.geometry.grid import BaseVolume
 from clrecon.geometry.images import image_of, make_nibabel, make_sitk, take_nibabel, take_sitk
 from clrecon.geometry.resample import resample_volume
+from clrecon.geometry.sampling import sample_volume
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.packages import public_function
 from clrecon.system.paths import keep_existing
@@ -111,27 +113,53 @@ class Volume(BaseVolume):
         return crop_volume(self, *box, margin=margin, space=space)
 
     @explains_arguments
-    def resample(self: Own, step_mm: float, *, progress: Progress | None = None) -> Own:
-        """Return a copy (trilinear) on a regular grid with one step along all axes, at right angles.
-
-        i runs as in the volume, j within the plane of its slices, k along their normal; points beyond the voxels are
-        ``AIR_HU``.  Uneven and tilted slices become even and straight.  The certificate stays, with the new shape and
-        place, its entry ``resampled`` and a warning.
+    def sample(self, points: ArrayLike, *, order: int = 1, outside: float = float("nan")) -> Any:
+        """Return the HU at points of the patient; uneven and tilted slices are where they are.
 
         Parameters
         ----------
-        step_mm : float
+        points : array_like, shape (n, 3) or (3,)
+            LPS mm, such as ``mesh.vertices``.
+        order : {0, 1, 3}
+            0 takes the nearest voxel, 1 is trilinear, 3 a cubic spline, which may exceed the values around it.
+        outside : float
+            Value more than half a voxel beyond the outer voxel centres, and where a point is not finite.
+
+        Returns
+        -------
+        ndarray, shape (n,), float64, or float for one point
+
+        Raises
+        ------
+        UsageError
+            ``points`` are none, or the order is another.
+        """
+        return map_points(lambda lps: sample_volume(self, lps, order, outside), points)
+
+    @explains_arguments
+    def resample(self: Own, to: float | Sequence[float] | Volume, *, progress: Progress | None = None) -> Own:
+        """Return a copy (trilinear) on a regular grid with other steps, or on the grid of another volume.
+
+        Of a regular grid, i runs as in the volume, j within the plane of its slices, k along their normal, at right
+        angles: uneven and tilted slices become even and straight.  Points beyond the voxels are ``AIR_HU``.  The
+        certificate stays, with the new shape and place, its entry ``resampled`` and a warning.  Longer steps take
+        single values and no means: smooth the volume first where that matters.
+
+        Parameters
+        ----------
+        to : float, (float, float, float) or Volume
+            One step in mm, or those along i, j and k; or a volume at whose voxel centres the values are taken.
         progress : callable, optional
             ``progress("resample", done, total)`` in slices.
 
         Raises
         ------
         UsageError
-            ``step_mm`` is no length, or below 0.01 mm.
+            A step is no length, or below 0.01 mm; or the two volumes have no place in common.
         RefusedInputError
             The result would have more than 2^31 voxels.
         """
-        return resample_volume(self, step_mm, progress=progress)
+        return resample_volume(self, to, progress=progress)
 
     @explains_arguments
     def save(

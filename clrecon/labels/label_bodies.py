@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.affine import slice_normal
+from clrecon.geometry.blocks import MM3_PER_ML
 from clrecon.labels.label_map import LabelMap
 
 MOST_OFFSETS = 5000
@@ -172,20 +172,6 @@ def _reach_from_faces(passable: NDArray[np.bool_]) -> NDArray[np.bool_]:
             reached[np.unique(np.moveaxis(components, axis, 0)[side])] = True
     reached[0] = False
     return np.asarray(reached[components])
-
-
-MM3_PER_ML = 1000.0
-
-
-def slice_voxel_ml(volume: Volume) -> NDArray[np.float64]:
-    """Return the volume of one voxel of each slice, shape (nk,), ml.
-
-    A slice reaches half way to both of its neighbours along the normal, the end slices as far outward as inward.  Shear
-    moves slices within their planes and changes no volume.
-    """
-    area = float(np.linalg.norm(np.cross(volume.affine[:3, 0], volume.affine[:3, 1])))
-    heights = volume.slice_origins(border=1) @ slice_normal(volume.affine)
-    return area * np.abs(heights[2:] - heights[:-2]) / 2.0 / MM3_PER_ML
 
 
 def label_ml(labels: LabelMap, number: int) -> float:

@@ -115,10 +115,11 @@ def test_three_steps_span_space_down_to_a_millionth():
         checked_affine(affine)
 
 
-def test_points_must_come_as_n_by_3():
+@pytest.mark.parametrize("points", [(1.0, 2.0), [(1.0, 2.0)], [[(1.0, 2.0, 3.0)]], 1.0])
+def test_points_must_come_as_n_by_3(points):
     volume = Volume(np.zeros((2, 3, 4), np.int16), np.eye(4))
     with pytest.raises(UsageError, match=r"\(n, 3\)"):
-        volume.ijk_to_lps((1.0, 2.0, 3.0))
+        volume.ijk_to_lps(points)
 
 
 @pytest.mark.parametrize("border", [0, 1, 2])

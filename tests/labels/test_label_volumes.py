@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from clrecon.geometry import Volume
+from clrecon.geometry import Volume, slice_voxel_ml
 from clrecon.labels import LabelMap
-from clrecon.labels.label_bodies import count_ml, label_ml, slice_voxel_ml
+from clrecon.labels.label_bodies import count_ml, label_ml
 
 pytestmark = pytest.mark.unit
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.geometry import Volume
+from clrecon.geometry import Volume, slice_voxel_ml
 from clrecon.proof.volumes.volume_twins import dilate, erode, fill_holes
 
 Bits = NDArray[np.bool_]
@@ -48,8 +48,6 @@ def find_filled(volume: Volume, bone: Bits, seal_mm: float, bone_ml: float) -> B
 def _between(volume: Volume, bone: Bits, mm: float, least_ml: float) -> Bits:
     """Return the voxels near two pieces that have some volume each."""
     from scipy.ndimage import label
-
-    from clrecon.labels.label_bodies import slice_voxel_ml
 
     pieces, count = label(bone)
     ml = slice_voxel_ml(volume)

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from clrecon.anatomy.marrow import find_open_places, holds_ball
 from clrecon.errors import NoSurfaceError
-from clrecon.geometry import Volume
+from clrecon.geometry import Volume, slice_voxel_ml
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.opencl import Device, download, upload
 from clrecon.operators.masks.mask import Mask
 from clrecon.operators.masks.regions import checked_mm
-from clrecon.operators.masks.runs import Components, find_components, mark_with_voxels, write_runs
+from clrecon.operators.masks.runs import Components, RunList, find_components, mark_with_voxels, write_runs
 from clrecon.operators.masks.voxel_mask import mask_bytes, zero_words
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points.stencil import Lattice
@@ -46,7 +46,7 @@ class Spaces:
     ml: NDArray[np.float64]
     mean_hu: NDArray[np.float64]
     at_ends: NDArray[np.bool_]
-    _runs: _Runs
+    _runs: RunList
     _found: Components
     _mask: Mask
 
@@ -66,7 +66,7 @@ class Spaces:
                 mask.device, found.runs.runs_d, found.runs.row_counts_d, found.numbers_d, upload(mask.device, marks),
                 words_d, mask.shape_ijk,
             )  # fmt: skip
-        return Mask(mask.volume, words_d, f"spaces in ({mask.name})", device=mask.device, memory=mask.memory)
+        return Mask(mask.scan, words_d, f"spaces in ({mask.name})", device=mask.device, memory=mask.memory)
 
     def are_wide(self, radius_mm: float) -> NDArray[np.bool_]:
         """Tell of each space whether a ball of this radius fits into it, see `holds_ball`, shape (n,).
@@ -75,7 +75,7 @@ class Spaces:
         """
         wide = np.zeros(self.count, bool)
         for place in np.flatnonzero(self.ml >= WIDE_ML) if np.isfinite(radius_mm) else ():
-            wide[place] = self._runs.of(self.numbers[place]).holds_ball(self.volume, radius_mm)
+            wide[place] = _hold_ball(self._runs.of(self.numbers[place]), self.volume, radius_mm)
         return wide
 
     def describe(self, which: NDArray[np.bool_]) -> dict[str, Any]:
@@ -84,70 +84,44 @@ class Spaces:
         if not which.any():
             return {**facts, "largest_ml": 0.0, "at_mm": None}
         largest = int(np.argmax(np.where(which, self.ml, -1.0)))
-        middle = self._runs.of(self.numbers[largest]).middle()
+        middle = _find_middle(self._runs.of(self.numbers[largest]))
         at = self.volume.ijk_to_lps(np.array([middle], np.float64))[0]
         return {**facts, "largest_ml": float(self.ml[largest]), "at_mm": [round(float(x), 1) for x in at]}
 
 
-@dataclass(frozen=True)
-class _Runs:
-    """Runs of voxels on the host: j, k, first and last i and component of each, shapes (n,)."""
+def _sum_hu(runs: RunList, volume: Volume, count: int) -> NDArray[np.float64]:
+    """Return the sum of the HU of each component, shape (count,)."""
+    sums = np.zeros(count)
+    nj, ni = volume.voxels.shape[1:]
+    bounds = np.searchsorted(runs.k, np.arange(len(volume.voxels) + 1))
+    for k in np.flatnonzero(np.diff(bounds)):
+        own = slice(int(bounds[k]), int(bounds[k + 1]))
+        totals = np.zeros(nj * ni + 1)
+        np.cumsum(volume.voxels[k].ravel(), dtype=np.float64, out=totals[1:])
+        row = runs.j[own] * ni
+        hu = totals[row + runs.last[own] + 1] - totals[row + runs.first[own]]
+        sums += np.bincount(runs.numbers[own], hu, count)
+    return sums
 
-    j: NDArray[np.int64]
-    k: NDArray[np.int64]
-    first: NDArray[np.int64]
-    last: NDArray[np.int64]
-    numbers: NDArray[np.int32]
 
-    @classmethod
-    def read(cls, mask: Mask, found: Components) -> _Runs:
-        """Read the runs of components from the device."""
-        count, (_, nj, nk) = found.runs.count, mask.shape_ijk
-        ends = download(mask.device, np.empty((count, 2), np.uint16), found.runs.runs_d).astype(np.int64)
-        starts = download(mask.device, np.empty(nj * nk + 1, np.uint32), found.runs.row_counts_d)
-        numbers = download(mask.device, np.empty(count, np.int32), found.numbers_d)
-        counts = starts[1:].astype(np.int64) - starts[:-1].astype(np.int64)
-        rows = np.repeat(np.arange(nj * nk), counts)
-        return cls(rows % nj, rows // nj, ends[:, 0], ends[:, 1], numbers)
+def _find_middle(runs: RunList) -> tuple[int, int, int]:
+    """Return i, j, k of a voxel in the middle of the middle slice."""
+    at = np.flatnonzero(runs.k == runs.k[len(runs.k) // 2])
+    one = at[len(at) // 2]
+    return int(runs.first[one] + runs.last[one]) // 2, int(runs.j[one]), int(runs.k[one])
 
-    def where(self, which: NDArray[np.bool_]) -> _Runs:
-        return _Runs(self.j[which], self.k[which], self.first[which], self.last[which], self.numbers[which])
 
-    def of(self, number: int) -> _Runs:
-        """Return the runs of one component."""
-        return self.where(self.numbers == number)
-
-    def sum_hu(self, volume: Volume, count: int) -> NDArray[np.float64]:
-        """Return the sum of the HU of each component, shape (count,)."""
-        sums = np.zeros(count)
-        nj, ni = volume.voxels.shape[1:]
-        bounds = np.searchsorted(self.k, np.arange(len(volume.voxels) + 1))
-        for k in np.flatnonzero(np.diff(bounds)):
-            own = slice(int(bounds[k]), int(bounds[k + 1]))
-            totals = np.zeros(nj * ni + 1)
-            np.cumsum(volume.voxels[k].ravel(), dtype=np.float64, out=totals[1:])
-            row = self.j[own] * ni
-            hu = totals[row + self.last[own] + 1] - totals[row + self.first[own]]
-            sums += np.bincount(self.numbers[own], hu, count)
-        return sums
-
-    def middle(self) -> tuple[int, int, int]:
-        """Return i, j, k of a voxel in the middle of the middle slice."""
-        at = np.flatnonzero(self.k == self.k[len(self.k) // 2])
-        one = at[len(at) // 2]
-        return int(self.first[one] + self.last[one]) // 2, int(self.j[one]), int(self.k[one])
-
-    def holds_ball(self, volume: Volume, radius_mm: float) -> bool:
-        """Tell whether a ball fits into these voxels."""
-        lows = [int(low.min()) for low in (self.k, self.j, self.first)]
-        highs = [int(high.max()) + 1 for high in (self.k, self.j, self.last)]
-        steps = np.zeros([high - low for low, high in zip(lows, highs, strict=True)] + np.array([0, 0, 1]), np.int8)
-        np.add.at(steps, (self.k - lows[0], self.j - lows[1], self.first - lows[2]), 1)
-        np.add.at(steps, (self.k - lows[0], self.j - lows[1], self.last + 1 - lows[2]), -1)
-        body = np.cumsum(steps, axis=2, dtype=np.int8)[:, :, :-1] > 0
-        ends = tuple((low == 0, high == n) for low, high, n in zip(lows, highs, volume.voxels.shape, strict=True))
-        di, dj, dk = volume.spacing
-        return holds_ball(body, ends, (dk, dj, di), radius_mm)
+def _hold_ball(runs: RunList, volume: Volume, radius_mm: float) -> bool:
+    """Tell whether a ball fits into these voxels."""
+    lows = [int(low.min()) for low in (runs.k, runs.j, runs.first)]
+    highs = [int(high.max()) + 1 for high in (runs.k, runs.j, runs.last)]
+    steps = np.zeros([high - low for low, high in zip(lows, highs, strict=True)] + np.array([0, 0, 1]), np.int8)
+    np.add.at(steps, (runs.k - lows[0], runs.j - lows[1], runs.first - lows[2]), 1)
+    np.add.at(steps, (runs.k - lows[0], runs.j - lows[1], runs.last + 1 - lows[2]), -1)
+    body = np.cumsum(steps, axis=2, dtype=np.int8)[:, :, :-1] > 0
+    ends = tuple((low == 0, high == n) for low, high, n in zip(lows, highs, volume.voxels.shape, strict=True))
+    di, dj, dk = volume.spacing
+    return holds_ball(body, ends, (dk, dj, di), radius_mm)
 
 
 def find_spaces(mask: Mask) -> Spaces:
@@ -157,25 +131,22 @@ def find_spaces(mask: Mask) -> Spaces:
     border of the volume, or reaches it only within what the mask encloses in that end slice alone: there an end of the
     volume cuts it, as that of a scan cuts the canal of a long bone.
     """
-    device, shape, volume = mask.device, mask.shape_ijk, mask.volume
+    device, shape, volume = mask.device, mask.shape_ijk, mask.scan
     rest = (~mask).bits
     found = find_components(device, rest, beside=2 * rest.needs()["mask of the voxels"], memory=mask.memory)
     none = np.empty(0)
     if not found.count:
         empty = np.empty(0, np.int64)
-        runs = _Runs(empty, empty, empty, empty, empty.astype(np.int32))
+        runs = RunList(empty, empty, empty, empty, empty.astype(np.int32))
         return Spaces(volume, none.astype(np.intp), none, none, none.astype(bool), runs, found, mask)
     marks_d, _ = mark_with_voxels(device, found, shape, _open_ends(mask))
     outside = download(device, np.empty(found.count, np.uint8), marks_d) != 0
     numbers = np.flatnonzero(~outside)
-    runs = _Runs.read(mask, found)
+    runs = RunList.read(device, found, shape)
     runs = runs.where(~outside[runs.numbers])
-    from clrecon.labels.label_bodies import slice_voxel_ml  # label maps load pydicom, which others need not wait for
-
-    lengths = (runs.last - runs.first + 1).astype(np.float64)
-    voxels = np.bincount(runs.numbers, lengths, found.count)[numbers]
-    each_ml = np.bincount(runs.numbers, lengths * slice_voxel_ml(volume)[runs.k], found.count)[numbers]
-    hu = runs.sum_hu(volume, found.count)[numbers] / np.maximum(voxels, 1.0)
+    voxels = np.bincount(runs.numbers, runs.lengths, found.count)[numbers]
+    each_ml = runs.sum_ml(volume, found.count)[numbers]
+    hu = _sum_hu(runs, volume, found.count)[numbers] / np.maximum(voxels, 1.0)
     ni, nj, nk = shape
     at_end = np.zeros(found.count, bool)
     ends = (runs.k == 0) | (runs.k == nk - 1) | (runs.j == 0) | (runs.j == nj - 1)
@@ -185,17 +156,14 @@ def find_spaces(mask: Mask) -> Spaces:
 
 def find_joints(mask: Mask, reach_mm: float, least_ml: float) -> Mask:
     """Choose what lies within a distance of two pieces of a mask that are apart and have some volume each."""
-    device, shape, volume = mask.device, mask.shape_ijk, mask.volume
+    device, shape, volume = mask.device, mask.shape_ijk, mask.scan
     words = mask_bytes(shape)["mask of the voxels"]
     found = find_components(device, mask.bits, beside=3 * words, memory=mask.memory)
-    from clrecon.labels.label_bodies import slice_voxel_ml  # label maps load pydicom, which others need not wait for
-
     joints = Mask(volume, zero_words(device, words // 4), "joints", device=device, memory=mask.memory)
     if found.count < 2:
         return joints
-    runs = _Runs.read(mask, found)
-    ml = np.bincount(runs.numbers, (runs.last - runs.first + 1) * slice_voxel_ml(volume)[runs.k], found.count)
-    large = np.flatnonzero(ml >= least_ml)
+    runs = RunList.read(device, found, shape)
+    large = np.flatnonzero(runs.sum_ml(volume, found.count) >= least_ml)
     # Two pieces differ in at least one bit of their places in the list.
     for bit in range(max(len(large) - 1, 0).bit_length()):
         sides = []
@@ -363,7 +331,7 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
     """Fill what a mask encloses, see `fill_enclosed`; `how` is the radius of the seal, that of wide spaces, and whether
     air stays.
     """
-    volume = bone.volume
+    volume = bone.scan
     seal_mm, largest_mm, keep_air = how
     # Near the ends of the volume no ball fits; there discs close what lies in the end slices themselves.
     sealed = bone.dilate(seal_mm).erode(seal_mm) | bone
@@ -378,7 +346,6 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
     left = kinds["wide"] | kinds["air"]
     body = sealed | spaces.choose(~left)
     room = body - bone
-    from clrecon.labels.label_bodies import slice_voxel_ml  # label maps load pydicom, which others need not wait for
 
     ml = slice_voxel_ml(volume)
     bone_ml = float(_count_by_slice(bone.to_numpy()) @ ml)
@@ -429,10 +396,10 @@ def _count_by_slice(marked: NDArray[np.bool_]) -> NDArray[np.int64]:
 def _lies_in_air(bone: Mask, sealed: Mask, spaces: Spaces, seal_mm: float) -> bool:
     """Tell whether most of what lies beside the bone, outside, is air, as round a specimen."""
     inner = sealed | spaces.choose(np.ones(spaces.count, bool))
-    step = float(np.max(bone.volume.spacing))
+    step = float(np.max(bone.scan.spacing))
     beside = bone.dilate(2.0 * max(seal_mm, step)) - inner
     low = float(np.finfo(np.float32).min)
-    air = Mask.from_band(bone.volume, (low, AIR_LIMIT_HU), device=bone.device, memory=bone.memory)
+    air = Mask.from_band(bone.scan, (low, AIR_LIMIT_HU), device=bone.device, memory=bone.memory)
     return bool(2 * (beside & air).count > beside.count)
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clrecon.errors import UsageError
+from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import AIR_HU, Volume
 from clrecon.geometry.certificate import amend
 from clrecon.opencl import Device, Stopwatch, check_budget, upload
@@ -19,11 +19,13 @@ from clrecon.operators.masks.shapes import MaskComponents
 from clrecon.operators.masks.voxel_mask import check_shape, checked_band, mark_band, mask_bytes, zero_words
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.packages import public_function
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_band
 
 if TYPE_CHECKING:  # label maps load pydicom, which others need not wait for
     from clrecon.labels import LabelMap
+    from clrecon.mesh import Mesh
 
 
 class Mask(MaskComponents):
@@ -34,7 +36,7 @@ class Mask(MaskComponents):
 
     Attributes
     ----------
-    volume : Volume
+    scan : Volume
         The volume whose voxels these are; its HU are not changed.
     device : Device
     memory : int or None
@@ -245,9 +247,24 @@ class Mask(MaskComponents):
         """
         from clrecon.labels import LabelMap
 
-        if self.volume.uneven:
+        if self.scan.uneven:
             raise UsageError("the slices of the volume are uneven, and a label map has even ones: take to_numpy()")
-        return LabelMap(self.to_numpy().view(np.uint8), self.volume.affine, {1: name or self.name})
+        return LabelMap(self.to_numpy().view(np.uint8), self.scan.affine, {1: name or self.name})
+
+    def to_mesh(self) -> Mesh:
+        """Return the surface of the chosen voxels, as `clrecon.extract_label_masks` makes that of a label.
+
+        Raises
+        ------
+        NoSurfaceError
+            No voxel is chosen.
+        UsageError
+            As `to_label_map`.
+        """
+        if not self.count:
+            raise NoSurfaceError(f"no voxel is chosen ({self.name}): there is no surface")
+        extract: Callable[..., dict[int, Mesh]] = public_function("extract_label_masks")
+        return extract(self.to_label_map(), device=self.device, memory=self.memory)[1]
 
     @explains_arguments
     def apply(self, volume: Volume | DeviceVolume, outside: float = AIR_HU) -> Any:

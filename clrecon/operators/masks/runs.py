@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import DeviceMemoryError
+from clrecon.geometry import Volume, slice_voxel_ml
 from clrecon.opencl import Device, Program, Stopwatch, allocate, check_budget, download, launch, load_program, upload
 from clrecon.operators.masks.voxel_mask import VoxelMask, zero_words
 from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
@@ -178,6 +179,45 @@ class Components:
     runs: RowRuns
     count: int
     numbers_d: Any
+
+
+@dataclass(frozen=True)
+class RunList:
+    """Runs of voxels on the host: j, k, first and last i and component of each, shapes (n,), row by row."""
+
+    j: NDArray[np.int64]
+    k: NDArray[np.int64]
+    first: NDArray[np.int64]
+    last: NDArray[np.int64]
+    numbers: NDArray[np.int32]
+
+    @classmethod
+    def read(cls, device: Device, found: Components, shape_ijk: tuple[int, int, int]) -> RunList:
+        """Read the runs of components from the device."""
+        count, (_, nj, nk) = found.runs.count, shape_ijk
+        ends = download(device, np.empty((count, 2), np.uint16), found.runs.runs_d).astype(np.int64)
+        starts = download(device, np.empty(nj * nk + 1, np.uint32), found.runs.row_counts_d)
+        numbers = download(device, np.empty(count, np.int32), found.numbers_d)
+        counts = starts[1:].astype(np.int64) - starts[:-1].astype(np.int64)
+        rows = np.repeat(np.arange(nj * nk), counts)
+        return cls(rows % nj, rows // nj, ends[:, 0], ends[:, 1], numbers)
+
+    @property
+    def lengths(self) -> NDArray[np.int64]:
+        """Voxels of each run."""
+        return self.last - self.first + 1
+
+    def where(self, which: NDArray[np.bool_]) -> RunList:
+        """Return some of the runs; `which` has shape (n,)."""
+        return RunList(self.j[which], self.k[which], self.first[which], self.last[which], self.numbers[which])
+
+    def of(self, number: int) -> RunList:
+        """Return the runs of one component."""
+        return self.where(self.numbers == number)
+
+    def sum_ml(self, volume: Volume, count: int) -> NDArray[np.float64]:
+        """Return the volume of each of `count` components, ml."""
+        return np.bincount(self.numbers, self.lengths * slice_voxel_ml(volume)[self.k], count).astype(np.float64)
 
 
 def find_components(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry import Volume, slice_normal
+from clrecon.geometry import Volume, slice_normal, slice_voxel_ml
 from clrecon.geometry.affine import Float64Array, checked_points
 from clrecon.opencl import (
     Device,
@@ -26,7 +26,14 @@ from clrecon.opencl import (
 )
 from clrecon.operators.masks import voxel_mask
 from clrecon.operators.masks.regions import checked_mm
-from clrecon.operators.masks.runs import Components, find_components, mark_at_border, mark_with_voxels, write_runs
+from clrecon.operators.masks.runs import (
+    Components,
+    RunList,
+    find_components,
+    mark_at_border,
+    mark_with_voxels,
+    write_runs,
+)
 from clrecon.operators.masks.voxel_mask import VoxelMask, mask_bytes, zero_words
 from clrecon.points.stencil import SLACK, Lattice, Stencil, make_stencil
 from clrecon.system.arguments import explains_arguments
@@ -192,7 +199,7 @@ class MaskBits:
     """One bit for each voxel of a volume, on a device; what `clrecon.Mask` is made of."""
 
     def __init__(self, volume: Volume, mask_d: Any, name: str, *, device: Device, memory: int | None = None):
-        self.volume, self.device, self.memory, self.name = volume, device, memory, name
+        self.scan, self.device, self.memory, self.name = volume, device, memory, name
         self._mask_d = mask_d
         self._extents: VoxelMask | None = None
         self._count: int | None = None
@@ -208,7 +215,7 @@ class MaskBits:
     @property
     def shape_ijk(self) -> tuple[int, int, int]:
         """Voxels along i, j and k."""
-        return self.volume.shape_ijk
+        return self.scan.shape_ijk
 
     @property
     def count(self) -> int:
@@ -220,7 +227,27 @@ class MaskBits:
     @property
     def share(self) -> float:
         """Share of the volume's voxels that are chosen, 0 to 1."""
-        return self.count / self.volume.voxels.size
+        return self.count / self.scan.voxels.size
+
+    @property
+    def ml(self) -> float:
+        """Volume of the chosen voxels, ml; each slice reaches half way to its neighbours."""
+        each = slice_voxel_ml(self.scan)
+        if not self.scan.uneven:
+            return self.count * float(each[0])
+        return float(np.count_nonzero(self.to_numpy(), axis=(1, 2)) @ each)
+
+    @property
+    def bounds(self) -> Float64Array | None:
+        """Lowest and highest corner of the box round the chosen voxels, shape (2, 3), LPS mm; None without any."""
+        chosen = self.to_numpy()
+        k, j = np.nonzero(chosen.any(axis=2))
+        if not len(k):
+            return None
+        rows = chosen[k, j]  # the ends of a row hold all between them
+        ends = (rows.argmax(axis=1), rows.shape[1] - 1 - rows[:, ::-1].argmax(axis=1))
+        places = np.concatenate([self.scan.ijk_to_lps(np.column_stack([i, j, k])) for i in ends])
+        return np.array([places.min(axis=0), places.max(axis=0)])
 
     @property
     def bits(self) -> VoxelMask:
@@ -265,7 +292,7 @@ class MaskBits:
     def _combined(self: Bits, other: Bits, operation: str) -> Bits:
         if not isinstance(other, MaskBits):
             return NotImplemented
-        self._check_frame(other.volume)
+        self._check_frame(other.scan)
         self._check_budget(3)
         other_d = other._mask_d
         if other.device is not self.device:  # a device failed, and another took over
@@ -278,7 +305,7 @@ class MaskBits:
     # How
 
     def _made(self: Bits, mask_d: Any, name: str) -> Bits:
-        return type(self)(self.volume, mask_d, name, device=self.device, memory=self.memory)
+        return type(self)(self.scan, mask_d, name, device=self.device, memory=self.memory)
 
     def _check_budget(self, masks: int, **more: int) -> None:
         size = mask_bytes(self.shape_ijk)["mask of the voxels"]
@@ -286,7 +313,7 @@ class MaskBits:
 
     def _check_frame(self, volume: Volume) -> None:
         """Refuse a volume whose voxels lie elsewhere."""
-        own = self.volume
+        own = self.scan
         if volume is own:
             return
         if volume.shape_ijk != own.shape_ijk:
@@ -357,19 +384,19 @@ class MaskShapes(MaskBits):
         mm: Above 0.
         """
         radius = checked_mm(mm, "the length of the ways")
-        steps = np.array(self.volume.spacing)
+        steps = np.array(self.scan.spacing)
         most = np.where(steps <= radius * (1.0 + SLACK), np.ceil(radius / steps - SLACK), 0).astype(int)
         reached = self
         for done in range(int(most.max())):
             self._check_budget(4)
-            cross = _cross_of(self.volume, most > done)
+            cross = _cross_of(self.scan, most > done)
             spread = self._made(spread_bits(self.device, reached.bits, cross), self.name)
             reached = reached | (spread & room)
         return self._made(reached._mask_d, f"({self.name}) dilated by {mm:g} mm within ({room.name})")
 
     def _erode(self, mm: float, by_slice: bool) -> Any:
         radius = checked_mm(mm, "the radius of the ball")
-        if not reaches_beyond(self.volume, radius, by_slice=by_slice):
+        if not reaches_beyond(self.scan, radius, by_slice=by_slice):
             return self._spread(mm, by_slice, erode=True, whole=True)
         self._check_budget(2)
         return zero_words(self.device, mask_bytes(self.shape_ijk)["mask of the voxels"] // 4)
@@ -378,7 +405,7 @@ class MaskShapes(MaskBits):
         self, mm: float, by_slice: bool, *, erode: bool = False, beyond: bool = False, whole: bool = False
     ) -> Any:
         radius = checked_mm(mm, "the radius of the ball")
-        ball = (whole_ball_of if whole else ball_of)(self.volume, radius, by_slice=by_slice)
+        ball = (whole_ball_of if whole else ball_of)(self.scan, radius, by_slice=by_slice)
         size, extents = mask_bytes(self.shape_ijk).values()
         needs = {"2 masks of the voxels": 2 * size, "row extents": extents, "rows of the ball": table_bytes(ball)}
         check_budget(self.device, needs, self.memory)
@@ -442,8 +469,47 @@ class MaskComponents(MaskShapes):
         self._write(found, marks_d, grown_d, wanted=1)
         return self._made(grown_d, f"({self.name}) grown from {len(points)} point{'s' * (len(points) != 1)}")
 
+    @explains_arguments
+    def components(self: ComponentMask, most: int = 100) -> list[ComponentMask]:
+        """Return the components as masks, the largest first: chosen voxels that are joined by faces of chosen voxels.
+
+        Parameters
+        ----------
+        most : int
+            Smaller ones than so many are left out.
+        """
+        found, sizes = self._measure_components(most)
+        largest = np.argsort(-sizes, kind="stable")[:most]
+        return [self._choose(found, largest[n : n + 1], f"component {n + 1}") for n in range(len(largest))]
+
+    @explains_arguments
+    def keep_largest(self: ComponentMask, count: int = 1) -> ComponentMask:
+        """Return the `count` largest components in one mask; joined as in `components`."""
+        found, sizes = self._measure_components(count)
+        what = "the largest component" if count == 1 else f"the {count} largest components"
+        return self._choose(found, np.argsort(-sizes, kind="stable")[:count], what)
+
+    def _measure_components(self, wanted: int) -> tuple[Components, Float64Array]:
+        """Find the components and the ml of each."""
+        if isinstance(wanted, bool) or not isinstance(wanted, int | np.integer) or wanted < 1:
+            raise UsageError(f"a number of components is a whole number from 1 on, not {wanted!r}")
+        size = mask_bytes(self.shape_ijk)["mask of the voxels"]
+        found = find_components(self.device, self.bits, beside=2 * size, memory=self.memory)
+        if not found.count:
+            return found, np.empty(0)
+        return found, RunList.read(self.device, found, self.shape_ijk).sum_ml(self.scan, found.count)
+
+    def _choose(self: ComponentMask, found: Components, numbers: NDArray[np.integer], what: str) -> ComponentMask:
+        """Return the components of these numbers as a mask."""
+        chosen_d = zero_words(self.device, mask_bytes(self.shape_ijk)["mask of the voxels"] // 4)
+        if len(numbers):
+            marks = np.zeros(4 * -(-found.count // 4), np.uint8)
+            marks[numbers] = 1
+            self._write(found, upload(self.device, marks), chosen_d, wanted=1)
+        return self._made(chosen_d, f"{what} of ({self.name})")
+
     def _find_voxels(self, points: Float64Array) -> NDArray[np.int32]:
-        ijk = np.floor(self.volume.lps_to_ijk(points) + 0.5)
+        ijk = np.floor(self.scan.lps_to_ijk(points) + 0.5)
         outside = ((ijk < 0) | (ijk >= self.shape_ijk)).any(axis=1)
         if outside.any():
             raise UsageError(self._describe_miss(points[outside][0], "lies outside of the volume"))
@@ -453,10 +519,10 @@ class MaskComponents(MaskShapes):
         """Return the message for a point that nothing can grow from."""
         where = ", ".join(f"{x:.1f}" for x in point)
         least = np.inf
-        for chosen, origin in zip(self.to_numpy(), self.volume.slice_origins(), strict=True):
+        for chosen, origin in zip(self.to_numpy(), self.scan.slice_origins(), strict=True):
             rows = np.argwhere(chosen)
             if len(rows):
-                places = origin + rows[:, ::-1] @ self.volume.affine[:3, :2].T
+                places = origin + rows[:, ::-1] @ self.scan.affine[:3, :2].T
                 least = min(least, float(np.linalg.norm(places - point, axis=1).min()))
         near = f"no voxel is chosen ({self.name})"
         if np.isfinite(least):

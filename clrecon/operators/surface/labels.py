@@ -15,11 +15,11 @@ from numpy.typing import DTypeLike
 
 from clrecon.anatomy.head import SKIN_HU, warn_of_skin
 from clrecon.errors import DeviceMemoryError, NoSurfaceError
-from clrecon.geometry import Volume
+from clrecon.geometry import Volume, slice_voxel_ml
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.geometry.vertices import warnings_of_far
 from clrecon.labels import LabelMap, ResampledLabels
-from clrecon.labels.label_bodies import Box, Growth, count_ml, fill_solid, find_boxes, label_ml, slice_voxel_ml
+from clrecon.labels.label_bodies import Box, Growth, count_ml, fill_solid, find_boxes, label_ml
 from clrecon.mesh import Mesh
 from clrecon.opencl import (
     Device,

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.geometry import Volume
+from clrecon.geometry import Volume, slice_voxel_ml
 from clrecon.labels import LabelMap
 from clrecon.labels.canal import Canal, find_canal
-from clrecon.labels.label_bodies import count_ml, slice_voxel_ml
+from clrecon.labels.label_bodies import count_ml
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device
 from clrecon.operators.masks.mask import Mask
@@ -57,7 +57,7 @@ def measure_thickness(mask: Mask) -> ShellThickness:
     Hildebrand and Rüegsegger 1997, A new method for the model-independent assessment of thickness in three-dimensional
     images.
     """
-    spacing = mask.volume.spacing
+    spacing = mask.scan.spacing
     first, step = max(spacing), min(spacing) / 2.0
     radii = np.arange(first, max(MOST_RADIUS_MM, first) + step, step)
     counts = []
@@ -370,7 +370,7 @@ def _warn_of_canal(crop: LabelCrop, found: Canal | None) -> list[str]:
 
 def _warn_of_missed(in_band: Mask, dense: Mask, solid: Mask, others: Mask, band: tuple[float, float]) -> list[str]:
     """Warn of a label that ends before the dense bone does."""
-    beside = in_band & (solid.dilate(min(max(solid.volume.spacing), 3.0)) - solid - others)
+    beside = in_band & (solid.dilate(min(max(solid.scan.spacing), 3.0)) - solid - others)
     share = beside.count / (beside.count + dense.count)
     if share < MISSED_SHARE:
         return []

@@ -163,7 +163,7 @@ def vertebra_solid(
     Returns
     -------
     Mask
-        ``mask.volume`` is the part of the volume around the vertebra, at its place in the patient; the order of its
+        ``mask.scan`` is the part of the volume around the vertebra, at its place in the patient; the order of its
         axes makes the slices as axial as they can be.
 
     Raises

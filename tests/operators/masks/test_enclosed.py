@@ -10,8 +10,7 @@ from uneven_volume import uneven
 
 import clrecon
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.geometry import Volume
-from clrecon.labels.label_bodies import slice_voxel_ml
+from clrecon.geometry import Volume, slice_voxel_ml
 from clrecon.operators.masks import enclosed
 from clrecon.proof.phantom import PhantomSettings, make_phantom
 

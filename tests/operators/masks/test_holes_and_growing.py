@@ -44,9 +44,7 @@ def test_rows_of_every_length(device, ni):
     mask = mask_of(device, chosen)
     np.testing.assert_array_equal(mask.fill_holes().to_numpy(), ndimage.binary_fill_holes(chosen))
     start = np.argwhere(chosen)[[0, -1]]
-    np.testing.assert_array_equal(
-        mask.grow(mask.volume.ijk_to_lps(start[:, ::-1])).to_numpy(), twin.grow(chosen, start)
-    )
+    np.testing.assert_array_equal(mask.grow(mask.scan.ijk_to_lps(start[:, ::-1])).to_numpy(), twin.grow(chosen, start))
 
 
 def test_the_densest_runs(device):
@@ -56,7 +54,7 @@ def test_the_densest_runs(device):
     inner = np.zeros_like(chosen)
     inner[1:-1, 1:-1, 1:-1] = True
     np.testing.assert_array_equal(mask.fill_holes().to_numpy(), chosen | inner)
-    assert mask.grow(mask.volume.ijk_to_lps([[2, 2, 2], [5, 4, 3]])).count == 2
+    assert mask.grow(mask.scan.ijk_to_lps([[2, 2, 2], [5, 4, 3]])).count == 2
 
 
 def test_holes_equal_fill_voids(device):
@@ -85,7 +83,7 @@ def test_components_equal_those_of_scipy(device, density):
     labels, _ = ndimage.label(chosen)
     seeds = np.argwhere(chosen)[[0, 40, -1]]
     mask = mask_of(device, chosen)
-    grown = mask.grow(mask.volume.ijk_to_lps(seeds[:, ::-1]))
+    grown = mask.grow(mask.scan.ijk_to_lps(seeds[:, ::-1]))
     np.testing.assert_array_equal(grown.to_numpy(), np.isin(labels, labels[tuple(seeds.T)]))
     assert (grown - mask).count == 0
     assert grown.name == "(an array) grown from 3 points"

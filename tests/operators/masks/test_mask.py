@@ -9,12 +9,13 @@ import re
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from surface_volumes import MIRRORED, OBLIQUE, random_volume
 from uneven_volume import uneven
 
 import clrecon
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
-from clrecon.geometry import Volume
+from clrecon.geometry import Volume, slice_voxel_ml
 from clrecon.proof.volumes import volume_twins as twin
 
 TILTED = np.array([[0.6, 0.0, 0.0, -20.0], [0.0, 0.6, 0.7, 5.0], [0.0, 0.0, 2.0, 100.0], [0, 0, 0, 1.0]])
@@ -203,3 +204,59 @@ def test_numpy_takes_a_mask_as_its_voxels(device):
     )
     assert np.asarray(mask).dtype == np.bool_ and np.array_equal(np.asarray(mask), mask.to_numpy())
     assert np.asarray(mask, dtype=np.uint8).sum() == 5
+
+
+@pytest.mark.parametrize("which", range(7))
+def test_a_mask_knows_its_volume_and_its_box(device, which):
+    volume = volumes()[which]
+    chosen = volume.voxels > 95
+    mask = clrecon.Mask.from_array(volume, chosen, device=device)
+    places = twin.find_places(volume)[chosen]
+    np.testing.assert_allclose(mask.bounds, [places.min(axis=0), places.max(axis=0)], atol=1e-9)
+    each = slice_voxel_ml(volume)
+    assert mask.ml == pytest.approx(sum(layer.sum() * ml for layer, ml in zip(chosen, each, strict=True)), rel=1e-12)
+    if not volume.uneven:
+        assert mask.ml == pytest.approx(chosen.sum() * abs(np.linalg.det(volume.affine[:3, :3])) / 1000.0, rel=1e-9)
+
+
+def test_an_empty_mask_has_no_box_no_component_and_no_surface(device):
+    mask = clrecon.Mask.from_array(volumes()[0], np.zeros((6, 13, 40), bool), device=device)
+    assert mask.bounds is None and mask.ml == 0.0 and mask.components() == [] and mask.keep_largest().count == 0
+    with pytest.raises(NoSurfaceError, match="no voxel is chosen"):
+        mask.to_mesh()
+
+
+@pytest.mark.parametrize("which", [0, 3, 4])
+def test_components_are_those_of_scipy_the_largest_first(device, which):
+    volume = volumes()[which]
+    chosen = volume.voxels > 70
+    labels, count = ndimage.label(chosen)
+    ml = np.bincount(labels.ravel(), np.broadcast_to(slice_voxel_ml(volume)[:, None, None], chosen.shape).ravel())[1:]
+    mask = clrecon.Mask.from_array(volume, chosen, device=device)
+    found = mask.components(most=5)
+    assert [part.ml for part in found] == pytest.approx(sorted(ml, reverse=True)[:5])
+    assert len(mask.components(most=10_000)) == count
+    for part in found:
+        (number,) = np.unique(labels[part.to_numpy()])
+        assert part.count == (labels == number).sum()
+    both = mask.keep_largest(2)
+    np.testing.assert_array_equal(both.to_numpy(), (found[0] | found[1]).to_numpy())
+    assert both.name == "the 2 largest components of (an array)" and found[0].name == "component 1 of (an array)"
+
+
+@pytest.mark.parametrize("wanted", [0, -1, 1.5, True, "2"])
+def test_a_number_of_components_is_a_whole_one(device, wanted):
+    mask = clrecon.Mask.from_box(volumes()[0], (0, 3, 0, 3, 0, 3), device=device)
+    with pytest.raises(UsageError, match="number of components is a whole number from 1 on"):
+        mask.keep_largest(wanted)
+
+
+def test_the_surface_of_a_mask_is_that_of_its_label(device):
+    volume = Volume(np.zeros((20, 24, 40), np.int16), TILTED)
+    chosen = np.zeros(volume.shape, bool)
+    chosen[4:15, 5:20, 6:33] = True
+    mask = clrecon.Mask.from_array(volume, chosen, device=device)
+    mesh = mask.to_mesh()
+    assert mesh.volume / 1000.0 == pytest.approx(mask.ml, rel=1e-3)
+    expected = clrecon.extract_label_masks(mask.to_label_map(), device=device)[1]
+    np.testing.assert_array_equal(mesh.vertices, expected.vertices)

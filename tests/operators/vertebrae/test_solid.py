@@ -43,8 +43,8 @@ def test_the_label_alone_is_closed_and_filled_and_its_canal_stays_open(device):
     holed[4:8, 6:8, 14:17] = False  # a cavity that no ball of 1.5 mm closes
     affine = np.diag([1.0, 1.0, 1.0, 1.0])
     solid = vertebra_solid(Volume(voxels, affine), LabelMap(holed, affine, {1: "ring"}), "ring", device=device)
-    at = np.rint(solid.volume.affine[:3, 3]).astype(int)[::-1]
-    nk, nj, ni = solid.volume.voxels.shape
+    at = np.rint(solid.scan.affine[:3, 3]).astype(int)[::-1]
+    nk, nj, ni = solid.scan.voxels.shape
     expected = ring[at[0] : at[0] + nk, at[1] : at[1] + nj, at[2] : at[2] + ni]
     assert solid.count == np.count_nonzero(expected) == np.count_nonzero(ring)
     assert np.array_equal(solid.to_numpy(), expected)
@@ -68,12 +68,12 @@ def test_volumes_of_a_phantom_are_those_of_its_truth_and_what_the_level_adds(spi
     # half of 850 HU of the cortex and 50 HU around is 450 HU: lower levels lie farther out
     volume, labels, ml = spine
     solid = vertebra_solid(volume, labels, "L1", level, device=device)
-    truth = clrecon.Mask.from_labels(solid.volume, labels, ["L1"], device=device)
+    truth = clrecon.Mask.from_labels(solid.scan, labels, ["L1"], device=device)
     assert truth.count == labels.counts[20]  # nothing of the label is cut off
     more = solid.count / truth.count - 1.0
     assert more_ml[0] <= more <= more_ml[1]
     assert 2 * (solid & truth).count / (solid.count + truth.count) >= dice
-    assert not (solid & clrecon.Mask.from_labels(solid.volume, labels, ["L2"], device=device)).count
+    assert not (solid & clrecon.Mask.from_labels(solid.scan, labels, ["L2"], device=device)).count
 
 
 def test_the_order_of_axes_and_the_grid_of_the_map_do_not_matter(spine, device):
@@ -85,10 +85,10 @@ def test_the_order_of_axes_and_the_grid_of_the_map_do_not_matter(spine, device):
     flipped[:3, 3] += labels.affine[:3, 0] * (labels.shape_ijk[0] - 1)
     other_map = LabelMap(labels.voxels[:, :, ::-1], flipped, labels.names)
     other = vertebra_solid(sagittal, other_map, 20, 300, device=device)
-    normal = np.cross(*other.volume.affine[:3, :2].T)
+    normal = np.cross(*other.scan.affine[:3, :2].T)
     assert abs(normal[2]) > 0.99 * np.linalg.norm(normal)
     points = np.argwhere(plain.to_numpy())[:, ::-1]
-    places = np.rint(other.volume.lps_to_ijk(plain.volume.ijk_to_lps(points))).astype(int)
+    places = np.rint(other.scan.lps_to_ijk(plain.scan.ijk_to_lps(points))).astype(int)
     assert other.count == plain.count
     assert other.to_numpy()[tuple(places.T[::-1])].all()
 
@@ -100,10 +100,10 @@ def test_an_uneven_stack_keeps_its_places(device):
     volume = Volume(voxels, affine, slice_positions=positions)
     labels = LabelMap(np.repeat(ring, 2, axis=0), np.diag([1.0, 1.0, 0.7, 1.0]), {1: "ring"})
     solid = vertebra_solid(volume, labels, 1, device=device)
-    assert solid.volume.uneven
+    assert solid.scan.uneven
     held = clrecon.Mask.from_labels(volume, labels, [1], device=device)
     assert solid.count == held.count > 0
-    places = solid.volume.ijk_to_lps(np.argwhere(solid.to_numpy())[:, ::-1])
+    places = solid.scan.ijk_to_lps(np.argwhere(solid.to_numpy())[:, ::-1])
     assert np.allclose(np.sort(np.unique(places[:, 2])), np.unique(positions[held.to_numpy().any(axis=(1, 2)), 2]))
 
 
