@@ -88,6 +88,7 @@ CALLS_PUBLIC = {
     "clrecon/geometry/volume.py": {"write_volume", "to_html", "show"},
     "clrecon/labels/label_map.py": {"to_html"},
     "clrecon/mesh/mesh.py": {"to_html", "show"},
+    "clrecon/operators/masks/mask.py": {"extract_label_masks"},
     "clrecon/points/cloud.py": {"to_html"},
     "clrecon/reading/common/source_facts.py": {"to_html"},
 }
