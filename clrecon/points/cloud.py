@@ -15,6 +15,7 @@ from clrecon.exchange.content import PointContent, facts_for_file
 from clrecon.exchange.coordinates import as_stored
 from clrecon.exchange.formats import write_cloud
 from clrecon.geometry import frame_from_lps
+from clrecon.geometry.affine import choose_space
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.base_classes import Message
 from clrecon.system.packages import install_command, public_function
@@ -187,8 +188,25 @@ class PointCloud(Message):
         """True where the points are voxel centres whose indices are known."""
         return self._ijk is not None
 
+    @property
+    def bounds(self) -> NDArray[np.float64] | None:
+        """Lowest and highest corner of the box round the points, shape (2, 3), LPS mm; None without points."""
+        if not len(self):
+            return None
+        return np.array([self._points.min(axis=0), self._points.max(axis=0)], np.float64)
+
     def __len__(self) -> int:
         return len(self._points)
+
+    __iter__ = None  # without it Python would try cloud[0], cloud[1], ...
+
+    def __getitem__(self, key: slice | ArrayLike) -> PointCloud:
+        """Return the cloud of a range of points, of those that are true in a mask, or of those with these numbers."""
+        if isinstance(key, slice):
+            return self.select(np.arange(len(self))[key])
+        if np.ndim(key) == 0:  # type: ignore[arg-type]
+            raise UsageError(f"a part of a cloud is a range, a mask or numbers of points: one is cloud.points[{key}]")
+        return self.select(key)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
         """Return the points as an array, for ``numpy.asarray(cloud)``."""
@@ -319,6 +337,69 @@ class PointCloud(Message):
 
         return wrap_cloud(self._points, self._normals, self._hu, self._labels)
 
+    @classmethod
+    @explains_arguments
+    def from_pyvista(cls, polydata: Any, space: str | None = None) -> PointCloud:
+        """Make a cloud of the points of a ``pyvista.PolyData``.
+
+        Parameters
+        ----------
+        polydata : pyvista.PolyData or vtkPolyData
+            In mm.  Its point arrays ``Normals``, ``HU`` and ``label`` are taken over, as `to_pyvista` names them.
+        space : {"lps", "ras"}, optional
+            Patient frame of the points; None: that of the field array ``SPACE``, else LPS.
+
+        Raises
+        ------
+        UsageError
+            It is no PolyData, or an array has a number that a cloud cannot have; or ``space`` is not that of the array.
+        """
+        from clrecon.points.vtk import unwrap_cloud
+
+        arrays, named = unwrap_cloud(polydata)
+        return cls._of_others(arrays, choose_space(space, named, "the PolyData"))
+
+    @classmethod
+    @explains_arguments
+    def from_open3d(cls, cloud: Any, space: str = "lps") -> PointCloud:
+        """Make a cloud of an ``open3d.t.geometry.PointCloud``, or of one of ``open3d.geometry``.
+
+        Parameters
+        ----------
+        cloud : open3d.t.geometry.PointCloud or open3d.geometry.PointCloud
+            In mm.  The attributes ``normals``, ``hu`` and ``label`` are taken over, as `to_open3d` names them.
+        space : {"lps", "ras"}
+            Patient frame of the points, which Open3D does not know.
+
+        Raises
+        ------
+        UsageError
+            It is no cloud of Open3D, or an attribute has a number that a cloud cannot have.
+        """
+        if hasattr(cloud, "point"):
+            arrays = {name: cloud.point[name].cpu().numpy() for name in cloud.point}
+            given = {"points": arrays.get("positions"), "normals": arrays.get("normals")}
+            given |= {"hu": arrays.get("hu"), "labels": arrays.get("label")}
+        elif hasattr(cloud, "points") and hasattr(cloud, "has_normals"):
+            given = {"points": np.asarray(cloud.points)}
+            given["normals"] = np.asarray(cloud.normals) if cloud.has_normals() else None
+        else:
+            raise UsageError(f"a {type(cloud).__name__} is no cloud of Open3D")
+        return cls._of_others(given, space)
+
+    @classmethod
+    def _of_others(cls, arrays: Mapping[str, NDArray[Any] | None], space: str) -> PointCloud:
+        """Make a cloud of the arrays of another library, in `space`; a column counts as a list."""
+        if arrays.get("points") is None:
+            raise UsageError("there are no points")
+        signs = np.diag(frame_from_lps(space))
+        turned: dict[str, Any] = {
+            name: values * signs.astype(values.dtype) if name in ("points", "normals") else np.ravel(values)
+            for name, values in arrays.items()
+            if values is not None
+        }
+        return cls(**turned)
+
     def to_open3d(self) -> Any:
         """Return the cloud as ``open3d.t.geometry.PointCloud`` in LPS mm, with copies of the arrays.
 
@@ -394,7 +475,7 @@ def count_numbers(numbers: NDArray[np.uint8], reasons: Sequence[str]) -> dict[st
     return {reason: int(np.count_nonzero(numbers == number)) for number, reason in enumerate(reasons, 1)}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PointStep:
     """The result of a function that takes a cloud and gives another one.
 
@@ -417,6 +498,10 @@ class PointStep:
     reasons: tuple[str, ...] = ()
     facts: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        counts = "".join(f", {count:,} as {reason}" for reason, count in self.counts.items())
+        return f"{type(self).__name__}({self.cloud!r} of {len(self.removed):,}{counts})"
 
     @property
     def counts(self) -> dict[str, int]:

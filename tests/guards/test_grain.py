@@ -11,10 +11,10 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 96_270,
+    "lines": 96_405,
     "modules": 418,
     "small_modules_with_one_reader": 12,
-    "docstrings_with_raises": 127,
+    "docstrings_with_raises": 130,
     "options_in_several_files": 19,
     "modules_with_own_all": 0,
 }

@@ -47,7 +47,7 @@ PLACE_TOLERANCE_MM = 0.01
 """Largest distance of a point from its voxel: float32 and files round by less."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Clustering(PointStep):
     """The result of `cluster_points`: a `PointStep` that removes nothing.
 

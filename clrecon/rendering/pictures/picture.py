@@ -13,7 +13,7 @@ from io import BytesIO
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.rendering.pictures.annotations import PictureData
@@ -50,6 +50,42 @@ class Rendering(PictureData):
     def __repr__(self) -> str:
         width, height = self.size
         return f"<Rendering {self.mode}, {width} x {height} pixels, camera {self.camera}>"
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        """Return ``image``, for numpy and for ``matplotlib.pyplot.imshow(rendering)``."""
+        array = self.image if dtype is None else self.image.astype(dtype, copy=False)
+        return array.copy() if copy else array
+
+    def world_points(self, *, expected: bool = False) -> NDArray[np.float64]:
+        """Return the place in the patient that each pixel shows, LPS mm.
+
+        Parameters
+        ----------
+        expected : bool
+            At the expected depth, not at the first hit.
+
+        Returns
+        -------
+        ndarray, shape (h, w, 3), float64
+            NaN where nothing is hit.
+
+        Raises
+        ------
+        UsageError
+            The picture has no camera.
+        """
+        if self.camera is None:
+            raise UsageError("this picture is no projection (its camera is None): its pixels have no depth")
+        origins, directions = self.camera.rays(self.size)
+        depth = self.expected_depth if expected else self.depth
+        return np.asarray(origins + depth[..., None].astype(np.float64) * directions)
+
+    def show(self) -> None:
+        """Open the picture in the system's own viewer, through Pillow; notebooks show it by themselves."""
+        load_pillow()
+        from PIL import Image
+
+        Image.fromarray(self.image).show()
 
     @explains_arguments
     def with_background(self, color: str | Sequence[float]) -> Rendering:
