@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry.vertices import float32_step, is_far
+from clrecon.system.pieces import find_bounds
 
 _MOST_STEPS_APART = 64
 
@@ -32,7 +33,7 @@ def rounding_step(vertices: NDArray[np.floating]) -> float:
     """
     if len(vertices) == 0:
         return 0.0
-    low, high = vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
+    low, high = (corner.astype(np.float64) for corner in find_bounds(vertices))
     largest = np.abs([low, high]).max() if vertices.dtype == np.float32 else 0.5 * (high - low).max()
     return float32_step(float(largest))
 

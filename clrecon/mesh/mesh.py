@@ -16,6 +16,7 @@ from clrecon.mesh.components import select_components, split_components
 from clrecon.mesh.quality import MeshQuality, measure_quality, measure_triangles
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.packages import import_package, public_function
+from clrecon.system.pieces import find_bounds
 
 
 class Mesh(BaseMesh):
@@ -49,7 +50,7 @@ class Mesh(BaseMesh):
         """Lowest and highest corner of the box round the vertices, shape (2, 3), LPS mm; None without vertices."""
         if not self.vertex_count:
             return None
-        return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)], dtype=np.float64)
+        return np.array(find_bounds(self.vertices), dtype=np.float64)
 
     @property
     def area(self) -> float:

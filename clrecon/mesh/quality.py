@@ -22,7 +22,7 @@ from clrecon.mesh.connectivity import (
     opposite_half_edges,
 )
 from clrecon.mesh.triangles import corner_edges, cross_product, cross_products
-from clrecon.system.pieces import CHUNK, local_origin
+from clrecon.system.pieces import CHUNK, find_bounds, local_origin
 from clrecon.system.records import Record
 
 
@@ -116,7 +116,7 @@ def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32
         area_mm2=area,
         volume_ml=volume / 1000.0,
         outward=volume > 0.0,
-        bounds_mm=[vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()] if vertex_count else None,
+        bounds_mm=[corner.tolist() for corner in find_bounds(vertices)] if vertex_count else None,
     )
 
 

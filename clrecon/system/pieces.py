@@ -70,6 +70,14 @@ def side_by_side(one: Callable[[], _One], other: Callable[[], _Other]) -> tuple[
         return first.result(), second
 
 
+def find_bounds(points: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Return the lowest and the highest coordinates of points, shape (n, 3), at least one.
+
+    Column by column: numpy takes ten times as long along the first of such axes.
+    """
+    return np.array([column.min() for column in points.T]), np.array([column.max() for column in points.T])
+
+
 def local_origin(vertices: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the centre of the bounds, shape (3,), float64.
 
@@ -77,7 +85,8 @@ def local_origin(vertices: NDArray[np.floating]) -> NDArray[np.float64]:
     """
     if len(vertices) == 0:
         return np.zeros(3)
-    return 0.5 * (vertices.min(axis=0).astype(np.float64) + vertices.max(axis=0))
+    low, high = find_bounds(vertices)
+    return 0.5 * (low.astype(np.float64) + high)
 
 
 def count_readers(slices: int, most: int) -> int:

@@ -13,6 +13,7 @@ from clrecon.jobs.mesh.surfaces import Part, describe_level
 from clrecon.jobs.presets import find_iso_preset
 from clrecon.jobs.run import RunReport
 from clrecon.system.paths import extension_of
+from clrecon.system.pieces import find_bounds
 
 if TYPE_CHECKING:
     from clrecon.jobs.mesh.make import MadeParts
@@ -243,7 +244,7 @@ def _bounds(mesh: Mesh, space: str) -> list[list[float]] | None:
     if mesh.vertex_count == 0:
         return None
     frame = frame_from_lps(space)
-    corners = (frame @ mesh.vertices.min(axis=0), frame @ mesh.vertices.max(axis=0))
+    corners = [frame @ corner for corner in find_bounds(mesh.vertices)]
     return [[float(pick(a, b)) for a, b in zip(*corners, strict=True)] for pick in (min, max)]
 
 

@@ -21,6 +21,7 @@ from clrecon.operators.rays.point_pictures import eye_table
 from clrecon.rendering import Lighting
 from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.rendering.views.camera import Camera
+from clrecon.system.pieces import find_bounds
 from clrecon.system.text import format_digits
 
 MOST_TRIANGLES = 2**32 - 2
@@ -198,7 +199,7 @@ def mesh_corners(mesh: Mesh) -> Float64Array:
     used = np.zeros(mesh.vertex_count, dtype=bool)
     used[mesh.triangles.ravel()] = True
     vertices = mesh.vertices if used.all() else mesh.vertices[used]
-    corners = np.array([vertices.min(axis=0), vertices.max(axis=0)], dtype=np.float64)
+    corners = np.array(find_bounds(vertices), dtype=np.float64)
     if np.abs(mesh.vertices).max() > FARTHEST_MM:
         raise UsageError(
             f"vertices of the mesh lie up to {format_digits(np.abs(mesh.vertices).max())} mm from the origin:"

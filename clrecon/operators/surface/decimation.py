@@ -39,7 +39,7 @@ from clrecon.opencl import (
 )
 from clrecon.operators.masks.voxel_mask import zero_words
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.pieces import chunks, in_threads
+from clrecon.system.pieces import chunks, find_bounds, in_threads
 from clrecon.system.progress import Progress, Steps
 
 FEWEST = 20_000
@@ -105,7 +105,7 @@ def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> Cro
     low, high = _find_boxes(scaled, triangles)
     box = (high - low).T
     longest = LONGEST * np.maximum(np.maximum(box[0], box[1]), box[2]).astype(np.float64)
-    origin, beyond = low.min(axis=0).astype(np.float64), low.max(axis=0).astype(np.float64)
+    origin, beyond = (corner.astype(np.float64) for corner in find_bounds(low))
     edge = max(1.0, float(np.quantile(longest[:: max(1, len(longest) // 10_000)], FINEST)))
     while np.prod(np.floor((beyond - origin)[1:] / edge) + 1.0) > MOST_ROWS:
         edge *= 1.25
@@ -157,7 +157,7 @@ def mark_crossings(
         name: upload(device, getattr(plan, name))
         for name in ("vertices", "corners", "low", "high", "starts", "levels", "edges")
     }
-    origin = plan.low.min(axis=0)
+    origin = find_bounds(plan.low)[0]
     for first in range(0, count, PIECE):
         items = min(PIECE, count - first)
         launch(
