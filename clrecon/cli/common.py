@@ -247,7 +247,7 @@ def make_part(part: type[Settings], options: argparse.Namespace, owner: str | No
         return make_settings(part, options)
     for own in options_of(part):
         if getattr(options, own.name):
-            raise UsageError(f"{own.flag} {needs}")
+            raise UsageError(f"{own.flags[0]} {needs}")
     return None
 
 
@@ -255,7 +255,7 @@ def add_fields(container: argparse._ActionsContainer, settings: type, *groups: s
     """Add the options of groups that are fields of settings; without a group those that have none."""
     for group in groups or ("",):
         for own in options_of(settings, group):
-            container.add_argument(own.flag, dest=own.name, **own.how)
+            container.add_argument(*own.flags, dest=own.name, **own.how)
 
 
 def add_output(parser: argparse._ActionsContainer, text: str, metavar: str = "OUT", required: bool = True) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 import os
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from clrecon.cli.common import (
@@ -43,7 +45,7 @@ from clrecon.jobs.render.settings import (
     describe_presets,
     parse_direction,
 )
-from clrecon.system.options import numbers_reader
+from clrecon.system.options import numbers_reader, option
 from clrecon.system.text import count_of
 
 _LABELS_LISTED = 24
@@ -86,17 +88,12 @@ def _epilog() -> str:
 _parse_ends = numbers_reader(2, "is not a window: the HU that are black and white, LOW,HIGH, such as -450,1050")
 
 
-def parse_window(text: str) -> str | tuple[float, ...]:
+def _parse_window(text: str) -> str | tuple[float, ...]:
     """Read ``LOW,HIGH`` in HU, or the name of a window."""
     return text if text[:1].isalpha() and "," not in text else _parse_ends(text)
 
 
-parse_clip_plane = numbers_reader(
-    6, "is not a plane: a point in LPS mm and the direction of the side that stays, PX,PY,PZ,NX,NY,NZ"
-)
-
-
-def parse_slices(text: str) -> int | tuple[int, ...]:
+def _parse_slices(text: str) -> int | tuple[int, ...]:
     """Read ``N`` (every N-th slice) or ``K,K,...`` (the slices of these numbers); ``K,`` is a single slice."""
     try:
         numbers = tuple(int(part) for part in text.split(",") if part.strip())
@@ -122,153 +119,107 @@ def parse_mesh(text: str) -> tuple[str, str | None, float]:
     return path, color or None, opacity
 
 
-def add_looks(parser: argparse.ArgumentParser) -> None:
-    """Add the options for the content of a picture and its colours."""
-    group = parser.add_argument_group("what is shown")
-    group.add_argument(
-        "--mode",
-        type=str.lower,
-        metavar="M",
+@dataclass(frozen=True, kw_only=True)
+class Looks:
+    """Keywords of `RenderSettings.of` that make the style, as options."""
+
+    mode: str | None = option(
+        "--mode M",
+        f"one of: {', '.join(describe_modes())} (default: what the other options ask)",
+        parse=str.lower,
+        first=True,
         words=describe_modes(),
-        help=f"one of: {', '.join(describe_modes())} (default: what the other options ask)",
-        first=True,
     )
-    group.add_argument(
-        "--preset",
-        type=str.lower,
-        metavar="NAME",
+    preset: str | None = option(
+        "--preset NAME",
+        "colours, opacities, light and mode by tissue (default: bone)",
+        parse=str.lower,
+        first=True,
         words=describe_presets(),
-        help="colours, opacities, light and mode by tissue (default: bone)",
-        first=True,
     )
-    group.add_argument(
-        "--transfer-function",
-        metavar="FILE[:NAME]",
-        help="colours and opacities by HU from a file of clrecon, 3D Slicer or ParaView, see docs/rendering.md",
+    transfer_function: str | None = option(
+        "--transfer-function FILE[:NAME]",
+        "colours and opacities by HU from a file of clrecon, 3D Slicer or ParaView, see docs/rendering.md",
     )
-    group.add_argument(
-        "--iso",
-        "--hu",
-        dest="iso_value",
-        type=float,
-        metavar="HU",
-        help="iso value of mode surface, inside is HU and above (default: 200)",
-        first=True,
+    iso_value: float | None = option(
+        "--iso --hu HU", "iso value of mode surface, inside is HU and above (default: 200)", first=True
     )
-    group.add_argument(
-        "--color",
-        metavar="C",
-        words=COLORS,
-        help="colour of a surface or of points, such as orange or #ff8000 (default: bone); of points also"
+    color: str | None = option(
+        "--color C",
+        "colour of a surface or of points, such as orange or #ff8000 (default: bone); of points also"
         f" {', '.join(POINT_COLORS)} (default: label, else hu, where points have them)",
+        words=COLORS,
     )
-    group.add_argument(
-        "--point-radius",
-        dest="radius_mm",
-        type=float,
-        metavar="MM",
-        help="of points, which are discs (default: their mean spacing)",
-    )
-    group.add_argument("--opacity", type=float, metavar="SHARE", help="of the mesh in mode mesh (default: 1)")
-    group.add_argument("--flat", action="store_true", help="light each triangle of a mesh by its own normal")
-    group.add_argument(
-        "--window",
-        type=parse_window,
-        metavar="LOW,HIGH|NAME",
-        help=f"HU that are black and white, of modes that show HU, or one of {', '.join(WINDOWS)}; mm of water in mode"
-        " drr",
+    radius_mm: float | None = option("--point-radius MM", "of points, which are discs (default: their mean spacing)")
+    opacity: float | None = option("--opacity SHARE", "of the mesh in mode mesh (default: 1)")
+    flat: bool = option("--flat", "light each triangle of a mesh by its own normal")
+    window: str | Sequence[float] | None = option(
+        "--window LOW,HIGH|NAME",
+        f"HU that are black and white, of modes that show HU, or one of {', '.join(WINDOWS)}; mm of water in mode drr",
+        parse=_parse_window,
         first=True,
     )
-    group.add_argument(
-        "--keep-air", action="store_true", help="of mode minip: count what lies outside of the body and of masks too"
+    keep_air: bool = option("--keep-air", "of mode minip: count what lies outside of the body and of masks too")
+    ray_step: float | None = option("--ray-step MM", "mm between samples (default: half the smallest spacing)")
+    light: str | Sequence[float] | None = option(
+        "--light L",
+        "head: a light at the camera; a side of the patient, or X,Y,Z in LPS: a light that stays where it is; none:"
+        " colours as they are (default: what the preset says)",
+        parse=parse_direction,
     )
-    group.add_argument(
-        "--ray-step", type=float, metavar="MM", help="mm between samples (default: half the smallest spacing)"
+    depth_cue: float | None = option(
+        "--depth-cue SHARE", "share of its brightness that a surface loses from its nearest to its farthest point"
     )
-    group.add_argument(
-        "--light",
-        type=parse_direction,
-        metavar="L",
-        help="head: a light at the camera; a side of the patient, or X,Y,Z in LPS: a light that stays where it is;"
-        " none: colours as they are (default: what the preset says)",
-    )
-    group.add_argument(
-        "--depth-cue",
-        type=float,
-        metavar="SHARE",
-        help="share of its brightness that a surface loses from its nearest to its farthest point",
-    )
-    group.add_argument("--shadows", action="store_true", help="shadows on a surface; wants a light beside the camera")
-    group.add_argument(
-        "--jitter", action="store_true", help="begin each ray at a place of its own: grain in place of rings"
-    )
-
-
-def add_camera(parser: argparse.ArgumentParser) -> None:
-    """Add the options for camera, size, background and annotations."""
-    group = parser.add_argument_group("camera and picture")
-    add_fields(group, RenderSettings, "camera")
-    group.add_argument("--depth", metavar="FILE", help="write mm along the ray to the first hit: .npy or .tif, float32")
-    group.add_argument("--values", metavar="FILE", help="write the HU of modes that show HU: .npy or .tif, float32")
-
-
-def add_clipping(parser: argparse.ArgumentParser) -> None:
-    """Add the planes that limit the part of space that is shown."""
-    group = parser.add_argument_group("clipping, in mm of the patient (LPS)")
-    group.add_argument(
-        "--clip",
-        dest="clip_planes",
-        type=parse_clip_plane,
-        metavar="PX,PY,PZ,NX,NY,NZ",
+    shadows: bool = option("--shadows", "shadows on a surface; wants a light beside the camera")
+    jitter: bool = option("--jitter", "begin each ray at a place of its own: grain in place of rings")
+    clip_planes: Sequence[Sequence[float]] = option(
+        "--clip PX,PY,PZ,NX,NY,NZ",
+        "keep the side of a plane through a point that a normal points to; may be given again",
+        group="clipping",
+        default=(),
+        parse=numbers_reader(
+            6, "is not a plane: a point in LPS mm and the direction of the side that stays, PX,PY,PZ,NX,NY,NZ"
+        ),
         action="append",
-        default=[],
-        help="keep the side of a plane through a point that a normal points to; may be given again",
     )
-
-
-def add_curve(parser: argparse.ArgumentParser) -> None:
-    """Add the options of slices (in space or single) and of curved reformations."""
-    group = parser.add_argument_group("slices and curved reformations")
-    group.add_argument("--thickness", type=float, metavar="MM", help="of a thick slice (default: 0, a plane)")
-    group.add_argument(
-        "--combine",
-        type=str.lower,
-        metavar="HOW",
+    thickness: float | None = option("--thickness MM", "of a thick slice (default: 0, a plane)", group="slices")
+    combine: str | None = option(
+        "--combine HOW",
+        "mean, max or min of a thick slice (default: mean)",
+        group="slices",
+        parse=str.lower,
         words=("mean", "max", "min"),
-        help="mean, max or min of a thick slice (default: mean)",
     )
-    group.add_argument(
-        "--offset", dest="offset_mm", type=float, metavar="MM", help="move the slice away from the camera by so much"
+    offset_mm: float | None = option("--offset MM", "move the slice away from the camera by so much", group="slices")
+    slices: int | Sequence[int] | None = option(
+        "--slices N|K,K,...",
+        "of mode slices and of a sheet: every N-th, or with a comma those numbers, from 0 (default: about twelve)",
+        group="slices",
+        parse=_parse_slices,
     )
-    group.add_argument(
-        "--slices",
-        type=parse_slices,
-        metavar="N|K,K,...",
-        help="of mode slices and of a sheet: every N-th, or with a comma those numbers, from 0 (default: about twelve)",
-    )
-    group.add_argument(
-        "--sheet",
+    sheet: int | str | None = option(
+        "--sheet N|MMmm",
+        f"contact sheet of mode slice: N slices side by side (default: {SHEET_SLICES}), or one every so many mm, such"
+        " as 5mm; --view says in which plane, --slices which planes of voxels",
+        group="slices",
         nargs="?",
         const=SHEET_SLICES,
-        metavar="N|MMmm",
-        help=f"contact sheet of mode slice: N slices side by side (default: {SHEET_SLICES}), or one every so many mm,"
-        " such as 5mm; --view says in which plane, --slices which planes of voxels",
     )
-    group.add_argument(
-        "--slice-opacity", type=float, metavar="SHARE", help="of each slice of mode slices (default: 0.5)"
+    slice_opacity: float | None = option(
+        "--slice-opacity SHARE", "of each slice of mode slices (default: 0.5)", group="slices"
     )
-    group.add_argument(
-        "--curve",
-        metavar="FILE|auto",
-        help="centre line: a text, CSV or JSON file of points in LPS mm, or markups of 3D Slicer; auto: the spinal"
-        " canal, found in the scan",
+    curve: str | None = option(
+        "--curve FILE|auto",
+        "centre line: a text, CSV or JSON file of points in LPS mm, or markups of 3D Slicer; auto: the spinal canal,"
+        " found in the scan",
+        group="slices",
     )
-    group.add_argument(
-        "--cpr",
-        type=str.lower,
-        metavar="KIND",
+    cpr: str | None = option(
+        "--cpr KIND",
+        "straightened or stretched (default: straightened)",
+        group="slices",
+        parse=str.lower,
         words=CURVED_KINDS,
-        help="straightened or stretched (default: straightened)",
     )
 
 
@@ -303,15 +254,19 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = _epilog()
-    kinds = f"a cloud of points ({', '.join(CLOUD_INPUTS)}); or a mesh ({', '.join(MESH_INPUTS)}; of .ply and .vtp say"
-    more = f"{kinds} --mode mesh); may be left out with --mesh"
-    add_input(parser, f"{SCAN_FOLDER}; {GRID_FILE}; {more}", nargs="?")
+    others = f"a cloud of points ({', '.join(CLOUD_INPUTS)}); or a mesh ({', '.join(MESH_INPUTS)}; of .ply and .vtp say"
+    text = f"{SCAN_FOLDER}; {GRID_FILE}; {others} --mode mesh); may be left out with --mesh"
+    add_input(parser, text, nargs="?")
     add_output(parser, "picture: .png, .jpg or .tif; may be left out with --turntable", required=False)
-    add_looks(parser)
-    add_camera(parser)
+    add_fields(parser.add_argument_group("what is shown"), Looks)
+    camera = parser.add_argument_group("camera and picture")
+    add_fields(camera, RenderSettings, "camera")
+    kinds = ".npy or .tif, float32"
+    camera.add_argument("--depth", metavar="FILE", help=f"write mm along the ray to the first hit: {kinds}")
+    camera.add_argument("--values", metavar="FILE", help=f"write the HU of modes that show HU: {kinds}")
     add_cropping(parser, "of the patient (LPS)")
-    add_clipping(parser)
-    add_curve(parser)
+    add_fields(parser.add_argument_group("clipping, in mm of the patient (LPS)"), Looks, "clipping")
+    add_fields(parser.add_argument_group("slices and curved reformations"), Looks, "slices")
     add_fields(parser.add_argument_group("labels"), LabelLook)
     add_meshes(parser)
     add_motion(parser)

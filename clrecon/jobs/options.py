@@ -154,8 +154,7 @@ class ScanSettings(Selection):
 def changed_fields(settings: InputSettings) -> list[str]:
     """Return the names of the fields that are not their defaults; an empty list is as good as an empty tuple."""
     values = [(own.name, getattr(settings, own.name), own.default) for own in fields(settings)]
-    empty = ((), [])
-    return [name for name, value, default in values if value != default and value not in empty]
+    return [name for name, value, default in values if value != default and value not in ((), [])]
 
 
 def label_map_option(**how: Any) -> Any:

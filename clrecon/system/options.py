@@ -16,11 +16,12 @@ class Option(NamedTuple):
     """How a field of settings is given on the command line.
 
     name: Of the field.
+    flags: The first is its name in messages.
     how: Keywords of `clrecon.cli.common.Parser.add_argument`.
     """
 
     name: str
-    flag: str
+    flags: list[str]
     how: dict[str, Any]
 
 
@@ -35,13 +36,14 @@ def option(
 ) -> Any:
     """Declare a field of settings that is an option of the command line.
 
-    usage: The flag, and what stands for its value in the help (for each of several values); a switch has none.
+    usage: Its flags, and what stands for its value in the help (for each of several values); a switch has none.
     group: Names those that stand together.
     default: Of the field; where the option is not given, the parser has None.
     parse: Reads the value from text; its ValueError is the refusal.  None: as the annotation of the field says.
     **how: More keywords of `clrecon.cli.common.Parser.add_argument`.
     """
-    flag, *values = usage.split()
+    flags = [word for word in usage.split() if word.startswith("-")]
+    values = usage.split()[len(flags) :]
     if not values:
         how = {"action": "store_false" if default else "store_true", **how}
         default = bool(default)
@@ -52,16 +54,16 @@ def option(
     if parse is not None:
         how["type"] = parse
     default = MISSING if how.get("required") else default
-    return field(default=default, metadata={_KEY: (flag, group, {"help": help, **how})})
+    return field(default=default, metadata={_KEY: (flags, group, {"help": help, **how})})
 
 
 def options_of(settings: type, group: str = "") -> Iterator[Option]:
     """Yield the options of a group, in the order of the fields."""
     for own in fields(settings):
-        flag, declared, how = own.metadata.get(_KEY, ("", None, {}))
+        flags, declared, how = own.metadata.get(_KEY, ([], None, {}))
         if declared == group:
             read = _READERS.get(str(own.type))
-            yield Option(own.name, flag, how if read is None else {"type": read, **how})
+            yield Option(own.name, flags, how if read is None else {"type": read, **how})
 
 
 def parse_numbers(text: str, *, ends: bool = False) -> tuple[float, ...] | None:

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from clrecon.cli.common import Parser, add_fields
+from clrecon.cli.common import Parser
 from clrecon.cli.main import main
-from clrecon.cli.render import add_camera, add_clipping
-from clrecon.jobs.render.settings import LabelLook
+from clrecon.cli.render import add_arguments
 
 GIVEN_TWICE = {
     "view": (["anterior,left", "30,15"], [("anterior", "left"), ("30,15",)]),
@@ -22,9 +21,7 @@ GIVEN_TWICE = {
 @pytest.fixture
 def parser() -> Parser:
     parser = Parser()
-    add_camera(parser)
-    add_clipping(parser)
-    add_fields(parser, LabelLook)
+    add_arguments(parser)
     return parser
 
 
