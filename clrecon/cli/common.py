@@ -246,7 +246,7 @@ def make_part(part: type[Settings], options: argparse.Namespace, owner: str | No
     if owner is not None:
         return make_settings(part, options)
     for own in options_of(part):
-        if getattr(options, own.name):
+        if getattr(options, own.name) is not None:
             raise UsageError(f"{own.flags[0]} {needs}")
     return None
 
