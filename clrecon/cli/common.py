@@ -335,12 +335,10 @@ def add_cropping(parser: argparse.ArgumentParser, frame: str) -> None:
     add_fields(parser.add_argument_group(f"crop, in mm {frame}", _CROP), InputSettings, "crop")
 
 
-def show_report(
-    report: dict[str, Any], lines: Iterable[str], options: argparse.Namespace, console: Console, *more: str
-) -> None:
-    """Print a report as JSON, its lines for people, more of what was written, and the warnings."""
+def show_report(report: dict[str, Any], lines: Iterable[str], options: argparse.Namespace, console: Console) -> None:
+    """Print a report: as JSON or its lines for people, and its warnings."""
     console.result(report)
-    for line in (*lines, *more):
+    for line in lines:
         console.say(line)
     if getattr(options, "report", None):
         console.say(f"report   {printable(options.report)}")
