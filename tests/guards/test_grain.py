@@ -11,9 +11,9 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 96_415,
+    "lines": 96_368,
     "modules": 418,
-    "small_modules_with_one_reader": 12,
+    "small_modules_with_one_reader": 11,
     "docstrings_with_raises": 130,
     "options_in_several_files": 19,
     "modules_with_own_all": 0,
