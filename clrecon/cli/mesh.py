@@ -58,6 +58,7 @@ def _epilog() -> str:
             "  clrecon mesh CT_FOLDER -o bone.stl",
             "  clrecon mesh CT_FOLDER -o skull.glb --hu 300 --keep-largest 1 --report skull.json",
             "  clrecon mesh CT_FOLDER -o bone.stl --hu auto",
+            "  clrecon mesh CT_FOLDER -o bone.ply --surface cortex",
             "  clrecon mesh CT_FOLDER -o print.3mf --for print",
             "  clrecon mesh CT_FOLDER -o bone.stl --hu auto --keep bone --solid",
             "  clrecon mesh CT_FOLDER -o bone.stl --hu 200,350 --min-volume 1 --split",

@@ -111,9 +111,16 @@ class Rings:
         other = np.concatenate([corners[:, 1], corners[:, 2], corners[:, 0]])
         self._next = csr_array((np.ones(len(one), np.float32), (one, other)), shape=(count, count))
 
-    def sums(self, values: NDArray[np.floating]) -> NDArray[Any]:
-        """Return the sum over each vertex and its neighbours, shape (n, ...) as given."""
-        return np.asarray(values + self._next @ values)
+    def sums(self, values: NDArray[np.floating], rows: IntArray | None = None) -> NDArray[Any]:
+        """Return the sum over each vertex, or each of `rows`, and its neighbours, shape (n, ...) as given."""
+        if rows is None:
+            return np.asarray(values + self._next @ values)
+        return np.asarray(values[rows] + self._next[rows] @ values)
+
+    def means(self, values: NDArray[np.floating], rows: IntArray) -> NDArray[Any]:
+        """Return the means over vertices `rows` and their neighbours, of values (n, k)."""
+        counts = 1 + np.diff(self._next.indptr)[rows]
+        return np.asarray(self.sums(values, rows) / counts[:, None])
 
 
 def find_edges(triangles: NDArray[np.uint32], vertex_count: int) -> Edges:

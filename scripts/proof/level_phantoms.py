@@ -41,6 +41,7 @@ __all__ = [
     "Phantom",
     "Profiles",
     "draw_phantom",
+    "find_on_mesh",
     "sample_profiles",
 ]
 
@@ -111,9 +112,14 @@ PHANTOMS = (
 
 @dataclass
 class Profiles:
-    """HU along the true normals, shape (n, steps), outwards, and the way along them in mm."""
+    """HU along the true normals, shape (n, steps), outwards, and the way along them in mm.
+
+    points, normals: shape (n, 3). Places of the true surface, LPS mm, and unit vectors outwards.
+    """
 
     values: NDArray[np.float32]
+    points: Points = field(default_factory=lambda: np.zeros((0, 3)))
+    normals: Points = field(default_factory=lambda: np.zeros((0, 3)))
     way_mm: NDArray[np.float32] = field(
         default_factory=lambda: np.arange(-REACH_MM, REACH_MM + STEP_MM / 2, STEP_MM, dtype=np.float32)
     )
@@ -130,6 +136,45 @@ class Profiles:
         nearest = np.abs(at).argmin(axis=1)
         found = at[np.arange(len(at)), nearest]
         return np.where(np.isfinite(found), found, np.nan).astype(np.float32)
+
+
+def find_on_mesh(
+    profiles: Profiles, vertices: Points, triangles: NDArray[np.uint32]
+) -> tuple[Points, NDArray[np.int64]]:
+    """Return where a mesh crosses each true normal nearest to the truth, as `Profiles.errors`, and the triangle there.
+
+    Only crossings whose triangle faces outwards count; -1 where there is none.
+    """
+    from scipy.spatial import cKDTree
+
+    a, b, c = (vertices[triangles[:, corner]].astype(np.float64) for corner in range(3))
+    middles = (a + b + c) / 3.0
+    radius = float(np.percentile(np.linalg.norm(a - middles, axis=1), 99.9)) + 0.05
+    tree = cKDTree(middles)
+    steps = np.arange(-REACH_MM, REACH_MM + radius, radius)
+    found, rows = np.full(len(profiles.points), np.inf), np.full(len(profiles.points), -1)
+    for begin in range(0, len(profiles.points), 500):
+        where = slice(begin, begin + 500)
+        line = profiles.points[where, None] + steps[:, None] * profiles.normals[where, None]
+        near = tree.query_ball_point(line.reshape(-1, 3), 1.2 * radius)
+        of_line = np.repeat(np.arange(len(near)) // len(steps), [len(one) for one in near])
+        of_face = np.concatenate([np.asarray(one, dtype=np.int64) for one in near])
+        pairs = np.unique(np.column_stack([of_line, of_face]), axis=0)
+        line_of, face = pairs[:, 0] + begin, pairs[:, 1]
+        p, n = profiles.points[line_of], profiles.normals[line_of]
+        one, two = b[face] - a[face], c[face] - a[face]
+        across = np.cross(n, two)
+        size = np.einsum("ij,ij->i", one, across)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = np.einsum("ij,ij->i", p - a[face], across) / size
+            turned = np.cross(p - a[face], one)
+            v = np.einsum("ij,ij->i", n, turned) / size
+            way = np.einsum("ij,ij->i", two, turned) / size
+        faces_out = np.einsum("ij,ij->i", np.cross(one, two), n) > 0.0
+        hit = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1.0 + 1e-9) & faces_out & (np.abs(way) <= REACH_MM)
+        for each in np.flatnonzero(hit)[np.argsort(-np.abs(way[hit]))]:  # the nearest comes last
+            found[line_of[each]], rows[line_of[each]] = way[each], face[each]
+    return np.where(np.isfinite(found), found, np.nan), rows
 
 
 def draw_phantom(phantom: Phantom) -> Volume:
@@ -239,4 +284,4 @@ def sample_profiles(phantom: Phantom, volume: Volume, seed: int = 1) -> Profiles
     whole = ((ijk >= 0) & (ijk <= limits)).all(axis=1).reshape(len(points), -1).all(axis=1)
     kji = ijk.reshape(len(points), -1, 3)[whole].reshape(-1, 3)[:, ::-1].T
     values = map_coordinates(volume.voxels.astype(np.float32), kji, order=1)
-    return Profiles(values.reshape(int(whole.sum()), -1).astype(np.float32))
+    return Profiles(values.reshape(int(whole.sum()), -1).astype(np.float32), points[whole], normals[whole])

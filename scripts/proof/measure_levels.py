@@ -6,10 +6,11 @@
     python scripts/proof/measure_levels.py page
 
 `phantoms` measures every phantom of `level_phantoms.py` (about five minutes on one core) at the preset bone, at
-`--hu auto`, at `--hu half:BONE,TISSUE` with the phantom's own materials, and at the best of the levels from 100 to
-900 HU. `scans` does what can be done without a truth: the level that auto picks in the scan, in its two halves and in
-every other slice, and how the surface differs. Both keep their figures in docs/benchmarks/levels; `page` writes them
-into docs/iso_value.md. The scans need an OpenCL device.
+`--hu auto`, at `--hu half:BONE,TISSUE` with the phantom's own materials, at the best of the levels from 100 to 900 HU,
+and the surface of `--surface cortex` itself; `--seed` draws other bodies, whose figures are in phantoms_SEED.  `scans`
+does what can be done without a truth: the level that auto picks in the scan, in its two halves and in every other
+slice, and how the surface differs.  Both keep their figures in docs/benchmarks/levels; `page` writes them into
+docs/iso_value.md.  The scans and the fitted surfaces need an OpenCL device.
 """
 
 from __future__ import annotations
@@ -20,15 +21,27 @@ import math
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent), str(ROOT / "scripts" / "guide")]
 
-from level_phantoms import NOTHING, PHANTOMS, SCANNING, Phantom, Profiles, draw_phantom, sample_profiles  # noqa: E402
+from level_phantoms import (  # noqa: E402
+    DRY,
+    NOTHING,
+    PHANTOMS,
+    SCANNING,
+    Phantom,
+    Profiles,
+    draw_phantom,
+    find_on_mesh,
+    sample_profiles,
+)
 from marked_tables import markdown_table, put_table  # noqa: E402
 
 from clrecon.anatomy.iso_choice import IsoChoice, choose_iso_value, half_iso_value  # noqa: E402
@@ -40,14 +53,43 @@ FIGURES = ROOT / "docs" / "benchmarks" / "levels"
 PAGE = ROOT / "docs" / "iso_value.md"
 TRIED = range(100, 901, 25)
 CLOSE_MM = 0.5
-RULES = ("preset", "auto", "half", "best")
+RULES = ("preset", "auto", "half", "best", "fitted")
+FITTED_AT = {DRY: -200.0}
+"""Level of the surface that is moved onto the cortex, where it is not the preset's: dry bones lie in air."""
 SHARES = (0.3, 0.35, 0.4, 0.45)
 """Levels at these shares of the way from tissue to bone, both as auto measures them."""
 
 
 def measure_errors(profiles: Profiles, level: float) -> dict[str, float]:
     """Measure a level: mean signed and absolute distance where it is crossed, share lost, share within `CLOSE_MM`."""
-    errors = profiles.errors(level)
+    return describe_errors(profiles.errors(level), level)
+
+
+def measure_fitted(phantom: Phantom, volume: Volume, profiles: Profiles) -> dict[str, float]:
+    """Measure the surface of `clrecon mesh --surface cortex` itself, with the shares of places within 1 and 1.96 of the
+    errors that it says.
+    """
+    import clrecon
+
+    level = FITTED_AT.get(phantom.group, PRESETS["bone"].iso_value)
+    mesh = clrecon.fit_cortex(clrecon.extract_isosurface(volume, level), volume)
+    errors, rows = find_on_mesh(profiles, mesh.vertices, mesh.triangles)
+    said = np.where(rows >= 0, mesh.values["error_mm"][mesh.triangles[rows, 0]], np.nan)
+    known = np.isfinite(said) & np.isfinite(errors)
+    within = [float(np.mean(np.abs(errors[known]) <= times * said[known])) for times in (1.0, 1.96)]
+    constants = mesh.report["cortex"]["constants"]
+    return {
+        **describe_errors(errors, level),
+        "within_error": round(within[0], 4),
+        "within_196_errors": round(within[1], 4),
+        **{name: round(float(constants[name]), 3) for name in ("blur_mm", "blur_across_mm", "cortex_hu")},
+        "seconds": round(mesh.report["cortex"]["seconds"], 2),
+        "triangles": mesh.triangle_count,
+    }
+
+
+def describe_errors(errors: NDArray[np.floating], level: float) -> dict[str, float]:
+    """Describe signed distances from the truth, NaN where there is no surface."""
     found = errors[np.isfinite(errors)]
     if not len(found):
         return {"level_hu": level, "lost_share": 1.0, "close_share": 0.0}
@@ -59,6 +101,11 @@ def measure_errors(profiles: Profiles, level: float) -> dict[str, float]:
         "lost_share": round(1.0 - len(found) / len(errors), 4),
         "close_share": round(float((np.abs(found) <= CLOSE_MM).sum() / len(errors)), 4),
     }
+
+
+def with_seed(seed: int) -> list[Phantom]:
+    """Return the phantoms with bodies and noise of another seed."""
+    return [replace(phantom, settings={**phantom.settings, "seed": seed}) for phantom in PHANTOMS]
 
 
 def choose(volume: Volume) -> tuple[IsoChoice | None, str, float]:
@@ -98,6 +145,7 @@ def measure_phantom(phantom: Phantom) -> dict[str, Any]:
         if hu is not None:
             figures[rule] = {**figures.get(rule, {}), **measure_errors(profiles, hu)}
     figures["best"] = max(tried.values(), key=lambda one: one["close_share"])
+    figures["fitted"] = measure_fitted(phantom, volume, profiles)
     if choice is not None:
         tissue, way = choice.tissue_hu, choice.bone_hu - choice.tissue_hu
         figures["shares"] = {f"{share:g}": measure_errors(profiles, round(tissue + share * way)) for share in SHARES}
@@ -198,7 +246,7 @@ def _cell(figures: dict[str, Any]) -> str:
 
 def phantom_table(figures: Sequence[dict[str, Any]]) -> str:
     """Return the table of phantoms."""
-    head = ("phantom", "preset bone", "auto", "half", "best")
+    head = ("phantom", "preset bone", "auto", "half", "best", "fitted to the cortex")
     rows = []
     for one in figures:
         cells = [_cell(one[rule]) if rule in one else "" for rule in RULES]
@@ -275,13 +323,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("phantoms", "scans", "page"))
     parser.add_argument("scans", nargs="*", metavar="NAME=CT_FOLDER")
+    parser.add_argument("--seed", type=int, help="of bodies other than those of the tables")
     options = parser.parse_args()
     if options.what == "page":
         write_page()
         return
     figures = []
     if options.what == "phantoms":
-        for phantom in PHANTOMS:
+        for phantom in PHANTOMS if options.seed is None else with_seed(options.seed):
             figures.append(measure_phantom(phantom))
             print(
                 phantom.name,
@@ -292,7 +341,7 @@ def main() -> None:
         name, _, folder = given.partition("=")
         figures.append(measure_scan(name, Path(folder)))
         print(json.dumps(figures[-1]), flush=True)
-    _keep(options.what, figures)
+    _keep(options.what if options.seed is None else f"{options.what}_{options.seed}", figures)
 
 
 if __name__ == "__main__":

@@ -56,6 +56,20 @@ def test_profiles_of_a_leg_are_level_with_its_bone() -> None:
     assert measure_levels.measure_errors(profiles, 200.0)["bias_mm"] > 0.5
 
 
+def test_a_mesh_is_met_where_it_crosses_the_true_normals() -> None:
+    corners = np.array(
+        [[0.0, 0.0, 0.4], [9.0, 0.0, 0.4], [0.0, 9.0, 0.4], [0.0, 0.0, -1.0], [9.0, 0.0, -1.0], [0.0, 9.0, -1.0]]
+    )
+    triangles = np.array([[0, 1, 2], [3, 4, 5], [3, 5, 4]], np.uint32)  # two face up, the last one down
+    points = np.array([[1.0, 1.0, 0.0], [1.0, 2.0, -1.1], [8.0, 8.0, 0.0]])
+    profiles = level_phantoms.Profiles(
+        np.empty((3, 0), np.float32), points=points, normals=np.tile([0.0, 0.0, 1.0], (3, 1))
+    )
+    errors, rows = level_phantoms.find_on_mesh(profiles, corners, triangles)
+    np.testing.assert_allclose(errors, [0.4, 0.1, np.nan], atol=1e-6)
+    assert rows.tolist() == [0, 1, -1]
+
+
 def test_tables_need_their_markers() -> None:
     text = "a\n<!-- x: made by me -->\nold\n<!-- end of x -->\nb"
     assert marked_tables.find_table(marked_tables.put_table(text, "x", "new"), "x") == "new"

@@ -59,8 +59,8 @@ def place_on_cortex(
 ) -> None:
     """Move the meshes onto the bone, if the settings ask for it, or with `measure` say how far they lie from it.
 
-    The constants of the scan are measured once, in its largest mesh.  A mesh at a level of bone that shows none gets
-    ``{"reason": words}`` in place of figures; where the cortex was asked for, that is an error.
+    The constants of the scan are measured once, in its largest mesh.  A mesh that shows no bone stays as it is and gets
+    ``{"reason": words}`` in place of figures; where the largest was to be moved, that is an error.
     """
     moves = settings.surface == "cortex"
     parts = sorted(made.parts, key=lambda part: -part.mesh.vertex_count)
@@ -73,19 +73,20 @@ def place_on_cortex(
 
     with DeviceVolume(made.volume, device=made.device, memory=settings.memory) as resident:
         constants = None
-        for number, part in enumerate(parts):
-            if moves:
-                part.mesh = fit_mesh(part.mesh, resident, constants=constants, progress=progress)
-                constants = part.mesh.report["cortex"].constants
-                continue
+        for part in parts:
             try:
-                found = measure_outside(part.mesh, resident, constants=constants)
+                if moves:
+                    part.mesh = fit_mesh(part.mesh, resident, constants=constants, progress=progress)
+                    constants = part.mesh.report["cortex"].constants
+                else:
+                    found = measure_outside(part.mesh, resident, constants=constants)
+                    part.mesh.report["cortex"], constants = found, found.constants
             except NoSurfaceError as error:
+                if moves and constants is None:
+                    raise
                 part.mesh.report["cortex"] = {"reason": str(error)}
-                if number == 0:
+                if constants is None:
                     break
-            else:
-                part.mesh.report["cortex"], constants = found, found.constants
 
 
 def _may_be_bone(part: Part) -> bool:

@@ -14,7 +14,8 @@ from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 from clrecon.mesh.connectivity import Rings
 from clrecon.mesh.refine.shifts import move_vertices
-from clrecon.mesh.triangles import vertex_normals
+from clrecon.mesh.refine.topology import any_corner
+from clrecon.mesh.triangles import cross_products, vertex_normals
 from clrecon.opencl import Device, Stopwatch
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.surface.cortex import (
@@ -28,7 +29,7 @@ from clrecon.operators.surface.cortex import (
 )
 from clrecon.operators.surface.decimation import find_crossings
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.progress import Progress, Steps, ignore_progress
 from clrecon.system.records import Record
 
 Float64Array = NDArray[np.float64]
@@ -107,44 +108,40 @@ def calm_vertices(
     """
     places = moved.astype(np.float64)
     before = _crosses(vertices, triangles)
-    counts = rings.sums(np.ones(len(vertices), np.float32))[:, None]
     rows = np.arange(len(triangles))
     for turn in range(CALM_ROUNDS + SHORT_ROUNDS + 1):
-        turned = _turned(places, triangles[rows], before[rows])
+        turned = _turned(places, triangles[rows], before[:, rows])
         if not turned.any():
             break
         bad = np.zeros(len(vertices), bool)
-        bad[triangles[rows[turned]].reshape(-1)] = True
-        if turn >= CALM_ROUNDS + SHORT_ROUNDS:
-            bad = rings.sums(bad.astype(np.float32)) > 0.0
+        bad[triangles[rows[turned]]] = True
+        if turn == CALM_ROUNDS + SHORT_ROUNDS:
+            bad[triangles[any_corner(bad, triangles)]] = True
             places[bad] = vertices[bad]
         elif turn >= CALM_ROUNDS:
             places[bad] = 0.5 * (places[bad] + vertices[bad])
         else:
-            places[bad] = (rings.sums(places) / counts)[bad]
-        rows = np.flatnonzero(bad[triangles].any(axis=1))
+            places[bad] = rings.means(places, np.flatnonzero(bad))
+        rows = np.flatnonzero(any_corner(bad, triangles))
     return places
 
 
-def _crosses(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> NDArray[np.float32]:
-    a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
-    return np.asarray(np.cross(b - a, c - a), np.float32)
-
-
-def _moved(
-    vertices: NDArray[np.floating], normals: NDArray[np.floating], shifts: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    return np.asarray(vertices + shifts[:, None] * normals, np.float32)
+def _crosses(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """Return the cross products of the triangles' edges, shape (3, m)."""
+    found = np.empty((3, len(triangles)))
+    for where, _, cross in cross_products(vertices, triangles, np.zeros(3)):
+        found[:, where] = cross
+    return found
 
 
 def _turned(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], before: NDArray[np.float32]
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], before: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Mark the triangles that turned by more than `LEAST_TURN` lets."""
     after = _crosses(vertices, triangles)
-    along = np.einsum("na,na->n", after, before)
-    lengths = np.sqrt(np.einsum("na,na->n", after, after) * np.einsum("na,na->n", before, before))
-    return np.asarray(along <= LEAST_TURN * lengths)
+    along = np.einsum("an,an->n", after, before)
+    squares = np.einsum("an,an->n", after, after) * np.einsum("an,an->n", before, before)
+    return np.asarray(along <= LEAST_TURN * np.sqrt(squares))
 
 
 @explains_arguments
@@ -158,11 +155,10 @@ def fit_cortex(
 ) -> Mesh:
     """Move a surface at a low level onto the outer surface of bone, vertex by vertex.
 
-    Three blurred plateaus (tissue, cortex, marrow) are fitted to the profile of HU along each vertex's normal; the
-    blur within and across the slices and the HU of the cortex are measured in the scan.  A vertex without a wall of
-    bone (vessel, marrow, metal, another wall or the border just outside of it) stays where it is.  Triangles, their
-    order and components stay as they are; no triangle is turned over, and no two cut each other that did not before.
-    See ``docs/iso_value.md``.
+    Three blurred plateaus (tissue, cortex, marrow) are fitted to the profile of HU along each vertex's normal; blur and
+    HU of the cortex are measured in the scan.  A vertex without a wall of bone (vessel, marrow, metal, another wall or
+    the border just outside) stays where it is.  Triangles and their order stay; no triangle is turned over, and no two
+    cut each other that did not before.  See ``docs/iso_value.md``.
 
     Parameters
     ----------
@@ -211,22 +207,20 @@ def fit_mesh(
     progress: Progress = ignore_progress,
 ) -> Mesh:
     """Do what `fit_cortex` does, with constants of the scan that are known."""
-    start, steps = time.perf_counter(), 5
-    progress("cortex", 0, steps)
+    start, steps = time.perf_counter(), Steps(progress, "cortex", 4)
     normals = _normals_of(mesh)
     fit = fit_walls(resident, mesh.vertices, normals, stopwatch=Stopwatch(), constants=constants)
     _refuse_few(fit)
-    progress("cortex", 1, steps)
+    steps.take()
     rings = Rings(mesh.triangles, mesh.vertex_count)
     shifts = choose_shifts(fit, rings)
-    progress("cortex", 2, steps)
     wanted = mesh.vertices + shifts[:, None] * normals.astype(np.float64)
     calm = calm_vertices(mesh.vertices, wanted, mesh.triangles, rings)
-    progress("cortex", 3, steps)
+    steps.take()
     vertices, _ = move_vertices(
         mesh.vertices, mesh.triangles, calm - mesh.vertices, partial(find_crossings, resident.device)
     )
-    progress("cortex", 4, steps)
+    steps.take()
     fitted = fit.states == FITTED
     kept = int(np.count_nonzero(fitted & (np.abs(vertices - wanted).max(axis=1) > KEPT_MM)))
     known = np.isin(fit.states, (FITTED, BADLY_FITTED))
@@ -236,7 +230,7 @@ def fit_mesh(
         "thickness_mm": np.where(known, fit.thickness_mm, np.float32(np.nan)),
         "error_mm": np.where(fitted, fit.error_mm, np.float32(np.nan)),
     }
-    progress("cortex", steps, steps)
+    steps.take()
     return made
 
 
@@ -277,17 +271,15 @@ def _describe(
 ) -> CortexReport:
     fitted = fit.states == FITTED
     shift, thickness = fit.shift_mm[fitted].astype(np.float64), fit.thickness_mm[fitted]
-    bias = _measure_bias(fit, resident, points, normals)
-    counts = fit.counts()
     return CortexReport(
         moved=moved,
         constants=fit.constants,
         vertices=len(fit.states),
-        **{name.replace(" ", "_"): count for name, count in counts.items()},
+        **{name.replace(" ", "_"): count for name, count in fit.counts().items()},
         kept=kept,
         outside_mm={"mean": float(-shift.mean()), **_percentiles(-shift, 5, 50, 95)},
         error_mm=_percentiles(fit.error_mm[fitted], 50, 95),
-        bias_mm=bias,
+        bias_mm=_measure_bias(fit, resident, points, normals),
         thickness_mm={
             **_percentiles(thickness, 5, 50, 95),
             "thin_share": float(np.mean(thickness < fit.constants.blur_mm)),

@@ -142,6 +142,19 @@ def test_the_command(shell, tmp_path, capsys):
     assert not report["cortex"]["moved"] and report["cortex"]["outside_mm"]["mean"] > 0.2
 
 
+def test_where_there_is_no_bone_it_is_said(shell, tmp_path, capsys):
+    soft = shell.with_voxels(np.where(shell.voxels > 500, 250, shell.voxels // 2).astype(np.int16))
+    soft.save(tmp_path / "ct.nii.gz")
+    given = (tmp_path / "ct.nii.gz", "-o", tmp_path / "a.stl", "--report", tmp_path / "a.json")
+    assert run(*given) == 0
+    report = json.loads((tmp_path / "a.json").read_text("utf-8"))
+    assert list(report["cortex"]) == ["reason"] and "no walls of bone" in report["cortex"]["reason"]
+    assert "of the bone (" not in capsys.readouterr().out
+    (tmp_path / "a.stl").unlink()
+    assert run(*given, "--surface", "cortex") == 2
+    assert "no walls of bone" in capsys.readouterr().err and not (tmp_path / "a.stl").exists()
+
+
 def test_a_label_lies_on_the_bone(shell, tmp_path):
     ct, labels = tmp_path / "ct.nii.gz", tmp_path / "labels.nii.gz"
     shell.save(ct)
