@@ -52,8 +52,6 @@ PROFILES = "profiles across walls"
 PIECE = 1 << 18
 """Places of a launch."""
 
-WIDEST_LANES = 8
-
 STEP_MM = 0.5
 """Step of a profile where voxels have 1 mm3; half of it gave the same places to 0.003 mm."""
 
@@ -269,8 +267,8 @@ class WallProfiles:
 
 
 def stride_of(count: int) -> int:
-    """Return the places of a row on the device: whole vectors."""
-    return WIDEST_LANES * -(-count // WIDEST_LANES)
+    """Return the places of a row on the device: whole vectors of eight."""
+    return 8 * -(-count // 8)
 
 
 def expected_precisions(
@@ -537,8 +535,7 @@ class CortexFit:
 
     def counts(self) -> dict[str, int]:
         """Return the number of vertices in each state."""
-        found = np.bincount(self.states, minlength=len(STATES))
-        return {name: int(count) for name, count in zip(STATES, found, strict=True)}
+        return {name: int(np.count_nonzero(self.states == state)) for state, name in enumerate(STATES)}
 
 
 def fit_walls(
