@@ -140,7 +140,7 @@ def test_strict_passes_what_is_good(
     arguments = ["mesh", str(noisy_torus[0]), "-o", str(tmp_path / "a.stl"), "--hu", level, "--keep-largest", "1"]
     assert main([*arguments, "--device", str(device.index), "--smooth", "--strict"]) == 0
     told = capsys.readouterr()
-    assert "smoothed (20 iterations)" in told.out
+    assert "smoothed (20 iterations; roughness " in told.out
     assert "gate" not in told.err
 
 
