@@ -79,9 +79,9 @@ class BaseMesh(Message):
         if self._normals is not None and len(self._normals) != len(self._vertices):
             raise UsageError(f"{len(self._normals)} normals for {len(self._vertices)} vertices: one a vertex is needed")
         self.report: dict[str, Any] = {} if report is None else report
-        self.values: dict[str, NDArray[np.float32]] = {}
-        """Numbers at the vertices by name, (n,) each, such as ``thickness_mm``; written to the formats that hold
-        some."""
+        self.values: dict[str, NDArray[np.floating]] = {}
+        """Numbers at the vertices by name, (n,) each, such as ``thickness_mm``, or ``HU`` of `Volume.sample`; written
+        to the formats that hold some."""
         if not trusted:
             self.check()
 
@@ -126,6 +126,21 @@ class BaseMesh(Message):
                 row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
                 raise UsageError(f"{name} {row:,} is not finite: {values[row].tolist()}")
 
+    def checked_values(self) -> dict[str, NDArray[np.float32]]:
+        """Return `values` as float32, refusing those that are no number a vertex, or have a name that no file holds."""
+        checked = {}
+        for name, values in self.values.items():
+            array = np.asarray(values)
+            if array.shape != (self.vertex_count,) or array.dtype.kind not in "biuf":
+                raise UsageError(
+                    f"values[{name!r}] are {array.dtype} of shape {array.shape}: one number a vertex is needed,"
+                    f" ({self.vertex_count},)"
+                )
+            if not isinstance(name, str) or not name.isidentifier():
+                raise UsageError(f"values have names of letters, digits and _ that begin with a letter, not {name!r}")
+            checked[name] = np.ascontiguousarray(array, np.float32)
+        return checked
+
     @explains_arguments
     def in_space(self, space: str) -> tuple[NDArray[np.floating], NDArray[np.float32] | None]:
         """Return vertices and normals in another patient frame; the mesh itself is always LPS.
@@ -164,7 +179,9 @@ class BaseMesh(Message):
         before = self.report.get("moved_by")
         report["moved_by"] = (checked if before is None else checked @ np.array(before)).tolist()
         triangles = self._triangles[:, ::-1] if mirrored else self._triangles
-        return type(self)(apply_affine(checked, self._vertices), triangles, normals, report)
+        made = type(self)(apply_affine(checked, self._vertices), triangles, normals, report)
+        made.values = dict(self.values)
+        return made
 
     def describe(self, space: str, *, keep_ids: bool = False) -> Content:
         """Return the contents of a file of the mesh in `space`; nothing else of `report` is ever written.
@@ -180,7 +197,7 @@ class BaseMesh(Message):
             normals=normals,
             name=None if name is None else str(name),
             color=None if color is None else (float(color[0]), float(color[1]), float(color[2])),
-            values=dict(self.values),
+            values=self.checked_values(),
             **facts,
         )
 

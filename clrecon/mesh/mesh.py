@@ -119,8 +119,8 @@ class Mesh(BaseMesh):
     def to_pyvista(self) -> Any:
         """Return the mesh as ``pyvista.PolyData`` in LPS mm, sharing the memory of vertices and normals.
 
-        The normals are the active point normals, named ``Normals``; the field arrays ``SPACE`` and ``UNIT`` name their
-        frame and unit.
+        The normals are the active point normals, named ``Normals``; `values` are point arrays; the field arrays
+        ``SPACE`` and ``UNIT`` name frame and unit.
 
         Raises
         ------
@@ -130,7 +130,7 @@ class Mesh(BaseMesh):
         from clrecon.mesh.vtk import wrap_polydata
 
         self.check()
-        return wrap_polydata(self._vertices, self._triangles, self._normals)
+        return wrap_polydata(self._vertices, self._triangles, self._normals, self.checked_values())
 
     @classmethod
     @explains_arguments
@@ -140,7 +140,8 @@ class Mesh(BaseMesh):
         Parameters
         ----------
         polydata : pyvista.PolyData or vtkPolyData
-            In mm.  Its point normals, if it has any that are named ``Normals``, are taken over.
+            In mm.  Its point normals, if it has any that are named ``Normals``, are taken over, and its point arrays of
+            one number each, whose names are letters, digits and _, become `values`.
         space : {"lps", "ras"}, optional
             Patient frame of the points; None: that of the field array ``SPACE``, which `to_pyvista` and 3D Slicer
             write, else LPS.
@@ -152,8 +153,10 @@ class Mesh(BaseMesh):
         """
         from clrecon.mesh.vtk import unwrap_polydata
 
-        vertices, triangles, normals, named = unwrap_polydata(polydata)
-        return cls._of_others(vertices, triangles, normals, choose_space(space, named, "the PolyData"))
+        vertices, triangles, normals, values, named = unwrap_polydata(polydata)
+        made = cls._of_others(vertices, triangles, normals, choose_space(space, named, "the PolyData"))
+        made.values = values
+        return made
 
     def to_trimesh(self) -> Any:
         """Return the mesh as ``trimesh.Trimesh`` in LPS mm, its ``units`` "mm" and ``metadata["SPACE"]`` "LPS".

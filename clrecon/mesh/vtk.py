@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -76,19 +77,24 @@ class CellLocator:
 
 
 def wrap_polydata(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], normals: NDArray[np.float32] | None
+    vertices: NDArray[np.floating],
+    triangles: NDArray[np.uint32],
+    normals: NDArray[np.float32] | None,
+    values: Mapping[str, NDArray[np.float32]],
 ) -> Any:
     """``pyvista.PolyData`` in LPS mm that shares the memory of vertices and normals; see `Mesh.to_pyvista`."""
     import pyvista
 
-    polydata = pyvista.wrap(make_polydata(vertices, triangles, normals))
+    polydata = pyvista.wrap(make_polydata(vertices, triangles, normals, values=values))
     polydata.field_data["SPACE"] = ["LPS"]
     polydata.field_data["UNIT"] = ["mm"]
     return polydata
 
 
-def unwrap_polydata(polydata: Any) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None, str | None]:
-    """Points, triangles, normals and the frame that a ``pyvista.PolyData`` names; see `Mesh.from_pyvista`."""
+def unwrap_polydata(
+    polydata: Any,
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None, dict[str, NDArray[Any]], str | None]:
+    """Points, triangles, normals, numbers and the frame that a ``pyvista.PolyData`` names; see `Mesh.from_pyvista`."""
     import pyvista
 
     found = pyvista.wrap(polydata) if hasattr(polydata, "GetPolys") else polydata
@@ -103,4 +109,7 @@ def unwrap_polydata(polydata: Any) -> tuple[NDArray[Any], NDArray[Any], NDArray[
         raise UsageError(f"the PolyData has {found.n_points:,} points and no faces: it is no surface")
     normals = found.point_data["Normals"] if "Normals" in found.point_data else None
     named = found.field_data["SPACE"][0] if "SPACE" in found.field_data else None
-    return np.array(found.points), faces.reshape(-1, 4)[:, 1:], normals, None if named is None else str(named)
+    arrays = {name: np.asarray(found.point_data[name]) for name in found.point_data if name.isidentifier()}
+    values = {name: np.array(array) for name, array in arrays.items() if array.ndim == 1 and array.dtype.kind in "biuf"}
+    triangles = faces.reshape(-1, 4)[:, 1:]
+    return np.array(found.points), triangles, normals, values, None if named is None else str(named)

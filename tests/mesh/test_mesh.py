@@ -131,3 +131,38 @@ def test_a_mirrored_mesh_still_looks_outward():
 def test_what_moves_a_mesh_is_an_affine(matrix, words):
     with pytest.raises(UsageError, match=words):
         Mesh(*samples.sphere((0, 0, 0))).transformed(matrix)
+
+
+def test_numbers_at_vertices_go_with_the_mesh(tmp_path):
+    pyvista = pytest.importorskip("pyvista")
+    mesh = Mesh.from_pyvista(pyvista.Sphere() + pyvista.Cube(center=(9, 0, 0)).triangulate())
+    mesh.values = {"HU": mesh.vertices[:, 0] * 2.0}
+    surface = mesh.to_pyvista()
+    np.testing.assert_array_equal(surface.point_data["HU"], mesh.values["HU"])
+    surface.point_data["vectors"], surface.point_data["with space"] = surface.points, surface.points[:, 0]
+    back = Mesh.from_pyvista(surface)
+    assert set(back.values) == {"HU"}
+    moved = back.transformed(np.diag([1.0, 2.0, 1.0, 1.0]))
+    largest = moved.keep_largest()
+    np.testing.assert_allclose(largest.values["HU"], largest.vertices[:, 0] * 2.0, rtol=1e-6)
+    assert len(largest.values["HU"]) == largest.vertex_count < mesh.vertex_count
+    back.save(tmp_path / "a.ply")
+    assert b"property float scalar_HU" in (tmp_path / "a.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"HU": np.zeros(3)}, r"values\['HU'\] are float64 of shape \(3,\): one number a vertex is needed, \(4,\)"),
+        ({"HU": np.zeros((4, 2))}, "one number a vertex"),
+        ({"HU": ["a"] * 4}, "one number a vertex"),
+        ({"a b": np.zeros(4)}, "letters, digits and _"),
+    ],
+)
+def test_numbers_that_fit_no_vertex_are_refused(values, words, tmp_path):
+    corners = np.vstack([np.zeros(3), np.eye(3)])
+    mesh = Mesh(corners, [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
+    mesh.values = values
+    with pytest.raises(UsageError, match=words):
+        mesh.save(tmp_path / "a.ply")
+    assert not list(tmp_path.iterdir())
