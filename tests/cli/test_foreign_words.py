@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
 import warnings
 from pathlib import Path
-from typing import Any
 
 import pytest
 from volume_files import make_ct, write_metaimage
@@ -24,16 +22,6 @@ def sphere(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("words") / "ct"
     write_phantom(folder, PhantomSettings(kind="sphere", size=(24, 24), slices=16))
     return folder
-
-
-@pytest.mark.slow
-def test_json_stands_alone_on_stdout(device: Any, sphere: Path, tmp_path: Path) -> None:
-    """One iteration leaves VTK's filter without its best offset, which it says on standard output."""
-    call = [*CLRECON, "mesh", str(sphere), "-o", "a.stl", "--smooth", "1", "--device", str(device.index)]
-    done = subprocess.run([*call, "--json"], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0 and json.loads(done.stdout)["refinement"] and done.stderr == ""
-    said = subprocess.run([*call, "-q", "--debug"], cwd=tmp_path, capture_output=True, text=True)
-    assert (said.returncode, said.stdout) == (0, "") and "optimal offset" in said.stderr  # still the case it is
 
 
 def test_a_library_that_writes_to_descriptor_1(tmp_path: Path) -> None:
