@@ -78,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_fields(parser, MeshSettings, "purpose")
     add_reading(parser)
     add_masking(parser, crop=True)
-    add_fields(add_levels(parser, "surface"), MeshSettings, "surface")
+    add_fields(add_levels(parser, "surface"), MeshSettings, "kind", "surface")
     method = parser.add_argument_group("method", "marching cubes as papers compare them: see docs/methods.md")
     add_fields(method, MeshSettings, "method")
     add_fields(parser.add_argument_group("components"), MeshSettings, "selection", "files")

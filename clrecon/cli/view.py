@@ -75,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_no_clobber(shown)
     add_reading(parser)
     add_masking(parser, crop=True)
-    add_levels(parser, "surface of a scan")
+    add_fields(add_levels(parser, "surface of a scan"), MeshSettings, "kind")
     add_fields(parser.add_argument_group("components of a scan"), MeshSettings, "selection")
     add_labels(parser)
     add_device(parser.add_argument_group("device, for scans"))

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 
 import pytest
 
 from clrecon.cli.common import Parser, add_fields, make_part, make_settings
+from clrecon.cli.main import COMMANDS
 from clrecon.errors import UsageError
 from clrecon.system.options import option
 
@@ -76,3 +78,11 @@ def test_options_of_a_part_need_the_one_that_it_is_about() -> None:
     lone = parser.parse_args(["--grow", "0"])
     with pytest.raises(UsageError, match="--grow is about labels"):
         make_part(Part, lone, lone.path, "is about labels")
+
+
+def test_a_view_takes_the_kinds_of_surface_that_a_mesh_takes() -> None:
+    for name in ("mesh", "view"):
+        parser = Parser(prog=name)
+        import_module(COMMANDS[name].module).add_arguments(parser)
+        given = parser.parse_args(["ct", *(("-o", "a.stl") if name == "mesh" else ()), "--surface", "CORTEX"])
+        assert given.surface == "cortex"

@@ -127,7 +127,7 @@ class MeshSettings(InputSettings):
         "hu: vertices lie at the level (default); cortex: each is moved onto the bone, whose place is read from the"
         " whole profile of HU across its wall (docs/iso_value.md); mask: with --labels the label's own surface,"
         " whatever the HU: organs, lungs, what HU do not show",
-        group="surface",
+        group="kind",
         default="hu",
         parse=str.lower,
     )
