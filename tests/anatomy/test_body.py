@@ -131,7 +131,6 @@ def test_circles_without_a_voxel_are_refused(radius):
 
 
 # --- real scans ---
-@pytest.mark.release
 @pytest.mark.parametrize(("folder", "table_voxels"), [("lumbar_4p25mm", 40_000), ("thoracic_0p8mm", 2_000)])
 def test_real_tables_go_and_real_bone_stays(real_data, folder, table_voxels):
     """What is as dense as bone may only go below the back, and at the raised rims of the table beside it."""

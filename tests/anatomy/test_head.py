@@ -108,7 +108,6 @@ def test_row_70_the_skin_that_a_surface_shows_is_measured() -> None:
         assert measure_skin(Volume(drilled, volume.affine), square, upwards) == pytest.approx(area, abs=1.0)
 
 
-@pytest.mark.release
 @pytest.mark.slow
 def test_row_70_surfaces_of_labels_say_so(
     device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

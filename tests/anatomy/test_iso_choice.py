@@ -307,7 +307,6 @@ def test_it_is_public_and_frozen() -> None:
 
 
 # --- real CT ---
-@pytest.mark.release
 @pytest.mark.parametrize("folder", ["lumbar_4p25mm", "thoracic_0p8mm", "thoracolumbar_labels/ct_2mm_jpeg2000"])
 def test_real_ct_gives_levels_between_tissue_and_dense_bone(real_data, folder) -> None:
     chosen = choose_iso_value(clrecon.read_volume(real_data / folder))

@@ -122,7 +122,6 @@ def test_paper_b_is_the_way_of_the_paper() -> None:
     assert MeshSettings(**settings_for("paper-b", {})).preprocess == "bilateral-2d,open:1"
 
 
-@pytest.mark.release
 def test_paper_b_runs_as_a_whole(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_phantom(tmp_path / "ct", PhantomSettings(size=(96, 96), slices=40, spacing=(1.6, 1.6, 2.0), noise=12.0))
     report_path, mesh_path = tmp_path / "r.json", tmp_path / "bone.stl"

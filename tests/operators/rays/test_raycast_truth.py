@@ -88,7 +88,6 @@ def test_a_fixed_light_lights_only_the_side_that_faces_it(cast, mode, rise):
             assert np.abs(image[..., :3] - truth).max() <= tolerances.RAY_SAME_255 + 0.5
 
 
-@pytest.mark.release
 def test_a_smaller_step_brings_a_picture_nearer(cast):
     volume = even_volume(blobs, "anisotropic", 18.0)
     soft = TransferFunction([(200, 1, 1, 1, 0.0), (300, 1, 1, 1, 0.5), (400, 1, 1, 1, 0.0)])
@@ -255,7 +254,6 @@ def test_a_camera_inside_sees_what_lies_ahead_of_it_alone(cast):
     assert (shot.depth >= 0.0).all() and (shot.depth < 1.0).all()
 
 
-@pytest.mark.release
 def test_a_ball_in_an_uneven_stack_is_round(cast):
     radius, size = 12.0, (40, 40)
     field = lambda p: 300.0 + 50.0 * (radius - np.linalg.norm(p, axis=1))  # noqa: E731
@@ -274,7 +272,6 @@ def test_a_ball_in_an_uneven_stack_is_round(cast):
     assert (np.isfinite(shot.depth) != (passing < radius))[~edge].sum() > 20
 
 
-@pytest.mark.release
 def test_uneven_and_even_samplings_of_one_field_look_alike(cast):
     field = lambda p: 900.0 * np.exp(-(p[:, 0] ** 2 + 2 * p[:, 1] ** 2 + p[:, 2] ** 2) / 120.0)  # noqa: E731
     uneven, even = uneven_volume(field), even_volume(field, "even", 60.0)

@@ -83,7 +83,6 @@ def test_both_borders_and_both_sides_equal_the_twin(closed: bool, below: bool, d
         assert_twin(random_volume((6, 9, 40), high=9, affine=affine), device, 2, closed=closed, below=below)
 
 
-@pytest.mark.release
 @pytest.mark.parametrize("dtype", daily(1, ["uint8", "float32"]))
 def test_types_ranges_and_uneven_slices_equal_the_twin(dtype: str, device: Any) -> None:
     volume = random_volume((6, 9, 40), dtype, high=9)
@@ -244,7 +243,6 @@ def test_memory_for_the_bits_of_the_volume_is_asked_for_first(device: Any) -> No
         extract_isosurface(smooth_volume((40, 64, 64)), 300, device=device, grow_from="auto", memory=150_000)
 
 
-@pytest.mark.release
 def test_the_golden_constant_is_off_and_the_search_is_not(device: Any) -> None:
     k, j, i = np.indices((31, 31, 31)) - 15.2
     volume = Volume((100.0 * (10.0 - np.sqrt(i**2 + j**2 + k**2))).astype(np.float32), np.eye(4))

@@ -224,7 +224,6 @@ def test_tilted_and_oblique_scans_have_the_same_parts(turned, device):
     assert 12.0 <= inside.canal_found.height_mm <= 15.6
 
 
-@pytest.mark.release
 def test_the_canal_of_real_masks(real_data, device):
     labels = clrecon.read_labels(real_data / "vertebra_masks" / "sub-verse004_seg-vert_msk.nii.gz")  # sagittal slices
     volume = Volume(np.where(labels.voxels > 0, 500, 0).astype(np.int16), labels.affine)
