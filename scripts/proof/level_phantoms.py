@@ -139,7 +139,7 @@ class Profiles:
 
 
 def find_on_mesh(
-    profiles: Profiles, vertices: Points, triangles: NDArray[np.uint32]
+    profiles: Profiles, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
 ) -> tuple[Points, NDArray[np.int64]]:
     """Return where a mesh crosses each true normal nearest to the truth, as `Profiles.errors`, and the triangle there.
 
