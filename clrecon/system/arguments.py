@@ -103,7 +103,7 @@ def _is_whole(value: Any) -> bool:
 def _is_sequence(value: Any) -> bool:
     if isinstance(value, str | bytes | dict | set):
         return False
-    return hasattr(value, "__len__") and hasattr(value, "__getitem__") and getattr(value, "ndim", 1) != 0
+    return hasattr(value, "__len__") and hasattr(value, "__getitem__") and _is_iterable(value)
 
 
 def _is_iterable(value: Any) -> bool:

@@ -100,6 +100,7 @@ def test_the_examples_of_volumes_run(folder, monkeypatch):
     monkeypatch.chdir(folder)
     volume, labels = clrecon.read_volume("ct"), clrecon.read_labels("segmentation.seg.nrrd")
     made: dict[str, Any] = {"clrecon": clrecon, "numpy": np, "volume": volume, "labels": labels}
+    made |= {"mesh": clrecon.extract_isosurface(volume, 226), "second_volume": volume[3:20, 5:]}
     made.update({name: pytest.importorskip(name) for name in ("SimpleITK", "nibabel")})
     for block in blocks:
         exec(compile(textwrap.dedent(block), "docs/python.md", "exec"), made)

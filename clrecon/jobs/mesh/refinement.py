@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from clrecon.errors import NoSurfaceError
+from clrecon.errors import DeviceMemoryError, NoSurfaceError
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part
 from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
@@ -81,8 +81,8 @@ def place_on_cortex(
                 else:
                     found = measure_outside(part.mesh, resident, constants=constants)
                     part.mesh.report["cortex"], constants = found, found.constants
-            except NoSurfaceError as error:
-                if moves and constants is None:
+            except (NoSurfaceError, DeviceMemoryError) as error:
+                if moves and (constants is None or isinstance(error, DeviceMemoryError)):
                     raise
                 part.mesh.report["cortex"] = {"reason": str(error)}
                 if constants is None:

@@ -49,8 +49,8 @@ RESULTS = kernel_constant("surface/cortex.cl", "RESULTS")
 PROFILES = "profiles across walls"
 """Purpose by which slabs are planned."""
 
-PIECE = 1 << 18
-"""Places of a launch."""
+PIECE, SMALLEST_PIECE = 1 << 18, 1 << 8
+"""Places of a launch, and the fewest where memory is short."""
 
 STEP_MM = 0.5
 """Step of a profile where voxels have 1 mm3; half of it gave the same places to 0.003 mm."""
@@ -298,20 +298,21 @@ class ProfileSampler:
         places, directions = self.frame.places(points), self.frame.directions(normals)
         least_gap = float(self.frame.gaps.min()) if nk > 1 else 1.0
         reach = int(np.ceil(-self.scale.first_mm / least_gap)) + 1
-        most = min(PIECE, len(points))
-        own = (4 * (ROWS + RESULTS) + 32) * stride_of(most)
+        piece = min(PIECE, len(points))
 
         def needs(slices: int) -> dict[str, int]:
             held = min(slices + 2 * reach + 1, nk) * resident.slice_bytes
+            own = (4 * (ROWS + RESULTS) + 32) * stride_of(piece)
             return {"volume": held, "profiles": own, "slices": self.frame.slices.nbytes}
 
-        planned = resident.plan(PROFILES, nk, needs)
+        while (planned := resident.plan(PROFILES, nk, needs)) < 1 and piece > SMALLEST_PIECE:
+            piece //= 2
         if planned < 1:
             raise DeviceMemoryError(f"no profiles can be sampled: {describe_shortage(resident.limits, needs(1))}")
         if planned >= nk:
             voxels_d = resident.whole(self._stopwatch)
-            for begin in range(0, len(points), PIECE):
-                rows = np.arange(begin, min(begin + PIECE, len(points)))
+            for begin in range(0, len(points), piece):
+                rows = np.arange(begin, min(begin + piece, len(points)))
                 yield rows, self._sample(voxels_d, 0, places[rows], directions[rows])
             return
         for first in range(0, nk, planned):
@@ -320,8 +321,8 @@ class ProfileSampler:
             if not len(rows_of_slab):
                 continue
             voxels_d = resident.part(low, high, self._stopwatch)
-            for begin in range(0, len(rows_of_slab), PIECE):
-                rows = rows_of_slab[begin : begin + PIECE]
+            for begin in range(0, len(rows_of_slab), piece):
+                rows = rows_of_slab[begin : begin + piece]
                 yield rows, self._sample(voxels_d, low, places[rows], directions[rows])
             resident.volume.release_slices(low, high)
 

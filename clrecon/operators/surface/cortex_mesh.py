@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from functools import partial
 
@@ -65,7 +64,6 @@ class CortexReport(Record):
     error_mm: ``p50`` and ``p95`` of the standard errors of the fitted vertices.
     bias_mm: How far the whole fitted surface may lie off, because the constants are not known better.
     thickness_mm: ``p5``, ``p50``, ``p95`` of the walls, and ``thin_share`` of those thinner than the blur.
-    seconds: Time that it took.
     """
 
     moved: bool
@@ -81,7 +79,6 @@ class CortexReport(Record):
     error_mm: dict[str, float]
     bias_mm: float
     thickness_mm: dict[str, float]
-    seconds: float
 
 
 def choose_shifts(fit: CortexFit, rings: Rings) -> NDArray[np.float32]:
@@ -207,10 +204,11 @@ def fit_mesh(
     progress: Progress = ignore_progress,
 ) -> Mesh:
     """Do what `fit_cortex` does, with constants of the scan that are known."""
-    start, steps = time.perf_counter(), Steps(progress, "cortex", 4)
+    steps = Steps(progress, "cortex", 4)
+    _refuse_few(mesh.vertex_count, mesh.vertex_count)
     normals = _normals_of(mesh)
     fit = fit_walls(resident, mesh.vertices, normals, stopwatch=Stopwatch(), constants=constants)
-    _refuse_few(fit)
+    _refuse_few(int(np.count_nonzero(fit.states == FITTED)), len(fit.states))
     steps.take()
     rings = Rings(mesh.triangles, mesh.vertex_count)
     shifts = choose_shifts(fit, rings)
@@ -224,7 +222,7 @@ def fit_mesh(
     fitted = fit.states == FITTED
     kept = int(np.count_nonzero(fitted & (np.abs(vertices - wanted).max(axis=1) > KEPT_MM)))
     known = np.isin(fit.states, (FITTED, BADLY_FITTED))
-    report = _describe(fit, resident, mesh.vertices, normals, True, kept, start)
+    report = _describe(fit, resident, mesh.vertices, normals, True, kept)
     made = Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), {**mesh.report, "cortex": report})
     made.values = {
         "thickness_mm": np.where(known, fit.thickness_mm, np.float32(np.nan)),
@@ -236,12 +234,12 @@ def fit_mesh(
 
 def measure_outside(mesh: Mesh, resident: DeviceVolume, *, constants: CortexConstants | None = None) -> CortexReport:
     """Measure how far a surface at a level lies outside of the bone, at up to `MOST_LOOKED_AT` of its vertices."""
-    start = time.perf_counter()
+    _refuse_few(mesh.vertex_count, mesh.vertex_count)
     rows = np.unique(np.linspace(0, mesh.vertex_count - 1, min(mesh.vertex_count, MOST_LOOKED_AT)).astype(np.int64))
     points, normals = mesh.vertices[rows], _normals_of(mesh)[rows]
     fit = fit_walls(resident, points, normals, stopwatch=Stopwatch(), constants=constants)
-    _refuse_few(fit)
-    return _describe(fit, resident, points, normals, False, 0, start)
+    _refuse_few(int(np.count_nonzero(fit.states == FITTED)), len(fit.states))
+    return _describe(fit, resident, points, normals, False, 0)
 
 
 def _normals_of(mesh: Mesh) -> NDArray[np.float32]:
@@ -251,11 +249,10 @@ def _normals_of(mesh: Mesh) -> NDArray[np.float32]:
     return vertex_normals(mesh.vertices, mesh.triangles) if mesh.normals is None else mesh.normals
 
 
-def _refuse_few(fit: CortexFit) -> None:
-    count = int(np.count_nonzero(fit.states == FITTED))
+def _refuse_few(count: int, vertices: int) -> None:
     if count < FEWEST_FITTED:
         raise NoSurfaceError(
-            f"the surface has no walls of bone to be fitted: {count} of {len(fit.states):,} vertices, at least"
+            f"the surface has no walls of bone to be fitted: {count} of {vertices:,} vertices, at least"
             f" {FEWEST_FITTED} are needed"
         )
 
@@ -267,7 +264,6 @@ def _describe(
     normals: NDArray[np.floating],
     moved: bool,
     kept: int,
-    start: float,
 ) -> CortexReport:
     fitted = fit.states == FITTED
     shift, thickness = fit.shift_mm[fitted].astype(np.float64), fit.thickness_mm[fitted]
@@ -284,7 +280,6 @@ def _describe(
             **_percentiles(thickness, 5, 50, 95),
             "thin_share": float(np.mean(thickness < fit.constants.blur_mm)),
         },
-        seconds=time.perf_counter() - start,
     )
 
 
