@@ -196,7 +196,7 @@ def resample_volume(volume: Own, to: float | Sequence[float] | BaseVolume, *, pr
 
 
 def _check_overlap(volume: BaseVolume, target: BaseVolume) -> None:
-    """Refuse volumes whose boxes round the voxel centres have nothing in common."""
+    """Refuse volumes whose boxes around the voxel centres have nothing in common."""
     (low, high), (first, last) = find_extent(volume), find_extent(target)
     away = np.maximum(first - high, low - last)
     if (away > 0.0).any():

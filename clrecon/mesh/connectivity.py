@@ -100,7 +100,7 @@ class Fans:
         return np.flatnonzero(found)
 
 
-class Rings:
+class NeighbourSums:
     """Sums over the neighbours of vertices, from the triangles that they share."""
 
     def __init__(self, triangles: NDArray[np.uint32], count: int):

@@ -190,7 +190,7 @@ class PointCloud(Message):
 
     @property
     def bounds(self) -> NDArray[np.float64] | None:
-        """Lowest and highest corner of the box round the points, shape (2, 3), LPS mm; None without points."""
+        """Lowest and highest corner of the box around the points, shape (2, 3), LPS mm; None without points."""
         if not len(self):
             return None
         return np.array([self._points.min(axis=0), self._points.max(axis=0)], np.float64)

@@ -269,7 +269,7 @@ class MeshSettings(InputSettings):
             raise UsageError(f"the topology {self.topology} follows HU: leave it out with labels, which pick the cells")
 
     def _check_surface(self) -> None:
-        """Refuse a surface that is none, and a cortex where no outer wall of bone is asked for."""
+        """Refuse an unknown kind of surface, and `cortex` where HU do not place the outer surface of bone."""
         if self.surface == "hu":
             return
         name = name_parameter("surface", self.surface)

@@ -239,7 +239,7 @@ class MaskBits:
 
     @property
     def bounds(self) -> Float64Array | None:
-        """Lowest and highest corner of the box round the chosen voxels, shape (2, 3), LPS mm; None without any."""
+        """Lowest and highest corner of the box around the chosen voxels, shape (2, 3), LPS mm; None without any."""
         chosen = self.to_numpy()
         k, j = np.nonzero(chosen.any(axis=2))
         if not len(k):

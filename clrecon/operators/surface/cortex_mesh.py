@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
-from clrecon.mesh.connectivity import Rings
+from clrecon.mesh.connectivity import NeighbourSums
 from clrecon.mesh.refine.shifts import move_vertices
 from clrecon.mesh.refine.topology import any_corner
 from clrecon.mesh.triangles import cross_products, vertex_normals
@@ -81,7 +81,7 @@ class CortexReport(Record):
     thickness_mm: dict[str, float]
 
 
-def choose_shifts(fit: CortexFit, rings: Rings) -> NDArray[np.float32]:
+def choose_shifts(fit: CortexFit, rings: NeighbourSums) -> NDArray[np.float32]:
     """Return the shift of each vertex, mm: that of the fit; 0 where there is no wall.
 
     What is badly fitted lies where its neighbours say, with the weights 1 / error^2.  Others are not smoothed: shifts
@@ -98,7 +98,7 @@ def choose_shifts(fit: CortexFit, rings: Rings) -> NDArray[np.float32]:
 
 
 def calm_vertices(
-    vertices: NDArray[np.floating], moved: NDArray[np.floating], triangles: NDArray[np.uint32], rings: Rings
+    vertices: NDArray[np.floating], moved: NDArray[np.floating], triangles: NDArray[np.uint32], rings: NeighbourSums
 ) -> NDArray[np.float64]:
     """Return moved vertices with no triangle turned over: the corners of such go to the mean of their neighbours, and
     after some rounds back half the way, and at last all of it.
@@ -210,7 +210,7 @@ def fit_mesh(
     fit = fit_walls(resident, mesh.vertices, normals, stopwatch=Stopwatch(), constants=constants)
     _refuse_few(int(np.count_nonzero(fit.states == FITTED)), len(fit.states))
     steps.take()
-    rings = Rings(mesh.triangles, mesh.vertex_count)
+    rings = NeighbourSums(mesh.triangles, mesh.vertex_count)
     shifts = choose_shifts(fit, rings)
     wanted = mesh.vertices + shifts[:, None] * normals.astype(np.float64)
     calm = calm_vertices(mesh.vertices, wanted, mesh.triangles, rings)

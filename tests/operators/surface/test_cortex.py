@@ -73,12 +73,16 @@ def test_constants_are_those_of_the_scan(device):
     assert found.places == cortex.MOST_WALLS and found.thick > 100
 
 
-@pytest.mark.parametrize("uneven", [False, True])
-def test_slabs_change_nothing(device, uneven):
+@pytest.mark.parametrize(
+    ("uneven", "few"), [(False, False), (True, False), (False, True)], ids=["even", "uneven", "few places at a time"]
+)
+def test_slabs_change_nothing(device, uneven, few):
     even = hollow_ball(thickness=2.0)
     volume = stack(even.voxels, OBLIQUE, uneven)
     mesh, whole = fit_surface(volume, device)
-    limit = volume.voxels.nbytes // 2 + 4 * 25 * cortex.stride_of(mesh.vertex_count) + 40 * mesh.vertex_count
+    places = 140 * cortex.SMALLEST_PIECE if few else 140 * cortex.stride_of(mesh.vertex_count)
+    limit = volume.voxels.nbytes // 2 + places
+    assert mesh.vertex_count > 4 * cortex.SMALLEST_PIECE
     with DeviceVolume(volume, device=device, memory=limit) as resident:
         sampler = ProfileSampler(resident, Stopwatch())
         assert len(list(sampler.pieces(mesh.vertices, mesh.normals))) > 1

@@ -14,7 +14,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.mesh.intersections import find_self_intersections
 from clrecon.operators.surface import cortex_mesh
-from clrecon.operators.surface.cortex_mesh import Rings, calm_vertices
+from clrecon.operators.surface.cortex_mesh import NeighbourSums, calm_vertices
 from clrecon.operators.surface.extract import extract_isosurface
 
 MIDDLE = np.array([19.5, 19.0, 18.0])
@@ -73,11 +73,13 @@ def test_what_is_said(fitted, level):
 def test_triangles_that_would_turn_over_are_calmed(level):
     random = np.random.default_rng(4)
     wild = level.vertices + random.normal(0.0, 0.4, level.vertices.shape)
-    calm = calm_vertices(level.vertices, wild, level.triangles, Rings(level.triangles, level.vertex_count))
+    calm = calm_vertices(level.vertices, wild, level.triangles, NeighbourSums(level.triangles, level.vertex_count))
     before = cortex_mesh._crosses(level.vertices, level.triangles)
     assert cortex_mesh._turned(wild, level.triangles, before).mean() > 0.05
     assert not cortex_mesh._turned(calm, level.triangles, before).any()
-    same = calm_vertices(level.vertices, level.vertices, level.triangles, Rings(level.triangles, level.vertex_count))
+    same = calm_vertices(
+        level.vertices, level.vertices, level.triangles, NeighbourSums(level.triangles, level.vertex_count)
+    )
     assert np.array_equal(same, level.vertices)
 
 
