@@ -38,11 +38,9 @@ class PeerRun(NamedTuple):
 class FlyingEdges:
     """vtkFlyingEdges3D on the voxels of a volume, shared without a copy.
 
-    Normals are on, scalars and gradients off, as in clrecon's surfaces.  VTK's wheels run sequentially by
-    default.  Spacing and origin of the grid are set, its direction is not: VTK would turn an oblique surface in a
-    second pass, while clrecon does so in the same pass.
-
-    threads: 1: VTK's backend "Sequential"; more: "STDThread" with so many threads.
+    Normals are on, scalars and gradients off, as in clrecon's surfaces.  VTK's wheels run sequentially by default: for
+    more than one of `threads` the backend is "STDThread".  Spacing and origin of the grid are set, its direction is
+    not: VTK would turn an oblique surface in a second pass, while clrecon does so in the same pass.
     """
 
     def __init__(self, volume: Volume, threads: int):
@@ -64,10 +62,7 @@ class FlyingEdges:
         return str(vtkVersion.GetVTKVersion())
 
     def run(self, level: float, keep: list[Any] | None = None) -> PeerRun:
-        """Contour at `level`, the HU of the surface between voxels, with a new filter.
-
-        The output is freed before the return, unless a list is given to `keep` it.
-        """
+        """Contour at `level`, the HU between voxels, with a new filter, whose output is freed or goes to `keep`."""
         from vtkmodules.vtkCommonCore import vtkSMPTools
         from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D
 

@@ -43,11 +43,11 @@ def make_demo(
 ) -> dict[str, Any]:
     """Write a phantom CT series, a picture of it, its bone mesh and the report; check a sphere of known volume.
 
-    output: A new or empty folder, or one of an earlier demonstration, which is replaced.
-    no_clobber: A folder that holds anything stays and is an `OutputError`.
+    The folder is new or empty, or one of an earlier demonstration, which is replaced; with `no_clobber` one that holds
+    anything stays and is an `OutputError`.
 
-    Returns: ``folder``, ``files``, ``affine_error_mm`` (largest difference between the affine of the report and that of
-        the truth), ``check`` (see `check_sphere`), ``seconds``, ``mesh`` and ``picture`` (the reports of both).
+    Return ``folder``, ``files``, ``affine_error_mm`` (largest difference between the affine of the report and that of
+    the truth), ``check`` (see `check_sphere`), ``seconds``, ``mesh`` and ``picture`` (the reports of both).
     """
     from clrecon.operators import choose_device
 
@@ -110,10 +110,8 @@ def _look(device: str) -> RenderSettings:
 
 
 def check_sphere(device: Device) -> dict[str, Any]:
-    """Mesh a sphere in anisotropic voxels, tilted gantry and oblique frame, and compare with geometry.
-
-    Returns: ``volume_ml``, ``true_volume_ml``, ``area_mm2``, ``true_area_mm2``, ``radius_error_max_mm`` (largest
-        distance of a vertex from the sphere), ``spacing_mm``, ``tilt_deg``.
+    """Mesh a sphere in anisotropic voxels, tilted gantry and oblique frame, and compare with geometry;
+    ``radius_error_max_mm`` is the largest distance of a vertex from the sphere.
     """
     import numpy as np
 

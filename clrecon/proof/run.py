@@ -61,15 +61,11 @@ MOST_PROCESSES = 4
 def run_selftest(
     device: Device, checks: Sequence[Check], *, silent_seconds: float, processes: int | None = None
 ) -> Generator[dict[str, Any], None, None]:
-    """Run checks on `device` in processes of their own, side by side, and yield each result at once.
+    """Run checks on `device` in processes of their own, side by side, and yield each result of `run_check` at once.
 
-    After a crash the checks that are left to a process run in a new one.  After a hang they count as failed: each of
-    them would take as long.
-
-    silent_seconds: Time without a line after which a process counts as hanging.
-    processes: Default: one for each core of this computer, up to four.
-
-    Yields: As `clrecon.proof.run.run_check`.
+    After a crash the checks that are left to a process run in a new one.  After a hang, `silent_seconds` without a
+    line, they count as failed: each of them would take as long.  By default there is a process for each core, up to
+    four.
     """
     many = min(processes or _count_cores(), MOST_PROCESSES, len(checks))
     if many <= 1:
@@ -229,8 +225,8 @@ class _Child:
 def run_check(device: Device, check: Check) -> dict[str, Any]:
     """Run one check.
 
-    Returns: ``operator`` (str: name of the check), ``passed`` (bool), ``detail`` (str: what was compared, or what is
-        wrong) and ``seconds`` (float, kernel builds included).
+    Return ``operator`` (name of the check), ``passed``, ``detail`` (what was compared, or what is wrong) and
+    ``seconds``, kernel builds included.
     """
     start = time.perf_counter()
     try:
@@ -276,12 +272,10 @@ def run_device_selftest(
 ) -> dict[str, Any]:
     """Compare every kernel with its twin, in a process of its own.
 
-    name: Device name or index.
-    progress: Called as ``progress("selftest", checks done, all checks)``.
-    tell: Called with the device and each result, as they are returned, as soon as it is there.
+    `tell` is called with the device and each result, as they are returned, as soon as it is there.
 
-    Returns: ``{"device": {...}, "passed": bool, "operators": [{"operator", "passed", "detail", "seconds"}], "warnings":
-        [text]}``.
+    Return ``{"device": {...}, "passed": bool, "operators": [{"operator", "passed", "detail", "seconds"}], "warnings":
+    [text]}``.
     """
     from clrecon.opencl import choose_unchecked
 

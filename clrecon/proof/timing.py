@@ -68,10 +68,7 @@ FEWEST_PAIRS = 3
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
-    """Median, quartiles, minimum and maximum of at least one value.
-
-    Returns: ``median, q1, q3, min, max``; quartiles are interpolated between the values (inclusive method).
-    """
+    """Median, quartiles (between the values, inclusive method), minimum and maximum of at least one value."""
     if len(values) == 1:
         q1 = median = q3 = float(values[0])
     else:
@@ -88,16 +85,11 @@ def alternate(
     limit_s: float | None = None,
     clock: Callable[[], float] = perf_counter,
 ) -> tuple[list[float], list[float]]:
-    """Run two programs in turn; their order changes with every pair, so that neither profits from its place.
+    """Run two programs, which return their seconds, in turn, first untimed if `warm`; their order changes with every
+    pair, so that neither profits from its place.
 
-    candidate, peer: Functions that run once and return the seconds to compare.
     pairs: Number of timed runs of each.
-    warm: Run each once before, untimed.
-    limit_s: Start no further pair after so many seconds, warm-up included; `FEWEST_PAIRS` are always run.
-    clock: Clock for the limit, in seconds.
-
-    Returns:
-    candidate_s, peer_s: Both of the same length.
+    limit_s: Start no further pair after so many seconds of the clock, warm-up included; `FEWEST_PAIRS` are always run.
     """
     start = clock()
     if warm:
@@ -117,9 +109,6 @@ def alternate(
 
 
 def summarise(ours: Sequence[float], theirs: Sequence[float]) -> dict[str, Any]:
-    """Spreads of both sides and of the ratio of each pair (above 1: clrecon is faster).
-
-    Returns: ``pairs`` (int); ``clrecon_s``, ``peer_s`` and ``ratio``, each from `spread`.
-    """
+    """Number of pairs, and spreads of both sides and of the ratio of each pair (above 1: clrecon is faster)."""
     ratios = [theirs_s / ours_s for ours_s, theirs_s in zip(ours, theirs, strict=True)]
     return {"pairs": len(ratios), "clrecon_s": spread(ours), "peer_s": spread(theirs), "ratio": spread(ratios)}

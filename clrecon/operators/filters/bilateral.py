@@ -38,11 +38,7 @@ NEAR_GROUP = kernel_constant("filters/near_level.cl", "GROUP")
 
 @dataclass(frozen=True)
 class SlicesThere:
-    """Slices of a volume on the device, and those of them that are worked on.
-
-    voxels_d: buffer, (count, nj, ni). Slices `first` to ``first + count - 1``.
-    core_first, core_count: The slices that are worked on.
-    """
+    """`count` slices from `first` on that are on the device; `core_count` from `core_first` on are worked on."""
 
     voxels_d: Any
     ni: int
@@ -89,13 +85,12 @@ def list_mixed_groups(
     *,
     stopwatch: Stopwatch | None = None,
 ) -> Compacted:
-    """List the groups of which some voxel has both sides of a level in the box around it.
+    """List the groups of which some voxel has both sides of a level in the box around it: ``32 * row_words(ni) * (core
+    row) + group``, ascending.
 
     there: With all slices within reach of those that are worked on, as far as the volume has them.
     level: Lowest value inside; NaN is not.
     reach: Half the size of the box along i, j, k, without the voxel in its middle; at most 16 along i.
-
-    Returns: Numbers ``32 * row_words(ni) * (core row) + group``, ascending.
     """
     program, words = prepare_near_level(device, dtype), row_words(there.ni)
     count, core_count = words * there.rows, words * there.core_rows
@@ -239,12 +234,7 @@ def _reach_ends(voxels: NDArray[Any], level: float) -> bool:
 
 @dataclass(frozen=True)
 class Filtered:
-    """What a run of the filter made.
-
-    voxels: ndarray, shape (nk, nj, ni)
-    voxels_d: The same on the device, where they fit as a whole.
-    share: Share of the voxels that were filtered.
-    """
+    """Filtered voxels, on the device too where they fit as a whole, and the share that went through the filter."""
 
     voxels: NDArray[Any]
     voxels_d: Any

@@ -39,12 +39,8 @@ _INSTALLED_AS = {"skimage": "scikit-image"}
 
 @dataclass(frozen=True)
 class _Denoiser:
-    """A filter of another package.
-
-    package: Module that has it.
-    defaults: Its parameters.
-    run: Takes the package, the volume and all parameters; returns voxels as floats, and what it used.
-    needs_grid: It takes the volume for a grid at right angles with even steps.
+    """A filter of the module `package`: `run` takes it, the volume and all parameters, and returns voxels as floats,
+    and what it used.  With `needs_grid` it takes the volume for a grid at right angles with even steps.
     """
 
     package: str

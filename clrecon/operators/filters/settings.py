@@ -34,9 +34,8 @@ class Window:
 
     offsets: ndarray, shape (n, 3), int32. Steps along i, j, k, the voxel itself among them.
     exponents: ndarray, shape (tables, n), float64. Logarithm to base 2 of the weight by distance: a row for each slice
-        where they are uneven, else one.
-    share: Weight of these taps over that of the whole window.
-    whole_taps: Taps of the whole window.
+    where they are uneven, else one.
+    share: Weight of these taps over that of the `whole_taps` of the whole window.
     """
 
     offsets: NDArray[np.int32]
@@ -71,13 +70,10 @@ class Window:
 def choose_window(volume: Volume, sigma_mm: float, dimensions: int, most_taps: int) -> Window:
     """Choose the taps of a window: the box around the ball of 2.5 sigma, or the nearest voxels of it.
 
-    Distances are those of the voxels' places, so that anisotropic, sheared and uneven volumes are filtered in mm.
-
-    dimensions: {2, 3}. 2: within a slice alone.
-    most_taps: If the box has more, the nearest voxels stay, in whole rings of equal distance: of square pixels 13 are
-        the disc of five that OpenCV has, and 5, 29 and 49 those of 3, 7 and 9.
-
-    Returns: The middle alone where `most_taps` is below the number of the first ring.
+    Distances are those of the voxels' places, so that anisotropic, sheared and uneven volumes are filtered in mm; in 2
+    dimensions the window stays within its slice.  Of a box with more than `most_taps` the nearest voxels stay, in whole
+    rings of equal distance: of square pixels 13 are the disc of five that OpenCV has, and 5, 29 and 49 those of 3, 7
+    and 9. Below the number of the first ring the middle stays alone.
     """
     box = _box(volume, RADIUS_OF_SIGMA * sigma_mm, dimensions)
     whole = _lattice(np.minimum(box, 3 * LARGEST_REACH))
@@ -175,11 +171,7 @@ LEAST_SHARE = 0.9
 
 @dataclass(frozen=True)
 class BilateralSettings:
-    """A filter of a volume.
-
-    rings: Rings of voxels around those that may change sides: 1, or 2 where normals count.
-    noise: Where it was measured.
-    """
+    """A filter of a volume; `rings` of voxels around those that may change sides: 1, or 2 where normals count."""
 
     sigma_mm: float
     sigma_hu: float
@@ -311,13 +303,7 @@ def _measured_noise(volume: Volume) -> Noise:
 
 
 def report_filter(volume: Volume, voxels: NDArray[Any], facts: dict[str, Any], warnings: Sequence[str]) -> Volume:
-    """Return a volume with filtered voxels, and one step more in ``report["filtered"]``.
-
-    volume: As it was before.
-    voxels: ndarray, shape (nk, nj, ni)
-    facts: The step, in plain JSON types.
-    warnings: Go to those of the report.
-    """
+    """Return a volume with filtered voxels, and one step more, in plain JSON types, in ``report["filtered"]``."""
     made = volume.with_voxels(voxels)
     steps = (made.report.get("filtered") or {}).get("steps", [])
     told = list(made.report.get("warnings", []))
@@ -334,10 +320,6 @@ def finish_result(
     *,
     keep: bool,
 ) -> Volume | DeviceVolume:
-    """Return the filtered volume; with `keep` on the device of `resident`.
-
-    voxels_d: The voxels on the device, if they are there as a whole.
-    others: See `report_filter`.
-    """
+    """Return the filtered volume, see `report_filter`; with `keep` on the device, where `voxels_d` may be it."""
     made = report_filter(resident.volume, voxels, facts, warnings)
     return resident.follow(made, voxels_d) if keep else made

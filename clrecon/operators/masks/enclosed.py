@@ -34,11 +34,9 @@ WIDE_ML = 20.0
 
 @dataclass(frozen=True)
 class Spaces:
-    """The components of what is not in a mask that it encloses, see `find_spaces`.
+    """The components of what is not in a mask that it encloses, see `find_spaces`; arrays of shape (n,).
 
-    numbers: ndarray, shape (n,). Number of each among all components, ascending.
-    ml, mean_hu: ndarray, shape (n,)
-    at_ends: ndarray, shape (n,), bool. True where an end of the volume cuts the space.
+    `numbers` are theirs among all components, ascending; `at_ends` tells where an end of the volume cuts the space.
     """
 
     volume: Volume
@@ -69,10 +67,7 @@ class Spaces:
         return Mask(mask.scan, words_d, f"spaces in ({mask.name})", device=mask.device, memory=mask.memory)
 
     def are_wide(self, radius_mm: float) -> NDArray[np.bool_]:
-        """Tell of each space whether a ball of this radius fits into it, see `holds_ball`, shape (n,).
-
-        What lies beyond the ends of the volume counts as part of a space that they cut.
-        """
+        """Tell of each space whether a ball of this radius fits into it and what lies beyond ends that cut it."""
         wide = np.zeros(self.count, bool)
         for place in np.flatnonzero(self.ml >= WIDE_ML) if np.isfinite(radius_mm) else ():
             wide[place] = _hold_ball(self._runs.of(self.numbers[place]), self.volume, radius_mm)

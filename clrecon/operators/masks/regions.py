@@ -21,10 +21,8 @@ BOX_SLACK_MM = 1e-6
 
 @dataclass(frozen=True)
 class RowSpans:
-    """Spans of voxels in rows of a volume.
-
-    columns: ndarray, shape (n, 2), uint16. First and last voxel of each span.
-    row_counts: ndarray, shape (nj nk + 1,), uint32. First span of each row k nj + j, and n.
+    """Spans of voxels in rows of a volume: first and last column, (n, 2) uint16, and the first span of each row k nj +
+    j, and n, (nj nk + 1,) uint32.
     """
 
     columns: NDArray[np.uint16]
@@ -65,10 +63,7 @@ def checked_box(box: Sequence[float | None] | ArrayLike) -> Float64Array:
 
 
 def box_spans(volume: Volume, sides: Float64Array) -> RowSpans:
-    """Find the voxels whose centres lie in a box.
-
-    sides: ndarray, shape (3, 2). LPS mm, see `checked_box`; see `BOX_SLACK_MM`.
-    """
+    """Find the voxels whose centres lie in a box of `sides`, (3, 2), LPS mm; see `checked_box` and `BOX_SLACK_MM`."""
     _, nj, nk = volume.shape_ijk
     starts = volume.slice_origins()[:, None, :] + np.arange(nj)[:, None] * volume.affine[:3, 1]
     starts = starts.reshape(-1, 3)
@@ -81,11 +76,7 @@ def box_spans(volume: Volume, sides: Float64Array) -> RowSpans:
 
 
 def tube_spans(volume: Volume, points: ArrayLike, radius_mm: float) -> RowSpans:
-    """Find the voxels whose centres lie within a distance of a line through points.
-
-    points: array_like, shape (n, 3). LPS mm; of one point the tube is a ball.
-    radius_mm: Distances up to ``radius_mm * (1 + 1e-6)`` are within.
-    """
+    """Find the voxels whose centres lie within ``radius_mm * (1 + 1e-6)`` of a line through points, LPS mm."""
     line = checked_points(points)
     if not len(line) or not np.isfinite(line).all():
         raise UsageError(f"the line of a tube needs points that are numbers, these are {len(line)} points")

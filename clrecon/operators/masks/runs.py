@@ -49,13 +49,11 @@ class StencilTable:
 
 @dataclass(frozen=True)
 class RowRuns:
-    """Runs of set voxels along i, on a device.
+    """Runs of set voxels along i, on a device; with `lone` each voxel is a run of its own.
 
     runs_d: buffer, (count, 2) uint16. First and last column, row by row; None before `list_runs`.
     row_counts_d: buffer, (2, rows + 1) uint32. First run of each row, and `count`; `count` and the voxels of all rows
-        before.
-    voxels: Set voxels of the mask.
-    lone: Each voxel is a run of its own.
+    before.
     """
 
     runs_d: Any
@@ -68,11 +66,7 @@ class RowRuns:
 def count_runs(
     device: Device, mask: VoxelMask, bits_d: Any, *, lone: bool = False, stopwatch: Stopwatch | None = None
 ) -> RowRuns:
-    """Count the runs of each row.
-
-    bits_d: buffer, (nk, nj, words) uint32. Voxels of the mask whose runs are counted; may be the mask itself.
-    lone: Each voxel is a run of its own.
-    """
+    """Count the runs of each row of `bits_d`, (nk, nj, words) uint32: voxels of the mask, or all of them."""
     rows = mask.rows
     counts_d = allocate(device, 8 * (rows + 1))
     launch(
@@ -110,16 +104,13 @@ def join_runs(
     parts_per_core: int = PARTS_PER_CORE,
     stopwatch: Stopwatch | None = None,
 ) -> tuple[int, Any]:
-    """Number the components of runs that are neighbours by a stencil.
+    """Number the components of runs that are neighbours by a stencil: (runs,) int32, in the order of their first runs.
 
     listed: At least one run.
     forward: Rows behind the voxel, see `Stencil.forward`.
     check: Called with the number of pairs of runs in different parts before memory is taken for them: 12 bytes a pair
-        and 5 a run.
+    and 5 a run.
     parts_per_core: Of CPU devices; the numbers do not depend on it.
-
-    Returns:
-    numbers_d: buffer, (runs,) int32. Component of each run, in the order of their first runs.
     """
     program = prepare_runs(device)
     _, nj, nk = shape_ijk
@@ -170,10 +161,8 @@ def write_runs(
 
 @dataclass(frozen=True)
 class Components:
-    """Components of the set voxels of a mask by the faces of voxels, run by run, on a device.
-
-    count: Number of components.
-    numbers_d: buffer, (runs.count,) int32. Component of each run, in the order of their first runs.
+    """Components of the set voxels of a mask by the faces of voxels, on a device: the number of each run, (runs.count,)
+    int32, in the order of their first runs.
     """
 
     runs: RowRuns
@@ -229,10 +218,7 @@ def find_components(
     memory: int | None = None,
     stopwatch: Stopwatch | None = None,
 ) -> Components:
-    """Find the components of set voxels that share a face, in the volume or within each slice.
-
-    beside: Bytes that are taken on the device for other masks meanwhile.
-    """
+    """Find the components of voxels that share a face; `beside` are bytes on the device for other masks."""
     needs = {"masks of the voxels": sum(mask.needs().values()) + beside, "counts of rows": 12 * (mask.rows + 1)}
     check_budget(device, needs, memory)
     counted = count_runs(device, mask, mask.mask_d, stopwatch=stopwatch)
@@ -282,13 +268,10 @@ def mark_with_voxels(
     *,
     stopwatch: Stopwatch | None = None,
 ) -> tuple[Any, NDArray[np.int32]]:
-    """Return a buffer with a mark for each component, 1 where it holds a voxel of a list, and each voxel's component.
+    """Return a buffer, (components,) uint8, with 1 for each component that holds one of `voxels`, and each voxel's
+    component, -1 where it is not set.
 
     voxels: ndarray, shape (n, 3), int32. i, j, k within the volume.
-
-    Returns:
-    marks_d: buffer, (components,) uint8
-    components: ndarray, shape (n,), int32. -1 where the voxel is not set.
     """
     n = len(voxels)
     marks_d = zero_words(device, -(-found.count // 4), stopwatch=stopwatch)

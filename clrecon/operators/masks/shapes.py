@@ -63,10 +63,8 @@ def prepare_balls(device: Device) -> Program:
 def ball_of(volume: Volume, radius: float, *, by_slice: bool = False) -> Stencil:
     """Return the voxels within ``radius * (1 + 1e-6)`` mm of a voxel, for each slice, as far as they are in the volume.
 
-    The places of the voxels count: those of oblique, tilted and uneven stacks too.
-
-    radius: mm, above 0.
-    by_slice: In the voxel's own slice alone: a disc.
+    The places of the voxels count, those of oblique, tilted and uneven stacks too; with `by_slice` only the voxel's own
+    slice: a disc.
     """
     return _checked(make_stencil(Lattice.of(volume), radius), volume, radius, by_slice)
 
@@ -161,15 +159,13 @@ def spread_bits(
     beyond: bool = False,
     stopwatch: Stopwatch | None = None,
 ) -> Any:
-    """Return the words of a mask that is dilated or eroded.
+    """Return the words of a mask that is dilated or eroded, (nk, nj, words) uint32.
 
     mask: Without zeros behind its rows.
     ball: For each slice the rows that its voxels look at; not only balls, but the voxel itself is among them.
     erode: Keep the voxels whose ball has no voxel that is not set; else set those whose ball has one that is set.
     beyond: What lies beyond the volume is set, else it is not.  The ball must then have its rows beyond, see
-        `whole_ball_of`, where it matters: of erosion with False, of dilation with True.
-
-    Returns: buffer, (nk, nj, words) uint32
+    `whole_ball_of`, where it matters: of erosion with False, of dilation with True.
     """
     ni, nj, nk = mask.shape_ijk
     words = mask.words

@@ -53,11 +53,10 @@ BAND = "voxels of a band"
 class VoxelMask:
     """One bit for each voxel of a volume, on a device.
 
-    mask_d: buffer, (nk, nj, words) uint32. Bit b of word w is voxel i = 32 w + b.
+    mask_d: buffer, (nk, nj, words) uint32. Bit b of word w is voxel i = 32 w + b; the last `pad` words of a row are
+        zeros.
     row_extents_d: buffer, (nk, nj, 2) uint16. First word of a row with a bit set, and the one after the last; 0, 0 in
-        rows without.
-    shape_ijk: (ni, nj, nk)
-    words: Words in a row, of which the last `pad` are zeros.
+    rows without.
     """
 
     mask_d: Any
@@ -130,14 +129,12 @@ def mark_band(
     stopwatch: Stopwatch | None = None,
     progress: Progress = ignore_progress,
 ) -> VoxelMask:
-    """Mark the voxels from ``hu[0]`` to ``hu[1]`` HU, both included; NaN lies in no band.
+    """Mark the voxels from ``hu[0]`` to ``hu[1]`` HU, both included, see `checked_band`; NaN lies in no band.
 
     The mask is that of the whole volume.  Where its voxels do not fit beside it, they go to the device slab by slab.
 
-    hu: See `checked_band`.
     pad: Words of zeros behind each row.
     beside: Bytes on the device that are taken already, or will be as long as voxels are there.
-    progress: Called as ``progress("mask", slices done, all slices)`` where there are several slabs.
     """
     volume, stopwatch = resident.volume, stopwatch or Stopwatch()
     check_shape(volume.shape_ijk, pad)
@@ -231,12 +228,7 @@ def mark_voxels(
     pad: int = 0,
     stopwatch: Stopwatch | None = None,
 ) -> VoxelMask:
-    """Mark the voxels of a list.
-
-    voxels: ndarray, shape (n, 3), int32, or VoxelNumbers of uint32. Voxels within the volume, by index or by number.
-    shape_ijk: (ni, nj, nk)
-    pad: Words of zeros behind each row.
-    """
+    """Mark voxels within the volume, by index, (n, 3), or by number, with `pad` words of zeros behind each row."""
     check_shape(shape_ijk, pad)
     ni, nj, nk = shape_ijk
     words, rows = -(-ni // 32) + pad, nj * nk

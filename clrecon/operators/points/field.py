@@ -43,10 +43,9 @@ def prepare_signs(device: Device) -> Program:
 
 
 class Masks:
-    """Masks of nodes on a device, cleared: a bit for each node, rows along x of whole words.
+    """Masks of nodes on a device, cleared: a bit for each node, (nz, ny, words) uint32, rows along x of whole words.
 
-    near_d, core_d, negative_d: buffer, (nz, ny, words) uint32. Nodes within B of a point, those within one spacing, and
-        near ones whose field is not positive.
+    They are of nodes within B of a point, of those within one spacing, and of near ones whose field is not positive.
     """
 
     COUNT: ClassVar[int] = 6
@@ -77,12 +76,10 @@ class Masks:
 
 @dataclass(frozen=True)
 class Signs:
-    """What `decide_signs` found.
+    """What `decide_signs` found: nodes inside, (nz, ny, words) uint32, votes for far `regions`, and those against the
+    winner.
 
-    inside_d: buffer, (nz, ny, words) uint32. Nodes inside.
-    votes, against: Votes for far regions, and those against the winner.
-    regions: Number of far regions.
-    outside_is_inside: The region around everything was voted inside: the normals point inward.
+    With `outside_is_inside` the region around everything was voted inside: the normals point inward.
     """
 
     inside_d: Any
@@ -195,12 +192,10 @@ class _Decision:
 def decide_signs(
     masks: Masks, limits: MemoryLimits, rounds: int, *, memory: int | None = None, taken: int = 0
 ) -> Signs:
-    """Decide which nodes are inside; see `clrecon.proof.points.field.decide_signs`.
+    """Decide which nodes are inside, signs flooding `rounds` nodes from a far one on; see its twin in
+    `clrecon.proof.points.field`.
 
-    masks: Its `negative_d` is used up.
-    rounds: Nodes that signs flood from a far node on.
-    memory: Bytes that may be taken on the device; None is all of its memory.
-    taken: Bytes that are taken already, those of the masks among them.
+    The `negative_d` of the masks is used up; `taken` are bytes that are taken already, those of the masks among them.
     """
     decision = _Decision(masks, limits, memory, taken)
     runs = decision.find_runs()
@@ -246,12 +241,9 @@ class FieldSettings:
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """The nodes of a field: whole bricks, at least B and a spacing beyond the points on each side.
+    """The nodes of a field: whole bricks (x, y, z), at least B and a spacing beyond the points on each side.
 
-    corner: ndarray, shape (3,), float32. Node (0, 0, 0) in mm relative to `base`.
-    base: ndarray, shape (3,), float64. LPS mm, as of the grid.
-    spacing: numpy.float32
-    bricks: (x, y, z)
+    `corner` is node (0, 0, 0) in mm, float32, relative to `base`, (3,) float64, LPS mm, as of the grid.
     """
 
     corner: NDArray[np.float32]
@@ -346,12 +338,7 @@ class _Slab:
 
 
 class NodeField:
-    """The field of a cloud on a device, for one set of lengths.
-
-    points: array_like, shape (n, 3). LPS mm, or a `PointCloud`.
-    normals: ndarray, shape (n, 3), float32. Unit vectors that point outward.
-    memory: Bytes that may be taken on the device; None is all of its memory.
-    """
+    """The field of a cloud on a device, for one set of lengths; normals are of length 1 and point outward."""
 
     def __init__(
         self,

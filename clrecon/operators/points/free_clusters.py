@@ -71,11 +71,9 @@ class FreeClusters:
     """The result of `cluster_free_points`.
 
     labels: ndarray, shape (n,), int32. Cluster of each point, numbered by the first core point; -1 is noise.
-    cores: ndarray, shape (n,), bool. The core points.
-    count: Number of clusters.
+    cores: ndarray, shape (n,), bool.
     facts: For a report: eps, min_samples, clusters, core and noise points, edge and number of the grid's cells, the
-        device and the seconds of its kernels.
-    warnings: A line each.
+    device and the seconds of its kernels.
     """
 
     labels: NDArray[np.int32]
@@ -123,23 +121,18 @@ def cluster_free_points(
     memory: int | None = None,
     progress: Progress = ignore_progress,
 ) -> FreeClusters:
-    """Cluster points anywhere in space by density (DBSCAN), equal to scikit-learn label for label.
+    """Cluster points anywhere in space by density (DBSCAN, Ester, Kriegel, Sander and Xu 1996), equal to scikit-learn
+    label for label.
 
     Points are core points when at least `min_samples` points lie within `eps`, themselves included.  Core points within
     `eps` of each other belong to one cluster.  Clusters are numbered by their first core point in the order of the
     points; other points near core points take the lowest number among these; all others are noise, -1.
 
-    points: array_like, shape (n, 3). LPS mm, finite, or a `PointCloud`.  Distances are those of the points as float32,
-        of far clouds relative to whole millimetres near their centre, and are compared as in exact arithmetic.
+    points: Finite.  Distances are those of the points as float32, of far clouds relative to whole millimetres near
+        their
+    centre, and are compared as in exact arithmetic.
     eps: mm.  Distances up to ``eps * (1 + 1e-6)`` are within.
     min_samples: From 1 on; 1 gives connected components.
-    device: See `clrecon.device`; None is the best of the machine.
-    memory: Bytes that may be taken on the device; None is all that it has.
-    progress: Called as ``progress("clusters", done, 4)`` after the grid, the core points, the links and the labels.
-
-    References
-    ----------
-    Ester, Kriegel, Sander and Xu 1996.
     """
     _check(eps, min_samples)
     check_memory(memory)
@@ -186,16 +179,10 @@ def find_clusters(
     stopwatch: Stopwatch | None = None,
     progress: Progress = ignore_progress,
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_], int, int]:
-    """Cluster the points of a plan on one device; parameters are those of `cluster_free_points`.
+    """Cluster the points of a plan that `plan_cells` made for `eps`; return labels (int32), cores (bool), the number of
+    clusters and that of cells with points.
 
-    plan: As `plan_cells` makes it for `eps`.
-    per_chunk: Cells of a chunk, a multiple of `CELLS_AN_ITEM`; the result does not depend on it.
-
-    Returns:
-    labels: ndarray, shape (n,), int32
-    cores: ndarray, shape (n,), bool
-    count: Number of clusters.
-    cells: Number of cells with points.
+    The result does not depend on `per_chunk`, the cells of a chunk, a multiple of `CELLS_AN_ITEM`.
     """
     n = len(plan.points)
     shortage = describe_shortage(memory_limits(device, memory), {**plan.needs(device), "clusters": 23 * n})

@@ -59,10 +59,10 @@ class GridPlan:
 
     points: ndarray, shape (n, 3), float32. mm relative to `base`.
     base: ndarray, shape (3,), float64. LPS mm: whole millimetres near the centre of a far cloud, see
-        `clrecon.geometry.vertices`, else zeros.
+    `clrecon.geometry.vertices`, else zeros.
     corner: ndarray, shape (3,), float32. Corner of cell (0, 0, 0) relative to `base`: the lowest coordinates less 1e-3
-        of the edge.
-    edge: numpy.float32. Edge of the cells in mm.
+    of the edge.
+    edge: mm.
     shape: (nx, ny, nz)
     """
 
@@ -99,7 +99,7 @@ class PointGrid:
     """A grid over points on a device: cubic cells, the points sorted by cell; cl/points/grid.h shows how it is read.
 
     n: Number of points.
-    edge: Edge of the cells in mm, a float32.
+    edge: mm, a float32.
     origin: ndarray, shape (3,), float64. LPS mm of the corner of cell (0, 0, 0).
     base: ndarray, shape (3,), float64. LPS mm; coordinates on the device are relative to it.
     shape: (nx, ny, nz). Number of cells; at most 2^31 in all, and 2^17 along an axis.
@@ -108,10 +108,10 @@ class PointGrid:
     ranks_d: buffer, (nz, ny, words) uint32. Number of cells with points before each word.
     cells: Number of cells with points.
     starts_d: buffer, (cells + 1,) uint32. First sorted point of each cell with points, then `n`.
-    order_d: buffer, (n,) uint32. Number of the point at each place of the sorted order; points of a cell are in the
-        order of the input.
+    order_d: buffer, (n,) uint32. Number of the point at each place of the sorted order; those of a cell as in the
+        input.
     x_d, y_d, z_d: buffer, (n + PADDING,) float32. Sorted coordinates in mm relative to `base`; the last ones are
-        undefined, so that a vector can be read from any point on.
+    undefined, so that a vector can be read from any point on.
     """
 
     device: Device
@@ -159,11 +159,7 @@ def find_box(points: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def plan_grid(points: ArrayLike, edge: float) -> GridPlan:
-    """Lay a grid over points.
-
-    points: array_like, shape (n, 3), float32 or float64. LPS mm, or a `PointCloud`; at least one point.
-    edge: Edge of the cells in mm.
-    """
+    """Lay a grid of cells with an edge in mm over at least one point."""
     places = np.asarray(points)
     if places.ndim != 2 or places.shape[1] != 3 or len(places) == 0:
         raise UsageError(f"a grid is laid over points of shape (n, 3), at least one, not {places.shape}")
@@ -207,14 +203,7 @@ def prepare_grid(device: Device) -> Program:
 def make_grid(
     device: Device, points: ArrayLike, edge: float, *, memory: int | None = None, stopwatch: Stopwatch | None = None
 ) -> PointGrid:
-    """Sort points by the cubic cells of a grid: `plan_grid`, then `fill_grid`.
-
-    points: array_like, shape (n, 3), float32 or float64. LPS mm, or a `PointCloud`; at least one point.
-    edge: Edge of the cells in mm.
-    memory: Bytes that may be taken on the device; None is all of its memory.
-
-    Returns: Equal on every device, and to `clrecon.proof.points.grid.make_grid`.
-    """
+    """Sort at least one point by the cubic cells of a grid, equal on every device: `plan_grid`, then `fill_grid`."""
     return fill_grid(device, plan_grid(points, edge), memory=memory, stopwatch=stopwatch)
 
 

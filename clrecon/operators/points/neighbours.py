@@ -66,15 +66,11 @@ _MIXERS = np.array([0x1E3779B97F4A7C15, 0x2545F4914F6CDD1D, 0x369DEA0F31A53F85, 
 
 
 def choose_cell_edge(points: NDArray[np.floating], k: int) -> float:
-    """Choose the edge so that the 27 cells around a typical point hold some `CANDIDATES` times `k` points.
+    """Choose the edge, in mm, so that the 27 cells around a typical point hold some `CANDIDATES` times `k` points.
 
     A cloud that is thinned to a share f at random leaves a point with c others in its block alone there with
     probability (1 - f)^c.  So a small sample tells the density of the whole cloud, in points of any dimension, and a
-    dense spot does not outweigh the rest.
-
-    points: ndarray, shape (n, 3). At least one, finite.
-
-    Returns: mm.  Results do not depend on it.
+    dense spot does not outweigh the rest.  Results do not depend on it.
     """
     n = len(points)
     low, high = find_box(points).astype(np.float64)
@@ -185,12 +181,7 @@ def take_points(points: PointCloud | ArrayLike) -> NDArray[np.floating]:
 
 
 def check_neighbours(k: int, points: int, fewest: int = 1) -> tuple[int, tuple[str, ...]]:
-    """Return the number of neighbours that a cloud has for each point, at most ``k``, and a warning if it is less.
-
-    k: Neighbours that are asked for, the point itself among them.
-    points: Points of the cloud.
-    fewest: Fewest that may be asked for.
-    """
+    """Return the number of neighbours, the point itself among them, that a cloud has, and a warning if fewer than k."""
     if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not fewest <= k <= MOST_NEIGHBOURS:
         raise UsageError(
             f"k, the number of neighbours with the point itself, is a whole number from {fewest} to {MOST_NEIGHBOURS},"
@@ -202,13 +193,10 @@ def check_neighbours(k: int, points: int, fewest: int = 1) -> tuple[int, tuple[s
 
 
 class NeighbourSearch:
-    """A grid over points and the kernel that lists neighbours by it.
+    """A grid over points, finite and at least `k`, and the kernel that lists neighbours by it.
 
-    points: ndarray, shape (n, 3). At least one, finite.
-    k: At most n.
-    needs: Bytes of further buffers, for the forecast.
-
-    parts: All cells, in parts of some `PART_POINTS` points.
+    `needs` are bytes of further buffers, for the forecast; `parts` are all cells, in parts of some `PART_POINTS`
+    points.
     """
 
     def __init__(

@@ -56,16 +56,10 @@ def find_gradients(
     progress: Progress = ignore_progress,
     warnings: list[str] | None = None,
 ) -> NDArray[np.float32]:
-    """Find the gradient of a volume at points.
+    """Find the gradient of a volume at points: (n, 3) float32, HU per mm, LPS.
 
-    A volume that does not fit the device goes through it slab by slab, with the same result.
-
-    points: ndarray, shape (n, 3), LPS mm
-    progress: Called as ``progress("gradients", slices done, all slices)``.
-    warnings: Gets a line each time that the device had no room for the planned slabs.
-
-    Returns: ndarray, shape (n, 3), float32. HU per mm, LPS.  Beyond the border the volume is surrounded by its lowest
-        value, at least -1024 HU; farther away the gradient is zero.
+    Beyond the border the volume is surrounded by its lowest value, at least -1024 HU; farther away the gradient is
+    zero. A volume that does not fit the device goes through it slab by slab, with the same result.
     """
     volume, nk = resident.volume, resident.volume.shape_ijk[2]
     places = np.clip(volume.lps_to_ijk(points), -FARTHEST, FARTHEST).astype(np.float32)
@@ -133,11 +127,8 @@ def prepare_normals(device: Device) -> Program:
 
 
 class PlaneFits:
-    """Planes through the neighbours of the points of one part after another.
-
-    neighbours_d: buffer, (most places of a part, k) int32
-    normals_d: buffer, (3, place_count) float32
-    variations_d: buffer, (place_count,) float32
+    """Planes through the neighbours of the points of one part after another: neighbours_d (most places of a part, k)
+    int32, normals_d (3, place_count) float32, variations_d (place_count,) float32.
     """
 
     def __init__(self, search: NeighbourSearch, stopwatch: Stopwatch):

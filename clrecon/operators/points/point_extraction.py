@@ -55,12 +55,11 @@ Points = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The voxels that become points.
+    """The voxels that become points, from `low` to `high`, both included.
 
-    low, high: Lowest and highest value, both included.
     shell: Only those with one of six neighbours outside; beyond the volume all is outside.
     labels: ndarray, shape (nk, nj, ni), uint8 or uint16, or None. On the volume's grid: only voxels with `label`, or
-        with any number but 0 where it is 0.
+    with any number but 0 where it is 0.
     paper: Every slice is put where the first one lies.
     """
 

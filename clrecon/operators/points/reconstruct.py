@@ -73,11 +73,10 @@ class Walls:
 
 
 def find_walls(near: Words, negative: Words, inside: Words, nx: int) -> Walls:
-    """Count the faces of a surface and those without support; see `clrecon.proof.points.field.find_walls`.
+    """Count the faces of a surface and those without support; see its twin in `clrecon.proof.points.field`.
 
-    near, negative, inside: ndarray, shape (nz, ny, words), uint32. Masks of nodes, bit b of word w is node 32 w + b:
-        within the bridge of a point, the sign of the field there, and the decided sign.
-    nx: Nodes of a row.
+    The masks, (nz, ny, words) uint32, bit b of word w being node 32 w + b of `nx` in a row, are of nodes within the
+    bridge of a point, of the sign of the field there, and of the decided sign.
     """
     nz, ny, words = near.shape
     shape = (-(-nz // CUBE), -(-ny // CUBE), words)

@@ -20,10 +20,7 @@ def prepare_slice_overlap(device: Device) -> Program:
 
 
 def count_overlaps(device: Device, mask: VoxelMask, *, stopwatch: Stopwatch | None = None) -> NDArray[np.int64]:
-    """Count the voxels of each slice, and those that it has in common with the next slice and with the one after.
-
-    Returns: ndarray, shape (3, nk), int64. 0 where there is no such slice.
-    """
+    """Count the voxels of each slice, and those in common with the next one and the one after, as (3, nk)."""
     _, nj, nk = mask.shape_ijk
     counts_d = allocate(device, 12 * mask.rows)
     launch(

@@ -66,14 +66,10 @@ def prepare_voxel_clusters(device: Device) -> Program:
 
 
 class ClusterSearch:
-    """The clusters of the set voxels of a mask.
+    """The clusters of the set voxels of a mask: `points` voxels, `runs` of core voxels along i, `count` clusters.
 
     mask: With `pad_for` words of zeros behind its rows.
-    stencil: Of the same volume.
-    memory: Bytes that may be taken on the device; None is all of its memory.
     parts_per_core: Of CPU devices; the labels do not depend on it.
-
-    points, runs, count: Number of set voxels, of runs of core voxels along i, and of clusters.
     numbers_d: buffer, (runs,) int32. Cluster of each run, numbered by their first core voxel in the order k, j, i.
     device_bytes: Most bytes on the device at a time.
     """
@@ -177,12 +173,9 @@ class ClusterSearch:
         )  # fmt: skip
 
     def label(self, numbers: NDArray[np.int32] | None = None) -> NDArray[np.int32]:
-        """Return the cluster of each point in the order k, j, i, -1 for noise.
+        """Return the cluster of each point in the order k, j, i, -1 for noise: (points,) int32.
 
-        numbers: ndarray, shape (runs,), int32. Other numbers of the runs' clusters; border points take the lowest of
-            these.
-
-        Returns: ndarray, shape (points,), int32
+        With `numbers`, (runs,) int32, others than those of the clusters; border points take the lowest of these.
         """
         labels, labels_d = empty_output(self._device, (self.points,), np.int32)
         if not self.runs:

@@ -20,10 +20,7 @@ LARGEST_SCAN = 2**31
 
 @dataclass(frozen=True)
 class Scanned:
-    """Offsets on the device, (n,) uint32, and the exact total.  Offsets are modulo 2^32, so check the total.
-
-    ``total_d`` is the total on the device, (1,) uint64.
-    """
+    """Offsets on the device, (n,) uint32, modulo 2^32, and the exact total, to be checked, there (1,) uint64."""
 
     offsets_d: Any
     total_d: Any
@@ -42,12 +39,7 @@ def _load_scan(device: Device) -> Program:
 def exclusive_scan(
     device: Device, counts_d: Any, n: int, *, in_place: bool = False, stopwatch: Stopwatch | None = None
 ) -> Scanned:
-    """Compute the sum of all counts before each element.
-
-    counts_d: buffer, (n,) uint32
-    n: Number of elements, at least 1.
-    in_place: The offsets overwrite the counts and need no memory of their own.
-    """
+    """Compute the sum of all counts, (n,) uint32, before each element; with `in_place` over the counts."""
     _check_size(n)
     offsets_d = counts_d if in_place else allocate(device, 4 * n)
     total_d = enqueue_scan(device, counts_d, offsets_d, n, stopwatch=stopwatch)
@@ -61,11 +53,7 @@ def _check_size(n: int) -> None:
 
 
 def enqueue_scan(device: Device, counts_d: Any, offsets_d: Any, n: int, *, stopwatch: Stopwatch | None = None) -> Any:
-    """Enqueue the same for offsets in a buffer that is there, which may be that of the counts.
-
-    Returns:
-    total_d: buffer, (1,) uint64. The exact total; nothing is waited for.
-    """
+    """Enqueue the same into offsets, or the counts, and wait for nothing; return the exact total, (1,) uint64."""
     _check_size(n)
     scan = _load_scan(device)
     blocks = -(-n // (SCAN_PER_ITEM * device.group_size))
@@ -108,11 +96,7 @@ def _load_compact(device: Device) -> Program:
 
 
 def compact(device: Device, mask_d: Any, words: int, *, stopwatch: Stopwatch | None = None) -> Compacted:
-    """Find the positions of the set bits of a bit mask.
-
-    mask_d: buffer, (words,) uint32. Bit b of word w is position ``32 * w + b``.
-    words: Number of words, 1 to 2^27, so that positions fit 32 bits.
-    """
+    """Find the set bits of a mask, (words,) uint32, words 1 to 2^27; bit b of word w is position ``32 * w + b``."""
     if not 1 <= words <= LARGEST_MASK:
         raise UsageError(f"{words:,} words: a mask has 1 to {LARGEST_MASK:,}, so that positions fit 32 bits")
     program = _load_compact(device)
@@ -145,11 +129,7 @@ MOST_CHUNKS = 4096
 
 @dataclass(frozen=True)
 class Sorted:
-    """Sorted keys on the device.
-
-    keys_d: buffer, (n,) uint32. Ascending.
-    values_d: buffer, (n,) uint32. Number of each of them in the input; equal keys are in the order of the input.
-    """
+    """Sorted keys on the device, (n,) uint32, and the number of each in the input; equal ones as in the input."""
 
     keys_d: Any
     values_d: Any
@@ -187,12 +167,7 @@ def sort_bytes(device: Device, n: int, bits: int = KEY_BITS) -> int:
 def radix_sort(
     device: Device, keys_d: Any, n: int, *, bits: int = KEY_BITS, stopwatch: Stopwatch | None = None
 ) -> Sorted:
-    """Sort keys, and find the number of each of them in the input; equal keys stay in the order of the input.
-
-    keys_d: buffer, (n,) uint32. They stay as they are.
-    n: Number of elements, 1 to 2^31.
-    bits: Bits of the keys that can be set, from the lowest: as many passes are made as they need.
-    """
+    """Sort 1 to 2^31 keys, (n,) uint32, by their lowest `bits`, the only ones that can be set; they stay."""
     if not 1 <= n <= LARGEST_SCAN:
         raise UsageError(f"{n:,} elements: a sort takes 1 to {LARGEST_SCAN:,}")
     if not 0 <= bits <= KEY_BITS:

@@ -46,15 +46,8 @@ def label_components(
 ) -> tuple[int, NDArray[np.int64]]:
     """Number the components of a mesh: triangles that share a vertex belong to one.
 
-    triangles: array_like, shape (m, 3), uint32. Indices of vertices.
-    memory: Bytes that may be taken on the device; None is all of its memory.
-    stopwatch: Records the time of the kernels.
-
-    Returns:
-    count: Number of components, not counting vertices that no triangle uses.
-    labels: ndarray, shape (vertex_count,), int64. Component of each vertex, numbered in order of the first vertex; -1
-        for unused vertices.  Equal on every device, and equal to the result of
-        `clrecon.mesh.connectivity.label_components`.
+    Return their count, and the component of each vertex, (vertex_count,) int64, numbered in order of the first vertex,
+    -1 where no triangle uses it: equal on every device, and to `clrecon.mesh.connectivity.label_components`.
     """
     faces = np.ascontiguousarray(triangles, dtype=np.uint32).reshape(-1, 3)
     _check_mesh(faces, vertex_count)
@@ -71,16 +64,12 @@ def join_parts(
 ) -> tuple[int, Any]:
     """Number the components of nodes that are joined within parts already, once the parts are joined by pairs.
 
-    labels_d: buffer, (n,) uint32. The smallest node of each node's component within its part, a root; of a lone node
-        its own number.  Overwritten.
-    spare_d: buffer, (n,) uint32. The same of roots; all else is arbitrary.  Overwritten.
-    n: Number of nodes, at least 1.
-    links_d: buffer, (links, 3) uint32. Pairs (a, b, b) of roots that belong together.
-    links: Number of pairs.
+    Return their count, lone nodes counted, and the component of each node, (n,) int32, in order of the first node.
 
-    Returns:
-    count: Number of components, lone nodes counted.
-    numbers_d: buffer, (n,) int32. Component of each node, numbered in order of the first node.
+    labels_d: buffer, (n,) uint32. The smallest node of each node's component within its part, a root; of a lone node
+    its own number.  Overwritten.
+    spare_d: buffer, (n,) uint32. The same of roots; all else is arbitrary.  Overwritten.
+    links_d: buffer, (links, 3) uint32. Pairs (a, b, b) of roots that belong together.
     """
     rounds = _Rounds(device, stopwatch, labels_d, spare_d, n)
     if links:
@@ -101,17 +90,14 @@ def hook_in_rounds(
 ) -> tuple[Any, Any]:
     """Find components by a kernel that hooks roots to smaller ones, in rounds, until it hooks none.
 
-    labels_d: buffer, (n,) uint32. For each node a root, which is its own label, of its component and not above it; 2^32
-        - 1 for nodes that take no part.
-    other_d: buffer, (n,) uint32. Overwritten.
-    n: Number of nodes, at least 1.
-    hook: Called with the labels, all of them roots; with a copy, in which it lowers the label of a root by atomic_min()
-        to another root of the same component; with two flags, of which it sets the second to the number that it is
-        called with where it finds such a root; and with that number.
+    Return the same two buffers: labels that are all roots, the least node of each component, and a free one.
 
-    Returns:
-    labels_d, other_d: buffer, (n,) uint32. The same two: labels that are all roots, the least node of each component,
-        and a free buffer.
+    labels_d: buffer, (n,) uint32. For each node a root, which is its own label, of its component and not above it; 2^32
+    - 1 for nodes that take no part.
+    other_d: buffer, (n,) uint32. Overwritten.
+    hook: Called with the labels, all of them roots; with a copy, in which it lowers the label of a root by atomic_min()
+    to another root of the same component; with two flags, of which it sets the second to the number that it is called
+    with where it finds such a root; and with that number.
     """
     rounds = _Rounds(device, stopwatch, labels_d, other_d, n)
     rounds.start()
@@ -148,11 +134,7 @@ class _Rounds:
         self.run("clear_labels", 1, labels=allocate(self._device, 4), flags=self._flags_d, n=1)
 
     def number(self, labels_d: Any, spare_d: Any, n: int) -> tuple[int, Any]:
-        """Number the components by their roots.
-
-        Returns:
-        numbers_d: buffer, (n,) int32
-        """
+        """Number the components by their roots: their count, and a buffer, (n,) int32."""
         self.run("flag_roots", n, labels=labels_d, roots=spare_d, n=n)
         roots = exclusive_scan(self._device, spare_d, n, stopwatch=self._stopwatch)
         numbers_d = allocate(self._device, 4 * n)
@@ -257,11 +239,7 @@ class _Search(_Rounds):
             raise DeviceMemoryError(f"the components of the mesh cannot be found: {shortage}")
 
     def find_roots(self) -> tuple[Any, Any]:
-        """Run all rounds.
-
-        Returns:
-        labels_d, spare_d: buffer, (n,) uint32. Labels whose labels are all roots, and a free buffer.
-        """
+        """Run all rounds; return labels whose labels are all roots, and a free buffer, both (n,) uint32."""
         self.run("clear_labels", self._vertices, labels=self._other_d, flags=self._flags_d, n=self._vertices)
         self.run("hook_corners", self._faces, triangles=self._faces_d, labels=self._other_d, m=self._faces)
         self.jump("jump_labels", self._vertices, n=self._vertices)

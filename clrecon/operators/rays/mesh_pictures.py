@@ -42,13 +42,11 @@ MOST_PIECES = 1 << 28
 class MeshPart:
     """Triangles with one look, in the form for a device.
 
-    vertices: ndarray, shape (n, 3), float32. Mm from `base`, finite.
-    triangles: ndarray, shape (m, 3), uint32. Indices of vertices that exist.
+    vertices: ndarray, shape (n, 3), float32. Mm from `base`, (3,) float64, LPS mm; finite.
     normals: ndarray, shape (n, 3), float32, or None. LPS, of any length; None: every triangle has its own.
     colors: ndarray, shape (n, 4), uint8, or None. Red, green, blue and 255 of each vertex, in place of `color`.
     opacity: Above 0 and up to 1.
     planes: ndarray, shape (p, 4), float64. Half-spaces in LPS mm that are kept: ``normal . p >= offset``.
-    base: ndarray, shape (3,), float64. LPS mm.
     """
 
     vertices: NDArray[np.float32]
@@ -99,11 +97,7 @@ class LayerKeys:
 
 
 class Triangles:
-    """A `MeshPart` on a device, before a camera.
-
-    first: Number of its first triangle among those of the picture.
-    size: (width, height)
-    """
+    """A `MeshPart` on a device, before a camera; its triangles are those from `first` on of the picture."""
 
     def __init__(
         self, device: Device, part: MeshPart, first: int, camera: Camera, size: tuple[int, int], stopwatch: Stopwatch
@@ -209,10 +203,7 @@ def mesh_corners(mesh: Mesh) -> Float64Array:
 
 
 def box_around(corners: Sequence[Float64Array] | NDArray[np.float64]) -> Grid:
-    """Return the box of points as a grid of one voxel, which `Camera.fit` places a camera for.
-
-    corners: array_like, shape (n, 3). LPS mm.
-    """
+    """Return the box of points, (n, 3), LPS mm, as a grid of one voxel, which `Camera.fit` places a camera for."""
     points = np.concatenate([np.atleast_2d(each) for each in corners])
     low, high = points.min(axis=0), points.max(axis=0)
     affine = np.diag([*np.maximum(high - low, SMALLEST_SIDE_MM), 1.0])

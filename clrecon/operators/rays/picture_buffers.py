@@ -34,14 +34,11 @@ ENDLESS = 1e30
 
 @dataclass(frozen=True)
 class RayView:
-    """The rays of a picture in the form for a device.
+    """The rays of a picture in the form for a device: a table, (rows, 4) float32, `planes` of whose rows are clip
+    planes.
 
-    size: (width, height)
-    ray_step: mm.
-    table: ndarray, shape (rows, 4), float32
-    planes: Number of clip planes among the rows.
-    spread: ndarray, shape (3,), float64. Largest distance in field coordinates between a ray of a tile and the one in
-        its middle, plus one ray step.
+    `spread`, (3,) float64, is the largest distance in field coordinates between a ray of a tile and the one in its
+    middle, plus one ray step.
     """
 
     camera: Camera
@@ -78,8 +75,7 @@ class RayView:
         """Set the table up.
 
         planes: ndarray, shape (n, 4), float64. Half-spaces in LPS mm that are kept: ``normal . p >= offset``.
-        box, focus: (low, high), each ndarray, shape (3,), float64. Field coordinates of the volume, and of its visible
-            part.
+        box, focus: (low, high), each (3,) float64. Field coordinates of the volume, and of its visible part.
         """
         frame = FieldFrame.of(volume)
         right, up, forward = camera.basis()
@@ -158,18 +154,14 @@ def highlight_table(lighting: Lighting) -> NDArray[np.float32]:
 
 
 def count_queues(device: Device) -> int:
-    """Return the number of parts into which a driver divides a launch; neighbouring tiles go to different parts for
-    equal work.
-    """
+    """Return into how many parts a driver divides a launch; neighbouring tiles go to different ones for equal work."""
     return max(1, device.compute_units) if device.type == "cpu" else 1
 
 
 @dataclass
 class Between:
-    """The part of the rays between two layers, for a ray caster that adds a volume to their states.
-
-    states_d: buffer, (h, w, 2) float4. See cl/rays/layers.cl.
-    nearest_d, farthest_d: buffer, (h, w) float32. Mm along the ray where it begins and ends.
+    """The part of the rays between two layers, for a ray caster that adds a volume to their states, (h, w, 2) float4,
+    see cl/rays/layers.cl; `nearest_d` and `farthest_d`, (h, w) float32, are mm along the ray where it begins and ends.
     """
 
     states_d: Any
@@ -178,10 +170,9 @@ class Between:
 
 
 class DrawnVolume(NamedTuple):
-    """A volume for a picture of layers.
+    """A volume for a picture of layers, whose rays begin at `near_mm`, see `VIEW_NEAR` in cl/rays/view.h.
 
-    sample: Adds what the volume shows between two layers to the states of the rays, and waits.
-    near_mm: Where its rays begin, see `VIEW_NEAR` in cl/rays/view.h.
+    `sample` adds what it shows between two layers to the states of the rays, and waits.
     """
 
     device: Device

@@ -64,12 +64,9 @@ _SHADINGS = {
 
 
 class SplatPicture(NamedTuple):
-    """A picture of points.
+    """A picture of points: (h, w, 4) uint8, and their depth, (h, w) float32, mm along the ray, NaN where none is.
 
-    image: ndarray, shape (h, w, 4), uint8
-    depth: ndarray, shape (h, w), float32. Mm along the ray; NaN where no point is.
-    shading: {"none", "normals", "depths"}
-    parts: Parts of the cloud that went through the device one after the other.
+    `shading` is "none", "normals" or "depths"; the cloud went through the device in `parts`.
     """
 
     image: NDArray[np.uint8]
@@ -96,16 +93,13 @@ def draw_splats(
 ) -> SplatPicture:
     """Draw each point as a disc that faces the camera; the nearest disc is seen.
 
-    points: ndarray, shape (n, 3), float32. Mm from `base`, finite; at most 2^32 - 2.
+    points: ndarray, shape (n, 3), float32. Mm from `base`, else the origin, finite; at most 2^32 - 2.
     colors: ndarray, shape (n, 4), uint8. Red, green, blue, 255.
     normals: ndarray, shape (n, 3), float32. Unit vectors, LPS.  Without them points are shaded by what lies around
-        them, see cl/rays/splats.cl.
-    size: (width, height)
+    them, see cl/rays/splats.cl.
     radius_mm: Of the discs; on the picture it is at least 0.7 and at most 128 pixels.
-    base: ndarray, shape (3,), float64. LPS mm; default: the origin.
     lighting: One that does not shade leaves the colours as they are.
-    background: str or (float, float, float). None: transparent.
-    memory: Bytes that may be taken on the device; a cloud over it goes through in parts, and gives the same picture.
+    memory: A cloud over it goes through in parts, and gives the same picture.
     progress: Called as ``progress("points", done, total)``, a point counted for each of the three passes.
     """
     job = _Splats(device, camera, size, radius_mm, base, lighting or Lighting(), background, normals is not None)
@@ -273,10 +267,7 @@ MOST_NAMED = 24
 
 
 def cloud_box(cloud: PointCloud, margin: float = 0.0) -> Grid:
-    """Return the box of a cloud as a grid of one voxel, which `Camera.fit` places a camera for.
-
-    margin: Mm that the box is larger on every side.
-    """
+    """Return the box of a cloud, `margin` mm larger on every side, as a grid of one voxel for `Camera.fit`."""
     if not len(cloud):
         raise UsageError("the cloud has no points: there is nothing to show")
     low, high = (np.asarray(end(axis=0), dtype=np.float64) for end in (cloud.points.min, cloud.points.max))
@@ -296,13 +287,9 @@ class _Colors(NamedTuple):
 
 
 class PointPictures(Closing):
-    """A cloud of points of which pictures are made one after the other.
+    """A cloud of points of which pictures are made one after the other: a context manager.
 
-    Use it as a context manager, or `close` it.
-
-    cloud: Its arrays must not change as long as this object is open.
-    device: See `clrecon.device`; None is the best of the machine.
-    memory: Bytes that may be taken on the device; a cloud over it goes through in parts.
+    Its arrays must not change as long as this object is open; a cloud over `memory` goes through in parts.
     """
 
     def __init__(self, cloud: PointCloud, *, device: Device | str | int | None = None, memory: int | None = None):
@@ -336,12 +323,7 @@ class PointPictures(Closing):
         background: str | Sequence[float] | None = None,
         progress: Progress | None = None,
     ) -> Rendering:
-        """Take one picture.
-
-        size: (width, height)
-        background: str or (float, float, float). None: transparent.
-        progress: Called as ``progress("points", done, total)``.
-        """
+        """Take one picture."""
         radius = self._radius(style)
         colors = self._colors_of(style)
         cloud, points = self.cloud, self._points

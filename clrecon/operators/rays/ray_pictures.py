@@ -68,18 +68,17 @@ LOWEST_LOG = -1000.0
 
 @dataclass(frozen=True)
 class TransferTables:
-    """A transfer function in tables for one ray step.
+    """A transfer function in tables for one ray step; buffers of (NODES,) float32 where nothing else is said.
 
-    colors_d: buffer, (NODES,) int32. Red, green and blue, 10 bits each.
-    opacities_d: buffer, (NODES,) float32. Opacities over one ray step.
-    clears_d: buffer, (NODES,) float32. Transparency of one of the `PARTS` parts of a ray step.
-    changes_d: buffer, (NODES,) float32. Sum of the changes of the opacity, up and down, from the first node to each
-        node.
+    colors_d: int32. Red, green and blue, 10 bits each.
+    opacities_d, clears_d: Opacities over one ray step, and transparency of one of its `PARTS` parts.
+    changes_d: Sum of the changes of the opacity, up and down, from the first node to each node.
     shown: ndarray, shape (NODES,), bool
     steepness: Steepness of `opacities_d`.
     low, scale: Nearest node to v: ``floor((v - low) * scale + 0.5)``.
-    factors_d: buffer, (GRADIENT_NODES,) float32. Factors on the opacity, by magnitude of the gradient times
-        `factor_scale`; used if it is `weighed`.
+    factors_d: buffer, (GRADIENT_NODES,). Factors on the opacity, by magnitude of the gradient times `factor_scale`;
+        used
+    if it is `weighed`.
     steps_per_unit: Number of ray steps in the unit distance.
     """
 
@@ -158,14 +157,12 @@ class TransferTables:
 
 @dataclass(frozen=True)
 class MainWay:
-    """The main direction of a picture's rays through the bricks of a slab.
+    """The main direction of a picture's rays through the bricks of a slab: `ahead` (1 or -1) along `axis`.
 
-    axis: 0, 1 or 2 for i, j or k.
-    ahead: 1 or -1: the direction along the axis.
     eye: ndarray, shape (4,), float32. The camera in bricks, and 1; or the direction of all rays in bricks, 1 along
-        `axis`, and 0.
+    `axis`, and 0.
     aside: Distance in bricks from the camera, or drift to the side per brick ahead, from which on rays count as
-        drifting.
+    drifting.
     """
 
     axis: int
@@ -208,13 +205,10 @@ def composite_slab(
     stopwatch: Stopwatch,
     between: Between | None = None,
 ) -> None:
-    """Blend one slab into a picture, and wait.
+    """Blend one slab, with the view of its focus and its leaps, into a picture with the results of earlier slabs, and
+    wait.
 
-    view: With the slab's focus.
-    leaps: Of this slab, for the transfer function of `tables`.
-    labels: Labels on the grid of the volume.
-    output: Picture with the results of earlier slabs.
-    between: The part of the rays that counts; only the states of `output` are written.
+    Of a part of the rays, `between`, only the states of `output` are written.
     """
     device = resident.device
     variants = {"GRADIENT_OPACITY": "1"} if tables.weighed else {}
@@ -292,10 +286,7 @@ PROJECTIONS = {
 def project_slab(
     resident: DeviceVolume, slab: RaySlab, view: RayView, mode: str, output: PictureBuffers, stopwatch: Stopwatch
 ) -> None:
-    """Add one slab to a projection; `output.means_d` receives the values.
-
-    mode: {"mip", "minip", "mean", "drr"}
-    """
+    """Add one slab to a projection, "mip", "minip", "mean" or "drr"; `output.means_d` receives the values."""
     variants = {"LEAST_VALUE": f"({AIR_HU:g})"} if mode == "drr" else {}
     device = resident.device
     queues, lanes = count_queues(device), int(device.kernel_variants["LANES"])
@@ -320,13 +311,7 @@ def take_picture(
     background: str | Sequence[float] | None = None,
     progress: Progress = ignore_progress,
 ) -> Rendering:
-    """Take one picture of a volume on a device.
-
-    size: (width, height)
-    ray_step: mm.
-    background: str or (float, float, float). None: transparent.
-    progress: Called as ``progress("slabs", slices done, all slices)``.
-    """
+    """Take one picture of a volume on a device."""
 
     for attempt in resident.with_fallback():
         with attempt as (_, warnings):
@@ -343,10 +328,9 @@ def take_with_layers(
     beside: Mapping[str, int],
     draw: Callable[[DrawnVolume], Rendering],
 ) -> Rendering:
-    """Take a picture of a volume with what lies in it.
+    """Take a picture of a volume with what lies in it, whose buffers take bytes `beside` it.
 
-    beside: Bytes of other buffers on the device.
-    draw: Draws the picture; it is called again where the device has no room, or another one takes over.
+    `draw` is called again where the device has no room, or another one takes over.
     """
 
     for attempt in resident.with_fallback():

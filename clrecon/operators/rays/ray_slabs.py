@@ -56,10 +56,8 @@ def entry_slice(volume: Volume, camera: Camera) -> float:
 
 @dataclass
 class LeapMap:
-    """The bricks of a slab that show something, and the distance of the next one from each brick.
-
-    distances_d: buffer, (bk, bj, bi) uint8. Chebyshev distance in bricks, 0 for visible bricks.
-    box: (low, high) or None. Field coordinates of the box around all visible bricks; None if no brick is visible.
+    """The bricks of a slab that show something: Chebyshev distance in bricks to the next one from each, (bk, bj, bi)
+    uint8, and the box around all, (low, high) in field coordinates, None if there is none.
     """
 
     distances_d: Any
@@ -70,8 +68,7 @@ class LeapMap:
 class RaySlab:
     """Slices ``first_k`` to ``end_k - 1`` of a volume on the device, at least two along each axis.
 
-    voxels_d: buffer, (end_k - first_k, nj, ni)
-    shape_ijk: (ni, nj, slices) of the buffer
+    shape_ijk: That of the buffer.
     low_k, high_k: Samples with ``low_k <= k < high_k`` are this slab's.
     stage: Bit 0: the first slab that a picture goes through, bit 1: the last.
     ranges_d: See `measure_cells`.
@@ -137,10 +134,8 @@ def pad_slices(voxels: NDArray[Any]) -> NDArray[Any]:
 def plan_ray_slabs(
     resident: DeviceVolume, others: Mapping[str, int], extra: Mapping[str, int], labels: ResampledLabels | None = None
 ) -> int:
-    """Return the number of slices in a slab, all if everything fits.
-
-    others, extra: Bytes of other buffers on the device, and of those needed only with more than one slab.
-    labels: Labels that are needed with the voxels.
+    """Return the number of slices in a slab, all if everything fits beside labels and `others`, bytes of other buffers;
+    `extra` are needed only with more than one slab.
     """
     ni, nj, nk = resident.volume.shape_ijk
     cells, size = choose_brick_cells(resident.volume), resident.dtype.itemsize
@@ -164,11 +159,8 @@ def plan_ray_slabs(
 
 
 def ray_slabs(resident: DeviceVolume, slices: int, entry_k: float, stopwatch: Stopwatch) -> Iterator[RaySlab]:
-    """Yield the volume in slabs of `slices` slices, starting where the rays come from.
-
-    slices: Result of `plan_ray_slabs`.
-    entry_k: Slice coordinate of the camera.  Rays go away from it, so slabs are ordered by their distance from it.
-        Infinite: slabs begin at that end.
+    """Yield the volume in slabs of `slices` slices, ordered by their distance from `entry_k`, the slice coordinate of
+    the camera, from which rays go away; infinite: slabs begin at that end.
     """
     nk = resident.volume.shape_ijk[2]
     if slices >= nk:
@@ -235,9 +227,7 @@ ROWS_AT_ONCE = kernel_constant("rays/leaps.cl", "ROWS_AT_ONCE")
 
 
 def measure_cells(resident: DeviceVolume, slab: RaySlab, stopwatch: Stopwatch) -> Any:
-    """Return the lowest and highest value that samples in each brick of a slab can have, (bk, bj, bi, 2), on the
-    device.
-    """
+    """Return the lowest and highest value of samples in each brick of a slab, (bk, bj, bi, 2), on the device."""
     if slab.ranges_d is None:
         bricks, (ni, nj, nk) = math.prod(slab.bricks), slab.shape_ijk
         slab.ranges_d = allocate(resident.device, 2 * bricks * resident.dtype.itemsize)
@@ -257,11 +247,10 @@ def find_leaps(
     scale: float,
     stopwatch: Stopwatch,
 ) -> LeapMap:
-    """Return the leap map for visible values, or the map that was made for `key` before.
+    """Return the leap map for visible values, or the map that was made for `key`, which tells the source of `shown`,
+    before.
 
-    key: Identifies the source of `shown`.
-    shown: ndarray, shape (nodes,), bool. Which nodes of a table of values are visible.
-    low, scale: Nearest node to a value v: ``floor((v - low) * scale + 0.5)``, within the table.
+    The visible nodes, (nodes,) bool, are those of a table; nearest to a value v is ``floor((v - low) * scale + 0.5)``.
     """
     known = slab.maps.get(key)
     if known is not None:

@@ -73,12 +73,9 @@ class Still(NamedTuple):
 
 
 class LayeredPicture(NamedTuple):
-    """A picture of layers.
+    """A picture of layers, (h, w, 4) uint8, with depths, (h, w) float32, mm along the ray, NaN where nothing is.
 
-    image: ndarray, shape (h, w, 4), uint8
-    depth, expected_depth: ndarray, shape (h, w), float32. Mm along the ray; NaN where nothing is.
-    layers: Layers that were drawn.
-    open_pixels: Pixels that may have further ones, which are left out.
+    `open_pixels` may have further layers than those that were drawn, which are left out.
     """
 
     image: NDArray[np.uint8]
@@ -106,14 +103,11 @@ def draw_layers(
     """Draw triangles, with what lies before, between and behind them.
 
     parts: The first triangles of the first part have the lowest numbers: of triangles at the same depth they are
-        nearer.
-    size: (width, height)
+    nearer.
     still: A picture of the same camera: one further layer at its depth.
     volume: Adds what a volume shows between two layers to the states of the rays, and waits; called from front to back.
     near_mm: Where the volume's rays begin, see `VIEW_NEAR` in cl/rays/view.h.
     most: Most layers.
-    background: str or (float, float, float). None: transparent.
-    memory: Bytes that may be taken on the device.
     progress: Called as ``progress("layers", done, most)`` before each layer.
     """
     needs = {"picture": PIXEL_BYTES * size[0] * size[1], "triangles": sum(part.device_bytes for part in parts)}
@@ -283,21 +277,17 @@ def check_objects(objects: Sequence[tuple[Any, Style]]) -> None:
 
 
 class ScenePictures(Closing):
-    """Objects of which pictures are made together, one after the other.
+    """Objects of which pictures are made together, one after the other: a context manager.
 
-    Every pixel has layers from front to back: triangles of meshes (`LayeredPicture`), and one for what
-    is opaque already when it is drawn, that is discs of points and surfaces of volumes.  Between them lies the volume
-    that is shown by volume rendering or as slices.
-
-    Use it as a context manager, or `close` it.
+    Every pixel has layers from front to back: triangles of meshes (`LayeredPicture`), and one for what is opaque
+    already when it is drawn, that is discs of points and surfaces of volumes.  Between them lies the volume that is
+    shown by volume rendering or as slices.
 
     objects: sequence of (object, style). Mesh and MeshLook; PointCloud and PointLook; Volume or DeviceVolume and
-        VolumeLook, SlicesInSpace or SurfaceLook.  Their arrays must not change as long as this object is open.  Of
-        triangles at the same depth the first is seen.
-    device: See `clrecon.device`; None is the best of the machine.
-    memory: Bytes that may be taken on the device.
+    VolumeLook, SlicesInSpace or SurfaceLook.  Their arrays must not change as long as this object is open.  Of
+    triangles at the same depth the first is seen.
     takers: What takes pictures of volumes and clouds alone, by the `id` of the object; the caller keeps it for its next
-        scenes and closes what is in it.  Objects are not looked at then, and there is no `box`.
+    scenes and closes what is in it.  Objects are not looked at then, and there is no `box`.
     """
 
     def __init__(
@@ -345,12 +335,7 @@ class ScenePictures(Closing):
         background: str | Sequence[float] | None = None,
         progress: Progress | None = None,
     ) -> Rendering:
-        """Take one picture.
-
-        size: (width, height)
-        background: str or (float, float, float). None: transparent.
-        progress: Called as ``progress("render", objects drawn, all objects)``, and as `draw_layers` says.
-        """
+        """Take one picture, with ``progress("render", objects drawn, all objects)``, and as `draw_layers` says."""
         tell = progress or ignore_progress
         tell("render", 0, len(self._objects))
         drawn: list[Rendering] = []

@@ -39,10 +39,7 @@ EDGE_ON = 1e-3
 
 
 def choose_slices(volume: Volume, slices: int | Sequence[int] | None = None) -> list[int]:
-    """Return the numbers k of the slices to show, ascending.
-
-    slices: As `SlicesInSpace.slices`.
-    """
+    """Return the numbers k of the slices to show, as `SlicesInSpace.slices`, ascending."""
     nk = volume.shape_ijk[2]
     if slices is None:
         count = min(nk, DEFAULT_COUNT)
@@ -63,16 +60,11 @@ def overlay_slices(
     background: str | Sequence[float] | None = None,
     progress: Progress = ignore_progress,
 ) -> Rendering:
-    """Show slices of a volume in space, each translucent at its own place: sheared and uneven stacks too.
+    """Show slices of a volume in space, each translucent at its own place, with the depth of the first visible one:
+    sheared and uneven stacks too.
 
     A volume that is already on the device is read there.  Else only the shown slices are uploaded, in parts if they do
     not fit together.
-
-    size: (width, height)
-    background: str or (float, float, float). None: transparent.
-    progress: Called as ``progress("slabs", slices done, all that are shown)``.
-
-    Returns: ``depth`` is that of the first visible slice.
     """
     chosen = choose_slices(resident.volume, style.slices)
 
@@ -94,10 +86,9 @@ def overlay_with_layers(
     beside: Mapping[str, int],
     draw: Callable[[DrawnVolume], Rendering],
 ) -> Rendering:
-    """Show slices of a volume in space with what lies between them.
+    """Show slices of a volume in space with what lies between them, whose buffers take bytes `beside` it.
 
-    beside: Bytes of other buffers on the device.
-    draw: Draws the picture; it is called again where the device has no room, or another one takes over.
+    `draw` is called again where the device has no room, or another one takes over.
     """
     chosen = choose_slices(resident.volume, style.slices)
 

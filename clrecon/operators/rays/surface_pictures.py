@@ -44,7 +44,7 @@ def cast_surface(
     background: str | Sequence[float] | None = None,
     progress: Progress = ignore_progress,
 ) -> Rendering:
-    """Show where the field first reaches an iso value along each ray.
+    """Show where the field first reaches an iso value along each ray; ``depth`` is that of the first hit.
 
     The field is that of the closed mesh of `extract_isosurface`, so that depths are those of the mesh: surrounded by a
     layer of outside, its surface at the level of `clrecon.geometry.iso_rule.IsoRule`. Between the first sample that is
@@ -52,16 +52,11 @@ def cast_surface(
     a clip plane with the plane's normal, so that cut bone is flat; at a camera inside, with the ray's direction.
 
     style: With `shadows`, a hit has only ambient light if the way from it to the fixed light meets something inside,
-        one ray step away or farther; translucent labels let their share through.  A hit in a label with opacity below 1
-        is blended, and the ray continues: out of the inside to the next entry, or into the next label. The label of a
-        hit is that of the nearest inside voxel of its cell; as in meshes of labels, a voxel without one has that of the
-        nearest of the voxels around it.
-    size: (width, height)
+    one ray step away or farther; translucent labels let their share through.  A hit in a label with opacity below 1 is
+    blended, and the ray continues: out of the inside to the next entry, or into the next label. The label of a hit is
+    that of the nearest inside voxel of its cell; as in meshes of labels, a voxel without one has that of the nearest of
+    the voxels around it.
     ray_step: Distance of samples, mm.  If the volume is processed in slabs, at most one slice.
-    background: str or (float, float, float). None: transparent.
-    progress: Called as ``progress("slabs", slices done, all slices)``.
-
-    Returns: ``depth`` is that of the first hit.
     """
     rule = choose_iso_rule(resident.volume, style.iso_value, values=resident.values)
 

@@ -63,12 +63,9 @@ def framing_key(volume: Volume, style: Style) -> tuple[object, ...]:
 
 
 def shown_box(shown: Volume | DeviceVolume, style: Style) -> Grid:
-    """Return the grid that cameras fit.
+    """Return the grid that cameras fit: the volume itself where all of it is shown, or nothing, else `find_seen_box`.
 
-    shown: The latter brings labels to the grid of the volume once for all pictures.
-
-    Returns: The volume itself where all of it is shown, or nothing.  Else the box of what can be seen, see
-        `find_seen_box`.
+    A `DeviceVolume` brings labels to the grid of the volume once for all pictures.
     """
     volume = shown.volume if isinstance(shown, DeviceVolume) else shown
     clip = getattr(style, "clip", None)

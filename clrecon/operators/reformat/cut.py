@@ -393,12 +393,10 @@ def take_contact_sheet(
     style: With a `sheet`; thickness, window and labels are those of each slice.
     plane: The plane in the middle, with zoom and centre, see `clrecon.rendering.views.reformation.find_plane`.
     shown: The volume, or the box of what is left of it: slices beside it are left out, and tiles fit it.
-    size: Width and height of the picture.
-    background, progress: As in `cut_slice`.
 
     Returns: Without a camera and depths; ``report["pixel_mm"]`` and ``report["edges"]`` are those of all slices,
-        ``report["tiles"]`` has ``middle_lps_mm``, ``slice`` (number of its plane of voxels, or None), ``left`` and
-        ``top`` (pixels) of each.
+    ``report["tiles"]`` has ``middle_lps_mm``, ``slice`` (number of its plane of voxels, or None), ``left`` and ``top``
+    (pixels) of each.
     """
     job = CutJob(resident, style, ignore_progress)
     _, plane = plane_sheet(plane, size)
@@ -441,9 +439,8 @@ def take_contact_sheet(
 
 
 def _turn_to_slices(volume: Volume, plane: Camera, warnings: list[str]) -> Camera:
-    """Return a camera across the planes of voxels that lie nearest to its own: a tilted stack is shown as it was taken.
-
-    The camera stays where no planes of voxels lie within `MOST_TURNED` degrees.
+    """Return a camera across the planes of voxels that lie nearest to its own, so that a tilted stack is shown as it
+    was taken, or the same one where none lie within `MOST_TURNED` degrees.
     """
     forward = plane.basis()[2]
     columns = volume.affine[:3, :3]

@@ -54,13 +54,7 @@ FARTHEST = 2.0**30
 
 @dataclass(frozen=True)
 class Reformation:
-    """Values of the pixels of a sheet, and figures of their computation.
-
-    values: ndarray, shape (h, w), float32. HU; NaN where no sample lies within the volume.
-    slices: Number of slices of the volume that the sheet meets.
-    slabs: Number of parts in which the volume was processed.
-    device_bytes: Most bytes taken on the device at one time.
-    """
+    """Values of the pixels of a sheet, (h, w), HU, NaN where no sample lies within the volume, from `slices` of it."""
 
     values: NDArray[np.float32]
     slices: int
@@ -212,15 +206,12 @@ def sample_sheet(
     progress: Progress = ignore_progress,
     warnings: list[str] | None = None,
 ) -> Reformation:
-    """Return the values of all pixels of a sheet: the trilinear field, combined through a thick slice.
+    """Return the values of all pixels of a sheet: the trilinear field, combined ("mean", "max", "min") through a thick
+    slice.
 
     A volume that is already on the device is read there.  Else only the slices that the sheet meets are uploaded, some
     at a time if they do not fit.  Single samples, `max` and `min` are then equal bit for bit, means up to the rounding
     of their sums.
-
-    combine: {"mean", "max", "min"}. How the samples of a pixel within the volume are combined.
-    progress: Called as ``progress("slabs", slices done, all slices)``.
-    warnings: Gets a line each time that the device had no room for the planned slabs.
     """
     if not isinstance(combine, str) or combine not in COMBINATIONS:
         raise UsageError(f"the samples of a slab are combined by one of {', '.join(COMBINATIONS)}, not {combine!r}")

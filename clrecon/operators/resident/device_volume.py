@@ -372,10 +372,7 @@ class DeviceVolume(Closing):
 def open_volume(
     volume: Volume | DeviceVolume, device: Device | str | int | None, memory: int | None, what: str
 ) -> Iterator[DeviceVolume]:
-    """Yield a volume on its device: a given open one, or a new one that is closed at the end.
-
-    what: The purpose, for messages, for example "a slice".
-    """
+    """Yield a volume on its device, for `what`: a given open one, or a new one that is closed at the end."""
     made, is_new = take_volume(volume, device, memory, what)
     try:
         yield made

@@ -44,11 +44,8 @@ BOX_BORDER = 0.5
 
 @dataclass(frozen=True)
 class FieldFrame:
-    """The map from LPS mm to field coordinates: indices; for uneven slices indices in the plane of slice 0, and height
-    in mm.
-
-    matrix: ndarray, shape (3, 3), float64
-    offset: ndarray, shape (3,), float64. Field coordinates of p are ``matrix @ p + offset``.
+    """The map from LPS mm to field coordinates, ``matrix @ p + offset``: indices; for uneven slices indices in the
+    plane of slice 0, and height in mm.
     """
 
     matrix: Float64Array
@@ -98,10 +95,9 @@ MOST_LAYERS = 1 << 16
 
 @dataclass(frozen=True)
 class StackTable:
-    """The place of each slice.
+    """The place of each slice: the arguments of kernels with STACK_PARAMETERS, none for even volumes.
 
-    arguments: The arguments of kernels with STACK_PARAMETERS; none for even volumes.
-    slope: ndarray, shape (4,), float32. Largest number of index steps along i, j and k per mm of height.
+    `slope`, (4,) float32, is the largest number of index steps along i, j and k per mm of height.
     """
 
     arguments: dict[str, Any]
@@ -139,9 +135,7 @@ class StackTable:
         return cls(arguments, slope)
 
     def index_steps(self, apart: Float64Array) -> Float64Array:
-        """Return the most index steps (3,) between places that differ by `apart` (3,) in field coordinates, not
-        negative.
-        """
+        """Return the most index steps (3,), not negative, between places `apart` (3,) in field coordinates."""
         if not self.arguments:
             return apart
         # Places at another height are also shifted sideways.
@@ -155,11 +149,7 @@ BRICK = kernel_constant("include/bricks.h", "BRICK")
 
 @dataclass(frozen=True)
 class BrickRanges:
-    """The lowest and highest value of every brick, on the device.
-
-    ranges_d: buffer, (bk, bj, bi, 2) of the voxels' type
-    shape: (bi, bj, bk)
-    """
+    """Lowest and highest value of every brick, (bk, bj, bi, 2) of the voxels' type; the shape is (bi, bj, bk)."""
 
     ranges_d: Any
     shape: tuple[int, int, int]
@@ -168,10 +158,8 @@ class BrickRanges:
 
 @dataclass(frozen=True)
 class BrickStates:
-    """The result of comparing words of 32 samples with an iso value, one row of words for each row of bricks.
-
-    states_d: buffer, (bk, bj, words) uint8
-    extents_d: buffer, (bk, bj, 2) uint16
+    """The result of comparing words of 32 samples with an iso value, one row of words for each row of bricks: states_d
+    (bk, bj, words) uint8, extents_d (bk, bj, 2) uint16.
     """
 
     states_d: Any
@@ -196,13 +184,7 @@ def measure_bricks(
     *,
     stopwatch: Stopwatch | None = None,
 ) -> BrickRanges:
-    """Find the lowest and highest value of each brick of 8 x 8 x 8 voxels.
-
-    voxels_d: buffer, (nk, nj, ni) of `dtype`, without NaN
-    shape_ijk: (ni, nj, nk)
-
-    Returns: Bricks at the upper ends of the volume may be smaller.
-    """
+    """Find the lowest and highest value of each brick of 8 x 8 x 8 voxels, or fewer at upper ends, none of them NaN."""
     ni, nj, nk = shape_ijk
     bi, bj, bk = (-(-n // BRICK) for n in shape_ijk)
     ranges_d = allocate(device, brick_bytes(shape_ijk, dtype))
@@ -216,14 +198,12 @@ def measure_bricks(
 def compare_bricks(
     device: Device, ranges: BrickRanges, level: Any, ni: int, border: int, *, stopwatch: Stopwatch | None = None
 ) -> BrickStates:
-    """Classify each word of 32 samples by its bricks: all outside (0), all inside (1) or mixed (2).
+    """Classify each word of 32 samples by its bricks, all outside (0), all inside (1) or mixed (2), and find the extent
+    of each row of bricks: the first word that is not all outside, and the one after the last.
 
     level: Lowest inside value.
-    ni: Number of voxels in a row.
     border: Word w begins at voxel ``32 * w - border``, and there are samples up to ``ni - 1 + border``. Samples beyond
-        the volume are ignored.
-
-    Returns: With the extent of each row of bricks: the first word that is not all outside, and the one after the last.
+    the volume are ignored.
     """
     _, bj, bk = ranges.shape
     words = -(-(ni + 2 * border) // 32)

@@ -66,12 +66,10 @@ class CrossingPlan:
     """Triangles in the rows of levels, as the kernel reads them.
 
     vertices: ndarray, shape (v, 3), float32. Scaled by a power of two, which changes no digit.
-    order: ndarray, shape (n,), int64. Triangle of each entry.
-    corners: ndarray, shape (n, 3), uint32
+    order, corners: ndarray, shape (n,) int64, (n, 3) uint32. Triangle of each entry, and its corners.
     low, high: ndarray, shape (n, 3), float32. Boxes of the entries.
     starts: ndarray, uint32. First entry of each row, and the number of entries.
-    levels: ndarray, shape (levels, 4), uint32
-    edges: ndarray, shape (levels,), float32
+    levels, edges: ndarray, shape (levels, 4) uint32, (levels,) float32
     """
 
     vertices: Float32Array
@@ -96,11 +94,7 @@ def prepare_crossings(device: Device) -> Program:
 
 
 def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> CrossingPlan:
-    """Enter the triangles into rows.
-
-    vertices: ndarray, shape (v, 3), float32
-    triangles: ndarray, shape (n, 3), uint32. At least one.
-    """
+    """Enter at least one triangle into rows."""
     scaled = np.ldexp(vertices, 11 - int(np.frexp(np.abs(vertices).max())[1]))
     low, high = _find_boxes(scaled, triangles)
     box = (high - low).T
@@ -182,18 +176,11 @@ def find_crossings(
     memory: int | None = None,
     steps: Steps | None = None,
 ) -> NDArray[np.int64]:
-    """Find the pairs of triangles that cut each other, see `clrecon.mesh.intersections.find_self_intersections`.
+    """Find the pairs of triangles that cut each other, (k, 2) int64, see
+    `clrecon.mesh.intersections.find_self_intersections`.
 
-    Small meshes, vertices in float64 and meshes for which the device has no room are looked at by the host alone, which
-    finds the same pairs.
-
-    vertices: ndarray, shape (v, 3), mm
-    triangles: ndarray, shape (n, 3), uint32
-    changed: ndarray, shape (n,), bool. Only pairs with one of these are found.
-    memory: Bytes that may be taken on the device; None is all that it has.
-    steps: Counts the triangles.
-
-    Returns: ndarray, shape (k, 2), int64. Numbers of triangles.
+    With `changed`, (n,) bool, only pairs with one of these.  Small meshes, vertices in float64 and meshes for which the
+    device has no room are looked at by the host alone, which finds the same pairs.  `steps` counts the triangles.
     """
     if len(triangles) < FEWEST or vertices.dtype != np.float32:
         return find_self_intersections(vertices, triangles, changed, steps=steps)
@@ -220,14 +207,10 @@ def prepare_near_faces(device: Device) -> Program:
 
 
 class DeviceBounds(SurfaceBounds):
-    """A surface to which distances are bounded on a device; its twin is `SurfaceBounds`.
+    """A surface, in mm near zero, to which distances are bounded on a device; its twin is `SurfaceBounds`.
 
-    The nearest point of each triangle is found, where the twin may take one near it: bounds are as short or shorter,
-    or within the limit.
-
-    vertices: ndarray, shape (n, 3), mm, near zero
-    triangles: ndarray, shape (m, 3), uint32
-    fans: As for `NearDistance`.
+    The nearest point of each triangle is found, where the twin may take one near it: bounds are as short or shorter, or
+    within the limit.  `fans` are as for `NearDistance`.
     """
 
     def __init__(

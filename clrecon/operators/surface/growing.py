@@ -43,11 +43,7 @@ _NEAR_MM = 2.0
 def find_cell_near(
     device: Device, grid: SampleGrid, classified: Classified, point: NDArray[np.float64]
 ) -> tuple[int, int, int]:
-    """Return the active cell (k, j, i) whose centre is nearest to a point.
-
-    classified: Inside mask of the whole grid.
-    point: ndarray, shape (3,), LPS mm
-    """
+    """Return the active cell (k, j, i), by the mask of the whole grid, whose centre is nearest to a point, LPS mm."""
     for reach in (_NEAR_MM, SEED_REACH_MM):
         found = _look(device, grid, classified, point, reach)
         if found is not None and found[1] <= reach:
@@ -369,11 +365,7 @@ def join_slabs(
 
 
 def grow(resident: DeviceVolume, grid: SampleGrid, classified: Classified, seeds: Seeds, stopwatch: Stopwatch) -> Grown:
-    """Find the components of active cells that hold a seed.
-
-    classified: Inside mask of the whole grid.
-    stopwatch: Runs already: the last kernels are not waited for.
-    """
+    """Find the components of active cells that hold a seed, from the inside mask of the whole grid, without waiting."""
     search = _Search(resident, grid, classified, stopwatch)
     runs = search.find_runs()
     if runs.total == 0:
@@ -387,13 +379,7 @@ def grow(resident: DeviceVolume, grid: SampleGrid, classified: Classified, seeds
 def find_components(
     resident: DeviceVolume, grid: SampleGrid, classified: Classified, stopwatch: Stopwatch
 ) -> tuple[int, int]:
-    """Find all components of active cells.
-
-    classified: Inside mask of the whole grid.
-
-    Returns:
-    count, cells: Components, and active cells.
-    """
+    """Count all components of active cells of the inside mask of the whole grid, and these cells."""
     search = _Search(resident, grid, classified, stopwatch)
     with stopwatch.running(resident.device):
         runs = search.find_runs()

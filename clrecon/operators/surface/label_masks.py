@@ -70,11 +70,7 @@ def prepare_survey(device: Device, label_dtype: DTypeLike = np.uint8) -> Program
 def survey_labels(
     labels: LabelMap, device: Device, memory: int | None, stopwatch: Stopwatch
 ) -> tuple[dict[int, Box], NDArray[np.integer[Any]]]:
-    """Return the box (k, j, i) of each label and the samples around it, and the table of `count_faces`.
-
-    labels: Label map with at least one label.
-    memory: Bytes that may be taken on the device; None is all that it has.
-    """
+    """Return the box (k, j, i) of each label, one at least, with samples around it, and counted faces."""
     try:
         surveyed = _survey(labels, device, memory, stopwatch)
     except DeviceMemoryError:

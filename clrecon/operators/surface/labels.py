@@ -65,15 +65,11 @@ def each_label(
     extract: Callable[[Held, int, Box], Made],
     warnings: list[str],
 ) -> Iterator[tuple[int, Made]]:
-    """Yield labels with their results, in order.
+    """Yield labels with their results, in order: `hold` uploads what a group of labels shares, `extract` makes the
+    result of one.
 
     If the device has no room for a group, its remaining labels are processed one by one; a single label is tried once
     more, with nothing else on the device.
-
-    groups: Labels that are processed together.
-    hold: Uploads the data that a group shares.
-    extract: Makes the result of one label.
-    warnings: Gets a line each time that the device had no room.
     """
     waiting, retried = list(groups), set[int]()
     while waiting:

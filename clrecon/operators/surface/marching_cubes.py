@@ -42,13 +42,11 @@ def load_cells(device: Device, grown: bool = False) -> Program:
 
 @dataclass(frozen=True)
 class Classified:
-    """The results of `marching_cubes.classify` for one slab, on the device.
+    """The results of `marching_cubes.classify` for one slab, on the device: mask_d, (gk, gj, words) uint32, whose
+    crossed edges have the vertices, and row_extents_d, (gk, gj) ushort2.
 
-    mask_d: buffer, (gk, gj, words) uint32. Its crossed edges have the vertices.
-    row_extents_d: buffer, (gk, gj) ushort2
-    grown_d, grown_extents_d: For a part of a surface: the samples of the whole grid whose edges have vertices, see
-        cl/surface/growing.cl, and their extents.
-    first_grown: Slice of them that the slab begins with.
+    For a part of a surface `grown_d` and `grown_extents_d` are the samples of the whole grid whose edges have vertices,
+    see cl/surface/growing.cl, and their extents; the slab begins with slice `first_grown` of them.
     """
 
     mask_d: Any
@@ -70,9 +68,8 @@ class Classified:
 
 @dataclass(frozen=True)
 class Counted:
-    """The results of `count` for one slab, on the device, and the totals of the slab's own rows.
-
-    `cells` exists if the topology is that of the trilinear field.
+    """The results of `count` for one slab, on the device, and the totals of the slab's own rows; `cells` with the
+    topology of the trilinear field.
     """
 
     row_offsets_d: Any
@@ -92,7 +89,7 @@ class Counted:
 def count(device: Device, slab: Slab, classified: Classified, stopwatch: Stopwatch, voxels_d: Any = None) -> Counted:
     """Passes 2 to 4: count vertices and triangles, find where those of each word begin, and which words have any.
 
-    voxels_d: Slices ``slab.voxel_slices`` of the volume; needed for the topology of the trilinear field.
+    The topology of the trilinear field needs slices ``slab.voxel_slices`` of the volume.
     """
     grid, rows = slab.grid, slab.counted_rows
     program = load_cells(device, classified.is_part)
@@ -194,12 +191,8 @@ def split_steps(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
 
 @dataclass(frozen=True)
 class Placement:
-    """The places of the samples of a grid in mm, in the form for emit_vertices.
-
-    slice_frames: ndarray, shape (gk, 9, 4), float32
-    steps: ndarray, shape (4, 4), float32
-    margin: ndarray, shape (4,), float32
-    origin: ndarray, shape (3,), float64, or None. Origin of the device's positions, see `find_vertex_origin`.
+    """The places of the samples of a grid in mm, in the form for emit_vertices: slice_frames (gk, 9, 4), steps (4, 4),
+    margin (4,), float32; `origin` is that of the device's positions, see `find_vertex_origin`.
     """
 
     slice_frames: NDArray[np.float32]
@@ -269,10 +262,7 @@ def too_many(vertices: int, triangles: int) -> DeviceError:
 
 
 class Emission:
-    """Passes 3 and 4: the mesh of a slab, on the device until it is downloaded.
-
-    voxels_d: Slices ``slab.voxel_slices`` of the volume.
-    """
+    """Passes 3 and 4: the mesh of a slab, on the device until it is downloaded, from slices ``slab.voxel_slices``."""
 
     def __init__(
         self, device: Device, slab: Slab, program: Program, voxels_d: Any, classified: Classified, counted: Counted,
@@ -296,10 +286,7 @@ class Emission:
         self._items = -(-counted.active_words // int(device.kernel_variants["WORDS_PER_ITEM"]))
 
     def vertices(self, iso_level: float, **label_arguments: Any) -> None:
-        """Launch the writing of positions and normals; it may be repeated at another level.
-
-        `label_arguments` are additional arguments of emit_vertices in a program that was built with labels.
-        """
+        """Launch the writing of positions and normals, with those of labels; it may be repeated at another level."""
         if not self._counted.vertices:
             return
         rule = self._slab.grid.rule

@@ -116,11 +116,10 @@ DECIMATED_SHARE = 0.9
 
 @dataclass(frozen=True)
 class Method:
-    """A method of marching cubes.
+    """A method of marching cubes, `what` it is in words; `on_device` by the kernels, else in numpy, as a row for
+    comparisons.
 
-    what: In words.
-    on_device: Extracted by the kernels; else in numpy, as a row for comparisons.
-    decimates: {"", "quadric", "bounded"}
+    It `decimates` "", "quadric" or "bounded".
     """
 
     name: str
@@ -146,11 +145,7 @@ METHODS = {
 def check_method(
     method: str, *, grows: bool = False, vertex_rule: str = "linear", topology: str = "separated", plain: bool = True
 ) -> Method:
-    """Return a method of the table.
-
-    grows: Seeds are given.
-    plain: The surface is that of one iso value and what lies above it.
-    """
+    """Return a method of the table; `plain`: the surface of what lies above one iso value."""
     if method not in METHODS:
         raise UsageError(f"there is no {name_parameter('method', method)}: it is one of {', '.join(METHODS)}")
     chosen, said = METHODS[method], name_parameter("method", method)

@@ -25,12 +25,9 @@ SEED_REACH_MM = 10.0
 
 @dataclass(frozen=True)
 class Seeds:
-    """Seeds of one surface; the components of all of them together are grown.
+    """Seeds of one surface; the components of all of them together are grown, with `auto` the largest components too.
 
-    auto: Take the largest components too.
-    points: ndarray, shape (n, 3), float64, LPS mm
-    voxels: ndarray, shape (nk, nj, ceil(ni / 32)), uint32, or None. Bits of the voxels that are seeds.
-    names: What was asked for, for the report.
+    `points` are (n, 3), float64, LPS mm; `voxels` bits of the voxels that are seeds, (nk, nj, ceil(ni / 32)) uint32.
     """
 
     auto: bool
@@ -40,15 +37,14 @@ class Seeds:
 
     @classmethod
     def read(cls, grow_from: Any, resident: DeviceVolume) -> Seeds:
-        """Read the parameter ``grow_from`` of `extract_isosurface`.
+        """Read the parameter ``grow_from`` of `extract_isosurface`: "auto", (3,) float, LabelMap, (LabelMap, label),
+        Mask, or a list of these.
 
         Only those parts of the surface are made whose cells hang together with a seed, through faces of which one to
-        three corners are inside; triangles of other parts are never made.
-
-        grow_from: "auto", (3,) float, LabelMap, (LabelMap, label), Mask, or a list of these. A point in LPS mm grows
-            from the nearest cell of the surface, which is not more than `SEED_REACH_MM` away. A label or mask grows all
-            parts that have one of its voxels at their inner side.  "auto" takes the parts with at least `AUTO_SHARE` of
-            the cells of the largest.
+        three corners are inside; triangles of other parts are never made.  A point in LPS mm grows from the nearest
+        cell of the surface, which is not more than `SEED_REACH_MM` away. A label or mask grows all parts that have one
+        of its voxels at their inner side.  "auto" takes the parts with at least `AUTO_SHARE` of the cells of the
+        largest.
         """
         items = _split(grow_from)
         points: list[NDArray[np.float64]] = []

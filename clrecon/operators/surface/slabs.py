@@ -19,7 +19,7 @@ BRICKS = "brick ranges"
 class SampleGrid:
     """The samples of a volume with its border, and their packing in the inside mask.
 
-    grows: Only a part of the surface is made, for which bits of the whole grid stay on the device.
+    If only a part of the surface is made (`grows`), bits of the whole grid stay on the device.
     """
 
     volume: Volume
@@ -55,9 +55,7 @@ class SampleGrid:
 
     @property
     def winds_backwards(self) -> bool:
-        """True where the winding of the case table is reversed: in a left-handed volume, or to enclose values below the
-        level.
-        """
+        """The winding of the case table is reversed: in a left-handed volume, or to enclose values below the level."""
         return is_left_handed(self.volume.affine) != (self.rule.inside == "below")
 
 

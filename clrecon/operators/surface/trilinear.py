@@ -61,8 +61,7 @@ def count_cells(
 ) -> CellVertices:
     """Count the slab's triangles again, in place, and the vertices inside cells, which follow those of each slice.
 
-    flags_d, row_counts_d, word_triangles_d: Results of count_rows: words with work, counts of each row, triangles of
-        the row before each word.
+    Of count_rows are: words with work, counts of each row, triangles of the row before each word.
     """
     grid, rows = slab.grid, slab.counted_rows
     row_vertices_d = allocate(device, 4 * rows)
@@ -94,11 +93,10 @@ def emit_cells(
     first_vertex: int,
     stopwatch: Stopwatch,
 ) -> None:
-    """Write the triangles of the slab and the vertices inside its cells.
+    """Write the triangles of the slab and the vertices inside its cells, after `first_vertex` vertices of earlier
+    slabs.
 
-    tables: ``slice_frames``, ``steps`` and ``margin``, as emit_vertices takes them.
-    output: The buffers ``positions``, ``normals`` and ``triangles``.
-    first_vertex: Number of vertices of all earlier slabs.
+    `tables` are as emit_vertices takes them; `output` has the buffers ``positions``, ``normals`` and ``triangles``.
     """
     program = prepare_trilinear(device, slab.grid.volume.voxels.dtype)
     cells: CellVertices = counted.cells

@@ -34,9 +34,8 @@ MOST_RADIUS_MM = 8.0
 class ShellThickness(Record):
     """How thick a shell of bone is.
 
-    limit_mm: Two voxels, by their largest step: what is not thicker is not resolved.
-    resolved_share: Share of the shell's voxels at places that are thicker.
-    median_mm, p95_mm: Of the voxels at these places, to a voxel; None where there are none.
+    What is not thicker than `limit_mm`, two voxels by their largest step, is not resolved; the other figures are of the
+    `resolved_share` of its voxels, at places that are thicker, None where there are none.
     """
 
     limit_mm: float

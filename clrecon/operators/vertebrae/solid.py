@@ -34,13 +34,10 @@ AXIAL_COSINE = 0.7
 
 @dataclass(frozen=True)
 class LabelCrop:
-    """A label with its surroundings.
+    """A label with its surroundings: the volume around it, and the same part of the label map, on its own grid.
 
-    volume: The voxels around the label, at their places in the patient.  Axes are in the order that makes the slices as
-        axial as they can be; only those of uneven stacks stay.
-    labels: The same part of the label map, on its own grid.
-    inside_share: Share of the label's voxels that lie in the whole volume, above 0.
-    axial: The slices are axial within 45 degrees.
+    Axes are in the order that makes the slices as axial as they can be, `axial` within 45 degrees; only those of uneven
+    stacks stay.  `inside_share` of the label's voxels, above 0, lie in the whole volume.
     """
 
     volume: Volume

@@ -20,10 +20,8 @@ LEAST_ITEMS = 501
 
 @dataclass(frozen=True)
 class Check:
-    """One check of the self-test.
+    """One check of the self-test, of kernels that it launches and whose results it compares.
 
-    name: What is tested, for people.
-    kernels: Kernels that it launches and whose results it compares.
     run: Takes the device, returns what was compared.  Raises `DeviceError` with what is wrong.
     variants: For a kernel file the ``-D`` macros, other than types and those of the device, that it is built with.
     """
@@ -45,18 +43,13 @@ def require_equal(found: ArrayLike, expected: ArrayLike, what: str) -> None:
 
 
 def require_close(found: ArrayLike, expected: ArrayLike, allowed: float, what: str) -> float:
-    """Refuse numbers that are more than `allowed` apart; return the largest distance.
-
-    NaN must be where NaN is expected.
-    """
+    """Refuse numbers more than `allowed` apart, or with NaN at other places; return the largest distance."""
     return require_share(found, expected, allowed, 0.0, what)
 
 
 def require_share(found: ArrayLike, expected: ArrayLike, allowed: float, share: float, what: str) -> float:
-    """Refuse numbers of which more than a share is more than `allowed` apart; return the largest distance of the
-    others.
-
-    share: Between 0 and 1: float32 takes the other side of an edge at some elements.
+    """Refuse numbers of which more than a share is more than `allowed` apart, as float32 takes the other side of an
+    edge at some elements; return the largest distance of the others.
     """
     one, other = np.asarray(found, dtype=np.float64), np.asarray(expected, dtype=np.float64)
     if one.shape != other.shape:
@@ -74,11 +67,7 @@ def require_share(found: ArrayLike, expected: ArrayLike, allowed: float, share: 
 
 
 def require_whole(report: Mapping[str, Any]) -> None:
-    """Refuse a result that was made in parts.
-
-    Wrong sums look like a lack of memory.  An operator then goes on with thinner slabs, perhaps so thin that a kernel's
-    fault does not show.
-    """
+    """Refuse a result made in parts: wrong sums look like a lack of memory, and thin slabs may hide a fault."""
     words = [text for text in report["warnings"] if "continued with" in text]
     if words or report.get("slabs", 1) != 1:
         raise DeviceError(f"made in parts: {'; '.join(words) or 'the device has too little memory'}")

@@ -23,8 +23,8 @@ LONG_SECONDS = 2.0
 def run_method(request: Request) -> dict[str, Any]:
     """Run a method: first, warm, its picture; its arrays are files of the request's folder afterwards.
 
-    Returns: ``state`` ("done", "failed", "declined" or "missing"), and with "done" the figures, see `_measure`; else
-        ``error``, what kind it is of, and why.
+    Return its ``state`` ("done", "failed", "declined" or "missing"), and with "done" the figures, see `_measure`; else
+    ``error``, what kind it is of, and why.
     """
     from clrecon.opencl import has_hung_commands
 

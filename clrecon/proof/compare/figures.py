@@ -42,12 +42,9 @@ Segments = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane across an axis of the volume.
+    """A plane across an `axis` (of i, j, k) of the volume at an index coordinate.
 
-    axis: Of (i, j, k).
-    at: Index coordinate along it.
-    across, down: The axes that run to the right and down in the picture.
-    flip: The axis `down` runs upward instead.
+    The axes `across` and `down` run to the right and down in the picture, with `flip` the latter upward.
     """
 
     name: str
@@ -59,11 +56,7 @@ class Plane:
 
 
 def find_planes(volume: Volume, iso_value: float) -> tuple[list[Plane], NDArray[np.float64]]:
-    """Choose two planes through the middle of what is inside.
-
-    Returns:
-    box: ndarray, shape (2, 3). Lowest and highest index (i, j, k) of the voxels that are inside.
-    """
+    """Choose two planes through the middle of what is inside; return its box too: lowest and highest (i, j, k)."""
     box = inside_box(volume, iso_value)
     middle = np.floor(box.mean(axis=0))
     wanted = (("across the body", 2, 0, 1, False), ("from the side", 0, 1, 2, bool(volume.affine[2, 2] > 0)))
@@ -219,9 +212,8 @@ CONTROLS = {
 
 
 def along_slices(volume: Volume) -> dict[str, Any]:
-    """Return camera and size of a picture that looks along the slices, pixel for pixel with the middle one.
-
-    The camera stands before the first slice; what runs along a row is to the right, as in the slice.
+    """Return camera and size of a picture that looks along the slices from before the first one, pixel for pixel with
+    the middle one and with what runs along a row to the right, as there.
     """
     ni, nj, nk = volume.shape_ijk
     di, dj, _ = volume.spacing
@@ -256,12 +248,10 @@ def middle_slice(volume: Volume, size: tuple[int, int], offset: int = 0) -> NDAr
 def measure_against_slice(
     volume: Volume, pictures: Mapping[str, NDArray[np.uint8]], size: tuple[int, int]
 ) -> dict[str, Any]:
-    """Compare pictures of methods with the middle slice, and pictures that show what that is worth.
+    """Compare pictures of methods, (height, width, 3) uint8, with the middle slice, and pictures that show what that is
+    worth.
 
-    pictures: mapping of str to ndarray, shape (height, width, 3), uint8
-    size: (width, height)
-
-    Returns: ``window_hu``, ``slice``; ``methods`` and ``controls``: ``ssim`` and ``mse`` by name.
+    Return ``window_hu``, ``slice``; ``methods`` and ``controls``: ``ssim`` and ``mse`` by name.
     """
     wanted = middle_slice(volume, size)
     controls = make_control_pictures(wanted, middle_slice(volume, size, 1))
@@ -288,10 +278,7 @@ Image = NDArray[np.uint8]
 
 
 def choose_camera(volume: Volume, box: NDArray[np.float64]) -> dict[str, Any]:
-    """Return the parameters of the camera that looks at what is inside.
-
-    box: ndarray, shape (2, 3). Lowest and highest index (i, j, k), see `clrecon.proof.compare.figures.find_planes`.
-    """
+    """Return the parameters of the camera that looks at what is inside; its box is that of `find_planes`."""
     low, high = box
     ends = np.stack([low - 1.0, high + 1.0])
     places = volume.ijk_to_lps([[ends[bit >> axis & 1, axis] for axis in range(3)] for bit in range(8)])
@@ -361,9 +348,8 @@ class Figures:
     """The pictures of a comparison.
 
     work: Folder with the arrays of the methods.
-    box: ndarray, shape (2, 3)
-    views: The picture of each method from the one camera.
-    contours: For each plane the lines of each method.
+    box: As of `find_planes`.
+    views, contours: The picture of each method from the one camera; for each plane the lines of each method.
     images: What is written as PNG, by file name without extension.
     same: Methods whose surface is that of the reference.
     """

@@ -54,25 +54,21 @@ def join(names: list[str]) -> str:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MethodRecord(Record):
-    """A row of the comparison.
+    """A row of the comparison; docs/contract.md and docs/compare.md explain the measures.
 
-    name, title, what: See `clrecon.proof.compare.methods.Compared`.
-    makes: {"mesh", "cloud", "picture"}
-    peer: Library of somebody else; empty for clrecon's own.
+    name, title, what, makes: See `clrecon.proof.compare.methods.Compared`.
     state: {"done", "failed", "declined", "missing"}
     first_s, warm_s: From voxels in memory to the result in memory, in a new process and again (median); no reading, no
-        drawing.
+    drawing.
     first_parts_s, warm_parts_s: By part: ``read``, ``build``, ``upload``, ``kernels``, ``host``, ``download``,
-        ``draw``.
+    ``draw``.
     kernels_ms: Of the warm run, as the device tells it; None without kernels.
-    memory_bytes: Most memory of its process, the interpreter and the scan included.
-    memory_own_bytes: The same beyond what the process had before it began.
-    growing: What was left out, see `clrecon.extract_isosurface`.
-    quality, cells, slices, surfaces, truth, points_mm, pictures: Measures, see docs/compare.md.
+    memory_bytes, memory_own_bytes: Most memory of its process, the interpreter and the scan included, and what of it
+        the
+    process did not have before it began.
     reasons: Why a measure is missing.
     small: Of ray casting: ``size``, ``first_s``, ``warm_s`` of a small picture, and ``scaled_s``, those of the full one
-        reckoned from it where it was not made.
-    picture, difference: Files.
+    reckoned from it where it was not made.
     """
 
     name: str
@@ -116,16 +112,7 @@ class MethodRecord(Record):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CompareReport(RunReport):
-    """The report of a comparison: a `RunReport` with further entries, which docs/compare.md explains.
-
-    date: Day, ISO 8601.
-    iso_value_hu, iso_level_hu: The level, and where the surface lies between integers.
-    versions: Of Python and of each library that works.
-    read_s: ``first`` and ``warm`` seconds of reading the input.
-    size: [int, int]. Width and height of the pictures.
-    slices: Pictures of slices with contours: ``axis``, ``index``, ``file``, ``detail``.
-    paper: The table against the middle slice.
-    """
+    """The report of a comparison: a `RunReport` with further entries, which docs/compare.md explains."""
 
     date: str
     shape_ijk: list[int]
@@ -164,10 +151,7 @@ WIDER_MM = 5e-3
 
 
 def find_findings(methods: Sequence[MethodRecord], reference: str, *, with_truth: bool) -> list[str]:
-    """Return the findings, each a sentence.
-
-    reference: Name of the method that others are compared with.
-    """
+    """Return the findings, each a sentence; `reference` is the name of the method that others are compared with."""
     done = {method.name: method for method in methods if method.is_done}
     found = [*_of_time(done, reference), *_of_same(done, reference), *_of_golden(done), *_of_growing(done, reference)]
     found += [*_of_decimation(done, reference), *_of_clouds(done, with_truth), *_of_rays(done)]

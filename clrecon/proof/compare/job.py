@@ -64,10 +64,7 @@ def check_report_folder(path: str | os.PathLike[str]) -> Path:
 
 
 class MadeFolder(StagedFolder):
-    """The folder while it is filled.
-
-    path: Its temporary place.
-    """
+    """The folder while it is filled, at its temporary `path`."""
 
     def __init__(self, path: str | os.PathLike[str], made: Path, folder: Path):
         super().__init__(path, made, folder, 0)
@@ -117,11 +114,9 @@ def make_comparison(
     Each method runs in a process of its own, one after another: the first run in a new process, then warm ones.  A
     method that fails, or whose library is not installed, is a row that says so.
 
-    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
+    source: See `clrecon.reading.read_volume`.
     output: Folder for ``index.html``, ``report.json`` and pictures: a new or empty one, or that of an earlier
-        comparison, which is replaced.
-    no_clobber: A folder that holds anything stays and is an `OutputError`.
-    progress: ``progress(stage, done, total)``.
+    comparison, which is replaced; with `no_clobber` a folder that holds anything stays and is an `OutputError`.
     """
     settings = settings or CompareSettings()
     progress = progress or ignore_progress

@@ -27,8 +27,8 @@ MEASURES = ("quality", "cells", "slices", "surfaces", "truth", "points")
 class Judge:
     """Measures of one scan, one level and one reference.
 
-    told: ``folder`` with the arrays; ``reference``, name of a method, None where it failed; ``iso_value``; ``closed``;
-        ``truth``, the folder of a phantom, or None.
+    They are `told` the ``folder`` with the arrays; ``reference``, name of a method, None where it failed;
+    ``iso_value``; ``closed``; ``truth``, the folder of a phantom, or None.
     """
 
     def __init__(self, told: Mapping[str, Any]):
@@ -56,10 +56,7 @@ class Judge:
         return find_mesh_cells(self.reference, self._volume, name=self._reference or "")
 
     def measure(self, method: str) -> dict[str, Any]:
-        """Measure what a method made.
-
-        Returns: An entry for each of `MEASURES`, None where it does not apply; and ``reasons``, why a measure failed.
-        """
+        """Measure what a method made: each of `MEASURES`, None where it does not apply, and ``reasons`` of failures."""
         mesh, points = load_mesh(self._folder, method), load_array(self._folder, method, "points")
         found: dict[str, Any] = dict.fromkeys(MEASURES)
         reasons: dict[str, str] = {}

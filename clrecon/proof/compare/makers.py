@@ -28,10 +28,7 @@ BACKGROUND = "black"
 
 
 def draw_mesh(mesh: Mesh, camera: Camera, size: tuple[int, int], *, device: Device | None = None) -> Image:
-    """Draw a mesh, shaded by the normals of its triangles alone, so that pictures differ only where surfaces do.
-
-    Returns: ndarray, shape (height, width, 3), uint8
-    """
+    """Draw a mesh, shaded by the normals of its triangles alone, so that pictures differ only where surfaces do."""
     from clrecon.operators.rays.render import render
     from clrecon.rendering.pictures.object_looks import MeshLook
 
@@ -41,10 +38,7 @@ def draw_mesh(mesh: Mesh, camera: Camera, size: tuple[int, int], *, device: Devi
 
 
 def draw_points(cloud: PointCloud, camera: Camera, size: tuple[int, int], *, device: Device | None = None) -> Image:
-    """Draw a cloud as discs.
-
-    Returns: ndarray, shape (height, width, 3), uint8
-    """
+    """Draw a cloud as discs."""
     from clrecon.operators.rays.point_pictures import PointPictures
     from clrecon.rendering.pictures.object_looks import PointLook
 
@@ -62,13 +56,9 @@ FILTERS = {"vtk-mc": "vtkMarchingCubes", "vtk-fe": "vtkFlyingEdges3D"}
 
 
 def extract_by_vtk(volume: Volume, iso_value: float, name: str, closed: bool) -> Mesh:
-    """Extract a surface by one of VTK's filters, with its own normals on, on all cores where it can.
+    """Extract a surface by VTK's filter "vtk-mc" or "vtk-fe", with its own normals on, on all cores where it can.
 
-    iso_value: HU.
-    name: {"vtk-mc", "vtk-fe"}
-    closed: As `clrecon.extract_isosurface`: a layer of air lies around the volume.
-
-    Returns: In LPS mm; its report has ``cells`` and ``seconds`` {extract, place}.
+    With `closed` a layer of air lies around the volume.  The report has ``cells`` and ``seconds`` {extract, place}.
     """
     from vtkmodules import vtkFiltersCore
     from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
@@ -136,10 +126,7 @@ class Scene:
 
 @dataclass
 class Made:
-    """What one run made.
-
-    seconds: By part, without drawing.
-    """
+    """What one run made, and its seconds by part, without drawing."""
 
     product: Any
     seconds: dict[str, float]
@@ -264,12 +251,7 @@ _MAKERS: dict[str, Callable[[Scene], Product]] = {
 
 
 def draw(scene: Scene, product: Any, view: str) -> Any:
-    """Draw what a method made.
-
-    view: {"view", "along"}. Name of `Request.views`.
-
-    Returns: ndarray, shape (height, width, 3), uint8. Before black.
-    """
+    """Draw what a method made, before black; `view` is "view" or "along", a name of `Request.views`."""
 
     camera, size = scene.request.views()[view]
     if isinstance(product, Mesh):

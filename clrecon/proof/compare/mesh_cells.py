@@ -34,9 +34,8 @@ def meets_box(corners: NDArray[np.float64], half: float) -> NDArray[np.bool_]:
     Two convex bodies are apart exactly where their shadows on one of 13 lines are: the normals of the cube's faces, the
     normal of the triangle, and the cross products of its edges with those of the cube.
 
-    corners: ndarray, shape (n, 3, 3), float64. Triangle, corner, axis; each triangle relative to the middle of its
-        cube.
-    half: Half the length of the cube's edges.
+    corners: ndarray, shape (n, 3, 3), float64. Triangle, corner, axis; relative to the middle of its cube, whose edges
+    are twice `half` long.
     """
     x = np.ascontiguousarray(corners.transpose(1, 2, 0))  # corner, axis, triangle
     meets = ((x.min(axis=0) <= half) & (x.max(axis=0) >= -half)).all(axis=0)
@@ -138,11 +137,9 @@ def _unpack(keys: IntArray) -> IntArray:
 class CellOverlap(Record):
     """How far the cells of a surface agree with those of a reference.
 
-    reference: Name of the reference set.
-    cells, reference_cells, common_cells: Cells of the surface, of the reference, and of both.
     cells_outside: Cells of the surface outside of the grid and its border of one voxel.
     recall: Share of the reference's cells that the surface passes through: the repetition rate of characteristic voxels
-        of Liu et al. 2019.
+    of Liu et al. 2019.
     precision: Share of the surface's cells that are the reference's too.
     dice, jaccard: 2 common / (cells + reference cells); common / all cells of either.
     """

@@ -264,12 +264,10 @@ Keys = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Lattice:
-    """Points that divide each cell between voxel centres alike.
+    """Points that divide each cell between voxel centres alike, `finer` along each axis.
 
-    finer: Points in a cell along each axis.
-    offsets: Where the points of a cell begin, in steps of the lattice, from 0 to below 1.
-    border: Layers of samples around the voxels.
-    cells_ijk: Cells along each axis, those of the border included.
+    They begin at `offsets` steps of the lattice, from 0 to below 1; `cells_ijk` are those along each axis, with
+    `border` layers of samples around the voxels.
     """
 
     finer: int
@@ -317,15 +315,11 @@ def exclusive_or(one: Keys, other: Keys) -> Keys:
 
 
 def find_level_runs(volume: Volume, rule: IsoRule, lattice: Lattice, told: Callable[[int], None]) -> Keys:
-    """Find the runs of points at which the trilinear HU reach the level of a rule.
+    """Find the ends of runs of points, (n,) int64, ascending, at which the trilinear HU reach the one level of a rule
+    or more.
 
     A trilinear field has its extremes at the corners of a cell: only cells with corners on both sides have points on
-    both sides.
-
-    rule: Of one level, with what lies above it inside.
-    told: Called with the number of layers of cells that are done.
-
-    Returns: ndarray, shape (n,), int64, ascending. Ends of runs.
+    both sides.  `told` is called with the number of layers of cells that are done.
     """
     layers = lattice.cells_ijk[2]
     ni, nj, _ = volume.shape_ijk

@@ -36,11 +36,9 @@ class TruthDistance(Record):
 
     bias_mm: Mean of the signed distances, positive outside: what the level does.
     scatter_mm: Standard deviation of the signed distances about their mean: what the method does.
-    p95_mm, max_mm: 95th percentile and largest of the distances without their sign.
-    normals_median_deg, normals_p95_deg: Angle between the triangles' normals and those of the true surface: median,
-        95th percentile.
-    outer_share: Share of the points that are of the outer side: within reach of the true surface, and facing as it
-        does.
+    p95_mm, max_mm: Of the distances without their sign.
+    normals_median_deg, normals_p95_deg: Angle between the triangles' normals and those of the true surface.
+    outer_share: Share of the points within reach of the true surface that face as it does.
     samples: Points on the whole mesh.
     """
 

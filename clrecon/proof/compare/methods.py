@@ -17,13 +17,10 @@ MESH, CLOUD, PICTURE = "mesh", "cloud", "picture"
 
 @dataclass(frozen=True)
 class Compared:
-    """A method that is compared.
+    """A method that is compared, by the user's name and by its title in tables and plots.
 
-    name: As the user names it.
-    title: In tables and plots.
-    makes: {"mesh", "cloud", "picture"}
-    on_device: True: its kernels run on the OpenCL device; False: on the CPU alone.
-    peer: The library of somebody else that does the work; empty for clrecon's own.
+    It makes a "mesh", "cloud" or "picture", by kernels on the device or on the CPU alone, by the library of a `peer`
+    or, if that is empty, by clrecon.
     """
 
     name: str
@@ -55,10 +52,7 @@ COMPARED = {
 
 
 def choose_methods(names: Sequence[str], reference: str) -> tuple[Compared, ...]:
-    """Return the methods that run, in the order of the table, the reference among them.
-
-    names: Empty: all.
-    """
+    """Return the methods that run, all if there are no names, in the order of the table, the reference among them."""
     for name in (*names, reference):
         if name not in COMPARED:
             raise UsageError(f"there is no method {name!r:.60} to compare: they are {', '.join(COMPARED)}")
@@ -87,14 +81,7 @@ def _parse_names(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class CompareSettings(InputSettings):
-    """Settings of the compare job.
-
-    Options say in their help what they do; beside that:
-
-    methods: Names of `COMPARED`; empty: all of them.  The reference always runs.
-    iso_value: float or (float,). One level, above which is inside.
-    half_way: See `MeshSettings`.
-    """
+    """Settings of the compare job; the reference always runs, at one level, above which is inside."""
 
     methods: Sequence[str] = option(
         "--methods M[,M...]",

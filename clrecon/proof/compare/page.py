@@ -82,10 +82,7 @@ CUT = 2.2
 
 
 def plot_times(report: CompareReport, which: str) -> str:
-    """Return stacked bars of the parts of each method's time.
-
-    which: {"first", "warm"}
-    """
+    """Return stacked bars of the parts of each method's time, "first" or "warm"."""
     done = [record for record in report.methods if record.is_done]
     parts = {record.name: getattr(record, f"{which}_parts_s") for record in done}
     totals = {name: sum(own.values()) for name, own in parts.items()}
@@ -230,10 +227,7 @@ def _finish(figure: Any, name: str) -> str:
 
 
 def make_page(report: CompareReport, figures: Figures) -> str:
-    """Return the page.
-
-    figures: The pictures of the report.
-    """
+    """Return the page."""
     parts = (
         _section("What the numbers say", _findings(report)),
         _section("All methods", _main(report)),

@@ -31,14 +31,11 @@ _VOXELS, _PLACE = "voxels.npy", "place.npz"
 
 @dataclass(frozen=True)
 class Request:
-    """What one process does.
+    """What one process does with a method: the volume is in `folder`, which gets the results.
 
-    method: Name in `COMPARED`.
-    folder: Has the volume; gets the results.
     repeat: Warm runs.
     timeout: Seconds after which a device that finishes nothing hangs.
-    camera: Parameters of the `Camera` of the picture.
-    size: [int, int]. Width and height of the picture.
+    camera, size: Parameters of the `Camera` of the picture, and its width and height.
     along: Camera and size of a picture along the slices, for the table of the paper.
     """
 
@@ -165,13 +162,11 @@ def _describe_end(code: int) -> str:
 
 
 def measure_in_processes(told: Mapping[str, Any], methods: Mapping[str, int]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Measure what methods made in a process a core, and yield the figures of each method.
+    """Measure what methods made in a process a core, and yield each name with its figures, see `Judge.measure`; only
+    ``reasons`` where the process ended before.
 
     told: See `clrecon.proof.compare.judge.Judge`.
     methods: Names, and how much there is to measure of each.
-
-    Yields:
-    figures: See `Judge.measure`; only ``reasons`` where the process ended before.
     """
     parts = _share(methods, min(usable_cores(), MOST_JUDGES))
     lines: queue.Queue[tuple[int, bytes]] = queue.Queue()

@@ -42,12 +42,7 @@ BUSY_SHARE = 0.5
 def make_record(
     method: Compared, told: Mapping[str, Any], measured: Mapping[str, Any], read_s: Mapping[str, float]
 ) -> MethodRecord:
-    """Compose the row of a method.
-
-    told: See `clrecon.proof.compare.child.run_method`.
-    measured: See `clrecon.proof.compare.judge.Judge.measure`.
-    read_s: ``first`` and ``warm`` seconds of reading.
-    """
+    """Compose the row of a method from `run_method`, `Judge.measure`, and both seconds of reading."""
     done = told["state"] == "done"
     first, runs = (told["first"], told["warm"]) if done else ({}, [])
     warm = {part: statistics.median(run[part] for run in runs) for part in PARTS} if done else {}
@@ -119,13 +114,7 @@ def compose_report(
     warnings: Sequence[str],
     watch: Laps,
 ) -> CompareReport:
-    """Compose the report.
-
-    volume: What the methods got.
-    level: HU.
-    reason: Why it is that level.
-    warnings: Those of the volume come before them.
-    """
+    """Compose the report of what the methods got: a level in HU, why that one, and warnings."""
     certificate = dict(volume.report) if settings.keep_ids else dict(without_ids(volume.report))
     said = [str(text) for text in certificate.pop("warnings", [])]
     cores, free = usable_cores(), free_cores()

@@ -30,10 +30,8 @@ GROUPS = {"mesh": "surfaces", "cloud": "clouds", "picture": "pictures of the vox
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the main table.
+    """A column of the main table: `take` gives the number of a row, or None, `write` its text.
 
-    take: The number of a row, or None.
-    write: Its text.
     best: {"", "low", "high"}. Which end of the numbers of meshes is set in bold.
     meaning: One line.
     truth: Only with the truth of a phantom.

@@ -74,11 +74,7 @@ def _angle(across: float, up: float) -> float:
 
 
 def facts_of_series(settings: PhantomSettings, placement: Placement) -> dict[str, Any] | None:
-    """Describe slices that are uneven, missing or of several phases; None for an even stack.
-
-    Returns: ``uneven_mm``, ``missing`` (numbers from 1), ``phases``, and ``slice_positions_lps_mm`` of the first pixel
-        of each slice that is written.
-    """
+    """Describe slices that are uneven, missing or of several phases, in plain JSON types; None for an even stack."""
     if not (settings.uneven_mm or settings.missing or settings.phases > 1):
         return None
     written = [k for k in range(settings.slices) if k + 1 not in settings.missing]
@@ -173,18 +169,15 @@ def make_phantom(
 ) -> tuple[NDArray[np.int16], NDArray[np.float64], dict[str, Any]]:
     """Make a phantom in memory.
 
-    progress: Called as ``progress(stage, done, total)``.
-
     Returns:
     voxels: ndarray, shape (nk, nj, ni), int16. HU; of several phases the first.
     affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm, as the decimal strings of a written series give
-        it; of an uneven or gapped series that of the even one, and the truth has the positions.
+    it; of an uneven or gapped series that of the even one, and the truth has the positions.
     truth: Plain JSON types: ``kind, shape_ijk, affine_ijk_to_lps_mm, spacing_mm (di, dj, dk), tilt_deg, iso_value_hu``,
-        ``half_maximum_hu`` and ``surface`` (analytic shapes, else null), ``spine`` (centres of the vertebrae, the
-        marker on the patient's left and what is absent, else null), ``ghosts`` (the foreign slices, else null),
-        ``parts`` (scenes: each material with its label in `label_materials`, voxels, volume and voxels above 300 HU,
-        else null), ``noise_hu, point_spread_mm, seed, version, settings``; and ``series`` of one that is uneven, gapped
-        or phased.
+    ``half_maximum_hu`` and ``surface`` (analytic shapes, else null), ``spine`` (centres of the vertebrae, the marker on
+    the patient's left and what is absent, else null), ``ghosts`` (the foreign slices, else null), ``parts`` (scenes:
+    each material with its label in `label_materials`, voxels, volume and voxels above 300 HU, else null), ``noise_hu,
+    point_spread_mm, seed, version, settings``; and ``series`` of one that is uneven, gapped or phased.
     """
     placement = place_slices(settings)
     voxels, truth, _ = _make(settings, placement, progress)
@@ -194,12 +187,7 @@ def make_phantom(
 
 
 def label_materials(settings: PhantomSettings) -> LabelArray:
-    """Label each voxel of a scene with its material; this is the truth for the voxels of `make_phantom`.
-
-    settings: Of a kind that is a scene.
-
-    Returns: ndarray, shape (nk, nj, ni), uint8. Index in `clrecon.proof.phantom.MATERIALS`, see ``parts`` of the truth.
-    """
+    """Label each voxel of a scene with its material, an index in `MATERIALS`: the truth of `make_phantom`."""
     if not KINDS[settings.kind].is_scene:
         raise UsageError(f"a {settings.kind} is no scene of materials: its truth is a surface or a list of levels")
     return draw_scene(plan_scene(settings), settings, place_slices(settings).affine)[1]
@@ -240,16 +228,11 @@ def _check_replaceable(folder: Path) -> None:
 def write_phantom(
     out_folder: str | Path, settings: PhantomSettings, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Write a phantom as a DICOM CT series with a truth.json; a scene also with the label map materials.nrrd, a spine
-    with chosen levels, bend or facets with the label map levels.nrrd.
+    """Write a phantom as a DICOM CT series with a truth.json, which is returned, see `make_phantom`; a scene also with
+    the label map materials.nrrd, a spine with chosen levels, bend or facets with the label map levels.nrrd.
 
-    The series is written into a temporary folder beside `out_folder`, read back, and then renamed: `out_folder` is
-    either complete or untouched.
-
-    out_folder: A new or empty folder, or one that holds an earlier phantom and nothing else (then replaced).
-    progress: Called as ``progress(stage, done, total)``.
-
-    Returns: The truth, see `make_phantom`; the same as in truth.json.
+    The series is written into a temporary folder beside `out_folder`, read back, and then renamed: `out_folder`, new,
+    empty or with an earlier phantom and nothing else (then replaced), is either complete or untouched.
     """
     folder = resolve_target(out_folder)
     try:

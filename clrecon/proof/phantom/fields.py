@@ -55,10 +55,7 @@ def ellipsoid(x: Field, y: Field, z: Field, half: Point) -> Field:
 def capsule(
     x: Field, y: Field, z: Field, a: Point, b: Point, radius_a: float, radius_b: float, flatten: float = 1.0
 ) -> Field:
-    """Distance to a rod from `a` to `b` whose radius runs from `radius_a` to `radius_b`.
-
-    With ``flatten < 1`` the rod is stretched along z: its height is its width divided by `flatten`.
-    """
+    """Distance to a rod from `a` to `b`, its radii `radius_a` and `radius_b`, its height its width / `flatten`."""
     ax, ay, az = a[0], a[1], a[2] * flatten
     dx, dy, dz = b[0] - ax, b[1] - ay, b[2] * flatten - az
     length2 = dx * dx + dy * dy + dz * dz
@@ -110,14 +107,11 @@ def gradient_of(function: Function, points: Float64Array) -> tuple[Float64Array,
 def nearest_on_surface(
     function: Function, points: Float64Array, starts: Float64Array, rounds: int, damping: float = 0.5
 ) -> Float64Array:
-    """Move `starts` over the surface towards `points`.
+    """Move `starts`, (n, 3), over the surface towards `points`; return the distances of the nearest points on the way,
+    (n,) mm, infinite where the surface was not reached.
 
     function: Zero on the surface; its gradient is no zero near it.
-    points, starts: ndarray, shape (n, 3). mm; a start near the surface for each point.
     damping: Share of the way along the tangent plane that a round goes.
-
-    Returns: ndarray, shape (n,). Distance to the nearest point of the surface on the way; infinite where none was
-        reached.
     """
     best = np.full(len(points), np.inf)
     at = starts

@@ -27,10 +27,7 @@ _CHUNK = 1 << 21
 def map_slices(
     work: Callable[[int], None], count: int, stage: str = "slices", progress: Progress | None = None
 ) -> None:
-    """Call ``work(k)`` for every slice on a thread pool; each call may write only to its own slice.
-
-    `progress` is called as ``progress(stage, done, count)`` from the calling thread.
-    """
+    """Call ``work(k)``, which may write only to its own slice, on threads; this one tells the progress."""
     workers = max(1, min(os.cpu_count() or 1, 8, count))
     with ThreadPoolExecutor(workers) as pool:
         for done, _ in enumerate(pool.map(work, range(count)), start=1):
@@ -87,15 +84,11 @@ def _boundary_coverage(body: Body, points: Float64Array, steps: Float64Array, su
 def sample_occupancy(
     body: Body, affine: ArrayLike, shape_kji: tuple[int, int, int], subsamples: int = 6
 ) -> Float32Array:
-    """Partial volume: the share of every voxel's parallelepiped that lies inside `body`.
+    """Partial volume: the share of every voxel's parallelepiped inside `body`, (nk, nj, ni) float32, 0 to 1, iso value
+    0.5.
 
-    Exactly 0 or 1 away from the surface; near it the average over ``subsamples**3`` cells of the voxel.
-
-    affine: array_like, shape (4, 4). Index (i, j, k) to LPS mm; any invertible affine, shear included.
-    shape_kji: (nk, nj, ni)
-    subsamples: Cells along each of the voxel's three edges.
-
-    Returns: ndarray, shape (nk, nj, ni), float32. 0 to 1; its iso value is 0.5.
+    Exactly 0 or 1 away from the surface; near it the average over ``subsamples**3`` cells of the voxel.  The affine,
+    index (i, j, k) to LPS mm, is any invertible one, shear included.
     """
     matrix, shape = checked_affine(affine), _checked_shape(shape_kji)
     if subsamples < 1:
@@ -157,17 +150,10 @@ def apply_point_spread(
     progress: Progress | None = None,
     places: Float64Array | None = None,
 ) -> Float32Array:
-    """Blur `voxels` in place by a Gaussian of `sigma_mm` along each of the affine's three steps.
+    """Blur `voxels`, (nk, nj, ni), in place by a Gaussian of `sigma_mm` along each of the affine's three steps.
 
-    On a perpendicular stack this is the isotropic point spread; on a sheared one the blur between slices follows
-    the slice step, as the averaging of a moving table does.
-
-    voxels: ndarray, shape (nk, nj, ni), float32. Changed in place.
-    affine: array_like, shape (4, 4)
-    sigma_mm: Standard deviation; 0 does nothing.
-    places: ndarray, shape (nk,). k of each slice in the affine; default: 0, 1, 2 and so on.
-
-    Returns: `voxels`.
+    On a perpendicular stack this is the isotropic point spread; on a sheared one the blur between slices follows the
+    slice step, as the averaging of a moving table does.  `places` are k of each slice in the affine, else 0, 1, 2...
     """
     if not (math.isfinite(sigma_mm) and sigma_mm >= 0.0):
         raise UsageError(f"the point spread must be 0 mm or more, got {sigma_mm}")
@@ -190,13 +176,7 @@ def apply_point_spread(
 
 
 def add_noise(voxels: Float32Array, sigma_hu: float, seed: int) -> Float32Array:
-    """Add white Gaussian noise in place; every slice has its own stream, so threads do not change the result.
-
-    voxels: ndarray, shape (nk, nj, ni), float32. HU, changed in place.
-    sigma_hu: Standard deviation in HU.
-
-    Returns: `voxels`.
-    """
+    """Add white Gaussian noise in place; every slice has its own stream, so threads do not change the result."""
     if sigma_hu > 0.0:
 
         def disturb(k: int) -> None:

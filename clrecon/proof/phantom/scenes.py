@@ -98,11 +98,10 @@ DENSE_HU = 300.0
 
 @dataclass(frozen=True)
 class Part:
-    """One solid of one material.
+    """One solid of one of `MATERIALS`.
 
-    material: One of `MATERIALS`.
     distance: Takes x, y, z (float32, mm in the part's own frame) and gives the distance to the surface in mm, positive
-        inside.
+    inside.
     low, high: (x, y, z). Box that holds the part, in its own frame, mm.
     center: (x, y, z). Origin of the frame of the part, mm about the centre of the volume.
     axes: ndarray, shape (3, 3). Rows are the directions of that frame.
@@ -125,9 +124,8 @@ class Part:
 
 @dataclass(frozen=True)
 class Plan:
-    """The parts of a body in order, with the y of its front and back surfaces, against which a table may lie.
-
-    `rest` is the middle (x, z) of the head, for a head rest.
+    """The parts of a body in order, with the y of its front and back surfaces, against which a table may lie, and the
+    middle (x, z) of the head, for a head rest.
     """
 
     parts: Sequence[Part]
@@ -139,16 +137,10 @@ class Plan:
 def draw_scene(
     parts: Sequence[Part], settings: PhantomSettings, affine: Float64Array, progress: Progress | None = None
 ) -> tuple[Float32Array, LabelArray]:
-    """Draw the parts without point spread and noise.
+    """Draw the parts, in order, without point spread and noise: HU, (nk, nj, ni) float32, and labels, uint8, index in
+    `MATERIALS` of the part that holds the centre of each voxel.
 
     Every interface is a linear ramp of about one voxel.  Thick slices are averaged from thin ones.
-
-    parts: In the order of painting.
-    progress: Called as ``progress("draw", done, slices)``.
-
-    Returns:
-    voxels: ndarray, shape (nk, nj, ni), float32. HU.
-    labels: ndarray, shape (nk, nj, ni), uint8. Index in `MATERIALS` of the part that holds the centre of each voxel.
     """
     shape = settings.shape_kji
     grid = affine.copy()
@@ -332,12 +324,7 @@ TABLES: dict[str, Callable[[Plan], list[Part]]] = {
 
 
 def lay_under(plan: Plan, table: str, gap_mm: float, prone: bool) -> list[Part]:
-    """Make the parts of a table `gap_mm` under a body: under its back, or under its front when it lies prone.
-
-    plan: Plan of the body.
-    table: One of `TABLES`.
-    gap_mm: Gap between body and table: at 0 they touch, below 0 the body sinks in.
-    """
+    """Make a table `gap_mm` under a body's back, or under its front when it lies prone; below 0 the body sinks in."""
     down = -1.0 if prone else 1.0
     center = (0.0, plan.front - gap_mm if prone else plan.back + gap_mm, 0.0)
     axes = np.diag((1.0, down, 1.0))

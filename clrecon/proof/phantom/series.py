@@ -57,9 +57,8 @@ class Placement:
     pixel_spacing: dj, di in mm.
     positions: Centre of pixel (0, 0) of every slice, LPS mm.
     slice_thickness, tilt: dk in mm and the gantry tilt in degrees.
-    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm; in an uneven stack that of even slices between the first
-        and the last.
-    places: ndarray, shape (slices,). k of each slice in the affine: 0, 1, 2 and so on, but for an uneven stack.
+    affine: Of an uneven stack that of even slices between the first and the last.
+    places: k of each slice in the affine: 0, 1, 2 and so on, but for an uneven stack.
     """
 
     orientation: list[str]
@@ -103,11 +102,7 @@ def place_slices(settings: PhantomSettings) -> Placement:
 def write_label_map(
     path: Path, labels: NDArray[np.uint8], affine: NDArray[np.float64], names: Mapping[int, str] | None = None
 ) -> None:
-    """Write labels that lie where `affine` says, oblique and sheared ones included.
-
-    labels: ndarray, shape (nk, nj, ni), uint8
-    names: Names of labels, in ASCII; they are written as segments, as 3D Slicer does.
-    """
+    """Write labels where `affine` says, sheared ones too; names, in ASCII, become segments as in 3D Slicer."""
 
     def vector(values: NDArray[np.float64]) -> str:
         return "(" + ",".join(repr(float(value)) for value in values) + ")"
@@ -220,9 +215,7 @@ def write_series(
 ) -> None:
     """Write one file for each slice that is not missing into an existing folder and read each back.
 
-    voxels: ndarray, shape (nk, nj, ni), int16. HU, at most 32767 + `RESCALE_INTERCEPT`.
-    progress: Called as ``progress("write", done, slices)``.
-    phase: Number of the phase, from 0; its files follow those of the phase before.
+    HU are at most 32767 + `RESCALE_INTERCEPT`; the files of a phase, from 0, follow those of the phase before.
     """
     for k, header in enumerate(_make_headers(settings, placement, phase)):
         if k + 1 not in settings.missing:

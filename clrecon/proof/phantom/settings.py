@@ -44,11 +44,8 @@ def ghost_places(slices: int) -> tuple[int, int]:
 
 
 def draw_ghosts(voxels: NDArray[np.int16], seed: int) -> dict[str, Any]:
-    """Replace two slices of a stack: by a screen capture, and by a sagittal view of the stack itself.
-
-    voxels: ndarray, shape (nk, nj, ni), int16. HU, changed in place.
-
-    Returns: What the truth says of them.
+    """Replace two slices of a stack in place, by a screen capture and by a sagittal view of the stack itself, and
+    return what the truth says of them.
     """
     capture, sagittal = ghost_places(len(voxels))
     view = _sagittal(voxels)
@@ -91,11 +88,7 @@ def _screen_capture(shape: tuple[int, ...], seed: int) -> NDArray[np.int16]:
 def make_localizer(
     slice_header: FileDataset, voxels: NDArray[np.int16], affine: Float64Array, number: int, instance: str
 ) -> tuple[FileDataset, NDArray[np.int16]]:
-    """Return header and HU of a sagittal localizer of the stack, in the series of its slices.
-
-    number: InstanceNumber.
-    instance: SOPInstanceUID.
-    """
+    """Return header and HU of a sagittal localizer of the stack, in the series of its slices."""
     from pydicom.uid import UID
 
     header = deepcopy(slice_header)
@@ -411,9 +404,7 @@ class PhantomSettings:
 
     @property
     def table_used(self) -> str:
-        """Name of the table: the given one, else that of the kind; ``own`` for the spine's own couch, which is too thin
-        to be a ghost.
-        """
+        """Name of the table; ``own`` is the spine's own couch, which is too thin to be a ghost."""
         return self.table or ("curved" if self.ghosts else KINDS[self.kind].table) or "none"
 
     @property
@@ -422,9 +413,10 @@ class PhantomSettings:
         return self.slices, self.size[1], self.size[0]
 
     def as_dict(self) -> dict[str, Any]:
-        """All settings as plain JSON types; those of table, spine and series where they are not the default.
+        """All settings as plain JSON types.
 
-        UIDs are derived from these texts, so the defaults are left out: phantoms of earlier versions keep their UIDs.
+        UIDs are derived from these texts, so defaults of table, spine and series are left out: phantoms of earlier
+        versions keep their UIDs.
         """
         plain = {
             name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self).items()

@@ -88,11 +88,7 @@ def _listed(vector: Float64Array) -> list[float]:
 
 
 class Sphere:
-    """Ball.
-
-    center: array_like, shape (3,). LPS mm.
-    radius: mm.
-    """
+    """Ball around a centre in LPS mm."""
 
     def __init__(self, center: ArrayLike, radius: float):
         self.center = _vector("center", center)
@@ -128,12 +124,7 @@ class Sphere:
 
 
 class Torus:
-    """Ring torus.
-
-    center: array_like, shape (3,). LPS mm.
-    axis: array_like, shape (3,). Axis of revolution, any length.
-    major, minor: Radius of the ring's centre line and of the tube in mm, ``minor < major``.
-    """
+    """Ring torus around an axis of any length; radius of the centre line, `major`, and of the tube, `minor`, in mm."""
 
     def __init__(self, center: ArrayLike, axis: ArrayLike, major: float, minor: float):
         self.center = _vector("center", center)
@@ -180,12 +171,7 @@ class Torus:
 
 
 class Cylinder:
-    """Circular cylinder with flat caps.
-
-    center: array_like, shape (3,). Middle of the axis, LPS mm.
-    axis: array_like, shape (3,). Direction of the axis, any length.
-    radius, length: mm.
-    """
+    """Circular cylinder with flat caps; its centre is the middle of its axis, which may have any length."""
 
     def __init__(self, center: ArrayLike, axis: ArrayLike, radius: float, length: float):
         self.center = _vector("center", center)
@@ -229,14 +215,10 @@ class Cylinder:
 
 
 class Box:
-    """Oblique box: a slab with two large faces square to `normal`.
+    """Oblique box: a slab with two large faces square to `normal`, of any length, along which it is `thickness` mm
+    thick.
 
-    center: array_like, shape (3,). LPS mm.
-    normal: array_like, shape (3,). Direction of the thickness, any length.
-    thickness: Extent along `normal`, mm.
-    width, height: Extents along the two other edges, mm.
-    edge: array_like, shape (3,). Direction of the width; its part along `normal` is taken out.  Default: some direction
-        square to `normal`.
+    The width is along `edge`, less its part along `normal`; default: some direction square to `normal`.
     """
 
     def __init__(
@@ -313,12 +295,7 @@ def _sub_voxel_centre(affine: NDArray[np.float64], settings: PhantomSettings) ->
 
 
 def choose_body(affine: NDArray[np.float64], settings: PhantomSettings) -> Body:
-    """Make the analytic body of `settings` for a volume with this affine.
-
-    settings: Of an analytic kind.
-
-    Returns: Wholly inside the volume, with at least one voxel of background on every side.
-    """
+    """Make the body of `settings` wholly inside a volume with this affine, a voxel of background on every side."""
     centre = _sub_voxel_centre(affine, settings)
     # distances between opposite faces of the volume, halved: rows of the inverse are the faces' normals per step
     per_step = 1.0 / np.linalg.norm(np.linalg.inv(affine)[:3, :3], axis=1)

@@ -141,15 +141,9 @@ def draw_tissue(
     *,
     blood_hu: float = BLOOD_HU,
 ) -> Field:
-    """Draw one slice without bone, in bands of rows.
+    """Draw one slice without bone, in bands of rows, HU, (nj, ni), at x, y, z in mm of the plan.
 
-    x, y, z: ndarray, shape (nj, ni), float32. mm of the plan.
-    ramp: Width of an interface, mm.
-    table: Table that the body lies on; None: a couch of its own.
-    prone: That couch is under the front.
-    blood_hu: HU of heart and vessels.
-
-    Returns: ndarray, shape (nj, ni), float32. HU.
+    Interfaces are `ramp` mm wide.  Without a table the body lies on a couch of its own, if prone under the front.
     """
     canvas = np.full(x.shape, AIR_HU, dtype=np.float32)
     rows = max(1, _BAND // x.shape[1])
@@ -335,12 +329,7 @@ class _Scene:
 
 
 def plan_spine(settings: PhantomSettings, affine: Float64Array) -> tuple[Anatomy, Float64Array]:
-    """Plan the spine of a phantom.
-
-    Returns:
-    anatomy: In mm about `CENTRE_LPS_MM`.
-    grid: ndarray, shape (4, 4). Index to mm of the plan.
-    """
+    """Plan the spine of a phantom, in mm about `CENTRE_LPS_MM`, and return the affine from index to mm of the plan."""
     # The plan's origin is the centre of the volume.
     grid = affine.copy()
     grid[:3, 3] -= CENTRE_LPS_MM
@@ -350,11 +339,7 @@ def plan_spine(settings: PhantomSettings, affine: Float64Array) -> tuple[Anatomy
 
 
 def label_levels(settings: PhantomSettings, affine: Float64Array) -> NDArray[np.uint8]:
-    """Label each voxel of a spine phantom with the number of the vertebra that holds its centre.
-
-    Returns: ndarray, shape (nk, nj, ni), uint8. 0 where no vertebra is, else
-        `clrecon.proof.phantom.spine_parts.level_number`.
-    """
+    """Label each voxel with the `level_number` of the vertebra that holds its centre; 0 where none is."""
     anatomy, grid = plan_spine(settings, affine)
     labels = np.zeros(settings.shape_kji, dtype=np.uint8)
     for vertebra in anatomy.vertebrae:
@@ -375,15 +360,9 @@ def draw_spine(
     places: Float64Array | None = None,
     blood_hu: float = BLOOD_HU,
 ) -> tuple[Float32Array, Anatomy]:
-    """Draw the spine phantom without point spread and noise.
+    """Draw the spine phantom in HU without point spread and noise, and return its plan, in mm about `CENTRE_LPS_MM`.
 
-    progress: Called as ``progress("draw", done, slices)``.
-    places: ndarray, shape (nk,). k of each slice in the affine; default: 0, 1, 2 and so on.
-    blood_hu: HU of heart and vessels.
-
-    Returns:
-    voxels: ndarray, shape (nk, nj, ni), float32. HU.
-    anatomy: The plan, in mm about `CENTRE_LPS_MM`.
+    `places` are k of each slice in the affine, else 0, 1, 2 and so on; `blood_hu` are HU of heart and vessels.
     """
     shape = settings.shape_kji
     di, dj, dk = column_spacing(affine)

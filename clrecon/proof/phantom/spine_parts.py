@@ -42,11 +42,8 @@ def _parse_level(text: str, whole: str) -> int:
 
 
 def parse_levels(text: str) -> tuple[str, ...]:
-    """Read a choice of levels such as ``"L1-L5"``, ``"C3"`` or ``"C3-C7,T1-T5"``.
-
-    text: Levels, and ranges from the upper to the lower one, with commas between them, in any order.
-
-    Returns: Each level once, from top to bottom.
+    """Read a choice of levels such as ``"L1-L5"``, ``"C3"`` or ``"C3-C7,T1-T5"``: levels, and ranges from the upper to
+    the lower one, in any order; each once, from top to bottom.
     """
     if not isinstance(text, str) or len(text) > _LONGEST or not re.fullmatch(r"[ -~]+", text):
         raise UsageError("levels are a text like C1-L5, L4-L5 or C3-C7,T1-T5")
@@ -107,12 +104,10 @@ _ANCHOR_LEVEL = "T12"
 
 @dataclass(frozen=True)
 class SpineChoice:
-    """What is chosen of a spine: its levels, its bend and its facets.
+    """What is chosen of a spine: its levels, from top to bottom, its bend and its facets.
 
-    levels: Levels that are shown, from top to bottom.
     kyphosis_deg, scoliosis_deg: Angle between the first and the last chosen level that is added to the natural one, in
-        the sagittal plane (positive: the back is round) and in the coronal plane (positive: the middle lies to the
-        left).
+    the sagittal plane (positive: the back is round) and in the coronal plane (positive: the middle lies to the left).
     facet_gap_mm: Distance of neighbouring vertebrae in their facet joints; None: the shapes' own, 2 mm and more.
     centred: True: the levels are put into the middle of the volume; False: T12 is, as without a choice.
     normal: (x, y, z). Normal of the slices.
@@ -135,12 +130,8 @@ class SpineChoice:
 
 @dataclass(frozen=True)
 class Chain:
-    """All planned levels.
-
-    sizes: mm of each level.
-    frames: list of ndarray, shape (3, 3). Rows are the local left, posterior and superior directions.
-    centres: ndarray, shape (n, 3). Middle of each vertebral body, mm.
-    moved: ndarray, shape (n, 3). How far the bend has moved each centre; 0 without one.
+    """All planned levels: sizes in mm, frames (rows are the local left, posterior and superior directions), the middle
+    of each body, (n, 3) mm, and how far the bend has moved it.
     """
 
     names: tuple[str, ...]
@@ -170,12 +161,12 @@ def _stack(sizes: dict[str, Float64Array], frames: list[Float64Array], anchor: i
 
 
 def lay_chain(generator: np.random.Generator, seed: int, half_depth: float, choice: SpineChoice | None) -> Chain:
-    """Lay the levels out, the middle of T12 a little below the middle of the volume.
+    """Lay the levels out, the middle of T12 a little below the middle of the volume; without a choice T1 to L5,
+    straight.
 
-    generator: Small changes of the curve of chest and loin.
-    seed: Those of the neck, which is planned where a cervical level is chosen.
-    half_depth: Half the depth of the trunk, mm: the tips of the spinous processes stay about 20 mm under the skin.
-    choice: None: T1 to L5, straight.
+    The generator makes small changes of the curve of chest and loin, the seed those of the neck, which is planned where
+    a cervical level is chosen.  The tips of the spinous processes stay about 20 mm under the skin of a trunk of twice
+    `half_depth` mm.
     """
     count = len(THORACOLUMBAR)
     sizes = {key: np.interp(np.arange(count), _KEYS, values) for key, values in _SIZES.items()}
@@ -232,11 +223,10 @@ _NECK_SHARE = {"C7": 0.45, "C6": 0.85}
 
 @dataclass(frozen=True)
 class Outline:
-    """Ellipses that follow each other along z.
+    """Ellipses that follow each other along z, (n,) mm, ascending.
 
-    z: ndarray, shape (n,). Heights in mm, ascending.
-    rows: ndarray, shape (5, n). Middle x and y, half width and half depth in mm, and the share of the neck, at these
-        heights; between them linear, beyond them constant.
+    Rows, (5, n), are middle x and y, half width and half depth in mm, and the share of the neck, at these heights;
+    between them linear, beyond them constant.
     """
 
     z: Float64Array
@@ -248,11 +238,8 @@ class Outline:
 
 
 def plan_outline(chain: Chain, half_width: float, half_depth: float) -> Outline | None:
-    """Plan the outline round a chain.
-
-    half_width, half_depth: Half axes of the trunk, mm.
-
-    Returns: None round a straight trunk: its ellipse has its middle at x = y = 0 at all heights.
+    """Plan the outline round a chain; None round a straight trunk: its ellipse, of these half axes in mm, has its
+    middle at x = y = 0 at all heights.
     """
     with_neck = chain.names[0] == "C1"
     if not with_neck and not chain.moved.any():
@@ -274,15 +261,14 @@ def plan_outline(chain: Chain, half_width: float, half_depth: float) -> Outline 
 
 @dataclass(frozen=True)
 class Vertebra:
-    """One level: its frame and its sizes.
+    """One level: its frame, rows of `axes` being the local left, posterior and superior directions, and its sizes in
+    mm.
 
-    center: ndarray, shape (3,). Middle of the vertebral body, mm.
-    axes: ndarray, shape (3, 3). Rows are the local left, posterior and superior directions.
-    width, depth, height, canal_half_width, canal_half_depth: mm.
+    center: Middle of the vertebral body.
     lumbar: 0 thoracic shape to 1 lumbar shape of the processes.
     waves: ndarray, shape (n, 5). Trabecular texture, see `clrecon.proof.phantom.fields.waves_at`.
     room: mm by which upper and lower articular processes lie farther apart than in a spine without a choice of levels,
-        in which neighbours nearly touch.
+    in which neighbours nearly touch.
     facets: ndarray, shape (m, 4). Balls (x, y, z, radius; local mm) that widen the upper articular processes.
     """
 
@@ -333,9 +319,10 @@ class Anatomy:
     """All parts of the spine phantom.
 
     half_width, half_depth: Half axes of the body outline about x = y = 0.
-    curve_x, curve_y: Polynomials (highest power first) in z / 100 mm: centre line of the vertebral bodies.
-    curve_z: (low, high). Range in which the polynomials hold.
-    marker: ndarray, shape (3,). Centre of the small metal ball on the patient's left.
+    curve_x, curve_y, curve_z: Polynomials (highest power first) in z / 100 mm: centre line of the vertebral bodies;
+        they
+    hold from the lower to the upper z of the last.
+    marker: Centre of the small metal ball on the patient's left.
     absent: Parts left out on purpose.
     centres: Middle of the body of every planned level, shown or not.
     outline: Where the body's outline is not that of a straight trunk.

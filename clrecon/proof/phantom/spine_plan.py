@@ -44,16 +44,10 @@ def _rotation(oblique: tuple[float, float, float]) -> Float64Array:
 def slice_directions(
     tilt_deg: float, oblique: tuple[float, float, float], prone: bool, gap_mm: float = 1.0
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return the directions of a phantom's axes in the patient.
+    """Return the directions of a phantom's axes in the patient: unit vectors along i and j, LPS, and the slice step in
+    mm, longer than the gap of the slices along their normal where the gantry is tilted.
 
-    tilt_deg: Gantry tilt.
-    oblique: (about_x, about_y, about_z). Degrees by which the frame is then rotated.
-    prone: Rows and columns are turned by half a turn.
-    gap_mm: Distance of two slices along their normal.
-
-    Returns:
-    row, column: ndarray, shape (3,). Unit vectors along i and j, LPS.
-    step: ndarray, shape (3,). Slice step in mm: longer than the gap where the gantry is tilted.
+    The frame is then rotated by `oblique` degrees (about_x, about_y, about_z); prone, rows and columns turn half round.
     """
     tilt = math.radians(tilt_deg)
     rotation = _rotation(oblique)
@@ -153,13 +147,13 @@ def _plan_ribs(vertebrae: list[Vertebra], moved: Float64Array, half_width: float
 def plan_anatomy(
     field_of_view_mm: tuple[float, float, float], steps_mm: Float64Array, seed: int, choice: SpineChoice | None = None
 ) -> Anatomy:
-    """Lay out the phantom for a field of view.
+    """Lay out the phantom for a field of view, (width, depth, length) along columns, rows and slices.
 
-    field_of_view_mm: (width, depth, length). Extents of the volume along columns, rows and slices.  The body outline
-        follows width and depth between the limits of a slim child and of an adult; bones keep their size.
+    The body outline follows width and depth between the limits of a slim child and of an adult; bones keep their size.
+
     steps_mm: ndarray, shape (3, 3). Columns are the voxel steps in LPS mm.
     seed: Small changes of position and the phases of the texture.
-    choice: Levels, bend and facets; None: T1 to L5, straight, T12 in the middle.
+    choice: None: T1 to L5, straight, T12 in the middle.
     """
     generator = np.random.default_rng((seed, 11))
     half_width = float(np.clip(min(0.45 * field_of_view_mm[0], 0.60 * field_of_view_mm[1]), 118.0, 160.0))
@@ -230,11 +224,8 @@ def spine_choice(
     directions: tuple[float, tuple[float, float, float], bool],
     length_mm: float | None,
 ) -> SpineChoice:
-    """Return a choice for slices that lie as `slice_directions` says.
-
-    bend: (kyphosis, scoliosis). Degrees.
-    directions: (tilt, oblique, prone)
-    length_mm: Length of the volume along the normal of its slices.
+    """Return a choice, bent by (kyphosis, scoliosis), for slices of directions (tilt, oblique, prone), see
+    `slice_directions`, and a volume of a length along their normal.
     """
     row, column, _ = slice_directions(*directions)
     x, y, z = (float(value) for value in np.cross(row, column))
@@ -255,8 +246,7 @@ def fit_slices(
 ) -> int:
     """Return the number of slices: the given one, if it holds the vertebral bodies, else as many as the bones need.
 
-    size: (columns, rows)
-    spacing: (dj, di, dk). mm.
+    size, spacing: (columns, rows) and (dj, di, dk), mm.
     directions: (tilt, oblique, prone)
     """
     dj, di, dk = spacing

@@ -261,10 +261,7 @@ def _arch_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
 
 
 def upper_facet_seats(vertebra: Vertebra) -> list[tuple[float, float, float]]:
-    """Return points along the middle of the upper articular process, local mm, with x of the left side.
-
-    C1 has none: what lies above it is not part of the phantom.
-    """
+    """Return points along the middle of the left upper articular process, local mm; C1 has none."""
     if vertebra.is_cervical:
         return facet_seats(vertebra)
     wide, middle = vertebra.canal_half_width, vertebra.depth / 2.0 + vertebra.canal_half_depth
@@ -296,8 +293,6 @@ def vertebra_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field
     """Return the distance to the outer surface of the bone, mm, positive inside; x, y, z are local mm.
 
     It is exact on the surface and of first order near it; `clrecon.proof.phantom.truth` has true distances.
-
-    Returns: ndarray, of the type and the broadcast shape of x, y and z
     """
     bone, cuts = vertebra_shape(vertebra, x, y, z)
     for cut in cuts:
@@ -392,9 +387,8 @@ def _distance_to(vertebra: Vertebra, points: Float64Array) -> Float64Array:
 
 
 def close_facets(vertebrae: Sequence[Vertebra], gap_mm: float) -> list[Vertebra]:
-    """Widen the upper articular processes by balls whose distance from the vertebra above is `gap_mm`.
-
-    vertebrae: From top to bottom; neighbours in this sequence that are not neighbours in the spine stay as they are.
+    """Widen the upper articular processes of vertebrae, from top to bottom, by balls `gap_mm` from the vertebra above,
+    where that is the neighbour in the spine.
     """
     closed = list(vertebrae[:1])
     for lower in vertebrae[1:]:

@@ -9,23 +9,13 @@ from clrecon.proof.points.grid import GridTwin, find_cells
 
 
 def cluster_points(points: ArrayLike, eps: float, min_samples: int) -> tuple[int, NDArray[np.int32], NDArray[np.bool_]]:
-    """Cluster points by DBSCAN in float64.
+    """Cluster points by DBSCAN (Ester, Kriegel, Sander and Xu 1996) in float64.
 
     Neighbours of a point are all points within ``eps * (1 + 1e-6)``, itself included.  A point with at least
     `min_samples` neighbours is a core point.  Core points that are neighbours are in one cluster.
 
-    points: array_like, shape (n, 3). mm.
-    eps: mm.
-
-    Returns:
-    count: Number of clusters.
-    labels: ndarray, shape (n,), int32. Clusters are numbered by their first core point.  Other neighbours of core
-        points take the lowest number among these; all further points are noise, -1.
-    cores: ndarray, shape (n,), bool
-
-    References
-    ----------
-    Ester, Kriegel, Sander and Xu 1996.
+    Return the number of clusters, labels and core points.  Clusters are numbered by their first core point.  Other
+    neighbours of core points take the lowest number among these; all further points are noise, -1.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -63,13 +53,8 @@ SEVERAL_ROOTS = np.uint32(0xFFFFFFFE)
 
 
 def join_chunks(grid: GridTwin, cores: NDArray[np.bool_], reach: float, per_chunk: int) -> NDArray[np.uint32]:
-    """Label the core cells: the least cell of the same chunk that each is linked with, by cells of that chunk.
-
-    cores: ndarray, shape (n,), bool. Core points in the sorted order.
-    reach: Largest distance of neighbours in mm.
-    per_chunk: Cells of a chunk.
-
-    Returns: ndarray, shape (cells,), uint32. `NO_CELL` for cells without core points.
+    """Label the core cells, (cells,): the least cell of the same chunk of `per_chunk` that each is linked with, by
+    cells of that chunk; `NO_CELL` for cells without core points, which `cores` tells in the sorted order.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

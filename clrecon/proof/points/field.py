@@ -15,10 +15,10 @@ _SIDES = tuple((axis, way) for axis in range(3) for way in (1, -1))
 
 @dataclass(frozen=True, eq=False)
 class FieldTwin:
-    """The field on nodes, arrays of shape (nz, ny, nx).
+    """The field on nodes, (nz, ny, nx).
 
-    value: float64, mm. Mean of <x - p, n>; NaN where no point has weight.
-    squared: float32, mm^2. Squared distance to the nearest point, in the arithmetic of float32; `FAR` beyond the reach.
+    value: mm. Mean of <x - p, n>; NaN where no point has weight.
+    squared: mm^2. Squared distance to the nearest point, in the arithmetic of float32; `FAR` beyond the reach.
     """
 
     value: NDArray[np.float64]
@@ -45,13 +45,11 @@ def measure_field(
     reach: float,
     smoothing: float,
 ) -> FieldTwin:
-    """Average the distances from the planes of the points around each node.
+    """Average the distances from the planes of the points around each node, of a shape (nx, ny, nz) from `corner` on,
+    in mm.
 
-    points, normals: ndarray, shape (n, 3), float32. mm, and unit vectors.
-    corner: ndarray, shape (3,), float32. Place of node (0, 0, 0) in mm.
-    spacing: mm between nodes.
-    shape: (nx, ny, nz). Number of nodes.
-    reach, smoothing: R and s in mm: a point at distance d < R has the weight ``(1 - d^2 / R^2)^2 / (d^2 + s^2)``.
+    A point at distance d < R, the reach, has the weight ``(1 - d^2 / R^2)^2 / (d^2 + s^2)``, s being the smoothing in
+    mm.
     """
     h, reach32 = np.float32(spacing), np.float32(reach)
     nx, ny, nz = shape
@@ -94,16 +92,13 @@ def _shifted(mask: NDArray[np.bool_], axis: int, way: int) -> NDArray[np.bool_]:
 def decide_signs(
     near: NDArray[np.bool_], core: NDArray[np.bool_], negative: NDArray[np.bool_], rounds: int
 ) -> SignsTwin:
-    """Decide which nodes are inside.
+    """Decide which nodes, (nz, ny, nx), are inside.
 
-    Nodes of `core` keep the sign of the field.  Far nodes, those that are not near, form regions over their six
-    neighbours; each pair of a near and a far neighbour is a vote with the near node's sign, and a region takes the sign
-    of most of its votes, outside where they are even.  The signs of far nodes then flood the near nodes that are not of
-    `core`, one neighbour farther in each of `rounds` rounds.  Nodes that both signs reach in one round, or none ever,
-    keep their own.
-
-    near, core, negative: ndarray, shape (nz, ny, nx), bool. Nodes within B of a point, those within one spacing, and
-        those whose field is not positive.
+    Nodes of `core`, within one spacing of a point, keep the sign of the field.  Far nodes, those that are not near,
+    farther than B, form regions over their six neighbours; each pair of a near and a far neighbour is a vote with the
+    near node's sign, and a region takes the sign of most of its votes, outside where they are even.  The signs of far
+    nodes then flood the near nodes that are not of `core`, one neighbour farther in each of `rounds` rounds.  Nodes
+    that both signs reach in one round, or none ever, keep their own.
     """
     from scipy import ndimage
 
@@ -131,9 +126,8 @@ def decide_signs(
 def fill_nodes(
     field: FieldTwin, near: NDArray[np.bool_], signs: SignsTwin, far_value: float, least: float
 ) -> NDArray[np.float64]:
-    """Return the volume whose surface at 0 is the result, positive inside.
-
-    Near nodes have |f|, at least `least` and at most `far_value`; all others have `far_value`.
+    """Return the volume whose surface at 0 is the result, positive inside: near nodes have |f|, from `least` to
+    `far_value`, all others `far_value`.
     """
     size = np.where(near, np.clip(np.abs(field.value), least, far_value), far_value)
     return np.where(signs.inside, size, -size)
@@ -147,11 +141,8 @@ def find_walls(
     A face is supported where both nodes are near and the field has two signs there.  Where it has one, the signs of far
     nodes have come through a hole in the cloud and stopped at the points of the other side: a wall.
 
-    near, negative, inside: ndarray, shape (nz, ny, nx), bool. As in `decide_signs`, and its result.
-    cube: Nodes along an edge of the cubes in which faces are counted, that of their lower node.
-
-    Returns: By cube (z, y, x): faces, walls, and the volume that these walls enclose in cubes of the spacing, by the
-        divergence of x - c, their mean place c.
+    Return by cube (z, y, x) of `cube` nodes, that of their lower node: faces, walls, and the volume that these walls
+    enclose in cubes of the spacing, by the divergence of x - c, their mean place c.
     """
     faces: dict[tuple[int, int, int], int] = {}
     walls: dict[tuple[int, int, int], list[tuple[NDArray[np.float64], NDArray[np.float64]]]] = {}

@@ -27,13 +27,7 @@ def find_cells(points: NDArray[np.float32], corner: NDArray[np.float32], edge: n
 
 
 def make_grid(points: NDArray[np.float32], edge: float) -> GridTwin:
-    """Sort points by cubic cells.
-
-    points: ndarray, shape (n, 3), float32. mm; a cloud that is far from the origin is relative to its base.
-    edge: mm, rounded to float32.
-
-    Returns: `points` has shape (n, 3), in the sorted order.
-    """
+    """Sort points, (n, 3) float32, mm from the base of a far cloud, by cubic cells; the edge is rounded to float32."""
     cell = np.float32(edge)
     corner = (points.min(axis=0).astype(np.float64) - 1e-3 * float(cell)).astype(np.float32)
     x, y, z = find_cells(points, corner, cell).T
@@ -52,11 +46,7 @@ def make_grid(points: NDArray[np.float32], edge: float) -> GridTwin:
 
 
 def choose_points(points: NDArray[np.float32], spacing: float) -> NDArray[np.uint32]:
-    """Return the number of the point nearest to the mean of each cell, in the order of the cells.
-
-    points: ndarray, shape (n, 3), float32. mm.
-    spacing: Edge of the cells in mm.
-    """
+    """Return the point nearest to the mean of each cell with an edge of `spacing` mm, in the order of the cells."""
     grid = make_grid(points, spacing)
     chosen = []
     for begin, end in zip(grid.starts[:-1], grid.starts[1:], strict=True):
@@ -70,15 +60,11 @@ def choose_points(points: NDArray[np.float32], spacing: float) -> NDArray[np.uin
 def grow_cells(
     points: NDArray[np.float32], edge: float, fewest: int, threshold: int, largest: bool
 ) -> NDArray[np.uint8]:
-    """Say for each point what becomes of it.
+    """Say for each point what becomes of it: 0: kept, 1: in a cell with few points, 2: not reached by growth, 3: in a
+    smaller component.
 
-    points: ndarray, shape (n, 3), float32. mm.
-    edge: mm.
     fewest, threshold: Fewest points of a cell that stays, and of one where growth begins.
     largest: Keep the component with the most cells alone; of several the one with the most points, then the first.
-
-    Returns: ndarray, shape (n,), uint8. 0: kept, 1: in a cell with few points, 2: not reached by growth, 3: in a
-        smaller component.
     """
     from scipy import ndimage
 

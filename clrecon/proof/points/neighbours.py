@@ -44,15 +44,9 @@ def _order(
 
 
 def find_neighbours(points: NDArray[np.float32], k: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Return the `k` nearest points of each point, itself among them.
+    """Return the `k` nearest points of each point, itself among them, (n, k), and their `float32_distances` in mm.
 
-    points: ndarray, shape (n, 3), float32. mm, relative to a place that is near enough for float32.
-    k: At most n.
-
-    Returns:
-    indices: ndarray, shape (n, k), int32. Ascending by (distance, index).  Of points at the same place the lowest index
-        comes first.
-    distances: ndarray, shape (n, k), float32. mm, see `float32_distances`.
+    They ascend by (distance, index); of points at the same place the lowest index comes first.
     """
     n = len(points)
     points = np.asarray(points, dtype=np.float32)
@@ -88,15 +82,11 @@ DOUBTFUL_COSINE = 0.2
 def principal_axes(
     points: NDArray[np.floating], indices: NDArray[np.integer]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the smallest principal axis of the neighbours of each point, and the eigenvalues.
+    """Return the smallest principal axis of the neighbours of each point, itself among them, and the eigenvalues, (m,
+    3) both.
 
-    points: ndarray, shape (n, 3), mm
-    indices: ndarray, shape (m, k). Neighbours, the point itself among them.
-
-    Returns:
-    axes: ndarray, shape (m, 3), float64. Unit vectors, which of both directions is not defined; zero for points in a
-        line or at one place.
-    eigenvalues: ndarray, shape (m, 3), float64. Of the covariance (population), ascending, mm2.
+    Axes are unit vectors, which of both directions is not defined; zero for points in a line or at one place.  The
+    eigenvalues are those of the covariance (population), ascending, mm2.
     """
     near = np.asarray(points, dtype=np.float64)[indices]
     away = near - near.mean(axis=1, keepdims=True)
@@ -111,15 +101,10 @@ def principal_axes(
 def orient_by_gradients(
     axes: NDArray[np.floating], gradients: NDArray[np.floating]
 ) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
-    """Turn normals towards lower HU.
+    """Turn normals towards lower HU; where there is none the gradient is zero or NaN.
 
-    axes: ndarray, shape (n, 3). Unit vectors of any direction.
-    gradients: ndarray, shape (n, 3). HU per mm, LPS; zero or NaN where there is none.
-
-    Returns:
-    normals: ndarray, shape (n, 3). Where the axis and the gradient are nearly at a right angle, the direction of
-        falling HU itself.
-    doubtful: ndarray, shape (n,), bool. True for these.
+    Where the axis and the gradient are nearly at a right angle, the normal is the direction of falling HU itself, and
+    doubtful, which is returned too.
     """
     length = np.linalg.norm(gradients, axis=1)
     known = length > 0.0
@@ -156,12 +141,8 @@ LEAST_RANGE_MM = 1e-6
 def filter_scales(
     points: NDArray[np.floating], normals: NDArray[np.floating], indices: NDArray[np.integer], range_factor: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return sigma_c and sigma_s of each point.
-
-    Returns:
-    sigma_c: ndarray, shape (n,), mm. Distance to the kth neighbour.
-    sigma_s: ndarray, shape (n,), mm. `range_factor` times the standard deviation (population) of the neighbours'
-        projections on the normal.
+    """Return sigma_c and sigma_s of each point, mm: the distance to the kth neighbour, and `range_factor` times the
+    standard deviation (population) of the neighbours' projections on the normal.
     """
     away = points[:, None].astype(np.float64) - points.astype(np.float64)[indices]
     heights = np.einsum("nki,ni->nk", away, normals)

@@ -32,16 +32,12 @@ def extract_voxels(
     label: int = 0,
     paper: bool = False,
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.int64]]:
-    """Return the centres of voxels from `low` to `high` HU, both included.
+    """Return the centres, (n, 3), LPS mm, in the order k, j, i, the HU and the ijk of voxels from `low` to `high`, both
+    included.
 
     shell: Only voxels with one of six neighbours outside; beyond the volume all is outside.
     labels: ndarray, shape (nk, nj, ni). Only voxels with `label`, or with any number but 0 where it is 0.
     paper: Every slice lies where the first one does.
-
-    Returns:
-    points: ndarray, shape (n, 3), float64, LPS mm, in the order k, j, i
-    hu: ndarray, shape (n,), float32
-    ijk: ndarray, shape (n, 3)
     """
     marked = (volume.voxels >= low) & (volume.voxels <= high)
     if labels is not None:
@@ -56,12 +52,7 @@ def extract_voxels(
 
 
 def count_overlaps(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Count the voxels of each slice, and those that it has in common with the next slice and with the one after.
-
-    inside: ndarray, shape (nk, nj, ni), bool
-
-    Returns: ndarray, shape (3, nk), int64. 0 where there is no such slice.
-    """
+    """Count the voxels of each slice, and those in common with the next one and the one after, as (3, nk)."""
     counts = np.zeros((3, len(inside)), np.int64)
     for apart in range(3):
         both = inside[: len(inside) - apart] & inside[apart:] if apart < len(inside) else inside[:0]
@@ -79,11 +70,7 @@ def _values(voxels: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray
 
 
 def find_gradients(volume: Volume, points: NDArray[np.floating], outside: float) -> NDArray[np.float64]:
-    """Return the gradient of a volume at points, (n, 3), HU per mm, LPS.
-
-    points: ndarray, shape (n, 3), LPS mm
-    outside: Value beyond the border.
-    """
+    """Return the gradient of a volume, surrounded by `outside`, at points: (n, 3), HU per mm, LPS."""
     voxels = np.pad(np.asarray(volume.voxels, dtype=np.float64), 1, constant_values=outside)
     places = volume.lps_to_ijk(points)
     origins, nk = volume.slice_origins(1), volume.shape_ijk[2]

@@ -21,17 +21,11 @@ STEEPEST, DARKENING = 8.0, 0.5
 def find_splats(
     points: NDArray[np.floating], camera: Camera, size: Sequence[int], radius_mm: float
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Find the point that each pixel shows: of the discs that cover its centre the nearest, of those the first.
+    """Find the point that each pixel shows: of the discs that cover its centre the nearest, of those the first; -1:
+    none.
 
-    All is float32, product by product and sum by sum as the kernel does it, so that both find the same.
-
-    points: ndarray, shape (n, 3), floating. LPS mm.
-    size: (width, height)
-    radius_mm: Of the discs; at least 0.7072 and at most 128 pixels count.
-
-    Returns:
-    depth: ndarray, shape (h, w), float32. Mm across the view; NaN where no point is.
-    numbers: ndarray, shape (h, w), int64. Points; -1 where none is.
+    All is float32, product by product and sum by sum as the kernel does it, so that both find the same; radii from
+    0.7072 to 128 pixels count.  Depths, (h, w), are mm across the view, NaN where no point is.
     """
     width, height = size
     x, y, z = (_coordinate(points, axis, camera.position) for axis in camera.basis())
@@ -81,20 +75,11 @@ def shade_splats(
     lighting: Lighting,
     apart: int,
 ) -> tuple[Float64Array, Float64Array]:
-    """Colour and light the points of a picture.
+    """Colour and light the points of a picture of `find_splats`: (h, w, 4), and mm along the ray, (h, w).
 
-    Points with normals are lit after Phong.  Without, eye-dome lighting (Boucheny 2009) darkens a pixel by
-    ``exp(-0.5 s)``, s being the mean slope down to it from the eight pixels at a distance of `apart` pixels, those that
-    are not nearer counted as 0 and none above 8.
-
-    depth, numbers: Result of `find_splats`.
-    colors: ndarray, shape (n, 3), float64. 0 to 1.
-    lighting: One that does not shade leaves the colours as they are.
-    apart: Pixels.
-
-    Returns:
-    rgba: ndarray, shape (h, w, 4), float64
-    depth: ndarray, shape (h, w), float64. Mm along the ray.
+    Points with normals are lit after Phong, if the lighting shades.  Without, eye-dome lighting (Boucheny 2009) darkens
+    a pixel by ``exp(-0.5 s)``, s being the mean slope down to it from the eight pixels at a distance of `apart` pixels,
+    those that are not nearer counted as 0 and none above 8.
     """
     height, width = depth.shape
     _, directions = camera.rays((width, height))
@@ -134,9 +119,7 @@ FAR_ENOUGH_MM = 0.1
 class Meetings(NamedTuple):
     """Where rays meet triangles, sorted by pixel, and in a pixel by depth and then by the number of the triangle.
 
-    pixels, triangles: ndarray, shape (n,), int64
-    depths: ndarray, shape (n,), float32. Mm across the view.
-    shares: ndarray, shape (n, 3), float64. Of the corners, in sum 1.
+    Depths are mm across the view; shares, (n, 3), of the corners, in sum 1.
     """
 
     pixels: NDArray[np.int64]
@@ -152,8 +135,6 @@ def find_meetings(
 
     All but the signs of areas is float32, product by product and sum by sum as the kernel does it; products of two
     float32 are exact in float64.
-
-    size: (width, height)
     """
     width, height = size
     pixel, half_x, half_y = (np.float32(v) for v in (2.0 * camera.half_height() / height, 0.5 * width, 0.5 * height))
@@ -207,15 +188,10 @@ def shade_layer(
     camera: Camera,
     lighting: Lighting,
 ) -> tuple[Float64Array, Float64Array]:
-    """Colour and light a layer.
+    """Colour and light a layer, the `places` of `nth_layer` among the meetings: (h, w, 3), and mm along the ray, (h,
+    w), NaN where it has nothing.
 
-    meetings, places: Results of `find_meetings` and `nth_layer`.
-    normals: ndarray, shape (n, 3), floating. Of the vertices; default: those of the triangles.
-    colors: ndarray, shape (n, 3), float64. Of the vertices, 0 to 1.
-
-    Returns:
-    rgb: ndarray, shape (h, w, 3), float64
-    depth: ndarray, shape (h, w), float64. Mm along the ray; NaN where the layer has nothing.
+    Colours are those of the vertices, normals too, by default those of the triangles.
     """
     height, width = places.shape
     there = places >= 0

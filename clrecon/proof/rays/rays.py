@@ -27,9 +27,6 @@ class Box:
     For an even stack the functions are its indices.  Slices of an uneven stack may shift sideways, so no box holds
     exactly its voxels.  The functions are then i and j counted in the plane of slice 0, with bounds around all slices,
     and the height over slice 0. Samples in that box but beside their slice are ignored.
-
-    normals: Rows are the functions' gradients.
-    offsets, low, high: ndarray, shape (3,), float64. Bounds on ``normals @ p + offsets``.
     """
 
     def __init__(self, normals: Float64Array, offsets: Float64Array, low: Float64Array, high: Float64Array):
@@ -60,15 +57,11 @@ def box_of(volume: Volume, border: float = 0.5) -> Box:
 def find_interval(
     origins: Float64Array, directions: Float64Array, box: Box, clip: Planes | None = None, nearest: float = -np.inf
 ) -> tuple[Float64Array, Float64Array, NDArray[np.int64]]:
-    """Find the part of rays that lies in a box and within clip planes.
+    """Find the part of rays that lies in a box and within clip planes, from `nearest` on: 0 for rays that begin at a
+    camera.
 
-    origins, directions: ndarray, shape (n, 3), float64
-    nearest: Start of the rays, mm: 0 for rays that begin at a camera.
-
-    Returns:
-    t_in, t_out: ndarray, shape (n,), float64. Mm along the ray; a ray that misses has ``t_out <= t_in``.
-    entered_by: ndarray, shape (n,), int64. Number of the clip plane through which the ray enters, -1 for a side of the
-        box or the camera.
+    Return mm along the ray, ``t_out <= t_in`` for one that misses, and the number of the clip plane through which it
+    enters, -1 for a side of the box or the camera.
     """
     planes = np.vstack(
         [
@@ -94,15 +87,11 @@ def find_interval(
 
 
 def sample_field(voxels: NDArray, ijk: Float64Array) -> Float64Array:
-    """Interpolate trilinearly (n,) at index coordinates (n, 3); beyond the outermost centres their value holds.
+    """Interpolate voxels, (nk, nj, ni) or (nk, nj, ni, c), trilinearly at index coordinates (n, 3); beyond the
+    outermost centres their value holds.
 
     Along i, then j, then k, each ``low + part * (high - low)``, so that a constant field stays constant to the last
     bit.
-
-    voxels: ndarray, shape (nk, nj, ni) or (nk, nj, ni, c)
-    ijk: ndarray, shape (n, 3), float64
-
-    Returns: ndarray, shape (n,) or (n, c), float64
     """
     last = np.array(voxels.shape[2::-1]) - 1
     inside = np.clip(ijk, 0, last)
@@ -119,14 +108,10 @@ def sample_field(voxels: NDArray, ijk: Float64Array) -> Float64Array:
 
 
 def voxel_gradients(voxels: NDArray, matrices: Float64Array) -> Float64Array:
-    """Compute the gradient per mm at every voxel; between voxels it is interpolated.
+    """Compute the gradient per mm at every voxel, (nk, nj, ni, 3), by the `slice_normal_matrices`; between voxels it is
+    interpolated.
 
     Central differences; at the border half a one-sided difference (the index beyond is clamped).
-
-    matrices: ndarray, shape (nk, 3, 3), float64. Matrix of each slice, from
-        `clrecon.geometry.iso_rule.slice_normal_matrices`.
-
-    Returns: ndarray, shape (nk, nj, ni, 3), float64. Along x, y, z.
     """
     wide = np.pad(voxels.astype(np.float64), 1, mode="edge")
     inner = slice(1, -1)

@@ -48,15 +48,13 @@ PLANE_SLACK = 1.0 / 4096.0
 
 @dataclass
 class RayPicture:
-    """The results of rays.
+    """The results of rays, (h, w).
 
-    rgba: ndarray, shape (h, w, 4), float64. Colours times opacity, and opacity; zero for modes that show values.
-    depth: ndarray, shape (h, w), float64. First hit, mm along the ray; NaN where nothing is hit.  In mip and minip the
-        first place of the value; NaN in mean and drr.
-    expected_depth: ndarray, shape (h, w), float64. Mean depth, weighted by the opacity that each sample adds; in mip
-        and minip the depth of the value.
-    values: ndarray, shape (h, w), float64. HU in mip, minip and mean, NaN outside of the volume; in drr mm of water, 0
-        there; NaN everywhere in dvr.
+    rgba: Colours times opacity, and opacity; zero for modes that show values.
+    depth: First hit, mm along the ray; NaN where nothing is hit.  In mip and minip the first place of the value; NaN in
+    mean and drr.
+    expected_depth: Mean depth, weighted by the opacity that each sample adds; in mip and minip the depth of the value.
+    values: HU in mip, minip and mean, NaN outside of the volume; in drr mm of water, 0 there; NaN everywhere in dvr.
     """
 
     rgba: Float64Array
@@ -106,19 +104,13 @@ def cast_rays(
 ) -> RayPicture:
     """Send a ray through each pixel.
 
-    The field is trilinear between voxel centres; up to half a voxel beyond the outermost centres it has their values.
-    A ray is divided into segments of `ray_step` from where it enters the volume within the clip planes; the last
-    segment ends where it leaves.  Each segment has a sample in its middle, or with jitter at a place that depends on
-    the pixel alone.  A mean is the integral along the ray divided by its length.  A radiograph is the integral of
-    attenuation relative to water; its field interpolates max(HU, -1000) / 1000 + 1 between voxels.
-
-    transfer_function: For dvr.
-    size: Width and height of the picture.
-    ray_step: Mm; default half the smallest spacing.
-    lighting: None: no shading.
-    mode: {"dvr", "mip", "minip", "mean", "drr"}. Compositing; highest, lowest or mean value along the ray; thickness of
-        water with the same attenuation as the ray.
-    jitter: Only in dvr: extremes have their samples on slice planes, and integrals in the middles of segments.
+    The field is trilinear between voxel centres; up to half a voxel beyond the outermost centres it has their values. A
+    ray is divided into segments of `ray_step`, by default half the smallest spacing, from where it enters the volume
+    within the clip planes; the last segment ends where it leaves.  Each segment has a sample in its middle, or with
+    jitter, which only dvr has, at a place that depends on the pixel alone.  Modes "mip", "minip" and "mean" take the
+    highest, lowest and mean value, the integral along the ray divided by its length.  A radiograph, "drr", is the
+    thickness of water with the same attenuation as the ray: the integral of attenuation relative to water; its field
+    interpolates max(HU, -1000) / 1000 + 1 between voxels.
     """
     if mode not in MODES:
         raise UsageError(f"there is no mode {mode!r}: it is one of {', '.join(MODES)}")
@@ -146,9 +138,8 @@ Found = tuple[Float64Array, Float64Array, Float64Array, Float64Array]
 
 
 def look_up(transfer_function: TransferFunction, hu: Float64Array) -> Float64Array:
-    """Return red, green, blue, opacity (n, 4) as in the device's table, float32 values as float64.
-
-    The nearest of `TABLE_NODES` evenly spaced HU is used, which cover the function's range with both ends.
+    """Return red, green, blue, opacity (n, 4) as in the device's table, float32 values as float64, at the nearest of
+    `TABLE_NODES` evenly spaced HU, which cover the function's range with both ends.
     """
     low, high = transfer_function.range_hu
     nodes = transfer_function.table(low, high, TABLE_NODES).astype(np.float64)

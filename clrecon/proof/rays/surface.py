@@ -58,22 +58,15 @@ def cast_surface(
     colour: tuple[float, float, float] = (1.0, 1.0, 1.0),
     shadows: bool = False,
 ) -> RayPicture:
-    """Find the surface along the ray of each pixel.
+    """Find the surface along the ray of each pixel; both depths are that of the hit, and there are no values.
 
-    Samples lie `ray_step` apart from where the ray enters the closed volume, the last where it leaves; between the
-    first inside and the one before it the surface is found by bisection.  A ray that begins inside, behind a clip plane
-    or at a camera inside, has its hit at once: on the clip plane the cap's normal is the plane's, at a camera it is the
-    ray's own direction.
+    Samples lie `ray_step` apart, by default half the smallest spacing, from where the ray enters the closed volume, the
+    last where it leaves; between the first inside and the one before it the surface is found by bisection.  A ray that
+    begins inside, behind a clip plane or at a camera inside, has its hit at once: on the clip plane the cap's normal is
+    the plane's, at a camera it is the ray's own direction.
 
-    iso_value: HU.
-    size: Width and height of the picture.
-    ray_step: Mm; default half the smallest spacing.
-    lighting: None: no shading.
-    colour: Red, green, blue of the surface, 0 to 1.
-    shadows: A hit has only ambient light if a ray from it towards a fixed light meets something inside, from one step
-        on and within the clip planes.
-
-    Returns: Both depths are that of the hit; there are no values.
+    With `shadows` a hit has only ambient light if a ray from it towards a fixed light meets something inside, from one
+    step on and within the clip planes.
     """
     step = 0.5 * min(volume.spacing) if ray_step is None else float(ray_step)
     field, box = _ClosedField(volume, iso_value), box_of(volume, border=1.0)
@@ -141,16 +134,12 @@ def overlay_slices(
     colors: Callable[[Float64Array], Float64Array],
     clip: Float64Array | None = None,
 ) -> tuple[Float64Array, Float64Array]:
-    """Find where each ray crosses the planes of slices, from front to back, and blend them.
+    """Find where each ray crosses the planes of slices, from front to back, and blend them: (h, w, 4), premultiplied,
+    and mm to the first visible slice, (h, w), NaN without one.
 
-    size: (width, height)
-    opacity: Opacity of a slice where its value is `lowest_hu` or more; elsewhere it is transparent.
+    opacity: Of a slice where its value is `lowest_hu` or more; elsewhere it is transparent.
     colors: Function from HU (n,) to red, green and blue (n, 3).
     clip: ndarray, shape (n, 4). Half-spaces that are kept: ``normal . p >= offset``.
-
-    Returns:
-    rgba: ndarray, shape (h, w, 4), float64. Premultiplied.
-    depth: ndarray, shape (h, w), float64. Mm to the first visible slice; NaN without one.
     """
     width, height = size
     origins, directions = (rays.reshape(-1, 3) for rays in camera.rays(size))

@@ -96,9 +96,8 @@ def _face_segments(case: int, joined: int) -> dict[int, int]:
 
 
 def case_loops(case: int, joined: int = 0) -> list[list[int]]:
-    """Return the closed loops of edges of a case, each counter-clockwise as seen from outside (< iso value).
-
-    joined: Bit f: the two diagonal inside corners of face f are joined on it; by default no face joins them.
+    """Return the closed loops of edges of a case, each counter-clockwise as seen from outside (< iso value); bit f of
+    `joined`: the two diagonal inside corners of face f are joined on it.
     """
     segments = _face_segments(case, joined)
     loops = []

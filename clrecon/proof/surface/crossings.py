@@ -11,8 +11,8 @@ Float64Array = NDArray[np.float64]
 def mark_crossings(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> NDArray[np.bool_]:
     """Mark the triangles that cut another one, none of which lies in the plane of another.
 
-    Returns: ndarray, shape (n,), bool. An edge without a common corner passes through the inside of the other triangle,
-        or one of its edges through the inside of this one.
+    An edge without a common corner passes through the inside of the other triangle, or one of its edges through the
+    inside of this one.
     """
     corners = vertices.astype(np.float64)[triangles]
     marked = np.zeros(len(triangles), bool)

@@ -39,9 +39,8 @@ def sample_grid(volume: Volume, rule: IsoRule, layers: int) -> NDArray[np.float6
 
 
 def gradients(field: NDArray[np.float64], closed: bool) -> NDArray[np.float64]:
-    """Return the gradient per index step (d/di, d/dj, d/dk) at every sample: central, one-sided at an open border.
-
-    `field` has one more layer on every side than the result.
+    """Return the gradient per index step (d/di, d/dj, d/dk) at every sample, central, one-sided at an open border, of a
+    field with one more layer on every side.
     """
     parts = []
     for axis in (2, 1, 0):
@@ -103,10 +102,8 @@ CellVertices = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]
 def _find_trilinear_triangles(
     inside: NDArray[np.bool_], numbers: NDArray[np.int64], heights: NDArray[np.float32], margins: NDArray[np.float64]
 ) -> tuple[NDArray[np.uint32], CellVertices]:
-    """Return the triangles of the trilinear field, and the vertices inside cells: cell (k, j, i), point, gradient.
-
-    Vertices inside cells are numbered after those on edges, cell by cell.  `margins` (gk, 3) are the margins of each
-    layer.
+    """Return the triangles of the trilinear field, and the vertices inside cells, numbered after those on edges, cell
+    by cell: cell (k, j, i), point, gradient.  `margins` (gk, 3) are those of each layer.
     """
     cases = _find_cases(inside)
     triangles: list[list[int]] = []
@@ -143,20 +140,14 @@ def extract_isosurface(
     vertex_rule: str = "linear",
     grown: Callable[[NDArray[np.bool_]], NDArray[np.bool_]] | None = None,
 ) -> Surface:
-    """Extract the iso surface of a small volume.
+    """Extract the iso surface of a small volume: vertices, LPS mm, unit normals towards what is outside, and triangles,
+    counter-clockwise as seen from outside.
 
-    iso_value: float or (float, float). HU, or the two ends of a range.
     closed: Surround the volume with outside.
     topology: {"separated", "trilinear"}. Keep inside corners apart that only meet across a face or cell, or join them
-        where the trilinear field does.
-    below: Inside is below the iso value.
+    where the trilinear field does.
     vertex_rule: {"linear", "golden", "golden-search"}
     grown: Function from the samples that are inside, (gk, gj, gi), to the cells whose triangles are wanted; None: all.
-
-    Returns:
-    vertices: ndarray, shape (n, 3), float64, LPS mm
-    normals: ndarray, shape (n, 3), float64, unit, towards what is outside
-    triangles: ndarray, shape (m, 3), uint32, counter-clockwise as seen from outside
     """
     rule = choose_iso_rule(volume, iso_value, closed, topology, below=below, vertex_rule=vertex_rule)
     inside = rule.mark_inside(sample_grid(volume, rule, rule.border))
@@ -177,14 +168,14 @@ def extract_inside(
     hu_places: NDArray[np.bool_] | None = None,
     cells: NDArray[np.bool_] | None = None,
 ) -> Surface:
-    """Extract the surface between the samples that are inside and the others.
+    """Extract the surface between the samples that are inside, on the grid of the volume and its border, and the
+    others.
 
-    inside: ndarray, shape (gk, gj, gi), bool. Samples that are inside, on the sample grid: the volume and its border.
     hu_places: ndarray, shape (gk, gj, gi), bool. Where both samples of an edge are marked, HU place the vertex at the
-        iso level.  Elsewhere it lies half way, and its normal follows `inside`. None: HU place every vertex.
+    iso level.  Elsewhere it lies half way, and its normal follows `inside`. None: HU place every vertex.
     cells: ndarray, shape (gk - 1, gj - 1, gi - 1), bool. Cells whose triangles are wanted.
 
-    Returns: As `extract_isosurface`; normals point down, and up where the surface ends a range at its upper end.
+    Normals point down, and up where the surface ends a range at its upper end.
     """
     field = sample_grid(volume, rule, rule.border)
     slopes = gradients(sample_grid(volume, rule, rule.border + 1), rule.closed)
@@ -220,9 +211,8 @@ class CrossedEdges:
     """Edges of the sample grid between a sample inside and one outside, in the order of their vertices.
 
     numbers: ndarray, shape (gk, gj, gi, 3), int64. The vertex on the edge that a sample owns along each axis, where it
-        is crossed.
+    is crossed.
     near, far: tuple of three ndarray, shape (n,), int64. (k, j, i) of the owner and of the other end.
-    axis: ndarray, shape (n,), int64
     """
 
     numbers: NDArray[np.int64]
@@ -258,13 +248,12 @@ def build_surface(
     next_slope: NDArray[np.float64],
     cells_wanted: NDArray[np.bool_] | None = None,
 ) -> Surface:
-    """Place the vertices at the parts `t` of their edges, and write the triangles.
+    """Place the vertices at the parts `t` of their edges, from the near end, and write the triangles.
 
-    t: ndarray, shape (n,). Position of each vertex on its edge, from the near end.
     slope, next_slope: ndarray, shape (n, 3). Parts of the two ends in the gradient at the vertex, per step along i, j,
-        k; where their sum vanishes, the direction of the edge is used.
+    k; where their sum vanishes, the direction of the edge is used.
     cells_wanted: ndarray, shape (gk - 1, gj - 1, gi - 1), bool. Cells whose triangles are wanted, of the topology
-        "separated"; vertices of no triangle are left out then.
+    "separated"; vertices of no triangle are left out then.
     """
     (k, j, i), (k1, j1, i1), axis, numbers = edges.near, edges.far, edges.axis, edges.numbers
     slope, next_slope = slope.copy(), next_slope.copy()

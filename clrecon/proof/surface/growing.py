@@ -33,10 +33,8 @@ def find_active(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def find_mixed(inside: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
-    """Mark the mixed faces between each cell and the next one along an axis (0, 1, 2: k, j, i).
-
-    A face is mixed where one, two or three of its four corners are inside: cases (a), (b) and (c) of the paper; (d) is
-    where all four are alike.
+    """Mark the mixed faces between each cell and the next one along an axis (0, 1, 2: k, j, i): those with one, two or
+    three corners inside, cases (a), (b) and (c) of the paper.
     """
     inner = [slice(None)] * 3
     inner[axis] = slice(1, -1)
@@ -54,22 +52,14 @@ def find_mixed(inside: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Frontier:
-    """The result of `grow_cells`.
-
-    cells: ndarray, shape (gk - 1, gj - 1, gi - 1), bool. Cells that were entered: the grown cells.
-    visited: Cells that were looked at: the grown ones, and neighbours of theirs that were not entered.
-    """
+    """The cells that `grow_cells` entered, (gk - 1, gj - 1, gi - 1), and the number of all that it looked at."""
 
     cells: NDArray[np.bool_]
     visited: int
 
 
 def grow_cells(inside: NDArray[np.bool_], seeds: Iterable[tuple[int, int, int]]) -> Frontier:
-    """Grow from seed cells through mixed faces, one cell after the other, as the paper does.
-
-    inside: ndarray, shape (gk, gj, gi), bool. Samples that are inside.
-    seeds: iterable of (k, j, i). Cells; those that are not active grow nothing.
-    """
+    """Grow from active seed cells (k, j, i) through mixed faces, one cell after the other, as the paper does."""
     active = find_active(inside)
     mixed = [find_mixed(inside, axis) for axis in range(3)]
     entered, looked_at = np.zeros(active.shape, bool), np.zeros(active.shape, bool)
@@ -94,12 +84,7 @@ def grow_cells(inside: NDArray[np.bool_], seeds: Iterable[tuple[int, int, int]])
 
 
 def label_cells(inside: NDArray[np.bool_]) -> tuple[int, NDArray[np.int64]]:
-    """Number the components of active cells that mixed faces join.
-
-    Returns:
-    numbers: ndarray, shape (gk - 1, gj - 1, gi - 1), int64. Components in the order of their first cell; -1 for cells
-        that are not active.
-    """
+    """Number the components of active cells that mixed faces join, in the order of their first cell; -1: not active."""
     import scipy.sparse
     from scipy.sparse.csgraph import connected_components
 

@@ -27,13 +27,8 @@ from clrecon.proof.surface.extract import (
 
 
 def own_labels(labels: NDArray[Any], volume: Volume, grow_mm: float | None) -> NDArray[np.uint16]:
-    """Grow labels into samples without one.
-
-    labels: ndarray, shape (nk, nj, ni). Labels on the grid of the volume; 0 is no label.
-    grow_mm: A sample without a label gets the nearest label within this distance in mm, the lowest of equally near
-        ones. None: the nearest, in mm, among its 26 neighbours.
-
-    Returns: ndarray, shape (nk, nj, ni), uint16. A sample that has a label keeps it.
+    """Grow labels on the grid of the volume into samples without one, which get the nearest within `grow_mm`, the
+    lowest of equally near ones; None: the nearest, in mm, among its 26 neighbours.
     """
     growth = Growth.of(volume, grow_mm)
     offsets, shells, reach = growth.offsets, growth.shells, growth.reach
@@ -72,16 +67,11 @@ def find_solid(
 def extract_label(
     volume: Volume, inside: NDArray[np.uint16], number: int, iso_value: float, *, closed: bool = True
 ) -> Surface:
-    """Extract the surface of one label of a small volume.
+    """Extract the surface of one label of a small volume, whose samples `find_solid` found.
 
     Where HU cross the iso level between a sample of the label and one without a label, the vertex lies there, as on the
     surface without labels.  Everywhere else (beside another label, or beside dense samples without a label) it lies
     half way, and its normal follows the label, not HU.
-
-    inside: ndarray, shape (nk, nj, ni), uint16. Result of `find_solid`.
-    iso_value: HU.
-
-    Returns: As `clrecon.proof.surface.extract.extract_isosurface`.
     """
     rule = choose_iso_rule(volume, iso_value, closed)
     grown = np.pad(inside, rule.border)
@@ -116,7 +106,7 @@ def extract_label_mask(
     closed: bool = True,
     enclosed: Mapping[int, int] | None = None,
 ) -> Surface:
-    """Extract one label's own surface at one level.
+    """Extract one label's own surface at one level, 1 to `FULL` - 1.
 
     The samples that carry the label are inside, whatever their occupancy.  On an edge from an inside sample to one
 
@@ -124,18 +114,11 @@ def extract_label_mask(
       level counts as one step on its own side.  Where the occupancy of the other labels is not lower at the label's end
       than at the far end (they lie alongside, not across a gap), that of all labels replaces the label's;
     - with another label, it lies where the leads of both are equal.  The lead at an end is the occupancy of its own
-      number less that of the other end's number, at least 1. The lead of an enclosed label is larger by the amount by
-      which its level is lower than the other's (`START` if that has none);
-    - beyond the map, it lies half way.
+      number less that of the other end's number, at least 1. The lead of an enclosed label, see `choose_enclosed`, is
+      larger by the amount by which its level is lower than the other's (`START` if that has none);
+    - beyond the map, which is closed at its border or not, it lies half way.
 
     No vertex comes nearer to a sample than `KEEP` of its edge.
-
-    labels: ndarray, shape (nk, nj, ni)
-    level: 1 to `FULL` - 1.
-    closed: The surface is closed at the border of the map.
-    enclosed: The levels of labels that others enclose, see `choose_enclosed`.
-
-    Returns: As `clrecon.proof.surface.extract.extract_isosurface`.
     """
     volume, border = Volume(labels, affine), int(closed)
     rule = IsoRule(0.5, FULL // 2, FULL / 2, 0.0, closed)
@@ -185,9 +168,8 @@ def _find_leads(
     grown: NDArray[np.int64],
     border: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return for each end of each edge the lead of its number over that of the other end.
-
-    `own` is the occupancy of the label whose samples are `inside`, `grown` has the number of each sample of the grid.
+    """Return for each end of each edge the lead of its number over that of the other end, `own` being the occupancy of
+    the label whose samples are `inside`, `grown` the number of each sample of the grid.
     """
     starts = inside[edges.near]
     other = np.where(starts, grown[edges.far], grown[edges.near])

@@ -49,10 +49,7 @@ def scale_heights(heights: Sequence[float], bits: int) -> list[int]:
 
 
 def decide_faces(case: int, heights: Sequence[float]) -> int:
-    """Return the mask of the ambiguous faces that join their two diagonal inside corners.
-
-    heights: Values of the corners less the iso level, float32.
-    """
+    """Return the mask of the ambiguous faces that join their diagonal inside corners, by heights over the level."""
     joined = 0
     for face in find_ambiguous_faces(case):
         a, b, c, d = scale_heights([heights[corner] for corner in FACES[face]], FACE_BITS)
@@ -92,10 +89,7 @@ def _sign_values(case: int, heights: Sequence[float]) -> list[int]:
 
 
 def decide_interior(values: Sequence[int]) -> int | None:
-    """Return the code of the tunnel that the cell has if its faces allow one, else None.
-
-    values: Heights of the corners as whole numbers.
-    """
+    """Return the code of the tunnel of a cell, by heights as whole numbers, if its faces allow one, or None."""
     z = _find_parabola(values, 2)
     if z.a == 0 or z.discriminant <= 0:
         return None
@@ -120,10 +114,7 @@ def _find_diagonal(values: Sequence[int]) -> int:
 
 
 def find_row(case: int, heights: Sequence[float]) -> Row:
-    """Return the triangles of a cell.
-
-    heights: Values of the corners less the iso level, float32.
-    """
+    """Return the triangles of a cell, whose heights over the iso level are float32."""
     state = cell_state(case, decide_faces(case, heights))
     return state.row(decide_interior(_sign_values(case, heights)) if state.tunnels else None)
 
@@ -160,9 +151,8 @@ def _place_centre(row: Row, values: Sequence[int], margin: NDArray[np.float64]) 
 
 
 def _place_waist(row: Row, values: Sequence[int], margin: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the corners, on the surface, of the box between the roots of the three parabolas.
-
-    The box keeps a margin from the faces and is at least two margins wide.
+    """Return the corners, on the surface, of the box between the roots of the three parabolas, which keeps a margin
+    from the faces and is at least two margins wide.
     """
     sides = np.empty((3, 2))
     for axis in range(3):
@@ -179,16 +169,10 @@ def _place_waist(row: Row, values: Sequence[int], margin: NDArray[np.float64]) -
 def place_cell_vertices(
     row: Row, case: int, heights: Sequence[float], margin: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the vertices inside a cell.
+    """Return the vertices inside a cell, at least a margin (3,) from the faces, and the gradients of the trilinear
+    field there, both (n, 3), in steps (x, y, z) from corner 0.
 
-    row: Result of `find_row`.
-    heights: Values of the corners less the iso level, float32.
-    margin: ndarray, shape (3,). Smallest distance of a vertex from the faces, steps.
-
-    Returns:
-    points: ndarray, shape (n, 3), float64. In steps (x, y, z) from corner 0; n is `Row.cell_vertices`.
-    gradients: ndarray, shape (n, 3), float64. Gradients of the trilinear field at the points, per step and up to a
-        common factor; (1, 1, 1) where they vanish.
+    The gradients are up to a common factor; (1, 1, 1) where they vanish.
     """
     values = _sign_values(case, heights)
     if row.cell_vertices == 1:

@@ -53,11 +53,9 @@ Loop = tuple[int, ...]
 
 @dataclass(frozen=True)
 class Tunnel:
-    """A tube through the cell.
+    """A tube through the cell, from corner `diagonal` (0 to 3) to corner ``7 - diagonal``, with loops at its two ends.
 
-    inside: True: it joins inside corners; False: outside corners.
-    diagonal: Direction of the tunnel, from corner `diagonal` (0 to 3) to corner ``7 - diagonal``.
-    loops: Loops at its two ends.
+    With `inside` it joins inside corners, else outside ones.
     """
 
     inside: bool

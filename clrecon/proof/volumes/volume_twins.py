@@ -28,26 +28,16 @@ def compact(mask: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 
 def radix_sort(keys: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
-    """Sort keys, equal ones in the order of the input.
-
-    Returns:
-    keys: ndarray, shape (n,), uint32, ascending
-    values: ndarray, shape (n,), uint32. Number of each of them in the input.
-    """
+    """Sort keys, equal ones in the order of the input; return the number of each in the input too."""
     order = np.argsort(keys, kind="stable")
     return keys[order], order.astype(np.uint32)
 
 
 def label_components(triangles: NDArray[np.uint32], vertex_count: int) -> tuple[int, NDArray[np.int64]]:
-    """Number the components of a mesh by label propagation.
+    """Number the components of a mesh by label propagation, in order of the first vertex; -1 for unused vertices.
 
-    Every vertex takes the smallest label in any of its triangles, until no label changes: the label of a component
-    is then its smallest vertex.
-
-    Returns:
-    count: Number of components, not counting vertices that no triangle uses.
-    labels: ndarray, shape (vertex_count,), int64. Component of each vertex, numbered in order of the first vertex; -1
-        for unused vertices.
+    Every vertex takes the smallest label in any of its triangles, until no label changes: the label of a component is
+    then its smallest vertex.
     """
     roots = np.arange(vertex_count)
     while True:
@@ -65,12 +55,7 @@ def label_components(triangles: NDArray[np.uint32], vertex_count: int) -> tuple[
 
 
 def measure_bricks(voxels: NDArray[Any], brick: int = 8) -> NDArray[Any]:
-    """Return the lowest and highest value of each brick.
-
-    brick: Voxels along each side.
-
-    Returns: ndarray, shape (bk, bj, bi, 2), of the voxels' type
-    """
+    """Return the lowest and highest value of each brick, (bk, bj, bi, 2)."""
     shape = [-(-n // brick) for n in voxels.shape]
     ranges = np.empty((*shape, 2), voxels.dtype)
     for at in np.ndindex(*shape):
@@ -141,11 +126,7 @@ def find_places(volume: Volume, border: tuple[int, int, int] = (0, 0, 0)) -> NDA
 
 
 def find_in_box(volume: Volume, sides: ArrayLike) -> NDArray[np.bool_]:
-    """Return the voxels in a box, its sides included, shape (nk, nj, ni).
-
-    sides: array_like, shape (3, 2). Lower and upper side in x, y and z, LPS mm; infinity leaves a side open.  Voxels up
-        to 1e-6 mm beyond are in.
-    """
+    """Return the voxels in a box of sides (3, 2), LPS mm, and up to 1e-6 mm beyond; infinity leaves a side open."""
     low, high = np.asarray(sides, dtype=np.float64).T
     places = find_places(volume)
     found: NDArray[np.bool_] = ((places >= low - 1e-6) & (places <= high + 1e-6)).all(axis=-1)
@@ -224,13 +205,10 @@ GROUP = 16
 
 
 def mark_mixed_groups(voxels: NDArray[Any], level: float, reach: tuple[int, int, int]) -> NDArray[np.bool_]:
-    """Mark the groups of which some voxel has both sides of a level in the box around it.
+    """Mark the groups, (nk, nj, groups), each of 16 voxels of a row or fewer at its end, of which some voxel has both
+    sides of a level in the box around it.
 
-    level: Inside are values from here on; NaN is not.
-    reach: Half the size of the box along i, j, k, without the voxel in its middle.
-
-    Returns: ndarray, shape (nk, nj, groups), bool. Group g is the voxels 16 g to 16 g + 15 of a row; the last one may
-        be shorter.
+    Inside are values from the level on, NaN not; `reach` is half the size of the box along i, j, k, without its middle.
     """
     from scipy import ndimage
 
@@ -246,12 +224,8 @@ def mark_mixed_groups(voxels: NDArray[Any], level: float, reach: tuple[int, int,
 
 
 def spatial_weights(volume: Volume, offsets: NDArray[np.integer[Any]], sigma_mm: float) -> NDArray[np.float64]:
-    """Return the weights of neighbours by their true distance, exp(-|t|^2 / (2 sigma^2)).
-
-    offsets: ndarray, shape (n, 3). Steps along i, j, k.
-
-    Returns: ndarray, shape (nk, n), float64. For the voxels of each slice; beyond the ends the slices go on in the
-        steps of the ends.
+    """Return the weights of neighbours, steps along i, j, k, by their true distance, exp(-|t|^2 / (2 sigma^2)): (nk, n)
+    for the voxels of each slice; beyond the ends the slices go on in the steps of the ends.
     """
     weights = np.empty((volume.shape_ijk[2], len(offsets)))
     for k, of_slice in enumerate(weights):
@@ -264,14 +238,10 @@ def spatial_weights(volume: Volume, offsets: NDArray[np.integer[Any]], sigma_mm:
 def filter_bilateral(
     voxels: NDArray[Any], offsets: NDArray[np.integer[Any]], weights: NDArray[np.float64], sigma_hu: float
 ) -> NDArray[np.float64]:
-    """Filter voxels: the weighted mean of the window, before it is rounded.
+    """Filter voxels: the weighted mean of the window, `offsets` (n, 3) along i, j, k, the voxel itself among them,
+    before it is rounded.
 
-    voxels: ndarray, shape (nk, nj, ni). Beyond the border lies the value of the nearest voxel.  NaN and infinite ones
-        stay, and count nowhere.
-    offsets: ndarray, shape (n, 3). Steps along i, j, k to the voxels of the window, the voxel itself among them.
-    weights: ndarray, shape (nk, n), float64. See `spatial_weights`.
-
-    Returns: ndarray, shape (nk, nj, ni), float64
+    Beyond the border lies the value of the nearest voxel.  NaN and infinite ones stay, and count nowhere.
     """
     values = voxels.astype(np.float64)
     centre = np.where(np.isfinite(values), values, 0.0)
@@ -305,13 +275,7 @@ def is_inside(volume: Volume, points: Float64Array) -> NDArray[np.bool_]:
 
 
 def sample_field(volume: Volume, points: Float64Array) -> Float64Array:
-    """Interpolate trilinearly between voxel centres.
-
-    points: ndarray, shape (n, 3), float64. LPS mm, all of them within the box of the volume.
-
-    Returns: ndarray, shape (n,), float64. HU; between the outer voxel centres and the faces of the box the nearest
-        value.
-    """
+    """Interpolate HU trilinearly in the box of the volume; beyond the outer centres the nearest value holds."""
     last = np.array(volume.shape_ijk) - 1
     at = np.clip(volume.lps_to_ijk(points), 0.0, last)
     low = np.floor(at).astype(np.intp)
@@ -327,12 +291,7 @@ def sample_field(volume: Volume, points: Float64Array) -> Float64Array:
 
 
 def reformat_sheet(volume: Volume, sheet: Sheet, samples: SlabSamples, combine: str = "mean") -> Float64Array:
-    """Compute the values of all pixels of a sheet.
-
-    combine: {"mean", "max", "min"}. How the samples of a pixel that lie within the volume are combined.
-
-    Returns: ndarray, shape (h, w), float64. HU; NaN where no sample lies within the volume.
-    """
+    """Compute the values of all pixels of a sheet, HU; NaN where no sample lies within the volume."""
     shape = sheet.height, sheet.width
     values = np.full(shape, 0.0 if combine == "mean" else np.nan)
     weights = np.zeros(shape)
