@@ -14,7 +14,6 @@ _RUNS = 7
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
     parser.epilog = (
         "Times the stages from the scan to its surface, and VTK's flying edges (all cores, normals on) on the same\n"
         'voxels at the same level, in turn. "--device all" takes every device one after the other. Ratios are medians\n'
@@ -35,7 +34,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command; returns the exit code."""
     from clrecon.proof.bench import run_bench
 
     result = run_bench(

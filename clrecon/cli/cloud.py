@@ -55,7 +55,6 @@ def _epilog() -> str:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
     parser.epilog = _epilog()
     kinds = ", ".join(CLOUD_INPUTS)
     add_input(parser, f"{SCAN_FOLDER}; {GRID_FILE}; or a cloud of points ({kinds})")
@@ -83,7 +82,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command; returns the exit code."""
     from clrecon.jobs.cloud.job import CloudFiles, make_cloud
 
     clusters = None if options.clusters is None else Clustering(**options.clusters)

@@ -238,9 +238,8 @@ def make_settings(settings: type[Settings], options: argparse.Namespace, **more:
 
 
 def make_part(part: type[Settings], options: argparse.Namespace, owner: str | None, needs: str) -> Settings | None:
-    """Make settings that mean nothing without one option; None where that has no value.
+    """Make settings that mean nothing without one option, whose value is `owner`; None where that has none.
 
-    owner: The value of that option.
     needs: What a refusal of the others says behind their names: what they are about, and which option they need.
     """
     if owner is not None:
@@ -347,13 +346,7 @@ def show_report(report: dict[str, Any], lines: Iterable[str], options: argparse.
 
 
 def guard(action: Callable[[], int], console: Console, debug: bool) -> int:
-    """Run `action` and turn any error into an exit code and at most one line on stderr.
-
-    action: Returns the exit code.
-    debug: Print the traceback too.
-
-    Returns: The exit code.
-    """
+    """Run `action` and turn any error into an exit code and at most one line on stderr."""
     try:
         code = action()
     except (Exception, KeyboardInterrupt) as error:

@@ -29,7 +29,6 @@ PARTLY_DONE = 8
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
     width = max(map(len, COMPARED))
     parser.epilog = "\n".join(
         (
@@ -64,7 +63,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command; returns the exit code."""
     from clrecon.proof.compare.job import make_comparison
 
     given = pick(options, CompareSettings)

@@ -37,7 +37,6 @@ class _Words:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
     parser.epilog = (
         "The script is made from the options of this version. Where it goes:\n"
         "  bash   clrecon completion bash > ~/.local/share/bash-completion/completions/clrecon\n"
@@ -49,7 +48,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command; returns the exit code."""
     script = write_script(options.shell)
     console.result({"shell": options.shell, "script": script})
     console.say(script.rstrip("\n"), whole=True)
@@ -57,10 +55,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 
 def write_script(shell: str) -> str:
-    """Return the script of a shell, made from the parsers of all commands.
-
-    shell: {"bash", "zsh", "fish"}
-    """
+    """Return the script of a shell, made from the parsers of all commands."""
     if shell not in SHELLS:
         raise UsageError(f"no completion for {shell!r:.60}{guess_word(shell, SHELLS)}: use one of {', '.join(SHELLS)}")
     return {"bash": _write_bash, "zsh": _write_zsh, "fish": _write_fish}[shell](_survey())

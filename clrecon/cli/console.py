@@ -144,10 +144,7 @@ def describe_stage(stage: str) -> str:
 
 
 def printable(text: object) -> str:
-    """Return `text` on one line, with control and direction characters as escapes.
-
-    Texts from DICOM files and file names can contain terminal sequences.
-    """
+    """Return `text` on one line, with control and direction characters as escapes: files can hold terminal codes."""
     return "".join(
         char if char.isprintable() and ord(char) not in _HIDDEN else char.encode("unicode_escape").decode("ascii")
         for char in " ".join(str(text).splitlines())
@@ -155,12 +152,8 @@ def printable(text: object) -> str:
 
 
 class Console:
-    """The output streams of one command.
+    """The output streams of one command; with `as_json` stdout gets one JSON object and nothing else.
 
-    as_json: stdout gets one JSON object and nothing else.
-
-    Notes
-    -----
     stdout: the result.  stderr: errors, warnings, progress; the moving line only if stderr is a terminal.
     It is not an error if a reader closes stdout early (``| head``).
     """
@@ -196,10 +189,7 @@ class Console:
         self._guard_stdout(lambda: sys.stdout.buffer.write(piece))
 
     def say(self, text: str = "", *, whole: bool = False) -> None:
-        """Print a line of the result for people; nothing with ``--json`` or ``-q``.
-
-        On terminals long lines are broken between words, unless it is to stay `whole`.
-        """
+        """Print a line of the result for people; nothing with ``--json`` or ``-q``.  A `whole` one is not broken."""
         if self.as_json or self.quiet:
             return
         if self._said_on_stderr:

@@ -37,7 +37,6 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
     parser.epilog = _EPILOG
     add_input(parser)
     add_fields(parser, CorridorSettings)
@@ -64,7 +63,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command; returns the exit code."""
     from clrecon.jobs.corridor import CorridorFiles, make_corridors, parse_screw, read_screws
 
     space = options.space or "lps"

@@ -11,7 +11,6 @@ from clrecon.cli.mesh import describe_mesh
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
     parser.epilog = (
         "Writes a made-up CT series of a spine to OUT/ct, a picture of it to OUT/bone.png, its bone surface to\n"
         "OUT/bone.stl and the report to OUT/report.json, and holds a sphere of known size against its mesh.\n"
@@ -23,7 +22,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command; returns the exit code."""
     from clrecon.proof.demo import DEMO_FOLDER, make_demo
 
     outcome = make_demo(

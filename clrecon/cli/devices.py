@@ -10,7 +10,6 @@ from clrecon.cli.console import Console, printable
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
     parser.epilog = (
         "The device marked * is the one that would be used: GPUs before CPUs, cards with memory of their own before\n"
         "others, then the most compute units. One that failed the check at its first use, and a simulator (Oclgrind),\n"
@@ -20,7 +19,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command; returns the exit code."""
     from clrecon.jobs.devices import survey_devices
 
     survey, problem = survey_devices(options.device)

@@ -33,7 +33,6 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
     parser.epilog = _EPILOG
     parser.add_argument("mesh", metavar="A", help=f"mesh: {', '.join(MESH_INPUTS)}")
     parser.add_argument("reference", metavar="B", help="mesh that it is measured against")
@@ -50,7 +49,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command; returns the exit code."""
     from clrecon.jobs.distance import DistanceFiles, measure_meshes
 
     report = measure_meshes(

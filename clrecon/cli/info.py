@@ -204,13 +204,10 @@ class _Sink(io.StringIO):
 def render_listing(
     listing: dict[str, Any], certificate: Sequence[tuple[str, str]], refused: int | None = None
 ) -> list[str]:
-    """Lay out a listing.
+    """Lay out a listing for stdout; with styles only if that is a terminal and ``NO_COLOR`` is not set.
 
-    listing: See `clrecon.jobs.info.InputListing`.
-    certificate: sequence of (str, str). Description of the series that was judged, see `clrecon.cli.info`.
+    certificate: Description of the series that was judged.
     refused: Number of a series whose problems are said elsewhere.
-
-    Returns: Lines for stdout; with styles only if stdout is a terminal and ``NO_COLOR`` is not set.
     """
     terminal = is_terminal(sys.stdout)
     width = max(shutil.get_terminal_size().columns, _NARROWEST) if terminal else _UNLIMITED
@@ -383,7 +380,6 @@ def _wrap(text: str, width: int, indent: str) -> list[str]:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
     parser.epilog = (
         'The series marked * is the one that "clrecon mesh" would use; beneath the table stands what is known of it,\n'
         "and the gates that it is held against. Only headers are read, unless --pixels is given. Exit code 0 when\n"
@@ -396,7 +392,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command; returns the exit code."""
     from clrecon.jobs.info import describe_input
 
     found = describe_input(options.input, make_settings(InfoSettings, options), progress=console.progress)

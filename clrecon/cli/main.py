@@ -109,12 +109,7 @@ example:    clrecon mesh CT_FOLDER -o bone.stl
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command.
-
-    argv: Arguments without the name of the program; default: those of the process.
-
-    Returns: The exit code.
-    """
+    """Run one command with these arguments, by default those of the process; return the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     _escape_unencodable()
     flags = arguments[: arguments.index("--")] if "--" in arguments else arguments

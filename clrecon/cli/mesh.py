@@ -71,7 +71,6 @@ def _epilog() -> str:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
     parser.epilog = _epilog()
     add_input(parser, f"{SCAN_FOLDER}; or {GRID_FILE}")
     add_output(parser, f"mesh file: {MESH_FILES}")
@@ -121,7 +120,6 @@ def mesh_fields(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command; returns the exit code."""
     from clrecon.jobs.mesh.job import make_mesh, makes_objects
 
     given = mesh_fields(options)
@@ -419,8 +417,7 @@ def finish_with_gates(report: dict[str, Any], console: Console, strict: bool) ->
     """Print the warnings of a report; returns the exit code.
 
     With `strict` a failed gate of the volume or of a mesh is an error, which is printed even with ``--quiet`` and
-    ``--json``; that of a mesh decides the code.  Exception: a failed gate of `GATES_OF_AFFINE` (uneven slices) stays a
-    warning.
+    ``--json``; that of a mesh decides the code.  A failed gate of `GATES_OF_AFFINE` (uneven slices) stays a warning.
     """
     from clrecon.jobs.mesh.refinement import warn_of_gates
 

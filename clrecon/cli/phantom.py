@@ -13,7 +13,6 @@ from clrecon.system.text import format_ml
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
     parser.epilog = (
         "Writes a real DICOM series and truth.json with the affine and the exact area and volume, or with the voxels\n"
         "of each material and the label map materials.nrrd; with chosen levels also the label map levels.nrrd. Same\n"
@@ -35,7 +34,6 @@ def _list_kinds() -> str:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command; returns the exit code."""
     from clrecon.proof.phantom import write_phantom
 
     settings = make_settings(PhantomSettings, options)

@@ -252,7 +252,6 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
     parser.epilog = _epilog()
     others = f"a cloud of points ({', '.join(CLOUD_INPUTS)}); or a mesh ({', '.join(MESH_INPUTS)}; of .ply and .vtp say"
     text = f"{SCAN_FOLDER}; {GRID_FILE}; {others} --mode mesh); may be left out with --mesh"
@@ -297,7 +296,6 @@ def render_settings(options: argparse.Namespace) -> RenderSettings:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command; returns the exit code."""
     from clrecon.jobs.render.job import PictureFiles, make_pictures
 
     if options.input is None:

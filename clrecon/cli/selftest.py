@@ -11,13 +11,11 @@ from clrecon.errors import DeviceError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
     parser.epilog = "Runs every kernel on small volumes and compares with plain numpy. Exit code 5 when one differs."
     add_device(parser, memory=False)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command; returns the exit code."""
     from clrecon.proof.run import CHECKS, run_device_selftest
 
     width = max(len(check.name) for check in CHECKS)

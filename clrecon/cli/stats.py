@@ -36,7 +36,6 @@ _LEAST_NAME = 8
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
     parser.epilog = _EPILOG
     add_input(parser)
     add_fields(parser, StatsSettings)
@@ -48,7 +47,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command; returns the exit code."""
     from clrecon.jobs.stats import measure_stats
 
     report = measure_stats(

@@ -40,7 +40,6 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
     parser.epilog = _EPILOG
     add_input(parser)
     add_output(parser, "label map: .nii.gz, .nii, or .dcm (DICOM SEG)")
@@ -58,7 +57,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command; returns the exit code."""
     from clrecon.jobs.vertebrae import make_vertebrae, picture_beside
 
     settings = make_settings(VertebraeSettings, options)

@@ -44,7 +44,6 @@ _SHOWN_PARTS = 12
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
     parser.epilog = _EPILOG
     parser.add_argument(
         "inputs",
@@ -82,7 +81,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    """Run the command; returns the exit code."""
     _check_faces(options)
     if options.window:
         return _show(options, console)

@@ -1,7 +1,6 @@
 """The corridor job: a CT series and its label map in; corridors, grades, pictures and meshes out.
 
-Corridors are the widest lines through the pedicles of labelled vertebrae.  Screws to be graded are given as six numbers
-and a diameter in a text, or as a file of them (JSON or CSV).
+Screws to be graded are six numbers and a diameter in a text, or a file of them (JSON or CSV).
 """
 
 from __future__ import annotations
@@ -49,8 +48,7 @@ class CorridorFiles:
     """Outputs of the job.
 
     output: Meshes: the vertebra and a cylinder a side, in files of its name with those of label and side.
-    picture: .png, .jpg or .tif; one for each vertebra.
-    report: JSON.
+    picture: One for each vertebra.
     """
 
     output: str | Path | None = None
@@ -86,7 +84,7 @@ def read_screws(path: str | Path, space: str) -> tuple[Screw, ...]:
     """Read screws from a file; its first character tells JSON from CSV.
 
     JSON is a list of objects with ``entry`` and ``tip`` (three numbers each, mm of `space`), ``diameter`` and, if
-    wanted, ``name`` and ``label``; or an object with such a list as ``screws``.  CSV has a header with `CSV_COLUMNS`.
+    wanted, ``name`` and ``label``; or an object with such a list as ``screws``.
     """
     shown = escape_text(Path(path).name)
     try:
@@ -147,11 +145,7 @@ _PLACED_BY_LABEL = 0.5
 def make_corridors(
     source: str | Path, settings: CorridorSettings, files: CorridorFiles | None = None, **how: Any
 ) -> CorridorReport:
-    """Find the corridors through the pedicles of labelled vertebrae, and grade given screws.
-
-    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
-    **how: See `Run`.
-    """
+    """Find the corridors through the pedicles of labelled vertebrae, and grade given screws."""
     files = files or CorridorFiles()
     with Run(settings, **how) as run:
         _check_formats(files)

@@ -1,8 +1,4 @@
-"""What the corridor job writes: entries of its report, the sheet of a vertebra, and meshes.
-
-The sheet has for each side three slices through its corridor, with line and circles; the meshes are the vertebra, and a
-cylinder for each corridor and given screw.
-"""
+"""What the corridor job writes: entries of its report, the sheet of a vertebra, and meshes."""
 
 from __future__ import annotations
 
@@ -34,16 +30,7 @@ KNOWN_BIAS = (
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CorridorReport(ScanReport):
-    """The report of the corridor job; the fields are the entries of its JSON.
-
-    notice: What the figures are not for.
-    level_bias: What is known of how far the surface at the level lies from that of the bone.
-    iso_value_choice: As in the report of a mesh.
-    space: Patient frame of all points.
-    grade_scale: The scale of `screws`, None without any.
-    outputs: Files with what they hold.
-    affine_ijk_to_lps_mm: nested list (4, 4)
-    """
+    """The report of the corridor job; docs/contract.md explains its entries."""
 
     notice: str
     level_bias: str
@@ -209,15 +196,10 @@ def _across(
 def draw_corridors(
     volume: Volume, found: VertebraCorridors, screws: Sequence[Screw], margin: float, footer: Sequence[str]
 ) -> PictureData:
-    """Draw the corridors of a vertebra.
+    """Draw the corridors of a vertebra, with a row for each side.
 
-    Each side has a row: the slice through line and left-right direction, the one through line and cranial direction,
-    and the one square to the line at the narrowest section of the pedicle.  A side without corridor shows the slices
-    through the vertebra's middle.
-
-    screws: Given screws of this vertebra.
-    margin: mm.
-    footer: Lines of text below.
+    A row has the slice through line and left-right direction, the one through line and cranial direction, and the one
+    square to the line at the narrowest section of the pedicle; without a corridor, through the vertebra's middle.
     """
     rows = [
         _draw_row(

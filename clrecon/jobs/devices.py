@@ -9,16 +9,10 @@ from clrecon.errors import DeviceError
 
 
 def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError | None]:
-    """List every OpenCL platform and device, and say which device would be used.
+    """List every OpenCL platform and device, and say which device would be used, or why none would.
 
-    name: Value of `device` for a job.
-
-    Returns:
-    survey: ``{"platforms": [{"name", "version", "note"}], "devices": [{"index", "name", "platform", "type", "version",
-        "driver", "memory_bytes", "max_allocation_bytes", "compute_units", "simulator", "fault", "chosen", ...}],
-        "chosen": index or None, "warnings": [text]}``.  A fault is what is remembered of the check at the first use of
-        a device, empty where it passed or was not checked yet; nothing runs on any device.
-    problem: Why no device would be used.
+    The survey is that of ``devices --json``.  A fault is what is remembered of the check at the first use of a device,
+    empty where it passed or was not checked yet; nothing runs on any device.
     """
     from clrecon.opencl import cache_warnings, choose_remembered, list_devices, list_platforms, remembered_fault
 

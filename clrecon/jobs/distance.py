@@ -1,7 +1,4 @@
-"""The job of distances: two meshes in; figures, a mesh coloured by distance and a picture of it out.
-
-The files of both are read, and doubts are raised where they cannot lie in one frame.
-"""
+"""The job of distances: two meshes in; figures, a mesh coloured by distance and a picture of it out."""
 
 from __future__ import annotations
 
@@ -37,15 +34,7 @@ _LEAST_RANGE_MM = 1e-3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DistanceReport(JobReport):
-    """Report of `measure_meshes`; distances are mm.
-
-    a, b: Each mesh: ``name``, ``kind``, ``space`` and ``space_from`` of its file, ``vertices``, ``triangles``,
-        ``closed``, ``area_mm2``, ``volume_ml``, ``bounds_mm`` (LPS).
-    a_to_b_signed_mm, b_to_a_signed_mm: None where the other mesh is not closed.
-    colors: ``range_mm``, ``signed`` and ``beyond_share`` of vertices of A: how distances became colours.
-    outputs: ``kind``, ``name`` and ``bytes`` of each file.
-    device: Where a picture was drawn.
-    """
+    """Report of `measure_meshes`; docs/contract.md explains its entries."""
 
     a: Mapping[str, Any]
     b: Mapping[str, Any]
@@ -64,12 +53,7 @@ class DistanceReport(JobReport):
 
 @dataclass(frozen=True)
 class DistanceFiles:
-    """Files that a job writes.
-
-    output: A coloured by its distance from B, ``.ply``.
-    picture: A picture of it with the scale of its colours.
-    report: JSON.
-    """
+    """Files that a job writes; `output` is A coloured by its distance from B, ``.ply``."""
 
     output: str | Path | None = None
     picture: str | Path | None = None
@@ -83,11 +67,7 @@ def measure_meshes(
     settings: DistanceSettings | None = None,
     **how: Any,
 ) -> DistanceReport:
-    """Measure how far two meshes lie apart.
-
-    mesh, reference: Files A and B, see `clrecon.read_mesh`.
-    **how: See `Run`.
-    """
+    """Measure how far two meshes lie apart, files A and B."""
     from clrecon.operators import take_device
 
     files, settings = files or DistanceFiles(), settings or DistanceSettings()

@@ -29,13 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ExportReport(ScanReport):
-    """Report of `export_volume`; its ``volume`` is the one that was written.
-
-    output: ``format``, ``bytes``, ``type`` of the values, ``shape_ijk``, ``affine_ijk_to_lps_mm``, ``corners_lps_mm``
-        (lowest and highest centre of a voxel), ``space`` of the file and ``outside_hu``: HU of what lies outside of the
-        region, None without one.
-    device: None where the job needed none.
-    """
+    """Report of `export_volume`; its ``volume`` is the one that was written."""
 
     output: Mapping[str, Any]
     device: str | None
@@ -53,11 +47,6 @@ def export_volume(
 
     A device is opened for a region and for preprocessing only.  Where the format cannot hold the volume and it is not
     resampled, that is refused before the device works.
-
-    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
-    output: .nii.gz, .nii, .nrrd or .mha, see `clrecon.write_volume`.
-    report_path: File for the report as JSON.
-    **how: See `Run`.
     """
     settings = settings or ExportSettings()
     with Run(settings, **how) as run:

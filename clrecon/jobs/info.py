@@ -14,12 +14,11 @@ from clrecon.system.progress import Progress
 class InputListing(NamedTuple):
     """The listing of an input.
 
-    listing: ``{"series": [...], "chosen": number or None, "certificate": {...} or None}``, see docs/contract.md.
-        ``chosen`` is the series that a job would use, None if it would refuse; ``certificate`` is that of the series
-        that was judged, refused or not.
+    listing: ``{"series": [...], "chosen": number or None, "certificate": {...} or None}``; ``certificate`` is that of
+        the series that was judged, refused or not.
     notes: Files that were passed over, series that were not chosen, and why none is chosen.
     problem: Why the command fails: no series can be used, the requested one cannot, or a gate failed.
-    refused: Number of the series that was judged and cannot be used; `problem` or the notes say why.
+    refused: Number of the series that was judged and cannot be used.
     """
 
     listing: dict[str, Any]

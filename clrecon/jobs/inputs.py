@@ -58,11 +58,7 @@ def refuse_other_clouds(source: str | Path) -> None:
 
 
 def refuse_scan_settings(settings: InputSettings, also: Sequence[str] = (), noun: str = "a cloud of points") -> None:
-    """Refuse settings that have no meaning where the input is a cloud or a mesh.
-
-    also: Further settings that are about a scan.
-    noun: What the input is.
-    """
+    """Refuse settings about a scan, with those named in `also`, where the input is a cloud or a mesh (the `noun`)."""
     of_scans = {own.name for own in fields(InputSettings)} - {*_OF_BOTH}
     for name in changed_fields(settings):
         if name in of_scans or name in also:
@@ -80,8 +76,7 @@ def read_with_labels(
 ) -> tuple[Volume, LabelMap | None]:
     """Read the labels, then the scan; but labels that take long to unpack after it, to be held against its grid.
 
-    path: File of the labels.
-    read_map: Reads the labels; gets the scan if it was read first.
+    read_map: Gets the scan if it was read first.
     """
     if path is None:
         return read_scan(), None

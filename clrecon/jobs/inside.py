@@ -52,12 +52,7 @@ def check_pictures(picture: str | Path, view: str) -> None:
 def draw_parts(
     meshes: Mapping[str, Mesh], view: str, device: Device, memory: int | None = None
 ) -> dict[str, Rendering]:
-    """Draw each part opaque, with others faded, all from one camera.
-
-    meshes: By the names of `clrecon.operators.vertebrae.inside.PARTS`.
-    view: See `clrecon.Camera.fit`.
-    memory: Most bytes on the device.
-    """
+    """Draw each part (by the names of `PARTS`) opaque, with others faded, all from one camera."""
     from clrecon.operators.rays.mesh_pictures import box_around, mesh_corners
     from clrecon.operators.rays.scene import ScenePictures
     from clrecon.rendering.pictures.object_looks import MeshLook
@@ -81,11 +76,7 @@ log = get_logger(__name__)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class InsideReport(RunReport):
-    """The report of the job: a `RunReport` with further entries, which docs/contract.md explains.
-
-    vertebrae: One for each label, see `clrecon.VertebraInside.as_dict`, with ``meshes`` beside: ``part``, ``vertices``,
-        ``triangles``, ``format`` and ``bytes`` of each file, and ``pictures``.
-    """
+    """The report of the job; docs/contract.md explains its entries."""
 
     vertebrae: list[dict[str, Any]]
     close_mm: float
@@ -104,15 +95,8 @@ def make_inside(
 ) -> InsideReport:
     """Read a CT series and its labels, look into vertebrae, and write the surfaces of their parts.
 
-    The files have the names of the parts: ``inside.stl`` becomes ``inside_solid.stl``, ``inside_dense.stl`` and so on,
-    with several vertebrae ``inside_L3_solid.stl``.  All are written under temporary names, then renamed; the report
-    comes last, as the commit mark.
-
-    source: DICOM folder or file, or a file of another format, see `clrecon.read_volume`.
-    output: Mesh file; its extension gives the format.
-    picture: Picture, .png, .jpg or .tif: one of each part, with names like those of the meshes.
-    report_path: File for the report as JSON.
-    **how: See `Run`.
+    ``inside.stl`` becomes ``inside_solid.stl``, ``inside_dense.stl`` and so on, with several vertebrae
+    ``inside_L3_solid.stl``; pictures are named in the same way.
     """
     from clrecon.labels import file_suffixes
     from clrecon.operators.vertebrae.inside import PARTS

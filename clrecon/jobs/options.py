@@ -1,7 +1,6 @@
 """Settings that every job shares: which scan, which parts of it become air, and which device.
 
-The region of interest and the steps of preprocessing are told as texts.  Nothing here loads numpy: help texts name the
-forms of both.
+Nothing here loads numpy: help texts name the forms of region and preprocessing.
 """
 
 from __future__ import annotations
@@ -195,16 +194,11 @@ def mesh_space_option(text: str = "files that do not name theirs") -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class InputSettings(ScanSettings, DeviceSettings):
-    """Settings of the input: what is read, which parts become air, and the device for the computation.
+    """Settings of the input: what is read, which parts become air, and the device; see the help of the options.
 
-    Options say in their help what they do; beside that:
-
-    field_of_view: float or "auto". mm from the centre of the slices; see `clrecon.anatomy.body.remove_table` for the
-        table.
-    clip_box, between, around: mm of the frame `space` where the job has one, else LPS; infinite numbers leave a side
-        open.  Whole voxels, see `clrecon.geometry.blocks.crop_volume`.
-    region: mm as above, see `parse_region_rules`.
-    preprocess: See `parse_preprocess`.
+    field_of_view: float or "auto". mm from the centre of the slices.
+    clip_box, between, around, region: mm of the frame `space` where the job has one, else LPS; infinite numbers leave a
+        side open.
     """
 
     remove_table: bool = option(
@@ -315,8 +309,8 @@ class RegionRule:
     """One rule.
 
     kind: {"box", "hu", "label", "mask", "seed", "tube"}
-    numbers: Of a box (x0, x1, y0, y1, z0, z1), infinite where a side is open; of HU the lowest and the highest; of a
-        seed a point; of a tube its radius.  Lengths are mm.
+    numbers: mm or HU: of a box (x0, x1, y0, y1, z0, z1), infinite where a side is open; of HU the lowest and the
+        highest; of a seed a point; of a tube its radius.
     path: Label map, or file of a centre line; a tube without one goes along the spinal canal.
     name: Label in the map.
     """
@@ -336,13 +330,7 @@ class RegionRule:
 
 
 def parse_region_rules(rules: str | Sequence[str]) -> tuple[RegionRule, ...]:
-    """Read region rules.
-
-    rules: ``box:X0,X1,Y0,Y1,Z0,Z1`` in mm, where an empty side is open; ``hu:LO,HI``, both ends included;
-        ``label:FILE:NAME``, a label of a label map by name or number; ``mask:FILE``, all labels of a label map;
-        ``seed:X,Y,Z``, what is joined to this point; ``tube:MM``, what lies so near to the middle of the spinal canal,
-        or with ``tube:MM:FILE`` to another centre line.
-    """
+    """Read region rules, of the forms `REGION_FORMS`."""
     parsed = tuple(_parse_region_rule(str(rule).strip()) for rule in ([rules] if isinstance(rules, str) else rules))
     kinds = {rule.kind for rule in parsed}
     if "seed" in kinds and not kinds & {"hu", "label", "mask"}:
@@ -420,13 +408,12 @@ class PreprocessStep:
 
 
 def parse_preprocess(steps: str | Sequence[str]) -> tuple[PreprocessStep, ...]:
-    """Read the steps of preprocessing, which run in this order.
+    """Read the steps of preprocessing, of the forms `PREPROCESS_FORMS`; they run in this order.
 
-    steps: A text with commas, or its parts.  Filters of HU may have parameters: spatial sigma in mm and range sigma in
-        HU of the bilateral filters, and so on as `FILTERS` says.  ``erode:MM``, ``dilate:MM``, ``open:MM`` and
-        ``close:MM`` take a ball of this radius, ``fill`` and ``fill-slices`` fill holes: all of the voxels at the level
-        of the job and above, or of ``level:HU`` if that stands before.  ``region`` is the place of the region of
-        interest, which else comes first.
+    ``erode:MM``, ``dilate:MM``, ``open:MM`` and ``close:MM`` take a ball of this radius, ``fill`` and ``fill-slices``
+    fill
+    holes: all of the voxels at the level of the job and above, or of ``level:HU`` if that stands before.  ``region`` is
+        the place of the region of interest, which else comes first.
     """
     words = steps.split(",") if isinstance(steps, str) else [str(step) for step in steps]
     parsed = tuple(_parse_step(word.strip()) for word in words)

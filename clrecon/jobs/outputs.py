@@ -27,10 +27,7 @@ MOST_FILES = 1000
 
 
 def name_outputs(output: str | Path, names: Sequence[str], report_path: str | Path | None = None) -> list[str | Path]:
-    """Name the files of several meshes: ``bone.stl`` and ``200hu`` give ``bone_200hu.stl``; an empty name adds nothing.
-
-    names: One for each mesh, see `clrecon.jobs.mesh.surfaces.Part`.
-    """
+    """Name the files of several meshes: ``bone.stl`` and ``200hu`` give ``bone_200hu.stl``, an empty name nothing."""
     if len(names) > MOST_FILES:
         raise UsageError(
             f"{len(names):,} meshes are more than {MOST_FILES:,} files:"
@@ -48,10 +45,7 @@ def name_outputs(output: str | Path, names: Sequence[str], report_path: str | Pa
 
 
 def check_distinct(*owned: Sequence[tuple[str, str | Path]]) -> None:
-    """Refuse two outputs that are the same file.
-
-    *owned: sequence of (str, path). Description and path of each file.
-    """
+    """Refuse two outputs that are the same file, each given by description and path."""
     owners: dict[str, str] = {}
     for own, path in chain(*owned):
         other = owners.get(_identity(path))
@@ -73,9 +67,8 @@ def check_kept(outputs: Sequence[tuple[str, str | Path | None]], *inputs: str | 
     Files with the mark of DICOM are never replaced (`clrecon.system.files`). This function protects data sets without
     the mark, files of other formats with their voxel files, and files with settings.
 
-    outputs: sequence of (str, path or None). Description and path of an output: a file, or a folder that is replaced as
-        a whole.
-    *inputs: Files and folders that are read; None and "" are ignored.
+    outputs: An output can be a folder that is replaced as a whole.
+    *inputs: None and "" are ignored.
     """
     there = [(what, path) for what, path in outputs if path is not None and os.path.exists(path)]
     read = [path for one in inputs if one and there for path in (one, _find_voxels(one)) if path]
@@ -156,10 +149,7 @@ def _identity(path: str | Path) -> str:
 def check_outputs(
     output: str | Path, report_path: str | Path | None, names: Sequence[str] = ("",)
 ) -> list[tuple[str, str | Path]]:
-    """Refuse outputs that cannot be written, before any work is done.
-
-    Returns: list of (str, path). Description and path of each output.
-    """
+    """Refuse outputs that cannot be written, before any work is done; return description and path of each."""
     check_format(output)
     outputs = [("the mesh", path) for path in name_outputs(output, names, report_path)]
     if report_path is not None:

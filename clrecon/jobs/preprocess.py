@@ -1,7 +1,7 @@
 """What happens to a scan before anything is made of it: masking, the region of interest, and steps of preprocessing.
 
-Masking turns the table, the surroundings and everything outside of the field of view into air, the region of interest
-what lies outside of it.  Steps are filters of HU, and morphology of what lies at the level and above.
+Masking and region turn what lies outside into air.  Steps are filters of HU, and morphology of what lies at the level
+and above.
 """
 
 from __future__ import annotations
@@ -257,8 +257,6 @@ def preprocess_volume(
     above it, voxels that it adds get that mean: the surface then runs half way between what stays and what went.
 
     bands: What the job takes as inside; morphology works on the only one, or on that of a step ``level:HU``.
-
-    Returns: With ``report["preprocess"]``, an entry a step: its name, parameters, what it took and added, seconds.
     """
     if settings.preprocess is None:
         return volume

@@ -11,12 +11,7 @@ from clrecon.system.text import guess_word, unknown_name
 
 @dataclass(frozen=True)
 class IsoPreset:
-    """An iso value with its name and its reason.
-
-    iso_value: HU.
-    description: One line about the surface.
-    source: Origin of the value.
-    """
+    """An iso value in HU with its name, a line about the surface, and the origin of the value."""
 
     name: str
     iso_value: float
@@ -64,10 +59,8 @@ def find_iso_preset(name: str) -> IsoPreset:
 
 @dataclass(frozen=True)
 class Purpose:
-    """A name that stands for settings.
+    """A name that stands for settings: fields of `MeshSettings` that it sets if they are not given.
 
-    settings: Fields of `MeshSettings` that it sets if they are not given.
-    description: One line.
     is_for_print: The surface has to be closed and of bone, and what a printer needs to know of it is measured.
     """
 

@@ -100,9 +100,8 @@ class DeviceOpening:
     The order of errors does not depend on which side is faster: if both the block and the device fail, the device's
     error is raised.  Only a cancellation by the caller is passed on in any case.
 
-    name: As `clrecon.device` takes it.
     trial: Builds the kernels: it runs the steps of the job on something small, such as `trial_cube`, and its result is
-        dropped.  Its functions go on on the stand-in of a device by themselves.
+        dropped.
     """
 
     def __init__(self, name: str | int | Device | None, trial: Callable[[Device], object]):
@@ -200,12 +199,7 @@ def peak_memory_bytes(status: Path = _OWN_STATUS) -> int | None:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JobReport(Record):
-    """The entries that all reports share.  In JSON they come last: first those that a report declares itself.
-
-    version, platform: Version of clrecon; system, machine and Python.
-    warnings: Those of the volume first, each once.
-    seconds: Seconds by part of the job, with ``total``.
-    """
+    """The entries that all reports share.  In JSON they come last: first those that a report declares itself."""
 
     _LAST: ClassVar[tuple[str, ...]] = ("version", "platform", "warnings", "volume", "seconds", "peak_memory_bytes")
     """Names of the entries at the end, in their order."""
@@ -227,21 +221,14 @@ class JobReport(Record):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScanReport(JobReport):
-    """Those of jobs that read a scan.
-
-    volume: The `Certificate` of the volume without its warnings.
-    """
+    """Those of jobs that read a scan; `volume` is its `Certificate` without warnings."""
 
     volume: Mapping[str, Any]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RunReport(ScanReport):
-    """Those of jobs that work on a device.
-
-    affine_ijk_to_lps_mm: nested list (4, 4); None where no scan was read
-    memory_allowed_bytes: Most bytes that may be taken on the device; None: all.
-    """
+    """Those of jobs that work on a device; the affine has shape (4, 4), None where no scan was read."""
 
     _LAST = ("device", "driver", "memory_allowed_bytes", *JobReport._LAST)
 
@@ -254,15 +241,10 @@ class RunReport(ScanReport):
 class Run(Laps):
     """One run of a job: checks and stages its files, times it, composes the shared part of its report, and commits.
 
-    All files are on the disk before the first replaces an older one; those that are not committed at the end of the
-    ``with`` block are removed.
+    All files are on the disk before the first replaces an older one, the report is renamed last, as the commit mark;
+    those that are not committed at the end of the ``with`` block are removed.
 
-    settings: Those of the job; of their fields ``keep_ids``, ``labels``, ``memory``, ``space`` and ``device`` are used
-        here.
     no_clobber: Files that exist stay and are an `OutputError`, before any work.
-    progress: ``progress(stage, done, total)``.
-
-    files: Those that are written so far.
     logged: Warnings that are in the log already: those of the volume of the report.
     """
 
@@ -290,10 +272,7 @@ class Run(Laps):
         return keep_existing(self.no_clobber)
 
     def check(self, outputs: Sequence[tuple[str, str | Path | None]], *inputs: str | Path | None) -> None:
-        """Refuse outputs that are the same file, cannot be written, or would replace one of the inputs.
-
-        outputs: Description and path of each file; None: it is not written.
-        """
+        """Refuse outputs that are the same file, cannot be written, or would replace one of the inputs."""
         named = [(what, path) for what, path in outputs if path is not None]
         with self.keeping():
             check_files(named)
@@ -382,11 +361,9 @@ class Run(Laps):
         before: Iterable[str] = (),
         **own: Any,
     ) -> Report:
-        """Compose a report.
+        """Compose a report of this kind: a `ScanReport` has the certificate of `volume`, a `RunReport` the device `on`.
 
-        kind: A `JobReport`; a `ScanReport` has the certificate of `volume`, a `RunReport` the device `on`.
-        warnings: Those of the job, which come after those of the volume.
-        before: Those of the job that come before.
+        warnings, before: Those of the job that come after and before those of the volume.
         **own: Entries that `kind` declares.
         """
         certificate = {} if volume is None else self.certificate(volume)

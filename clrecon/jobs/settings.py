@@ -79,11 +79,7 @@ class ExportSettings(InputSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class StatsSettings(ScanSettings):
-    """Settings of the job of statistics.
-
-    only: None: all.
-    percentiles: None: `clrecon.labels.statistics.PERCENTILES`.
-    """
+    """Settings of the job of statistics; without `only` all labels are measured."""
 
     labels: str | Path = label_map_option(required=True)
     only: Sequence[str | int] = option(
@@ -108,10 +104,7 @@ MOST_SAMPLES = 10_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class DistanceSettings(DeviceSettings):
-    """Settings of the job of distances.
-
-    samples: None: `clrecon.mesh.compare.distances.SAMPLES`.
-    """
+    """Settings of the job of distances."""
 
     mesh_space: str | None = mesh_space_option("files that do not name theirs")
     samples: int | None = option("--samples N", "points on each mesh, evenly by area (default: 50000)")
@@ -159,10 +152,7 @@ def _parse_band(text: str) -> tuple[float | None, float | None]:
 class InsideSettings(ScanSettings, DeviceSettings):
     """Settings of the job that looks into vertebrae.
 
-    only: Numbers or names of labels.
-    dense: (low, high). None leaves an end open.  Default: `clrecon.operators.vertebrae.inside.DENSE_HU`.
-    close_mm: Default: `clrecon.operators.vertebrae.solid.CLOSE_MM`.
-    grow_mm: See `clrecon.extract_labels`.
+    dense: (low, high). None leaves an end open.
     """
 
     labels: str | Path = label_map_option(required=True)
@@ -277,12 +267,7 @@ def _parse_level(text: str) -> float | None:
 
 @dataclass(frozen=True, kw_only=True)
 class CorridorSettings(ScanSettings, DeviceSettings):
-    """Settings of the corridor job.
-
-    only: At least one.
-    iso_value: None: half way, measured in the scan.
-    screws: See `clrecon.jobs.corridor.parse_screw`.
-    """
+    """Settings of the corridor job; without `iso_value` it is half way, measured in the scan."""
 
     labels: str | Path = label_map_option(required=True)
     only: Sequence[str | int] = option(

@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 class StatsReport(ScanReport):
     """Report of `measure_stats`.
 
-    labels: list of `clrecon.labels.statistics.LabelFigures`
     resampled: The map was brought to the grid of the scan, and its voxels do not all coincide with those of the scan.
-    affine_ijk_to_lps_mm: nested list (4, 4)
     """
 
     labels: list[LabelFigures]

@@ -1,7 +1,4 @@
-"""The vertebrae job: a CT series in, a first guess of a label map out, with a picture to judge it by.
-
-The picture of every run is the straightened spine with planes and vertebrae drawn over it.
-"""
+"""The vertebrae job: a CT series in, a first guess of a label map out, with a picture to judge it by."""
 
 from __future__ import annotations
 
@@ -29,14 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VertebraeReport(ScanReport):
-    """Report of `make_vertebrae`.
-
-    vertebrae: All that were found, from the head downwards.
-    low_confidence: How many of them have a confidence below 0.5.
-    written: How many the label map has.
-    discs: ``centre_mm`` and ``normal`` (downwards) of each disc, LPS.
-    output: ``format`` and ``bytes`` of the label map.
-    """
+    """Report of `make_vertebrae`; docs/contract.md explains its entries."""
 
     vertebrae: list[Vertebra]
     low_confidence: int
@@ -59,14 +49,7 @@ def make_vertebrae(
 ) -> VertebraeReport:
     """Read a CT series, find its vertebrae, and write a label map and a picture of the discs and labels.
 
-    No device is needed.
-
-    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
-    output: Label map: .nii.gz or .nii; .dcm is a DICOM SEG, for a scan in DICOM.
     picture_path: PNG; by default beside the label map, with its name.
-    with_picture: False: without `picture_path` there is no picture.
-    report_path: File for the report as JSON.
-    **how: See `Run`.
     """
     from clrecon.spine import split_vertebrae
 
@@ -182,8 +165,8 @@ NAMES_MM = 62
 def draw_vertebrae(split: VertebraSplit) -> bytes:
     """Return the picture as PNG: from the side, names and confidence, and from the front.
 
-    The spine is straightened along the canal; a row is a millimetre of it.  Planes between vertebrae are yellow,
-    vertebrae have colours of their own, and those of low confidence are hatched in red.
+    The spine is straightened along the canal; a row is a millimetre of it.  Vertebrae of low confidence are hatched in
+    red.
     """
     load_pillow()
     from PIL import Image, ImageDraw

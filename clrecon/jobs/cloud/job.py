@@ -34,12 +34,7 @@ log = get_logger(__name__)
 def make_cloud(source: str | Path, files: CloudFiles, settings: CloudSettings | None = None, **how: Any) -> CloudReport:
     """Read a CT series or a cloud, run the steps that are asked for, and write the cloud that is left.
 
-    The steps run in the order of `clrecon.jobs.cloud.settings.STEPS`.  Checks come first: the outputs, then the device,
-    then the input.  All files are written under temporary names and renamed when all are done; the report comes last,
-    as the commit mark.
-
-    source: DICOM folder or file, a file of another format, or a file of points, see `clrecon.read_points`.
-    **how: See `Run`.
+    Checks come first: the outputs, then the device, then the input.
     """
     settings = settings or CloudSettings()
     with Run(settings, **how) as run:
@@ -170,10 +165,8 @@ def _write_files(
 class CloudFiles:
     """Files that a cloud job writes.
 
-    output: The cloud: ``.ply``, ``.vtp``, ``.npz``, ``.xyz`` or ``.las``.
-    removed: The points as they were extracted, each with the number of the reason why it went as its label; 0 is kept.
-    surface: A closed mesh around the cloud, in a format of meshes.
-    report: The report as JSON.
+    removed: The points as they were extracted, each labelled with the number of the reason why it went; 0 is kept.
+    surface: A closed mesh around the cloud.
     """
 
     output: str | Path

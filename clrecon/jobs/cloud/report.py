@@ -24,22 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CloudReport(RunReport):
-    """The report of a cloud job: a `RunReport` with further entries, which docs/contract.md explains.
-
-    kind: Kind of the points; None for a cloud that was read.
-    hu: [low, high] or None
-    cloud_read: The cloud that was read, see `clrecon.jobs.inputs.describe_cloud`.
-    points, points_first: Points of the written cloud, and before any step.
-    removed: Points that went, by reason.
-    normals, has_hu, labels: What the written cloud knows of its points.
-    bounds_mm: [[x, y, z], [x, y, z]]
-    steps: In the order in which they ran: ``step``, ``points_before``, ``points_after``, ``removed``, ``seconds`` and
-        figures of their own.
-    removed_labels: The labels of the file of removed points.
-    surface: The mesh around the cloud: ``vertices``, ``triangles``, ``spacing_mm``, ``bridge_mm``,
-        ``votes_against_share``, ``wall_share``, ``lost_share``, ``open_cubes``, ``warnings``.
-    outputs: ``what``, ``format`` and ``bytes`` of each file but the report.
-    """
+    """The report of a cloud job; docs/contract.md explains its entries."""
 
     PARTS = ("device", "read", "mask", "steps", "surface", "write")
 
@@ -81,13 +66,7 @@ def report_of(
     outputs: list[dict[str, Any]],
     losses: Sequence[str],
 ) -> CloudReport:
-    """Compose the report of a job.
-
-    subject: What was read.
-    has_removed: The points that went were written too.
-    outputs: Results of `describe_file`.
-    losses: Warnings of what the format of the cloud cannot hold.
-    """
+    """Compose the report of a job on what was read, the `subject`; `losses` are warnings of the cloud's format."""
     from clrecon.points import PointCloud
 
     settings: CloudSettings = run.settings

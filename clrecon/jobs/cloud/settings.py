@@ -95,15 +95,11 @@ def _parse_denoisers(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class CloudSettings(InputSettings):
-    """Settings of the cloud job.
-
-    Options say in their help what they do; beside that:
+    """Settings of the cloud job; options say in their help what they do.
 
     hu: float or (low, high).
     label: Number or name.
-    ghost_slices: See `clrecon.find_ghost_slices`.
-    keep: See `clrecon.keep_clusters`; they need clusters, which then have the default parameters.
-    normals: Points without normals get them, and points that were moved new ones.
+    keep: They need clusters, which then have the default parameters.
     """
 
     space: str = space_option("patient frame of the written files and of seeds")

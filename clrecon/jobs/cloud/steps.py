@@ -1,7 +1,6 @@
 """The points of a cloud job on their way: from a scan or a file, and through the steps, in their one order.
 
-Foreign slices inside the stack (ghosts) are found before anything is masked, named, and dropped if asked for.
-`CloudSteps` has the cloud after each step, and why each of its first points went.
+Foreign slices inside the stack (ghosts) are found before anything is masked.
 """
 
 from __future__ import annotations
@@ -98,11 +97,7 @@ def try_steps(device: Device, settings: CloudSettings, is_cloud: bool) -> None:
 def run_steps(
     steps: CloudSteps, settings: CloudSettings, device: Device, resident: DeviceVolume | None, progress: Progress
 ) -> None:
-    """Run the steps that are asked for, from the clusters to the spacing.
-
-    steps: Gets the result of each step.
-    resident: The volume of the points; None for clouds that were read.
-    """
+    """Run the steps that are asked for, from the clusters to the spacing; `resident` is the volume of a scan."""
     shared: dict[str, Any] = {"device": device.current, "memory": settings.memory, "progress": progress}
     for run in (_cluster_points, _remove_sparse, _remove_outliers, _denoise_points, _find_normals, _thin_points):
         steps.start()
@@ -269,13 +264,8 @@ _TAKEN_BY_RULE = ("small cluster", "other cluster")
 class CloudSteps:
     """The points of a job, from the first cloud to the last.
 
-    cloud: As it was extracted or read.
-    began: When its extraction began, see `clock`; None for a cloud that was read.
-
-    first, cloud: The first cloud, and what is left of it.
-    entries: That of each step in the report.
-    reasons: All reasons so far for which a point went: number r of `fate` is ``reasons[r - 1]``.
-    fate: ndarray, shape (n,), uint8. For each point of the first cloud 0, or the number of the reason why it went.
+    began: When the extraction began, see `clock`; None for a cloud that was read.
+    fate: ndarray, shape (n,), uint8. For each point of the first cloud 0, or r where it went by ``reasons[r - 1]``.
     """
 
     def __init__(self, cloud: PointCloud, began: float | None = None):
@@ -305,12 +295,7 @@ class CloudSteps:
         self._lap = time.perf_counter()
 
     def add(self, name: str, step: PointStep, *, takes_noise: bool = False) -> None:
-        """Take the result of a step over.
-
-        name: One of `clrecon.jobs.cloud.settings.STEPS`.
-        takes_noise: A step that takes more than half of the points by reasons that are no rule of the caller fails a
-            gate.
-        """
+        """Take the result of a step over; one that `takes_noise` is judged by the share of points that it took."""
         numbers = [0]
         for reason, count in step.counts.items():
             if count and reason not in self.reasons:

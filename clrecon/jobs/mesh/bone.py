@@ -35,9 +35,7 @@ def find_bone(
 ) -> NDArray[np.bool_]:
     """Find the components that look like bone or, if none does, the one that holds the spinal canal.
 
-    mesh, volume, surface, labelled: The components of `surface` in `volume`.
     without_table: The table was already removed, so the message does not advise it.
-
     Returns: ndarray, shape (count,), bool
     """
     import numpy as np
@@ -191,9 +189,8 @@ def _is_of_bone(surface: Surface, lowest: float) -> bool:
 
 
 def warn_of_walls(parts: Sequence[Part], settings: MeshSettings, choice: IsoChoice | None = None) -> list[str]:
-    """Return warnings for a surface that should be bone but is contrast medium, joined to it, or something else.
+    """Return warnings for judged parts that should be bone but are contrast medium, joined to it, or something else.
 
-    parts: Parts that `judge_surfaces` has judged.
     choice: The choice of the iso value; warnings about contrast medium at its edges are included.
     """
     contrast = [] if choice is None else warn_of_contrast(choice)

@@ -40,16 +40,9 @@ def make_mesh(
 
     One mesh is written to `output`.  Several, of several iso values or split into components, get a name between
     stem and extension: ``bone_200hu.stl``, ``bone_001.stl``, ``bone_200hu_001.stl``, ``bone_T12.stl``.
+    Outputs that cannot be written are refused first, then a missing device, then the input.
 
-    Outputs that cannot be written are refused first, then a missing device, then the input.  The device is opened and
-    its kernels are built while the input is read.  All files are written under temporary names, then renamed; the
-    report comes last, as the commit mark.
-
-    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
-    output: Mesh file; its extension gives the format.
-    report_path: File for the report as JSON.
     measure: Measure the meshes, which costs time; without it those entries are None.  Default: with a `report_path`.
-    **how: See `Run`.
     """
     settings = settings or MeshSettings()
     if settings.all_parts and makes_objects(output):

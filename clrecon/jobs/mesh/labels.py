@@ -55,14 +55,7 @@ def extract_label_surfaces(
     settings: MeshSettings,
     progress: Progress,
 ) -> tuple[list[Surface], list[Mesh]]:
-    """Extract each label at each iso value, or only once if its own surface is asked for.
-
-    surfaces: One for each iso value.
-
-    Returns:
-    surfaces: One for each label and iso value with a surface; named by the label and, if there are several, the iso
-        value.
-    """
+    """Extract each label at each iso value, or only once if its own surface is asked for; name the surfaces by both."""
     from clrecon.labels import file_suffixes
     from clrecon.operators.surface.labels import extract_labels
 
@@ -145,10 +138,8 @@ def describe_label(origin: dict[str, Any]) -> dict[str, Any]:
 def judge_label_volumes(parts: Sequence[Part], closed: bool) -> list[dict[str, Any]]:
     """Compare the meshes of each label, all components together, with the volume of its voxels in the CT.
 
-    `closed` says that surfaces are closed at the border of the scan.  Each part of a label gets ``label_mesh_ml`` and
-    ``label_compared_ml`` among its `facts`.
-
-    Returns: A gate for each label and iso value, see `clrecon.mesh.compare.mesh_gates.judge_label_volume`.
+    Each part of a label gets ``label_mesh_ml`` and ``label_compared_ml`` among its `facts`; there is a gate for each
+    label and iso value.
     """
     from clrecon.mesh.compare.mesh_gates import judge_label_volume
     from clrecon.mesh.triangles import enclosed_ml

@@ -1,8 +1,4 @@
-"""From a scan to the meshes of a job, before they are refined, measured and written.
-
-Kernels are built, the volume is narrowed to what its surfaces are made of, and of each surface the parts are selected
-that become one file each.
-"""
+"""From a scan to the meshes of a job, before they are refined, measured and written."""
 
 from __future__ import annotations
 
@@ -63,7 +59,6 @@ class MadeParts:
 def make_parts(source: str | Path, run: Run, check_map: Callable[[LabelMap], None] | None = None) -> MadeParts:
     """Read a scan, extract its surfaces and select components.
 
-    run: Its settings are those of the mesh job; it gets the times of the parts.
     check_map: Called with the label map whose labels become meshes, before the device works.
     """
     settings: MeshSettings = run.settings
@@ -179,9 +174,7 @@ def mask_parts(
 def mask_and_preprocess(
     volume: Volume, surfaces: Sequence[Surface], settings: MeshSettings, device: Device, progress: Progress
 ) -> Volume:
-    """Return the volume without what the surfaces shall not hold: outside air, where they lie below a level, what is
-    outside of the region, and what preprocessing takes.
-    """
+    """Return the volume without outside air below a level, and after region and preprocessing."""
     bands = _bands_of(surfaces)
     volume = drop_outside_air(volume, settings, progress)
     if settings.below is not None:
@@ -286,10 +279,7 @@ def extract_surfaces(
 def select_parts(
     surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device, volume: Volume, steps: Steps
 ) -> list[Part]:
-    """Keep the components that the settings ask for, and measure what the purpose of the mesh needs.
-
-    `steps` counts `SELECT_STEPS`, or fewer.
-    """
+    """Keep the components that are asked for, and measure what the purpose needs; `steps` counts `SELECT_STEPS`."""
     if not settings.is_for_print:
         return _select_parts(surface, mesh, settings, device, volume, steps)
     from clrecon.jobs.mesh.purposes import measure_pieces

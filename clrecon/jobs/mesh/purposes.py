@@ -1,7 +1,4 @@
-"""The purposes of meshes: the settings that follow from one, and facts for people who print a mesh.
-
-The facts are size, walls, cavities and parts left out.
-"""
+"""The purposes of meshes: the settings that follow from one, and facts for people who print a mesh."""
 
 from __future__ import annotations
 
@@ -25,14 +22,12 @@ if TYPE_CHECKING:
 
 
 def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of `MeshSettings` that a purpose sets, with the given fields, which win.
+    """Return the fields of `MeshSettings` that a purpose sets, with the given ones, which win.
 
-    given: Fields; None, False and empty values count as not given.
-
-    Returns: The given fields, and ``purpose``.  If components are chosen in another way, the purpose leaves none out.
-        Bone is distinguished from other material only if all iso values are those of bone, from 100 to 1500 HU or
-        ``"auto"``; it is made solid if there is one of them, and ``solid`` is not given as False.  Labels whose surface
-        HU place are made solid one by one.
+    None, False and empty values count as not given.  If components are chosen in another way, the purpose leaves none
+    out.  Bone is told from other material only if all iso values are those of bone, from 100 to 1500 HU or ``"auto"``;
+    it is made solid if there is one of them, and ``solid`` is not given as False.  Labels whose surface HU place are
+    made solid one by one.
     """
     if name is None:
         return dict(given)
@@ -89,11 +84,7 @@ THIN_SHARE = 0.05
 
 
 def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> dict[str, float]:
-    """Measure the volumes that components enclose; `vertices` have shape (n, 3), in mm, `triangles` (m, 3).
-
-    Returns: ``pieces``, ``pieces_ml`` : components that enclose something, and how much ``cavities``, ``cavities_ml`` :
-        walls of cavities, and what they enclose
-    """
+    """Return number and ml of the components that enclose something (pieces), and of the walls of cavities."""
     from clrecon.mesh.refine.shifts import measure_volumes
     from clrecon.system.pieces import local_origin
 
@@ -107,15 +98,10 @@ def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
 
 
 def describe_print(mesh: Mesh, found: dict[str, float], kept: dict[str, float]) -> dict[str, Any]:
-    """Return the facts for people who print a mesh: ``print`` of the report.
+    """Return ``print`` of the report for a mesh as it is written.
 
-    mesh: The mesh as it is written.
-    found, kept: `measure_pieces` of the surface as it was extracted, and of what was kept of it.
-
-    Returns: ``size_mm`` : x, y, z of the box around it ``wall`` : see `clrecon.mesh.compare.distances.measure_walls`
-        ``left_out`` : pieces and cavities as in `measure_pieces`; cavities that are left out are filled; and
-        ``not_bone``, ``not_bone_ml``, the pieces whose walls are not like bone or that are crumbs, None where that was
-        not asked ``pieces``, ``pieces_ml``, ``cavities``, ``cavities_ml`` : those that are in it
+    found, kept: `measure_pieces` of the surface as it was extracted, and of what was kept of it.  Cavities that are
+        left out are filled; what is no bone is None where that was not asked.
     """
     from clrecon.mesh.compare.distances import measure_walls
 

@@ -27,9 +27,6 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress:
     """Smooth and decimate as the settings say; return the mesh itself if they ask for neither.
 
     Distances are bounded on the device, unless the settings limit its memory: what they allow is for the surface.
-
-    Returns: Its report: ``refinement``: ``smooth``, ``decimate`` (see `clrecon.mesh.refine.decimation`), ``deviation``,
-        which is `clrecon.mesh.compare_meshes` with the surface before, and ``voxel_mm``.
     """
     if not settings.refines:
         return mesh
@@ -104,15 +101,10 @@ def measure_parts(
     device: Device | None = None,
     progress: Progress = ignore_progress,
 ) -> None:
-    """Measure the quality of each part, and with `strict` the triangles that cut each other.
+    """Measure the `quality` of each part, and with `strict` the triangles that cut each other.
 
-    The device looks for these while the host measures all else, the distance from the scan too.
-
-    parts: As they are written; the result is their `quality`.
-    volume: The volume that they were made from.
-    device: Helps with the search; without one the host finds the same.
-    progress: Called as ``progress("measure", parts done, parts)``, with `strict` as ``progress("crossings", triangles
-        done, triangles)``.
+    The device looks for these while the host measures all else, the distance from the scan too; without a device the
+    host finds the same.
     """
     if not settings.strict:
         steps = Steps(progress, "measure", len(parts))
@@ -145,15 +137,9 @@ def _measure_distance(part: Part, volume: Volume) -> IsoDistance | None:
 def judge_parts(
     parts: Sequence[Part], volume: Volume, settings: MeshSettings, progress: Progress = ignore_progress
 ) -> list[dict[str, Any]]:
-    """Judge the parts of a job by the gates; the measures are stored in the `facts` of each.
+    """Judge the parts of a job by the gates, and store the measures in the `facts` of each.
 
-    parts: Parts as they are written, after `measure_parts`.  A part that was not measured has only the gates of
-        refinement.
-    volume: The volume that they were made from.
-    progress: Called as ``progress("distance", parts done, parts)``.
-
-    Returns: All gates, see `clrecon.mesh.compare.mesh_gates.judge_mesh`, each with ``mesh``, the name of its part or
-        None.
+    A part that was not measured has only the gates of refinement.  Gates have ``mesh``, the name of their part or None.
     """
     if not (settings.refines or any(part.quality for part in parts)):
         for part in parts:

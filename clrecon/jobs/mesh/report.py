@@ -28,11 +28,9 @@ _SAID_ABOVE = ("vertices", "triangles", "closed", "manifold", "components", "are
 
 
 def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], space: str) -> dict[str, Any]:
-    """Return one object of ``meshes``.
+    """Return one object of ``meshes``; entries that were not measured are None.
 
-    Lengths are mm, areas mm2, volumes ml (1 ml = 1000 mm3). ``bounds_mm`` is ``[[x, y, z], [x, y, z]]``, the lowest and
-    the highest corner in the patient frame `space`, also for formats that store another frame (GLB: metres, Y up).
-    Entries that were not measured are None.
+    Bounds are in the patient frame `space`, also for formats that store another frame (GLB: metres, Y up).
     """
     quality: dict[str, Any] = part.quality or {}
     origin = part.mesh.report
@@ -67,25 +65,11 @@ def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeshReport(RunReport):
-    """The report of a mesh job: a `RunReport` with further entries, which docs/contract.md explains.
+    """The report of a mesh job; docs/contract.md explains its entries.
 
     With one mesh, its entries are here too.  With several, counts and sizes are sums (components of one surface that
     are written one by one were found together, and count once), `bounds_mm` is the box around all, `closed` and
     `manifold` are true if they are for each mesh, and entries that differ or cannot be summed are None.
-
-    iso_value_hu, iso_level_hu: The iso value as asked for, and the level of the surface.
-    inside, inside_hu, inside_levels_hu, outside_hu: The values that the surfaces enclose, and the value beyond the
-        border of the volume.
-    iso_value_reason, iso_value_choice, preset, preset_reason: Origin of the iso value: in words, the `IsoChoice`
-        without its value, the preset and its source.
-    bounds_mm: [[x, y, z], [x, y, z]] or None
-    keep, keep_largest, min_volume_ml, seeds_mm, all_parts, split, purpose: The settings.
-    slabs: Largest number for a surface.
-    device_bytes: Most bytes taken on the device, by purpose.
-    quality, walls, iso_distance, cortex, refinement, print, cells, growing: Entries of the only mesh.
-    meshes: One for each file, see `describe_part`.
-    output: ``format`` and ``bytes`` of all files.
-    gates: `Gate`, each with ``mesh``, the name of its part or None.
     """
 
     _LEFT_OUT = ("preset_reason",)
@@ -154,11 +138,7 @@ _DEVICE_PARTS = ("upload", "build", "kernels", "download")
 def report_of(
     run: Run, made: MadeParts, meshes: Sequence[dict[str, Any]], gates: list[dict[str, Any]], warnings: Sequence[str]
 ) -> MeshReport:
-    """Make the report of a job.
-
-    meshes: Result of `describe_part` for each part.
-    warnings: Warnings of the job; those of the volume and the meshes come before them.
-    """
+    """Make the report of a job; its `warnings` come after those of the volume and the meshes."""
     settings: MeshSettings = run.settings
     parts = made.parts
     level, level_warnings = describe_level(made.solid, settings, made.choice)

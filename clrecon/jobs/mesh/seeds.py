@@ -39,7 +39,7 @@ def check_growing(
 ) -> None:
     """Check the seeds, the method and the vertex rule of a mesh job, each and with its other settings.
 
-    has_labels, makes_labels: There is a label map; labels of it are named that become meshes.
+    makes_labels: Labels of the map are named that become meshes.
     """
     for seed in grow_from:
         if not isinstance(seed, str):

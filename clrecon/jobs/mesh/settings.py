@@ -68,23 +68,16 @@ def name_level(level: float | Sequence[float]) -> str:
 
 @dataclass(frozen=True)
 class MeshSettings(InputSettings):
-    """Settings of the mesh job.
-
-    Options say in their help what they do; beside that:
+    """Settings of the mesh job; options say in their help what they do.
 
     iso_value: float or sequence of float or (low, high). A pair in the sequence is a range: ``((100, 300),)``.
     half_way: "auto" or (bone, tissue), see `clrecon.jobs.options.parse_hu`.
-    preset: See `clrecon.jobs.presets`.  If no level is given, it is "bone".
-    surface: "cortex": see `clrecon.fit_cortex`; "mask" is that of the labels, `LabelChoice.surface`.
-    topology, vertex_rule: See `clrecon.extract_isosurface`.
+    preset: If no level is given, it is "bone".
+    surface: "mask" is that of the labels, `LabelChoice.surface`.
     method: One of `clrecon.operators.surface.methods.METHODS`; None: "i-mc" with seeds in `grow_from`, else "t-mc".
     grow_from: With ``label:NAME`` the label map makes no meshes of its own.
-    keep: See `clrecon.mesh.compare.walls`.  With `keep_largest`: of these the largest, as with `min_volume_ml`.
-    solid: See `clrecon.fill_enclosed`.
-    seal_mm: Radius of the balls that close pores.
-    smooth, decimate: See `clrecon.mesh.smooth_mesh`, `clrecon.mesh.decimate_mesh`.
+    keep: With `keep_largest`: of these the largest, as with `min_volume_ml`.
     purpose: More is measured for it.  It sets nothing here, see `clrecon.jobs.mesh.purposes.settings_for`.
-    strict: Measure everything that a gate needs, triangles that cut each other included.
     """
 
     purpose: str | None = option(
@@ -496,13 +489,10 @@ class MeshSettings(InputSettings):
 
 @dataclass(frozen=True)
 class LabelChoice:
-    """The labels of a map that become meshes, and the kind of their surfaces.
+    """The labels of a map, by numbers or names, that become meshes, and the kind of their surfaces.
 
-    only: Numbers or names; empty means all that have a surface.
-    grow_mm, surface: See `clrecon.operators.surface.labels.extract_labels`, and of masks
-        `clrecon.operators.surface.label_masks.extract_label_masks`.
+    only: Empty means all that have a surface.
     solid: Fill less dense parts within a label.
-    colors: tuple of (str or int, str).
     """
 
     path: str | Path = label_map_option(default=MISSING)

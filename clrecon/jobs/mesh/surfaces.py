@@ -1,7 +1,4 @@
-"""The surfaces of a mesh job and the parts of them that become one file each, and the choice of their iso value.
-
-The iso value is chosen here if it was not given as a number.
-"""
+"""The surfaces of a mesh job, the parts of them that become one file each, and the choice of an iso value."""
 
 from __future__ import annotations
 
@@ -28,11 +25,9 @@ if TYPE_CHECKING:
 class Surface:
     """A surface to extract.
 
-    name: Part of its file names that distinguishes it from other surfaces, for example ``"200hu"``; empty if it is the
-        only one.
-    iso_value: float or (float, float) or None. HU; or the two ends of a range; None: it is a label's own.
+    name: Part of its file names, for example ``"200hu"``; empty if it is the only one.
+    iso_value: HU; or the two ends of a range; None: it is a label's own.
     below: It encloses the values below the iso value.
-    label: Label that selects its cells, if there is a label map.
     """
 
     name: str
@@ -64,13 +59,10 @@ class Bones(NamedTuple):
 class Part:
     """A mesh that becomes a file: a surface, or a component of one.
 
-    name: Text between the stem of the output and its extension, for example ``"200hu_001"``; empty if the part is the
-        only one.
-    quality: Its quality, if measured.
+    name: Text between the stem of the output and its extension, for example ``"200hu_001"``; empty if it is alone.
     facts: Further entries of its object in the report.
-    pieces: (dict, dict). Enclosed volumes of the components of its surface, as extracted and as kept, if the purpose
-        needs them.
-    bones: Number of its components that are bone, if it does not look like bone as a whole.
+    pieces: Enclosed volumes of the components of its surface, as extracted and as kept, if the purpose needs them.
+    bones: Counted if it does not look like bone as a whole.
     """
 
     surface: Surface

@@ -1,7 +1,4 @@
-"""The render job: from a CT series to pictures, animations and their report.
-
-Its files are checked early, and written under temporary names.
-"""
+"""The render job: from a CT series to pictures, animations and their report."""
 
 from __future__ import annotations
 
@@ -46,15 +43,10 @@ log = get_logger(__name__)
 def make_pictures(
     source: str | Path, files: PictureFiles, settings: RenderSettings | None = None, **how: Any
 ) -> PictureReport:
-    """Read a CT series or a cloud and take the pictures that are asked for.
+    """Read a scan, a cloud (mode points) or a mesh (mode mesh), and take the pictures that are asked for.
 
     Checks come in this order: the outputs, the settings files (transfer function, centre line, meshes), the device, the
-    input.  Pictures and turntable are written under temporary names and renamed when all are done.  The report is
-    renamed last: it marks that everything is complete.
-
-    source: DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`; for mode points a file
-        of points, see `clrecon.read_points`, and for mode mesh one of a mesh, see `clrecon.read_mesh`.
-    **how: See `Run`; an empty folder of frames is filled.
+    input.  An empty folder of frames is filled, whatever `Run` does with files that exist.
     """
     settings = settings or RenderSettings()
     if (files.turntable is None) != (settings.turntable is None):
@@ -223,10 +215,8 @@ OPAQUE_ONLY = (".jpg", ".jpeg", ".mp4", ".gif")
 class PictureFiles:
     """Paths of the outputs of a job; with several views each picture gets its own file names.
 
-    picture: .png, .jpg or .tif.
     depth, values: .npy or .tif, with the distances to the first hit in mm, and with HU.
     turntable: See `clrecon.rendering.movies.check_animation`.
-    report: JSON.
     """
 
     picture: str | Path | None = None
@@ -248,10 +238,7 @@ class PictureFiles:
 
 
 def name_view(view: str, views: Sequence[str]) -> str:
-    """Name of a view between the stem of a file and its extension; empty for a single view.
-
-    Returns: The view's own name, or ``az30_el-15`` for angles.
-    """
+    """Name a view for its files: its own name, or ``az30_el-15`` for angles; empty for a single view."""
     if len(views) == 1:
         return ""
     azimuth, comma, elevation = view.strip().lower().partition(",")
@@ -265,10 +252,7 @@ def path_of(path: str | Path, name: str) -> str | Path:
 
 
 def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[str, str | Path]]:
-    """Refuse outputs that cannot be written, before any work is done.
-
-    Returns: list of (str, path). A description of each output, and its path.
-    """
+    """Refuse outputs that cannot be written, before any work is done; return description and path of each."""
     from clrecon.rendering.movies import animation_kind, check_animation
     from clrecon.rendering.pictures.annotations import check_caption
     from clrecon.rendering.pictures.picture import check_float_path, check_image_path

@@ -69,8 +69,7 @@ class PictureTaker(Closing):
     """Taker of the pictures that settings ask for; a context manager that frees the memory of the device.
 
     function: Transfer function from a file; None means that of the preset.
-    curve: ndarray, shape (n, 3). Centre line of curved reformations in LPS mm; None means that of the style.
-    meshes: Those of the settings.
+    curve: ndarray, shape (n, 3). Centre line in LPS mm; None means that of the style.
     """
 
     def __init__(

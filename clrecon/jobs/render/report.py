@@ -123,17 +123,7 @@ def warn_of_picture(picture: Rendering, known: Collection[str] = ()) -> list[str
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PictureReport(RunReport):
-    """Report of a render job, in addition to the entries of every `RunReport`.  See docs/contract.md.
-
-    transfer_function, lighting: As they were used for the pictures.
-    iso_value_hu, color, depth_cue: Settings of a surface; None in other modes.
-    clip_planes_lps_mm: nested list (n, 4)
-    thickness_mm, combine, offset_mm: Settings of slices and reformations; None in other modes.
-    labels: The labels with a look of their own.
-    meshes: Each mesh: ``triangles``, ``color``, ``opacity``; ``file``: what its file says.
-    cloud: Of a cloud: ``points``, and whether it has ``normals``, ``hu``, ``labels``; ``file``: what its file says.
-    pictures: See `describe_picture`, with the files.
-    """
+    """Report of a render job; docs/contract.md explains its entries, None where a mode has no such thing."""
 
     PARTS = ("device", "read", "mask", "render", "turntable", "write")
 
@@ -166,11 +156,7 @@ def report_of(
     pictures: Sequence[dict[str, Any]],
     turntable: dict[str, Any] | None,
 ) -> PictureReport:
-    """Compose the report of a job.
-
-    taker: The taker of the pictures: it knows their transfer function, light and warnings.
-    pictures: The entry of each picture from `describe_picture`, with its files.
-    """
+    """Compose the report of a job; the `taker` knows transfer function, light and warnings."""
     from clrecon.geometry import Volume
     from clrecon.points import PointCloud
 

@@ -108,10 +108,9 @@ class Turntable:
 
 @dataclass(frozen=True)
 class LabelLook:
-    """A label map and the look of its labels.
+    """A label map and the look of its labels, by number or name.
 
-    colors: Colour by number or name of the label, see `clrecon.rendering.looks.colors.find_color`; or pairs of both.
-    opacities: Factor on the opacity, in the same way; "0" stands for all that has no label.
+    opacities: Factor on the opacity; "0" stands for all that has no label.
     """
 
     path: str = label_map_option(default=MISSING)
@@ -145,12 +144,7 @@ class LabelLook:
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh that is shown with the input.
-
-    path: See `clrecon.read_mesh`.
-    color: str or (float, float, float). See `clrecon.rendering.looks.colors.find_color`; default: "bone" for one mesh,
-        a colour for each of several.
-    """
+    """A mesh that is shown with the input; by default it is "bone", and several have a colour each."""
 
     path: str
     color: str | Sequence[float] | None = None
@@ -175,19 +169,15 @@ def color_apart(meshes: Sequence[MeshFile]) -> list[MeshFile]:
 
 @dataclass(frozen=True)
 class RenderSettings(InputSettings):
-    """Settings of the render job, which makes pictures from a CT series.
-
-    Options say in their help what they do; beside that:
+    """Settings of the render job, which makes pictures from a CT series; options say in their help what they do.
 
     style: What the pictures show.  The files below add to it, see `style_with`.
     preset: The preset that the style was made from.
-    transfer_function: ``FILE`` or ``FILE:NAME``, see `clrecon.rendering.looks.transfer_files.load_transfer_function`.
+    transfer_function: ``FILE`` or ``FILE:NAME``.
     curve: File with the centre line; "spine" (or "auto") and None mean the curve of the style.
-    meshes: Shown with the input.
     light: "head", "none", side of the patient or (x, y, z). Origin of the light: the camera, nowhere (no shading), or a
         direction in LPS as seen from the patient.  Default: that of the style and its transfer function.
-    views, up, zoom, size, view_angle, center: See `clrecon.rendering.views.camera.Camera.fit`.  The default size of a
-        contact sheet is 1600 x 1200; for a curved reformation it depends on the curve.
+    size: Default of a contact sheet: 1600 x 1200; for a curved reformation it depends on the curve.
     """
 
     style: Style = VolumeLook()

@@ -19,8 +19,7 @@ class ViewSettings:
     """Settings of the view.
 
     scan: How surfaces are made of inputs that are scans; its `space` is the frame in which places are shown.
-    names: In the order of the inputs; those without one are numbered.  File names are not shown: they can hold the name
-        of a patient.
+    names: Those without one are numbered; file names are not shown, as they can hold the name of a patient.
     """
 
     scan: MeshSettings = field(default_factory=MeshSettings)

@@ -1,7 +1,4 @@
-"""Settings and inputs of a view: scans, meshes, clouds and a label map, each read by what the other jobs read it with.
-
-Settings of the job that shows are validated on construction; some of them mean nothing where nothing is made.
-"""
+"""Settings and inputs of a view: scans, meshes, clouds and a label map, each read as the other jobs read it."""
 
 from __future__ import annotations
 
@@ -60,7 +57,6 @@ _LEAST_EMPTY = 0.2
 class OpenedInput:
     """What was read of an input.
 
-    subject: In LPS mm.
     said: What has to be said of it: its certificate's warnings, the frame that it was turned from.
     """
 
@@ -78,9 +74,6 @@ def open_inputs(
 ) -> list[OpenedInput]:
     """Read the inputs of a view, and the label map of its settings as the last one.
 
-    inputs: Scans as `clrecon.read_volume` takes them, meshes as `clrecon.read_mesh`, clouds as `clrecon.read_points`,
-        and label maps in files of volumes.
-    settings: How scans are read, masked and cropped, and the label map.
     ready: Called with each input as soon as it is read.
     """
     settings, tell = settings or ViewSettings(), progress or ignore_progress

@@ -50,10 +50,6 @@ def write_view(
 
     The surface of one mesh without labels is divided into its components, which can be switched; of several meshes each
     is a part.
-
-    inputs: Scans, as `clrecon.read_volume` takes them, and mesh files, as `clrecon.read_mesh` takes them.
-    output: ``.html``.
-    **how: See `Run`.
     """
     settings = settings or ViewSettings()
     with Run(settings.scan, **how) as run:
@@ -201,16 +197,7 @@ def _doubt_frames(shown: Sequence[_ShownInput]) -> list[str]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ViewReport(JobReport):
-    """Report of `write_view`.
-
-    inputs: Each input: ``name`` of the file or folder without those above it, ``kind`` ("scan", "STL" ...), ``space``
-        and ``space_from`` of a mesh (None for a scan), ``triangles``; of a scan ``volume``, its certificate, and
-        ``surface``, the values that it encloses.
-    parts: ``name``, ``triangles``, ``ml`` and ``color`` of each part that can be switched.
-    half_step_mm: Largest distance along an axis that a vertex is moved by.
-    output: ``format`` and ``bytes``.
-    device: None where no input is a scan.
-    """
+    """Report of `write_view`; docs/contract.md explains its entries."""
 
     _LAST = ("device", *JobReport._LAST)
 
