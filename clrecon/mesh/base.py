@@ -1,7 +1,4 @@
-"""`BaseMesh`: the arrays of an indexed triangle surface in LPS mm, checked, moved and written.
-
-What makes other meshes of one, or goes to other libraries, is in `clrecon.mesh.mesh`.
-"""
+"""`BaseMesh`: the arrays of an indexed triangle surface in LPS mm, checked, moved and written."""
 
 from __future__ import annotations
 

@@ -43,9 +43,9 @@ product, by up to 1 where triangles are long and thin."""
 class _Chosen:
     """Components of a mesh, and which of them are kept.
 
-    label_of_vertex, label_of_triangle: ndarray, int64. Number of the component; -1 for vertices that no triangle uses.
-    ranked: ndarray, shape (count,), int64. Components from the largest area to the smallest, see `_rank_areas`; in
-        their own order if no rank was asked for.
+    label_of_vertex, label_of_triangle: Number of the component; -1 for vertices that no triangle uses.
+    ranked: Components from the largest area to the smallest, see `_rank_areas`; in their own order if no rank was asked
+        for.
     keep: ndarray, shape (count,), bool
     facts: Entries for the report of the result.
     """
@@ -167,10 +167,7 @@ def _choose_components(
     *,
     rank: bool = False,
 ) -> _Chosen:
-    """Find the components and decide which are kept; parameters and errors as in `select_components`.
-
-    Areas are measured only if the decision or `rank` needs them, else they are zeros.
-    """
+    """Find the components and decide which are kept; areas are measured only if the decision or `rank` needs them."""
     if keep_largest is not None and (isinstance(keep_largest, float) or keep_largest < 1):
         raise UsageError(f"keep_largest is a whole number from 1, not {keep_largest}")
     if min_volume_ml is not None and not (math.isfinite(min_volume_ml) and min_volume_ml >= 0):
@@ -212,12 +209,9 @@ def _choose_components(
 
 
 def _rank_areas(areas: NDArray[np.float64], step: float) -> NDArray[np.int64]:
-    """Components from the largest area to the smallest, those of equal area in their own order.
+    """Components from the largest area, mm2, to the smallest, those of equal area in their own order.
 
     Areas are equal when they differ from the first of their group by no more than rounding explains.
-
-    areas: ndarray, shape (count,), float64. mm2.
-    step: Rounding step of the coordinates, mm: `rounding_step`.
     """
     ranked = np.argsort(-areas, kind="stable")
     falling = areas[ranked]

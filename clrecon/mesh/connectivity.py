@@ -22,14 +22,12 @@ IntArray = NDArray[np.integer]
 class Edges:
     """The edges of a mesh; half-edges that start and end at one vertex are left out.
 
-    count: Number of different edges.
     boundary, nonmanifold: Edges with exactly one face, and with more than two.
     oriented: No two faces run along an edge in the same direction.
-    half_edges: ndarray, int32 or int64. All half-edges, those of one edge side by side, first those that run to the
-        higher vertex number.
-    first: ndarray, int64, shape (count,). Index in `half_edges` at which those of an edge begin.
-    ends: ndarray, uint32, shape (2, count). Lower and higher vertex number of each edge; edges are in order of the
-        lower, then of the higher one.
+    half_edges: All half-edges, those of one edge side by side, first those that run to the higher vertex number.
+    first: Shape (count,). Index in `half_edges` at which those of an edge begin.
+    ends: Shape (2, count). Lower and higher vertex number of each edge; edges are in order of the lower, then of the
+        higher one.
     """
 
     count: int
@@ -73,12 +71,7 @@ def order_by_number(numbers: IntArray, size: int) -> IntArray:
 
 
 class Fans:
-    """The triangles around each vertex.
-
-    rows: ndarray, shape (3 * m,), int. Triangles, those around vertex v from ``begin[v]`` to ``begin[v + 1]``, in their
-        order.
-    begin: ndarray, shape (vertex_count + 1,), int64
-    """
+    """The triangles around each vertex: of vertex v `rows` from ``begin[v]`` to ``begin[v + 1]``, in their order."""
 
     def __init__(self, triangles: NDArray[np.uint32], vertex_count: int):
         corners = triangles.reshape(-1)
@@ -170,7 +163,7 @@ def find_split_vertices(
 ) -> IntArray:
     """Find the vertices whose faces form several fans, for example the waist of an hourglass.
 
-    opposite: Result of `opposite_half_edges`; with it the faces around each vertex are counted by going round it once.
+    opposite: With it the faces around each vertex are counted by going round it once.
     """
     corners = triangles.reshape(-1)
     degree = np.bincount(corners, minlength=vertex_count)
@@ -221,7 +214,6 @@ def label_components(
     """Number the components: triangles that share a vertex belong to one component.
 
     edges: If they are already known, labelling takes a third of the time.
-
     Returns:
     count: Number of components, not counting vertices that no triangle uses.
     labels: ndarray, shape (vertex_count,), int64. Component of each vertex, numbered in order of the first vertex; -1
@@ -272,8 +264,7 @@ def _connect(one: NDArray[np.integer], other: NDArray[np.integer], size: int) ->
 def count_duplicate_faces(triangles: NDArray[np.uint32], vertex_count: int, opposite: IntArray | None = None) -> int:
     """Count the triangles that have the three vertices of an earlier one, in any order.
 
-    Where every edge has two faces (`opposite` is given, see `opposite_half_edges`), two triangles with the same
-    vertices are neighbours on all three sides.  Else they are found as by `find_duplicate_faces`.
+    Where every edge has two faces (`opposite`), two triangles with the same vertices are neighbours on all three sides.
     """
     if opposite is not None:
         return len(find_faces_back_to_back(opposite)) // 2

@@ -40,17 +40,14 @@ def find_self_intersections(
     *,
     steps: Steps | None = None,
 ) -> NDArray[np.int64]:
-    """Find the pairs of triangles that cut each other, as CGAL counts them.
+    """Find the pairs of triangles, shape (k, 2), that cut each other, as CGAL counts them.
 
     Two triangles cut each other when they have a point in common, touch or overlap in one plane.  Of two with a common
     corner only the edges opposite to it can reach the other triangle.  Two with a common edge cut each other when they
     lie in one plane on the same side of it.  Corners at the same place are common; triangles with three common corners,
     without area, or with a corner that is not finite, are left out.  The signs of all volumes and areas are exact.
 
-    changed: ndarray, shape (m,), bool. Only pairs with one of these are examined.
-    steps: Counts the triangles.
-
-    Returns: ndarray, shape (k, 2), int64. Numbers of triangles.
+    changed: Only pairs with one of these triangles are examined.
     """
     sound = np.isfinite(vertices).all(axis=1)
     if not sound.all():
@@ -112,12 +109,9 @@ def find_changed_intersections(
     changed: NDArray[np.bool_],
     find_crossings: FindCrossings = find_self_intersections,
 ) -> NDArray[np.int64]:
-    """Find the pairs of triangles that cut each other and of which one has changed.
+    """Find the pairs of triangles that cut each other and of which one has changed; as of `find_self_intersections`.
 
-    find_crossings: `find_self_intersections`, or what finds the same elsewhere.  It is not needed where few have
-        changed.
-
-    Returns: ndarray, shape (k, 2), int64. As of `find_self_intersections`.
+    find_crossings: Finds the same, perhaps elsewhere.  It is not needed where few have changed.
     """
     if not changed.any():
         return np.zeros((0, 2), dtype=np.int64)
@@ -169,7 +163,7 @@ class _Entries:
 
     triangle: ndarray, shape (e,), int64
     cell: ndarray, shape (3, e), int32
-    later: ndarray, shape (e,), int64. Number of entries of the same cell that follow.
+    later: Number of entries of the same cell that follow.
     low, high: ndarray, shape (3, e), float32, mm. Box of the triangle, rounded outward.
     first: ndarray, shape (3, m), int32. Lowest cell of each triangle.
     """
@@ -211,11 +205,7 @@ class _Entries:
 
 @dataclass(frozen=True)
 class _Planes:
-    """Planes of triangles: a corner x is surely above one where normal . x - offset > slack, below where < -slack.
-
-    normal: ndarray, shape (3, m), float64
-    offset, slack: ndarray, shape (m,), float64
-    """
+    """Planes (3, m) of triangles: a corner x is surely above if normal . x - offset > slack, below if < -slack."""
 
     normal: Float64Array
     offset: Float64Array

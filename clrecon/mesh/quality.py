@@ -1,7 +1,4 @@
-"""Measures of a surface: the figures that tell whether it can be printed, and its components by their size.
-
-The figures of quality are used for planning and measured.
-"""
+"""Measures of a surface: the figures that tell whether it can be printed, and its components by their size."""
 
 from __future__ import annotations
 
@@ -76,10 +73,7 @@ class MeshQuality(Record):
 
 
 def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> MeshQuality:
-    """Measure a triangle surface.
-
-    triangles: ndarray, shape (m, 3), uint32. Indices of vertices.
-    """
+    """Measure a triangle surface."""
     vertex_count, triangle_count = len(vertices), len(triangles)
     if triangle_count and int(triangles.max()) >= vertex_count:
         raise UsageError(f"a triangle refers to vertex {int(triangles.max())}, the mesh has {vertex_count} vertices")
@@ -156,12 +150,12 @@ def measure_triangles(
 
 
 def find_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32], most: int) -> Pieces:
-    """Divide a surface into its components of largest area, and one part of all others.
+    """Divide a surface into its `most` components of largest area, that first, and one part of all others.
 
-    most: Components that are parts of their own.  1: the surface is one part, whatever its components.
+    The volume of an open component is measured as if its rim were joined to the mean of its corners; that of all others
+    together is the sum, regardless of sign.
 
-    Returns: The largest area first.  The volume of an open component is measured as if its rim were joined to the mean
-        of its corners; that of all others together is the sum, regardless of sign.
+    most: 1: the surface is one part, whatever its components.
     """
     if most == 1:
         whole = np.zeros(len(triangles), dtype=np.int64)

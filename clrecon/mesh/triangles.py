@@ -1,7 +1,4 @@
-"""Triangles: areas and volumes, normals of vertices from the faces around them, and the triangle nearest to a point.
-
-They are computed in pieces that fit the processor's cache.
-"""
+"""Triangles, in pieces that fit the processor's cache: areas, volumes, normals, the triangle nearest to a point."""
 
 from __future__ import annotations
 
@@ -50,16 +47,11 @@ def cross_product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.
 def cross_products(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], origin: NDArray[np.float64], size: int = CHUNK
 ) -> Iterator[tuple[slice, NDArray[np.float64], NDArray[np.float64]]]:
-    """Yield the first corner of the triangles and the cross product of the edges from it, float64, `size` at a time.
+    """Yield the first corner of the triangles and the cross product of the edges from it, as `corner_edges`.
 
-    The cross product c of the edges from the first corner a is twice the area times the outward normal, and a . c is
-    six times the signed volume of the tetrahedron over the origin (divergence theorem). With float32 coordinates, c is
-    zero exactly for triangles without area.
-
-    Yields:
-    where: The triangles of this piece.
-    corner, cross: ndarray, shape (3, k), float64. One row each for x, y, z; `corner` is relative to `origin`, mm;
-        `cross` is mm2.
+    The cross product c of the edges from the first corner a, mm2, is twice the area times the outward normal, and a . c
+    is six times the signed volume of the tetrahedron over the origin (divergence theorem). With float32 coordinates, c
+    is zero exactly for triangles without area.
     """
     for where, corner, p, q in corner_edges(vertices, triangles, origin, size):
         yield where, corner, cross_product(p, q)
@@ -72,11 +64,10 @@ def enclosed_ml(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -
 
 
 def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> NDArray[np.float32]:
-    """Return the mean of the face normals, weighted by the angle of each face at the vertex.
+    """Return the mean of the face normals, weighted by the angle of each face at the vertex, as unit vectors (n, 3).
 
-    These normals do not depend on how the surface is divided into triangles (Thuermer and Wuethrich 1998).
-
-    Returns: ndarray, shape (n, 3), float32. Unit vectors; (0, 0, 1) where a vertex has no face or its faces cancel.
+    These normals do not depend on how the surface is divided into triangles (Thuermer and Wuethrich 1998).  They are
+    (0, 0, 1) where a vertex has no face or its faces cancel.
     """
     columns = np.ascontiguousarray(vertices.T.astype(np.float64))
     total = np.zeros((3, len(vertices)))
@@ -100,10 +91,7 @@ def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
 
 
 def _sum_normals(columns: NDArray[np.float64], corners: NDArray[np.uint32], low: int) -> NDArray[np.float64]:
-    """Sum the normals of triangles at their corners, weighted by angle, for vertices from `low` on, shape (3, k).
-
-    corners: ndarray, shape (3, m)
-    """
+    """Sum the normals of triangles at corners (3, m), weighted by angle, for vertices from `low` on, (3, k)."""
     a, b, c = (columns.take(corner, axis=1, mode="clip") for corner in corners.astype(np.intp))
     p, q = b - a, c - a
     cross = cross_product(p, q)
@@ -126,17 +114,11 @@ Points = NDArray[np.float64]
 def find_nearest_triangle(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], point: NDArray[np.float64]
 ) -> tuple[int, float]:
-    """Find the triangle nearest to a point.
+    """Find the triangle nearest to a point, and its distance in mm.
 
     The box around a triangle is never farther away than the triangle, and its nearest corner is never nearer.  So only
-    triangles whose box is nearer than the nearest of all corners are measured exactly.
-
-    triangles: ndarray, shape (m, 3), uint32. At least one, every index below n.
-    point: ndarray, shape (3,), float64. mm.
-
-    Returns:
-    triangle: Row of `triangles`; of several that are equally near, up to the rounding of the coordinates, the first.
-    distance: mm.
+    triangles whose box is nearer than the nearest of all corners are measured exactly.  Of several that are equally
+    near, up to the rounding of the coordinates, it is the first.
     """
     columns = np.ascontiguousarray(vertices.T.astype(np.float64)) - point[:, None]
     corner_distance = np.einsum("ij,ij->j", columns, columns)
@@ -158,9 +140,7 @@ def find_nearest_triangle(
 
 
 def _distances_from_origin(a: Points, b: Points, c: Points) -> NDArray[np.float64]:
-    """Return the distance of the origin from each triangle (a, b, c), corners of shape (k, 3): from its face or an
-    edge.
-    """
+    """Return the distance of the origin from each triangle (a, b, c), corners of shape (k, 3): from face or edge."""
     edges = np.minimum(np.minimum(_distances_to_edge(a, b), _distances_to_edge(b, c)), _distances_to_edge(c, a))
     normal = np.cross(b - a, c - a)
     above = [np.einsum("ij,ij->i", normal, np.cross(p, q)) for p, q in ((a, b), (b, c), (c, a))]

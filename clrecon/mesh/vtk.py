@@ -18,11 +18,7 @@ LINE_TOLERANCE = 1e-9
 
 
 class CellLocator:
-    """Search for triangles of a surface by place, with `vtkStaticCellLocator`.
-
-    vertices: ndarray, shape (n, 3), mm, near zero
-    triangles: ndarray, shape (m, 3), uint32, at least one
-    """
+    """Search for triangles of a surface, in mm near zero, by place, with `vtkStaticCellLocator`."""
 
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
         from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator

@@ -1,7 +1,7 @@
 """What a notebook shows of a mesh, a volume, a cloud, a label map or a listing: HTML that needs nothing from outside.
 
-A mesh is the page of `clrecon.exchange.page` in a sandboxed frame, which works offline and in what nbconvert writes,
-without widgets.  Where the page is too large, and for clouds and volumes, it is a picture.
+A mesh is the page of `clrecon.exchange.page` in a sandboxed frame, which works offline and in what nbconvert writes.
+Where the page is too large, and for clouds and volumes, it is a picture.
 """
 
 from __future__ import annotations

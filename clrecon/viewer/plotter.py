@@ -110,10 +110,7 @@ def open_plotter(
     memory: int | None = None,
     off_screen: bool = False,
 ) -> Iterator[pyvista.Plotter]:
-    """A plotter with the objects, the slider of the iso value and the keys; it is closed with the block.
-
-    iso_value: HU at the start; None: 200, or the nearest value that the slider has.
-    """
+    """A plotter with the objects, the slider of the iso value and the keys; it is closed with the block."""
     load_pillow()
     import pyvista
 

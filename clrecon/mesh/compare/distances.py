@@ -1,7 +1,4 @@
-"""Distances between two surfaces, and between the walls of one that is closed.
-
-They are exact distances from points of one surface to the triangles of the other.
-"""
+"""Exact distances from points of one surface to the triangles of another, and between the walls of a closed one."""
 
 from __future__ import annotations
 
@@ -29,10 +26,7 @@ Points = NDArray[np.float64]
 
 
 def sample_surface(vertices: NDArray[np.floating], triangles: NDArray[np.uint32], count: int = SAMPLES) -> Points:
-    """Return points that cover a surface evenly by area, the same points at every call.
-
-    Returns: ndarray, shape (count, 3), float64, mm
-    """
+    """Return points that cover a surface evenly by area, the same at every call: shape (count, 3), float64, mm."""
     return sample_surface_points(vertices, triangles, count)[0]
 
 
@@ -58,10 +52,7 @@ def sample_surface_points(
 
 
 class SurfaceDistance:
-    """Exact distances from points to the nearest triangle of a surface.
-
-    triangles: ndarray, shape (m, 3), uint32, at least one
-    """
+    """Exact distances from points to the nearest triangle of a surface, which has at least one."""
 
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
         self._origin = local_origin(vertices)
@@ -99,7 +90,6 @@ class MeshDistance(Record):
     hd95_mm: The larger of the two 95th percentiles (robust Hausdorff distance).
     assd_mm: Mean of both sides (average symmetric surface distance).
     max_mm: Largest distance found; what lies between the points can be a little further.
-    to_reference_mm, from_reference_mm: Of each side.
     volume_change_percent: Enclosed volume against that of the reference; None where that is zero, and without meaning
         for open surfaces.
     samples: Number of points on each surface.
@@ -183,14 +173,12 @@ _INWARD = 1e-3
 def wall_thickness(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], samples: int = WALL_SAMPLES
 ) -> NDArray[np.float64]:
-    """Measure the wall thickness at points that cover a surface evenly by area, the same points at every call.
+    """Measure the wall thickness at points that cover a closed surface evenly by area, the same points at every call.
 
     From each point a ray goes inward, against the normal of its triangle, to the first triangle that it meets.
 
-    triangles: ndarray, shape (m, 3), uint32. Triangles of a closed surface, facing outward.
-
-    Returns: ndarray, shape (samples,), float64, mm. NaN where the ray meets nothing: between triangles that do not
-        close, or on an edge.
+    Returns: ndarray, shape (samples,), mm. NaN where the ray meets nothing: between triangles that do not close, or on
+        an edge.
     """
     origin = local_origin(vertices)
     near = vertices - origin
@@ -205,11 +193,10 @@ def wall_thickness(
 
 @dataclass(frozen=True, eq=False)
 class WallFigures(Record):
-    """How thick the walls of a surface are.
+    """How thick the walls of a surface are; None where no ray met anything.
 
-    min_mm, p5_mm, median_mm: None where no ray met anything.
     thin_share: Share of the surface whose wall is below `thin_mm`.
-    samples, not_measured: Points, and those whose ray met nothing.
+    not_measured: Points whose ray met nothing.
     """
 
     min_mm: float | None
@@ -224,11 +211,7 @@ class WallFigures(Record):
 def measure_walls(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], thin_mm: float, samples: int = WALL_SAMPLES
 ) -> WallFigures:
-    """Summarise `wall_thickness`.
-
-    vertices, triangles, samples: As for `wall_thickness`.
-    thin_mm: Walls below this are thin.
-    """
+    """Summarise `wall_thickness`; walls below `thin_mm` are thin."""
     thickness = wall_thickness(vertices, triangles, samples)
     measured = thickness[np.isfinite(thickness)]
     missed = samples - len(measured)

@@ -43,10 +43,7 @@ def smallest_voxel_mm(volume: Volume) -> float:
 
 
 def rule_of_report(report: dict[str, Any]) -> IsoRule | None:
-    """Return the iso rule of a mesh, as far as distances need it; None for a mesh that is not an iso surface.
-
-    report: Report of a mesh: ``iso_level_hu`` or ``inside_levels_hu``, ``outside_hu``, ``closed_at_border``.
-    """
+    """Return the iso rule of a mesh by its report, as far as distances need it; None where it is no iso surface."""
     ends = report.get("inside_levels_hu") or [report.get("iso_level_hu")]
     levels = [float(level) for level in ends if level is not None]
     closed = bool(report.get("closed_at_border", False))
@@ -58,15 +55,10 @@ def rule_of_report(report: dict[str, Any]) -> IsoRule | None:
 
 
 def trilinear_field(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Return value and gradient of the trilinear field.
+    """Return value, HU, and gradient, HU per step along i, j, k, of the trilinear field at index coordinates (n, 3).
 
-    rule: Gives the value beyond the border: `outside` for a closed volume.  For an open one, points beyond the border
-        are moved to it.
-    ijk: ndarray, shape (n, 3), float64. Index coordinates.
-
-    Returns:
-    value: ndarray, shape (n,), float64, HU
-    gradient: ndarray, shape (n, 3), float64. HU per step along i, j, k.
+    Beyond the border of a closed volume the value is `outside` of the rule; for an open one, points there are moved to
+    it.
     """
     value = np.zeros(len(ijk))
     gradient = np.zeros((len(ijk), 3))
@@ -114,17 +106,13 @@ def distances_to_iso_surface(volume: Volume, rule: IsoRule, points: Float64Array
     """Measure the distances of points from a near trilinear iso surface, by Newton steps along the gradient.
 
     The surface of a range consists of the surfaces of both ends: the nearer one counts.
-
     Where the field is flat, or steps alternate across a crease, the surface is searched along lines to the surrounding
     voxels.  A step is residual over gradient, at most half a voxel long, in mm through the affine of the slice, so it
     is also correct for sheared and unevenly spaced stacks.  The result is the distance to a point of the surface: never
     less than the true distance, and equal to it where the surface is smooth.
 
-    rule: Gives the levels and the value beyond the border.
     points: ndarray, shape (n, 3), float64, LPS mm
-
-    Returns: ndarray, shape (n,), float64, mm. NaN where no surface was found, neither along the gradient nor along
-        lines to the surrounding voxels.
+    Returns: ndarray, shape (n,), mm. NaN where no surface was found.
     """
     distances = _distances_to_level(volume, rule, rule.iso_level, points)
     for level in rule.levels[1:]:
@@ -199,15 +187,12 @@ def _distances_along_lines(volume: Volume, rule: IsoRule, level: float, points: 
 
 @dataclass(frozen=True, eq=False)
 class IsoDistance(Record):
-    """How far a mesh lies from the trilinear iso surface.
+    """How far a mesh lies from the trilinear iso surface, in mm and in units of `voxel_mm`, the shortest voxel step.
 
-    voxel_mm: Shortest voxel step.
     samples: ``vertices`` and ``centres`` that were measured.
     not_found: Points from which no surface was reached; the figures are of the others.
-    vertices_mm, centres_mm: None where none was found.
-    vertices_voxel, centres_voxel: The same in units of `voxel_mm`.
     near_metal: Measured vertices within `METAL_REACH` voxels of a voxel above `METAL_HU`.
-    away_from_metal_voxel: As `vertices_voxel`, without those near metal; None where these are none, or more than half.
+    away_from_metal_voxel: Without those near metal; None where these are none, or more than half.
     """
 
     voxel_mm: float
@@ -222,14 +207,11 @@ class IsoDistance(Record):
 
 
 def measure_iso_distance(mesh: Mesh, volume: Volume, rule: IsoRule, samples: int = SAMPLES) -> IsoDistance:
-    """Measure how far vertices and centres of triangles lie from the trilinear iso surface.
+    """Measure how far vertices and centres of triangles lie from the iso surface that a mesh was made from.
 
     The vertices of an extracted surface lie on it, up to the rounding of float32; the centres show the error of flat
     triangles.  After smoothing and decimation both show the error that these have added.
 
-    mesh: With at least one triangle.
-    volume: The mesh was made from it.
-    rule: The mesh was made with it, see `clrecon.geometry.iso_rule.choose_iso_rule`.
     samples: Most vertices and triangles that are measured; of more, every n-th.
     """
     voxel = smallest_voxel_mm(volume)

@@ -33,15 +33,12 @@ def judge_mesh(
     deviation: Mapping[str, Any] | None = None,
     voxel_mm: float | None = None,
 ) -> list[Gate]:
-    """Judge the measures of a mesh by the gates.
+    """Judge the measures of a mesh by the gates; only what was measured has some.
 
-    quality: Result of `measure_quality`, for the gates of the mesh itself.
     closed: The surface should be closed.  A surface left open at the border of the scan has no gates on closedness,
         outside and volume.
     outward: The surface should enclose a volume above zero, unlike the wall of a cavity by itself.
-    iso_distance: Result of `measure_iso_distance`, for the gates on the vertices.
-    deviation: Result of `compare_meshes` with the surface before smoothing and decimation, for the gates on their
-        changes.
+    deviation: From the surface before smoothing and decimation.
     voxel_mm: Shortest voxel step, the unit of the bounds; needed with `deviation`.
     """
     gates: list[Gate] = []
@@ -55,11 +52,10 @@ def judge_mesh(
 
 
 def judge_label_volume(mesh_ml: float | None, label_ml: float, advice: str = "", *, by_hu: bool = True) -> Gate:
-    """Compare the volume of a label's mesh with that of its voxels.
+    """Compare the volume of a label's mesh with that of its voxels, which is above 0.
 
     mesh_ml: None: the mesh is open at the border of the scan and encloses no volume.
-    label_ml: Volume of the label's voxels, above 0.
-    advice: Advice for the message where they differ by more than the bound.
+    advice: For the message where they differ by more than the bound.
     by_hu: True: HU place the surface.  False: it is the label's own surface, which should have the label's volume.
     """
     name, bound = "label_volume", LABEL_VOLUME_PERCENT if by_hu else MASK_VOLUME_PERCENT

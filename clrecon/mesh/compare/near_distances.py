@@ -32,8 +32,6 @@ class NearDistance:
 
     If a triangle around that vertex is near enough, its distance is returned; it is never less than the distance to the
     surface.  For the other points all triangles are searched, and the result is exact.
-
-    fans: Fans of the triangles if they are known.
     """
 
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], fans: Fans | None = None):
@@ -44,12 +42,9 @@ class NearDistance:
         self._frames: FaceFrames | None = None
 
     def __call__(self, points: Points, near: NDArray[np.integer], limit: float) -> NDArray[np.float64]:
-        """Return distances in mm, shape (k,); up to `limit` they may be too large, as only nearby triangles are
-        examined.
+        """Return distances in mm, shape (k,), from points (k, 3) with a vertex near each, shape (k,).
 
-        points: ndarray, shape (k, 3), float64, mm
-        near: ndarray, shape (k,), int. A vertex near each point.
-        limit: mm.
+        Up to `limit` mm they may be too large, as only nearby triangles are examined.
         """
         found, _ = self.find_within(points, near, limit)
         rest = np.flatnonzero(~(found <= limit))
@@ -61,11 +56,7 @@ class NearDistance:
     def find_within(
         self, points: Points, near: NDArray[np.integer], limit: float
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return distances to the triangles around one vertex only, and the rows of these; up to `limit` as for
-        `__call__`.
-
-        points, near, limit: As in `__call__`.
-        """
+        """Return distances to the triangles around one vertex only, and their rows; up to `limit` as `__call__`."""
         found, rows = self._around(points, near, _perpendicular)
         rest = np.flatnonzero(~(found <= limit))
         if len(rest):
@@ -75,10 +66,7 @@ class NearDistance:
     def find_surely_within(
         self, points: Points, near: NDArray[np.integer], limit: float
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """As `find_within`, but by upper bounds first: up to `limit` distances may be too large and rows others.
-
-        points, near, limit: As in `__call__`.
-        """
+        """As `find_within`, but by upper bounds first: up to `limit` distances may be too large and rows others."""
         found, rows = self.find_upper_bounds(points, near)
         rest = np.flatnonzero(~(found <= limit))
         if len(rest):
@@ -88,10 +76,7 @@ class NearDistance:
     def find_upper_bounds(
         self, points: Points, near: NDArray[np.integer]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return upper bounds of the distances to the triangles around one vertex, and the rows of these.
-
-        points, near: As in `__call__`.
-        """
+        """Return upper bounds of the distances to the triangles around one vertex, and the rows of these."""
         found, rows = np.full(len(points), np.inf), np.full(len(points), -1)
         self.prepare()
 
@@ -134,11 +119,9 @@ class NearDistance:
         return self._frames
 
     def find_around(self, points: Points, near: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return distances to the triangles around some vertices only; infinity and row -1 where there are no
-        triangles.
+        """Return distances to the triangles around several vertices for each point, shape (k, v), and their rows.
 
-        points: ndarray, shape (k, 3), float64, mm
-        near: ndarray, shape (k, v), int. Several vertices for each point.
+        Infinity and -1 where there are no triangles.
         """
         found, rows = self._around(points, near[:, 0], triangle_distances)
         for others in near.T[1:]:
@@ -180,8 +163,9 @@ class NearDistance:
         return found, rows
 
     def _pairs(self, near: NDArray[np.integer]) -> tuple[IntArray, IntArray, IntArray, NDArray[np.bool_]]:
-        """List the triangles around vertices: number of the vertex in `near`, and the triangle; for each vertex where
-        its pairs begin, and whether it has any.
+        """List the pairs of a vertex and a triangle around it: place of the vertex in `near`, and triangle.
+
+        Then for each vertex where its pairs begin, and whether it has any.
         """
         row, count = self._fans.around(near)
         return np.repeat(np.arange(len(count)), count), row, np.cumsum(count) - count, count > 0
@@ -203,9 +187,7 @@ def _perpendicular(points: Columns, a: Columns, b: Columns, c: Columns) -> NDArr
 def triangle_distances(points: Columns, a: Columns, b: Columns, c: Columns) -> NDArray[np.float64]:
     """Return the distance of each point from its triangle: to the face by the perpendicular, else to the nearest edge.
 
-    points, a, b, c: ndarray, shape (3, k), float64, mm. Points and corners of the triangles, one row each for x, y, z.
-
-    Returns: ndarray, shape (k,), float64, mm
+    points, a, b, c: ndarray, shape (3, k), float64, mm. One row each for x, y, z.
     """
     shortest = _perpendicular(points, a, b, c)
     beside = np.flatnonzero(np.isinf(shortest))
@@ -232,10 +214,7 @@ def rounding_of_bounds(largest: float) -> float:
 
 
 class FaceFrames:
-    """A frame in each triangle: a corner, two edges, and what gives the coordinates along them.
-
-    vertices: ndarray, shape (n, 3), mm, near zero
-    """
+    """A frame in each triangle near zero: a corner, two edges, and what gives the coordinates along them."""
 
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
         columns = np.ascontiguousarray(vertices.T, dtype=np.float64)
@@ -253,14 +232,9 @@ class FaceFrames:
         self.slack = rounding_of_bounds(float(np.abs(columns).max(initial=0.0)))
 
     def squares(self, points: NDArray[np.float32], rows: NDArray[np.integer]) -> NDArray[np.float32]:
-        """Return squares of distances from points to a point of the triangle, the nearest one or one near it.
+        """Return squares of distances, mm2, from points (3, k) to a point of their triangle, near the nearest one.
 
         The square root is an upper bound of the distance, but for `slack` mm by rounding.
-
-        points: ndarray, shape (3, k), float32, mm
-        rows: ndarray, shape (k,), int. Triangle of each point.
-
-        Returns: ndarray, shape (k,), float32, mm2
         """
         frames = np.ascontiguousarray(self._rows.take(rows, axis=0, mode="clip").T)
         away = points - frames[0:3]

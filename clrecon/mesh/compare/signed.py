@@ -41,8 +41,8 @@ _PIECE = 1 << 14
 class SignedDistance:
     """Exact distances from points to the nearest triangle of a closed surface, below zero inside.
 
-    triangles: ndarray, shape (m, 3), uint32. Every edge in two triangles, which run along it in opposite directions;
-        triangles with a corner twice, which are no surface, are left out.
+    triangles: Every edge in two triangles, which run along it in opposite directions; triangles with a corner twice,
+        which are no surface, are left out.
     outward: False: the triangles face inward, and the sign is turned.
     """
 
@@ -102,10 +102,7 @@ class SignedDistance:
 
 @dataclass(frozen=True, eq=False)
 class SideDistance(Record):
-    """Signed distances of points of one surface from another, mm; positive outside of the other.
-
-    outside_share: Share of the points at a distance above 0.
-    """
+    """Signed distances of points of one surface from another, mm; positive outside of the other."""
 
     mean: float
     sd: float
@@ -124,7 +121,7 @@ class MeshDeviation(Record):
     hausdorff_mm: Largest distance found, of both sides; what lies between the points can be a little further.
     hd95_mm: The larger of the two 95th percentiles (robust Hausdorff distance).
     assd_mm: Mean of both sides (average symmetric surface distance).
-    to_reference_mm, from_reference_mm: Of each side, without sign: from points of the mesh to the reference, and back.
+    to_reference_mm, from_reference_mm: From points of the mesh to the reference, and back, without sign.
     to_reference_signed_mm: Positive where the mesh lies outside the reference; None where the reference is not closed.
     from_reference_signed_mm: Positive where the reference lies outside the mesh; None where the mesh is not closed.
     warnings: Why a side has no sign, or that one was turned.

@@ -52,7 +52,7 @@ class Walls:
     """Values below some vertices of a surface; shapes (n,).
 
     points: ndarray, shape (n, 3), float64, LPS mm
-    wall: ndarray, HU. Highest value at the depths `WALL_MM`.
+    wall: HU. Highest value at the depths `WALL_MM`.
     flat: Values below the wall are equal, below `COMPACT_HU`, and inside down to the last depth.
     near_mm: Largest distance of a compact wall.
     """
@@ -68,11 +68,7 @@ class Walls:
 
 
 def sample_walls(vertices: NDArray[np.floating], normals: NDArray[np.floating], volume: Volume, rule: IsoRule) -> Walls:
-    """Sample values below the vertices of a surface, along their normals.
-
-    vertices, normals: ndarray, shape (n, 3). Vertices and normals of a mesh that was extracted from `volume`, LPS mm.
-    rule: The rule that the mesh was made with.
-    """
+    """Sample values below the vertices (n, 3) of a mesh that was extracted from a volume, along their normals."""
     points, inward = vertices.astype(np.float64), -normals.astype(np.float64)
     longer = np.maximum(_step_along(inward, volume), 1.0)
 
@@ -88,9 +84,7 @@ def sample_walls(vertices: NDArray[np.floating], normals: NDArray[np.floating], 
 
 
 def _step_along(directions: NDArray[np.float64], volume: Volume) -> NDArray[np.float64]:
-    """Return the way in mm along unit vectors (n, 3) from one plane of voxels to the next, for the axis crossed
-    soonest.
-    """
+    """Return the mm along unit vectors (n, 3) from one plane of voxels to the next, for the axis crossed soonest."""
     steps = directions @ np.linalg.inv(volume.affine[:3, :3]).T
     return np.asarray(1.0 / np.maximum(np.abs(steps).max(axis=1), 1e-9))
 
@@ -104,8 +98,6 @@ class WallLook(Record):
     compact_share: Share of the surface that has a wall of `COMPACT_HU` or more.
     contrast_share: Share that is flat beneath and has no compact wall within about ``near_mm``.
     metal_share: Share that has a wall above `METAL_HU`.
-    wall_hu: ``median``, ``p90`` and ``p99`` of the walls.
-    samples: Vertices looked at.
     """
 
     looks_like: str
@@ -149,12 +141,7 @@ def looks_like_bone(judged: WallLook | None) -> bool:
 def judge_components(
     mesh: Mesh, volume: Volume, rule: IsoRule, count: int, label_of_vertex: NDArray[np.int64]
 ) -> list[WallLook | None]:
-    """Judge each component of a surface; None for crumbs of less than `FEWEST_VERTICES`.
-
-    mesh: With normals.
-    volume, rule: As `sample_walls`.
-    count, label_of_vertex: What `clrecon.mesh.connectivity.label_components` returns.
-    """
+    """Judge each component of a surface with normals; None for crumbs of less than `FEWEST_VERTICES`."""
     order = np.argsort(label_of_vertex, kind="stable")
     ends = np.searchsorted(label_of_vertex[order], np.arange(count + 1))
     sizes = np.diff(ends)
@@ -180,9 +167,8 @@ def find_rails(
     A table moves through the scanner along the step of the slices; bones taper and bend, and shafts are thicker than
     `RAIL_MM`. In scans shorter than `STRAIGHT_MM` bones are just as straight, so nothing is found.
 
-    volume: The mesh was extracted from it.
-    label_of_vertex: ndarray, shape (n,), int64. The component of each vertex, below 0 for none.
-    chosen: ndarray, shape (count,), bool. Components that are examined.
+    label_of_vertex: Shape (n,), below 0 for none.
+    chosen: Shape (count,).
     """
     rails = np.zeros(len(chosen), dtype=bool)
     last = volume.shape_ijk[2] - 1

@@ -36,9 +36,7 @@ class Clusters:
     collapses is a name for each vertex and a place for each name.  The collapses are kept in their order: a cluster is
     undone from the last one on, and what it comes apart into gets places of its own.
 
-    vertices: ndarray, shape (n, 3), float64, mm, relative to `origin`
-    origin: ndarray, shape (3,), float64, mm. Places are rounded as a `Mesh` stores them after this is added.
-    find_crossings: `find_self_intersections`, or what finds the same elsewhere.
+    vertices: Relative to `origin`; places are rounded as a `Mesh` stores them after this is added.
     """
 
     def __init__(
@@ -76,10 +74,8 @@ class Clusters:
         return as_stored(places + self._origin).astype(np.float64) - self._origin
 
     def collapse(self, collapses: IntArray, points: Float64Array, faces: IntArray) -> None:
-        """Apply a round of collapses.
+        """Apply a round of collapses (c, 2): the second vertex of the present `surface` is merged into the first.
 
-        collapses: ndarray, shape (c, 2). In each, the second vertex of the present `surface` is merged into the first,
-            which remains.
         points, faces: The mesh afterwards; its vertices are those that remain and have faces, in their order.
         """
         standing = self.standing()
@@ -308,8 +304,6 @@ class Clusters:
 
         Only faces that changed since the last call are examined.  Of the corners of a triangle that is too far away,
         the one with the last collapse is named: collapses come in order of their error.
-
-        deviation: The original surface, with the same triangles, and the bound.
         """
         if not self._new_to_distances.any():
             return np.zeros(0, dtype=np.int64)
@@ -346,8 +340,6 @@ class Clusters:
         """Find names of clusters with vertices that are too far from the surface around the name.
 
         Only vertices with changed faces around their name are examined, and no triangles: `find_far` is exact.
-
-        deviation: As in `find_far`.
         """
         beside, near = (np.zeros(len(self._names), dtype=bool) for _ in range(2))
         beside[self._named[self._face_rows(self._new_to_vertices)]] = True

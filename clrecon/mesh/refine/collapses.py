@@ -21,11 +21,7 @@ _PULL = 1e-3
 
 
 def last_of_collapses(collapses: NDArray[np.integer], count: int) -> NDArray[np.int64]:
-    """Return for each vertex the one that it was merged into in the end.
-
-    collapses: ndarray, shape (c, 2), int. In each, the second vertex is merged into the first.
-    count: Number of vertices.
-    """
+    """Return for each vertex the one that it was merged into in the end by collapses, see `Collapses.add`."""
     into = np.arange(count)
     into[collapses[:, 1]] = collapses[:, 0]
     while True:
@@ -40,8 +36,6 @@ class Collapses:
 
     Every collapse joins two clusters, so those of a cluster form a tree: without the last of them it is two clusters
     again, each as it was before.
-
-    count: Number of vertices.
     """
 
     def __init__(self, count: int):
@@ -55,23 +49,16 @@ class Collapses:
         self._turns[:] = 0
 
     def latest(self, names: IntArray) -> IntArray:
-        """Return for each cluster the number of its last collapse, shape (n,); -1 where there is none.
-
-        names: ndarray, shape (n,), int. Cluster of each vertex.
-        """
+        """Return for each cluster the number of its last collapse, -1 where there is none, from names of vertices."""
         found = np.full(len(names), -1)
         found[names[self._into]] = np.arange(len(self._into))  # the last of equals stays
         return found
 
     def undo(self, marked: NDArray[np.bool_], names: IntArray) -> tuple[NDArray[np.bool_], IntArray]:
-        """Undo the last collapses of clusters: one of each, and more where a cluster of this round is undone often.
+        """Undo the last collapses of marked clusters: one of each, and more where one is undone often in this round.
 
-        marked: ndarray, shape (n,), bool. Clusters by their names.
         names: ndarray, shape (n,), int. Cluster of each vertex.
-
-        Returns:
-        undone: ndarray, shape (n,), bool. Clusters that had collapses.
-        left: ndarray, shape (k, 2), int. Collapses of these clusters that stay.
+        Returns: Which clusters had collapses, shape (n,), and their collapses that stay, shape (k, 2).
         """
         undone = np.zeros(len(marked), dtype=bool)
         # "clip" avoids checking each index, which takes longer than the look-up.
@@ -101,10 +88,7 @@ class Collapses:
 
 
 class Quadrics:
-    """Squared distances to the planes of the triangles around each vertex (Garland and Heckbert 1997).
-
-    vertices: ndarray, shape (n, 3), float64, mm, near zero
-    """
+    """Squared distances to the planes of the triangles around each vertex (Garland and Heckbert 1997), near zero."""
 
     def __init__(self, vertices: Float64Array, triangles: NDArray[np.uint32]):
         from scipy.sparse import csr_array
@@ -125,13 +109,10 @@ class Quadrics:
         self._vertices, self._sums = vertices, around.T @ planes
 
     def best_places(self, clusters: IntArray, members: IntArray, count: int) -> Float64Array:
-        """Return the places with the least sum of squares for clusters of vertices.
+        """Return the places, shape (count, 3), mm, with the least sum of squares for clusters of vertices.
 
-        clusters: ndarray, shape (k,), int. Cluster of each member, from 0 to ``count - 1``; each cluster has members.
-        members: ndarray, shape (k,), int. Vertices.
-        count: Number of clusters.
-
-        Returns: ndarray, shape (count, 3), float64, mm
+        clusters: ndarray, shape (k,). Cluster of each member, from 0 to ``count - 1``; each cluster has members.
+        members: ndarray, shape (k,). Vertices.
         """
         from scipy.sparse import csr_array
 

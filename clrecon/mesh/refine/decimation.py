@@ -168,11 +168,7 @@ def _nearly(wanted: float) -> float:
 def _collapse_in_rounds(
     clusters: Clusters, deviation: Deviation, wanted: float, bound: float, tell: Callable[[int], None]
 ) -> tuple[int, int]:
-    """Collapse edges and repair until few triangles are left, or hardly any more can be removed.
-
-    Returns:
-    taken_back: Number of collapses that were undone.
-    """
+    """Collapse and repair until few triangles are left, or hardly any more go; return rounds and undone collapses."""
     left, rounds, taken_back, is_last = len(clusters.faces()), 0, 0, False
     while left > _nearly(wanted) and rounds < _ROUNDS:
         tell(left)

@@ -1,7 +1,4 @@
-"""Deviation: whether a decimated surface and the original lie within the error bound of each other.
-
-Upper bounds of distances to a surface are found by numpy, where vertices of it near each point are known.
-"""
+"""Deviation: whether a decimated surface and the original lie within the error bound of each other."""
 
 from __future__ import annotations
 
@@ -35,11 +32,8 @@ Corners = list[Float32Array]
 
 
 class SurfaceBounds(NearDistance):
-    """A surface to which distances are bounded, by numpy.
-
-    `clrecon.operators.surface.decimation.DeviceBounds` does the same on a device.
-
-    vertices: ndarray, shape (n, 3), mm, near zero
+    """A surface to which distances are bounded, by numpy, mm near zero; on a device
+    `clrecon.operators.surface.decimation.DeviceBounds` does the same.
     """
 
     def find_bounds(
@@ -47,17 +41,9 @@ class SurfaceBounds(NearDistance):
     ) -> tuple[Float32Array, IntArray]:
         """Return upper bounds of the distances from points to the surface, and the triangles that they are taken from.
 
-        The triangles around each of the vertices near a point are measured, and then, some times, those around the
-        nearest corner of the nearest triangle.  Nothing nearer than `limit` is looked for.
-
-        points: ndarray, shape (k, 3), float64, mm
-        near: ndarray, shape (k, v), int. Vertices near each point.
-        limit: mm.
-        walks: Most steps from triangle to triangle.
-
-        Returns:
-        length: ndarray, shape (k,), float32, mm. Infinity where no triangle was measured.
-        rows: ndarray, shape (k,), int. -1 where no triangle was measured.
+        The triangles around each of the vertices near a point, shape (k, v), are measured, and then, `walks` times,
+        those around the nearest corner of the nearest triangle.  Nothing nearer than `limit` mm is looked for.  Where
+        no triangle was measured the bound is infinite and the row -1.
         """
         found: tuple[Float32Array, IntArray] = (np.full(len(points), np.inf, np.float32), np.full(len(points), -1))
         self.prepare()
@@ -85,20 +71,15 @@ class SurfaceBounds(NearDistance):
     def find_witnesses(
         self, places: Float32Array, triangles: IntArray, names: IntArray, beside: IntArray, limit: float
     ) -> tuple[IntArray, NDArray[np.uint8]]:
-        """Find triangles of this surface that show that those of another lie within a limit.
+        """Find triangles of this surface that show that those of another lie within a limit in mm.
 
         If one triangle is within the limit of all corners, it is so of every point between them.  If not, the middles
         of the triangle and of its edges are compared with the triangles nearest to the corners, then with all around
         the names.
 
-        places: ndarray, shape (v, 3), float32, mm. Vertices of the other surface.
-        triangles: ndarray, shape (k, 3), uint32. Its triangles that are examined.
-        names: ndarray, shape (v,), int. For each vertex one of this surface near it.
-        beside: ndarray, shape (v,), int32. For each vertex a triangle of this surface that is within the limit; -1
-            where there is none.
-        limit: mm.
-
-        Returns:
+        places, triangles: The other surface, and its triangles that are examined.
+        names, beside: For each of its vertices a vertex of this surface near it, and a triangle that is within the
+            limit, -1 where there is none. Returns:
         witnesses: ndarray, shape (7, k), int32. For the corners, the middle and the middles of the edges of each; -1
             for corners without one.
         left: ndarray, shape (k,), uint8. Bit b says that nothing shows middle b of `MIDDLES` to be within the limit.
@@ -151,10 +132,9 @@ class SurfaceBounds(NearDistance):
         witnesses: IntArray,
         left: NDArray[np.uint8],
     ) -> None:
-        """Look at the middles of triangles and edges, see `find_witnesses`, of a piece.
+        """Look at the middles of triangles and edges, see `find_witnesses`, of the triangles `rest` of a piece.
 
         corners, near, names: Places in columns, faces nearest to them, shape (3, k), names, shape (k, 3).
-        rest: ndarray, shape (r,), int. Triangles of this piece that are looked at.
         witnesses, left: Of this piece; changed in place.
         """
         one, two, three = (corner[:, rest] for corner in corners)
@@ -199,12 +179,7 @@ MakeBounds = Callable[..., SurfaceBounds]
 
 
 class Deviation:
-    """The original surface, and the bound.
-
-    bound: mm.
-    make_bounds: `SurfaceBounds`, or what does the same elsewhere.
-    fans: Fans of the triangles if they are known.
-    """
+    """The original surface, and the bound in mm."""
 
     def __init__(
         self,
@@ -233,8 +208,6 @@ class Deviation:
         """Mark triangles that have changed, or have a corner that moved farther than the bound.
 
         In the others no point has moved farther than the corners.
-
-        rows, names, places: As in `is_far_from`.
         """
         triangles = self._triangles[rows]
         a, b, c = names[triangles].T
@@ -257,14 +230,10 @@ class Deviation:
         the edges are measured.  Distances are measured only to the triangles around the names of the corners, the part
         of the surface that came from this triangle.  They are never less than those to the whole surface.
 
-        rows: ndarray, shape (k,), int. Triangles to examine.
-        names: ndarray, shape (n,), int. For each vertex a near vertex of the present surface.
-        places: ndarray, shape (n, 3), float64, mm
-        faces: ndarray, shape (f, 3), uint32. The present surface, at least all faces around the names of the corners.
-
-        Returns:
-        witnesses: ndarray, shape (7, k), int. Rows of `faces` that show that a triangle is within the bound; it is so
-            as long as these faces stay.  -1 where it is not.
+        names: For each vertex a near vertex of the present surface.
+        faces: The present surface, at least all faces around the names of the corners.
+        Returns witnesses too: shape (7, k), rows of `faces` that show that a triangle is within the bound; it is so as
+            long as these faces stay.  -1 where it is not.
         """
         triangles = self._triangles[rows]
         used = np.zeros(len(names), dtype=bool)
@@ -291,11 +260,7 @@ class Deviation:
     def are_left_behind(
         self, vertices: IntArray, names: IntArray, places: Float64Array, faces: NDArray[np.uint32]
     ) -> NDArray[np.bool_]:
-        """Mark vertices of the original surface for which no upper bound shows that they lie within the bound.
-
-        vertices: ndarray, shape (k,), int. Vertices to examine.
-        names, places, faces: As in `is_far_from`.
-        """
+        """Mark vertices of the original surface for which no upper bound shows that they lie within the bound."""
         length, _ = self._make(places, faces).find_surely_within(self._vertices[vertices], names[vertices], self._bound)
         return np.asarray(length > self._bound)
 
@@ -305,10 +270,7 @@ class Deviation:
         Tested are the corners, the middle, and points of a lattice with steps of at most two mean edges of the original
         surface; the middle of each edge is one of them.
 
-        places: ndarray, shape (n, 3), float64, mm
-        faces: ndarray, shape (f, 3), uint32. Their corners are numbers of vertices of the original surface too.
-        rows: ndarray, shape (f,), int. The triangle of the original surface that each face came from: its corners are
-            near the face.
+        rows: The triangle of the original surface that each face came from: its corners are near the face.
         """
         far = np.zeros(len(faces), dtype=bool)
         if len(faces) == 0:
@@ -334,8 +296,9 @@ class Deviation:
     def _find_far_within(
         self, places: Float64Array, corners: NDArray[np.uint32], near: IntArray, look_at: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Mark edges, shape (n, 2), or triangles, shape (n, 3), that have a point inside that is too far away; `near`,
-        of the same shape, are vertices of the original surface near them.
+        """Mark edges (n, 2) or triangles (n, 3) that have a point inside that is too far away.
+
+        `near`, of the same shape, are vertices of the original surface near them.
         """
         columns = [places.take(corner, axis=0) for corner in corners.T]
         longest = np.zeros(len(corners))

@@ -133,9 +133,7 @@ def measure_farthest(
 ) -> float:
     """Return the largest distance found between a mesh and another surface, in mm.
 
-    vertices, triangles: The other surface.
-    also: ndarray, shape (k,), int. Vertices of the mesh to measure from besides points that cover each surface evenly;
-        default: all.
+    also: Vertices of the mesh to measure from besides points that cover each surface evenly; default: all.
     """
     origin = local_origin(mesh.vertices)
     before, after = mesh.vertices - origin, vertices - origin

@@ -41,10 +41,8 @@ IntArray = NDArray[np.integer]
 class Volumes:
     """Components of a surface, and the volumes that they enclose.
 
-    labels: ndarray, shape (n,), int64. Component of each vertex; -1 for vertices that no triangle uses.
-    mm3: ndarray, shape (count,), float64. Enclosed volume, negative for walls of cavities; meaningless for open
-        components.
-    is_open: ndarray, shape (count,), bool
+    labels: ndarray, shape (n,). Component of each vertex; -1 for vertices that no triangle uses.
+    mm3: ndarray, shape (count,). Negative for walls of cavities; meaningless for open components.
     """
 
     labels: NDArray[np.int64]
@@ -63,11 +61,10 @@ def measure_volumes(
     labels: NDArray[np.int64] | None = None,
     border: NDArray[np.bool_] | None = None,
 ) -> Volumes:
-    """Measure the components of a surface.
+    """Measure the components of a surface, in mm from a point near it.
 
-    vertices: ndarray, shape (n, 3), float64, mm from a point near them
-    count, labels, border: int, ndarray, shape (n,), int64, and ndarray, shape (n,), bool. Number of components,
-        component of each vertex, and vertices at edges of one triangle, if they are known.
+    count, labels, border: Number of components, component of each vertex, and which vertices lie at edges of one
+        triangle, if they are known.
     """
     if count is None or labels is None or border is None:
         edges = find_edges(triangles, len(vertices))
@@ -91,9 +88,8 @@ def restore_volumes(
     A small shift is a large share of the volume of a thin sheet: in a thin-walled bone at voxels of 3 mm, 6 % of the
     volume were 0.03 voxel.
 
-    step: ndarray, shape (n, 3), float64, mm. Changed in place; no step becomes longer than `longest`.
-    labels: ndarray, shape (n,), int64. Component of `wanted` that each vertex belongs to, -1 for none.
-    longest: mm.
+    step: ndarray, shape (n, 3), mm. Changed in place; no step becomes longer than `longest`.
+    labels: Component of `wanted` that each vertex belongs to, -1 for none.
     """
     count = len(wanted.mm3)
     moving = np.flatnonzero((labels >= 0) & ~np.append(wanted.is_open, True)[labels])
@@ -145,12 +141,9 @@ def move_vertices(
 
     All triangles are looked at once, and then those around what is taken back.
 
-    step: ndarray, shape (n, 3), float64, mm
-    find_crossings: `find_self_intersections`, or what finds the same elsewhere.
     find_changed: Given places and the share of each step that is made, finds vertices that are not to move at all.
-
     Returns:
-    vertices: ndarray, shape (n, 3). Vertices as stored.  Faults that existed before may remain.
+    vertices: As stored.  Faults that existed before may remain.
     taken_back: Number of vertices that were not moved by the full step.
     """
     share = np.ones(len(vertices))
@@ -185,8 +178,7 @@ def _touching(vertices: IntArray, triangles: NDArray[np.uint32], size: int) -> N
 class _Near:
     """Search for what is spoilt around changed triangles, among those that come near them.
 
-    moved: ndarray, shape (n, 3), mm. Vertices, which change between two calls of `find_spoilt`.
-    longest: mm. No coordinate of a vertex changes by more.
+    moved: mm. Vertices, no coordinate of which changes by more than `longest` between two calls of `find_spoilt`.
     """
 
     def __init__(self, moved: NDArray[np.floating], triangles: NDArray[np.uint32], longest: float):

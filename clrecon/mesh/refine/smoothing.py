@@ -69,8 +69,7 @@ IntArray = NDArray[np.integer]
 class Rings:
     """The corners of triangles at each vertex: of vertex v those from ``begin[v]`` to ``begin[v + 1]``.
 
-    begin: ndarray, shape (n + 1,), int32
-    after, before: ndarray, shape (3 m,), uint32. The next and the previous corner of the triangle.
+    after, before: ndarray, shape (3 m,). The next and the previous corner of the triangle.
     weights: ndarray, shape (n,), float32. 1 / number of corners; 0 for vertices at a border and for those without
         triangles, which do not move.
     """
@@ -114,13 +113,9 @@ class Filter:
         return label_components(triangles, len(self._rings.weights))
 
     def measure_bends(self, places: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """Measure how far each vertex lies from the mean of its neighbours, and its normal.
+        """Return how far each vertex (n, 3) lies from the mean of its neighbours, mm, and its normal.
 
-        places: ndarray, shape (n, 3), mm
-
-        Returns:
-        bends: ndarray, shape (n, 3), mm
-        normals: ndarray, shape (n, 3), mm2. Twice the sum of the areas around each vertex.
+        Normals are twice the sum of the areas around each vertex, mm2.
         """
         rings = self._rings
         own = np.repeat(places, np.diff(rings.begin), axis=0)
@@ -186,10 +181,8 @@ def sinc_terms(iterations: int) -> list[Term]:
 
 
 class _Components:
-    """Components of a surface that are to keep their volumes.
+    """Components of a surface near zero that are to keep their volumes, by shifts along `normals` of any length.
 
-    places: ndarray, shape (n, 3), float64, mm, near zero
-    normals: ndarray, shape (n, 3). Of any length; a shift along them restores volumes.
     components: Their number, and the one of each vertex, -1 for none.
     still: Vertices that do not move: their components are open.
     """
@@ -223,14 +216,10 @@ class _Components:
         return np.bincount(of_triangle, volumes, self._count + 1).astype(np.float64)
 
     def keep_volumes(self, steps: Float32Array, longest: float) -> tuple[Float64Array, int, int]:
-        """Shorten steps, shape (n, 3), and shift them so that each closed component keeps its volume.
+        """Shorten steps (n, 3) to `longest` mm, and shift them so that each closed component keeps its volume.
 
-        longest: mm. No step is longer.
-
-        Returns:
-        steps: ndarray, shape (n, 3), float64, mm
-        held: Number of steps that were longer.
-        left: Number of components that are not moved, as no share of their steps leaves them their volume.
+        Returns them with the number of steps that were longer, and of components that are not moved, as no share of
+        their steps leaves them their volume.
         """
         wanted = np.ascontiguousarray(steps.T, dtype=np.float64)
         length = np.sqrt(_dot(wanted, wanted))
@@ -295,7 +284,6 @@ class _Components:
     def find_changed(self, vertices: Float64Array, share: Float64Array) -> IntArray:
         """Find the vertices of the components that have lost their volume where steps were taken back.
 
-        vertices: ndarray, shape (n, 3), mm, near zero
         share: ndarray, shape (n,). Of each step that is made.
         """
         touched = np.zeros(self._count + 1, bool)
@@ -310,10 +298,7 @@ class _Components:
 def _determinants(
     columns: Float64Array, normals: Float64Array | None, triangles: NDArray[np.uint32]
 ) -> list[Float64Array]:
-    """Return of each triangle its part of the volume in mm3, or with normals its parts of the cubic of a shift.
-
-    columns, normals: ndarray, shape (3, n)
-    """
+    """Return of each triangle its part of the volume in mm3, or with normals its parts of the cubic of a shift."""
     parts = [np.empty(len(triangles)) for _ in range(1 if normals is None else 4)]
 
     def work(where: slice) -> None:

@@ -23,12 +23,9 @@ LISTED = 20
 
 @dataclass(frozen=True, eq=False)
 class Topology:
-    """Euler numbers of the components of a surface.
+    """Euler numbers of the components of a surface, their faces, and the edges that are not in two faces.
 
-    euler: ndarray, shape (count,), int64. Vertices - edges + faces of each component: 2 for a closed surface without
-        tunnels, and 2 less for each tunnel.
-    faces: ndarray, shape (count,), int64
-    loose_edges: Edges that are not in two faces.
+    euler: Vertices - edges + faces of each: 2 for a closed surface without tunnels, and 2 less for each tunnel.
     """
 
     euler: NDArray[np.int64]
@@ -40,13 +37,12 @@ class Topology:
 class TopologyChange(Record):
     """What became of the topology of a surface.
 
-    euler_number_before, euler_number_after: Used vertices - edges + faces.
-    components_before, components_lost: Components of the surface before, and those of them that have no face any more.
+    components_lost: Those that have no face any more.
     loose_edges_before, loose_edges_after: Edges that are not in two faces: where the surface is open, or several sheets
         meet.
     components_changed: Components that are still there with another Euler number.
-    changes: The first of these: ``component`` (numbered in order of the first vertex), ``euler_number_before``,
-        ``euler_number_after``.  In a closed and manifold component 2 more is a tunnel closed, 2 less a tunnel opened.
+    changes: The first of these, numbered in order of the first vertex.  In a closed and manifold component 2 more is a
+        tunnel closed, 2 less a tunnel opened.
     """
 
     euler_number_before: int
@@ -62,12 +58,7 @@ class TopologyChange(Record):
 def measure_topology(
     triangles: NDArray[np.uint32], labels: NDArray[np.int64], count: int, edges: Edges | None = None
 ) -> Topology:
-    """Measure the Euler number of each component.
-
-    labels: ndarray, shape (n,), int64. Component of each vertex.
-    count: Number of components.
-    edges: Edges of the triangles if they are known.
-    """
+    """Measure the Euler number of each component."""
     edges = find_edges(triangles, len(labels)) if edges is None else edges
     used = np.zeros(len(labels), dtype=bool)
     used[triangles.reshape(-1)] = True
@@ -109,11 +100,7 @@ def any_corner(flags: NDArray[np.bool_], triangles: IntArray) -> NDArray[np.bool
 
 
 def find_sheets(faces: NDArray[np.uint32], size: int, edges: Edges) -> list[IntArray]:
-    """Find the vertices at edges with several sheets, of doubled faces and of several fans of faces.
-
-    size: Number of vertices.
-    edges: Edges of these faces.
-    """
+    """Find the vertices at edges with several sheets, of doubled faces and of several fans of faces."""
     faults = _find_ridges(faces, edges)
     opposite = opposite_half_edges(faces, edges)
     if opposite is not None:
@@ -135,8 +122,7 @@ def _find_ridges(faces: NDArray[np.uint32], edges: Edges) -> list[IntArray]:
 def find_faults_beside(faces: NDArray[np.uint32], new: NDArray[np.bool_]) -> IntArray:
     """Find the same faults as `find_sheets`, but only those that new vertices can have made.
 
-    faces: ndarray, shape (f, 3), uint32. The whole surface.
-    new: ndarray, shape (n,), bool. Vertices that were not there, or elsewhere: every face that is new has one of them.
+    new: Vertices that were not there, or elsewhere: every face that is new has one of them.
     """
     touched = np.zeros(len(new), dtype=bool)
     touched[faces[any_corner(new, faces)]] = True
@@ -165,8 +151,7 @@ def find_torn(triangles: NDArray[np.uint32], names: IntArray) -> IntArray:
     It stays as it was where the triangles that shrank to a vertex form a disc, and those that shrank to an edge a strip
     from one side of it to the other: their vertices - edges + faces are then 1 and, as they have no vertices, -1.
 
-    triangles: ndarray, shape (m, 3), uint32. Triangles before vertices were merged.
-    names: ndarray, shape (n,), int. For each vertex the one that it was merged into.
+    names: For each vertex the one that it was merged into.
     """
     size = len(names)
     edges = find_edges(triangles, size)

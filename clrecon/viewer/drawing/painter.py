@@ -70,9 +70,7 @@ class _Drawn:
 
 
 class Painter(Stage):
-    """Draws states of views; safe for several threads and views, which take turns.
-
-    Use it as a context manager, or `close` it.
+    """Draws states of views; safe for several threads and views, which take turns; a context manager.
 
     memory: Bytes that may be taken on the device.  A scan that does not fit goes through in slabs, which is slow.
     """
@@ -104,14 +102,11 @@ class Painter(Stage):
         share: float = 1.0,
         cancelled: Callable[[], bool] = never,
     ) -> Rendering:
-        """Take the picture of a state.
+        """Take the picture of a state, with a transparent background; ``depth`` in mm, NaN where there is nothing.
 
         size: (width, height)
         sharp: False: coarse meshes, translucent ones opaque, longer steps in volume rendering.
         share: Of a coarse picture, its width as a share of `size`.
-
-        Returns: With a transparent background; ``depth`` in mm, NaN where there is nothing.  A coarse one is smaller
-            than `size`.  ``report["ms"]`` is the time it took, that of waiting for other views not counted.
         """
         width, height = checked_size(size)
         if not sharp:
@@ -126,12 +121,7 @@ class Painter(Stage):
             return made
 
     def slice(self, state: ViewState, plane: str, size: Sequence[int]) -> Rendering:
-        """Cut a slice through the cross.
-
-        plane: {"axial", "coronal", "sagittal"}
-
-        Returns: Its camera maps pixels to LPS and back; empty where there is no scan.
-        """
+        """Cut a slice ("axial", "coronal" or "sagittal") through the cross; empty where there is no scan."""
         width, height = checked_size(size)
         with self.lock:
             found = self._sliced(state)
@@ -164,12 +154,10 @@ class Painter(Stage):
     # Places
 
     def pick(self, state: ViewState, size: Sequence[int], x: float, y: float) -> Pick | None:
-        """Return what is seen at a place of the picture, None where nothing is.
+        """Return what is seen at a place of the picture, None where nothing is: the nearest object on one ray.
 
-        One ray is sent through the place; the nearest object is taken.
-
-        size: (width, height)
-        x, y: Pixels from the top left corner of a picture of this size; the first pixel's centre is (0.5, 0.5).
+        x, y: Pixels from the top left corner of a picture of this (width, height); the first pixel's centre is (0.5,
+            0.5).
         """
         camera = pixel_camera(state.camera, checked_size(size), x, y)
         nearest: tuple[float, _Drawn] | None = None
@@ -233,7 +221,7 @@ class Painter(Stage):
             return renderer.render(CurveCut(list(state.curve), window=state.window), size=checked_size(size))
 
     def prepare(self, progress: Progress | None = None) -> None:
-        """Build the kernels of the surface picture, the slices and the extraction, that of bricks too.
+        """Build the kernels of the surface picture, the slices and the extraction.
 
         The second extraction from a volume uses bricks, whose kernels would be built at the first move of the slider.
         """

@@ -53,13 +53,7 @@ def check_target(path: str | os.PathLike[str], painter: Painter, state: ViewStat
 
 
 def free_name(wanted: str | Path) -> Path:
-    """Return a name that no file has: the wanted one, else with the first number from 2 on that is free.
-
-    >>> free_name("bone.stl")  # bone.stl is there already
-    PosixPath('bone-2.stl')
-
-    ``bone.nii.gz`` becomes ``bone-2.nii.gz``.
-    """
+    """Return the wanted name, or where it is taken with the first free number: ``bone-2.nii.gz``."""
     path = Path(wanted)
     ends = (
         "".join(path.suffixes[-2:]) if path.name.lower().endswith((".nii.gz", ".xyz.gz", ".seg.nrrd")) else path.suffix

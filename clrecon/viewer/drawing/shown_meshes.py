@@ -113,8 +113,6 @@ def make_meshes(stage: Stage, state: ViewState, progress: Progress | None = None
 
     Parts with colours of their own are meshes of their own, else a scan is one.  What clip planes cut off a scan is
     closed, meshes stay open there, as in the picture.
-
-    Returns: With ``report["part_name"]`` and, where it was set, ``report["color"]``.
     """
     tell = progress or ignore_progress
     only_labels = find_modes()[state.mode].kind == "labels"
@@ -220,11 +218,8 @@ def clip_volume(volume: Volume, clip: Clip, iso_value: float) -> Volume:
 
 
 def number_vertices(mesh: Mesh, volume: Volume, iso_value: float, voxels: NDArray) -> NDArray:
-    """Return for each vertex of a surface the number of the voxel that is inside at its edge.
+    """Return for each vertex of an iso surface of `volume` the number of the voxel that is inside at its edge.
 
-    A vertex lies on an edge between two neighbouring voxels, one inside and one outside.
-
-    mesh: Extracted from `volume` at `iso_value`.
     voxels: ndarray, shape (nk, nj, ni). Numbers.
     """
     level = choose_iso_rule(volume, iso_value).iso_level

@@ -43,10 +43,7 @@ STRIP_ROWS = 16
 def take_strips(
     take: Callable[[Camera, tuple[int, int]], Rendering], camera: Camera, size: tuple[int, int]
 ) -> Rendering:
-    """Take the picture of a parallel camera strip by strip, where it is large; others in one.
-
-    take: Takes a picture of a camera and a size; what it raises ends the work.
-    """
+    """Take the picture of a parallel camera strip by strip, where it is large; others in one."""
     width, height = size
     rows = max(STRIP_ROWS, STRIP_PIXELS // width // STRIP_ROWS * STRIP_ROWS)
     if not camera.is_parallel or rows >= height:
@@ -85,10 +82,7 @@ PICTURE = (8, 8)
 
 
 def warm_kernels(objects: Sequence[ShownObject], device: Device, progress: Progress | None = None) -> None:
-    """Build what the first pictures, the slider and the parts need, on a small volume of each type of voxels.
-
-    Views are not kept waiting: nothing of theirs is used but the device.
-    """
+    """Build what the first pictures, the slider and the parts need, on a small volume of each type of voxels."""
     tell = progress or ignore_progress
     done = set()
     for each in objects:
@@ -149,12 +143,7 @@ size."""
 
 
 class Stage(Closing):
-    """What is on the device; safe for several threads.
-
-    objects, device, memory: See `clrecon.viewer.drawing.painter.Painter`.
-
-    lock: Held while the device works for a view.
-    """
+    """What is on the device; safe for several threads: `lock` is held while the device works for a view."""
 
     def __init__(
         self, objects: Sequence[ShownObject], *, device: Device | str | int | None = None, memory: int | None = None
@@ -188,10 +177,7 @@ class Stage(Closing):
     # Parts
 
     def find_parts(self, state: ViewState, progress: Progress | None = None) -> list[FoundParts]:
-        """Find the parts of all scans at the iso value; those that were found before are taken again.
-
-        Scans with a label map have its labels as parts.
-        """
+        """Find the parts of all scans without a label map at the iso value, or take those that were found before."""
         made = []
         for scan in self._clustered():
             key = (scan.number, state.iso_value, state.table)

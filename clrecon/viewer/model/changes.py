@@ -32,11 +32,7 @@ FIT_PIXELS = 1000
 def fit_camera(
     points: Float64Array, view: str | Sequence[float], aspect: float, view_angle: float | None = None
 ) -> Camera:
-    """Return a camera that looks from a side of the patient, so that the box around points fits.
-
-    points: ndarray, shape (n, 3). LPS mm.
-    aspect: Width of the picture by its height.
-    """
+    """Return a camera from a side of the patient so that points (n, 3) fit; `aspect` is width by height."""
     size = (max(1, round(aspect * FIT_PIXELS)), FIT_PIXELS)
     return Camera.fit(box_around([points]), view, view_angle=view_angle, size=size)
 
@@ -44,8 +40,7 @@ def fit_camera(
 def plane_step(scans: Sequence[ShownScan], plane: str) -> Float64Array:
     """Return the step from one slice of a plane to the next, away from the eye: (3,) in mm.
 
-    It is the distance of the first scan's voxels along its axis that is nearest to the normal of the plane; 1 mm
-    without a scan.
+    It is the distance of the first scan's voxels along its axis that is nearest to the normal; 1 mm without a scan.
     """
     normal = -np.array(DIRECTIONS[PLANES[plane]])
     if not scans:
@@ -109,7 +104,6 @@ def zoom_camera(camera: Camera, factor: float, at: tuple[float, float] = (0.0, 0
 def pixel_camera(camera: Camera, size: tuple[int, int], x: float, y: float) -> Camera:
     """Return a camera whose picture of one pixel is seen along the ray of a place in this camera's picture.
 
-    size: (width, height)
     x, y: Pixels from the top left corner; the first pixel's centre is (0.5, 0.5).
     """
     right, up, forward = camera.basis()
@@ -154,11 +148,7 @@ _GESTURES = frozenset(
 
 
 class ChangingView:
-    """What `clrecon.viewer.model.model.ViewModel` is made of.
-
-    state: At the start.
-    clock: Seconds, see `SAME_GESTURE_S`.
-    """
+    """What `clrecon.viewer.model.model.ViewModel` is made of."""
 
     def __init__(self, objects: tuple[ShownObject, ...], state: ViewState, clock: Callable[[], float] = monotonic):
         self.objects, self.state = objects, state
@@ -195,10 +185,7 @@ class ChangingView:
         self._change("pan", "the shift", camera=pan_camera(self.camera, *checked_numbers("a shift", dx, dy)))
 
     def zoom(self, factor: float, at: tuple[float, float] = (0.0, 0.0)) -> None:
-        """Show everything larger by a factor; what is seen at `at` stays there.
-
-        at: (x, y). From the middle of the picture to the right and down, in shares of its height.
-        """
+        """Show everything larger by a factor; what is seen at `at` stays there, see `zoom_camera`."""
         (factor,) = checked_numbers("the factor of a zoom", factor)
         x, y = checked_numbers("the place of a zoom", *at)
         self._change("zoom", "the zoom", camera=zoom_camera(self.camera, factor, (x, y)))

@@ -49,14 +49,10 @@ BOX_SHARE = 0.5
 
 
 class ViewModel(ChangingView):
-    """The state of one view.
-
-    Every change is a method, and can be undone.  It is not safe for several threads at once: `ViewSession` locks it.
+    """The state of one view: every change is a method, and can be undone.  `ViewSession` locks it.
 
     space: {"lps", "ras"}. Frame in which places are said; everything in here is LPS mm.
     iso_value: HU; default: 200, or the nearest value that the slider has.
-    clock: Seconds, see `SAME_GESTURE_S`.
-
     version: Grows with each change.
     aspect: Width of the picture by its height, for views that fit.
     iso_range: HU at the ends of the slider.
@@ -180,10 +176,7 @@ class ViewModel(ChangingView):
         self.set_mode(names[(names.index(self.mode) + steps) % len(names)])
 
     def set_window(self, low: float, high: float, of: str = "slices") -> None:
-        """Set the HU that are black and white.
-
-        of: {"slices", "picture"}. The three slices, or the projection.
-        """
+        """Set the HU that are black and white, of the three slices or of the projection ("picture")."""
         low, high = checked_numbers("a window", low, high)
         if not low < high:
             raise UsageError(f"a window runs from black to white, the lower HU first, not from {low:g} to {high:g}")
@@ -268,7 +261,7 @@ class ViewModel(ChangingView):
     def add_clip(self, direction: str | Sequence[float]) -> None:
         """Cut with a plane half way along a direction; the side that the direction points to is taken away.
 
-        direction: str or (x, y, z). A side of the patient, "view" for the side of the camera, or a vector in LPS.
+        direction: A side of the patient, "view" for the side of the camera, or a vector in LPS.
         """
         if direction == "view":
             direction = (-self.camera.basis().forward).tolist()

@@ -31,9 +31,8 @@ SLICE_WINDOW = (-450.0, 1050.0)
 
 @dataclass(frozen=True)
 class ViewMode:
-    """A mode.
+    """A mode; `words` say what is seen.
 
-    name, words: The words say what is seen.
     kind: "surface", "volume" (volume rendering), "projection", "slices" or "labels".
     style: Name of the preset or of the projection.
     joins: Other objects are shown with it in one picture.
@@ -73,7 +72,6 @@ def find_modes() -> dict[str, ViewMode]:
 class ShownObject:
     """One input of a view, in LPS mm.  It does not change.
 
-    number: From 1, in the order of the inputs.
     name: Shown in lists.  No file name: it can hold the name of a patient.
     said: What has to be said of it, such as that it was turned from RAS.
     """
@@ -140,10 +138,7 @@ class ShownCloud(ShownObject):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShownLabels(ShownObject):
-    """A label map: it colours and divides the scan that it lies in, or is shown alone.
-
-    within: Number of the scan that it lies in.
-    """
+    """A label map: it colours and divides the scan of number `within`, or is shown alone."""
 
     labels: LabelMap
     within: int | None = None
@@ -167,11 +162,9 @@ def show_objects(
     names: Sequence[str] = (),
     said: Sequence[Sequence[str]] = (),
 ) -> list[ShownObject]:
-    """Number and name what was read or made.
+    """Number and name what was read or made; a label map belongs to the first scan, if there is one.
 
-    subjects: A label map belongs to the first scan, if there is one.
-    names: Names in their order; those that are missing or empty are "scan 1", "mesh 2" and so on.
-    said: What has to be said of each.
+    names: Those that are missing or empty are "scan 1", "mesh 2" and so on.
     """
     if not subjects:
         raise UsageError("there is nothing to show")

@@ -102,12 +102,8 @@ def find_clusters(
     *,
     lock: AbstractContextManager[Any] | None = None,
 ) -> FoundParts:
-    """Find the parts of a scan.
+    """Find the parts of a scan; voxels at the iso value and above are inside.
 
-    scan: Number of the object.
-    iso_value: HU; voxels that are not lower are inside.
-    table: See `FoundParts`.
-    progress: ``progress("parts", done, 5)``; what it raises ends the search.
     lock: Held while the device works, which is not most of the time.
     """
     tell, volume = progress or ignore_progress, resident.volume

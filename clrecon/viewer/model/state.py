@@ -1,5 +1,4 @@
-"""`ViewState`: everything that a view shows, frozen: what a painter draws, and what undo goes back to; picks, measures,
-clip planes."""
+"""`ViewState`: everything that a view shows, frozen, which a painter draws; picks, measures and clip planes."""
 
 from __future__ import annotations
 
@@ -29,13 +28,7 @@ TOOLS = tuple(POINTS_OF)
 
 @dataclass(frozen=True, kw_only=True)
 class Pick:
-    """A place that was pointed at.
-
-    point: (x, y, z). LPS mm.
-    object: Number of the object that is seen there; None in a slice.
-    part: Key of its part.
-    hu: HU of the scan there, trilinear.
-    """
+    """A place in LPS mm that was pointed at, the object (None in a slice) and its part there, and the HU, trilinear."""
 
     point: Point
     object: int | None = None
@@ -53,11 +46,9 @@ class Pick:
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """What was measured.
+    """What was measured between points in LPS mm.
 
-    kind: "distance", "angle", "curve" (its length) or "seed".
-    points: tuple of (x, y, z). LPS mm.
-    value: None for a seed.
+    kind: "distance", "angle", "curve" (its length) or "seed", which has no value.
     unit: "mm", "degrees" or "".
     text: As it is written beside the picture.
     """
@@ -74,11 +65,7 @@ class Measure:
 
 
 def measure_points(kind: str, points: Sequence[Point]) -> Measure:
-    """Measure points.
-
-    kind: One of `TOOLS`.
-    points: sequence of (x, y, z). LPS mm; the angle is that at the second of three.
-    """
+    """Measure points in LPS mm by one of `TOOLS`; the angle is that at the second of three."""
     places = np.array(points, dtype=np.float64).reshape(-1, 3)
     if kind == "seed":
         (point,) = points
@@ -105,8 +92,7 @@ def measure_points(kind: str, points: Sequence[Point]) -> Measure:
 class ClipPlane:
     """A plane that cuts everything, along a direction in the patient.
 
-    direction: (x, y, z). Unit vector in LPS towards the side that is taken away.
-    name: Of the direction.
+    direction: Unit vector in LPS towards the side that is taken away.
     low, high: Of what is shown along the direction, mm.
     share: 0 takes all away, 1 nothing.
     flipped: The other side is taken away, with 0 nothing and with 1 all.
@@ -164,15 +150,14 @@ class ShownPart:
     """A part that can be switched: an object as a whole, a cluster of a scan's voxels, or a label.
 
     key: "2" for the object of number 2, "2/5" for its part of number 5.
-    name, kind: Kinds are "scan", "mesh", "cloud", "cluster", "rest" (what of a scan lies below the iso value) and
-        "label".
+    kind: "scan", "mesh", "cloud", "labels", "cluster", "rest" (what of a scan lies below the iso value) or "label".
     number: Number of the cluster or label in the label map by which it is drawn; 0 for "rest" and for whole objects.
     ml: Volume of its voxels.
     count: Voxels, triangles or points.
-    color: (red, green, blue) or None. 0 to 1; None: as it looks by itself.
+    color: (red, green, blue), 0 to 1; None: as it looks by itself.
     opacity: 0 to 1; seen only while it is visible.
-    box: ((x, y, z), (x, y, z)) or None. LPS mm.
-    inside: (x, y, z) or None. LPS mm of a place within the cluster, by which it is known again at another iso value.
+    box: LPS mm.
+    inside: LPS mm of a place within the cluster, by which it is known again at another iso value.
     """
 
     key: str
@@ -215,19 +200,16 @@ class ShownPart:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewState:
-    """What a view shows.
+    """What a view shows; places are LPS mm.
 
-    camera: LPS mm.
-    mode: One of `clrecon.viewer.model.model.view_modes`.
     iso_value: HU, of all scans.
     window: HU shown as black and white in slices.
     picture_window: The same in projections; None: that of the mode.
     table: Table and blankets are shown.
-    cross: (x, y, z). LPS mm, where the three slices go through.
+    cross: Where the three slices go through.
     parts_at: Iso value of the clusters; None: they are not known.
     parts_table: Of which volume, see `table`.
     points: Points of the tool that is used.
-    clip_box: ((x, y, z), (x, y, z)) or None. LPS mm.
     """
 
     camera: Camera

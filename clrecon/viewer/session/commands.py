@@ -68,10 +68,8 @@ def _or_none(check: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 @dataclass(frozen=True)
 class Command:
-    """A command.
+    """A command, with the checks of arguments that it needs and takes.
 
-    words: What it does.
-    needs, takes: Arguments that must be there, and those that may be, with the check of each.
     call: Called with the session and the checked arguments; a mapping that it returns is added to the facts.
     """
 

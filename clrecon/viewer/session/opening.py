@@ -34,12 +34,7 @@ def choose_iso(objects: Sequence[ShownObject], scan: MeshSettings, progress: Pro
 
 
 class OpenedView(Closing):
-    """What the views of some inputs share.
-
-    Use it as a context manager, or `close` it after its sessions.
-
-    said: What has to be said of the inputs.
-    """
+    """What the views of some inputs share, and what has to be `said` of the inputs; a context manager."""
 
     def __init__(self, inputs: Sequence[str | Path], settings: ViewSettings, progress: Progress = ignore_progress):
         scan = settings.scan
@@ -68,11 +63,7 @@ class OpenedView(Closing):
 def open_view(
     inputs: Sequence[str | Path], settings: ViewSettings | None = None, *, progress: Progress | None = None
 ) -> OpenedView:
-    """Read inputs for a view.
-
-    inputs: See `clrecon.jobs.view.inputs.open_inputs`.
-    settings: How scans are read, masked and cropped, the iso value to begin with, the label map.
-    """
+    """Read inputs for a view; the settings say how, and with which iso value it begins."""
     settings = settings or ViewSettings()
     check_view_settings(settings)
     return OpenedView(inputs, settings, progress or ignore_progress)

@@ -37,10 +37,8 @@ def picture_key(state: ViewState, view: str) -> Hashable:
 
 
 def seen_pieces(rendering: Rendering, lines: Sequence[Float64Array], *, expected: bool) -> list[list[list[float]]]:
-    """Return the pieces of lines that nothing in a picture hides, each as its first and last point.
+    """Return the pieces of lines (n, 3) in LPS mm that nothing in a picture hides, each as its first and last point.
 
-    rendering: With a camera.
-    lines: Points of each line, (n, 3) in LPS mm.
     expected: True where the picture has no surface: the expected depth counts.
     """
     camera, size = rendering.camera, rendering.size

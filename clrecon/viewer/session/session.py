@@ -50,16 +50,11 @@ _WORDS = {
 
 
 class ViewSession(Closing):
-    """One view.
-
-    Methods may be called from any thread.  Pictures come in a thread of the session, work that takes longer in another.
+    """One view.  Methods may be called from any thread; pictures and longer work come in threads of the session.
 
     painter: Shared with other views of the same objects; it stays open.  None: one of its own.
-    device, memory: Of its own painter.
     space: {"lps", "ras"}. Frame in which places are said and saved.
     iso_value: HU at the start.
-    keep_ids: Write hashes of UIDs into files.
-    no_clobber: Files that exist stay, and to save over one is an error.
     on_change: Called, in any thread, when something happened that was not asked for by the caller just now: work began
         or ended, parts were found, an error came.
     """
@@ -108,12 +103,11 @@ class ViewSession(Closing):
     # Pictures
 
     def picture(self, size: Sequence[int], moving: bool, then: Callable[[Rendering], None]) -> None:
-        """Ask for the picture; the latest request wins.
+        """Ask for the picture; the latest request wins, and `then` is called with it in a thread of the session.
 
         size: (width, height)
         moving: Coarse, its width steered so that it takes 40 ms.  A coarse one that is drawn is always delivered, a
             sharp one is dropped when the next is asked for.
-        then: Called with the `Rendering` in a thread of the session.
         """
         width, height = checked_size(size)
         self.fit(size)
@@ -316,7 +310,6 @@ class ViewSession(Closing):
     ) -> None:
         """Write what is shown to a file, in the background; the extension says as what.
 
-        path: See `clrecon.viewer.drawing.saving.KINDS`.
         then: Called with lines that say what was written.
         size: (width, height). Of a picture.
         """

@@ -43,7 +43,6 @@ class Job:
 class Worker:
     """A thread with one place for each kind of work.
 
-    name: Of the thread.
     on_error: Called with the kind and the words of an error, in the thread.
     on_change: Called when work begins and when it ends.
     """
@@ -60,11 +59,9 @@ class Worker:
     def ask(self, kind: str, work: Callable[[Job], Any], rank: int = 0, *, gives_way: bool = True) -> Job | None:
         """Ask for work; one of the same kind that waits is dropped, and one that runs is cancelled if it gives way.
 
-        work: Called with the `Job` in the thread.
         rank: Lower ones come first.
         gives_way: False: once it runs it is finished, so that pictures are seen while requests come faster than
             pictures.
-
         Returns: None after `close`.
         """
         job = Job(kind, work, rank, gives_way)

@@ -34,11 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Download:
-    """A finished file.
-
-    ticket: Random, part of its address; it counts as the secret does, once.
-    path: In a folder of its own.
-    """
+    """A finished file in a folder of its own; its random `ticket` is part of its address, and a secret of its own."""
 
     ticket: str
     path: Path
@@ -49,10 +45,7 @@ class Download:
 
 
 class Downloads:
-    """The finished files of one browser.
-
-    folder: Where each gets a folder of its own; only the owner of the process can read it.
-    """
+    """The finished files of one browser; `folder` is one that only the owner of the process can read."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -127,7 +120,6 @@ class Connection:
 
     open_session: Makes its session; called with a function that the session calls, in any thread, when something
         happened.
-    folder: For files that it asks for.
     save_as: Files on this computer that it may have written; numbered where they exist.
     wrote: Called with a line for each of these.
     quit: Ends the server.

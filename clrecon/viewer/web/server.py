@@ -89,8 +89,7 @@ class Page(NamedTuple):
 def compose_page(host: str) -> Page:
     """Return the page for a server under the name `host`, as the browser calls it, with its port.
 
-    The page may run its own script and style, whose hashes the policy names, show pictures that it received, and talk
-    to this server.  Nothing else.
+    The page may run its own script and style, show pictures that it received, and talk to this server.  Nothing else.
     """
     content, script, style = _compose()
     policy = (
@@ -119,10 +118,7 @@ _WAITING = 64
 
 
 def bind_port(port: int | None = None) -> socket.socket:
-    """Return a socket that listens on a port of 127.0.0.1; it is closed by the caller.
-
-    port: Default: a free one.
-    """
+    """Return a socket that listens on a port (default: a free one) of 127.0.0.1; it is closed by the caller."""
     if port is not None and (isinstance(port, bool) or not 1 <= port <= LARGEST_PORT):
         raise UsageError(f"a port is a whole number from 1 to {LARGEST_PORT}, not {port!r}")
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -191,14 +187,9 @@ OpenSession = Callable[[Callable[[], None]], Session]
 
 
 class WebServer:
-    """The server of a view.
+    """The server of a view, a context manager; its `address` holds the secret.
 
-    The port is taken at once, so that one that is not free is said before a scan is read.  Use it in a ``with`` block.
-
-    port: Default: a free one.
-    save_as, wrote: See `Connection`.
-
-    address: To be opened in a browser; it holds the secret.
+    The port is taken at once, so that one that is not free is said before a scan is read.
     """
 
     def __init__(
@@ -222,7 +213,7 @@ class WebServer:
     def serve(self, open_session: OpenSession, ready: Callable[[Path], object] = lambda folder: None) -> None:
         """Serve until `stop`, or SIGINT (Ctrl-C), SIGTERM or SIGHUP, which end it within a second.
 
-        open_session: Makes the session of a browser, see `Connection`; called in the thread of the server.
+        open_session: Called in the thread of the server, see `Connection`.
         ready: Called once when the page can be opened, with a folder for private files that is removed at the end.
         """
         with tempfile.TemporaryDirectory(prefix="clrecon-") as folder, contextlib.suppress(KeyboardInterrupt):
@@ -405,14 +396,8 @@ def serve_view(
 ) -> None:
     """Show inputs in browsers, until SIGINT (Ctrl-C), SIGTERM or SIGHUP.
 
-    The server listens on 127.0.0.1 alone and lets in what knows its secret.
-
-    inputs: See `clrecon.jobs.view.inputs.open_inputs`.
-    port: Default: a free one.
-    opens: Open the user's browser.
     save_as: Files that a save writes into the current folder, in place of a download; numbered where they exist.
     wrote: Called with a line for each of these.
-    progress: Of the reading.
     ready: Called with the server, what was read and warnings, once the address can be opened.
     """
     settings = settings or ViewSettings()
