@@ -3,9 +3,10 @@
 All buffers of an operator are summed and compared with the device before any is allocated.  On a CPU device they use
 numpy's memory without a copy.
 
-The memory of results is used again for later results.  When a kernel first writes to a new page, the system has to find
-and clear it.  For the mesh of a CT series this takes as long as computing the mesh.  Arrays made here return their
-pages when their last view is gone, and a later result of the same process uses them without that delay."""
+When a kernel first writes to a new page, the system has to find and clear it.  For the mesh of a CT series this takes
+as long as computing the mesh.  So arrays made here return their pages when their last view is gone, and a later result
+of the same process uses them.
+"""
 
 from __future__ import annotations
 
@@ -37,12 +38,7 @@ def _mib(size: int, up: bool = False) -> str:
 
 @dataclass(frozen=True)
 class MemoryLimits:
-    """The memory that may be taken on a device.
-
-    label: Name of the device, for messages.
-    device_bytes, device_buffer_bytes: Memory of the device for all buffers together, and for the largest single one.
-    asked_bytes: Bytes that the user allows, if less.
-    """
+    """The memory that may be taken on a device: all buffers together, the largest one, and what the user allows."""
 
     label: str
     device_bytes: int
@@ -102,13 +98,9 @@ def describe_shortage(limits: MemoryLimits, buffers: Mapping[str, int]) -> str:
 def check_budget(
     device: Device, buffers: Mapping[str, int], memory: int | None = None, *, less_may_fit: bool = False
 ) -> int:
-    """Check that all `buffers` fit the device together and each alone.
+    """Check that all `buffers`, bytes by description, fit the device together and each alone; return the sum.
 
-    buffers: Bytes of all buffers that exist at the same time, by description.
-    memory: Bytes that may be taken on the device; None is all of its memory.
     less_may_fit: The caller can do the work in smaller parts.
-
-    Returns: The sum in bytes.
     """
     limits = memory_limits(device, memory)
     shortage = describe_shortage(limits, buffers)
@@ -144,10 +136,7 @@ class _Loan(np.ndarray[Any, np.dtype[Any]]):
 
 
 class PagePool:
-    """Blocks of memory that are lent as numpy arrays and return automatically.
-
-    spare_bytes: Most bytes of unused memory that are kept.
-    """
+    """Blocks of memory that are lent as numpy arrays and return automatically."""
 
     def __init__(self, spare_bytes: int = SPARE_BYTES):
         self._spare_bytes = spare_bytes

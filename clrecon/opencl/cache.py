@@ -60,7 +60,7 @@ class Caches(NamedTuple):
 
     pocl: Folder of PoCL, only for kernels of clrecon.
     is_lasting: `pocl` is there for the next process too.
-    binaries: Folder of `clrecon.opencl.cache`; None where nothing can be kept.
+    binaries: Folder of our own; None where nothing can be kept.
     warnings: What the user should know, at most one text.
     refusal: Why PoCL cannot build in `pocl`; empty if it can.
     """

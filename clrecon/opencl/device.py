@@ -26,10 +26,7 @@ Kept = TypeVar("Kept")
 
 
 class CommandFailedError(Exception):
-    """A command failed while the device worked on it.
-
-    code: OpenCL's number of the error.
-    """
+    """A command failed while the device worked on it, with OpenCL's number of the error."""
 
     def __init__(self, code: int):
         self.code = code
@@ -37,11 +34,7 @@ class CommandFailedError(Exception):
 
 
 class Command(NamedTuple):
-    """A kernel or a transfer that was enqueued.
-
-    what: For messages, such as "kernel emit_vertices".
-    held: Buffers and arrays that the command uses.
-    """
+    """A kernel or a transfer that was enqueued; `what` is for messages, `held` are buffers and arrays that it uses."""
 
     what: str
     event: Any
@@ -209,21 +202,15 @@ class Device:
     """An OpenCL device; context and queue are made at first use.
 
     index: Index in ``clrecon.devices()``; this number chooses the device.
-    name, platform, type, version, driver: `type` is "gpu", "accelerator", "cpu" or "custom"; `platform` is the
-        platform's name.
+    type: "gpu", "accelerator", "cpu" or "custom".
     memory_bytes, max_allocation_bytes: All memory of the device, and the largest single buffer.
     has_own_memory: A graphics card, not a part of the processor that shares its memory.
-    most_steps: Steps after which the loops of a work-item end whatever they have done, see `quirks.most_steps`.
-    is_simulator: A checking simulator such as Oclgrind: used only when it is named.
+    most_steps, kernel_variants, first_header, build_options, is_simulator: See `clrecon.opencl.quirks`.
     shortcoming: Why the device cannot be used; empty if it can.
     fault: What the check at first use found wrong, empty if nothing; None before the check.
     keeps_binaries: Built programs are kept for the next process by `clrecon.opencl.cache`: the driver keeps
         none.
     known_good: The check of the programs that PoCL keeps; None for other drivers, and where nothing is kept.
-    kernel_variants: ``-D`` definitions for kernels that are written for vectors, see `quirks.kernel_variants`.
-    first_header: Header that stands before every kernel file, see `quirks.first_header`; empty for none.
-    build_options: Options for every program: the language, exact rounding, and in caches that several computers share
-        one that distinguishes CPUs that the driver does not; see `clrecon.opencl.quirks`.
     lock: Held while a kernel gets its arguments and is enqueued: kernels are shared between threads.
     stand_in: The CPU device that takes over if this one fails, see `clrecon.opencl.select`; None for a device that
         was named.
@@ -407,8 +394,6 @@ class Device:
     def fail(self, what: str, error: Exception, *, is_late: bool = False) -> DeviceError:
         """Return the error for a failed call, and give the context up: a lost device needs a new one.
 
-        what: What failed.
-        error: Error of the driver.
         is_late: The driver had accepted the command before.
         """
         self.give_up()

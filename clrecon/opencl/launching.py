@@ -233,9 +233,7 @@ def launch(
 ) -> None:
     """Enqueue `kernel` over at least `items` work-items.
 
-    kernel: Kernel of a program, see `load_program`.
-    items: Number of work-items; rounded up to whole groups of `Device.group_size`, so kernels check their bounds first.
-    stopwatch: Records the time.
+    items: Rounded up to whole groups of `Device.group_size`, so kernels check their bounds first.
     **arguments: The kernel's arguments, by their names in its source: buffers, numbers, and four numbers for a float4.
         Numbers are converted to the types in the source.
     """

@@ -62,12 +62,7 @@ _Files = dict[str, list[Any]]
 
 
 class KnownGood:
-    """The records of one folder of PoCL.
-
-    folder: PoCL's folder; only this class and PoCL write to it.
-
-    warnings: What was found and removed.
-    """
+    """The records of one folder of PoCL, to which only this class and PoCL write."""
 
     def __init__(self, folder: Path):
         self._folder = folder
@@ -335,8 +330,6 @@ class NameOfCpu:
     """The place where a PoCL device keeps the name of its CPU, and the name to write there.
 
     address: Address of the driver's structure of the device (its ``cl_device_id``).
-
-    name: One of `CPU_NAMES`.
     """
 
     def __init__(self, address: int):
@@ -360,9 +353,7 @@ class NameOfCpu:
 
 
 class _Memory:
-    """Memory of this process, read through the system, which reports an error where a wrong pointer would end the
-    process.
-    """
+    """Memory of this process, read through the system, which reports an error for a wrong pointer."""
 
     def __enter__(self) -> _Memory:
         self._file = os.open("/proc/self/mem", os.O_RDWR | os.O_CLOEXEC)

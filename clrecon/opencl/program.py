@@ -61,10 +61,7 @@ def _take_float4(numbers: Any) -> Any:
 
 
 class Kernel:
-    """A kernel of a built program, with its arguments.
-
-    arguments: In the kernel's order.
-    """
+    """A kernel of a built program, with its arguments in the kernel's order."""
 
     def __init__(self, cl_kernel: Any, arguments: tuple[KernelArgument, ...]):
         self.cl_kernel = cl_kernel
@@ -78,9 +75,7 @@ class Kernel:
         self._launches = 0
 
     def enqueue(self, queue: Any, items: int, group: int, values: tuple[Any, ...]) -> Any:
-        """Launch the kernel over `items` work-items with the result of `order`; the caller holds the lock of the
-        device.
-        """
+        """Launch the kernel over `items` work-items with the result of `order`; the caller holds the device's lock."""
         self._launches += 1
         if self._launches == LAUNCHES_BEFORE_TYPES:
             types = [None if argument.is_buffer else _TYPES[argument.type] for argument in self.arguments]
@@ -88,10 +83,7 @@ class Kernel:
         return self.cl_kernel(queue, (items,), (group,), *values)
 
     def order(self, values: Mapping[str, Any]) -> tuple[Any, ...]:
-        """Return the arguments as the driver takes them: in the kernel's order, with numbers in its types.
-
-        values: One for each argument, by name.
-        """
+        """Return the arguments as the driver takes them: in the kernel's order, with numbers in its types."""
         if values.keys() != self._expected:
             raise TypeError(self._describe_difference(values))
         try:
@@ -143,9 +135,8 @@ class Program:
 
 
 def load_program(device: Device, name: str, variants: Mapping[str, str] | None = None) -> Program:
-    """Build kernel file `name` for `device`, or return what an earlier call built.
+    """Build a kernel file, such as ``"surface/marching_cubes.cl"``, or return what an earlier call built.
 
-    name: For example ``"surface/marching_cubes.cl"``.
     variants: ``-D`` definitions; only for variants such as the element type, never for sizes.
     """
     chosen = (f"-D{macro}={value}" for macro, value in sorted((variants or {}).items()))
@@ -205,9 +196,7 @@ def _build_from_source(device: Device, source: str, options: tuple[str, ...]) ->
 
 
 def _build_from_binary(device: Device, source: str, options: tuple[str, ...]) -> Any:
-    """Build the program from the binary that an earlier process kept; None without a binary, or if the driver refuses
-    it.
-    """
+    """Build the program from the binary that an earlier process kept; None without one, or if the driver refuses it."""
     cl = import_pyopencl()
     binary = read_binary(_key(device, source, options))
     if binary is None:

@@ -379,10 +379,7 @@ Given = TypeVar("Given")
 
 
 def take_device(name: str | int | Device | None) -> Device:
-    """Choose the device for some work; one that nobody named has a stand-in, if the machine has a CPU device.
-
-    name: As for `choose_device`.
-    """
+    """Choose the device for some work; one that nobody named has a stand-in, if the machine has a CPU device."""
     device = choose_device(name)
     if isinstance(name, Device):
         return name
@@ -430,8 +427,6 @@ def with_fallback(device: Device) -> Iterator[Attempt[tuple[Device, list[str]]]]
 
     The block makes everything anew on `current`; `warnings` are for the report of the work.  Once the stand-in has
     taken over, it does all further work.
-
-    device: As `take_device` returns it.
     """
     lost: list[str] = []
     first: DeviceFailedError | None = None

@@ -100,11 +100,7 @@ def _numbers(name: str) -> dict[str, set[str]]:
 
 
 def kernel_number(name: str, macro: str) -> float:
-    """Return the number that a kernel file or header defines as `macro`: its one place.
-
-    name: Such as ``"rays/project.cl"``.
-    macro: Such as ``"AIR_HU"``, of a line ``#define AIR_HU (-1000.0f)``.
-    """
+    """Return the number that a kernel file or header defines as `macro`, as in ``#define AIR_HU (-1000.0f)``."""
     numbers = _numbers(name).get(macro, set())
     if len(numbers) != 1:
         there = f"several numbers {macro}: {', '.join(sorted(numbers))}" if numbers else f"no number {macro}"
@@ -132,9 +128,8 @@ _QUALIFIERS = {"const", "restrict", "volatile", "unsigned", "__global", "__const
 
 @dataclass(frozen=True)
 class KernelArgument:
-    """One argument of a kernel.
+    """One argument of a kernel, with its type in OpenCL C; for a buffer the type of its elements.
 
-    type: Type in OpenCL C, for example ``"int"`` or ``"float4"``; for a buffer the type of its elements.
     is_written: A buffer whose elements are not const.
     """
 
@@ -168,11 +163,7 @@ def _split_source(source: str) -> tuple[tuple[str, str, str], ...]:
 
 
 def find_signatures(source: str, definitions: Mapping[str, str]) -> dict[str, tuple[KernelArgument, ...]]:
-    """Return the arguments of all kernels of a source.
-
-    source: Text with its includes, as `clrecon.opencl.sources.read_kernel_source` returns it.
-    definitions: Macros that the options of the build define.
-    """
+    """Return the arguments of all kernels of a source with its includes; `definitions` are those of the build."""
     macros, text = _preprocess(source, definitions)
     signatures = {}
     at = text.find("__kernel")

@@ -1,12 +1,12 @@
 """Moving pictures: the cameras of a turntable, and the writing of frames to a file or a folder.
 
 Frames are taken from an iterator and written one by one, so that a thousand need the memory of one.  The name, the
-place and the encoder are checked before the first frame is computed.  Folders of frames appear as a whole.
+place and the encoder are checked before the first frame is computed.
 
 Pillow writes GIF and APNG, but holds all frames in memory until the end.  Here Pillow compresses each frame as a
-separate picture, whose compressed blocks are copied into the animation: the memory of one frame suffices.  MP4 is
-written by the program ffmpeg: it gets frames through a pipe, and writes the file to a temporary folder.  Every browser
-and every slide program plays H.264 in yuv420p.
+separate picture, whose compressed blocks are copied into the animation.  MP4 is written by the program ffmpeg: it gets
+frames through a pipe, and writes the file to a temporary folder.  Every browser and every slide program plays H.264 in
+yuv420p.
 
 Sources: CompuServe, Graphics Interchange Format, version 89a; W3C, Portable Network Graphics, third edition.
 """
@@ -86,23 +86,14 @@ def turntable_cameras(camera: Camera, frames: int, degrees: float = 360.0) -> li
 
 
 def animation_kind(path: str | os.PathLike[str]) -> str:
-    """Return the extension of a moving picture in lower case; empty for a folder: no extension, a final slash, or a
-    folder.
-    """
+    """Return the extension of a moving picture in lower case; empty for a folder: none, a final slash, or a folder."""
     text = os.fspath(path)
     is_folder = text.endswith(tuple(filter(None, (os.sep, os.altsep)))) or os.path.isdir(text)
     return "" if is_folder else os.path.splitext(text)[1].lower()
 
 
 def check_animation(path: str | os.PathLike[str], fps: float = 25.0) -> str:
-    """Refuse a moving picture that cannot be written, before a frame is computed.
-
-    path: ``.mp4``, ``.gif``, ``.apng``, or a folder: a name without extension, a name that ends with a slash, or an
-        existing folder.
-    fps: Frames per second.
-
-    Returns: The extension, empty for a folder.
-    """
+    """Refuse a moving picture that cannot be written, before a frame is computed; return its `animation_kind`."""
     try:
         text = os.fspath(path)
     except TypeError as error:
@@ -185,11 +176,7 @@ def stage_animation(
     total: int = 0,
     progress: Progress | None = None,
 ) -> Iterator[Staged]:
-    """Write a moving picture under a temporary name; ``commit`` of the yielded object moves it to its place.
-
-    For files that belong together: stage all of them, then commit one after the other.  Files that are not committed
-    are removed at the end of the block.  Parameters and errors as in `write_animation`.
-    """
+    """Write a moving picture under a temporary name; ``commit`` of the yielded object moves it to its place."""
     extension = check_animation(path, fps)
     checked = _checked_frames(frames, extension, total, progress)
     if extension == "":
@@ -244,11 +231,7 @@ def check_frame_folder(path: str | os.PathLike[str]) -> Path:
 
 @contextlib.contextmanager
 def stage_frame_folder(frames: Iterator[NDArray[np.uint8]], path: str | os.PathLike[str]) -> Iterator[StagedFolder]:
-    """Write frames (h, w, 3 or 4) as frame_0000.png, ... into a folder under a temporary name.
-
-    `StagedFolder.commit` in the ``with`` block moves it to its place; a folder that is not committed is removed at the
-    end of the block.
-    """
+    """Write frames (h, w, 3 or 4) as frame_0000.png, ... into a folder under a temporary name."""
     from clrecon.rendering.pictures.pillow import load_pillow
 
     load_pillow()

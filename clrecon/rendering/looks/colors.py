@@ -1,7 +1,4 @@
-"""Colours by name, in hexadecimal or as numbers, and colours of numbers on a scale.
-
-A scale runs from blue over grey to red about zero, or from yellow to dark red from zero on.
-"""
+"""Colours by name, in hexadecimal or as numbers, and colours of numbers on a scale."""
 
 from __future__ import annotations
 
@@ -43,12 +40,9 @@ def is_transparent(background: Any) -> bool:
 
 
 def find_color(color: str | Sequence[float]) -> Float64Array:
-    """Red, green and blue from 0 to 1.
+    """Return red, green and blue from 0 to 1 of a colour.
 
-    color: str or (float, float, float). A name of `COLORS` (grey for gray is fine), ``#rgb``, ``#rrggbb``, or three
-        numbers from 0 to 1.
-
-    Returns: ndarray, shape (3,), float64
+    color: A name of `COLORS` (grey for gray is fine), ``#rgb``, ``#rrggbb``, or three numbers from 0 to 1.
     """
     if isinstance(color, str):
         text = color.strip().lower()
@@ -88,11 +82,7 @@ def round_up(value: float) -> float:
 
 @dataclass(frozen=True)
 class ColorScale:
-    """A scale of colours for numbers from ``-limit`` to `limit`, or from 0 to `limit`.
-
-    limit: Above 0.  Numbers beyond have the colours of the ends.
-    signed: About zero, else from zero on.
-    """
+    """A scale of colours for numbers from 0 or, if `signed`, from ``-limit`` to `limit`; those beyond have its ends."""
 
     limit: float
     signed: bool = True

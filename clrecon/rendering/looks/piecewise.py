@@ -63,8 +63,7 @@ def merge_curves(first: tuple[Float64Array, Float64Array], second: tuple[Float64
 
 
 def _bend(sharpness: float) -> tuple[Float64Array, Float64Array]:
-    """Return shares of the way and of the rise at which a bent part (vtkPiecewiseFunction) is broken into straight
-    ones.
+    """Return shares of the way and of the rise at which a bent part (vtkPiecewiseFunction) is broken.
 
     The rise is one half at 0.5. Breaks are evenly spaced in VTK's own parameter s, so they are dense where the way is
     steep, and towards its ends.
@@ -121,8 +120,7 @@ time."""
 class Steepness:
     """The steepness of a table of opacities over one ray step.
 
-    changes: ndarray, shape (nodes,), float64. Sum of the changes of opacity, up and down, from the first node to each
-        node.
+    changes: Shape (nodes,). Sum of the changes of opacity, up and down, from the first node to each node.
     narrow: Number of nodes within which the opacity changes by at most `STEEP`.
     has_dense: The opacity is above `DENSE` somewhere.
     is_steep: The opacity changes by more than `STEEP` within `STEEP_HU` somewhere.

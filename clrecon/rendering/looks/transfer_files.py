@@ -212,9 +212,7 @@ def _parse_number(text: str, what: str) -> float:
 
 
 def _parse_nodes(text: str, what: str, width: int) -> Float64Array:
-    """Return nodes (n, width + 2) of ``COUNT X VALUES X VALUES ...``, with VTK's midpoint and sharpness of a straight
-    part.
-    """
+    """Return nodes (n, width + 2) of ``COUNT X VALUES ...``, with VTK's midpoint and sharpness of a straight part."""
     words = text.split()
     numbers = np.array([_parse_number(word, f"number {n + 1} of {what}") for n, word in enumerate(words)])
     if not numbers.size or numbers[0] != numbers.size - 1 or (numbers.size - 1) % width or numbers.size == 1:
@@ -226,9 +224,7 @@ def _parse_nodes(text: str, what: str, width: int) -> Float64Array:
 
 
 def _slicer_parameters(texts: Mapping[str, str], place: Callable[[str], str]) -> dict[str, Any]:
-    """Make the parameters from the words that .vp lines and XML attributes share; `place` describes the place of a
-    field.
-    """
+    """Make the parameters from the words that .vp lines and XML attributes share; `place` says where a field is."""
 
     def number(name: str, default: float) -> float:
         text = texts.get(name, "").strip()
@@ -261,9 +257,7 @@ def read_slicer_text(text: str) -> list[Entry]:
 
 
 def read_slicer_xml(data: bytes) -> list[Entry]:
-    """Read every ``VolumeProperty`` of presets.xml or of a .mrml scene.  A DOCTYPE is refused, because it can define
-    entities.
-    """
+    """Read every ``VolumeProperty`` of presets.xml or of a .mrml scene; no DOCTYPE, which can define entities."""
     parser = expat.ParserCreate()
     entries: list[Entry] = []
 

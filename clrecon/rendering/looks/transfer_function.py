@@ -391,8 +391,6 @@ def transfer_text(
     """Return a transfer function as text; reading it gives the same function, bit for bit.
 
     head: Name, description, unit distance and lighting, by the names of the format.
-    points: sequence of (hu, red, green, blue, opacity)
-    gradient_opacity: sequence of (HU per mm, factor), or None
     """
     first = {"format": FORMAT, "version": VERSION, **head}
     fields = [f'  "{key}": {json.dumps(value)}' for key, value in first.items()]

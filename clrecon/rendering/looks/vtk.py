@@ -118,9 +118,7 @@ def parameters_from_vtk(volume_property: Any, voxel_mm: float) -> dict[str, Any]
 
 
 def gradient_points(curve: tuple[Float64Array, Float64Array], voxel_mm: float) -> Float64Array | None:
-    """Return the points of a gradient opacity in HU per mm from a curve in HU per `voxel_mm`; None if it is 1
-    everywhere.
-    """
+    """Return the points of a gradient opacity in HU per mm from a curve in HU per `voxel_mm`; None if it is 1."""
     positions, factors = curve
     if np.all(factors == 1.0):
         return None

@@ -33,10 +33,7 @@ BODY_HU = -500.0
 
 
 def checked_window(window: Sequence[float] | str) -> tuple[float, float]:
-    """Check a window and return its low and high end.
-
-    window: (low, high) or str. HU that are black and white, or a name of `WINDOWS`, in upper or lower case.
-    """
+    """Return the low and high end, HU that are black and white, of a window or of a name of `WINDOWS`."""
     if isinstance(window, str):
         named = WINDOWS.get(window.strip().lower())
         if named is None:
@@ -55,13 +52,7 @@ def checked_window(window: Sequence[float] | str) -> tuple[float, float]:
 
 
 def grey_image(values: NDArray[Any], window: Sequence[float]) -> NDArray[np.uint8]:
-    """Turn values into a grey picture.
-
-    values: ndarray, shape (h, w), float. HU, NaN for empty pixels.
-    window: (low, high). HU that are black and white; linear between.
-
-    Returns: ndarray, shape (h, w, 4), uint8. Opacity 255, and 0 for empty pixels.
-    """
+    """Turn values (h, w), HU or NaN for empty pixels, into a picture (h, w, 4), where these have opacity 0."""
     low, high = checked_window(window)
     there = ~np.isnan(values)
     share = np.clip((np.where(there, values, low) - low) / (high - low), 0.0, 1.0)
@@ -91,8 +82,8 @@ def choose_mip_window(values: NDArray[Any]) -> tuple[float, float]:
 def choose_water_window(values: NDArray[Any]) -> tuple[float, float]:
     """Choose a window from the 1st to the 99th percentile of the rays of a radiograph that meet the body.
 
-    values: Mm of water, see `clrecon.rendering.Rendering.values`. Rays with less than `BODY_SHARE` of the largest value
-        do not count.  If all others have the same value, black is 0.
+    values: Mm of water. Rays with less than `BODY_SHARE` of the largest value do not count.  If all others have the
+        same value, black is 0.
     """
     most = float(values.max(initial=0.0))
     if not most > 0.0:

@@ -75,16 +75,10 @@ class _Ink(NamedTuple):
 
 
 def orientation_letters(direction: ArrayLike) -> str:
-    """Name a direction in the patient as DICOM's Patient Orientation does: ``L``, ``LP``, ``PLS``.
+    """Name a direction in the patient, a vector in LPS, as DICOM's Patient Orientation does: ``L``, ``LP``, ``PLS``.
 
-    direction: array_like, shape (3,). A vector in LPS of any length.
-
-    Returns: Letters L, R, P, A, S (superior, DICOM's H) and I (inferior, DICOM's F), one for each component, the
-        largest component first.  Components of less than 5 % get no letter; equal ones come in the order x, y, z.
-
-    Notes
-    -----
-    DICOM PS3.3 C.7.6.1.1.1.
+    Letters L, R, P, A, S (superior, DICOM's H) and I (inferior, DICOM's F), one for each component, the largest first
+    (DICOM PS3.3 C.7.6.1.1.1).  Components of less than 5 % get no letter; equal ones come in the order x, y, z.
     """
     vector = np.asarray(direction, dtype=np.float64)
     vector = vector / np.linalg.norm(vector)
@@ -103,10 +97,8 @@ def edge_letters(camera: Camera) -> dict[str, str]:
 def sheet_letters(sheet: Sheet, rows: NDArray[np.bool_]) -> dict[str, str]:
     """Letters of the edges of a picture whose rows turn along a curve; empty where no letter is true for all of it.
 
-    rows: ndarray, shape (h,), bool. Rows that show something.
-
-    Returns: As `edge_letters`: the letters with which the directions of all rows begin, so that the first is everywhere
-        the side to which the edge looks most.
+    They are those with which the directions of all `rows` that show something begin, so that the first is everywhere
+    the side to which the edge looks most.
     """
     right = sheet.steps[rows]
     up = np.cross(right, sheet.normals[rows])
@@ -127,17 +119,13 @@ def bar_length(width_mm: float) -> float:
 def annotate(
     rendering: PictureData, *, letters: bool = False, scale_bar: bool = False, caption: str | None = None
 ) -> NDArray[np.uint8]:
-    """Draw annotations into a copy of a picture.
+    """Draw annotations into a copy of a picture, (h, w, 4); without any it is the image of the picture itself.
 
-    rendering: Not changed.
     letters: Mark each edge with the side of the patient in its direction, see `orientation_letters`; along a curve only
         those that are true for all of the picture, see `sheet_letters`.
     scale_bar: Draw a bar of a round length at the bottom left.  In a perspective picture the bar is valid in the focal
         plane only, and its text says so.
     caption: One line of text at the top left, cut at the edge of the picture.
-
-    Returns: ndarray, shape (h, w, 4), uint8. The image, opaque under annotations.  Without any annotation it is the
-        image of the picture itself.
     """
     check_caption(caption)
     if not (letters or scale_bar or caption):

@@ -1,7 +1,4 @@
-"""Labels in pictures: the colour and opacity of each, and how they lie over grey slices.
-
-`LabelStyle` has the colours.  Over a slice lies an outline in the colour of each label, and a share of it within.
-"""
+"""Labels in pictures: the colour and opacity of each, and how they lie over grey slices."""
 
 from __future__ import annotations
 
@@ -33,8 +30,8 @@ GOLDEN_SHARE = 0.618034
 class LabelStyle(Message):
     """The look of the labels of a map; what is not named keeps its look, voxels without a label (0) too.
 
-    table: ndarray, shape (largest number + 1, 4), float32. Red, green, blue and opacity by number, 0 to 1; red below 0
-        keeps the colour of the picture without labels.
+    table: Shape (largest number + 1, 4). Red, green, blue and opacity by number, 0 to 1; red below 0 keeps the colour
+        of the picture without labels.
     """
 
     labels: LabelMap
@@ -48,8 +45,6 @@ class LabelStyle(Message):
         opacity: Mapping[int | str, float] | None = None,
     ) -> LabelStyle:
         """Choose colours and opacities.
-
-        >>> LabelStyle.of(labels, colors={"L1": "orange"}, opacity={"L2": 0.2})
 
         colors: Labels by number or name as `LabelMap.find` takes them, colours as `find_color` does.  Labels that are
             not named keep the colour of the picture; without a mapping every label gets its own colour, see
@@ -131,12 +126,10 @@ OUTLINE_SHARE = 1 / 400
 
 
 def labels_on_sheet(labels: LabelMap, sheet: Sheet) -> NDArray[Any]:
-    """Return the label in which the centre of each pixel of a sheet lies.
+    """Return the label in which the centre of each pixel of a sheet lies, (h, w); 0 where none is, and beyond the map.
 
     The place of a pixel in mm is looked up in the map itself, whatever slices the scan has: neither tilted nor uneven
     ones move a label.
-
-    Returns: ndarray, shape (h, w), of the type of the map. 0 where no label is, and beyond the map.
     """
     size = np.array(labels.shape_ijk)
     found = np.zeros((sheet.height, sheet.width), labels.voxels.dtype)
@@ -157,15 +150,13 @@ def draw_labels(
     tints: Mapping[int | str, float] | None = None,
     width: int | None = None,
 ) -> NDArray[np.uint8]:
-    """Draw labels over a copy of a picture.
+    """Draw labels over a copy of a picture (h, w, 4), an outline in the colour of each and a share of it within.
 
-    image: ndarray, shape (h, w, 4), uint8. Pixels with opacity 0 show nothing of the scan and stay as they are.
-    numbers: ndarray, shape (h, w). Label of each pixel, 0 for none.
-    look: Labels without a colour, and those with opacity 0, are not drawn.  What has no label keeps its look.
+    image: Pixels with opacity 0 show nothing of the scan and stay as they are.
+    numbers: Label of each pixel, 0 for none.
+    look: Labels without a colour, and those with opacity 0, are not drawn.
     tints: Share of its colour that the inside of a label gets; others get `FILL`.
     width: Of outlines, in pixels inwards; default: a 400th of the shorter side, a pixel at least.
-
-    Returns: ndarray, shape (h, w, 4), uint8
     """
     table = look.table
     drawn = (table[:, 0] >= 0.0) & (table[:, 3] > 0.0)

@@ -32,10 +32,8 @@ _SEED = 20190601
 
 @dataclass(frozen=True, eq=False)
 class PictureLikeness(Record):
-    """How alike two pictures are.
+    """How alike two pictures are: mean squared difference, 0 to 65025, and structural similarity, 1 for equal pictures.
 
-    mse: Mean squared difference of the values, 0 to 65025.
-    ssim: Structural similarity, 1 for equal pictures.
     box: First row, first column, and the row and column after the last: what was compared.
     """
 

@@ -71,19 +71,12 @@ _ALONE = {"keep_air": ("minip",)}
 
 
 def keywords_of(mode: str) -> dict[str, str]:
-    """Keywords of `render` for a mode, each with the field of the style that it sets.
-
-    Keyword and field have the same name, except for `CurveCut.kind` (cpr), `SlicesInSpace.opacity` (slice_opacity) and
-    `Projection.kind` (mode).
-    """
+    """Return the keywords of `render` for a mode, each with the field of the style that it sets."""
     return {own.metadata.get("keyword", own.name): own.name for own in fields(MODES[mode].style)}
 
 
 def check_known(mode: str, keyword: str, called: str | None = None) -> None:
-    """Refuse a keyword that has no meaning in a mode.
-
-    called: Name of the keyword in the message, if the caller has another one.
-    """
+    """Refuse a keyword, which the message can call otherwise, that has no meaning in a mode."""
     modes = [name for name in MODES if keyword in keywords_of(name) or name in _BESIDE.get(keyword, ())]
     modes = [name for name in modes if name in _ALONE.get(keyword, modes)]
     if mode not in modes:
@@ -92,11 +85,10 @@ def check_known(mode: str, keyword: str, called: str | None = None) -> None:
 
 
 def choose_mode(mode: str | None = None, preset: str | None = None, **look: object) -> str:
-    """Choose the mode that names and keywords ask for: a name of `MODES`.
+    """Choose the mode that names and keywords ask for: a name of `MODES`, by default volume rendering.
 
     Without `mode` an iso value means a surface, a curve means a curved reformation, a sheet means slices, a radius of
     points or what they are coloured by means points, and a preset means its own mode.
-    The default is volume rendering.
     """
     if mode is not None:
         if not isinstance(mode, str) or mode not in MODES:
@@ -114,14 +106,9 @@ def choose_mode(mode: str | None = None, preset: str | None = None, **look: obje
 
 
 def make_style(mode: str | None = None, preset: str | None = None, **look: object) -> Style:
-    """Make the style that names and keywords ask for.
+    """Make the style that names and keywords ask for: ``make_style("surface", iso_value=300)``.
 
-    >>> make_style("surface", iso_value=300)
-    SurfaceLook(iso_value=300.0, ...)
-
-    mode: A name of `MODES`; default: see `choose_mode`.
-    preset: Name of a preset, see `clrecon.rendering.looks.presets`.  Volume rendering and slices in space use its
-        transfer function, the other modes that show HU use its window.
+    preset: Volume rendering and slices in space use its transfer function, the other modes that show HU use its window.
     **look: Fields of the mode's style, see `keywords_of`.  None and False mean the default.
     """
     given = {keyword: value for keyword, value in look.items() if value is not None and value is not False}

@@ -1,7 +1,6 @@
 """`Rendering`: a picture with its depths and its camera, the merging of it with a scene, and its files.
 
-Layers from the same camera are merged pixel by pixel, without PyVista or a screen.  Files hold no patient data, date or
-path; the same picture gives the same bytes.
+Files hold no patient data, date or path; the same picture gives the same bytes.
 """
 
 from __future__ import annotations
@@ -232,13 +231,10 @@ def merge_layers(rendering: Rendering, colors: NDArray[np.uint8], depth: NDArray
     Each pixel of the picture is one layer at its expected depth.  A mesh within translucent tissue is therefore drawn
     wholly before or wholly behind the tissue.
 
-    rendering: The picture, with a transparent background.
-    colors: ndarray, shape (h, w, 4), uint8. The scene: red, green, blue and opacity, not premultiplied; row 0 is the
-        top.
-    depth: ndarray, shape (h, w), floating. Depths of the scene in mm, as in `Rendering.depth`; NaN where the scene is
-        empty.
-
-    Returns: The merged picture.  Both of its depths include the scene; `values` is None.
+    rendering: With a transparent background.
+    colors: ndarray, shape (h, w, 4), uint8. The scene, not premultiplied; row 0 is the top.
+    depth: ndarray, shape (h, w). mm; NaN where the scene is empty.
+    Returns: Both depths include the scene; `values` is None.
     """
     width, height = rendering.size
     if colors.shape != (height, width, 4) or depth.shape != (height, width):
@@ -314,11 +310,7 @@ def write_image(rendering: PictureData, path: str | os.PathLike[str], quality: i
 
 
 def encode_image(rendering: PictureData, extension: str, quality: int = 95) -> bytes:
-    """Return the bytes of the file that `write_image` writes.
-
-    extension: One of `IMAGE_FORMATS`.
-    quality: Quality of JPEG, 1 to 100.
-    """
+    """Return the bytes of a file with an extension of `IMAGE_FORMATS`; the quality of JPEG is 1 to 100."""
     load_pillow()
     from PIL import Image
 
@@ -345,13 +337,7 @@ def encode_image(rendering: PictureData, extension: str, quality: int = 95) -> b
 
 
 def write_floats(array: NDArray[np.float32], path: str | os.PathLike[str], pixel_mm: float | None = None) -> int:
-    """Write one float32 per pixel, NaN included, to a file with an extension of `FLOAT_FORMATS`.
-
-    array: ndarray, shape (h, w)
-    pixel_mm: Side of a pixel, for the resolution of a TIFF file.
-
-    Returns: Size of the file in bytes.
-    """
+    """Write float32 pixels (h, w), NaN included, to a file with an extension of `FLOAT_FORMATS`; return its bytes."""
     return _replace_image(path, encode_floats(array, check_float_path(path), pixel_mm))
 
 

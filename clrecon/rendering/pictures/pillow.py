@@ -15,7 +15,6 @@ def load_pillow() -> None:
     """Make ``from PIL import ...`` work from here on.
 
     The command line hides Pillow by an entry of None in `sys.modules`, because pydicom would load it without need.
-    This function removes the entry; pydicom is loaded by then.
     """
     if sys.modules.get("PIL", load_pillow) is None:
         del sys.modules["PIL"]

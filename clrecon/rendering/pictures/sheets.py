@@ -31,11 +31,7 @@ TEXT_SHARE, LEAST_TEXT, MOST_TEXT = 1 / 14, 9.0, 18.0
 
 @dataclass(frozen=True)
 class SheetLayout:
-    """Tiles of one size in rows.
-
-    tile: Width and height of a tile, pixels.
-    corners: sequence of (int, int). Left and top pixel of each tile.
-    """
+    """Tiles of one size in rows: width and height in pixels, and the left and top pixel of each."""
 
     tile: tuple[int, int]
     pixel_mm: float
@@ -47,7 +43,6 @@ def lay_out(count: int, mm: tuple[float, float], size: tuple[int, int], zoom: fl
 
     mm: Width and height that a tile shows at zoom 1.
     size: Width and height of the picture; it is not exceeded.
-    zoom: 2 shows everything twice as large, and half as much of it.
     """
     best: tuple[float, int, tuple[int, int]] | None = None
     for columns in range(1, count + 1):
@@ -78,10 +73,8 @@ def lay_out(count: int, mm: tuple[float, float], size: tuple[int, int], zoom: fl
 
 
 def write_on_tile(image: NDArray[np.uint8], texts: tuple[str, ...], edges: Mapping[str, str]) -> NDArray[np.uint8]:
-    """Write on a copy of a tile.
+    """Write on a copy of a tile (h, w, 4): the first text that fits, else the last, at the top left.
 
-    image: ndarray, shape (h, w, 4), uint8
-    texts: The first that fits stands at the top left, else the last.
     edges: Letters of the sides of the patient at the ``left`` and ``right`` edge; tiles under `LEAST_LETTERED` pixels
         have none.
     """
@@ -114,7 +107,6 @@ class Stroke:
     """A line or circle on a panel, in mm from the panel's centre: x to the right, y down.
 
     points: ndarray, shape (n, 2). Corners of a line; of a circle its centre alone.
-    color: Red, green, blue.
     radius_mm: Of a circle; 0 for a line.
     """
 
@@ -125,9 +117,8 @@ class Stroke:
 
 @dataclass(frozen=True)
 class Panel:
-    """A slice with what is drawn over it.
+    """A slice, in HU, with what is drawn over it.
 
-    values: ndarray, shape (h, w). HU.
     captions: Lines of text at the top left.
     edges: Letters at the left, right, top and bottom edge.
     """
@@ -142,13 +133,7 @@ class Panel:
 def draw_sheet(
     rows: Sequence[Sequence[Panel]], footer: Sequence[str] = (), window: tuple[float, float] = BONE_WINDOW
 ) -> PictureData:
-    """Draw panels in rows, with lines of text below.
-
-    rows: Panels of one size.
-    window: HU of black and white.
-
-    Returns: Opaque; its pixels have the size of the panels' own.
-    """
+    """Draw panels of one size in rows, with lines of text below; the picture is opaque, with the panels' own pixels."""
     load_pillow()
     from PIL import Image, ImageDraw
 
@@ -211,10 +196,9 @@ _TEXT_SHARE, _SMALLEST_TEXT = 1 / 36, 9.0
 
 
 def add_scale(picture: Rendering, scale: ColorScale, title: str) -> Rendering:
-    """Return a picture with a strip at its right that has the colours, their numbers and a title.
+    """Return an opaque picture with a strip at its right: the colours, their numbers and a title, such as ``mm``.
 
-    picture: With an opaque background.  Only its image grows: depth and camera stay those of the left part.
-    title: Lines over the scale, such as ``mm``.
+    Only its image grows: depth and camera stay those of the left part.
     """
     load_pillow()
     from PIL import Image, ImageDraw

@@ -49,10 +49,10 @@ FARTHEST_MM = 1e9
 
 
 def box_corners(volume: Grid) -> Float64Array:
-    """Corners of the space that voxels fill, half a voxel beyond the outer centres.
+    """Corners (n, 3) in LPS mm of the space that voxels fill, half a voxel beyond the outer centres.
 
-    Returns: ndarray, shape (n, 3), float64. LPS mm.  The first and the last four are those of the whole box; for uneven
-        slices, those of every slice are between them.  The volume lies in the convex hull of these points.
+    The first and the last four are those of the whole box; for uneven slices, those of every slice are between them.
+    The volume lies in the convex hull of these points.
     """
     ni, nj, nk = volume.shape_ijk
     inner = np.arange(nk) if getattr(volume, "uneven", False) else np.empty(0)
@@ -182,9 +182,7 @@ class Camera:
         return cls(_triple(position), _triple(middle), _triple(up_lps), view_angle, scale).zoomed(zoom)
 
     def _room_for(self, points: Float64Array, aspect: float) -> float:
-        """Return the parallel scale, or the distance of a perspective camera, at which points about the focal point
-        fit.
-        """
+        """Return the parallel scale, or the distance of a perspective camera, at which points about the focus fit."""
         right, up, forward = self.basis()
         across = np.maximum(np.abs(points @ up), np.abs(points @ right) / aspect) * FIT_MARGIN
         if self.is_parallel:

@@ -1,8 +1,4 @@
-"""Centre lines: a smooth curve through points in mm, and the files that hold such points.
-
-Curves are parametrised by arc length, with frames that do not twist.  Files are text, CSV, JSON, and the markups of 3D
-Slicer.
-"""
+"""Centre lines: a smooth curve through points in mm, and the files that hold such points."""
 
 from __future__ import annotations
 
@@ -147,16 +143,12 @@ def _as_text(point: ArrayLike) -> str:
 
 
 def rotation_minimising_normals(places: Float64Array, tangents: Float64Array, first: ArrayLike) -> Float64Array:
-    """Return normals along a curve that rotate around it as little as possible, so that frames do not twist.
+    """Return normals (n, 3) along a curve that rotate around it as little as possible, so that frames do not twist.
 
     Method: double reflection (Wang, Juettler, Zheng and Liu 2008, "Computation of rotation minimizing frames"), of
     fourth order in the distance of the places.
 
-    places: ndarray, shape (n, 3). Places along the curve.
-    tangents: ndarray, shape (n, 3). Unit.
-    first: array_like, shape (3,). Direction of the first normal; its component along the tangent is ignored.
-
-    Returns: ndarray, shape (n, 3), float64. Unit, across the tangents.
+    first: Direction of the first normal; its component along the tangent is ignored.
     """
     normals = np.empty_like(places)
     start = np.asarray(first, dtype=np.float64)

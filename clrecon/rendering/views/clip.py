@@ -144,17 +144,15 @@ def find_seen_box(
     labels: ShownLabels | None = None,
     slices: Iterable[int] | None = None,
 ) -> Grid | None:
-    """Return the box along the patient's axes around everything that a picture can show of a volume.
+    """Return the box along the patient's axes around everything that a picture can show of a volume, as one voxel.
 
     A trilinear value within a band of HU needs a voxel at its low end or above and one at its high end or below, both
     around its place.  So the box holds what lies within a voxel of both kinds: it can be larger than what is seen, and
-    is never smaller.
+    is never smaller.  None where nothing can be seen.
 
     band: (low, high). HU that are shown, infinite where it has no end.
     labels: Voxels of labels that are not shown do not count.
     slices: Only these slices are shown.
-
-    Returns: One voxel that fills the box; None where nothing can be seen.
     """
     chosen = range(volume.shape_ijk[2]) if slices is None else sorted(slices)
     reach = 1.0 if slices is None else 0.0

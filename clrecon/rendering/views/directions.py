@@ -64,16 +64,12 @@ def checked_size(size: Sequence[int]) -> tuple[int, int]:
 
 
 def find_view(view: str | Sequence[float]) -> tuple[Float64Array, Float64Array]:
-    """Return the direction from which a view is taken, and the direction at its top.
+    """Return the unit vectors in LPS from the patient to the camera of a view, and to the top of its picture.
 
-    view: str or (float, float). A name of `DIRECTIONS`, or azimuth and elevation in degrees, as a pair or as text
-        ``"AZ,EL"``: azimuth turns the camera from anterior towards the patient's left, elevation (-90 to 90) lifts it
-        to the head.
+    The top is the head; for a view along the body, the side of the azimuth, which is anterior for the views by name.
 
-    Returns:
-    towards, up: ndarray, shape (3,), float64. Unit vectors in LPS: from the patient to the camera, and to the top of
-        the picture (the head; for a view along the body, the side of the azimuth, which is anterior for the views by
-        name).
+    view: A name of `DIRECTIONS`, or azimuth and elevation in degrees, as a pair or as text ``"AZ,EL"``: azimuth turns
+        the camera from anterior towards the patient's left, elevation (-90 to 90) lifts it to the head.
     """
     named = DIRECTIONS.get(view.strip().lower()) if isinstance(view, str) else None
     if named is not None:

@@ -41,10 +41,9 @@ THIN_LAYER = 0.25
 class Sheet:
     """Pixel (x, y) of a picture lies at ``origins[y] + x * steps[y]``, LPS mm.
 
-    origins: ndarray, shape (h, 3), float64. Centre of the first pixel of each row.
-    steps: ndarray, shape (h, 3), float64. Step from one pixel of a row to the next, mm.
-    normals: ndarray, shape (h, 3), float64. Unit vectors into the picture, along which a thick slice is sampled.
-    width: Number of pixels in a row.
+    origins: ndarray, shape (h, 3). Centre of the first pixel of each row.
+    steps: ndarray, shape (h, 3). Step from one pixel of a row to the next, mm.
+    normals: ndarray, shape (h, 3). Unit vectors into the picture, along which a thick slice is sampled.
     """
 
     origins: Float64Array
@@ -90,9 +89,7 @@ class SlabSamples:
 
 
 def finest_step(volume: Volume) -> float:
-    """Return the smallest distance in mm between neighbouring planes of voxel centres, over the three families of
-    planes.
-    """
+    """Return the smallest distance in mm between neighbouring planes of voxel centres, over their three families."""
     columns = volume.affine[:3, :3]
     if not volume.uneven:
         return float(1.0 / np.linalg.norm(np.linalg.inv(columns), axis=1).max())
@@ -131,16 +128,12 @@ def find_plane(
     pixel_mm: float | None = None,
     center: ArrayLike | None = None,
 ) -> Camera:
-    """Return a parallel camera for a slice through the middle of a volume.
+    """Return a parallel camera for a slice through the middle of a volume, or through a `center` in LPS mm.
 
-    view: str or (float, float). axial, coronal, sagittal, or a view as in `Camera.fit`.
-    size: Width and height of the picture.
+    view: axial, coronal, sagittal, or a view as in `Camera.fit`.
     zoom: At 1 the volume's box, seen in this direction, just fits into the picture: a slice is shown larger than a
         picture of the whole volume, for which `Camera.fit` leaves room in every direction.
-    up: str or array_like, shape (3,). As in `Camera.fit`.
     pixel_mm: Side of a pixel; default: so that the box fits.
-    center: array_like, shape (3,). A point of the plane, LPS mm, in the middle of the picture; default: the middle of
-        the volume.
     """
     if isinstance(view, str):
         name = view.strip().lower()
@@ -188,14 +181,10 @@ def positive_mm(what: str, value: float) -> float:
 
 
 def plane_sheet(camera: Camera, size: Sequence[int], offset_mm: float = 0.0) -> tuple[Sheet, Camera]:
-    """Make the plane through a camera's focal point across its view.
+    """Make the plane through a camera's focal point across its view, and the parallel camera of its pixels.
 
     camera: For a perspective camera its scale at the focal point is used.
-    size: (w, h). Pixels.
     offset_mm: Moves the plane along the view, away from the camera.
-
-    Returns:
-    camera: A parallel camera with its focal point in the plane: each of its rays meets the sheet in its own pixel.
     """
     width, height = checked_size(size)
     right, up, forward = camera.basis()
@@ -218,8 +207,8 @@ FRAME_STEP_MM = 0.25
 class CurvedSheet:
     """The sheet of a picture along a curve.
 
-    arc: ndarray, shape (h,), float64. Arc length of the curve in mm at each row; NaN for rows beyond its ends.
-    columns: ndarray, shape (h,), float64. Column in which each row shows the curve, pixel centres at whole numbers.
+    arc: ndarray, shape (h,). Arc length of the curve in mm at each row; NaN for rows beyond its ends.
+    columns: ndarray, shape (h,). Column in which each row shows the curve, pixel centres at whole numbers.
     """
 
     sheet: Sheet
@@ -250,7 +239,6 @@ def straightened_sheet(
 ) -> CurvedSheet:
     """Make a sheet whose rows cross a curve, which becomes a straight line down the middle of the picture.
 
-    curve: The curve from the top of the picture to its bottom.
     across: ndarray, shape (3,). Direction in LPS that the rows follow as well as a frame without twist allows: the mean
         of their rotation from it, along the curve, is zero.
     size: (w, h)
@@ -287,7 +275,6 @@ def straightened_sheet(
 def stretched_sheet(curve: Curve, across: Float64Array, size: tuple[int, int], pixel: float) -> CurvedSheet:
     """Make a sheet of parallel rows through a curve, at equal distances on the surface that the rows form.
 
-    curve: The curve from the top of the picture to its bottom.
     across: ndarray, shape (3,). Direction of all rows, LPS.
     size: (w, h)
     pixel: mm.

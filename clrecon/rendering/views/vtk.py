@@ -23,9 +23,7 @@ at 1000 mm, in the middle of a patient."""
 def parameters_from_vtk(source: Any, size: Sequence[int] | None = None) -> dict[str, Any]:
     """Return the parameters of the `Camera` with the same view as a VTK or PyVista camera, or the camera of a plotter.
 
-    source: Camera or plotter of a scene in LPS mm.
-    size: Width and height of the picture, needed where the view angle is the horizontal one; default: those of the
-        plotter's window.
+    size: Needed where the view angle is the horizontal one; default: that of the plotter's window.
     """
     camera = getattr(source, "camera", source)
     if not hasattr(camera, "GetFocalPoint"):
