@@ -11,8 +11,8 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 95_494,
-    "modules": 418,
+    "lines": 94_444,
+    "modules": 417,
     "small_modules_with_one_reader": 11,
     "docstrings_with_raises": 130,
     "options_in_several_files": 19,
