@@ -9,10 +9,10 @@ from clrecon.errors import DeviceError
 
 
 def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError | None]:
-    """List every OpenCL platform and device, and say which device would be used, or why none would.
+    """List every OpenCL platform and device, as docs/contract.md says, and which would be used, or why none would.
 
-    The survey is that of ``devices --json``.  A fault is what is remembered of the check at the first use of a device,
-    empty where it passed or was not checked yet; nothing runs on any device.
+    A fault is what is remembered of the check at the first use of a device, empty where it passed or was not checked
+    yet; nothing runs on any device.
     """
     from clrecon.opencl import cache_warnings, choose_remembered, list_devices, list_platforms, remembered_fault
 
