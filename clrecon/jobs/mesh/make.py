@@ -15,7 +15,7 @@ from clrecon.jobs.inputs import read_with_labels
 from clrecon.jobs.mesh.bone import find_bone
 from clrecon.jobs.mesh.labels import extract_label_surfaces, open_labels
 from clrecon.jobs.mesh.seeds import find_seeds
-from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface, check_known_values, choose_level, plan_surfaces
 from clrecon.jobs.outputs import MOST_FILES
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
@@ -112,38 +112,55 @@ def _read_inputs(
 
 
 def _try_steps(device: Device, settings: MeshSettings) -> None:
-    """Build the kernels by making the surface of a small cube, or of a label of it."""
-    from clrecon.labels import LabelMap
-    from clrecon.operators.primitives.union_find import label_components
-    from clrecon.operators.surface.decimation import decimate_mesh
-    from clrecon.operators.surface.label_masks import extract_label_masks
-    from clrecon.operators.surface.labels import extract_labels
-    from clrecon.operators.surface.methods import METHODS
+    """Build the kernels by making the surface of a small cube, or of a label of it.
 
-    cube, choice = trial_cube(), settings.labels
-    surface = Surface("", (300.0, 2000.0) if settings.inside == "between" else 300.0, below=settings.below is not None)
-    if choice is not None and settings.labels_pick:
-        labels = LabelMap((cube.voxels >= 0).astype("uint8"), cube.affine)
-        if choice.surface == "mask":
-            meshes = [*extract_label_masks(labels, device=device).values()]
-        else:
-            meshes = [*extract_labels(cube, labels, 300.0, device=device, solid=choice.solid).values()]
-    elif METHODS[settings.method_used].on_device:
-        small = MeshSettings(
-            below=300.0 if surface.below else None, closed=settings.closed, topology=settings.topology,
-            method=settings.method, vertex_rule=settings.vertex_rule,
-            grow_from=("auto",) if settings.grow_from else (), seal_mm=settings.seal_mm, solid=settings.solid,
-        )  # fmt: skip
-        if settings.solid:
-            fill_solid(cube, [surface], small, device, ignore_progress)
-        meshes = extract_surfaces(cube, [surface], device, small, ignore_progress)
+    What only some jobs need is imported in its branch: the scan is read beside this, and waits for each import.
+    """
+    if settings.labels is not None and settings.labels_pick:
+        meshes = _try_labels(device, settings.labels)
     else:
-        return
-    if settings.selects:
+        meshes = _try_levels(device, settings)
+    if meshes and settings.selects:
+        from clrecon.operators.primitives.union_find import label_components
+
         with suppress(DeviceFailedError):  # the host does it then
             label_components(device.current, meshes[0].triangles, meshes[0].vertex_count)
-    if settings.decimate_used is not None and settings.method != "g-mc" and settings.memory is None:
+    if meshes and settings.decimate_used is not None and settings.method != "g-mc" and settings.memory is None:
+        from clrecon.operators.surface.decimation import decimate_mesh
+
         decimate_mesh(meshes[0], settings.decimate_used, device=device)
+
+
+def _try_labels(device: Device, choice: LabelChoice) -> list[Mesh]:
+    from clrecon.labels import LabelMap
+
+    cube = trial_cube()
+    labels = LabelMap((cube.voxels >= 0).astype("uint8"), cube.affine)
+    if choice.surface == "mask":
+        from clrecon.operators.surface.label_masks import extract_label_masks
+
+        return [*extract_label_masks(labels, device=device).values()]
+    from clrecon.operators.surface.labels import extract_labels
+
+    return [*extract_labels(cube, labels, 300.0, device=device, solid=choice.solid).values()]
+
+
+def _try_levels(device: Device, settings: MeshSettings) -> list[Mesh]:
+    """Return the surface of the small cube; none for a method that has no kernels."""
+    from clrecon.operators.surface.methods import METHODS
+
+    if not METHODS[settings.method_used].on_device:
+        return []
+    cube = trial_cube()
+    surface = Surface("", (300.0, 2000.0) if settings.inside == "between" else 300.0, below=settings.below is not None)
+    small = MeshSettings(
+        below=300.0 if surface.below else None, closed=settings.closed, topology=settings.topology,
+        method=settings.method, vertex_rule=settings.vertex_rule,
+        grow_from=("auto",) if settings.grow_from else (), seal_mm=settings.seal_mm, solid=settings.solid,
+    )  # fmt: skip
+    if settings.solid:
+        fill_solid(cube, [surface], small, device, ignore_progress)
+    return extract_surfaces(cube, [surface], device, small, ignore_progress)
 
 
 def _bands_of(surfaces: Sequence[Surface]) -> list[Band]:
