@@ -22,8 +22,8 @@ _PIECE = 1 << 16
 _FEW = 0.05
 """Share of changed triangles up to which it is faster to search only around them."""
 
-_CELLS_A_SIDE = 128
-"""Coarse cells along the longest side of a surface."""
+_FEWEST_CELLS, _MOST_CELLS, _CELLS_FOR_ONE = 1 << 12, 1 << 22, 64
+"""Coarse cells of a surface: so many for a triangle within these bounds, and none smaller than changed ones are."""
 
 _ROUNDING = 2.0**-50
 """Share of the sum of its absolute terms that the rounding of a volume or an area does not reach (Shewchuk 1997)."""
@@ -122,27 +122,49 @@ def find_changed_intersections(
 
 
 def find_beside(
-    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], changed: NDArray[np.bool_], margin: float = 0.0
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], changed: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Find the changed triangles and those that can touch one of them: whose box shares a coarse cell with one.
+    """Find the changed triangles and those that can touch one of them: whose box shares a coarse cell with one."""
+    low, high = find_boxes(vertices, triangles)
+    return find_boxes_beside(low, high, low[changed], high[changed])
 
-    margin: mm that boxes of changed triangles are longer by.
-    """
-    if np.count_nonzero(changed) > _FEW * len(triangles):
-        return np.ones(len(triangles), dtype=bool)
-    if not changed.any():
-        return changed
-    columns = np.ascontiguousarray(vertices.T)
-    # "clip" avoids checking each index, which takes longer than the look-up.
-    one, two, three = (columns.take(corner, axis=1, mode="clip") for corner in triangles.T.astype(np.intp))
-    low, high = np.minimum(np.minimum(one, two), three), np.maximum(np.maximum(one, two), three)
-    low[:, changed] -= margin
-    high[:, changed] += margin
+
+def find_boxes(
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Return the lowest and the highest coordinates of each triangle, shape (m, 3)."""
+    low, high = (np.empty((len(triangles), 3), vertices.dtype) for _ in range(2))
+
+    def work(where: slice) -> None:
+        one, two, three = (vertices.take(corners, axis=0) for corners in triangles[where].T)
+        np.minimum(np.minimum(one, two), three, out=low[where])
+        np.maximum(np.maximum(one, two), three, out=high[where])
+
+    in_threads(work, len(triangles))
+    return low, high
+
+
+def find_boxes_beside(
+    low: NDArray[np.floating],
+    high: NDArray[np.floating],
+    some_low: NDArray[np.floating],
+    some_high: NDArray[np.floating],
+) -> NDArray[np.bool_]:
+    """Find the boxes, shape (m, 3), that share a coarse cell with one of some, which lie within all of them."""
+    if len(some_low) == 0:
+        return np.zeros(len(low), dtype=bool)
+    low, high, some_low, some_high = (np.ascontiguousarray(corner.T) for corner in (low, high, some_low, some_high))
     start = low.min(axis=1)[:, None]
-    size = float((high.max(axis=1)[:, None] - start).max()) / _CELLS_A_SIDE or 1.0
-    first, last = (((corner - start) / size).astype(np.int32) for corner in (low, high))
-    # Of each box the number of cells with a changed triangle, from sums over all cells below and before (Crow 1984).
-    _, cell = _enter_into_cells(first[:, changed], last[:, changed])
+    length = high.max(axis=1).astype(np.float64) - start[:, 0]
+    size = float((some_high - some_low).max(axis=0).mean()) or float(length.max()) or 1.0
+    most = min(max(_CELLS_FOR_ONE * low.shape[1], _FEWEST_CELLS), _MOST_CELLS)
+    while (length / size + 1.0).prod() > most:
+        size *= 1.25
+    first, last, some_first, some_last = (
+        ((corner - start) / size).astype(np.int32) for corner in (low, high, some_low, some_high)
+    )
+    # Of each box the number of cells with one of some, from sums over all cells below and before (Crow 1984).
+    _, cell = _enter_into_cells(some_first, some_last)
     sums = np.zeros(last.max(axis=1) + 2, dtype=np.int32)
     sums[tuple(cell + 1)] = 1
     for axis in range(3):
@@ -150,7 +172,7 @@ def find_beside(
     last += 1
     steps = np.array([sums.shape[1] * sums.shape[2], sums.shape[2], 1], dtype=np.int32)[:, None]
     x, y, z = zip(first * steps, last * steps, strict=True)
-    count = np.zeros(len(triangles), dtype=np.int32)
+    count = np.zeros(low.shape[1], dtype=np.int32)
     for corner in np.ndindex(2, 2, 2):
         here = sums.take(x[corner[0]] + y[corner[1]] + z[corner[2]], mode="clip")
         count += here if sum(corner) % 2 else -here

@@ -219,22 +219,31 @@ def test_triangles_that_are_points_cut_nothing():
 
 @pytest.mark.parametrize("axis", range(3))
 def test_only_triangles_that_can_touch_a_changed_one_lie_beside_it(axis):
-    """Triangles in a row, in boxes of 2 with steps of 2.5: 40 of them are cut into 128 cells of 99.5 / 128 = 0.777."""
+    """Triangles in a row, in boxes of 2 with steps of 4.5, and cells as long as the changed one: 2."""
     face = np.roll([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.5]], axis, axis=1)
-    along = np.roll([2.5, 0.0, 0.0], axis)
+    along = np.roll([4.5, 0.0, 0.0], axis)
     vertices = (face + np.arange(40)[:, None, None] * along).reshape(-1, 3)
     triangles = np.arange(120, dtype=np.uint32).reshape(-1, 3)
-    # The 20th reaches from 50 to 52, cells 64 to 66; its neighbours from 47.5 to 49.5, cells 61 to 63, and from 52.5
-    # on, cell 67.  From 49.8 on the one before would meet cell 64.
+    # The 20th reaches from 90 to 92, cells 45 and 46; its neighbours from 85.5 to 87.5, cells 42 and 43, and from 94.5
+    # on, cell 47.  From 90 on the one before meets cell 45.
     changed = np.arange(40) == 20
     assert np.flatnonzero(find_beside(vertices, triangles, changed)).tolist() == [20]
     longer = vertices.copy()
-    longer[58] += np.roll([0.4, 0.0, 0.0], axis)
+    longer[58] += np.roll([2.5, 0.0, 0.0], axis)
     assert np.flatnonzero(find_beside(longer, triangles, changed)).tolist() == [19, 20]
     for number in (0, 39):
         assert np.flatnonzero(find_beside(vertices, triangles, np.arange(40) == number)).tolist() == [number]
     assert not find_beside(vertices, triangles, np.zeros(40, bool)).any()
-    assert find_beside(vertices, triangles, np.arange(40) < 3).all()  # more than one of twenty: all are looked at
+    assert find_beside(vertices, triangles, np.ones(40, bool)).all()
+
+
+def test_cells_are_enlarged_where_there_would_be_too_many():
+    """A speck that has changed, far from another: 1/64 of 10 mm is as fine as 4096 cells of a cube can be."""
+    face = np.array([[0.0, 0.0, 0.0], [1e-6, 0.0, 0.0], [0.0, 1e-6, 1e-6]])
+    vertices = np.concatenate([face, face + [0.05, 0.0, 0.0], face + [2.0, 2.0, 0.0], face + 10.0])
+    triangles = np.arange(12, dtype=np.uint32).reshape(-1, 3)
+    beside = find_beside(vertices, triangles, np.arange(4) == 0)
+    assert beside.tolist() == [True, True, False, False]
 
 
 def test_what_touches_a_changed_triangle_lies_beside_it():

@@ -10,8 +10,15 @@ from numpy.typing import NDArray
 
 from clrecon.exchange.coordinates import as_stored, find_coincident
 from clrecon.mesh.connectivity import find_edges, label_components
-from clrecon.mesh.intersections import FindCrossings, find_beside, find_changed_intersections, find_self_intersections
-from clrecon.mesh.refine.topology import any_corner
+from clrecon.mesh.intersections import (
+    FindCrossings,
+    find_beside,
+    find_boxes,
+    find_boxes_beside,
+    find_changed_intersections,
+    find_self_intersections,
+)
+from clrecon.mesh.refine.topology import TriangleFinder
 from clrecon.mesh.triangles import cross_products
 
 _VOLUME_STEPS = 4
@@ -29,9 +36,6 @@ _SMALLEST_SHARE = 0.2
 
 _ROUNDS_OF_ITS_OWN = 3
 """After this many rounds the vertices around an offending place are taken back too."""
-
-_RINGS = 4
-"""Rings of triangles around what was taken back that may be taken back in the next rounds."""
 
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]
@@ -148,11 +152,11 @@ def move_vertices(
     """
     share = np.ones(len(vertices))
     moved = as_stored(vertices + step)
-    near = _Near(moved, triangles, float(np.abs(step).max(initial=0.0)))
     spoilt: IntArray = _find_spoilt(moved, triangles, np.ones(len(triangles), dtype=bool), find_crossings)
+    near = _Near(vertices, moved, triangles)
     for turn in range(_ROUNDS):
         if turn >= _ROUNDS_OF_ITS_OWN:
-            spoilt = np.unique(triangles[_touching(spoilt, triangles, len(vertices))])
+            spoilt = np.unique(triangles[near.touching(spoilt)])
         spoilt = spoilt[share[spoilt] > 0.0]
         if len(spoilt):
             share[spoilt] *= 0.5
@@ -164,41 +168,41 @@ def move_vertices(
         if len(spoilt) == 0:
             break
         moved[spoilt] = vertices[spoilt] + share[spoilt, None] * step[spoilt]
-        spoilt = near.find_spoilt(_touching(spoilt, triangles, len(vertices)))
+        spoilt = near.find_spoilt(spoilt)
     return moved, int(np.count_nonzero(share < 1.0))
 
 
-def _touching(vertices: IntArray, triangles: NDArray[np.uint32], size: int) -> NDArray[np.bool_]:
-    """Mark the triangles that have one of these vertices."""
-    flags = np.zeros(size, dtype=bool)
-    flags[vertices] = True
-    return any_corner(flags, triangles)
-
-
 class _Near:
-    """Search for what is spoilt around changed triangles, among those that come near them.
+    """Search for what is spoilt around vertices that were taken back, among the triangles that can touch theirs.
 
-    moved: mm. Vertices, no coordinate of which changes by more than `longest` between two calls of `find_spoilt`.
+    vertices, moved: mm. Where vertices were, and are; between two calls of `find_spoilt` some go back on their way.
     """
 
-    def __init__(self, moved: NDArray[np.floating], triangles: NDArray[np.uint32], longest: float):
-        self._moved, self._triangles, self._longest = moved, triangles, longest
-        self._expected = np.zeros(len(triangles), dtype=bool)
-        self._rows = self._vertices = np.zeros(0, np.int64)
-        self._local = np.zeros((0, 3), np.uint32)
+    def __init__(self, vertices: NDArray[np.floating], moved: NDArray[np.floating], triangles: NDArray[np.uint32]):
+        self._moved, self._triangles = moved, triangles
+        self._at = TriangleFinder(triangles)
+        was, now = (find_boxes(places, triangles) for places in (vertices, moved))
+        self._low = np.minimum.reduceat(np.minimum(was[0], now[0]), self._at.starts)
+        self._high = np.maximum.reduceat(np.maximum(was[1], now[1]), self._at.starts)
 
-    def find_spoilt(self, changed: NDArray[np.bool_]) -> IntArray:
-        """Find the vertices of spoilt triangles near those that have changed."""
-        if (changed & ~self._expected).any():
-            self._expected |= changed
-            for _ in range(_RINGS):
-                expected = self._triangles[self._expected].reshape(-1)
-                self._expected |= _touching(expected, self._triangles, len(self._moved))
-            self._rows = np.flatnonzero(find_beside(self._moved, self._triangles, self._expected, self._longest))
-            self._vertices, local = np.unique(self._triangles[self._rows], return_inverse=True)
-            self._local = local.reshape(-1, 3).astype(np.uint32)
-        places = self._moved[self._vertices]
-        return self._vertices[_find_spoilt(places, self._local, changed[self._rows], find_self_intersections)]
+    def touching(self, vertices: IntArray) -> NDArray[np.int64]:
+        """Return the triangles that have one of these vertices."""
+        flags = np.zeros(len(self._moved), dtype=bool)
+        flags[vertices] = True
+        return self._at.find(flags)
+
+    def find_spoilt(self, vertices: IntArray) -> IntArray:
+        """Find the vertices of spoilt triangles after these vertices went back.
+
+        What is spoilt elsewhere has nothing around it that could still be taken back.
+        """
+        moved, changed = self._moved, self.touching(vertices)
+        boxes = find_boxes(moved, self._triangles[changed])
+        rows = self._at.rows_of(find_boxes_beside(self._low, self._high, *boxes))
+        rows = rows[find_beside(moved, self._triangles[rows], np.isin(rows, changed))]
+        used, local = np.unique(self._triangles[rows], return_inverse=True)
+        corners = local.reshape(-1, 3).astype(np.uint32)
+        return used[_find_spoilt(moved[used], corners, np.isin(rows, changed), find_self_intersections)]
 
 
 def _find_spoilt(

@@ -99,6 +99,33 @@ def any_corner(flags: NDArray[np.bool_], triangles: IntArray) -> NDArray[np.bool
     return np.asarray(one | two | three)
 
 
+class TriangleFinder:
+    """Triangles, shape (m, 3), found by their vertices: only pieces of some hundred in a row that can have them are
+    looked through.
+    """
+
+    PIECE = 256
+
+    def __init__(self, triangles: IntArray):
+        self._triangles = triangles
+        self.starts = np.arange(0, len(triangles), self.PIECE)
+        self._first = np.minimum.reduceat(triangles.min(axis=1), self.starts)
+        self._last = np.maximum.reduceat(triangles.max(axis=1), self.starts)
+
+    def find(self, flags: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Return the triangles, in order, that have a corner whose flag is set."""
+        vertices = np.flatnonzero(flags)
+        pieces = np.searchsorted(vertices, self._first) < np.searchsorted(vertices, self._last, "right")
+        if 2 * np.count_nonzero(pieces) > len(pieces):
+            return np.flatnonzero(any_corner(flags, self._triangles))
+        rows = self.rows_of(pieces)
+        return rows[any_corner(flags, self._triangles[rows])]
+
+    def rows_of(self, pieces: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Return the triangles of the marked pieces, in order."""
+        return np.flatnonzero(np.repeat(pieces, self.PIECE)[: len(self._triangles)])
+
+
 def find_sheets(faces: NDArray[np.uint32], size: int, edges: Edges) -> list[IntArray]:
     """Find the vertices at edges with several sheets, of doubled faces and of several fans of faces."""
     faults = _find_ridges(faces, edges)

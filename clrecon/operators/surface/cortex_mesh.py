@@ -13,8 +13,8 @@ from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 from clrecon.mesh.connectivity import NeighbourSums
 from clrecon.mesh.refine.shifts import move_vertices
-from clrecon.mesh.refine.topology import any_corner
-from clrecon.mesh.triangles import cross_products, vertex_normals
+from clrecon.mesh.refine.topology import TriangleFinder
+from clrecon.mesh.triangles import cross_product, vertex_normals
 from clrecon.opencl import Device, Stopwatch
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.surface.cortex import (
@@ -28,6 +28,7 @@ from clrecon.operators.surface.cortex import (
 )
 from clrecon.operators.surface.decimation import find_crossings
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.pieces import in_threads
 from clrecon.system.progress import Progress, Steps, ignore_progress
 from clrecon.system.records import Record
 
@@ -104,7 +105,7 @@ def calm_vertices(
     after some rounds back half the way, and at last all of it.
     """
     places = moved.astype(np.float64)
-    before = _crosses(vertices, triangles)
+    before, at = _crosses(vertices, triangles), TriangleFinder(triangles)
     rows = np.arange(len(triangles))
     for turn in range(CALM_ROUNDS + SHORT_ROUNDS + 1):
         turned = _turned(places, triangles[rows], before[:, rows])
@@ -113,21 +114,25 @@ def calm_vertices(
         bad = np.zeros(len(vertices), bool)
         bad[triangles[rows[turned]]] = True
         if turn == CALM_ROUNDS + SHORT_ROUNDS:
-            bad[triangles[any_corner(bad, triangles)]] = True
+            bad[triangles[at.find(bad)]] = True
             places[bad] = vertices[bad]
         elif turn >= CALM_ROUNDS:
             places[bad] = 0.5 * (places[bad] + vertices[bad])
         else:
             places[bad] = rings.means(places, np.flatnonzero(bad))
-        rows = np.flatnonzero(any_corner(bad, triangles))
+        rows = at.find(bad)
     return places
 
 
 def _crosses(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> NDArray[np.float64]:
     """Return the cross products of the triangles' edges, shape (3, m)."""
     found = np.empty((3, len(triangles)))
-    for where, _, cross in cross_products(vertices, triangles, np.zeros(3)):
-        found[:, where] = cross
+
+    def work(where: slice) -> None:
+        one, two, three = (vertices.take(corners, axis=0).T.astype(np.float64) for corners in triangles[where].T)
+        found[:, where] = cross_product(two - one, three - one)
+
+    in_threads(work, len(triangles))
     return found
 
 

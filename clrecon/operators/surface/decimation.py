@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.near_distances import rounding_of_bounds
 from clrecon.mesh.connectivity import Fans
-from clrecon.mesh.intersections import find_self_intersections
+from clrecon.mesh.intersections import find_boxes, find_self_intersections
 from clrecon.mesh.refine import decimation
 from clrecon.mesh.refine.deviation import WITNESSES, SurfaceBounds
 from clrecon.opencl import (
@@ -39,7 +39,7 @@ from clrecon.opencl import (
 )
 from clrecon.operators.masks.voxel_mask import zero_words
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.pieces import chunks, find_bounds, in_threads
+from clrecon.system.pieces import chunks, find_bounds
 from clrecon.system.progress import Progress, Steps
 
 FEWEST = 20_000
@@ -96,7 +96,7 @@ def prepare_crossings(device: Device) -> Program:
 def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> CrossingPlan:
     """Enter at least one triangle into rows."""
     scaled = np.ldexp(vertices, 11 - int(np.frexp(np.abs(vertices).max())[1]))
-    low, high = _find_boxes(scaled, triangles)
+    low, high = find_boxes(scaled, triangles)
     box = (high - low).T
     longest = LONGEST * np.maximum(np.maximum(box[0], box[1]), box[2]).astype(np.float64)
     origin, beyond = (corner.astype(np.float64) for corner in find_bounds(low))
@@ -125,19 +125,6 @@ def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> Cro
 def _order_by(numbers: NDArray[np.integer]) -> NDArray[np.int64]:
     """Return the stable order of numbers of 32 bits; sorting them with their places is far faster than `argsort`."""
     return np.sort(numbers.astype(np.int64) << 32 | np.arange(len(numbers))) & 0xFFFFFFFF
-
-
-def _find_boxes(vertices: Float32Array, triangles: NDArray[np.uint32]) -> tuple[Float32Array, Float32Array]:
-    """Return the lowest and the highest coordinates of each triangle."""
-    low, high = np.empty((len(triangles), 3), np.float32), np.empty((len(triangles), 3), np.float32)
-
-    def work(where: slice) -> None:
-        one, two, three = (vertices[triangles[where, corner]] for corner in range(3))
-        np.minimum(np.minimum(one, two), three, out=low[where])
-        np.maximum(np.maximum(one, two), three, out=high[where])
-
-    in_threads(work, len(triangles))
-    return low, high
 
 
 def mark_crossings(

@@ -12,9 +12,11 @@ from clrecon.exchange.coordinates import find_coincident
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.intersections import find_self_intersections
+from clrecon.mesh.refine import shifts
 from clrecon.mesh.refine.decimation import default_deviation
 from clrecon.mesh.refine.shifts import move_vertices, shorten_steps
 from clrecon.mesh.refine.smoothing import Filter, Rings, sinc_terms, smooth_mesh
+from clrecon.mesh.refine.topology import TriangleFinder
 from clrecon.mesh.triangles import vertex_normals
 
 pytestmark = pytest.mark.unit
@@ -207,6 +209,58 @@ def test_vertices_that_stay_in_the_way_are_taken_back_wholly():
     moved, taken_back = move_vertices(vertices.astype(np.float32), triangles.astype(np.uint32), step)
     np.testing.assert_array_equal(moved, vertices)
     assert taken_back > 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_steps_are_taken_back_as_if_all_triangles_were_looked_at_after_each_round(seed, monkeypatch):
+    """Shells in each other, with wild steps, a flat triangle and vertices at one place: later rounds look at few."""
+    random = np.random.default_rng(seed)
+    shells = [samples.sphere((0, 0, 0), radius, 5) for radius in (10.0, 10.4)]
+    vertices, triangles = samples.join(*shells, samples.sphere((25, 0, 0), 10.0, 5))
+    vertices, triangles = vertices.astype(np.float32), triangles.astype(np.uint32)
+    vertices[triangles[50, 1]] = vertices[triangles[50, 0]]
+    vertices[-1] = vertices[7]
+    step = random.normal(0.0, 1.0, vertices.shape) * np.where(random.random((len(vertices), 1)) < 0.1, 0.5, 0.04)
+    step[(random.random(len(vertices)) < 0.3) & (vertices[:, 0] > 12)] = 0.0
+    looked_at = []
+
+    def find(places, faces, *more):
+        looked_at.append(len(faces))
+        return find_spoilt(places, faces, *more)
+
+    class All:
+        def __init__(self, before, places, faces):
+            self.places, self.faces = places, faces
+
+        def touching(self, those):
+            return np.flatnonzero(np.isin(self.faces, those).any(axis=1))
+
+        def find_spoilt(self, those):
+            changed = np.isin(self.faces, those).any(axis=1)
+            return find_spoilt(self.places, self.faces, changed, find_self_intersections)
+
+    find_spoilt = shifts._find_spoilt
+    monkeypatch.setattr(shifts, "_find_spoilt", find)
+    moved, taken_back = move_vertices(vertices, triangles, step)
+    monkeypatch.setattr(shifts, "_Near", All)
+    expected, count = move_vertices(vertices, triangles, step)
+    np.testing.assert_array_equal(moved, expected)
+    assert taken_back == count > 100
+    rounds = len(looked_at) - 1
+    assert looked_at[0] == len(triangles) and rounds > 5
+    assert max(looked_at[2:rounds]) < 0.5 * len(triangles) and looked_at[rounds - 1] < 0.05 * len(triangles)
+
+
+def test_what_is_in_the_way_back_is_found(monkeypatch):
+    """A box that would go into a wall finds another half way, of which nothing lies where it was to go."""
+    monkeypatch.setattr(TriangleFinder, "PIECE", 4)
+    walls = [samples.box((place, -5, -5), (0.2, 10, 10)) for place in (8.4, 4.4)]
+    vertices, triangles = samples.join(samples.box(), *walls)
+    step = np.zeros((24, 3))
+    step[:8, 0] = 8.0
+    moved, taken_back = move_vertices(vertices.astype(np.float32), triangles.astype(np.uint32), step)
+    np.testing.assert_array_equal(moved[:8], vertices[:8] + [2.0, 0.0, 0.0])
+    assert taken_back == 24
 
 
 def test_smoothing_tells_its_three_steps():
