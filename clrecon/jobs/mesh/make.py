@@ -125,10 +125,24 @@ def _try_steps(device: Device, settings: MeshSettings) -> None:
 
         with suppress(DeviceFailedError):  # the host does it then
             label_components(device.current, meshes[0].triangles, meshes[0].vertex_count)
+    if meshes and settings.surface == "cortex":
+        _try_cortex(device, meshes[0])
     if meshes and settings.decimate_used is not None and settings.method != "g-mc" and settings.memory is None:
         from clrecon.operators.surface.decimation import decimate_mesh
 
         decimate_mesh(meshes[0], settings.decimate_used, device=device)
+
+
+def _try_cortex(device: Device, mesh: Mesh) -> None:
+    from clrecon.opencl import Stopwatch
+    from clrecon.operators.resident.device_volume import DeviceVolume
+    from clrecon.operators.surface.cortex import ProfileSampler
+    from clrecon.operators.surface.decimation import mark_crossings, plan_crossings
+
+    with suppress(DeviceFailedError), DeviceVolume(trial_cube(), device=device.current) as resident:
+        sampler = ProfileSampler(resident, Stopwatch())
+        sampler.take(sampler.values(mesh.vertices, mesh.vertices)).fit(0.7, 0.7, 1000.0, 20.0)
+        mark_crossings(device.current, plan_crossings(mesh.vertices, mesh.triangles))
 
 
 def _try_labels(device: Device, choice: LabelChoice) -> list[Mesh]:

@@ -12,8 +12,11 @@ from scipy.special import ndtr
 import clrecon
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
+from clrecon.jobs.mesh.make import _try_steps
+from clrecon.jobs.mesh.settings import LabelChoice, MeshSettings
 from clrecon.mesh.intersections import find_self_intersections
-from clrecon.operators.surface import cortex_mesh
+from clrecon.opencl.launching import launch
+from clrecon.operators.surface import cortex, cortex_mesh, decimation
 from clrecon.operators.surface.cortex_mesh import NeighbourSums, calm_vertices
 from clrecon.operators.surface.extract import extract_isosurface
 
@@ -142,6 +145,21 @@ def test_the_command(shell, tmp_path, capsys):
     assert "outside of the bone" in capsys.readouterr().out
     report = json.loads((tmp_path / "a.json").read_text("utf-8"))
     assert not report["cortex"]["moved"] and report["cortex"]["outside_mm"]["mean"] > 0.2
+
+
+@pytest.mark.parametrize("labels", [False, True])
+def test_the_trial_run_launches_the_kernels_of_the_cortex(labels, device, monkeypatch):
+    launched = set()
+
+    def note(opened, kernel, *more, **arguments):
+        launched.add(kernel.name)
+        launch(opened, kernel, *more, **arguments)
+
+    for module in (cortex, decimation):
+        monkeypatch.setattr(module, "launch", note)
+    choice = LabelChoice("labels.nii.gz") if labels else None
+    _try_steps(device, MeshSettings(surface="cortex", labels=choice))
+    assert launched == {"sample_profiles", "fit_profiles", "mark_crossings"}
 
 
 def test_where_there_is_no_bone_it_is_said(shell, tmp_path, capsys):
