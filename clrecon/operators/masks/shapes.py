@@ -13,7 +13,6 @@ from clrecon.geometry import Volume, slice_normal, slice_voxel_ml
 from clrecon.geometry.affine import Float64Array, checked_points
 from clrecon.opencl import (
     Device,
-    Program,
     Stopwatch,
     allocate,
     check_budget,
@@ -53,11 +52,6 @@ HALO_BITS = 32
 
 ANY_NUMBER = 1 << 30
 """More voxels than any ball reaches."""
-
-
-def prepare_balls(device: Device) -> Program:
-    """Build the kernels."""
-    return load_program(device, "masks/balls.cl", {"LANES": device.kernel_variants["LANES"]})
 
 
 def ball_of(volume: Volume, radius: float, *, by_slice: bool = False) -> Stencil:
@@ -175,8 +169,9 @@ def spread_bits(
     pieces = -(-words // step)
     rows, tables = _split_tables(ball, HALO_BITS if halo else None)
     spread_d = allocate(device, 4 * words * nj * nk)
+    program = load_program(device, "masks/balls.cl", {"LANES": device.kernel_variants["LANES"]})
     launch(
-        device, prepare_balls(device)["spread_ball"], nj * nk * pieces, stopwatch=stopwatch, mask=mask.mask_d,
+        device, program["spread_ball"], nj * nk * pieces, stopwatch=stopwatch, mask=mask.mask_d,
         row_extents=mask.row_extents_d, reach_j=int(np.abs(rows[:, 0]).max()), reach_k=int(np.abs(rows[:, 1]).max()),
         stencil=upload(device, rows), tables=upload(device, tables), spread=spread_d, ni=ni, nj=nj,
         nk=nk, words=words, pieces=pieces, piece=step, halo=halo, shifted=int(rows[:, 2].any()),

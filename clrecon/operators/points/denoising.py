@@ -34,18 +34,15 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 
 
-def prepare_outliers(device: Device) -> Program:
-    """Build the kernel of `remove_outliers`, but for those that search neighbours."""
-    return load_program(device, "points/outliers.cl", {"LANES": device.kernel_variants["LANES"]})
-
-
 class DistanceMeasure:
     """Mean and nearest distance of each point to its neighbours, filled by one part after another."""
 
     def __init__(self, search: NeighbourSearch, stopwatch: Stopwatch):
         self._search, self._stopwatch = search, stopwatch
         with stopwatch.timed("build"):
-            self._kernel = prepare_outliers(search.device)["measure_distances"]
+            lanes = search.device.kernel_variants["LANES"]
+            program = load_program(search.device, "points/outliers.cl", {"LANES": lanes})
+        self._kernel = program["measure_distances"]
         n = search.grid.n
         self._means, self._means_d = empty_output(search.device, (n,), np.float32)
         self._nearest, self._nearest_d = empty_output(search.device, (n,), np.float32)
@@ -159,11 +156,6 @@ MOST_ITERATIONS = 100
 
 CELL_OF_SPACING = 2.0
 """Edge of the cells of paper B over the median distance to the kth neighbour: about 15 points a cell for k = 16."""
-
-
-def prepare_bilateral(device: Device) -> Program:
-    """Build the kernels of `denoise_points`, but for those of neighbours and planes."""
-    return load_program(device, "points/bilateral.cl", {"LANES": device.kernel_variants["LANES"]})
 
 
 @explains_arguments
@@ -284,7 +276,7 @@ class _Run:
         search = NeighbourSearch(device, points, settings.k, results, self.memory, stopwatch)
         fits = PlaneFits(search, stopwatch)
         with stopwatch.timed("build"):
-            program = prepare_bilateral(device)
+            program = load_program(device, "points/bilateral.cl", {"LANES": device.kernel_variants["LANES"]})
         distances = DistanceMeasure(search, stopwatch) if split else None
         moves, moves_d = empty_output(device, (n, 3), np.float32)
         planes, planes_d = empty_output(device, (n if split else 1, PLANE_NUMBERS), np.float32)

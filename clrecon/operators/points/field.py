@@ -17,7 +17,6 @@ from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.opencl import (
     Device,
     MemoryLimits,
-    Program,
     Stopwatch,
     allocate,
     describe_shortage,
@@ -31,15 +30,8 @@ from clrecon.opencl import (
     upload,
 )
 from clrecon.operators.points.grid import CELL_ROUNDING, GridPlan, fill_grid, plan_grid
-from clrecon.operators.primitives.scan import compact, exclusive_scan, prepare_compact, prepare_scan
-from clrecon.operators.primitives.union_find import label_components, prepare_components
-
-
-def prepare_signs(device: Device) -> Program:
-    """Build the kernels of `decide_signs`."""
-    prepare_scan(device)
-    prepare_components(device)
-    return load_program(device, "points/field_signs.cl")
+from clrecon.operators.primitives.scan import compact, exclusive_scan
+from clrecon.operators.primitives.union_find import label_components
 
 
 class Masks:
@@ -110,7 +102,7 @@ class _Decision:
     def __init__(self, masks: Masks, limits: MemoryLimits, memory: int | None, taken: int):
         self.masks, self.device, self.memory = masks, masks.device, memory
         self._limits, self._taken = limits, taken
-        self._program = prepare_signs(masks.device)
+        self._program = load_program(masks.device, "points/field_signs.cl")
         self._lines = {"words": masks.words, "rows": masks.rows}
 
     def run(self, kernel: str, items: int, **arguments: Any) -> None:
@@ -321,12 +313,6 @@ def plan_nodes(points: GridPlan, settings: FieldSettings) -> Nodes:
     return nodes
 
 
-def prepare_field(device: Device) -> Program:
-    """Build the kernels of a field."""
-    prepare_compact(device)
-    return load_program(device, "points/field.cl", {"LANES": device.kernel_variants["LANES"]})
-
-
 @dataclass(frozen=True)
 class _Slab:
     """Layers of bricks that go through the device together, and the listed bricks in them."""
@@ -358,7 +344,7 @@ class NodeField:
         extent = float(np.ptp(plan.points, axis=0).max()) + 2.0 * settings.bridge
         self._within = settings.reach + 1e-3 * settings.spacing + 4.0 * CELL_ROUNDING * extent
         self._check_first(device, plan)
-        self._program = prepare_field(device)
+        self._program = load_program(device, "points/field.cl", {"LANES": device.kernel_variants["LANES"]})
         self.grid = fill_grid(device, plan, memory=memory, stopwatch=stopwatch)
         self._normals_d = self._sort_normals(normals)
         self._list_d, self._list = self._find_bricks()

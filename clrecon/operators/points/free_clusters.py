@@ -37,7 +37,7 @@ from clrecon.operators.points.grid import (
     prepare_grid,
 )
 from clrecon.operators.primitives.scan import exclusive_scan
-from clrecon.operators.primitives.union_find import hook_in_rounds, prepare_components
+from clrecon.operators.primitives.union_find import hook_in_rounds
 from clrecon.system.arguments import name_parameter
 from clrecon.system.progress import Progress, ignore_progress
 
@@ -81,14 +81,6 @@ class FreeClusters:
     count: int
     facts: dict[str, Any]
     warnings: tuple[str, ...] = ()
-
-
-def prepare_clusters(device: Device) -> Program:
-    """Build the kernels of `find_clusters`."""
-    prepare_grid(device)
-    prepare_components(device)
-    lanes = device.kernel_variants["LANES"] if device.has_long_items else "1"
-    return load_program(device, "points/free_clusters.cl", {"LANES": lanes})
 
 
 def _check(eps: float, min_samples: int) -> None:
@@ -220,8 +212,10 @@ class ClusterSearch:
         stopwatch: Stopwatch | None = None,
     ):
         self._device, self._grid, self._stopwatch = device, grid, stopwatch
-        self._program, self._of_grid = prepare_clusters(device), prepare_grid(device)
         self._is_cpu = device.has_long_items
+        lanes = device.kernel_variants["LANES"] if self._is_cpu else "1"
+        self._program = load_program(device, "points/free_clusters.cl", {"LANES": lanes})
+        self._of_grid = prepare_grid(device)
         self._samples = min_samples
         nx, ny, nz = grid.shape
         self._total_words = grid.words * ny * nz

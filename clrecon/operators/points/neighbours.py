@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.opencl import (
     Device,
-    Program,
     Stopwatch,
     check_memory,
     describe_shortage,
@@ -161,12 +160,6 @@ class Part(NamedTuple):
     place_count: int
 
 
-def prepare_neighbours(device: Device) -> Program:
-    """Build the kernels of `find_neighbours`."""
-    prepare_grid(device)
-    return load_program(device, "points/neighbours.cl", {"LANES": "1" if _has_one_lane(device) else "8"})
-
-
 def _has_one_lane(device: Device) -> bool:
     """True where the form for GPUs is taken: there, and where the loops of a work-item must be short."""
     return not device.has_long_items
@@ -221,7 +214,9 @@ class NeighbourSearch:
                 f"the neighbours of {len(points):,} points cannot be found: {shortage}; fewer points need less"
             )
         with stopwatch.timed("build"):
-            self._program = prepare_neighbours(device)
+            prepare_grid(device)
+            lanes = "1" if _has_one_lane(device) else "8"
+            self._program = load_program(device, "points/neighbours.cl", {"LANES": lanes})
         with stopwatch.running(device):
             self.grid = fill_grid(device, plan, memory=memory, stopwatch=stopwatch)
         self._margin = _rounding_of(plan)

@@ -11,7 +11,6 @@ from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
 from clrecon.opencl import (
     Device,
-    Program,
     Stopwatch,
     allocate,
     check_memory,
@@ -41,11 +40,6 @@ BELOW, ABOVE = 1, 2
 
 FARTHEST = 2.0**29
 """Farthest place in index steps: what lies beyond has no gradient anyway."""
-
-
-def prepare_gradients(device: Device, dtype: np.dtype) -> Program:  # type: ignore[type-arg]
-    """Build the kernel for volumes of `dtype`."""
-    return load_program(device, "points/gradients.cl", voxel_variants(dtype))
 
 
 def find_gradients(
@@ -83,7 +77,7 @@ def _all_slabs(
     device, volume = resident.device, resident.volume
     ni, nj, nk = volume.shape_ijk
     with stopwatch.timed("build"):
-        program = prepare_gradients(device, resident.dtype)
+        program = load_program(device, "points/gradients.cl", voxel_variants(resident.dtype))
     origins = volume.slice_origins(1)
     origins_d = upload(device, (origins - origins[0]).astype(np.float32))
     places_d = upload(device, places)
@@ -121,11 +115,6 @@ _STATES = {
 }
 
 
-def prepare_normals(device: Device) -> Program:
-    """Build the kernels of `estimate_normals`, but for those that search neighbours."""
-    return load_program(device, "points/normals.cl", {"LANES": device.kernel_variants["LANES"]})
-
-
 class PlaneFits:
     """Planes through the neighbours of the points of one part after another: neighbours_d (most places of a part, k)
     int32, normals_d (3, place_count) float32, variations_d (place_count,) float32.
@@ -134,7 +123,7 @@ class PlaneFits:
     def __init__(self, search: NeighbourSearch, stopwatch: Stopwatch):
         self._search, self._stopwatch, device = search, stopwatch, search.device
         with stopwatch.timed("build"):
-            self.program = prepare_normals(device)
+            self.program = load_program(device, "points/normals.cl", {"LANES": device.kernel_variants["LANES"]})
         most = search.most_places
         self.neighbours_d = allocate(device, 4 * search.k * most)
         self.normals_d, self.variations_d = allocate(device, 12 * most), allocate(device, 4 * most)

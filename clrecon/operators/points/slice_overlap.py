@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.geometry import Volume
-from clrecon.opencl import Device, Program, Stopwatch, allocate, download, launch, load_program
+from clrecon.opencl import Device, Stopwatch, allocate, download, launch, load_program
 from clrecon.operators.masks.voxel_mask import VoxelMask, checked_band, mark_band
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points.ghost_slices import GhostSlices, judge_slices
@@ -14,17 +14,13 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 
 
-def prepare_slice_overlap(device: Device) -> Program:
-    """Build the kernel of `count_overlaps`."""
-    return load_program(device, "points/slice_overlap.cl")
-
-
 def count_overlaps(device: Device, mask: VoxelMask, *, stopwatch: Stopwatch | None = None) -> NDArray[np.int64]:
     """Count the voxels of each slice, and those in common with the next one and the one after, as (3, nk)."""
     _, nj, nk = mask.shape_ijk
     counts_d = allocate(device, 12 * mask.rows)
+    program = load_program(device, "points/slice_overlap.cl")
     launch(
-        device, prepare_slice_overlap(device)["count_overlaps"], mask.rows, stopwatch=stopwatch,
+        device, program["count_overlaps"], mask.rows, stopwatch=stopwatch,
         mask=mask.mask_d, counts=counts_d, nj=nj, nk=nk, words=mask.words,
     )  # fmt: skip
     rows = download(device, np.empty((3, nk, nj), np.uint32), counts_d)

@@ -28,21 +28,15 @@ from clrecon.opencl import (
     upload,
     with_fallback,
 )
-from clrecon.operators.points.grid import GridPlan, PointGrid, fill_grid, plan_grid, prepare_grid
+from clrecon.operators.points.grid import GridPlan, PointGrid, fill_grid, plan_grid
 from clrecon.operators.points.neighbours import find_neighbours
-from clrecon.operators.primitives.union_find import hook_in_rounds, prepare_components
+from clrecon.operators.primitives.union_find import hook_in_rounds
 from clrecon.points import PointCloud, PointStep
 from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_share
 
 REASON = "thinned"
-
-
-def prepare_thin(device: Device) -> Program:
-    """Build the kernels of `thin_points`."""
-    prepare_grid(device)
-    return load_program(device, "points/thin.cl")
 
 
 def choose_points(
@@ -55,8 +49,9 @@ def choose_points(
         raise DeviceMemoryError(f"the cloud cannot be thinned: {shortage}")
     grid = fill_grid(device, plan, memory=memory, stopwatch=stopwatch)
     chosen, chosen_d = empty_output(device, (grid.cells,), np.uint32)
+    program = load_program(device, "points/thin.cl")
     launch(
-        device, prepare_thin(device)["choose_points"], grid.cells, stopwatch=stopwatch,
+        device, program["choose_points"], grid.cells, stopwatch=stopwatch,
         x=grid.x_d, y=grid.y_d, z=grid.z_d, starts=grid.starts_d, order=grid.order_d, chosen=chosen_d,
         cells=grid.cells,
     )  # fmt: skip
@@ -133,13 +128,6 @@ SPARSE = 2**32 - 1
 """The label of a sparse cell."""
 
 
-def prepare_sparse_cells(device: Device) -> Program:
-    """Build the kernels of `remove_sparse_cells`."""
-    prepare_grid(device)
-    prepare_components(device)
-    return load_program(device, "points/sparse_cells.cl")
-
-
 def choose_edge(cloud: PointCloud, *, device: Device | str | int | None = None, memory: int | None = None) -> float:
     """Return twice the median distance from a point to the 16th of its nearest points, itself counted, in mm."""
     if len(cloud) == 1:
@@ -178,7 +166,7 @@ def grow_cells(
     shortage = describe_shortage(memory_limits(device, memory), needs)
     if shortage:
         raise DeviceMemoryError(f"sparse cells cannot be found: {shortage}")
-    program = prepare_sparse_cells(device)
+    program = load_program(device, "points/sparse_cells.cl")
     grid = fill_grid(device, plan, memory=memory, stopwatch=stopwatch)
     labels = _label_cells(device, program, grid, fewest, stopwatch)
     starts = download(device, np.empty(grid.cells + 1, np.uint32), grid.starts_d).astype(np.int64)

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.opencl import (
     Device,
-    Program,
     Stopwatch,
     allocate,
     describe_shortage,
@@ -21,7 +20,7 @@ from clrecon.opencl import (
     memory_limits,
     upload,
 )
-from clrecon.operators.masks.runs import PARTS_PER_CORE, StencilTable, count_runs, join_runs, list_runs, prepare_runs
+from clrecon.operators.masks.runs import PARTS_PER_CORE, StencilTable, count_runs, join_runs, list_runs
 from clrecon.operators.masks.voxel_mask import VoxelMask
 from clrecon.points.stencil import Stencil
 
@@ -59,12 +58,6 @@ def search_bytes(mask_bytes: dict[str, int], stencil: Stencil, rows: int) -> dic
     }
 
 
-def prepare_voxel_clusters(device: Device) -> Program:
-    """Build the kernels of `ClusterSearch`."""
-    prepare_runs(device)
-    return load_program(device, "points/voxel_clusters.cl", {"LANES": device.kernel_variants["LANES"]})
-
-
 class ClusterSearch:
     """The clusters of the set voxels of a mask: `points` voxels, `runs` of core voxels along i, `count` clusters.
 
@@ -97,7 +90,7 @@ class ClusterSearch:
         self._needs = search_bytes(mask.needs(), stencil, mask.rows)
         self.device_bytes = 0
         self._check_budget({})
-        self._program = prepare_voxel_clusters(device)
+        self._program = load_program(device, "points/voxel_clusters.cl", {"LANES": device.kernel_variants["LANES"]})
         self._full, self._forward = StencilTable.of(device, stencil), StencilTable.of(device, stencil.forward())
         self._cores_d = mask.mask_d if self._samples == 1 or self._is_one else self._find_cores()
         self._count()

@@ -87,12 +87,6 @@ class CrossingPlan:
         return {"triangles in rows": sum(getattr(self, name).nbytes for name in tables), "marks": len(self.order) // 8}
 
 
-def prepare_crossings(device: Device) -> Program:
-    """Build the kernels of `find_crossings`."""
-    load_program(device, "masks/band_mask.cl")
-    return load_program(device, "surface/crossings.cl")
-
-
 def plan_crossings(vertices: Float32Array, triangles: NDArray[np.uint32]) -> CrossingPlan:
     """Enter at least one triangle into rows."""
     scaled = np.ldexp(vertices, 11 - int(np.frexp(np.abs(vertices).max())[1]))
@@ -132,7 +126,7 @@ def mark_crossings(
 ) -> NDArray[np.bool_]:
     """Mark the triangles that may cut another one, shape (n,), in the order of the mesh."""
     count = len(plan.order)
-    kernel = prepare_crossings(device)["mark_crossings"]
+    kernel = load_program(device, "surface/crossings.cl")["mark_crossings"]
     marks_d = zero_words(device, (count + 31) // 32, stopwatch=stopwatch)
     buffers = {
         name: upload(device, getattr(plan, name))
@@ -188,11 +182,6 @@ Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]
 
 
-def prepare_near_faces(device: Device) -> Program:
-    """Build the kernels of `DeviceBounds`."""
-    return load_program(device, "surface/near_faces.cl")
-
-
 class DeviceBounds(SurfaceBounds):
     """A surface, in mm near zero, to which distances are bounded on a device; its twin is `SurfaceBounds`.
 
@@ -221,7 +210,7 @@ class DeviceBounds(SurfaceBounds):
 
     @cached_property
     def _program(self) -> Program:
-        return prepare_near_faces(self._device)
+        return load_program(self._device, "surface/near_faces.cl")
 
     @cached_property
     def _surface(self) -> dict[str, Any]:

@@ -62,11 +62,6 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 
 
-def prepare_survey(device: Device, label_dtype: DTypeLike = np.uint8) -> Program:
-    """Build the kernels for labels of this type."""
-    return load_program(device, "surface/label_survey.cl", label_variants(label_dtype))
-
-
 def survey_labels(
     labels: LabelMap, device: Device, memory: int | None, stopwatch: Stopwatch
 ) -> tuple[dict[int, Box], NDArray[np.integer[Any]]]:
@@ -94,7 +89,7 @@ def _survey(
     if describe_shortage(memory_limits(device, memory), needs):
         return None
     with stopwatch.timed("build"):
-        program = prepare_survey(device, voxels.dtype)
+        program = load_program(device, "surface/label_survey.cl", label_variants(voxels.dtype))
     with stopwatch.timed("upload"):
         map_d = upload(device, voxels)
     boxes_d, faces_d = allocate(device, boxes.nbytes), allocate(device, faces.nbytes)
