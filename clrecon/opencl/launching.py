@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from queue import SimpleQueue
 from typing import Any
 
@@ -197,14 +198,19 @@ class Stopwatch:
 
     @contextmanager
     def running(self, device: Device) -> Iterator[None]:
-        """Time a block that launches kernels, and wait for them at its end, also after an error."""
+        """Time the kernels that a block launches, and wait for them at its end, also after an error."""
         start = time.perf_counter()
+        outer = _running.get()
+        _running.set(self)
         try:
             yield
         except BaseException as error:
             self._events.clear()
             settle(device, error)
             raise
+        finally:
+            if _running.get() is self:  # a generator that ends late leaves another's block alone
+                _running.set(outer)
         try:
             wait(device)
         except BaseException:
@@ -228,10 +234,12 @@ class Stopwatch:
         self.seconds["build"] += max(wall - busy, 0.0)
 
 
-def launch(
-    device: Device, kernel: Kernel, items: int, /, *, stopwatch: Stopwatch | None = None, **arguments: Any
-) -> None:
-    """Enqueue `kernel` over at least `items` work-items.
+_running: ContextVar[Stopwatch | None] = ContextVar("running", default=None)
+"""The stopwatch in whose `running` block this thread is."""
+
+
+def launch(device: Device, kernel: Kernel, items: int, /, **arguments: Any) -> None:
+    """Enqueue `kernel` over at least `items` work-items; the stopwatch that is running has its time.
 
     items: Rounded up to whole groups of `Device.group_size`, so kernels check their bounds first.
     **arguments: The kernel's arguments, by their names in its source: buffers, numbers, and four numbers for a float4.
@@ -254,7 +262,7 @@ def launch(
         raise device.fail(what, error) from error
     if device.trace is not None:
         wait(device)  # what crashes or hangs is then the kernel that was told last
-    if stopwatch is not None:
+    if (stopwatch := _running.get()) is not None:
         stopwatch.record(kernel.name, event)
 
 

@@ -55,7 +55,7 @@ def measure_components(job: Job) -> dict[str, Any]:
         figures["ratios"][name] = figures["sides"][name]["ratio"]
     stopwatch = Stopwatch()
     with stopwatch.running(job.device):
-        label_components(job.device, triangles, vertices, stopwatch=stopwatch)
+        label_components(job.device, triangles, vertices)
     return {
         **figures,
         "vertices": vertices,

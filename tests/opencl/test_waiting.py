@@ -75,10 +75,7 @@ def test_nothing_is_remembered_of_what_has_ended(device):
     program = load_program(device, "primitives/scan.cl", {"SCAN_GROUP": str(device.group_size)})
     counts_d, sums_d = upload(device, np.arange(50, dtype=np.uint32)), allocate(device, 4)
     with launched.running(device):
-        launch(
-            device, program["sum_blocks"], device.group_size, stopwatch=launched, counts=counts_d, block_sums=sums_d,
-            n=50,
-        )  # fmt: skip
+        launch(device, program["sum_blocks"], device.group_size, counts=counts_d, block_sums=sums_d, n=50)
         assert device.commands.last.what == "kernel sum_blocks"
     assert device.commands.last is None
     download(device, np.empty(1, np.uint32), sums_d)

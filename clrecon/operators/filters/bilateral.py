@@ -77,13 +77,7 @@ def prepare_near_level(device: Device, dtype: DTypeLike = np.int16) -> Program:
 
 
 def list_mixed_groups(
-    device: Device,
-    there: SlicesThere,
-    dtype: DTypeLike,
-    level: Any,
-    reach: tuple[int, int, int],
-    *,
-    stopwatch: Stopwatch | None = None,
+    device: Device, there: SlicesThere, dtype: DTypeLike, level: Any, reach: tuple[int, int, int]
 ) -> Compacted:
     """List the groups of which some voxel has both sides of a level in the box around it: ``32 * row_words(ni) * (core
     row) + group``, ascending.
@@ -97,19 +91,19 @@ def list_mixed_groups(
     some_d, all_d, some_near_d, all_near_d = (allocate(device, 4 * count) for _ in range(4))
     mask_d = allocate(device, 4 * core_count)
     launch(
-        device, program["classify_groups"], there.rows, stopwatch=stopwatch, voxels=there.voxels_d, some=some_d,
+        device, program["classify_groups"], there.rows, voxels=there.voxels_d, some=some_d,
         every=all_d, level=level, ni=there.ni, rows=there.rows, words=words, reach=reach[0],
     )  # fmt: skip
     launch(
-        device, program["spread_groups"], count, stopwatch=stopwatch, some=some_d, every=all_d, some_near=some_near_d,
+        device, program["spread_groups"], count, some=some_d, every=all_d, some_near=some_near_d,
         all_near=all_near_d, count=count, words=words, nj=there.nj, reach=reach[1],
     )  # fmt: skip
     launch(
-        device, program["mark_mixed_groups"], core_count, stopwatch=stopwatch, some_near=some_near_d,
+        device, program["mark_mixed_groups"], core_count, some_near=some_near_d,
         all_near=all_near_d, mask=mask_d, count=core_count, slice_words=words * there.nj, slices=there.count,
         core_first=there.core_first - there.first, reach=reach[2],
     )  # fmt: skip
-    return compact(device, mask_d, core_count, stopwatch=stopwatch)
+    return compact(device, mask_d, core_count)
 
 
 VolumeKind = TypeVar("VolumeKind", Volume, DeviceVolume)
@@ -358,7 +352,7 @@ class _Run:
         with stopwatch.running(device):
             if self.strips:
                 launch(
-                    device, self.program["copy_row_ends"], there.rows * self.strips, stopwatch=stopwatch,
+                    device, self.program["copy_row_ends"], there.rows * self.strips,
                     voxels=there.voxels_d, ends=ends_d, ni=self.ni, rows=there.rows, **sides,
                 )  # fmt: skip
             near = self.settings.near
@@ -370,7 +364,7 @@ class _Run:
                 copy_buffer(device, there.voxels_d, filtered_d, size, source_offset=offset)
                 level = inside_level(self.dtype, near)
                 box = (self.box[0], self.box[1], self.box[2])
-                found = list_mixed_groups(device, there, self.dtype, level, box, stopwatch=stopwatch)
+                found = list_mixed_groups(device, there, self.dtype, level, box)
                 groups, per_row, groups_d = found.count, 32 * row_words(self.ni), found.positions_d
             self._launch(there, filtered_d, ends_d, groups, per_row, groups_d, sides)
         return groups
@@ -394,7 +388,7 @@ class _Run:
         for first in range(0, groups, most):
             count = min(most, groups - first)
             launch(
-                device, self.program["filter_bilateral"], count * items, stopwatch=self.stopwatch,
+                device, self.program["filter_bilateral"], count * items,
                 voxels=there.voxels_d, ends=ends_d, tap_rows=self.tap_rows_d, spatial=self.spatial_d,
                 groups=self.tap_rows_d if groups_d is None else groups_d, filtered=filtered_d, range=range_factor,
                 is_listed=groups_d is not None, first_entry=first, group_count=first + count, row_groups=per_row,

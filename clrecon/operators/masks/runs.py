@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import DeviceMemoryError
 from clrecon.geometry import Volume, slice_voxel_ml
-from clrecon.opencl import Device, Program, Stopwatch, allocate, check_budget, download, launch, load_program, upload
+from clrecon.opencl import Device, Program, allocate, check_budget, download, launch, load_program, upload
 from clrecon.operators.masks.voxel_mask import VoxelMask, zero_words
 from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
 from clrecon.operators.primitives.union_find import join_parts, prepare_components
@@ -63,33 +63,28 @@ class RowRuns:
     lone: bool
 
 
-def count_runs(
-    device: Device, mask: VoxelMask, bits_d: Any, *, lone: bool = False, stopwatch: Stopwatch | None = None
-) -> RowRuns:
+def count_runs(device: Device, mask: VoxelMask, bits_d: Any, *, lone: bool = False) -> RowRuns:
     """Count the runs of each row of `bits_d`, (nk, nj, words) uint32: voxels of the mask, or all of them."""
     rows = mask.rows
     counts_d = allocate(device, 8 * (rows + 1))
     launch(
-        device, prepare_runs(device)["count_row_runs"], rows + 1, stopwatch=stopwatch, mask=mask.mask_d, bits=bits_d,
+        device, prepare_runs(device)["count_row_runs"], rows + 1, mask=mask.mask_d, bits=bits_d,
         row_extents=mask.row_extents_d, row_counts=counts_d, rows=rows, words=mask.words, lone=int(lone),
     )  # fmt: skip
     # One scan of both: the second half begins with the number of all runs.
-    both = exclusive_scan(device, counts_d, 2 * (rows + 1), in_place=True, stopwatch=stopwatch).total
+    both = exclusive_scan(device, counts_d, 2 * (rows + 1), in_place=True).total
     count = int(download(device, np.empty(1, np.uint32), counts_d, 4 * rows)[0])
     if both >= 2**32:
         raise DeviceMemoryError(f"{both - count:,} voxels are set: components are found among up to 2^31")
     return RowRuns(None, counts_d, count, both - count, lone)
 
 
-def list_runs(
-    device: Device, mask: VoxelMask, bits_d: Any, counted: RowRuns, *, stopwatch: Stopwatch | None = None
-) -> RowRuns:
+def list_runs(device: Device, mask: VoxelMask, bits_d: Any, counted: RowRuns) -> RowRuns:
     """List the runs that were counted."""
     runs_d = allocate(device, 4 * counted.count)
     launch(
-        device, prepare_runs(device)["list_row_runs"], mask.rows, stopwatch=stopwatch, bits=bits_d,
-        row_extents=mask.row_extents_d, row_counts=counted.row_counts_d, runs=runs_d, rows=mask.rows,
-        words=mask.words, lone=int(counted.lone),
+        device, prepare_runs(device)["list_row_runs"], mask.rows, bits=bits_d, row_extents=mask.row_extents_d,
+        row_counts=counted.row_counts_d, runs=runs_d, rows=mask.rows, words=mask.words, lone=int(counted.lone),
     )  # fmt: skip
     return RowRuns(runs_d, counted.row_counts_d, counted.count, counted.voxels, counted.lone)
 
@@ -102,7 +97,6 @@ def join_runs(
     *,
     check: Callable[[int], None],
     parts_per_core: int = PARTS_PER_CORE,
-    stopwatch: Stopwatch | None = None,
 ) -> tuple[int, Any]:
     """Number the components of runs that are neighbours by a stencil: (runs,) int32, in the order of their first runs.
 
@@ -122,20 +116,17 @@ def join_runs(
     labels_d, roots_d, row_links_d = (allocate(device, 4 * n) for n in (runs, runs, rows))
     given = {"runs": listed.runs_d, "row_counts": listed.row_counts_d, **forward.arguments, "nj": nj, "nk": nk}
     given |= {"labels": labels_d, "part_rows": part_rows}
-    launch(
-        device, program["join_runs"], -(-rows // part_rows) * spread, stopwatch=stopwatch, roots=roots_d,
-        spread=spread, **given,
-    )  # fmt: skip
+    launch(device, program["join_runs"], -(-rows // part_rows) * spread, roots=roots_d, spread=spread, **given)
     given |= {"row_links": row_links_d}
-    launch(device, program["count_links"], rows, stopwatch=stopwatch, **given)
-    links = exclusive_scan(device, row_links_d, rows, in_place=True, stopwatch=stopwatch).total
+    launch(device, program["count_links"], rows, **given)
+    links = exclusive_scan(device, row_links_d, rows, in_place=True).total
     if links >= 2**32:
         raise DeviceMemoryError(f"{links:,} pairs of runs are neighbours: fewer than 2^32 can be joined")
     check(links)
     links_d = allocate(device, 12 * links)
     if links:
-        launch(device, program["list_links"], rows, stopwatch=stopwatch, links=links_d, **given)
-    return join_parts(device, labels_d, roots_d, runs, links_d, links, stopwatch=stopwatch)
+        launch(device, program["list_links"], rows, links=links_d, **given)
+    return join_parts(device, labels_d, roots_d, runs, links_d, links)
 
 
 def write_runs(
@@ -148,14 +139,12 @@ def write_runs(
     shape_ijk: tuple[int, int, int],
     *,
     wanted: int = 1,
-    stopwatch: Stopwatch | None = None,
 ) -> None:
     """Set the bits of runs whose component has the mark `wanted`, 0 or 1; the other bits stay as they are."""
     ni, nj, nk = shape_ijk
     launch(
-        device, prepare_runs(device)["write_runs"], nj * nk, stopwatch=stopwatch, runs=runs_d,
-        row_counts=row_counts_d, numbers=numbers_d, marks=marks_d, mask=mask_d, wanted=wanted, rows=nj * nk,
-        words=-(-ni // 32),
+        device, prepare_runs(device)["write_runs"], nj * nk, runs=runs_d, row_counts=row_counts_d, numbers=numbers_d,
+        marks=marks_d, mask=mask_d, wanted=wanted, rows=nj * nk, words=-(-ni // 32),
     )  # fmt: skip
 
 
@@ -210,23 +199,17 @@ class RunList:
 
 
 def find_components(
-    device: Device,
-    mask: VoxelMask,
-    *,
-    by_slice: bool = False,
-    beside: int = 0,
-    memory: int | None = None,
-    stopwatch: Stopwatch | None = None,
+    device: Device, mask: VoxelMask, *, by_slice: bool = False, beside: int = 0, memory: int | None = None
 ) -> Components:
     """Find the components of voxels that share a face; `beside` are bytes on the device for other masks."""
     needs = {"masks of the voxels": sum(mask.needs().values()) + beside, "counts of rows": 12 * (mask.rows + 1)}
     check_budget(device, needs, memory)
-    counted = count_runs(device, mask, mask.mask_d, stopwatch=stopwatch)
+    counted = count_runs(device, mask, mask.mask_d)
     if not counted.count:
         return Components(counted, 0, None)
     needs |= {"runs of voxels": 16 * counted.count}
     check_budget(device, needs, memory)
-    listed = list_runs(device, mask, mask.mask_d, counted, stopwatch=stopwatch)
+    listed = list_runs(device, mask, mask.mask_d, counted)
     faces = [(1, 0, 0, 0)] if by_slice else [(1, 0, 0, 0), (0, 1, 0, 0)]
     nk = mask.shape_ijk[2]
     table = StencilTable(
@@ -237,23 +220,18 @@ def find_components(
     def check(links: int) -> None:
         check_budget(device, {**needs, "pairs of runs": 12 * links, "roots": 5 * counted.count}, memory)
 
-    count, numbers_d = join_runs(device, listed, mask.shape_ijk, table, check=check, stopwatch=stopwatch)
+    count, numbers_d = join_runs(device, listed, mask.shape_ijk, table, check=check)
     return Components(listed, count, numbers_d)
 
 
 def mark_at_border(
-    device: Device,
-    found: Components,
-    shape_ijk: tuple[int, int, int],
-    *,
-    by_slice: bool = False,
-    stopwatch: Stopwatch | None = None,
+    device: Device, found: Components, shape_ijk: tuple[int, int, int], *, by_slice: bool = False
 ) -> Any:
     """Return a buffer with a mark, 0 or 1, for each component: 1 where it reaches the border of the volume or slice."""
     ni, nj, nk = shape_ijk
-    marks_d = zero_words(device, -(-found.count // 4), stopwatch=stopwatch)
+    marks_d = zero_words(device, -(-found.count // 4))
     launch(
-        device, prepare_runs(device)["mark_border_runs"], nj * nk, stopwatch=stopwatch, runs=found.runs.runs_d,
+        device, prepare_runs(device)["mark_border_runs"], nj * nk, runs=found.runs.runs_d,
         row_counts=found.runs.row_counts_d, numbers=found.numbers_d, marks=marks_d, ni=ni, nj=nj, nk=nk,
         by_slice=int(by_slice),
     )  # fmt: skip
@@ -261,12 +239,7 @@ def mark_at_border(
 
 
 def mark_with_voxels(
-    device: Device,
-    found: Components,
-    shape_ijk: tuple[int, int, int],
-    voxels: NDArray[np.int32],
-    *,
-    stopwatch: Stopwatch | None = None,
+    device: Device, found: Components, shape_ijk: tuple[int, int, int], voxels: NDArray[np.int32]
 ) -> tuple[Any, NDArray[np.int32]]:
     """Return a buffer, (components,) uint8, with 1 for each component that holds one of `voxels`, and each voxel's
     component, -1 where it is not set.
@@ -274,12 +247,11 @@ def mark_with_voxels(
     voxels: ndarray, shape (n, 3), int32. i, j, k within the volume.
     """
     n = len(voxels)
-    marks_d = zero_words(device, -(-found.count // 4), stopwatch=stopwatch)
+    marks_d = zero_words(device, -(-found.count // 4))
     which, which_d = np.empty(n, np.int32), allocate(device, 4 * n)
     launch(
-        device, prepare_runs(device)["mark_voxel_runs"], n, stopwatch=stopwatch,
+        device, prepare_runs(device)["mark_voxel_runs"], n,
         voxels=upload(device, np.ascontiguousarray(voxels, np.int32)), runs=found.runs.runs_d,
-        row_counts=found.runs.row_counts_d, numbers=found.numbers_d, marks=marks_d, found=which_d, n=n,
-        nj=shape_ijk[1],
+        row_counts=found.runs.row_counts_d, numbers=found.numbers_d, marks=marks_d, found=which_d, n=n, nj=shape_ijk[1],
     )  # fmt: skip
     return marks_d, download(device, which, which_d)

@@ -13,7 +13,6 @@ from clrecon.geometry import Volume, slice_normal, slice_voxel_ml
 from clrecon.geometry.affine import Float64Array, checked_points
 from clrecon.opencl import (
     Device,
-    Stopwatch,
     allocate,
     check_budget,
     copy_buffer,
@@ -144,15 +143,7 @@ def table_bytes(ball: Stencil) -> int:
     return 2 * ball.rows.nbytes + ball.tables.nbytes
 
 
-def spread_bits(
-    device: Device,
-    mask: VoxelMask,
-    ball: Stencil,
-    *,
-    erode: bool = False,
-    beyond: bool = False,
-    stopwatch: Stopwatch | None = None,
-) -> Any:
+def spread_bits(device: Device, mask: VoxelMask, ball: Stencil, *, erode: bool = False, beyond: bool = False) -> Any:
     """Return the words of a mask that is dilated or eroded, (nk, nj, words) uint32.
 
     mask: Without zeros behind its rows.
@@ -171,7 +162,7 @@ def spread_bits(
     spread_d = allocate(device, 4 * words * nj * nk)
     program = load_program(device, "masks/balls.cl", {"LANES": device.kernel_variants["LANES"]})
     launch(
-        device, program["spread_ball"], nj * nk * pieces, stopwatch=stopwatch, mask=mask.mask_d,
+        device, program["spread_ball"], nj * nk * pieces, mask=mask.mask_d,
         row_extents=mask.row_extents_d, reach_j=int(np.abs(rows[:, 0]).max()), reach_k=int(np.abs(rows[:, 1]).max()),
         stencil=upload(device, rows), tables=upload(device, tables), spread=spread_d, ni=ni, nj=nj,
         nk=nk, words=words, pieces=pieces, piece=step, halo=halo, shifted=int(rows[:, 2].any()),

@@ -182,7 +182,9 @@ class _Marking:
         ni, nj, nk = resident.volume.shape_ijk
         mask_d, extents_d = allocate(device, 4 * self.words * nj * nk), allocate(device, 4 * nj * nk)
         if slices == nk:
-            self._classify(resident.whole(self.stopwatch), mask_d, extents_d, nk)
+            voxels_d = resident.whole(self.stopwatch)
+            with self.stopwatch.running(device):
+                self._classify(voxels_d, mask_d, extents_d, nk)
             return VoxelMask(mask_d, extents_d, (ni, nj, nk), self.words, self.pad)
         resident.make_way()
         part_d, part_extents_d = (allocate(device, size * nj * slices) for size in (4 * self.words, 4))
@@ -205,35 +207,29 @@ class _Marking:
         ni, nj, _ = volume.shape_ijk
         launch(
             self.resident.device,
-            prepare_classify(self.resident.device, volume.voxels.dtype, "between")["classify_samples"],
-            nj * slices, stopwatch=self.stopwatch, voxels=voxels_d, mask=mask_d, row_extents=extents_d,
-            level=self.bounds[0], highest=self.bounds[1], ni=ni, nj=nj, nk=slices, border=0, first_slice=0,
-            first_sample_slice=0, gk=slices, words=self.words,
+            prepare_classify(self.resident.device, volume.voxels.dtype, "between")["classify_samples"], nj * slices,
+            voxels=voxels_d, mask=mask_d, row_extents=extents_d, level=self.bounds[0], highest=self.bounds[1], ni=ni,
+            nj=nj, nk=slices, border=0, first_slice=0, first_sample_slice=0, gk=slices, words=self.words,
         )  # fmt: skip
 
 
-def zero_words(device: Device, words: int, *, stopwatch: Stopwatch | None = None) -> Any:
+def zero_words(device: Device, words: int) -> Any:
     """Return a buffer of words of 32 zero bits that kernels may write: uploaded buffers are for reading alone."""
     words_d = allocate(device, 4 * words)
     clear = load_program(device, "masks/band_mask.cl")["clear_words"]
-    launch(device, clear, words, stopwatch=stopwatch, mask=words_d, n=words)
+    launch(device, clear, words, mask=words_d, n=words)
     return words_d
 
 
 def mark_voxels(
-    device: Device,
-    voxels: NDArray[np.int32] | VoxelNumbers,
-    shape_ijk: tuple[int, int, int],
-    *,
-    pad: int = 0,
-    stopwatch: Stopwatch | None = None,
+    device: Device, voxels: NDArray[np.int32] | VoxelNumbers, shape_ijk: tuple[int, int, int], *, pad: int = 0
 ) -> VoxelMask:
     """Mark voxels within the volume, by index, (n, 3), or by number, with `pad` words of zeros behind each row."""
     check_shape(shape_ijk, pad)
     ni, nj, nk = shape_ijk
     words, rows = -(-ni // 32) + pad, nj * nk
     program = load_program(device, "masks/band_mask.cl")
-    mask_d, extents_d = zero_words(device, words * rows, stopwatch=stopwatch), allocate(device, 4 * rows)
+    mask_d, extents_d = zero_words(device, words * rows), allocate(device, 4 * rows)
     if isinstance(voxels, VoxelNumbers):
         n, kernel = len(voxels.numbers), "set_numbered_bits"
         given = {"numbers": np.ascontiguousarray(voxels.numbers, np.uint32)}
@@ -243,11 +239,8 @@ def mark_voxels(
         given, sizes = {"ijk": np.ascontiguousarray(voxels, np.int32)}, {"nj": nj}
     if n:
         given_d = {name: upload(device, values) for name, values in given.items()}
-        launch(device, program[kernel], n, stopwatch=stopwatch, mask=mask_d, n=n, words=words, **given_d, **sizes)
-    launch(
-        device, program["find_extents"], rows, stopwatch=stopwatch, mask=mask_d, row_extents=extents_d, rows=rows,
-        words=words,
-    )  # fmt: skip
+        launch(device, program[kernel], n, mask=mask_d, n=n, words=words, **given_d, **sizes)
+    launch(device, program["find_extents"], rows, mask=mask_d, row_extents=extents_d, rows=rows, words=words)
     return VoxelMask(mask_d, extents_d, shape_ijk, words, pad)
 
 
@@ -265,54 +258,42 @@ def prepare_logic(device: Device, dtype: DTypeLike = np.int16) -> Program:
     return load_program(device, "masks/logic.cl", voxel_variants(dtype))
 
 
-def combine(
-    device: Device,
-    a_d: Any,
-    b_d: Any,
-    shape_ijk: tuple[int, int, int],
-    operation: str,
-    stopwatch: Stopwatch | None = None,
-) -> Any:
+def combine(device: Device, a_d: Any, b_d: Any, shape_ijk: tuple[int, int, int], operation: str) -> Any:
     """Return the words of two masks of one shape joined; `operation` is one of `OPERATIONS`."""
     words, rows = _words(shape_ijk)
     combined_d = allocate(device, 4 * words * rows)
     launch(
-        device, prepare_logic(device)["combine_masks"], words * rows, stopwatch=stopwatch, a=a_d, b=b_d,
+        device, prepare_logic(device)["combine_masks"], words * rows, a=a_d, b=b_d,
         combined=combined_d, n=words * rows, operation=OPERATIONS[operation],
     )  # fmt: skip
     return combined_d
 
 
-def invert(device: Device, mask_d: Any, shape_ijk: tuple[int, int, int], stopwatch: Stopwatch | None = None) -> Any:
+def invert(device: Device, mask_d: Any, shape_ijk: tuple[int, int, int]) -> Any:
     """Return the words of the voxels that are not set."""
     words, rows = _words(shape_ijk)
     inverted_d = allocate(device, 4 * words * rows)
     launch(
-        device, prepare_logic(device)["invert_mask"], words * rows, stopwatch=stopwatch, mask=mask_d,
+        device, prepare_logic(device)["invert_mask"], words * rows, mask=mask_d,
         inverted=inverted_d, n=words * rows, ni=shape_ijk[0], words=words,
     )  # fmt: skip
     return inverted_d
 
 
-def count_bits(device: Device, mask_d: Any, shape_ijk: tuple[int, int, int], stopwatch: Stopwatch | None = None) -> int:
+def count_bits(device: Device, mask_d: Any, shape_ijk: tuple[int, int, int]) -> int:
     """Return the number of set voxels."""
     words, rows = _words(shape_ijk)
     counts, counts_d = empty_output(device, (rows,), np.uint32)
-    launch(
-        device, prepare_logic(device)["count_row_bits"], rows, stopwatch=stopwatch, mask=mask_d, counts=counts_d,
-        rows=rows, words=words,
-    )  # fmt: skip
+    launch(device, prepare_logic(device)["count_row_bits"], rows, mask=mask_d, counts=counts_d, rows=rows, words=words)
     return int(download(device, counts, counts_d).sum(dtype=np.int64))
 
 
-def find_extents(
-    device: Device, mask_d: Any, shape_ijk: tuple[int, int, int], stopwatch: Stopwatch | None = None
-) -> VoxelMask:
+def find_extents(device: Device, mask_d: Any, shape_ijk: tuple[int, int, int]) -> VoxelMask:
     """Return the mask with the extents of its rows."""
     words, rows = _words(shape_ijk)
     extents_d = allocate(device, 4 * rows)
     launch(
-        device, load_program(device, "masks/band_mask.cl")["find_extents"], rows, stopwatch=stopwatch, mask=mask_d,
+        device, load_program(device, "masks/band_mask.cl")["find_extents"], rows, mask=mask_d,
         row_extents=extents_d, rows=rows, words=words,
     )  # fmt: skip
     return VoxelMask(mask_d, extents_d, shape_ijk, words, 0)
@@ -320,14 +301,13 @@ def find_extents(
 
 def replace_outside(
     device: Device, voxels_d: Any, dtype: np.dtype[Any], mask_d: Any, shape_ijk: tuple[int, int, int], outside: float,
-    stopwatch: Stopwatch | None = None,
 ) -> tuple[NDArray[Any], Any]:  # fmt: skip
     """Return voxels with `outside` where the mask is not set: a host array, (nk, nj, ni), and a buffer."""
     ni, nj, nk = shape_ijk
     words, rows = _words(shape_ijk)
     replaced, replaced_d = empty_output(device, (nk, nj, ni), dtype)
     launch(
-        device, prepare_logic(device, dtype)["replace_outside"], rows, stopwatch=stopwatch, voxels=voxels_d,
+        device, prepare_logic(device, dtype)["replace_outside"], rows, voxels=voxels_d,
         mask=mask_d, replaced=replaced_d, outside=dtype.type(outside), rows=rows, words=words, ni=ni,
     )  # fmt: skip
     return download(device, replaced, replaced_d), replaced_d

@@ -234,9 +234,7 @@ def _cluster_band(
     beside = {what: size for what, size in own.items() if what not in masks}
     mask = mark_band(resident, band, pad=pad, beside=beside, stopwatch=stopwatch, progress=progress)
     with stopwatch.running(device):
-        search = ClusterSearch(
-            device, mask, request.stencil, request.samples, memory=resident.memory, stopwatch=stopwatch
-        )
+        search = ClusterSearch(device, mask, request.stencil, request.samples, memory=resident.memory)
         labels, cores = search.label(), search.flag_cores()
     if not len(labels):
         raise UsageError(f"no voxel lies from {band[0]:g} to {band[1]:g} HU: there is nothing to cluster")
@@ -314,12 +312,8 @@ def _cluster_cloud(
         with attempt as (current, told):
             stopwatch = Stopwatch()
             with stopwatch.running(current):
-                mask = mark_voxels(
-                    current, voxels, lattice.shape_ijk, pad=pad_for(request.stencil), stopwatch=stopwatch
-                )
-                search = ClusterSearch(
-                    current, mask, request.stencil, request.samples, memory=memory, stopwatch=stopwatch
-                )
+                mask = mark_voxels(current, voxels, lattice.shape_ijk, pad=pad_for(request.stencil))
+                search = ClusterSearch(current, mask, request.stencil, request.samples, memory=memory)
                 labels, cores = search.label(), search.flag_cores()
                 if order is not None:
                     labels, cores = _restore_order(search, labels, cores, order)

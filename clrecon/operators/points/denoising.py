@@ -57,9 +57,8 @@ class DistanceMeasure:
         search = self._search
         launch(
             search.device, self._kernel, -(-part.place_count // int(search.device.kernel_variants["LANES"])),
-            stopwatch=self._stopwatch, **search.coordinates, order=search.grid.order_d, neighbours=neighbours_d,
-            means=self._means_d, nearest=self._nearest_d, k=search.k, first_place=part.first_place,
-            place_count=part.place_count,
+            **search.coordinates, order=search.grid.order_d, neighbours=neighbours_d, means=self._means_d,
+            nearest=self._nearest_d, k=search.k, first_place=part.first_place, place_count=part.place_count,
         )  # fmt: skip
 
     def read(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -284,7 +283,7 @@ class _Run:
         for part in search.each_part("denoise", self.progress):
             fits.fit(part)
             launch(
-                device, program["filter_points"], -(-part.place_count // lanes), stopwatch=stopwatch,
+                device, program["filter_points"], -(-part.place_count // lanes),
                 **search.coordinates, order=search.grid.order_d, neighbours=fits.neighbours_d, normals=fits.normals_d,
                 variations=fits.variations_d, moves=moves_d, planes=planes_d, range_factor=settings.range_factor,
                 keep_planes=split, k=settings.k, first_place=part.first_place, place_count=part.place_count,
@@ -311,7 +310,8 @@ class _Run:
             self.feature_points = n
             return
         self.cell_mm = CELL_OF_SPACING * spacing
-        grid = fill_grid(device, plan_grid(points, self.cell_mm), memory=self.memory, stopwatch=stopwatch)
+        with stopwatch.running(device):
+            grid = fill_grid(device, plan_grid(points, self.cell_mm), memory=self.memory)
         if self.settings.features == "paper":
             means, nearest = distances.read()
             starts = download(device, np.empty(grid.cells + 1, np.uint32), grid.starts_d)
@@ -325,7 +325,7 @@ class _Run:
         self.feature_points = int(np.count_nonzero(features))
         with stopwatch.running(device):
             launch(
-                device, program["filter_cells"], n, stopwatch=stopwatch, x=grid.x_d, y=grid.y_d, z=grid.z_d,
+                device, program["filter_cells"], n, x=grid.x_d, y=grid.y_d, z=grid.z_d,
                 order=grid.order_d, starts=grid.starts_d, planes=planes_d,
                 features=upload(device, features.astype(np.uint8)), moves=moves_d, cells=grid.cells, points=n,
             )  # fmt: skip

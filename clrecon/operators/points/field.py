@@ -17,7 +17,6 @@ from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.opencl import (
     Device,
     MemoryLimits,
-    Stopwatch,
     allocate,
     describe_shortage,
     download,
@@ -43,14 +42,14 @@ class Masks:
     COUNT: ClassVar[int] = 6
     """Masks that exist together at most, those of `decide_signs` among them."""
 
-    def __init__(self, device: Device, shape: tuple[int, int, int], stopwatch: Stopwatch | None = None):
-        self.device, self.shape, self.stopwatch = device, shape, stopwatch
+    def __init__(self, device: Device, shape: tuple[int, int, int]):
+        self.device, self.shape = device, shape
         self.words = -(-shape[0] // 32)
         self.rows = shape[1] * shape[2]
         self.near_d, self.core_d, self.negative_d = (self.make() for _ in range(3))
         program = load_program(device, "points/grid.cl", {"LANES": device.kernel_variants["LANES"]})
         for mask_d in (self.near_d, self.core_d, self.negative_d):
-            launch(device, program["clear_cells"], self.total, stopwatch=stopwatch, mask=mask_d, total=self.total)
+            launch(device, program["clear_cells"], self.total, mask=mask_d, total=self.total)
 
     @property
     def total(self) -> int:
@@ -107,7 +106,7 @@ class _Decision:
 
     def run(self, kernel: str, items: int, **arguments: Any) -> None:
         """Launch a kernel over `items` work-items."""
-        launch(self.device, self._program[kernel], items, stopwatch=self.masks.stopwatch, **arguments)
+        launch(self.device, self._program[kernel], items, **arguments)
 
     def _check(self, what: str, size: int) -> None:
         shortage = describe_shortage(self._limits, {"field": self._taken, what: size})
@@ -120,7 +119,7 @@ class _Decision:
         along = {"nx": masks.shape[0], **self._lines}
         counts_d = allocate(self.device, 4 * rows)
         self.run("count_runs", rows, near=masks.near_d, counts=counts_d, **along)
-        offsets = exclusive_scan(self.device, counts_d, rows, in_place=True, stopwatch=masks.stopwatch)
+        offsets = exclusive_scan(self.device, counts_d, rows, in_place=True)
         self._check("runs of far nodes", 25 * offsets.total + 8 * rows)
         firsts_d, lasts_d = (allocate(self.device, 4 * offsets.total) for _ in range(2))
         self.run(
@@ -135,7 +134,7 @@ class _Decision:
         sizes = {"ny": masks.shape[1], "rows": rows, "runs": runs.count}
         counts_d = allocate(self.device, 4 * rows)
         self.run("count_joins", rows, counts=counts_d, **of, **sizes)
-        places = exclusive_scan(self.device, counts_d, rows, in_place=True, stopwatch=masks.stopwatch)
+        places = exclusive_scan(self.device, counts_d, rows, in_place=True)
         self._check("pairs of runs", 25 * runs.count + 12 * places.total)
         pairs = np.empty((places.total, 3), np.uint32)
         if places.total:
@@ -143,7 +142,7 @@ class _Decision:
             self.run("list_joins", rows, places=places.offsets_d, pairs=pairs_d, **of, **sizes)
             download(self.device, pairs, pairs_d)
             del pairs_d
-        count, labels = label_components(self.device, pairs, runs.count, memory=self.memory, stopwatch=masks.stopwatch)
+        count, labels = label_components(self.device, pairs, runs.count, memory=self.memory)
         lone = np.flatnonzero(labels < 0)
         labels[lone] = count + np.arange(len(lone))
         return count + len(lone), labels
@@ -334,9 +333,8 @@ class NodeField:
         settings: FieldSettings,
         *,
         memory: int | None = None,
-        stopwatch: Stopwatch | None = None,
     ):
-        self.device, self.settings, self.stopwatch = device, settings, stopwatch
+        self.device, self.settings = device, settings
         self.limits = memory_limits(device, memory)
         plan = plan_grid(points, 2.0 * settings.spacing)
         self.nodes = plan_nodes(plan, settings)
@@ -345,15 +343,15 @@ class NodeField:
         self._within = settings.reach + 1e-3 * settings.spacing + 4.0 * CELL_ROUNDING * extent
         self._check_first(device, plan)
         self._program = load_program(device, "points/field.cl", {"LANES": device.kernel_variants["LANES"]})
-        self.grid = fill_grid(device, plan, memory=memory, stopwatch=stopwatch)
+        self.grid = fill_grid(device, plan, memory=memory)
         self._normals_d = self._sort_normals(normals)
         self._list_d, self._list = self._find_bricks()
         self.slabs = self._plan_slabs()
-        self.masks = Masks(device, self.nodes.shape, stopwatch)
+        self.masks = Masks(device, self.nodes.shape)
         self._values = self._measure()
 
     def _run(self, kernel: str, items: int, **arguments: Any) -> None:
-        launch(self.device, self._program[kernel], items, stopwatch=self.stopwatch, **arguments)
+        launch(self.device, self._program[kernel], items, **arguments)
 
     @property
     def bricks(self) -> int:
@@ -403,7 +401,7 @@ class NodeField:
             merged=merged_d, bricks=bricks_d, nx=grid.shape[0], words=grid.words, bricks_x=bricks_x,
             brick_words=words, rows=rows, **self._where,
         )  # fmt: skip
-        found = compact(self.device, bricks_d, rows * words, stopwatch=self.stopwatch)
+        found = compact(self.device, bricks_d, rows * words)
         listed = download(self.device, np.empty(found.count, np.uint32), found.positions_d)
         return found.positions_d, listed
 

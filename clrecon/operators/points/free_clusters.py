@@ -143,9 +143,7 @@ def cluster_free_points(
         with attempt as (current, told):
             stopwatch = Stopwatch()
             with stopwatch.running(current):
-                search = find_clusters(
-                    current, plan, eps, min_samples, memory=memory, stopwatch=stopwatch, progress=progress
-                )
+                search = find_clusters(current, plan, eps, min_samples, memory=memory, progress=progress)
             labels, cores, count, cells = search
             found = {
                 "clusters": count,
@@ -168,7 +166,6 @@ def find_clusters(
     *,
     per_chunk: int | None = None,
     memory: int | None = None,
-    stopwatch: Stopwatch | None = None,
     progress: Progress = ignore_progress,
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_], int, int]:
     """Cluster the points of a plan that `plan_cells` made for `eps`; return labels (int32), cores (bool), the number of
@@ -180,9 +177,9 @@ def find_clusters(
     shortage = describe_shortage(memory_limits(device, memory), {**plan.needs(device), "clusters": 23 * n})
     if shortage:
         raise DeviceMemoryError(f"the clusters of the points cannot be found: {shortage}")
-    grid = fill_grid(device, plan, memory=memory, stopwatch=stopwatch)
+    grid = fill_grid(device, plan, memory=memory)
     progress("clusters", 1, 4)
-    search = ClusterSearch(device, grid, eps, min_samples, per_chunk, stopwatch)
+    search = ClusterSearch(device, grid, eps, min_samples, per_chunk)
     search.check_pairs()
     search.find_cores()
     progress("clusters", 2, 4)
@@ -202,16 +199,8 @@ class ClusterSearch:
     count: Number of clusters, once `label` has run.
     """
 
-    def __init__(
-        self,
-        device: Device,
-        grid: PointGrid,
-        eps: float,
-        min_samples: int,
-        per_chunk: int | None = None,
-        stopwatch: Stopwatch | None = None,
-    ):
-        self._device, self._grid, self._stopwatch = device, grid, stopwatch
+    def __init__(self, device: Device, grid: PointGrid, eps: float, min_samples: int, per_chunk: int | None = None):
+        self._device, self._grid = device, grid
         self._is_cpu = device.has_long_items
         lanes = device.kernel_variants["LANES"] if self._is_cpu else "1"
         self._program = load_program(device, "points/free_clusters.cl", {"LANES": lanes})
@@ -240,7 +229,7 @@ class ClusterSearch:
         return max(-(-share // CELLS_A_CHUNK), 1) * CELLS_A_CHUNK
 
     def _run(self, kernel: str, items: int, program: Program | None = None, **arguments: Any) -> None:
-        launch(self._device, (program or self._program)[kernel], items, stopwatch=self._stopwatch, **arguments)
+        launch(self._device, (program or self._program)[kernel], items, **arguments)
 
     def check_pairs(self) -> None:
         """Refuse clouds that are so dense that comparing their points would take many minutes."""
@@ -316,7 +305,7 @@ class ClusterSearch:
             )  # fmt: skip
 
         self.labels_d, self._other_d = hook_in_rounds(
-            self._device, self.labels_d, self._other_d, self._grid.cells, hook, stopwatch=self._stopwatch
+            self._device, self.labels_d, self._other_d, self._grid.cells, hook
         )
 
     def label(self) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
@@ -333,7 +322,7 @@ class ClusterSearch:
             "mark_firsts", grid.cells, labels=self.labels_d, firsts=self._firsts_d, marks=marks_d, cells=grid.cells
         )
         self._run("count_marked", words, self._of_grid, mask=marks_d, counts=before_d, total=words)
-        self.count = exclusive_scan(self._device, before_d, words, in_place=True, stopwatch=self._stopwatch).total
+        self.count = exclusive_scan(self._device, before_d, words, in_place=True).total
         numbers_d = self._other_d
         self._run(
             "number_cells", grid.cells,

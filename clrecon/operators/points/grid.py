@@ -14,7 +14,6 @@ from clrecon.geometry.vertices import is_far
 from clrecon.opencl import (
     Device,
     Program,
-    Stopwatch,
     allocate,
     describe_shortage,
     kernel_constant,
@@ -200,16 +199,12 @@ def prepare_grid(device: Device) -> Program:
     return load_program(device, "points/grid.cl", {"LANES": device.kernel_variants["LANES"]})
 
 
-def make_grid(
-    device: Device, points: ArrayLike, edge: float, *, memory: int | None = None, stopwatch: Stopwatch | None = None
-) -> PointGrid:
+def make_grid(device: Device, points: ArrayLike, edge: float, *, memory: int | None = None) -> PointGrid:
     """Sort at least one point by the cubic cells of a grid, equal on every device: `plan_grid`, then `fill_grid`."""
-    return fill_grid(device, plan_grid(points, edge), memory=memory, stopwatch=stopwatch)
+    return fill_grid(device, plan_grid(points, edge), memory=memory)
 
 
-def fill_grid(
-    device: Device, plan: GridPlan, *, memory: int | None = None, stopwatch: Stopwatch | None = None
-) -> PointGrid:
+def fill_grid(device: Device, plan: GridPlan, *, memory: int | None = None) -> PointGrid:
     """Sort the points of a plan by cells; see `make_grid`."""
     shortage = describe_shortage(memory_limits(device, memory), plan.needs(device))
     if shortage:
@@ -226,18 +221,18 @@ def fill_grid(
     points_d, mask_d, ranks_d = upload(device, plan.points), allocate(device, 4 * total), allocate(device, 4 * total)
 
     def run(kernel: str, items: int, **arguments: Any) -> None:
-        launch(device, program[kernel], items, stopwatch=stopwatch, **arguments)
+        launch(device, program[kernel], items, **arguments)
 
     run("clear_cells", total, mask=mask_d, total=total)
     together = MARKED_TOGETHER if int(device.kernel_variants["LANES"]) > 1 else 1
     run("mark_cells", -(-n // together), points=points_d, mask=mask_d, **where)
     run("count_marked", total, mask=mask_d, counts=ranks_d, total=total)
-    cells = exclusive_scan(device, ranks_d, total, in_place=True, stopwatch=stopwatch).total
+    cells = exclusive_scan(device, ranks_d, total, in_place=True).total
     if not 1 <= cells <= n:
         raise DeviceError(f"{device.label} computes wrongly: {n:,} points in {cells:,} cells")
     keys_d = allocate(device, 4 * n)
     run("number_points", n, points=points_d, mask=mask_d, ranks=ranks_d, keys=keys_d, **where)
-    by_cell = radix_sort(device, keys_d, n, bits=_bits(cells), stopwatch=stopwatch)
+    by_cell = radix_sort(device, keys_d, n, bits=_bits(cells))
     wait(device)  # what the sort used is free then
     del keys_d
     x_d, y_d, z_d = (allocate(device, 4 * (n + PADDING)) for _ in range(3))

@@ -218,7 +218,7 @@ class NeighbourSearch:
             lanes = "1" if _has_one_lane(device) else "8"
             self._program = load_program(device, "points/neighbours.cl", {"LANES": lanes})
         with stopwatch.running(device):
-            self.grid = fill_grid(device, plan, memory=memory, stopwatch=stopwatch)
+            self.grid = fill_grid(device, plan, memory=memory)
         self._margin = _rounding_of(plan)
         starts = download(device, np.empty(self.grid.cells + 1, np.uint32), self.grid.starts_d)
         _check_pairs(self.grid, starts)
@@ -243,11 +243,10 @@ class NeighbourSearch:
         (nx, ny, nz), (x, y, z) = grid.shape, (float(value) for value in grid.origin - grid.base)
         launch(
             self.device, self._program["list_neighbours"],
-            part.place_count if one_lane else -(-part.cell_count // BATCH_CELLS), stopwatch=self._stopwatch,
-            mask=grid.mask_d, ranks=grid.ranks_d, starts=grid.starts_d, order=grid.order_d, **self.coordinates,
-            neighbours=neighbours_d, distances=distances_d, nx=nx, ny=ny, nz=nz, words=grid.words, cells=grid.cells,
-            points=grid.n, origin=(x, y, z, grid.edge), margin=self._margin, k=self.k, by_place=by_place,
-            **part._asdict(),
+            part.place_count if one_lane else -(-part.cell_count // BATCH_CELLS), mask=grid.mask_d, ranks=grid.ranks_d,
+            starts=grid.starts_d, order=grid.order_d, **self.coordinates, neighbours=neighbours_d,
+            distances=distances_d, nx=nx, ny=ny, nz=nz, words=grid.words, cells=grid.cells, points=grid.n,
+            origin=(x, y, z, grid.edge), margin=self._margin, k=self.k, by_place=by_place, **part._asdict(),
         )  # fmt: skip
 
     def list_places(self, part: Part, neighbours_d: Any) -> None:

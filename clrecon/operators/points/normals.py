@@ -91,7 +91,7 @@ def _all_slabs(
             voxels_d = resident.part(low, high, stopwatch)
         with stopwatch.running(device):
             launch(
-                device, program["find_gradients"], len(places), stopwatch=stopwatch,
+                device, program["find_gradients"], len(places),
                 voxels=voxels_d, places=places_d, origins=origins_d, gradients=gradients_d, ni=ni, nj=nj, nk=nk,
                 first_k=low, own_first=first, own_end=end, step_i=(*volume.affine[:3, 0], 0.0),
                 step_j=(*volume.affine[:3, 1], 0.0), outside=resident.values.lowest, points=len(places),
@@ -139,7 +139,7 @@ class PlaneFits:
         search.list_places(part, self.neighbours_d)
         lanes = int(search.device.kernel_variants["LANES"])
         launch(
-            search.device, self.program["fit_planes"], -(-part.place_count // lanes), stopwatch=self._stopwatch,
+            search.device, self.program["fit_planes"], -(-part.place_count // lanes),
             **search.coordinates, neighbours=self.neighbours_d, normals=self.normals_d, variations=self.variations_d,
             first_place=part.first_place, place_count=part.place_count, k=search.k,
         )  # fmt: skip
@@ -260,7 +260,7 @@ class _Run:
         for part in search.each_part("normals", self.progress):
             fits.fit(part)
             launch(
-                device, fits.program["orient_normals"], part.place_count, stopwatch=stopwatch, **search.coordinates,
+                device, fits.program["orient_normals"], part.place_count, **search.coordinates,
                 order=search.grid.order_d, normals=fits.normals_d, gradients=gradients_d, oriented=normals_d,
                 states=states_d, viewpoint=(*seen_from, 0.0), how=_HOW[how], first_place=part.first_place,
                 place_count=part.place_count,

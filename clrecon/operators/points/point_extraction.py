@@ -205,12 +205,11 @@ class VoxelEmission:
             words_per_item = words if device.kernel_variants["LANES"] == "8" else 1
             with stopwatch.running(device):
                 launch(
-                    device, program["emit_points"], rows * -(-words // words_per_item), stopwatch=stopwatch,
-                    mask=mask_d, row_extents=extents_d, offsets=counts_d, voxels=voxels_d,
+                    device, program["emit_points"], rows * -(-words // words_per_item), mask=mask_d,
+                    row_extents=extents_d, offsets=counts_d, voxels=voxels_d,
                     origins=upload(device, self._origins[first:end]), steps=upload(device, self._steps),
-                    positions=positions_d, hu=hu_d, numbers=numbers_d,
-                    first_number=first * nj * ni if is_small else 0, ni=ni, nj=nj,
-                    words_per_item=words_per_item, **where,
+                    positions=positions_d, hu=hu_d, numbers=numbers_d, first_number=first * nj * ni if is_small else 0,
+                    ni=ni, nj=nj, words_per_item=words_per_item, **where,
                 )  # fmt: skip
             with stopwatch.timed("download"):
                 download_all(device, (positions, positions_d, 0), (hu, hu_d, 0), (numbers, numbers_d, 0))
@@ -219,15 +218,14 @@ class VoxelEmission:
 
     def _mark(self, voxels_d: Any, begin: int, stop: int, own: dict[str, int]) -> tuple[Any, Any, int | None]:
         """Mark the voxels of the band, of the label; with a label or a shell also count those of the band."""
-        device, stopwatch, (ni, nj, nk) = self.resident.device, self.stopwatch, self.volume.shape_ijk
+        device, _stopwatch, (ni, nj, nk) = self.resident.device, self.stopwatch, self.volume.shape_ijk
         chosen, words = self.selection, own["words"]
         rows = (stop - begin) * nj
         mask_d, extents_d = allocate(device, 4 * rows * words), allocate(device, 4 * rows)
         launch(
             device, prepare_classify(device, self.volume.voxels.dtype, "between")["classify_samples"], rows,
-            stopwatch=stopwatch, voxels=voxels_d, mask=mask_d, row_extents=extents_d, level=chosen.low,
-            highest=chosen.high, ni=ni, nj=nj, nk=nk, border=0, first_slice=begin, first_sample_slice=begin,
-            gk=stop - begin, words=words,
+            voxels=voxels_d, mask=mask_d, row_extents=extents_d, level=chosen.low, highest=chosen.high, ni=ni, nj=nj,
+            nk=nk, border=0, first_slice=begin, first_sample_slice=begin, gk=stop - begin, words=words,
         )  # fmt: skip
         if chosen.labels is None and not chosen.shell:
             return mask_d, extents_d, None
@@ -237,13 +235,13 @@ class VoxelEmission:
         )
         if chosen.labels is not None:
             launch(
-                device, program["restrict_mask"], rows, stopwatch=stopwatch, mask=mask_d, row_extents=extents_d,
+                device, program["restrict_mask"], rows, mask=mask_d, row_extents=extents_d,
                 labels=upload(device, chosen.labels[begin:stop]), label=chosen.label, ni=ni, words=words, rows=rows,
             )  # fmt: skip
         if chosen.shell:
             shell_d = allocate(device, 4 * rows * words)
             launch(
-                device, program["find_shell"], rows, stopwatch=stopwatch,
+                device, program["find_shell"], rows,
                 mask=mask_d, row_extents=extents_d, shell=shell_d, nj=nj, words=words, slices=stop - begin,
             )  # fmt: skip
             mask_d = shell_d
@@ -251,14 +249,11 @@ class VoxelEmission:
 
     def _count(self, mask_d: Any, extents_d: Any, own: dict[str, int]) -> tuple[Any, int]:
         """Count the voxels of a mask in the slab's own rows; return the number before each row, and all."""
-        device, stopwatch = self.resident.device, self.stopwatch
+        device, _stopwatch = self.resident.device, self.stopwatch
         program = prepare_voxels(device, self.volume.voxels.dtype)
         counts_d = allocate(device, 4 * own["rows"])
-        launch(
-            device, program["count_points"], own["rows"], stopwatch=stopwatch,
-            mask=mask_d, row_extents=extents_d, counts=counts_d, **own,
-        )  # fmt: skip
-        scanned = exclusive_scan(device, counts_d, own["rows"], in_place=True, stopwatch=stopwatch)
+        launch(device, program["count_points"], own["rows"], mask=mask_d, row_extents=extents_d, counts=counts_d, **own)
+        scanned = exclusive_scan(device, counts_d, own["rows"], in_place=True)
         if scanned.total > MOST_POINTS:
             raise DeviceMemoryError(f"a slab has {scanned.total:,} points: more than {MOST_POINTS:,}")
         return scanned.offsets_d, scanned.total

@@ -412,9 +412,7 @@ class _Reconstruction:
 
     def _try(self) -> tuple[NodeField, Signs, NDArray[np.uint32]]:
         self.progress("field", 0, 3)
-        field = NodeField(
-            self.device, self.cloud, self.normals, self.settings, memory=self.memory, stopwatch=self.stopwatch
-        )
+        field = NodeField(self.device, self.cloud, self.normals, self.settings, memory=self.memory)
         field.release_points()
         self.progress("field", 1, 3)
         negative = field.masks.fetch(field.masks.negative_d)  # which the signs use up

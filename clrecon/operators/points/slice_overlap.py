@@ -14,15 +14,14 @@ from clrecon.system.arguments import explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 
 
-def count_overlaps(device: Device, mask: VoxelMask, *, stopwatch: Stopwatch | None = None) -> NDArray[np.int64]:
+def count_overlaps(device: Device, mask: VoxelMask) -> NDArray[np.int64]:
     """Count the voxels of each slice, and those in common with the next one and the one after, as (3, nk)."""
     _, nj, nk = mask.shape_ijk
     counts_d = allocate(device, 12 * mask.rows)
     program = load_program(device, "points/slice_overlap.cl")
     launch(
-        device, program["count_overlaps"], mask.rows, stopwatch=stopwatch,
-        mask=mask.mask_d, counts=counts_d, nj=nj, nk=nk, words=mask.words,
-    )  # fmt: skip
+        device, program["count_overlaps"], mask.rows, mask=mask.mask_d, counts=counts_d, nj=nj, nk=nk, words=mask.words
+    )
     rows = download(device, np.empty((3, nk, nj), np.uint32), counts_d)
     counts: NDArray[np.int64] = rows.sum(axis=2, dtype=np.int64)
     return counts
@@ -83,6 +82,6 @@ def find_ghost_slices(
                     resident, band, beside=beside, stopwatch=stopwatch, progress=progress or ignore_progress
                 )
                 with stopwatch.running(current):
-                    counts = count_overlaps(current, mask, stopwatch=stopwatch)
+                    counts = count_overlaps(current, mask)
                 ghosts = judge_slices(counts, ni * nj, band, tuple(warnings))
     return ghosts

@@ -39,21 +39,18 @@ from clrecon.system.text import format_share
 REASON = "thinned"
 
 
-def choose_points(
-    device: Device, plan: GridPlan, *, memory: int | None = None, stopwatch: Stopwatch | None = None
-) -> NDArray[np.uint32]:
+def choose_points(device: Device, plan: GridPlan, *, memory: int | None = None) -> NDArray[np.uint32]:
     """Return the number of the point nearest to the mean of each cell with points, in the order of the cells."""
     needs = {**plan.needs(device), "chosen points": 4 * len(plan.points)}
     shortage = describe_shortage(memory_limits(device, memory), needs)
     if shortage:
         raise DeviceMemoryError(f"the cloud cannot be thinned: {shortage}")
-    grid = fill_grid(device, plan, memory=memory, stopwatch=stopwatch)
+    grid = fill_grid(device, plan, memory=memory)
     chosen, chosen_d = empty_output(device, (grid.cells,), np.uint32)
     program = load_program(device, "points/thin.cl")
     launch(
-        device, program["choose_points"], grid.cells, stopwatch=stopwatch,
-        x=grid.x_d, y=grid.y_d, z=grid.z_d, starts=grid.starts_d, order=grid.order_d, chosen=chosen_d,
-        cells=grid.cells,
+        device, program["choose_points"], grid.cells, x=grid.x_d, y=grid.y_d, z=grid.z_d, starts=grid.starts_d,
+        order=grid.order_d, chosen=chosen_d, cells=grid.cells,
     )  # fmt: skip
     return download(device, chosen, chosen_d)
 
@@ -107,7 +104,7 @@ def thin_points(
             stopwatch = Stopwatch()
             tell("thin", 0, 1)
             with stopwatch.running(current):
-                chosen = np.sort(choose_points(current, plan, memory=memory, stopwatch=stopwatch))
+                chosen = np.sort(choose_points(current, plan, memory=memory))
             removed = np.ones(len(made), np.uint8)
             removed[chosen] = 0
             facts = {"spacing_mm": float(spacing), "device": current.label, "kernel_seconds": dict(stopwatch.by_kernel)}
@@ -152,14 +149,7 @@ class _Grown:
 
 
 def grow_cells(
-    device: Device,
-    plan: GridPlan,
-    fewest: int,
-    threshold: int,
-    largest: bool,
-    *,
-    memory: int | None = None,
-    stopwatch: Stopwatch | None = None,
+    device: Device, plan: GridPlan, fewest: int, threshold: int, largest: bool, *, memory: int | None = None
 ) -> _Grown:
     """Find the cells that stay; parameters are those of `remove_sparse_cells`."""
     needs = {**plan.needs(device), "labels of cells": 9 * len(plan.points), "marks of points": len(plan.points)}
@@ -167,39 +157,33 @@ def grow_cells(
     if shortage:
         raise DeviceMemoryError(f"sparse cells cannot be found: {shortage}")
     program = load_program(device, "points/sparse_cells.cl")
-    grid = fill_grid(device, plan, memory=memory, stopwatch=stopwatch)
-    labels = _label_cells(device, program, grid, fewest, stopwatch)
+    grid = fill_grid(device, plan, memory=memory)
+    labels = _label_cells(device, program, grid, fewest)
     starts = download(device, np.empty(grid.cells + 1, np.uint32), grid.starts_d).astype(np.int64)
     counts = starts[1:] - starts[:-1]
     kinds, facts = _judge_cells(labels, counts, threshold, largest)
     removed, removed_d = empty_output(device, (grid.n,), np.uint8)
     launch(
-        device, program["mark_places"], grid.cells, stopwatch=stopwatch,
+        device, program["mark_places"], grid.cells,
         starts=grid.starts_d, order=grid.order_d, kinds=upload(device, kinds), marks=removed_d, cells=grid.cells,
     )  # fmt: skip
     return _Grown(download(device, removed, removed_d), facts)
 
 
-def _label_cells(
-    device: Device, program: Program, grid: PointGrid, fewest: int, stopwatch: Stopwatch | None
-) -> NDArray[np.uint32]:
+def _label_cells(device: Device, program: Program, grid: PointGrid, fewest: int) -> NDArray[np.uint32]:
     """Return the first cell of the component of each cell, `SPARSE` for sparse ones."""
     cells, (nx, ny, nz) = grid.cells, grid.shape
     labels_d, other_d = allocate(device, 4 * cells), allocate(device, 4 * cells)
-    launch(
-        device, program["label_crowded"], cells, stopwatch=stopwatch,
-        starts=grid.starts_d, labels=labels_d, cells=cells, fewest=fewest,
-    )  # fmt: skip
+    launch(device, program["label_crowded"], cells, starts=grid.starts_d, labels=labels_d, cells=cells, fewest=fewest)
 
     def hook(roots_d: Any, hooked_d: Any, flags_d: Any, number: int) -> None:
         launch(
-            device, program["hook_touching"], cells, stopwatch=stopwatch,
-            x=grid.x_d, y=grid.y_d, z=grid.z_d, starts=grid.starts_d, mask=grid.mask_d, ranks=grid.ranks_d,
-            labels=roots_d, hooked=hooked_d, flags=flags_d, origin=grid.origin_and_scale, nx=nx, ny=ny, nz=nz,
-            words=grid.words, cells=cells, pass_number=number,
+            device, program["hook_touching"], cells, x=grid.x_d, y=grid.y_d, z=grid.z_d, starts=grid.starts_d,
+            mask=grid.mask_d, ranks=grid.ranks_d, labels=roots_d, hooked=hooked_d, flags=flags_d,
+            origin=grid.origin_and_scale, nx=nx, ny=ny, nz=nz, words=grid.words, cells=cells, pass_number=number,
         )  # fmt: skip
 
-    roots_d = hook_in_rounds(device, labels_d, other_d, cells, hook, stopwatch=stopwatch)[0]
+    roots_d = hook_in_rounds(device, labels_d, other_d, cells, hook)[0]
     return download(device, np.empty(cells, np.uint32), roots_d)
 
 
@@ -289,9 +273,7 @@ def remove_sparse_cells(
         with attempt as (current, told):
             stopwatch = Stopwatch()
             with stopwatch.running(current):
-                grown = grow_cells(
-                    current, plan, int(fewest), int(threshold), keep_largest, memory=memory, stopwatch=stopwatch
-                )
+                grown = grow_cells(current, plan, int(fewest), int(threshold), keep_largest, memory=memory)
             asked = {"edge_is_default": edge is None, "fewest": int(fewest), "threshold": int(threshold)}
             made_on = {"device": current.label, "kernel_seconds": dict(stopwatch.by_kernel)}
             facts = {"edge_mm": float(plan.edge), **asked, **grown.facts, **made_on}

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.opencl import (
     Device,
-    Stopwatch,
     allocate,
     describe_shortage,
     download,
@@ -76,9 +75,8 @@ class ClusterSearch:
         *,
         memory: int | None = None,
         parts_per_core: int = PARTS_PER_CORE,
-        stopwatch: Stopwatch | None = None,
     ):
-        self._device, self._mask, self._stopwatch = device, mask, stopwatch
+        self._device, self._mask = device, mask
         self._limits = memory_limits(device, memory)
         self._parts = parts_per_core
         self._samples = checked_min_samples(min_samples)
@@ -126,7 +124,7 @@ class ClusterSearch:
         self.device_bytes = max(self.device_bytes, sum(needs.values()))
 
     def _run(self, kernel: str, items: int, **arguments: Any) -> None:
-        launch(self._device, self._program[kernel], items, stopwatch=self._stopwatch, **arguments)
+        launch(self._device, self._program[kernel], items, **arguments)
 
     def _find_cores(self) -> Any:
         mask = self._mask
@@ -142,9 +140,7 @@ class ClusterSearch:
 
     def _count(self) -> None:
         """Count runs and points, row by row."""
-        counted = count_runs(
-            self._device, self._mask, self._cores_d, lone=not self._stencil.joins_columns, stopwatch=self._stopwatch
-        )
+        counted = count_runs(self._device, self._mask, self._cores_d, lone=not self._stencil.joins_columns)
         self._counted, self._row_counts_d = counted, counted.row_counts_d
         self.runs, self.points = counted.count, counted.voxels
         if self._is_one and self.points < self._samples:
@@ -155,14 +151,14 @@ class ClusterSearch:
 
     def _join(self) -> tuple[int, Any]:
         device, runs = self._device, self.runs
-        listed = list_runs(device, self._mask, self._cores_d, self._counted, stopwatch=self._stopwatch)
+        listed = list_runs(device, self._mask, self._cores_d, self._counted)
         self._runs_d = listed.runs_d
         if self._is_one:
             return 1, upload(device, np.zeros(runs, np.int32))
         return join_runs(
             device, listed, self._mask.shape_ijk, self._forward,
             check=lambda links: self._check_budget({"pairs of runs": 12 * links, "roots": 5 * runs}),
-            parts_per_core=self._parts, stopwatch=self._stopwatch,
+            parts_per_core=self._parts,
         )  # fmt: skip
 
     def label(self, numbers: NDArray[np.int32] | None = None) -> NDArray[np.int32]:

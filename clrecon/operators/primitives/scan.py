@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import UsageError
-from clrecon.opencl import Device, Program, Stopwatch, allocate, download, kernel_constant, launch, load_program
+from clrecon.opencl import Device, Program, allocate, download, kernel_constant, launch, load_program
 
 SCAN_PER_ITEM = kernel_constant("primitives/scan.cl", "SCAN_PER_ITEM")
 """Elements a work-item."""
@@ -36,13 +36,11 @@ def _load_scan(device: Device) -> Program:
     return load_program(device, "primitives/scan.cl", {"SCAN_GROUP": str(device.group_size)})
 
 
-def exclusive_scan(
-    device: Device, counts_d: Any, n: int, *, in_place: bool = False, stopwatch: Stopwatch | None = None
-) -> Scanned:
+def exclusive_scan(device: Device, counts_d: Any, n: int, *, in_place: bool = False) -> Scanned:
     """Compute the sum of all counts, (n,) uint32, before each element; with `in_place` over the counts."""
     _check_size(n)
     offsets_d = counts_d if in_place else allocate(device, 4 * n)
-    total_d = enqueue_scan(device, counts_d, offsets_d, n, stopwatch=stopwatch)
+    total_d = enqueue_scan(device, counts_d, offsets_d, n)
     total = download(device, np.empty(1, dtype=np.uint64), total_d)
     return Scanned(offsets_d, total_d, int(total[0]))
 
@@ -52,22 +50,19 @@ def _check_size(n: int) -> None:
         raise UsageError(f"{n:,} elements: a scan takes 1 to {LARGEST_SCAN:,}")
 
 
-def enqueue_scan(device: Device, counts_d: Any, offsets_d: Any, n: int, *, stopwatch: Stopwatch | None = None) -> Any:
+def enqueue_scan(device: Device, counts_d: Any, offsets_d: Any, n: int) -> Any:
     """Enqueue the same into offsets, or the counts, and wait for nothing; return the exact total, (1,) uint64."""
     _check_size(n)
     scan = _load_scan(device)
     blocks = -(-n // (SCAN_PER_ITEM * device.group_size))
     sums_d, block_offsets_d, total_d = (allocate(device, 4 * blocks), allocate(device, 4 * blocks), allocate(device, 8))
     items = blocks * device.group_size
-    launch(device, scan["sum_blocks"], items, stopwatch=stopwatch, counts=counts_d, block_sums=sums_d, n=n)
+    launch(device, scan["sum_blocks"], items, counts=counts_d, block_sums=sums_d, n=n)
     launch(
-        device, scan["scan_block_sums"], device.group_size, stopwatch=stopwatch,
+        device, scan["scan_block_sums"], device.group_size,
         block_sums=sums_d, block_offsets=block_offsets_d, total=total_d, blocks=blocks,
     )  # fmt: skip
-    launch(
-        device, scan["scan_blocks"], items, stopwatch=stopwatch,
-        counts=counts_d, block_offsets=block_offsets_d, offsets=offsets_d, n=n,
-    )  # fmt: skip
+    launch(device, scan["scan_blocks"], items, counts=counts_d, block_offsets=block_offsets_d, offsets=offsets_d, n=n)
     return total_d
 
 
@@ -95,7 +90,7 @@ def _load_compact(device: Device) -> Program:
     return load_program(device, "primitives/compact.cl")
 
 
-def compact(device: Device, mask_d: Any, words: int, *, stopwatch: Stopwatch | None = None) -> Compacted:
+def compact(device: Device, mask_d: Any, words: int) -> Compacted:
     """Find the set bits of a mask, (words,) uint32, words 1 to 2^27; bit b of word w is position ``32 * w + b``."""
     if not 1 <= words <= LARGEST_MASK:
         raise UsageError(f"{words:,} words: a mask has 1 to {LARGEST_MASK:,}, so that positions fit 32 bits")
@@ -103,12 +98,12 @@ def compact(device: Device, mask_d: Any, words: int, *, stopwatch: Stopwatch | N
     chunks = -(-words // COMPACT_WORDS)
     counts_d = allocate(device, 4 * chunks)
     launch(
-        device, program["count_set_bits"], chunks, stopwatch=stopwatch, mask=mask_d, counts=counts_d, words=words
+        device, program["count_set_bits"], chunks, mask=mask_d, counts=counts_d, words=words
     )  # fmt: skip
-    scanned = exclusive_scan(device, counts_d, chunks, stopwatch=stopwatch)
+    scanned = exclusive_scan(device, counts_d, chunks)
     positions_d = allocate(device, 4 * scanned.total)
     launch(
-        device, program["list_set_bits"], chunks, stopwatch=stopwatch,
+        device, program["list_set_bits"], chunks,
         mask=mask_d, offsets=scanned.offsets_d, positions=positions_d, words=words,
     )  # fmt: skip
     return Compacted(positions_d, scanned.total)
@@ -164,9 +159,7 @@ def sort_bytes(device: Device, n: int, bits: int = KEY_BITS) -> int:
     return 4 * buffers * n + (4 << min(RADIX_BITS, max(bits, 1))) * _plan_chunks(device, n)[1]
 
 
-def radix_sort(
-    device: Device, keys_d: Any, n: int, *, bits: int = KEY_BITS, stopwatch: Stopwatch | None = None
-) -> Sorted:
+def radix_sort(device: Device, keys_d: Any, n: int, *, bits: int = KEY_BITS) -> Sorted:
     """Sort 1 to 2^31 keys, (n,) uint32, by their lowest `bits`, the only ones that can be set; they stay."""
     if not 1 <= n <= LARGEST_SCAN:
         raise UsageError(f"{n:,} elements: a sort takes 1 to {LARGEST_SCAN:,}")
@@ -180,13 +173,12 @@ def radix_sort(
     for number, (shift, width) in enumerate(digits):
         sizes = {"n": n, "shift": shift, "bins": 1 << width, "per_chunk": per_chunk, "chunks": chunks}
         counts_d = allocate(device, (4 << width) * chunks)
-        launch(device, program["count_digits"], items, stopwatch=stopwatch, keys=taken[0], counts=counts_d, **sizes)
-        offsets_d = exclusive_scan(device, counts_d, chunks << width, in_place=True, stopwatch=stopwatch).offsets_d
+        launch(device, program["count_digits"], items, keys=taken[0], counts=counts_d, **sizes)
+        offsets_d = exclusive_scan(device, counts_d, chunks << width, in_place=True).offsets_d
         made = free.pop() if free else (allocate(device, 4 * n), allocate(device, 4 * n))
         launch(
-            device, program["scatter_by_digit"], items, stopwatch=stopwatch,
-            keys=taken[0], values=taken[1], offsets=offsets_d, sorted_keys=made[0], sorted_values=made[1],
-            numbered=int(number == 0), **sizes,
+            device, program["scatter_by_digit"], items, keys=taken[0], values=taken[1], offsets=offsets_d,
+            sorted_keys=made[0], sorted_values=made[1], numbered=int(number == 0), **sizes,
         )  # fmt: skip
         if number > 0:
             free.append(taken)

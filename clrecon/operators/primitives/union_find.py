@@ -12,7 +12,6 @@ from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
 from clrecon.opencl import (
     Device,
     Program,
-    Stopwatch,
     allocate,
     describe_shortage,
     download,
@@ -37,12 +36,7 @@ def prepare_components(device: Device) -> Program:
 
 
 def label_components(
-    device: Device,
-    triangles: ArrayLike,
-    vertex_count: int,
-    *,
-    memory: int | None = None,
-    stopwatch: Stopwatch | None = None,
+    device: Device, triangles: ArrayLike, vertex_count: int, *, memory: int | None = None
 ) -> tuple[int, NDArray[np.int64]]:
     """Number the components of a mesh: triangles that share a vertex belong to one.
 
@@ -53,15 +47,13 @@ def label_components(
     _check_mesh(faces, vertex_count)
     if len(faces) == 0:
         return 0, np.full(vertex_count, -1, dtype=np.int64)
-    search = _Search(device, faces, vertex_count, memory, stopwatch)
+    search = _Search(device, faces, vertex_count, memory)
     count, numbers_d = search.number(*search.find_roots(), vertex_count)
     numbers = download(device, np.empty(vertex_count, dtype=np.int32), numbers_d)
     return count, numbers.astype(np.int64)
 
 
-def join_parts(
-    device: Device, labels_d: Any, spare_d: Any, n: int, links_d: Any, links: int, *, stopwatch: Stopwatch | None = None
-) -> tuple[int, Any]:
+def join_parts(device: Device, labels_d: Any, spare_d: Any, n: int, links_d: Any, links: int) -> tuple[int, Any]:
     """Number the components of nodes that are joined within parts already, once the parts are joined by pairs.
 
     Return their count, lone nodes counted, and the component of each node, (n,) int32, in order of the first node.
@@ -71,7 +63,7 @@ def join_parts(
     spare_d: buffer, (n,) uint32. The same of roots; all else is arbitrary.  Overwritten.
     links_d: buffer, (links, 3) uint32. Pairs (a, b, b) of roots that belong together.
     """
-    rounds = _Rounds(device, stopwatch, labels_d, spare_d, n)
+    rounds = _Rounds(device, labels_d, spare_d, n)
     if links:
         rounds.start()
         rounds.join_roots(links_d, links)
@@ -80,13 +72,7 @@ def join_parts(
 
 
 def hook_in_rounds(
-    device: Device,
-    labels_d: Any,
-    other_d: Any,
-    n: int,
-    hook: Callable[[Any, Any, Any, int], None],
-    *,
-    stopwatch: Stopwatch | None = None,
+    device: Device, labels_d: Any, other_d: Any, n: int, hook: Callable[[Any, Any, Any, int], None]
 ) -> tuple[Any, Any]:
     """Find components by a kernel that hooks roots to smaller ones, in rounds, until it hooks none.
 
@@ -99,7 +85,7 @@ def hook_in_rounds(
     to another root of the same component; with two flags, of which it sets the second to the number that it is called
     with where it finds such a root; and with that number.
     """
-    rounds = _Rounds(device, stopwatch, labels_d, other_d, n)
+    rounds = _Rounds(device, labels_d, other_d, n)
     rounds.start()
     return rounds.hook_by(hook)
 
@@ -117,8 +103,8 @@ def _check_mesh(triangles: NDArray[np.uint32], vertex_count: int) -> None:
 class _Rounds:
     """The rounds of cl/primitives/union_find.cl: two buffers of labels, one read and one written, and flags."""
 
-    def __init__(self, device: Device, stopwatch: Stopwatch | None, labels_d: Any, other_d: Any, nodes: int):
-        self._device, self._stopwatch = device, stopwatch
+    def __init__(self, device: Device, labels_d: Any, other_d: Any, nodes: int):
+        self._device = device
         self._program = prepare_components(device)
         self._labels_d, self._other_d, self._nodes = labels_d, other_d, nodes
         self._flags_d = allocate(device, 8)
@@ -127,7 +113,7 @@ class _Rounds:
 
     def run(self, kernel: str, items: int, **arguments: Any) -> None:
         """Launch a kernel over `items` work-items."""
-        launch(self._device, self._program[kernel], items, stopwatch=self._stopwatch, **arguments)
+        launch(self._device, self._program[kernel], items, **arguments)
 
     def start(self) -> None:
         """Clear the flags; the labels are there."""
@@ -136,7 +122,7 @@ class _Rounds:
     def number(self, labels_d: Any, spare_d: Any, n: int) -> tuple[int, Any]:
         """Number the components by their roots: their count, and a buffer, (n,) int32."""
         self.run("flag_roots", n, labels=labels_d, roots=spare_d, n=n)
-        roots = exclusive_scan(self._device, spare_d, n, stopwatch=self._stopwatch)
+        roots = exclusive_scan(self._device, spare_d, n)
         numbers_d = allocate(self._device, 4 * n)
         self.run("number_components", n, labels=labels_d, offsets=roots.offsets_d, numbers=numbers_d, n=n)
         return roots.total, numbers_d
@@ -209,20 +195,13 @@ class _Rounds:
         words = -(-size // 32)
         mask_d = allocate(self._device, 4 * words)
         self.run(kernel, words, mask=mask_d, **inputs)
-        return compact(self._device, mask_d, words, stopwatch=self._stopwatch)
+        return compact(self._device, mask_d, words)
 
 
 class _Search(_Rounds):
     """The rounds on a mesh."""
 
-    def __init__(
-        self,
-        device: Device,
-        triangles: NDArray[np.uint32],
-        vertex_count: int,
-        memory: int | None,
-        stopwatch: Stopwatch | None,
-    ):
+    def __init__(self, device: Device, triangles: NDArray[np.uint32], vertex_count: int, memory: int | None):
         self._limits = memory_limits(device, memory)
         self._faces, self._vertices = len(triangles), vertex_count
         labels = 4 * vertex_count
@@ -231,7 +210,7 @@ class _Search(_Rounds):
         self._check_budget({"component offsets": labels, "component numbers": labels})
         prepare_components(device)
         self._faces_d = upload(device, triangles)
-        super().__init__(device, stopwatch, allocate(device, labels), allocate(device, labels), vertex_count)
+        super().__init__(device, allocate(device, labels), allocate(device, labels), vertex_count)
 
     def _check_budget(self, more: dict[str, int]) -> None:
         shortage = describe_shortage(self._limits, {**self._buffers, **more})

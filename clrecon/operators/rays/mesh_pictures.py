@@ -121,14 +121,11 @@ class Triangles:
         sums_d = allocate(device, 4 * len(part.triangles))
         with stopwatch.running(device):  # wait: CPU devices read the host's arrays
             launch(
-                device, self._program["place_vertices"], len(part.vertices), stopwatch=stopwatch,
+                device, self._program["place_vertices"], len(part.vertices),
                 vertices=vertices_d, view=self._view_d, placed=self._placed_d, count=len(part.vertices),
             )  # fmt: skip
-            launch(
-                device, self._program["count_pieces"], len(part.triangles), stopwatch=stopwatch,
-                pieces=sums_d, **self._picture,
-            )  # fmt: skip
-            scanned = exclusive_scan(device, sums_d, len(part.triangles), in_place=True, stopwatch=stopwatch)
+            launch(device, self._program["count_pieces"], len(part.triangles), pieces=sums_d, **self._picture)
+            scanned = exclusive_scan(device, sums_d, len(part.triangles), in_place=True)
         self._sums_d, self._pieces = scanned.offsets_d, scanned.total
         if self._pieces > MOST_PIECES:
             raise UsageError(
@@ -138,16 +135,16 @@ class Triangles:
 
     def draw(self, layer: LayerKeys, finds_numbers: bool) -> None:
         """Bring depths, or numbers where all depths are known, to the pixels of a layer, without a wait."""
-        device, stopwatch = self.device, self.stopwatch
+        device, _stopwatch = self.device, self.stopwatch
         common: dict[str, Any] = {
             **self._picture, **layer.arguments, "planes": self._planes_d, "plane_count": len(self.part.planes),
             "first": self.first, "finds_numbers": finds_numbers,
         }  # fmt: skip
-        launch(device, self._program["draw_triangles"], len(self.part.triangles), stopwatch=stopwatch, **common)
+        launch(device, self._program["draw_triangles"], len(self.part.triangles), **common)
         for first in range(0, self._pieces, PIECES_A_LAUNCH):
             end = min(first + PIECES_A_LAUNCH, self._pieces)
             launch(
-                device, self._program["draw_pieces"], end - first, stopwatch=stopwatch,
+                device, self._program["draw_pieces"], end - first,
                 sums=self._sums_d, first_piece=first, end_piece=end, **common,
             )  # fmt: skip
 
@@ -157,10 +154,9 @@ class Triangles:
         color = np.array([*part.color, part.opacity], np.float32)
         launch(
             self.device, self._program["shade_triangles"], self._picture["width"] * self._picture["height"],
-            stopwatch=self.stopwatch, normals=self._normals_d, colors=self._colors_d, highlights=self._highlights_d,
-            numbers=layer.numbers_d, keys=layer.keys_d, layer=layer_d, layer_depths=depths_d, color=color,
-            has_normals=part.normals is not None, has_colors=part.colors is not None, shaded=part.lighting.shades,
-            first=self.first, **self._picture,
+            normals=self._normals_d, colors=self._colors_d, highlights=self._highlights_d, numbers=layer.numbers_d,
+            keys=layer.keys_d, layer=layer_d, layer_depths=depths_d, color=color, has_normals=part.normals is not None,
+            has_colors=part.colors is not None, shaded=part.lighting.shades, first=self.first, **self._picture,
         )  # fmt: skip
 
 

@@ -189,17 +189,14 @@ class _Splats:
 
         tell(0)
         with stopwatch.running(device):
-            launch(
-                device, program["clear_splats"], pixels, stopwatch=stopwatch,
-                keys=keys_d, numbers=numbers_d, pixels=pixels,
-            )  # fmt: skip
+            launch(device, program["clear_splats"], pixels, keys=keys_d, numbers=numbers_d, pixels=pixels)
         for number, kernel in enumerate(("splat_depths", "splat_numbers")):
             for first in starts:
                 held, points_d = min(count, n - first), hold(first)
                 more = {"numbers": numbers_d, "first": first} if number else {}
                 with stopwatch.running(device):  # wait: CPU devices read the host's arrays
                     launch(
-                        device, program[kernel], max(held, 1), stopwatch=stopwatch,
+                        device, program[kernel], max(held, 1),
                         points=points_d, keys=keys_d, radius=self.radius, count=held, **more, **picture,
                     )  # fmt: skip
                 del points_d
@@ -214,10 +211,9 @@ class _Splats:
             )
             with stopwatch.running(device):
                 launch(
-                    device, program["shade_splats"], pixels, stopwatch=stopwatch,
-                    keys=keys_d, numbers=numbers_d, normals=normals_d, colors=colors_d, highlights=lights_d,
-                    image=image_d, depths=depths_d, background=self.background, shading=_SHADINGS[self.shading],
-                    apart=self.apart, first=first, count=held, **picture,
+                    device, program["shade_splats"], pixels, keys=keys_d, numbers=numbers_d, normals=normals_d,
+                    colors=colors_d, highlights=lights_d, image=image_d, depths=depths_d, background=self.background,
+                    shading=_SHADINGS[self.shading], apart=self.apart, first=first, count=held, **picture,
                 )  # fmt: skip
             del normals_d, colors_d
             tell(2 * n + first + held)

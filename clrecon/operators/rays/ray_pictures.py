@@ -149,9 +149,8 @@ class TransferTables:
             factors = function.gradient_table(top, GRADIENT_NODES)
         return cls(
             upload(device, colors), upload(device, opacities), upload(device, clears),
-            upload(device, steepness.changes.astype(np.float32)), upload(device, factors), shown, low,
-            scale, steepness, (GRADIENT_NODES - 1) / top, function.unit_distance / ray_step,
-            function.gradient_opacity is not None,
+            upload(device, steepness.changes.astype(np.float32)), upload(device, factors), shown, low, scale, steepness,
+            (GRADIENT_NODES - 1) / top, function.unit_distance / ray_step, function.gradient_opacity is not None,
         )  # fmt: skip
 
 
@@ -230,11 +229,11 @@ def composite_slab(
     queues = count_queues(device)
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
     with stopwatch.running(device):  # wait: CPU devices read host arrays that are freed here
-        entries_d = enter_tiles(resident, slab, view, leaps, output, stopwatch)
+        entries_d = enter_tiles(resident, slab, view, leaps, output)
         way = MainWay.of(resident, slab, view.camera)
-        ways_d = look_ahead(resident, slab, way, leaps, stopwatch)
+        ways_d = look_ahead(resident, slab, way, leaps)
         launch(
-            device, program["composite_rays"], output.items(queues, lanes), stopwatch=stopwatch,
+            device, program["composite_rays"], output.items(queues, lanes),
             ways=ways_d, entries=entries_d, highlights=upload(device, highlight_table(lighting)),
             view=upload(device, view.table), last_place=last, slope=resident.stack.slope, shaded=lighting.shades,
             jitter=jitter, queues=queues, **{**slab.arguments, **shortened}, **tables.arguments, **output.arguments,
@@ -242,9 +241,7 @@ def composite_slab(
         )  # fmt: skip
 
 
-def enter_tiles(
-    resident: DeviceVolume, slab: RaySlab, view: RayView, leaps: LeapMap, output: PictureBuffers, stopwatch: Stopwatch
-) -> Any:
+def enter_tiles(resident: DeviceVolume, slab: RaySlab, view: RayView, leaps: LeapMap, output: PictureBuffers) -> Any:
     """Return for each tile the distance in mm before which its rays meet nothing visible, on the device."""
     device = resident.device
     lanes = int(device.kernel_variants["LANES"])
@@ -253,7 +250,7 @@ def enter_tiles(
     margin = math.ceil(min((resident.stack.index_steps(view.spread) / slab.brick_cells).max(), FARTHEST))
     entries_d = allocate(device, 4 * output.tiles)
     launch(
-        device, resident.program("rays/tiles.cl")["enter_tiles"], -(-output.tiles // lanes), stopwatch=stopwatch,
+        device, resident.program("rays/tiles.cl")["enter_tiles"], -(-output.tiles // lanes),
         leaps=leaps.distances_d, view=upload(device, view.widened()), entries=entries_d, slope=resident.stack.slope,
         first_k=slab.first_k, margin=margin, width=width, height=height, perspective=not camera.is_parallel,
         **slab.brick_arguments, **resident.stack.arguments,
@@ -261,14 +258,14 @@ def enter_tiles(
     return entries_d
 
 
-def look_ahead(resident: DeviceVolume, slab: RaySlab, way: MainWay, leaps: LeapMap, stopwatch: Stopwatch) -> Any:
+def look_ahead(resident: DeviceVolume, slab: RaySlab, way: MainWay, leaps: LeapMap) -> Any:
     """Return for each brick the empty distance around it, and ahead of it along the main way, on the device."""
     bi, bj, bk = bricks = slab.bricks
     count = math.prod(bricks)
     ways_d = allocate(resident.device, count)
     launch(
         resident.device, resident.program("rays/leaps.cl")["look_ahead"], count // bricks[way.axis],
-        stopwatch=stopwatch, distances=leaps.distances_d, ways=ways_d, bi=bi, bj=bj, bk=bk, **way.arguments,
+        distances=leaps.distances_d, ways=ways_d, bi=bi, bj=bj, bk=bk, **way.arguments,
     )  # fmt: skip
     return ways_d
 
@@ -283,9 +280,7 @@ PROJECTIONS = {
 """Numbers of the modes in the kernel."""
 
 
-def project_slab(
-    resident: DeviceVolume, slab: RaySlab, view: RayView, mode: str, output: PictureBuffers, stopwatch: Stopwatch
-) -> None:
+def project_slab(resident: DeviceVolume, slab: RaySlab, view: RayView, mode: str, output: PictureBuffers) -> None:
     """Add one slab to a projection, "mip", "minip", "mean" or "drr"; `output.means_d` receives the values."""
     variants = {"LEAST_VALUE": f"({AIR_HU:g})"} if mode == "drr" else {}
     device = resident.device
@@ -293,7 +288,7 @@ def project_slab(
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
     launch(
         device, resident.program("rays/project.cl", **variants)["project_rays"], output.items(queues, lanes),
-        stopwatch=stopwatch, ranges=measure_cells(resident, slab, stopwatch), view=upload(device, view.table),
+        ranges=measure_cells(resident, slab), view=upload(device, view.table),
         states=output.states_d, depths=output.depths_d, values=output.means_d, last_place=last,
         which=PROJECTIONS[mode], queues=queues, **slab.arguments, **view.arguments, **resident.stack.arguments,
     )  # fmt: skip
@@ -385,7 +380,7 @@ class _Job:
             slabs += 1
             if isinstance(style, Projection):
                 with stopwatch.running(device):  # wait: CPU devices read host arrays
-                    project_slab(resident, slab, self._view(self.box), style.kind, output, stopwatch)
+                    project_slab(resident, slab, self._view(self.box), style.kind, output)
             else:
                 self._composite(slab, style, output)
             self.progress("slabs", min(slabs * slices, nk), nk)
@@ -426,7 +421,7 @@ class _Job:
         key = (style.function, self.ray_step)
         tables = resident.keep("transfer function", key, 0, lambda: TransferTables.of(resident.device, *key))
         with stopwatch.running(resident.device):
-            leaps = find_leaps(resident, slab, key, tables.shown, tables.low, tables.scale, stopwatch)
+            leaps = find_leaps(resident, slab, key, tables.shown, tables.low, tables.scale)
         nothing = (self.box[1], self.box[1])
         view = self._view(nothing if leaps.box is None else leaps.box)
         composite_slab(

@@ -226,26 +226,20 @@ ROWS_AT_ONCE = kernel_constant("rays/leaps.cl", "ROWS_AT_ONCE")
 """Rows of bricks for each work-item."""
 
 
-def measure_cells(resident: DeviceVolume, slab: RaySlab, stopwatch: Stopwatch) -> Any:
+def measure_cells(resident: DeviceVolume, slab: RaySlab) -> Any:
     """Return the lowest and highest value of samples in each brick of a slab, (bk, bj, bi, 2), on the device."""
     if slab.ranges_d is None:
         bricks, (ni, nj, nk) = math.prod(slab.bricks), slab.shape_ijk
         slab.ranges_d = allocate(resident.device, 2 * bricks * resident.dtype.itemsize)
         launch(
-            resident.device, resident.program("rays/leaps.cl")["measure_cells"], bricks, stopwatch=stopwatch,
+            resident.device, resident.program("rays/leaps.cl")["measure_cells"], bricks,
             voxels=slab.voxels_d, ranges=slab.ranges_d, ni=ni, nj=nj, nk=nk, **slab.brick_arguments,
         )  # fmt: skip
     return slab.ranges_d
 
 
 def find_leaps(
-    resident: DeviceVolume,
-    slab: RaySlab,
-    key: Any,
-    shown: NDArray[np.bool_],
-    low: float,
-    scale: float,
-    stopwatch: Stopwatch,
+    resident: DeviceVolume, slab: RaySlab, key: Any, shown: NDArray[np.bool_], low: float, scale: float
 ) -> LeapMap:
     """Return the leap map for visible values, or the map that was made for `key`, which tells the source of `shown`,
     before.
@@ -255,19 +249,18 @@ def find_leaps(
     known = slab.maps.get(key)
     if known is not None:
         return known
-    ranges_d = measure_cells(resident, slab, stopwatch)
+    ranges_d = measure_cells(resident, slab)
     device, program = resident.device, resident.program("rays/leaps.cl")
     bi, bj, bk = slab.bricks
     bricks = bi * bj * bk
     counts_d = upload(device, np.concatenate([[0], np.cumsum(shown)]).astype(np.int32))
     from_d, to_d = allocate(device, bricks), allocate(device, bricks)
     launch(
-        device, program["mark_bricks"], bricks, stopwatch=stopwatch,
-        ranges=ranges_d, shown=counts_d, distances=from_d, bins_low=low, bins_scale=scale, bins=len(shown),
-        bricks=bricks,
+        device, program["mark_bricks"], bricks, ranges=ranges_d, shown=counts_d, distances=from_d, bins_low=low,
+        bins_scale=scale, bins=len(shown), bricks=bricks,
     )  # fmt: skip
     launch(
-        device, program["spread_in_rows"], -(-bj * bk // ROWS_AT_ONCE), stopwatch=stopwatch,
+        device, program["spread_in_rows"], -(-bj * bk // ROWS_AT_ONCE),
         distances=from_d, spread=to_d, bi=bi, rows=bj * bk,
     )  # fmt: skip
     for outer, count, stride in ((bk, bj, bi), (1, bk, bi * bj)):
@@ -275,7 +268,7 @@ def find_leaps(
         chunks = -(-stride // 16)
         items = outer * count * chunks
         launch(
-            device, program["spread_along"], items, stopwatch=stopwatch,
+            device, program["spread_along"], items,
             distances=from_d, spread=to_d, count=count, stride=stride, chunks=chunks, items=items,
         )  # fmt: skip
     from_d = to_d

@@ -214,7 +214,7 @@ class _Layers:
 
     def _count_open(self) -> int:
         with self.stopwatch.running(self.device):
-            open_d = zero_words(self.device, 1, stopwatch=self.stopwatch)
+            open_d = zero_words(self.device, 1)
             items = -(-self.pixels // COUNTED)
             self._launch("count_open", items, keys=self.keys.keys_d, open=open_d, pixels=self.pixels)
         return int(download(self.device, np.zeros(1, np.uint32), open_d)[0])
@@ -224,10 +224,7 @@ class _Layers:
             self._launch("fill_depths", depths=depths_d, depth=depth, pixels=self.pixels)
 
     def _launch(self, kernel: str, items: int | None = None, **arguments: Any) -> None:
-        launch(
-            self.device, self.program[kernel], self.pixels if items is None else items, stopwatch=self.stopwatch,
-            **arguments,
-        )  # fmt: skip
+        launch(self.device, self.program[kernel], self.pixels if items is None else items, **arguments)
 
     @property
     def _rays(self) -> dict[str, Any]:
@@ -410,9 +407,8 @@ class ScenePictures(Closing):
         """Draw all layers on a device."""
         found = draw_layers(
             device, self._parts, camera, size, still=_join_stills(drawn),
-            volume=None if volume is None else volume.sample,
-            near_mm=0.0 if volume is None else volume.near_mm, background=background, memory=self.memory,
-            stopwatch=stopwatch, progress=progress,
+            volume=None if volume is None else volume.sample, near_mm=0.0 if volume is None else volume.near_mm,
+            background=background, memory=self.memory, stopwatch=stopwatch, progress=progress,
         )  # fmt: skip
         warnings = [*device.warnings, *told]
         for each in drawn:

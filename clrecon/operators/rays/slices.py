@@ -234,9 +234,8 @@ class _Overlay:
         program = load_program(device, "rays/slices.cl", variants)
         with stopwatch.running(device):  # wait: CPU devices read the host's array
             launch(
-                device, program["overlay_slices"], output.items(queues, 1), stopwatch=stopwatch,
-                slices=slices_d, places=upload(device, places), colors=upload(device, colors.table),
-                view=upload(device, view.table), ni=ni, nj=nj, count=len(part), bins_low=colors.low,
-                bins_scale=colors.scale, opacity=style.opacity, lowest=style.lowest_hu, stage=stage, queues=queues,
-                **output.arguments, **view.arguments, **shortened,
+                device, program["overlay_slices"], output.items(queues, 1), slices=slices_d,
+                places=upload(device, places), colors=upload(device, colors.table), view=upload(device, view.table),
+                ni=ni, nj=nj, count=len(part), bins_low=colors.low, bins_scale=colors.scale, opacity=style.opacity,
+                lowest=style.lowest_hu, stage=stage, queues=queues, **output.arguments, **view.arguments, **shortened,
             )  # fmt: skip

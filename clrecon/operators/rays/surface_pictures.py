@@ -146,11 +146,11 @@ class _Job:
         low_k, high_k = _field_heights(volume, self.frame, (slab.low_k, slab.high_k))
         last = [n - 1 for n in volume.shape_ijk]
         with self.stopwatch.running(device):  # wait: CPU devices read host arrays
-            leaps = _find_leaps(resident, slab, rule.iso_level, self.stopwatch)
+            leaps = _find_leaps(resident, slab, rule.iso_level)
             view = self._view(leaps)
             launch(
                 device, resident.program("rays/surface.cl", **variants)["trace_surface"], output.items(queues, lanes),
-                stopwatch=self.stopwatch, leaps=leaps.distances_d, view=upload(device, view.table),
+                leaps=leaps.distances_d, view=upload(device, view.table),
                 highlights=upload(device, highlight_table(look.light)), last_place=_float4(*last),
                 slope=resident.stack.slope, level=rule.iso_level, outside=rule.outside, color=_float4(*look.rgb),
                 light_step=self._light_step(), cue=self._cue(), queues=queues,
@@ -217,16 +217,14 @@ def _float4(*numbers: float) -> NDArray[np.float32]:
     return vector
 
 
-def _find_leaps(resident: DeviceVolume, slab: RaySlab, level: float, stopwatch: Stopwatch) -> LeapMap:
+def _find_leaps(resident: DeviceVolume, slab: RaySlab, level: float) -> LeapMap:
     """Find the bricks that reach the level.
 
     The table has two nodes, and the second is visible.  A value is nearest to it from half a `unit` above `low` on,
     which is the level.  Marking subtracts a hundredth of a unit, far more than the errors of float32.
     """
     unit = max(1e-3 * abs(level), 1e-6)
-    return find_leaps(
-        resident, slab, ("surface", level), np.array([False, True]), level - 0.5 * unit, 1.0 / unit, stopwatch
-    )
+    return find_leaps(resident, slab, ("surface", level), np.array([False, True]), level - 0.5 * unit, 1.0 / unit)
 
 
 def _field_heights(volume: Volume, frame: FieldFrame, ks: Sequence[float]) -> list[float]:

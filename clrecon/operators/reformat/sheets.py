@@ -190,9 +190,8 @@ class _Run:
         for first in range(0, height, rows):
             count = min(rows, height - first)
             launch(
-                self.device, program["reformat_rows"], count * width, stopwatch=self.stopwatch,
-                first_row=first, row_count=count, width=width, ni=ni, nj=nj, nk=nk,
-                intervals=self.samples.intervals, combine=COMBINATIONS[self.combine], **part,
+                self.device, program["reformat_rows"], count * width, first_row=first, row_count=count, width=width,
+                ni=ni, nj=nj, nk=nk, intervals=self.samples.intervals, combine=COMBINATIONS[self.combine], **part,
             )  # fmt: skip
 
 

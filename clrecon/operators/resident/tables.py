@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike, NDArray
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.iso_rule import slice_normal_matrices
-from clrecon.opencl import Device, Program, Stopwatch, allocate, kernel_constant, launch, load_program, upload
+from clrecon.opencl import Device, Program, allocate, kernel_constant, launch, load_program, upload
 
 _NAMES = {
     "int8": "char", "uint8": "uchar", "int16": "short", "uint16": "ushort", "int32": "int", "float32": "float",
@@ -176,28 +176,19 @@ def prepare_bricks(device: Device, dtype: np.dtype[Any]) -> Program:
     return load_program(device, "resident/bricks.cl", voxel_variants(dtype))
 
 
-def measure_bricks(
-    device: Device,
-    voxels_d: Any,
-    shape_ijk: tuple[int, int, int],
-    dtype: np.dtype[Any],
-    *,
-    stopwatch: Stopwatch | None = None,
-) -> BrickRanges:
+def measure_bricks(device: Device, voxels_d: Any, shape_ijk: tuple[int, int, int], dtype: np.dtype[Any]) -> BrickRanges:
     """Find the lowest and highest value of each brick of 8 x 8 x 8 voxels, or fewer at upper ends, none of them NaN."""
     ni, nj, nk = shape_ijk
     bi, bj, bk = (-(-n // BRICK) for n in shape_ijk)
     ranges_d = allocate(device, brick_bytes(shape_ijk, dtype))
     launch(
-        device, prepare_bricks(device, dtype)["measure_bricks"], bi * bj * bk, stopwatch=stopwatch,
+        device, prepare_bricks(device, dtype)["measure_bricks"], bi * bj * bk,
         voxels=voxels_d, ranges=ranges_d, ni=ni, nj=nj, nk=nk, bi=bi, bj=bj, bk=bk,
     )  # fmt: skip
     return BrickRanges(ranges_d, (bi, bj, bk), dtype)
 
 
-def compare_bricks(
-    device: Device, ranges: BrickRanges, level: Any, ni: int, border: int, *, stopwatch: Stopwatch | None = None
-) -> BrickStates:
+def compare_bricks(device: Device, ranges: BrickRanges, level: Any, ni: int, border: int) -> BrickStates:
     """Classify each word of 32 samples by its bricks, all outside (0), all inside (1) or mixed (2), and find the extent
     of each row of bricks: the first word that is not all outside, and the one after the last.
 
@@ -209,8 +200,7 @@ def compare_bricks(
     words = -(-(ni + 2 * border) // 32)
     states_d, extents_d = allocate(device, words * bj * bk), allocate(device, 4 * bj * bk)
     launch(
-        device, prepare_bricks(device, ranges.dtype)["compare_bricks"], bj * bk, stopwatch=stopwatch,
-        ranges=ranges.ranges_d, states=states_d, extents=extents_d, level=level, ni=ni, border=border, words=words,
-        rows=bj * bk,
+        device, prepare_bricks(device, ranges.dtype)["compare_bricks"], bj * bk, ranges=ranges.ranges_d,
+        states=states_d, extents=extents_d, level=level, ni=ni, border=border, words=words, rows=bj * bk,
     )  # fmt: skip
     return BrickStates(states_d, extents_d)

@@ -243,14 +243,13 @@ class WallProfiles:
         noise_hu: float,
         *,
         cortex_spread: float = CORTEX_SPREAD,
-        stopwatch: Stopwatch | None = None,
     ) -> WallFits:
         """Fit a wall to each profile."""
         device, lanes = self._device, int(self._device.kernel_variants["LANES"])
         fits, fits_d = empty_output(device, (RESULTS, self._stride), np.float32)
         outer, cortex, inner = expected_precisions(cortex_hu, noise_hu, cortex_spread, self._scale.independent)
         launch(
-            device, self._program["fit_profiles"], -(-self._count // lanes), stopwatch=stopwatch,
+            device, self._program["fit_profiles"], -(-self._count // lanes),
             profiles=self._values_d, weights=self._weights_d, fits=fits_d,
             first_mm=self._scale.first_mm, step_mm=self._scale.step_mm, blur=blur_mm, across=across_mm,
             cortex=cortex_hu, inner=INNER_SHARE * cortex_hu, keep_outer=outer, keep_cortex=cortex, keep_inner=inner,
@@ -258,11 +257,11 @@ class WallProfiles:
         )  # fmt: skip
         return WallFits(*download(device, fits, fits_d)[:, : self._count])
 
-    def fit_with(self, constants: CortexConstants, stopwatch: Stopwatch | None = None) -> WallFits:
+    def fit_with(self, constants: CortexConstants) -> WallFits:
         """Fit a wall to each profile with the constants of a scan."""
         return self.fit(
             constants.blur_mm, constants.blur_across_mm, constants.cortex_hu, constants.known_noise,
-            cortex_spread=constants.cortex_spread, stopwatch=stopwatch,
+            cortex_spread=constants.cortex_spread,
         )  # fmt: skip
 
 
@@ -331,7 +330,7 @@ class ProfileSampler:
         stride = stride_of(len(places))
         values_d = allocate(device, 4 * ROWS * stride)
         launch(
-            device, self.program["sample_profiles"], len(places), stopwatch=self._stopwatch, voxels=voxels_d,
+            device, self.program["sample_profiles"], len(places), voxels=voxels_d,
             slices=upload(device, self.frame.slices), places=upload(device, places),
             directions=upload(device, directions), profiles=values_d, ni=ni, nj=nj, nk=nk, first_k=first_k,
             first_mm=self.scale.first_mm, step_mm=self.scale.step_mm, usual_gap=self.frame.usual_gap,
@@ -559,7 +558,7 @@ def fit_walls(
     fit = CortexFit(constants, np.empty(count, np.uint8), *(np.empty(count, np.float32) for _ in range(5)))
     for rows, values_d in sampler.pieces(points, normals):
         with stopwatch.running(resident.device):
-            walls = WallProfiles(sampler, values_d, len(rows)).fit_with(constants, stopwatch)
+            walls = WallProfiles(sampler, values_d, len(rows)).fit_with(constants)
         fit.states[rows] = judge_walls(walls, constants, sampler.scale)
         fit.shift_mm[rows], fit.thickness_mm[rows] = walls.shift_mm, walls.thickness_mm
         fit.room_mm[rows] = walls.room_mm

@@ -163,11 +163,11 @@ class Extraction:
             classified = join_slabs(
                 self.resident, self.grid, ((slab, self._classify(slab, self._upload_part(slab))) for slab in slabs)
             )
-            self._grown = grow(self.resident, self.grid, classified, seeds, self.stopwatch)
+            self._grown = grow(self.resident, self.grid, classified, seeds)
 
     def _classify(self, slab: Slab, voxels_d: Any) -> Classified:
         bricks = self._compare_bricks(slab, voxels_d)
-        return marching_cubes.classify(self.device, slab, voxels_d, self.levels, self.stopwatch, bricks)
+        return marching_cubes.classify(self.device, slab, voxels_d, self.levels, bricks)
 
     def _add_slab(self, slab: Slab) -> None:
         """Make the part of the surface that belongs to a slab."""
@@ -185,9 +185,9 @@ class Extraction:
                 classified = self._classify(slab, voxels_d)
             if self._seeds is not None:
                 if self._grown is None:
-                    self._grown = grow(self.resident, self.grid, classified, self._seeds, stopwatch)
+                    self._grown = grow(self.resident, self.grid, classified, self._seeds)
                 classified = self._grown.part(classified, slab.first)
-            counted = count(device, slab, classified, stopwatch, voxels_d)
+            counted = count(device, slab, classified, voxels_d)
         if self._vertices_only:
             counted = replace(counted, triangles=0)
         self._check_output(slab, counted)
@@ -213,15 +213,13 @@ class Extraction:
         """
         if not slab.is_whole or not self.was_held or slab.grid.rule.inside != "above":
             return None
-        volume, stopwatch = self.grid.volume, self.stopwatch
+        volume, _stopwatch = self.grid.volume, self.stopwatch
         ranges = self.resident.keep(
             BRICKS, None, brick_bytes(volume.shape_ijk, volume.voxels.dtype),
-            lambda: measure_bricks(
-                self.device, voxels_d, volume.shape_ijk, volume.voxels.dtype, stopwatch=stopwatch
-            ),
+            lambda: measure_bricks( self.device, voxels_d, volume.shape_ijk, volume.voxels.dtype ),
         )  # fmt: skip
         ni, border = volume.shape_ijk[0], slab.grid.rule.border
-        return compare_bricks(self.device, ranges, self.levels[0], ni, border, stopwatch=stopwatch)
+        return compare_bricks(self.device, ranges, self.levels[0], ni, border)
 
     def _check_output(self, slab: Slab, counted: Counted) -> None:
         """Refuse a slab whose mesh does not fit beside the other buffers; record the memory of the slab."""

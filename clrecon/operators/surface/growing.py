@@ -175,14 +175,13 @@ class Components:
 
 def choose_components(
     device: Device, grid: SampleGrid, classified: Classified, runs: Runs, components: Components, seeds: Seeds,
-    stopwatch: Stopwatch,
 ) -> None:  # fmt: skip
     """Choose the components that hold a seed, and sum up all."""
     program, (gi, gj, gk) = prepare_choosing(device), grid.shape
     sizes = {"gi": gi, "gj": gj, "gk": gk, "words": grid.words}
 
     def run(kernel: str, items: int, **arguments: Any) -> None:
-        launch(device, program[kernel], items, stopwatch=stopwatch, **arguments)
+        launch(device, program[kernel], items, **arguments)
 
     n = runs.total
     if seeds.auto:
@@ -202,7 +201,7 @@ def choose_components(
             seeds=upload(device, seeds.voxels), enclosed_set=grid.rule.inside != "below",
             voxel_words=seeds.voxels.shape[2], **runs.places, **components.places, **sizes,
         )  # fmt: skip
-    sum_components(device, runs, components, stopwatch)
+    sum_components(device, runs, components)
     if seeds.auto or len(seeds.points):
         return
     sums = Sums.read(device, components.sums_d)
@@ -213,10 +212,10 @@ def choose_components(
         )
 
 
-def sum_components(device: Device, runs: Runs, components: Components, stopwatch: Stopwatch) -> None:
+def sum_components(device: Device, runs: Runs, components: Components) -> None:
     """Sum up the components."""
     launch(
-        device, prepare_choosing(device)["sum_components"], runs.total, stopwatch=stopwatch,
+        device, prepare_choosing(device)["sum_components"], runs.total,
         run_cells=components.cells_d, sums=components.sums_d, runs=runs.total, **components.places,
     )  # fmt: skip
 
@@ -276,8 +275,8 @@ class Grown:
 class _Search:
     """Components of the active cells of one grid."""
 
-    def __init__(self, resident: DeviceVolume, grid: SampleGrid, classified: Classified, stopwatch: Stopwatch):
-        self.resident, self.grid, self.classified, self.stopwatch = resident, grid, classified, stopwatch
+    def __init__(self, resident: DeviceVolume, grid: SampleGrid, classified: Classified):
+        self.resident, self.grid, self.classified = resident, grid, classified
         self.device = resident.device
         self.program = prepare_growing(self.device)
         gi, gj, gk = grid.shape
@@ -286,7 +285,7 @@ class _Search:
         self.sizes = {"gi": gi, **self.row_sizes}
 
     def run(self, kernel: str, items: int, **arguments: Any) -> None:
-        launch(self.device, self.program[kernel], items, stopwatch=self.stopwatch, **arguments)
+        launch(self.device, self.program[kernel], items, **arguments)
 
     def find_runs(self) -> Runs:
         """Find the runs of all rows."""
@@ -299,7 +298,7 @@ class _Search:
             word_runs=words_d, row_runs=counts_d, run_extents=extents_d,
             **self.sizes,
         )  # fmt: skip
-        scanned = exclusive_scan(self.device, counts_d, self.rows, in_place=True, stopwatch=self.stopwatch)
+        scanned = exclusive_scan(self.device, counts_d, self.rows, in_place=True)
         if scanned.total >= MOST_RUNS:
             raise DeviceMemoryError(f"the surface has {scanned.total:,} runs of cells: {MOST_RUNS:,} can be numbered")
         return Runs(active_d, starts_d, words_d, extents_d, scanned.offsets_d, scanned.total)
@@ -336,7 +335,7 @@ class _Search:
             "count_visited", self.rows, grown=grown_d, grown_extents=extents_d, counts=counts_d,
             **self.sizes,
         )  # fmt: skip
-        return grown_d, extents_d, enqueue_scan(device, counts_d, counts_d, self.rows, stopwatch=self.stopwatch)
+        return grown_d, extents_d, enqueue_scan(device, counts_d, counts_d, self.rows)
 
 
 def growing_needs(grid: SampleGrid) -> dict[str, int]:
@@ -364,14 +363,14 @@ def join_slabs(
     return Classified(mask_d, extents_d)
 
 
-def grow(resident: DeviceVolume, grid: SampleGrid, classified: Classified, seeds: Seeds, stopwatch: Stopwatch) -> Grown:
+def grow(resident: DeviceVolume, grid: SampleGrid, classified: Classified, seeds: Seeds) -> Grown:
     """Find the components of active cells that hold a seed, from the inside mask of the whole grid, without waiting."""
-    search = _Search(resident, grid, classified, stopwatch)
+    search = _Search(resident, grid, classified)
     runs = search.find_runs()
     if runs.total == 0:
         raise NoSurfaceError(f"no surface {grid.rule.phrase()} to grow")
     components = search.join(runs)
-    choose_components(resident.device, grid, classified, runs, components, seeds, stopwatch)
+    choose_components(resident.device, grid, classified, runs, components, seeds)
     grown_d, extents_d, visited_d = search.mark(runs, components)
     return Grown(grown_d, extents_d, classified, components.sums_d, visited_d, seeds.names)
 
@@ -380,12 +379,12 @@ def find_components(
     resident: DeviceVolume, grid: SampleGrid, classified: Classified, stopwatch: Stopwatch
 ) -> tuple[int, int]:
     """Count all components of active cells of the inside mask of the whole grid, and these cells."""
-    search = _Search(resident, grid, classified, stopwatch)
+    search = _Search(resident, grid, classified)
     with stopwatch.running(resident.device):
         runs = search.find_runs()
         if runs.total == 0:
             return 0, 0
         components = search.join(runs)
-        sum_components(resident.device, runs, components, stopwatch)
+        sum_components(resident.device, runs, components)
     sums = Sums.read(resident.device, components.sums_d)
     return sums.components, sums.active_cells

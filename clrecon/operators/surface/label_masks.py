@@ -96,10 +96,10 @@ def _survey(
     ni, nj, nk = labels.shape_ijk
     grid: dict[str, Any] = {"map": map_d, "ni": ni, "nj": nj, "nk": nk}
     with stopwatch.running(device):
-        launch(device, program["clear_survey"], size, stopwatch=stopwatch, boxes=boxes_d, faces=faces_d, labels=size)
-        launch(device, program["find_boxes"], nj * nk, stopwatch=stopwatch, boxes=boxes_d, **grid)
+        launch(device, program["clear_survey"], size, boxes=boxes_d, faces=faces_d, labels=size)
+        launch(device, program["find_boxes"], nj * nk, boxes=boxes_d, **grid)
         if touch:
-            launch(device, program["count_faces"], nj * nk, stopwatch=stopwatch, faces=faces_d, **grid)
+            launch(device, program["count_faces"], nj * nk, faces=faces_d, **grid)
     return _widen(download(device, boxes, boxes_d), labels.numbers, (ni, nj, nk)), download(device, faces, faces_d)
 
 
@@ -218,17 +218,14 @@ class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
         row_k = max(held.first, begin_k - REACH), min(held.end, end_k + REACH)
         slices = row_k[1] - row_k[0]
         launch(
-            self.device, self.programs()[0]["smooth_rows"], slices * (row_j[1] - row_j[0]), stopwatch=self.stopwatch,
-            map=held.map_d, rows=held.rows_d, strips=held.strips_d, label=number, ni=ni, nj=nj,
-            begin_i=begin_i, end_i=end_i, begin_j=row_j[0], end_j=row_j[1], begin_slice=row_k[0] - held.first,
-            slices=slices,
+            self.device, self.programs()[0]["smooth_rows"], slices * (row_j[1] - row_j[0]), map=held.map_d,
+            rows=held.rows_d, strips=held.strips_d, label=number, ni=ni, nj=nj, begin_i=begin_i, end_i=end_i,
+            begin_j=row_j[0], end_j=row_j[1], begin_slice=row_k[0] - held.first, slices=slices,
         )  # fmt: skip
         launch(
-            self.device, self.programs()[0]["smooth_across"], (end_k - begin_k) * (end_j - begin_j),
-            stopwatch=self.stopwatch,
-            rows=held.rows_d, strips=held.strips_d, occupancy=occupancy_d, ni=ni, nj=nj, nk=nk,
-            begin_i=begin_i, end_i=end_i, begin_j=begin_j, end_j=end_j, first_row_slice=held.first,
-            first_slice=begin_k, slices=end_k - begin_k,
+            self.device, self.programs()[0]["smooth_across"], (end_k - begin_k) * (end_j - begin_j), rows=held.rows_d,
+            strips=held.strips_d, occupancy=occupancy_d, ni=ni, nj=nj, nk=nk, begin_i=begin_i, end_i=end_i,
+            begin_j=begin_j, end_j=end_j, first_row_slice=held.first, first_slice=begin_k, slices=end_k - begin_k,
         )  # fmt: skip
 
     def keep_enclosed(self, numbers: Sequence[int], boxes: dict[int, Box]) -> None:
@@ -265,11 +262,11 @@ class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
         with stopwatch.running(device):
             self._smooth(held, number, box, held.occupancy_d)
             launch(
-                device, own["classify_mask"], window.mask_rows, stopwatch=stopwatch,
+                device, own["classify_mask"], window.mask_rows,
                 map=held.map_d, mask=classified.mask_d, row_extents=classified.row_extents_d, label=number,
                 begin_j=box[1].start, end_j=box[1].stop, **window.arguments,
             )  # fmt: skip
-            counted = count(device, window, classified, stopwatch)
+            counted = count(device, window, classified)
         self.check_output(window, counted)
         emission = marching_cubes.Emission(
             device, window, surface, held.occupancy_d, classified, counted, self.placement, stopwatch
@@ -331,7 +328,7 @@ class StartedMesh:
         sums_d = allocate(device, sums.nbytes)
         with stopwatch.running(device):
             launch(
-                device, self.run.programs()[0]["sum_volumes"], len(sums), stopwatch=stopwatch,
+                device, self.run.programs()[0]["sum_volumes"], len(sums),
                 positions=self.emission.positions_d, triangles=self.emission.triangles_d, sums=sums_d, centre=centre,
                 triangle_count=triangles, triangles_per_sum=TRIANGLES_PER_SUM,
             )  # fmt: skip

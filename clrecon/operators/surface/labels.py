@@ -263,9 +263,8 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
         inside_d = allocate(device, labels.nbytes)
         with stopwatch.running(device):
             launch(
-                device, own["own_samples"], labels.size, stopwatch=stopwatch,
-                voxels=voxels_d, labels=labels_d, near=near_d, inside=inside_d, level=self.level,
-                nk=labels.shape[0], nj=labels.shape[1], ni=labels.shape[2], offsets=len(near),
+                device, own["own_samples"], labels.size, voxels=voxels_d, labels=labels_d, near=near_d, inside=inside_d,
+                level=self.level, nk=labels.shape[0], nj=labels.shape[1], ni=labels.shape[2], offsets=len(near),
             )  # fmt: skip
         if self.solid:
             inside_d = self._fill(boxes, first, end, inside_d)
@@ -291,11 +290,10 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
         half_way_d = allocate(device, 4)
         with stopwatch.running(device):
             launch(
-                device, own["classify_label"], window.mask_rows, stopwatch=stopwatch,
-                inside=held.inside_d, mask=classified.mask_d, row_extents=classified.row_extents_d,
-                half_way_count=half_way_d, label=number, **window.arguments,
+                device, own["classify_label"], window.mask_rows, inside=held.inside_d, mask=classified.mask_d,
+                row_extents=classified.row_extents_d, half_way_count=half_way_d, label=number, **window.arguments,
             )  # fmt: skip
-            counted = count(device, window, classified, stopwatch)
+            counted = count(device, window, classified)
         if counted.triangles == 0:
             return None
         self.check_output(window, counted)

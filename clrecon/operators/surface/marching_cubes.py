@@ -86,7 +86,7 @@ class Counted:
         return {"vertices": 24 * self.vertices, "triangles": 12 * self.triangles}
 
 
-def count(device: Device, slab: Slab, classified: Classified, stopwatch: Stopwatch, voxels_d: Any = None) -> Counted:
+def count(device: Device, slab: Slab, classified: Classified, voxels_d: Any = None) -> Counted:
     """Passes 2 to 4: count vertices and triangles, find where those of each word begin, and which words have any.
 
     The topology of the trilinear field needs slices ``slab.voxel_slices`` of the volume.
@@ -98,7 +98,7 @@ def count(device: Device, slab: Slab, classified: Classified, stopwatch: Stopwat
     word_vertices_d, word_triangles_d = (allocate(device, 2 * rows * grid.words) for _ in range(2))
     flags_d = allocate(device, 4 * rows * grid.flag_words)
     launch(
-        device, program["count_rows"], rows, stopwatch=stopwatch,
+        device, program["count_rows"], rows,
         mask=classified.mask_d, row_extents=classified.row_extents_d, row_counts=row_counts_d,
         words_with_work=flags_d, word_vertices=word_vertices_d, word_triangles=word_triangles_d,
         gi=gi, gj=gj, gk=slab.mask_slices, words=grid.words, flag_words=grid.flag_words, rows_to_count=rows,
@@ -106,13 +106,11 @@ def count(device: Device, slab: Slab, classified: Classified, stopwatch: Stopwat
     )  # fmt: skip
     cells = None
     if grid.rule.topology == "trilinear":
-        cells = count_cells(
-            device, slab, voxels_d, classified.mask_d, flags_d, row_counts_d, word_triangles_d, stopwatch
-        )
-    total_d = enqueue_scan(device, row_counts_d, row_counts_d, 3 * rows, stopwatch=stopwatch)
+        cells = count_cells(device, slab, voxels_d, classified.mask_d, flags_d, row_counts_d, word_triangles_d)
+    total_d = enqueue_scan(device, row_counts_d, row_counts_d, 3 * rows)
     totals_d = allocate(device, 12)
     launch(
-        device, program["total_counts"], 1, stopwatch=stopwatch,
+        device, program["total_counts"], 1,
         row_offsets=row_counts_d, total=total_d, totals=totals_d, rows=slab.rows, rows_to_count=rows,
     )  # fmt: skip
     totals, total = np.empty(3, np.uint32), np.empty(1, np.uint64)
@@ -124,7 +122,7 @@ def count(device: Device, slab: Slab, classified: Classified, stopwatch: Stopwat
     vertices, triangles, active = (int(n) for n in totals)
     active_words_d = allocate(device, 4 * active)
     launch(
-        device, program["list_words"], slab.rows, stopwatch=stopwatch,
+        device, program["list_words"], slab.rows,
         words_with_work=flags_d, row_offsets=row_counts_d, active_words=active_words_d, rows=slab.rows,
         rows_to_count=rows, flag_words=grid.flag_words, row_shift=grid.row_shift,
     )  # fmt: skip
@@ -221,12 +219,7 @@ class Placement:
 
 
 def classify(
-    device: Device,
-    slab: Slab,
-    voxels_d: Any,
-    levels: Sequence[Any],
-    stopwatch: Stopwatch,
-    bricks: BrickStates | None = None,
+    device: Device, slab: Slab, voxels_d: Any, levels: Sequence[Any], bricks: BrickStates | None = None
 ) -> Classified:
     """Pass 1: mark the samples of the slab that are inside; for a rule that encloses values below, those that are not.
 
@@ -240,14 +233,14 @@ def classify(
     if bricks is not None:
         (ni, nj, nk), border = slab.grid.volume.shape_ijk, slab.grid.rule.border
         launch(
-            device, program["classify_bricks"], slab.mask_rows, stopwatch=stopwatch,
+            device, program["classify_bricks"], slab.mask_rows,
             word_states=bricks.states_d, word_extents=bricks.extents_d, voxels=voxels_d, mask=mask_d,
             row_extents=row_extents_d, level=levels[0], ni=ni, nj=nj, nk=nk, border=border, words=slab.grid.words,
         )  # fmt: skip
         return Classified(mask_d, row_extents_d)
     bounds = {"level": levels[0]} if len(levels) == 1 else {"level": levels[0], "highest": levels[1]}
     launch(
-        device, program["classify_samples"], slab.mask_rows, stopwatch=stopwatch,
+        device, program["classify_samples"], slab.mask_rows,
         voxels=voxels_d, mask=mask_d, row_extents=row_extents_d, **bounds, **slab.arguments,
     )  # fmt: skip
     return Classified(mask_d, row_extents_d)
@@ -292,7 +285,7 @@ class Emission:
         rule = self._slab.grid.rule
         upper = {} if rule.upper_level is None else {"upper_level": rule.upper_level, "highest": rule.highest_inside}
         launch(
-            self._device, self._program["emit_vertices"], self._items, stopwatch=self._stopwatch,
+            self._device, self._program["emit_vertices"], self._items,
             voxels=self._voxels_d, **self.tables, positions=self.positions_d, normals=self.normals_d,
             iso_level=iso_level, outside=rule.outside, value_scale=rule.value_scale,
             **self._slab.arguments, **self._common, **self._classified.own, **label_arguments, **upper,
@@ -311,7 +304,7 @@ class Emission:
         gi, gj, _ = slab.grid.shape
         program = load_cells(self._device, self._classified.is_part)
         launch(
-            self._device, program["emit_triangles"], self._items, stopwatch=self._stopwatch,
+            self._device, program["emit_triangles"], self._items,
             word_triangles=counted.word_triangles_d, triangles=self.triangles_d, first_vertex=first_vertex,
             rows_to_count=slab.counted_rows, gi=gi, gj=gj, gk=slab.mask_slices, words=slab.grid.words,
             mirrored=slab.grid.winds_backwards, **self._common, **self._classified.own,
@@ -353,7 +346,6 @@ def emit(
         if counted.cells is not None:
             emit_cells(
                 device, slab, voxels_d, classified.mask_d, counted, emission.tables, emission.output, first_vertex,
-                stopwatch,
             )  # fmt: skip
         else:
             emission.triangles(first_vertex)

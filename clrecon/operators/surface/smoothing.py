@@ -15,7 +15,6 @@ from clrecon.mesh.refine.smoothing import Filter, Rings, Term
 from clrecon.opencl import (
     Device,
     Program,
-    Stopwatch,
     describe_shortage,
     download,
     download_all,
@@ -44,9 +43,9 @@ def prepare_smoothing(device: Device) -> Program:
 class DeviceFilter(Filter):
     """A low pass over a surface on a device, with the bits of its twin, which does it where the device has no room."""
 
-    def __init__(self, device: Device, rings: Rings, stopwatch: Stopwatch | None = None):
+    def __init__(self, device: Device, rings: Rings):
         super().__init__(rings)
-        self._device, self._stopwatch, self._count = device, stopwatch, len(rings.weights)
+        self._device, self._count = device, len(rings.weights)
         needs = {"vertices and their steps": 4 * 16 * self._count, "corners": 8 * len(rings.after) + 8 * self._count}
         self._fits = self._count > 0 and not describe_shortage(memory_limits(device), needs)
 
@@ -67,7 +66,7 @@ class DeviceFilter(Filter):
         device, count = self._device, self._count
         (bends, bends_d), (normals, normals_d) = (empty_output(device, (count, 4), np.float32) for _ in range(2))
         launch(
-            device, prepare_smoothing(device)["measure_bends"], count, stopwatch=self._stopwatch,
+            device, prepare_smoothing(device)["measure_bends"], count,
             places=upload(device, _padded(places)), **self._corners, bends=bends_d, normals=normals_d, count=count,
         )  # fmt: skip
         download_all(device, (bends, bends_d, 0), (normals, normals_d, 0))
@@ -79,11 +78,11 @@ class DeviceFilter(Filter):
             return super().find_steps(bends, terms)
         device, count = self._device, self._count
         kernel, bends_d = prepare_smoothing(device)["filter_bends"], upload(device, _padded(bends))
-        later_d, sums_d = (zero_words(device, 4 * count, stopwatch=self._stopwatch) for _ in range(2))
+        later_d, sums_d = (zero_words(device, 4 * count) for _ in range(2))
         corners = {name: self._corners[name] for name in ("begin", "after", "weights")}
         for factor, share in terms:
             launch(
-                device, kernel, count, stopwatch=self._stopwatch, bends=bends_d, later=later_d, **corners, sums=sums_d,
+                device, kernel, count, bends=bends_d, later=later_d, **corners, sums=sums_d,
                 factor=factor, share=share, count=count,
             )  # fmt: skip
             later_d, sums_d = sums_d, later_d

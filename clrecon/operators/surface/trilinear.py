@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.opencl import Device, Program, Stopwatch, allocate, launch, load_program
+from clrecon.opencl import Device, Program, allocate, launch, load_program
 from clrecon.operators.primitives.scan import exclusive_scan
 from clrecon.operators.resident.tables import voxel_variants
 from clrecon.operators.surface.slabs import Slab
@@ -50,14 +50,7 @@ def _field_arguments(slab: Slab) -> dict[str, Any]:
 
 
 def count_cells(
-    device: Device,
-    slab: Slab,
-    voxels_d: Any,
-    mask_d: Any,
-    flags_d: Any,
-    row_counts_d: Any,
-    word_triangles_d: Any,
-    stopwatch: Stopwatch,
+    device: Device, slab: Slab, voxels_d: Any, mask_d: Any, flags_d: Any, row_counts_d: Any, word_triangles_d: Any
 ) -> CellVertices:
     """Count the slab's triangles again, in place, and the vertices inside cells, which follow those of each slice.
 
@@ -68,15 +61,15 @@ def count_cells(
     word_places_d = allocate(device, 2 * slab.rows * grid.words)
     program = prepare_trilinear(device, grid.volume.voxels.dtype)
     launch(
-        device, program["count_cells"], rows, stopwatch=stopwatch,
+        device, program["count_cells"], rows,
         voxels=voxels_d, mask=mask_d, words_with_work=flags_d, row_counts=row_counts_d,
         word_triangles=word_triangles_d, row_cell_vertices=row_vertices_d, word_cell_vertices=word_places_d,
         flag_words=grid.flag_words, own_rows=slab.rows, rows_to_count=rows, **_field_arguments(slab),
     )  # fmt: skip
-    scanned = exclusive_scan(device, row_vertices_d, rows, stopwatch=stopwatch)
+    scanned = exclusive_scan(device, row_vertices_d, rows)
     slices = rows // grid.shape[1]
     launch(
-        device, program["make_room"], slices, stopwatch=stopwatch,
+        device, program["make_room"], slices,
         row_counts=row_counts_d, cell_vertex_offsets=scanned.offsets_d, gj=grid.shape[1], slices=slices,
     )  # fmt: skip
     return CellVertices(scanned.offsets_d, word_places_d, scanned.total)
@@ -91,7 +84,6 @@ def emit_cells(
     tables: dict[str, Any],
     output: dict[str, Any],
     first_vertex: int,
-    stopwatch: Stopwatch,
 ) -> None:
     """Write the triangles of the slab and the vertices inside its cells, after `first_vertex` vertices of earlier
     slabs.
@@ -114,13 +106,12 @@ def emit_cells(
     }
     if counted.triangles:
         launch(
-            device, program["emit_cell_triangles"], active, stopwatch=stopwatch,
-            word_vertices=counted.word_vertices_d, word_triangles=counted.word_triangles_d,
-            triangles=output["triangles"], first_vertex=first_vertex, rows_to_count=slab.counted_rows,
-            mirrored=slab.grid.winds_backwards, **common,
+            device, program["emit_cell_triangles"], active, word_vertices=counted.word_vertices_d,
+            word_triangles=counted.word_triangles_d, triangles=output["triangles"], first_vertex=first_vertex,
+            rows_to_count=slab.counted_rows, mirrored=slab.grid.winds_backwards, **common,
         )  # fmt: skip
     if cells.total:
         launch(
-            device, program["emit_cell_vertices"], active, stopwatch=stopwatch,
+            device, program["emit_cell_vertices"], active,
             positions=output["positions"], normals=output["normals"], **tables, **common,
         )  # fmt: skip

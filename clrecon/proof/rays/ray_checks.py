@@ -113,8 +113,8 @@ def _check_leaps(device: Device) -> str:
         counts = slab.bricks[::-1]
         with stopwatch.running(device):
             ranges = np.empty((*counts, 2), dtype)
-            download(device, ranges, measure_cells(resident, slab, stopwatch))
-            leaps = find_leaps(resident, slab, "key", np.arange(100) > 50, 0.0, 1.0, stopwatch)
+            download(device, ranges, measure_cells(resident, slab))
+            leaps = find_leaps(resident, slab, "key", np.arange(100) > 50, 0.0, 1.0)
             distances = download(device, np.empty(counts, np.uint8), leaps.distances_d)
         low, high = _count_cells(voxels, np.minimum), _count_cells(voxels, np.maximum)
         require_equal(ranges, np.stack([low, high], axis=-1), f"ranges of bricks of {dtype} voxels")
@@ -125,7 +125,7 @@ def _check_leaps(device: Device) -> str:
                 way = MainWay(axis, 1 if axis else -1, np.array(eye, np.float32), aside)
                 with stopwatch.running(device):
                     known = LeapMap(upload(device, expected), None)
-                    ways_d = look_ahead(resident, slab, way, known, stopwatch)
+                    ways_d = look_ahead(resident, slab, way, known)
                     ways = download(device, np.empty(counts, np.uint8), ways_d)
                 require_equal(ways >> 4, _count_ahead(expected, way), f"free bricks ahead along axis {axis}")
                 require_equal(ways & FARTHEST, expected, "distances of bricks, copied")
@@ -147,8 +147,8 @@ def _check_tiles(device: Device) -> str:
         view = RayView.of(volume, camera, size, 0.5, box=box, focus=box)
         output = PictureBuffers(device, size, None, False)
         with stopwatch.running(device):
-            leaps = find_leaps(resident, slab, "key", np.arange(100) > 50, 0.0, 0.1, stopwatch)
-            entries_d = enter_tiles(resident, slab, view, leaps, output, stopwatch)
+            leaps = find_leaps(resident, slab, "key", np.arange(100) > 50, 0.0, 0.1)
+            entries_d = enter_tiles(resident, slab, view, leaps, output)
             entries = download(device, np.empty((nj, ni), np.float32), entries_d) + view.table[-1, 0]
         heights = volume.slice_origins()[:, 2]
         first, last = (heights[np.maximum(stair - n, 0)] + distance for n in (BEFORE, 0))

@@ -22,7 +22,7 @@ def look(device, shape, distances, way: MainWay):
     resident, stopwatch = DeviceVolume(Volume(np.zeros(shape, np.int16), np.eye(4)), device=device), Stopwatch()
     slab = next(ray_slabs(resident, shape[0], np.inf, stopwatch))
     with stopwatch.running(device):
-        ways_d = ray_pictures.look_ahead(resident, slab, way, LeapMap(upload(device, distances), None), stopwatch)
+        ways_d = ray_pictures.look_ahead(resident, slab, way, LeapMap(upload(device, distances), None))
         return download(device, np.empty_like(distances), ways_d)
 
 
@@ -80,7 +80,7 @@ def test_distances_are_those_of_a_chessboard(device, shape):
     for brick in np.ndindex(counts):  # cells of a brick end at the voxels that the next one begins with
         bright[brick] = (voxels[tuple(slice(4 * n, 4 * n + 5) for n in brick)] > 500).any()
     with stopwatch.running(device):
-        leaps = find_leaps(resident, slab, "key", np.arange(100) > 50, 0.0, 0.1, stopwatch)
+        leaps = find_leaps(resident, slab, "key", np.arange(100) > 50, 0.0, 0.1)
         found = download(device, np.empty(counts, np.uint8), leaps.distances_d)
     truth = ndimage.distance_transform_cdt(~bright, "chessboard")
     assert np.array_equal(found, np.minimum(truth, FARTHEST))

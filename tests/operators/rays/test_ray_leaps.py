@@ -38,7 +38,7 @@ def take_every_sample(monkeypatch, *arguments, **settings) -> Rendering:
         bi, bj, bk = slab.bricks
         return ray_slabs.LeapMap(upload(resident.device, np.zeros((bk, bj, bi), np.uint8)), volume_box(resident.volume))
 
-    def enter_at_once(resident, slab, view, leaps, output, stopwatch):
+    def enter_at_once(resident, slab, view, leaps, output):
         return upload(resident.device, np.full(output.tiles, -np.inf, np.float32))
 
     with monkeypatch.context() as patch:

@@ -32,7 +32,7 @@ def test_it_is_the_nearest_of_all(affine: Any, closed: bool, device: Any) -> Non
     grid, watch = SampleGrid(volume, rule), Stopwatch()
     with watch.running(device), DeviceVolume(volume, device=device) as resident:
         level = (volume.voxels.dtype.type(rule.lowest_inside),)
-        classified = classify(device, Slab(grid, 0, grid.shape[2]), resident.whole(watch), level, watch)
+        classified = classify(device, Slab(grid, 0, grid.shape[2]), resident.whole(watch), level)
     cells = np.argwhere(find_active(np.pad(volume.voxels >= 300, rule.border)))
     centres = volume.ijk_to_lps(cells[:, ::-1] + 0.5 - rule.border)
     random = np.random.default_rng(4)
