@@ -120,26 +120,7 @@ def _order_by(numbers: NDArray[np.integer]) -> NDArray[np.int64]:
     return np.sort(numbers.astype(np.int64) << 32 | np.arange(len(numbers))) & 0xFFFFFFFF
 
 
-<<<<<<< HEAD
-def mark_crossings(
-    device: Device, plan: CrossingPlan, *, steps: Steps | None = None, stopwatch: Stopwatch | None = None
-) -> NDArray[np.bool_]:
-=======
-def _find_boxes(vertices: Float32Array, triangles: NDArray[np.uint32]) -> tuple[Float32Array, Float32Array]:
-    """Return the lowest and the highest coordinates of each triangle."""
-    low, high = np.empty((len(triangles), 3), np.float32), np.empty((len(triangles), 3), np.float32)
-
-    def work(where: slice) -> None:
-        one, two, three = (vertices[triangles[where, corner]] for corner in range(3))
-        np.minimum(np.minimum(one, two), three, out=low[where])
-        np.maximum(np.maximum(one, two), three, out=high[where])
-
-    in_threads(work, len(triangles))
-    return low, high
-
-
 def mark_crossings(device: Device, plan: CrossingPlan, *, steps: Steps | None = None) -> NDArray[np.bool_]:
->>>>>>> 26b3c028 (A launch is timed by the stopwatch that is running: operators pass none on)
     """Mark the triangles that may cut another one, shape (n,), in the order of the mesh."""
     count = len(plan.order)
     kernel = load_program(device, "surface/crossings.cl")["mark_crossings"]
