@@ -1,11 +1,8 @@
 """The gate ``hu_scale``: whether air and soft tissue have the values that a CT gives them.
 
 Headers may be wrong about rescale, and cone-beam scanners often have a scale of their own: no check of the geometry
-notices.  What tells is the two materials of which nearly every scan holds much.  The gate fails only where both are in
-the wrong places: a dry bone has no soft tissue, a crop of a body no air, bone in water neither, and raw values of a
-micro-CT may be any.
-
-Shares and peaks are those of a sample of the values, in a few milliseconds.
+notices.  The gate fails only where both are in the wrong places: a dry bone has no soft tissue, a crop of a body no
+air, bone in water neither, and raw values of a micro-CT may be any.
 """
 
 from __future__ import annotations
@@ -66,8 +63,8 @@ class ValueSample:
         return float(found[counts.argmax()]), float(counts.max()) / len(self.values)
 
     def without_spikes(self, low: float, high: float) -> ValueSample | None:
-        """Return the sample without values outside of a range that stand out of the values beside them; None where too
-        few are left.
+        """Return the sample without values that stand out of those beside them outside of a range; None if too few are
+        left.
         """
         found, counts = np.unique(self.values, return_counts=True)
         before, after = np.pad(counts, (1, 0))[:-1], np.pad(counts, (0, 1))[1:]
@@ -191,8 +188,7 @@ def judge_scale(
 ) -> tuple[Gate, dict[str, float]]:
     """Judge the gate ``hu_scale``; where it fails, return the places of ``air`` and ``soft_tissue`` too.
 
-    sample: Values of the measured voxels; None where there are too few.
-    slopes: Slopes of the rescale.  Where all are 1, one that is too large cannot be told from a dry specimen.
+    slopes: Of the rescale.  Where all are 1, one that is too large cannot be told from a dry specimen.
     known: False: the header does not say that the values are HU.  Then only a missing or doubled intercept is told.
     """
     if sample is None or len(sample.values) < FEWEST_VALUES:
@@ -240,9 +236,7 @@ def _find_shift(sample: ValueSample, facts: PixelFacts) -> _Doubt | None:
 
 
 def _fits(sample: ValueSample, shift: int) -> bool:
-    """True if air and soft tissue lie where a shift of the HU by `shift` puts them, with less between them than
-    tissue.
-    """
+    """True if air and soft tissue lie where a shift of the HU puts them, with less between them than tissue."""
     air = sample.between(shift - 1100, shift - 900)
     tissue = sample.between(shift - 150, shift + 150)
     least = max(LEAST_TISSUE, TISSUE_PART * sample.between(shift - 300, np.inf)) if shift else LEAST_SHARE

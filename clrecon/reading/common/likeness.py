@@ -1,10 +1,9 @@
 """Likeness of neighbouring slices: the pixels show two interleaved volumes that no header distinguishes.
 
 Within one volume, slices differ the more the farther apart they are.  Where the slices of two volumes alternate, each
-slice differs more from its neighbours than from the next but one, which is of its own volume.  With three volumes it
-differs more than from the third slice, and with two volumes in pairs more than from the fourth.  Squares of differences
-are compared, over the whole picture and in small parts of it.  They are taken between means of several pixels, which
-reduces noise.
+slice differs more from its neighbours than from the next but one, which is of its own volume; of three volumes from the
+third slice, of two in pairs from the fourth.  Squares of differences between means of several pixels, which have less
+noise, are compared over the whole picture and in small parts of it.
 """
 
 from __future__ import annotations
@@ -21,18 +20,16 @@ from clrecon.geometry.affine import TILT_REPORT_DEG
 from clrecon.system.pieces import count_readers
 
 LEAST_LIKENESS = 1.25
-"""Ratio of the differences from neighbours to those from the slice one period on; from this ratio on slices belong to
-several volumes.  Four real scans, whole and with every 2nd, 3rd and 4th slice: at most 0.58, for periods of 3 and 4 at
-most 0.74 and 0.82; water with noise: 0.99, 1.06, 1.12."""
+"""Ratio of the differences from neighbours to those one period on, from which on slices belong to several volumes.
+Four real scans, whole and with every 2nd, 3rd and 4th slice: at most 0.58, for periods of 3 and 4 at most 0.74 and
+0.82; water with noise: 0.99, 1.06, 1.12."""
 PART_LIKENESS = 2.0
-"""The same ratio in parts of the picture, with period 2, from which on `PARTS` of them show several volumes.  Those
-scans: at most 1.47 in any part (slices 17 mm apart), at most 0.89 where slices are nearer.  The content of a part
-matters little: water with noise 1.01."""
+"""The same in parts of the picture, with period 2, for `PARTS` of them.  Those scans: at most 1.47 in any part (slices
+17 mm apart), at most 0.89 where slices are nearer; water with noise 1.01."""
 PARTS = 4
 """Number of parts that must reach it; of fewer, all.  One part alone must reach it along more slices
 (`MOST_ALIKE_PART`), in a long stack in more than one window: a vessel with contrast medium in one of two volumes does.
-A single place, such as a saw cut in bone of a sharp kernel, alternates within one volume too, because artefacts of a
-helical scan turn there."""
+A saw cut in bone of a sharp kernel alternates within one volume too: artefacts of a helical scan turn there."""
 PERIODS = (2, 3, 4)
 MOST_ALIKE, LEAST_ALIKE = 12, 4
 """Number of consecutive slices that must all reach it; of fewer slices all, but at least the second number."""
@@ -40,8 +37,7 @@ MOST_ALIKE_PART, LEAST_ALIKE_PART = 20, 6
 HU_RANGE = (-1000, 2000)
 """Values are limited to this range; beyond are padding and metal.  Sums over a cell then fit 16 bits."""
 CELL, FINE_CELL, COARSE_CELLS = 4, 2, 32
-"""Pixels along the side of a cell that is averaged: `CELL` where that gives `COARSE_CELLS` cells along a side, else
-fewer."""
+"""Pixels along the side of an averaged cell: `CELL` where that gives `COARSE_CELLS` cells along a side, else fewer."""
 FEWEST_CELLS = 64
 """Least number of cells; in smaller pictures differences are due to chance."""
 PART = 8
@@ -90,10 +86,8 @@ class Likeness:
 
 
 def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool | None = False) -> Likeness | None:
-    """Apply `measure_likeness` to slices (n, rows, columns) along any axis of a grid; to many where it is most
-    suspicious.
-
-    A tilt of None is an unknown one.
+    """Apply `measure_likeness` to slices (n, rows, columns); to many where it is most suspicious.  An unknown tilt is
+    None.
     """
     parts = tilt_deg is not None and abs(tilt_deg) <= TILT_REPORT_DEG
     count = len(voxels)
@@ -109,14 +103,11 @@ def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool |
 
 
 def measure_likeness(voxels: NDArray[Any], parts: bool = True) -> Likeness | None:
-    """Compare slices with their neighbours and with slices farther on.
+    """Compare slices (nk, nj, ni) of HU with their neighbours and those farther on; None for too few slices or pixels.
 
-    voxels: ndarray, shape (nk, nj, ni). HU, one slice at each place, in the order of the places.
-    parts: True: examine parts of the picture too.  Use False for a tilted gantry: scanners that measure several slices
-        in one turn shift the slices of a turn against each other, which shows in objects that do not change along the
-        table (a head holder) in real scans.
-
-    Returns: None where there are too few slices or pixels.
+    parts: Examine parts of the picture too.  Not for a tilted gantry: scanners that measure several slices in one turn
+        shift them against each other, which shows in objects that do not change along the table (a head holder) in real
+        scans.
     """
     if len(voxels) < min(PERIODS) + LEAST_ALIKE:
         return None
@@ -144,9 +135,7 @@ def measure_likeness(voxels: NDArray[Any], parts: bool = True) -> Likeness | Non
 
 
 def _ratios(differences: Sequence[NDArray[np.float32]], noise: float) -> NDArray[np.float32]:
-    """Return for each stretch of `period` slices the largest mean difference over fewer steps, divided by that over
-    `period` steps.
-    """
+    """Return for each stretch of slices the largest mean difference over fewer steps than its length, over that of all."""
     period = len(differences)
     count = len(differences[-1])
     nearer = []

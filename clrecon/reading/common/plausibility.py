@@ -1,12 +1,11 @@
 """Plausibility of HU: what the voxels themselves say of their values, in a few milliseconds.
 
-Shares are those of a sample of the voxels.  A figure that a warning states is counted in all voxels.
+Shares are those of a sample of the voxels; a figure that a warning states is counted in all voxels.
 
-The gate ``stored_sign``: whether the highest stored bit was read as what it is, a sign or a part of the value.
-
-Where it was not, values wrap around: air becomes the densest of all, or dense bone turns negative inside of bone.  It
-shows at neighbours on either side of the highest bit: in a picture they are close together, once wrapped they are
-nearly the whole range of the stored bits apart.
+The gate ``stored_sign``: whether the highest stored bit was read as what it is, a sign or a part of the value. Where it
+was not, values wrap around: air becomes the densest of all, or dense bone turns negative inside of bone.  Neighbours on
+either side of the highest bit are close together in a picture; once wrapped they are nearly the whole range of the
+stored bits apart.
 """
 
 from __future__ import annotations
@@ -130,9 +129,7 @@ LEAST_PADDING_SHARE = 0.01
 
 @dataclass(frozen=True)
 class VoxelFindings:
-    """What the voxels say of their values: warnings, the gates ``hu_scale`` and ``stored_sign``, and the values of
-    ``air`` and ``soft_tissue`` where the first fails.
-    """
+    """Warnings, the gates ``hu_scale`` and ``stored_sign``, and the values of both materials where the first fails."""
 
     warnings: list[str]
     gates: list[Gate]
@@ -149,9 +146,8 @@ def examine_voxels(
 ) -> VoxelFindings:
     """Examine the values that were read.
 
-    slices: In the order of k; empty for files other than DICOM.
+    slices: In the order of k; empty for files other than DICOM, which have `stored` where their numbers are whole.
     known: False: the header does not say that the values are HU, or they surely are not.
-    stored: As `slices`, for other files of whole numbers.
     """
     if facts.hu_min == facts.hu_max:
         what = "padding" if facts.padding_share == 1.0 else f"{facts.hu_min:g} HU"
@@ -213,10 +209,7 @@ def _count_near(picture: NDArray[Any], ceiling: float, slope: float) -> tuple[in
 
 
 def _warn_of_padding(sample: ValueSample, voxels: NDArray[Any]) -> list[str]:
-    """Warn of one value far below air that many voxels have, without being declared as padding.
-
-    The value is found in the sample; its voxels are counted in the whole volume.
-    """
+    """Warn of one value far below air that many voxels have, without being declared as padding."""
     found = sample.commonest_below(LOWEST_AIR_HU)
     if found is None or found[1] < LEAST_PADDING_SHARE:
         return []

@@ -12,15 +12,12 @@ from clrecon.system.packages import public_function
 
 @dataclass(frozen=True)
 class PixelFacts:
-    """Figures of the pixels that were read.
+    """Figures of the pixels that were read, padding included.
 
-    padding_share: Share of the voxels, 0 to 1.
-    hu_min, hu_max: Lowest and highest HU of the volume, padding included.
+    padding_share: 0 to 1.
     padding_hu: HU that padding was filled with; None without padding.
     stray: Number of values that lost bits of their own, see `clrecon.reading.dicom.pixels.voxels`.
-    stray_text: One line about these values; empty if there are none.
-    padding_text: One line about padding that no header declares and that was found by its shape, or about declared
-        padding that masks tissue; empty if there is none.
+    padding_text: Of padding that no header declares and that was found by its shape, or that masks tissue.
     """
 
     padding_share: float
@@ -33,10 +30,7 @@ class PixelFacts:
 
 
 class StoredValues(Protocol):
-    """What a header says of the values of its slice.
-
-    slope, intercept: Of the rescale to HU.
-    """
+    """What a header says of the values of its slice; slope and intercept of the rescale to HU."""
 
     @property
     def bits_stored(self) -> int: ...
@@ -59,20 +53,16 @@ class StoredRange(NamedTuple):
 
 @dataclass(frozen=True)
 class SeriesEntry:
-    """One line of a listing; `as_dict` is the documented machine-readable form.
+    """One line of a listing; `as_dict` is the documented machine-readable form (docs/contract.md).
 
     number: From 1, the value that ``series=`` takes.
-    patient, study: Numbers of the patient and the study among those found, from 1; their identifiers are not given.
-        None where the files do not tell.
+    patient, study: From 1, among those found; identifiers are not given.  None where the files do not tell.
     kind: {"stack", "localizer", "capture", "other"}. Only stacks are read.
     phases: ``{"number", "keyword", "value", "slices"}`` of each volume, where slices share places; else empty.
     slices: Number of images, with copies and all phases.
-    uid_hash: First 16 hexadecimal digits of the SHA-256 of the SeriesInstanceUID, None where the files have none.
-    shape_ijk, spacing_mm, affine_ijk_to_lps_mm, tilt_deg: None where the geometry is unknown or refused.
-    grid_residual_max_mm: Largest distance of a slice position from the affine.
-    gap_mm: "min", "max" and "median" distance of neighbouring slices along the normal, None where unknown.
+    uid_hash: First 16 hexadecimal digits of the SHA-256 of the SeriesInstanceUID.
+    gap_mm: "min", "max" and "median" distance of neighbouring slices along the normal.
     extent_mm: Size of the box of whole voxels along rows, columns and the slice normal.
-    slice_thickness_mm: As stated; not used for the geometry.
     dropped: Maps a reason to the number of slices left out of the stack.
     """
 
@@ -109,8 +99,7 @@ class SeriesListing:
 
     chosen: Number of the series that `read_volume` reads for the same ``series``; None where it would not choose.
     skipped: Maps a reason to the number of files passed over.
-    certificate: Certificate of the chosen series, as in ``volume.report``, even if the series is refused; None where no
-        series is chosen or none of its slices has a valid header.
+    certificate: Of the chosen series, even if it is refused; None where none of its slices has a valid header.
     refusal: The reason why no series is chosen; `warnings` contains its text too.
     """
 

@@ -94,16 +94,8 @@ _UNKNOWN = {"not DICOM", "NumPy array"}
 
 
 def read_series(path: str | os.PathLike[str], selection: Selection, progress: Progress | None = None) -> Volume:
-    """Read one CT series as a volume in HU and LPS mm, see `clrecon.read_volume`.
+    """Read one CT series as a volume in HU and LPS mm, see `clrecon.read_volume`; slices rise along their normal.
 
-    path: A folder, searched with its subfolders (any file names; DICOMDIR not needed), or one file.
-
-    Returns: ``voxels`` (nk, nj, ni) int16, int32 or float32 in HU, padding at the air beside it
-        (``report["padding_hu"]``); ``affine`` index (i, j, k) to LPS mm, slices by ascending position along the normal;
-        ``report`` the certificate.  Unevenly spaced slices keep their own positions (`Volume.uneven`), with a warning.
-
-    Notes
-    -----
     Source: DICOM PS3.3 C.7.6.2 (Image Plane), C.7.5.1 (padding), C.8.2.1 (CT image, rescale).
     """
     with _quiet_warnings():
@@ -131,9 +123,8 @@ def read_series(path: str | os.PathLike[str], selection: Selection, progress: Pr
 
 
 def list_slices(path: str | os.PathLike[str], selection: Selection) -> list[tuple[Path, int, int]]:
-    """List the slices of which `read_series` makes a volume, slice k at place k.
-
-    Returns: list of (Path, int, int). File of the slice, its frame there from 0, and number of frames of the file.
+    """List the slices of which `read_series` makes a volume: file, frame there from 0, and number of frames of the
+    file.
     """
     with _quiet_warnings():
         _, found = _scan_and_group(path, selection, None)
@@ -154,11 +145,9 @@ def _checked_phase(selection: Selection) -> int | None:
 def list_scan(
     path: str | os.PathLike[str], selection: Selection, pixels: bool = False, progress: Progress | None = None
 ) -> SeriesListing:
-    """List the series at a path, with the geometry and problems of each, and the certificate of the chosen one.
+    """List the series at a path with their geometry and problems, and the certificate of that which would be read.
 
-    selection: `read_series` would read the series chosen here.
-    pixels: True: also read the pixels of the chosen series, for padding, range of HU and saturation.  False: read only
-        headers.
+    pixels: Also read the pixels of the chosen series, for padding, range of HU and saturation, not only headers.
     """
     phase = _checked_phase(selection)
     with _quiet_warnings():

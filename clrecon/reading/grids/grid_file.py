@@ -1,8 +1,7 @@
 """`GridFile`: the header of a file in our words and frame (LPS), and its numbers as a stream, slice by slice.
 
-A header may be wrong or hostile: a small file can promise a huge array, or name any file of the machine.  No memory is
-taken before the promised size is compared with the bytes that are there, and compressed voxels are inflated slice by
-slice.
+A header may be wrong or hostile: a small file can promise a huge array, or name any file of the machine.  The promised
+size is compared with the bytes that are there before memory is taken, and voxels are inflated slice by slice.
 """
 
 from __future__ import annotations
@@ -45,9 +44,8 @@ _CHUNK = 2**18
 
 @dataclass(frozen=True)
 class VoxelBytes:
-    """The place of a grid's numbers in a file.
+    """The place of a grid's numbers in the file itself, or in the one that its header names.
 
-    path: The file itself, or the file that its header names.
     offset: Bytes in the file before the numbers, or before their compressed stream.
     packing: {"raw", "gzip", "zlib"}
     skip: Inflated bytes before the numbers.
@@ -106,13 +104,7 @@ class ZlibFile(io.RawIOBase):
 
 
 def check_size(name: str, shape: tuple[int, ...], item_bytes: int, file_bytes: int, compressed: bool) -> None:
-    """Compare the size that a header promises with what the file can hold.
-
-    name: Name of the file.
-    item_bytes: Bytes of one number.
-    file_bytes: Size of the file.
-    compressed: The data are compressed.
-    """
+    """Compare the size that a header promises with what the file can hold."""
     if min(shape) < 1 or prod(shape) > LARGEST_GRID:
         raise RefusedInputError(
             f"{name} says that it has {' x '.join(map(str, shape))} voxels: at least 1 an axis and at most"
@@ -192,13 +184,11 @@ VOLUME = Purpose("volume")
 class GridFile:
     """A grid of numbers in a file.
 
-    name: Name of the file, for messages on the terminal; it is never written to reports.
+    name: Of the file, for messages on the terminal; it is never written to reports.
     kind: "NIfTI-1", "NIfTI-2", "NRRD" or "MetaImage".
-    shape_ijk: (ni, nj, nk).
     layers: Numbers of one voxel, side by side in the file; 1 except for layered label maps.
     dtype: Type as stored, with its byte order.
     slope, intercept: The value of a stored number is ``stored * slope + intercept``.
-    voxel_bytes: Where the numbers are.
     warnings: Doubtful points of the header; they contain no names.
     extension: The bytes between the header and the voxels (NIfTI).
     fields: All fields of the header (NRRD).
@@ -261,11 +251,9 @@ PACKING = 1
 
 @dataclass(frozen=True, eq=False)
 class VolumeContent:
-    """What a volume file holds.
+    """What a volume file holds: voxels (nk, nj, ni) int16, int32 or float32, and their affine.
 
-    voxels: ndarray, shape (nk, nj, ni). int16, int32 or float32.
     lines: The certificate, plain ASCII, one fact a line: name, blank, value.
-    progress: ``progress("write", done, total)``.
     """
 
     voxels: NDArray[Any]

@@ -4,12 +4,10 @@ SimpleITK, the reference reader of this format, interprets the header, but only 
 here; and it never reads the voxels.  The reasons were seen with SimpleITK 2.5.  A header with NDims = 100000 ends the
 process (a write beyond an array).  A header without a position is placed at the origin.  A field with too few numbers
 swallows the next one: a spacing of 2 mm was then read as 1 mm.  Damaged compressed voxels come back as numbers, with
-only a line on standard error.
+only a line on standard error.  It also writes: the certificate as fields of its own, the voxels not packed.
 
 Its frame is LPS mm.  AnatomicalOrientation only informs people; the affine comes from TransformMatrix, Offset and
 ElementSpacing.
-
-SimpleITK also writes it: the certificate as fields of its own, the voxels as they are, not packed.
 
 Source: the MetaIO documentation (itk.org/Wiki/MetaIO/Documentation) and ITK's MetaImageIO.
 """

@@ -1,7 +1,6 @@
 """NIfTI-1 and NIfTI-2 (.nii, .nii.gz, and pairs of .hdr and .img) to read, NIfTI-1 to write.
 
-nibabel parses the header; the voxels are read slice by slice.  NIfTI's frame is RAS mm; `nifti_affine` converts it to
-LPS, and no other module sees it.
+nibabel parses the header.  NIfTI's frame is RAS mm; `nifti_affine` converts it to LPS, and no other module sees it.
 
 Source: the NIfTI-1 and NIfTI-2 definitions (nifti1.h, nifti2.h).
 """
@@ -42,8 +41,8 @@ AFFINES_DIFFER_MM = 0.1
 """Distance at a corner from which sform and qform count as different; the quaternions of a qform are only float32."""
 
 SPACINGS_DIFFER = 0.01
-"""Difference, as a share of the longest step, from which spacings count as different: ITK takes the spacing from
-pixdim, others from the sform."""
+"""Difference, as a share of the longest step, from which spacings count as different: ITK reads pixdim, others the
+sform."""
 
 _FIRST = (b"\x5c\x01\0\0", b"\0\0\x01\x5c")
 _SECOND = (b"\x1c\x02\0\0", b"\0\0\x02\x1c")
@@ -171,12 +170,8 @@ def _dtype(header: Any, name: str, purpose: Purpose) -> np.dtype[Any]:
 
 
 def nifti_affine(header: Any, shape: tuple[int, int, int], name: str) -> tuple[Float64Array, list[str]]:
-    """Return the affine of a NIfTI header, converted from RAS to LPS: the sform, else the qform.
-
-    shape: (ni, nj, nk)
-
-    Returns:
-    warnings: Disagreements of sform and qform, or of the affine and pixdim.
+    """Return the affine of a NIfTI header, the sform, else the qform, converted from RAS to LPS; warnings tell if they
+    differ.
     """
     warnings = []
     sform = header.get_sform(coded=True)[0]

@@ -1,9 +1,7 @@
 """NRRD: .nrrd, and .nhdr with the voxels in one file beside it.
 
-pynrrd parses the header; the voxels are read slice by slice.  A path in a header could name any file: only one in the
-folder of the header is read.
-
-pynrrd also writes it: the affine as space directions and origin, the certificate as fields of its own.
+pynrrd parses the header, in which a path could name any file: only one in the folder of the header is read.  It also
+writes: the affine as space directions and origin, the certificate as fields of its own.
 
 Source: the NRRD format definition (teem.sourceforge.net/nrrd/format.html).
 """
@@ -184,12 +182,7 @@ def _dtype(header: dict[str, Any], name: str, purpose: Purpose) -> np.dtype[Any]
 
 
 def nrrd_affine(header: dict[str, Any], name: str) -> Float64Array:
-    """Return the affine of a NRRD header, converted from the frame that it names to LPS.
-
-    header: As `nrrd.read_header` returns it.
-
-    Returns: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm, of the three axes that have a direction.
-    """
+    """Return the affine of the three axes with a direction in a header as pynrrd reads it, from its frame to LPS."""
     space = str(header.get("space", "")).strip().lower()
     if space not in LPS_FROM_SPACE:
         raise RefusedInputError(

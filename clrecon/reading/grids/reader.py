@@ -2,12 +2,9 @@
 
 The kind of a file is found from its first bytes; its name is not trusted.
 
-One rule holds for every stored type.  If all values are whole numbers, the volume is int16 where all fit, else int32.
-Otherwise it is float32.  So a CT gives the same volume and the same mesh from DICOM and from a file in which it was
-saved as float64.  The type is found in the one pass that reads the values: the volume is converted to a wider type when
-a slice needs it.
-
-The certificate has those entries of `clrecon.reading.dicom.series.certificate` that are known.
+One rule holds for every stored type: int16 where all values are whole and fit, else int32 if they are whole, otherwise
+float32.  So a CT gives the same volume and the same mesh from DICOM and from a file in which it was saved as float64.
+The type is found in the one pass that reads the values: a slice that needs a wider one converts the volume.
 """
 
 from __future__ import annotations
@@ -91,18 +88,19 @@ LADDER = (np.dtype(np.int16), np.dtype(np.int32), np.dtype(np.float32))
 """Types of a volume, from the narrowest to the widest."""
 
 MOST_LABELS = 256
-"""Most different whole numbers of what is probably not a CT: label maps have up to about 120, 8-bit images 256, a CT
-some thousand."""
+"""Most different whole numbers of what is no CT: label maps have up to about 120, 8-bit images 256, a CT some
+thousand."""
 LARGEST_LABEL = 65_535
 
 LEAST_SPAN = 100.0
-"""Least range of HU in a CT.  Air and soft tissue differ by 1000 HU; normalised values span 1, standardised ones about
+"""Least range of HU in a CT: air and soft tissue differ by 1000, normalised values span 1, standardised ones about
 10."""
 
 
 @dataclass(frozen=True)
 class GridValues:
-    """Voxels (nk, nj, ni) int16, int32 or float32, with facts about them, warnings, and reasons why they may not be HU.
+    """Voxels (nk, nj, ni) int16, int32 or float32, with facts about them, and reasons (`doubts`) why they may not be
+    HU.
 
     `likeness` is that of the slices along the axis of the longest step; None where there are too few.
     """
@@ -118,8 +116,6 @@ def read_values(grid: GridFile, progress: Progress | None = None) -> GridValues:
     """Read the voxels of a grid file, scaled as its header says.
 
     NaN, which resampling writes where there was no image, becomes `AIR_HU` with a warning.
-
-    progress: Called as ``progress("read", done, total)``.
     """
     filling = _Filling(grid)
     for k, stored in enumerate(grid.iterate_slices()):
@@ -199,9 +195,7 @@ class _Filling:
 
 
 def _judge_likeness(voxels: NDArray[Any], grid: GridFile) -> Likeness | None:
-    """Judge the likeness of neighbouring slices along the axis of the longest step, which most likely was that of the
-    scan.
-    """
+    """Judge the likeness of neighbours along the axis of the longest step, which most likely was that of the scan."""
     spacing = column_spacing(grid.affine)
     axis = max((2, 1, 0), key=lambda place: round(spacing[place], 4))  # equal steps: the last axis
     return judge_slices(np.moveaxis(voxels, 2 - axis, 0), tilt_degrees(grid.affine))
@@ -269,11 +263,7 @@ def judge_spacing(grid: GridFile) -> Gate:
 def certify_grid(
     grid: GridFile, values: GridValues | None, warnings: Sequence[str], findings: VoxelFindings | None = None
 ) -> Certificate:
-    """Build the report of a volume.
-
-    values: None: the voxels were not read, and entries that depend on them are None.
-    findings: What the voxels say of their values; None: they were not read.
-    """
+    """Build the report of a volume; entries that depend on its voxels are None where they were not read."""
     facts = None if values is None else values.facts
     spacing = column_spacing(grid.affine)
     gap = abs(float(slice_normal(grid.affine) @ grid.affine[:3, 2]))
@@ -309,8 +299,8 @@ def certify_grid(
 def judge_grid(grid: GridFile, values: GridValues | None, value_gates: Sequence[Gate] | None) -> list[Gate]:
     """Judge a grid by the gates of a DICOM volume that apply to it, and by its own header.
 
-    No file of this kind says that its values are HU. So the gate ``hu_known`` fails where they surely are not, and else
-    counts as not measured.
+    No file of this kind says that its values are HU: the gate ``hu_known`` fails if they are not, else it is
+    unmeasured.
     """
     doubtful = "values that cannot be HU, or hardly"
     share = "share of voxels without a measurement (padding)"
@@ -346,12 +336,7 @@ log = get_logger(__name__)
 
 
 def read_grid(path: Path, kind: str, *, rescale: Rescale | None = None, progress: Progress | None = None) -> Volume:
-    """Read a volume.
-
-    kind: {"NIfTI", "NRRD", "MetaImage"}. As `clrecon.reading.grids.reader.tell_kind` returns it.
-    rescale: In place of the slope and intercept of the header.
-    progress: Called as ``progress("read", done, total)``.
-    """
+    """Read a volume of one of the kinds of `tell_kind`; a given rescale replaces that of the header."""
     grid = _open(path, kind, rescale)
     values = read_values(grid, progress)
     findings = _examine(grid, values)
@@ -380,11 +365,7 @@ def _collect_warnings(grid: GridFile, values: GridValues | None, findings: Voxel
 def list_grid(
     path: Path, kind: str, *, rescale: Rescale | None = None, pixels: bool = False, progress: Progress | None = None
 ) -> SeriesListing:
-    """List the one volume of a file, with its certificate.
-
-    path, kind, rescale, progress: As in `read_grid`.
-    pixels: True: read the voxels too, for the entries that depend on them.  False: read only the header.
-    """
+    """List the one volume of a file, with its certificate, as `read_grid` reads it; with `pixels` also by its voxels."""
     grid = _open(path, kind, rescale)
     values = read_values(grid, progress) if pixels else None
     findings = None if values is None else _examine(grid, values)

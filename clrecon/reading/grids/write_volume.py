@@ -1,7 +1,7 @@
 """`write_volume`: a volume as NIfTI, NRRD or MetaImage, with its affine and its certificate.
 
-nibabel, pynrrd and SimpleITK write the headers.  What is written are whole numbers as int16 where they fit, else int32,
-and other values as float32: nothing is rounded.  The same volume gives the same bytes.
+Whole numbers are written as int16 where they fit, else int32, and other values as float32: nothing is rounded.  The
+same volume gives the same bytes.
 """
 
 from __future__ import annotations
@@ -41,7 +41,6 @@ class VolumeFormat:
     kind: As `clrecon.reading.grids.reader.tell_kind` names it.
     module: The library that writes it.
     holds_shear: The axes of its voxels may lie at any angle.
-    write: Gets a stream and the content.
     """
 
     kind: str
@@ -119,10 +118,7 @@ def write_volume(
 def stage_volume(
     volume: Volume, path: str | os.PathLike[str], *, keep_ids: bool = False, progress: Progress | None = None
 ) -> AbstractContextManager[StagedFile]:
-    """Write a volume under a temporary name, to be committed with other files; see `clrecon.system.files.stage_file`.
-
-    Parameters and errors as in `write_volume`.
-    """
+    """Write a volume under a temporary name, to be committed with other files; see `write_volume` and `stage_file`."""
     if not isinstance(volume, Volume):
         raise UsageError(f"a volume is written, not {type(volume).__name__}")
     extension = check_volume_format(path)

@@ -65,12 +65,8 @@ def _share_halves(orientation: tuple[float, ...]) -> tuple[tuple[float, float, f
 def read_headers(
     path: Path, start: FileStart | None = None, force: bool = False
 ) -> list[SliceHeader] | OtherImage | None:
-    """Read and validate the header of one file.
-
-    path, start, force: See `read_elements`.
-
-    Returns: One header for the slice, or one for each frame; None for a DICOMDIR, which only lists files that are found
-        anyway.
+    """Read and validate one file (see `read_elements`): a header for each frame, or None for a DICOMDIR, which only
+    lists.
     """
     elements = read_elements(path, WANTED_TAGS, start, force)
     values = Values(elements)

@@ -1,19 +1,16 @@
 """CT images with many frames: the elements of each frame, as if the frame were a file of its own.
 
-A classic image has its elements at the top level.  An enhanced image has them in functional groups, shared by all
-frames or for each frame.  The wanted values of the groups replace those of the top level, so that slices and frames
-pass the same checks (`clrecon.reading.dicom.headers.header`). A frame's place comes from its Plane Position alone.  The
-order of the frames, In-Stack Position Number and Dimension Index Values are not used for the geometry; they only help
-to distinguish frames at the same place.
+An enhanced image has its elements in functional groups, shared by all frames or for each frame.  The wanted values of
+the groups replace those of the top level, so that slices and frames pass the same checks (`header`). A frame's place
+comes from its Plane Position alone; In-Stack Position Number and Dimension Index Values only help to distinguish frames
+at the same place.
 
-Classic CT images may have many frames too.
-
-CT Image Storage has one slice in a file, yet many cone beams write a whole volume as its frames.  The places are whole
+CT Image Storage has one slice in a file, yet many cone beams write a whole volume as its frames.  The places are known
 where ImagePositionPatient, ImageOrientationPatient and PixelSpacing stand beside GridFrameOffsetVector, whose offsets
 run along the normal (row x column), or beside SpacingBetweenSlices, which leaves open which way the frames run.
 
 Sources: DICOM PS3.3 A.38 (Enhanced CT), A.70 (Legacy Converted Enhanced CT), C.7.6.16 (functional groups), C.7.6.17
-(dimensions), C.8.15 (Enhanced CT); DICOM PS3.3 C.7.6.6 (Multi-frame), C.8.8.3.2 (Grid Frame Offset Vector).
+(dimensions), C.8.15 (Enhanced CT), C.7.6.6 (Multi-frame), C.8.8.3.2 (Grid Frame Offset Vector).
 """
 
 from __future__ import annotations
@@ -129,9 +126,7 @@ COMPUTED_CONTRAST = (
 class Groups:
     """The functional groups of one file, still undecoded.
 
-    frames: One for each frame.
-    dimensions: tuple of (int, str). Index in DimensionIndexValues and name of each dimension that is not a place in the
-        patient.
+    dimensions: Index in DimensionIndexValues and name of each dimension that is not a place in the patient.
     """
 
     shared: Item
@@ -143,11 +138,9 @@ class Groups:
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame in the form of a classic image.
+    """One frame in the form of a classic image; with a problem its elements must not be used.
 
-    elements: Elements of the file, replaced by the values of the frame's groups.
-    phase: tuple of (str, str). Keyword and value, see `SliceHeader`.
-    problem: The problem of its groups; if there is one, do not use the elements.
+    phase: Pairs of keyword and value, see `SliceHeader`.
     """
 
     elements: DicomElements
@@ -157,10 +150,7 @@ class Frame:
 
 
 def read_groups(path: Path, elements: DicomElements) -> Groups:
-    """Read the functional groups of a multi-frame image, given the elements of its top level.
-
-    elements: Elements of the top level, with NumberOfFrames; the file has pixel data.
-    """
+    """Read the functional groups of a multi-frame image with pixel data, given the elements of its top level."""
     if elements.restored:
         raise ValueProblem("multi-frame image without preamble or meta header: convert it to a DICOM file first")
     values = Values(elements)
@@ -202,12 +192,10 @@ def read_groups(path: Path, elements: DicomElements) -> Groups:
 
 
 def split_frames(elements: DicomElements, groups: Groups) -> Iterator[Frame]:
-    """Give each frame the elements that a classic image of it would have.
+    """Give each frame, in the order of the file, the elements that a classic image of it would have.
 
     Where a value is given at several places, the first of these is used: macro of the frame, shared macro, unassigned
     attributes of the frame, shared unassigned attributes, top level.
-
-    Yields: In the order of the file.
     """
     top_values = {tag: value for tag, value in elements.values.items() if tag not in GEOMETRY}
     top_vrs = {tag: vr for tag, vr in elements.vrs.items() if tag not in GEOMETRY}
@@ -376,11 +364,10 @@ EXACT_DIGITS = 15
 
 @dataclass(frozen=True)
 class FramePlaces:
-    """Where the frames of one file lie.
+    """Where the frames of one file lie: offsets (n,) from the first frame along the normal, and the element that says
+    so.
 
-    offsets_mm: ndarray, shape (n,), float64. From the first frame along the normal.
     digits: Number of decimals with which they were written.
-    element: The element that states them.
     """
 
     offsets_mm: NDArray[np.float64]

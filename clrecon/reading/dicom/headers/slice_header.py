@@ -1,8 +1,4 @@
-"""`SliceHeader`: the facts about one CT slice before its pixels are read, for the geometry and the reader.
-
-One multi-frame image may be written as several files, a concatenation, all of which must be present (DICOM PS3.3
-C.7.6.16.1.1).
-"""
+"""`SliceHeader`: the facts about one CT slice before its pixels are read, for the geometry and the reader."""
 
 from __future__ import annotations
 
@@ -46,7 +42,8 @@ CONCATENATION_TAGS = (UID, PART, PARTS, FIRST_FRAME)
 
 @dataclass(frozen=True)
 class Concatenation:
-    """The place of a file in a concatenation: one multi-frame image written as several files.
+    """The place of a file in one multi-frame image written as several, all of which must be present (PS3.3
+    C.7.6.16.1.1).
 
     uid: Used only for comparison.
     part, parts: InConcatenationNumber, from 1, and InConcatenationTotalNumber.
@@ -91,8 +88,7 @@ class OtherImage:
     """A DICOM object that cannot be a slice, and the reason.
 
     frames: Number of per-frame functional groups, 1 where it has none.
-    kind: {"broken", "capture", "other"}. "broken": a CT image with a wrong header.  "capture": a secondary capture.
-        "other": any other object.
+    kind: "broken": a CT image with a wrong header.  "capture": a secondary capture.  "other": any other object.
     problem: One line, which names the file and, if there is one, the tag.
     """
 
@@ -108,13 +104,9 @@ class OtherImage:
 class SliceHeader:
     """All facts about one CT slice before its pixels are read.  All values are validated.
 
-    file, name: Path of the file; its base name, escaped for messages, with the frame number (from 1) where there are
-        several.
-    frame, frames: Frame index in the file, from 0, and number of frames in the file.
-    localizer: ImageType contains LOCALIZER.
-    concatenation: The part of a concatenation that the slice belongs to.
-    phase: tuple of (str, str). Keyword and value of the elements that can distinguish this slice from others at the
-        same place, the most specific first: see `clrecon.reading.dicom.headers.slice_header.PHASE_KEYWORDS`.
+    name: Base name of the file, escaped for messages, with the frame number (from 1) where there are several.
+    frame: In the file, from 0.
+    phase: Keyword and value of what can distinguish slices at the same place, in the order of `PHASE_KEYWORDS`.
     row_cosines, column_cosines: ImageOrientationPatient as stored.
     position_mm: ImagePositionPatient, LPS mm, centre of the first voxel.
     position_digits: Number of decimals of each number of ImagePositionPatient, as it was written.
@@ -125,10 +117,9 @@ class SliceHeader:
     slope, intercept: 1 and 0 where the file has none, see `has_slope` and `has_intercept`.
     patient_hash: Used only for comparison, never written to messages or reports.
     pixel_offset, pixel_length, inflate_from, file_bytes: See `DicomElements`.
-    patient_position: Position of the patient in the scanner, for example HFS; empty if it is not one of
-        `PATIENT_POSITIONS`.
+    patient_position: In the scanner, for example HFS; empty if it is not one of `PATIENT_POSITIONS`.
     derived: The `DERIVED_WORDS` of a derived image; empty for an image that was measured.
-    instance_number: InstanceNumber; None for a frame of a multi-frame image.
+    instance_number: None for a frame of a multi-frame image.
     stated_images, stated_files: ImagesInAcquisition and NumberOfSeriesRelatedInstances.
     modality_lut: A table, not slope and intercept, gives the measured values.
     quadruped: AnatomicalOrientationType says that the directions are those of an animal on four legs.

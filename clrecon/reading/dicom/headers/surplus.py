@@ -1,8 +1,8 @@
 """Surplus bytes beyond the pixels that a header promises: padding, further elements, or a sign of damage.
 
 A header with one column too few shears the picture.  A transfer as text (each LF became CRLF) moves all pixels after
-the first LF.  Surplus bytes are the only sign of both faults, so they must be explained.  Zeros within the pixel data
-are padding, which some scanners write.  After the pixel data there may be elements with rising tags, the last of them
+the first LF.  Surplus bytes are the only sign of both, so they must be explained: zeros within the pixel data are
+padding, which some scanners write; after the pixel data there may be elements with rising tags, the last of them
 (FFFC,FFFC), or nothing (DICOM PS3.5 7.1, PS3.10 7.2).
 """
 
@@ -38,9 +38,8 @@ _CHUNK = 2**20
 
 
 def check_surplus(elements: DicomElements, header: SliceHeader, force: bool = False) -> tuple[str, ...]:
-    """Examine the surplus bytes of a file with uncompressed pixels.
+    """Examine the surplus bytes of a file; `header` is its only or first slice.
 
-    header: The file's only or first slice; the file holds its pixels.
     force: Accept surplus bytes other than zeros as padding.
     """
     if is_encapsulated(header.transfer_syntax):
@@ -112,9 +111,7 @@ def _is_zero(file: BinaryIO, place: int, count: int) -> bool:
 
 
 def _find_hidden_columns(file: BinaryIO, header: SliceHeader, found: int) -> int:
-    """Return the number of columns that the first frame's pixels suggest, if the bytes suffice for more columns; else
-    0.
-    """
+    """Return the number of columns that the first frame's pixels suggest, if the bytes suffice for more; else 0."""
     item = header.bits_allocated // 8
     columns, rest = divmod(found, header.frames * header.rows * item)
     if rest or columns <= header.columns or header.rows < 2:

@@ -1,18 +1,13 @@
 """The raw data elements of one file, with undecoded values, and the place of its pixel data.
 
 Only the start of a file is read: the first `PREFIX_BYTES` hold the header of nearly every CT image.  The plain parser
-walks over it by lengths.  Files that it cannot handle are parsed with pydicom.  No value is converted here, because
-pydicom accepts wrong values (text, NaN, the wrong count) without an error.
-
-The careful parser is pydicom's element generator, with all of its errors caught.  pydicom is imported at its first
-call: most series never need it.
-
-Data sets without preamble or meta header: the missing start is guessed.
+walks over it by lengths.  Files that it cannot handle are parsed with pydicom's element generator, all of its errors
+caught, which most series never need to import.  No value is converted here, because pydicom accepts wrong values (text,
+NaN, the wrong count) without an error.
 
 DICOM files begin with a preamble, the mark "DICM" and a meta header that names the transfer syntax (PS3.10 7.1).
-Network dumps and old archives hold bare data sets; their encoding has to be guessed, which is done only when a user
-asks for it.  Without a transfer syntax, implicit VR little endian is the default (PS3.5 10.1); explicit VR shows two
-capital letters after the first tag.
+Network dumps and old archives hold bare data sets; their encoding is guessed, only when a user asks for it.  Implicit
+VR little endian is the default (PS3.5 10.1); explicit VR shows two capital letters after the first tag.
 """
 
 from __future__ import annotations
@@ -78,19 +73,14 @@ def describe_way_out() -> str:
 
 
 def find_program(start: bytes) -> str:
-    """Return the kind of program that a file begins with; empty for none.
-
-    A file may be a DICOM image and a program at once: the preamble is free for any use (PS3.10 7.1).
-    """
+    """Return the kind of program that a file begins with, since the preamble is free for any use (PS3.10 7.1); or ""."""
     return next((name for mark, name in PROGRAMS.items() if start.startswith(mark)), "")
 
 
 def restore_start(data: bytes) -> Start | None:
-    """Return the standard start for a file that has none.
+    """Return the standard start for a file that has none, given its first bytes.
 
-    data: The first bytes of the file.
-
-    Returns: None where the file has a meta header after its preamble, or does not begin like a data set.
+    None where it has a meta header after its preamble, or does not begin like a data set.
     """
     marked = data[128:MARK_END] == b"DICM"
     skip = MARK_END if marked else 4 if data[:4] == b"DICM" else 0
@@ -125,17 +115,14 @@ DESCRIPTIVE_TAGS = (0x00080005, 0x0008103E)
 """SpecificCharacterSet and SeriesDescription.  They only describe, so two different values in one file do no harm."""
 
 READ_LIMIT = 4 * 1024 * 1024
-"""Most bytes that are read of one file; values that are skipped by their length do not count.
-
-pydicom turns everything inside sequences of undefined length into objects, which takes 50 times the memory and seconds
-for each MiB. For other values of undefined length it searches the whole rest of the file for the end.
-"""
+"""Most bytes that are read of one file; values that are skipped by their length do not count. pydicom turns everything
+inside sequences of undefined length into objects, which takes 50 times the memory and seconds for each MiB, and for
+other values of undefined length it searches the whole rest of the file for the end."""
 
 
 def parse_carefully(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -> DicomElements:
-    """Parse a file, or the start of one.
+    """Parse a file, or the start of one, from the preamble on.
 
-    file: Begins with the preamble; seekable.
     size: Bytes of the whole file.
     wanted: Tags to keep; None keeps all.
     """
@@ -216,10 +203,9 @@ def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -> Di
 def _collect(
     file: BinaryIO, *, implicit: bool, little: bool, last_group: int | None, wanted: tuple[int, ...] | None
 ) -> tuple[dict[int, bytes], dict[int, str | None], list[str]]:
-    """Read elements up to the end of `last_group`, or up to the pixel data; the file position is left there.
+    """Read elements up to the end of `last_group`, or to the pixel data: values, VRs, and remarks about their order.
 
-    Returns values, their VRs, and remarks about their order.  pydicom's data sets silently keep the last of two
-    elements of one tag; here each element is seen.
+    pydicom's data sets silently keep the last of two elements of one tag; here each element is seen.
     """
     from pydicom.filereader import data_element_generator
 
@@ -252,8 +238,7 @@ def _collect(
 class _Order:
     """Watches for elements that occur twice, or after an element of a higher tag (PS3.5 7.1 allows neither).
 
-    Of two different values nobody can tell which was meant: where this could change a result, the file is corrupt.  The
-    same value twice, or a value in a wrong place, gives only a remark.
+    Of two different values nobody can tell which was meant: where this could change a result, the file is corrupt.
     """
 
     def __init__(self) -> None:

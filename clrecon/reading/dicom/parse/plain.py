@@ -2,8 +2,8 @@
 
 It reads by the lengths of the elements alone.  The usual form is: little endian, encoded as the transfer syntax says,
 known value representations, no length beyond the bytes at hand, sequences of undefined length with well-formed items,
-each wanted element once and in rising order, and pixel data at the end.  For any other form the result is None, and
-`parse_carefully` decides.  The results of both are equal; tests compare them on mutated files.
+each wanted element once and in rising order, and pixel data at the end.  Any other form is left to `parse_carefully`;
+the results of both are equal, which tests compare on mutated files.
 """
 
 from __future__ import annotations
@@ -28,10 +28,7 @@ PIXEL_VRS = (b"OB", b"OW", b"OF", b"OD", b"OL", b"OV", b"UN")
 
 
 class NotDicomError(RefusedInputError):
-    """The file is not a DICOM file: there is no "DICM" at byte 128.
-
-    start: The first bytes of the file; all of them where it is no longer than `PREFIX_BYTES`.
-    """
+    """There is no "DICM" at byte 128; `start` are the first bytes, all of a file no longer than `PREFIX_BYTES`."""
 
     def __init__(self, message: str, start: bytes):
         super().__init__(message)
@@ -47,14 +44,12 @@ class DicomElements(NamedTuple):
 
     values: Tag to undecoded value, of the wanted tags that are present and not empty.
     vrs: Value representations of these elements; None in implicit VR.
-    encoding_differs: Implicit VR where the transfer syntax says explicit, or explicit where it says implicit; parsed as
-        found.
+    encoding_differs: Implicit where the transfer syntax says explicit VR, or the other way round; parsed as found.
     pixel_tag: None where the file ends without pixel data.
     pixel_offset, pixel_length: First byte and count of bytes of the pixel data value in the file, or, in deflated
         files, in the inflated data set.  The length is -1 where it is undefined (encapsulated).
     pixel_vr: Empty in implicit VR.
     inflate_from: Offset in the file of the deflated data set, -1 where it is not deflated.
-    remarks: Unusual points of the start of the file.
     restored: The file lacks the start of a DICOM file.
     """
 
@@ -80,14 +75,11 @@ def decode_uid(value: bytes | None) -> str:
 
 
 def read_pixel_head(head: bytes, start: int, implicit: bool, little: bool) -> tuple[int | None, int, int, str]:
-    """Read the head of the pixel data element.
+    """Read the head of the pixel data element: tag, offset and length of its value, VR (empty if implicit).
+
+    The tag is None where this is another element, or the end; the length -1 where it is undefined.
 
     head: 12 bytes of the data set from byte `start` on, fewer at its end.
-
-    Returns:
-    tag: None where this is another element, or the end.
-    offset, length: Place and length of the value; the length is -1 where it is undefined.
-    vr: Empty in implicit VR.
     """
     if len(head) < 8:
         return None, -1, 0, ""
@@ -160,13 +152,10 @@ class _Everything(dict[int, int]):
 
 
 def parse_plainly(data: bytes, size: int, wanted: tuple[int, ...] | None) -> DicomElements | None:
-    """Parse the start of a file.
+    """Parse the start of a file; None where the header has another form, or its end is not in `data`.
 
-    data: Begins with the preamble.
     size: Bytes of the whole file.
     wanted: Tags to keep; SpecificCharacterSet (0008,0005) is among them.  None keeps all of defined length.
-
-    Returns: None where the header has another form, or its end is not in `data`.
     """
     try:
         return _parse(data, size, wanted)

@@ -2,12 +2,12 @@
 
 All decoders are under permissive licences; they run in a process of their own (see `decoder_pool`). JPEG baseline,
 extended and the retired lossy JPEGs are refused: a CT image has 12 bits or more (DICOM PS3.3 C.8.2.1.1), so baseline
-JPEG of a CT image is never legal, and data stored under the names of the others often have 8 bits.  A wrong surface is
-worse than no surface.
+JPEG is never legal, and data stored under the names of the others often have 8 bits.  A wrong surface is worse than
+none.
 
-Compressed pixel data is a sequence of items: first the basic offset table, which may be empty, then fragments (DICOM
-PS3.5 A.4).  They are walked once for each file.  An extended offset table (7FE0,0001) is not needed: it is allowed only
-where every frame is one fragment (PS3.3 C.7.6.3.1.8), and then the fragments alone tell the frames.
+Compressed pixel data is a sequence of items: the basic offset table, which may be empty, then fragments (PS3.5 A.4). An
+extended offset table (7FE0,0001) is not needed: it is allowed only where every frame is one fragment (PS3.3
+C.7.6.3.1.8), and then the fragments alone tell the frames.
 """
 
 from __future__ import annotations
@@ -109,12 +109,9 @@ _STARTS = (b"\xff\xd8\xff", b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP")
 
 
 def find_frames(file: BinaryIO, start: int, file_bytes: int, frames: int, transfer_syntax: str) -> list[Pieces]:
-    """Find the fragments of every frame.
+    """Find the fragments of every frame, of as many as the header says, in a buffered file of `file_bytes`.
 
-    file: Buffered, opened for reading.
     start: Offset of the first item, bytes.
-    file_bytes: Size of the file.
-    frames: Number of frames according to the header.
     """
     table, fragments, _ = _walk_items(file, start, file_bytes, min(MAX_FRAGMENTS, FRAGMENTS_PER_FRAME * (frames + 1)))
     if not fragments:
@@ -148,10 +145,7 @@ def read_pieces(file: BinaryIO, pieces: Pieces) -> bytes:
 
 
 def _walk_items(file: BinaryIO, start: int, file_bytes: int, most: int) -> tuple[tuple[int, int], Pieces, int]:
-    """Return the offset table, the fragments, and the offset of the byte after them.
-
-    A cut codestream still decodes to an image, so a cut must be noticed here.
-    """
+    """Return the offset table, the fragments, and the offset of the byte after them.  A cut codestream still decodes."""
     items: Pieces = []
     place = start
     file.seek(start)

@@ -3,9 +3,9 @@
 pydicom converts "1,5", "nan" or a wrong count of numbers without an error.  Here a decimal string must be the requested
 count of finite numbers with a decimal point; else a `ValueProblem` names the tag.
 
-Of sequences only the tags that a schema names are read.  pydicom reads them by recursion and makes a data set of every
-item: slow for thousands of frames, and a nest of some hundred levels ends in a RecursionError.  The walk here reads
-only wanted elements, skips all others by their length, and is limited in depth and in number of items.
+Of sequences only the tags that a schema names are read; all others are skipped by their length, with limits of depth
+and of items.  pydicom reads them by recursion and makes a data set of every item: slow for thousands of frames, and a
+nest of some hundred levels ends in a RecursionError.
 
 Source: DICOM PS3.5 7.5 (nesting of data sets), 6.2.2 (UN holds implicit VR little endian).
 """
@@ -161,9 +161,8 @@ class ValueProblem(RefusedInputError):
 
 
 class Values:
-    """Typed access to raw elements; every accessor checks what it returns.
-
-    warnings: Doubtful points of the numbers that were asked for.
+    """Typed access to raw elements; every accessor checks what it returns.  `warnings` are of doubtful numbers among
+    them.
     """
 
     def __init__(self, elements: DicomElements):
@@ -335,10 +334,9 @@ _UNKNOWN = _make_encoding(implicit=True, little=True)
 def read_sequences(
     data: bytes, start: int, schema: Schema, *, implicit: bool, little_endian: bool, items_limit: int
 ) -> Item:
-    """Read the wanted values and sequences of one data set, up to its pixel data.
+    """Read the wanted values and sequences of one data set, from `start` up to its pixel data, within which `data` may
+    end.
 
-    data: Bytes that hold the data set from `start` on; may end within its pixel data.
-    implicit, little_endian: Encoding of the data set.
     items_limit: Most items that all wanted sequences may hold together.
     """
     walk = _Walk(data, items_limit)

@@ -36,11 +36,10 @@ SCRIPT = Path(__file__).with_name("decoder_process.py")
 START_SECONDS = 120.0
 FRAME_SECONDS = 60.0
 SECONDS_PER_MIB = 1.0
-"""Time limit of a frame: `FRAME_SECONDS`, and this much more for each MiB of its pixels, a hundred times the usual
-time."""
+"""Limit of a frame: `FRAME_SECONDS`, and this much more for each MiB of its pixels, a hundred times the usual time."""
 
 STOPPED_SECONDS = 2.0
-"""When this process stood still for longer (Ctrl-Z, a sleeping laptop), the decoders did too, and their time starts
+"""When this process stood still longer (Ctrl-Z, a sleeping laptop), the decoders did too, and their time starts
 again."""
 
 FRAME_MEMORY_BYTES = 256 * 2**20
@@ -67,9 +66,8 @@ class DecoderPool(Closing):
     """Processes that decode frames of one size; a context manager, safe to use from several threads at once.
 
     decoders: Names of `decoder_process.DECODERS` that will be asked for, or MODULE:FUNCTION.
-    frame_bytes: Bytes of the pixels of one frame.
-    seconds, memory_bytes: Limits for one frame; by default they grow with `frame_bytes`.  The limit on memory holds on
-        Linux and other systems that know RLIMIT_AS; Windows and macOS have the limit on time alone.
+    seconds, memory_bytes: Limits for one frame; by default they grow with the bytes of its pixels.  The limit on memory
+        holds where RLIMIT_AS does (Linux); Windows and macOS have the limit on time alone.
     """
 
     def __init__(
@@ -88,13 +86,7 @@ class DecoderPool(Closing):
         self._watchdog: threading.Thread | None = None
 
     def decode(self, data: bytes, decoder: str, out: NDArray[Any]) -> None:
-        """Decode one frame into `out`.
-
-        data: One codestream.
-        decoder: One of the names that the pool was made for.
-        out: ndarray, shape (rows, columns), C-contiguous. Receives the pixels, in the type that the decoder returns for
-            this codestream.
-        """
+        """Decode one codestream into `out` (rows, columns), C-contiguous, of the type that the decoder returns for it."""
         request = {
             "decoder": decoder,
             "length": len(data),
@@ -264,9 +256,7 @@ class _Worker:
         return status, text
 
     def wait(self) -> bool:
-        """Wait for the end of the process, kill it if that takes long, and close the pipes; False when it had to be
-        killed.
-        """
+        """Wait for the end of the process and close the pipes; False when it took long and had to be killed."""
         self._input.close()
         try:
             self.process.wait(2.0)
@@ -322,10 +312,8 @@ def _lift(number: int) -> int:
 
 
 def _find_modules() -> list[str]:
-    """Return the folders where the process looks for modules: ours without the current folder, which may hold any
-    files.
-
-    The current folder is included if numpy itself comes from it.
+    """Return the folders to look for modules: ours without the current one, which may hold any files, if not numpy
+    itself.
     """
     try:
         here = {os.getcwd()} - {str(Path(np.__file__).parents[1])}

@@ -1,13 +1,11 @@
 """The process that decodes compressed frames.  `decoder_pool` runs this file as a script; clrecon never imports it.
 
 Decoders are C code that may get malicious bytes.  Here they may crash, hang or ask for all memory, and only this
-process ends.  It imports numpy and the decoders in use, not clrecon and not pydicom, so that it starts in a tenth of a
-second.
+process ends.  It imports numpy and the decoders in use, not clrecon and not pydicom, and starts in a tenth of a second.
 
 Standard input starts with one line of JSON with settings.  Then come requests: a line of JSON, followed by the number
 of bytes of the compressed frame that it states.  For each request, standard output gets a status, a count and that many
-bytes: the pixels in C order, or a text with the error.  This process ends when its input ends or its parent does: see
-`end_with`.
+bytes: the pixels in C order, or a text with the error.
 """
 
 from __future__ import annotations
@@ -139,9 +137,8 @@ def limit_memory(more_bytes: int) -> None:
 
 
 def limit_time(seconds: float, orphan: bool) -> None:
-    """End this process when the next frame takes too long.  The parent does so too; this works without the parent.
-
-    The wall clock also counts, because the decoder of an orphaned process may wait for ever.
+    """End this process when the next frame takes too long, as the parent does too, by the wall clock if it is an
+    orphan.
     """
     try:
         import resource
@@ -156,10 +153,9 @@ def limit_time(seconds: float, orphan: bool) -> None:
 
 
 def end_with(lifeline: int) -> None:
-    """Let the system end this process (by SIGIO) when the other end of a pipe closes, that is when the parent has
-    ended.
+    """Let the system end this process (by SIGIO), even while a decoder runs, when its parent's end of a pipe closes.
 
-    This works even while a decoder runs.  Where the system has no such signal, the alarm ends an orphan.
+    Where the system has no such signal, the alarm ends an orphan.
     """
     if lifeline < 0:
         return

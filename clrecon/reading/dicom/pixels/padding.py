@@ -6,15 +6,13 @@ The median of the air beside the padding separates the fewest neighbours from it
 no noise, else no more than noise separates anyway.  Where the body reaches the circle it still meets air there, so its
 surface stays closed.
 
-No header declares some padding: one value everywhere outside of a round field of view.
+Some padding no header declares: many cone-beam scanners write 0, maybe the value of tissue, outside of a round field of
+view.  Nothing that was measured has one value without noise everywhere outside of a circle, and nowhere inside along
+it.
 
-Many cone-beam scanners write 0 there, which on their scale may be the value of tissue.  Nothing that was measured has
-one value without noise everywhere outside of a circle, and nowhere inside along it.
-
-A wrong PixelPaddingValue or PixelPaddingRangeLimit masks tissue: air stands in its place then.
-
-Padding has one value, mostly far below air, and reaches the edge of the picture.  Voxels with the HU of tissue are
-measured ones where they lie within the picture, or have values between the ends of a range.
+A wrong PixelPaddingValue or PixelPaddingRangeLimit masks tissue, and air stands in its place.  Padding has one value,
+mostly far below air, and reaches the edge of the picture: voxels with the HU of tissue are measured ones where they lie
+within the picture, or have values between the ends of a range.
 """
 
 from __future__ import annotations
@@ -72,11 +70,10 @@ class PaddingMasks:
         return sum(self._counts.values())
 
     def fill(self, run: Map = map) -> float | None:
-        """Set all padding to the value of the air beside it, or to `AIR_HU` where there is no air beside it.
+        """Set all padding to the value in HU of the air beside it, or to `AIR_HU` without such air; None without
+        padding.
 
         run: Processes several slices at once: the ``map`` of a pool.
-
-        Returns: The value in HU; None without padding.
         """
         if not self._packed:
             return None
@@ -113,17 +110,14 @@ OUTSIDE, RIM = 1.03, (0.9, 0.97)
 """Where all voxels have the value, and where hardly any has it, in radii."""
 LEAST_PART, LEAST_OUTSIDE, MOST_IN_RIM, FEWEST_VALUES = 0.05, 0.999, 0.05, 16
 """Least share of a slice that lies outside, least share of it that has the value, largest share of the rim that has it,
-and fewest values there.
-"""
+and fewest values there."""
 
 
 def fill_disc_padding(voxels: NDArray[Any]) -> tuple[float, int, float] | None:
-    """Fill the outside of a round field of view of one value above air, as declared padding is filled.
+    """Fill, in place, the outside of a round field of view of one value above air, as declared padding is filled.
 
-    voxels: ndarray, shape (nk, nj, ni). Changed in place.
-
-    Returns: (float, int, float) or None. The value, the number of its voxels outside, and what they were filled with;
-        None where there is no such disc.
+    Returns: The value, the number of its voxels outside, and what they were filled with; None where there is no such
+        disc.
     """
     nk, nj, ni = voxels.shape
     value = voxels[0, 0, 0]
@@ -142,8 +136,8 @@ def fill_disc_padding(voxels: NDArray[Any]) -> tuple[float, int, float] | None:
 
 
 def _measure_disc(measured: NDArray[np.bool_]) -> NDArray[np.float64] | None:
-    """Return the distance of each pixel from the centre of a disc, in radii; None where no disc has these ends along
-    the middle row and column, or leaves next to nothing outside.
+    """Return the distance of each pixel from the centre of a disc, in radii; None where no disc ends as the middle row
+    and column do, or next to nothing is outside.
     """
     nj, ni = measured.shape
     row, column = np.flatnonzero(measured[nj // 2]), np.flatnonzero(measured[:, ni // 2])
@@ -167,11 +161,7 @@ def _is_disc(picture: NDArray[Any], value: Any, distance: NDArray[np.float64]) -
 
 
 def count_masked_tissue(header: SliceHeader, stored: NDArray[Any], padding: NDArray[np.bool_]) -> int:
-    """Count voxels of the padding of a slice that are tissue by value and place.
-
-    stored: ndarray, shape (rows, columns). Before padding is replaced.
-    padding: ndarray of bool, shape (rows, columns)
-    """
+    """Count voxels of the padding of a slice (rows, columns) that are tissue by value and place, before it is replaced."""
     assert header.padding is not None
     low, high = header.padding
     # Padding below air is the usual case and needs no search.  NaN is not above air either.

@@ -1,9 +1,7 @@
 """Stored pixel values of slices as in the files: plain, deflated or compressed, one frame or many in a file.
 
-Only the bytes of the frame are read.  Facts about a whole file (the places of its compressed frames, its inflated data
-set) are found once and kept while the volume is read.
-
-The head of a compressed frame (format, size, bits, sign) is read before a decoder sees it.
+Only the bytes of the frame are read, the head of a compressed one (format, size, bits, sign) before a decoder sees it.
+Facts about a whole file (the places of its compressed frames, its inflated data set) are found once and kept.
 
 Sources: JPEG ITU-T T.81 B.2.2, JPEG-LS T.87 C.2.2, JPEG 2000 T.800 A.5.1 and I.2.2, RLE DICOM PS3.5 annex G.
 """
@@ -60,10 +58,8 @@ _NO_FRAMES = (0xC4, 0xC8, 0xCC)  # tables, though within the range of starts of 
 
 @dataclass(frozen=True)
 class Codestream:
-    """A compressed frame and the facts in its head.
-
-    data: The codestream alone, without a container around it.
-    signed: None where the format does not tell.
+    """A compressed frame, without a container around it, and the facts in its head; its sign is None where that is
+    silent.
     """
 
     data: bytes
@@ -80,12 +76,7 @@ class Codestream:
 
 
 def read_codestream(data: bytes, transfer_syntax: str, rows: int, columns: int, bits_allocated: int) -> Codestream:
-    """Read the head of a frame and compare it with the header of the image.
-
-    data: One frame; bytes after its end mark are allowed.
-    transfer_syntax: A compressed transfer syntax.
-    rows, columns, bits_allocated: From the header.
-    """
+    """Read the head of a frame, which may go on after its end mark, and compare it with the header of the image."""
     if transfer_syntax == RLE:
         frame = _read_rle(data, rows, columns, bits_allocated)
     elif transfer_syntax in JPEG_2000:
@@ -197,12 +188,7 @@ Known = TypeVar("Known")
 
 
 class StoredPixels(Closing):
-    """Reads stored pixel values of the slices of one stack; a context manager, to be used from several threads.
-
-    slices: All of one size.
-
-    compressed: Some of the slices are compressed.
-    """
+    """Reads stored pixel values of the slices of one stack; a context manager, to be used from several threads."""
 
     def __init__(self, slices: Sequence[SliceHeader]):
         compressed = sorted({h.transfer_syntax for h in slices if is_encapsulated(h.transfer_syntax)})
@@ -224,11 +210,9 @@ class StoredPixels(Closing):
     def load(self, header: SliceHeader, out: NDArray[Any]) -> NDArray[Any]:
         """Read one slice.
 
-        out: ndarray, shape (rows, columns), C-contiguous. Memory that may be used for the result where its type has the
-            same width.
+        out: C-contiguous (rows, columns); memory that may be used for the result where its type has the same width.
 
-        Returns: ndarray, shape (rows, columns). Stored values in the type that the header declares, unused bits
-            included, in native byte order.
+        Returns: Stored values in the type that the header declares, unused bits included, in native byte order.
         """
         dtype = stored_dtype(header.float_pixels, header.signed, header.bits_allocated)
         fits = out.dtype.itemsize == dtype.itemsize and (out.dtype.kind == "f") == (dtype.kind == "f")
@@ -317,9 +301,8 @@ def _check_compressed_bytes(found: int, pixel_bytes: int) -> None:
 
 
 def _inflate_data_set(header: SliceHeader, needed: int) -> bytes:
-    """Return the first `needed` bytes of a deflated data set, or those that exist; memory is bounded by `needed`.
-
-    zlib bounds its output and its state does not grow, so no separate process is needed.
+    """Return the first `needed` bytes of a deflated data set, or those that exist; zlib takes no more memory than
+    these.
     """
     if needed > INFLATED_LIMIT:
         raise RefusedInputError(f"deflated image of {needed} bytes, no more than {INFLATED_LIMIT} are inflated")
@@ -341,10 +324,9 @@ def _inflate_data_set(header: SliceHeader, needed: int) -> bytes:
 def _settle_sign(header: SliceHeader, frame: Codestream, decoded: NDArray[Any]) -> None:
     """Give decoded values, in place, the sign that the header declares.
 
-    A codestream may have fewer bits than its memory cell, and another sign than the header or none.  Its values then
-    have bits without their sign, or the other way round.  From BitsStored bits on the value is certain, and unused bits
-    are dropped later.  With fewer than BitsStored bits there are two readings, which agree as long as the highest bit
-    is 0.
+    A codestream may have fewer bits than its memory cell, and another sign than the header or none.  From BitsStored
+    bits on the value is certain, and unused bits are dropped later.  With fewer there are two readings, which agree as
+    long as the highest bit is 0.
     """
     if frame.signed is None and not header.signed or frame.signed == header.signed:
         return

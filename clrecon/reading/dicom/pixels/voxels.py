@@ -6,10 +6,9 @@ integers: int16 where every value fits, else int32; other slopes give float32. I
 volume in modular arithmetic, which is exact because the result is known to fit beforehand.  Float pixel data are HU as
 they are (float32, from 64 bits too): the standard gives them no rescale (PS3.3 C.7.6.24).
 
-Stray bits are those of stored values above HighBit: the sign, an overlay, or part of the value after all.
-
-By the standard they hold the extended sign or, in old files, overlays (PS3.5 8.1.1). They are cut off.  Where they were
-part of the value, because BitsStored is too small, the HU wrap around: metal turns into air.
+Stray bits are those of stored values above HighBit: by the standard the extended sign or, in old files, overlays (PS3.5
+8.1.1). They are cut off.  Where they were part of the value, because BitsStored is too small, the HU wrap around: metal
+turns into air.
 """
 
 from __future__ import annotations
@@ -58,12 +57,9 @@ class StrayBits(NamedTuple):
 
 
 def find_stray_bits(header: SliceHeader, stored: NDArray[Any], left_out: NDArray[np.bool_] | None) -> StrayBits | None:
-    """Examine the stored values of a slice, (rows, columns), as they are in the file.
+    """Examine the stored values of a slice (rows, columns) as they are in the file; None where no bit can be stray.
 
-    stored: ndarray of int, shape (rows, columns)
-    left_out: ndarray of bool, same shape, or None. Padding that fills unused bits too.
-
-    Returns: None where no bit can be stray.
+    left_out: Padding that fills unused bits too.
     """
     spare = header.bits_allocated - 1 - header.high_bit
     if header.float_pixels or spare == 0:
@@ -98,9 +94,7 @@ def find_stray_bits(header: SliceHeader, stored: NDArray[Any], left_out: NDArray
 
 
 def _read_overlay_bits(header: SliceHeader) -> list[int]:
-    """Return the bits of the stored values that hold overlays by the header; position 0 is an overlay with its own
-    data.
-    """
+    """Return the bits of stored values that hold overlays by the header; position 0 is an overlay with its own data."""
     try:
         values = read_elements(header.file, OVERLAY_BITS, force=True).values
     except (OSError, CorruptFileError, NotDicomError):
@@ -135,8 +129,8 @@ FLOAT_LIMIT = 1e9
 
 
 class _SliceFacts(NamedTuple):
-    """Figures of one slice: its padding, packed, its lowest and highest measured HU, unusual bits, and how many voxels
-    of its padding are tissue by their looks.
+    """Figures of one slice: packed padding, lowest and highest measured HU, unusual bits, padding that looks like
+    tissue.
     """
 
     padding: tuple[bytes, int] | None
@@ -153,14 +147,9 @@ class _RangeError(Exception):
 def read_voxels(
     slices: Sequence[SliceHeader], progress: Progress | None = None, source: StoredPixels | None = None
 ) -> tuple[NDArray[Any], PixelFacts]:
-    """Read the pixels of sorted slices of one size into one volume.
+    """Read the pixels of slices of one size, in the order of k, as HU (n, rows, columns): int16, int32 or float32.
 
-    slices: In the order of k.
-    progress: Called as ``progress("read", done, total)``.
     source: An open source for these slices, which stays open; without it the call opens its own.
-
-    Returns:
-    voxels: ndarray, shape (n, rows, columns), int16, int32 or float32. HU.
     """
     integral = all(
         float(h.slope).is_integer() and float(h.intercept).is_integer() and not h.float_pixels for h in slices

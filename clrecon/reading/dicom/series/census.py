@@ -37,7 +37,6 @@ class Census:
     """Numbers and counts in the files of one SeriesInstanceUID, localizers and all phases included.
 
     numbers: InstanceNumber of its images.
-    images, files: Images and files that are there.
     stated_images, stated_files: ImagesInAcquisition and NumberOfSeriesRelatedInstances, the largest value of each.
     ends_before: Last numbers of the other series of the study, from where this one may be numbered on.
     """
@@ -80,11 +79,7 @@ def take_census(
 
 
 def judge_numbers(census: Census, stack: Stack, copies: int) -> Gate:
-    """Judge the gate ``complete_series``.
-
-    stack: The slices that are or would be read.
-    copies: Number of images that are copies of others.
-    """
+    """Judge the gate ``complete_series`` of the slices that are or would be read; `copies` of its images are copies."""
     what = "slices missing according to the numbers and counts in the headers"
     numbers = _ordered_numbers(stack)
     if numbers is None and census.stated_images is None and census.stated_files is None:
@@ -154,9 +149,8 @@ def _judge_steps(census: Census, stack: Stack, numbers: NDArray[np.int64]) -> tu
 
 
 def _judge_start(census: Census, numbers: NDArray[np.int64]) -> tuple[int, str]:
-    """Return how many slices are missing before the first number, and why.
-
-    Where as many are missing as are there, the series is numbered on from another one, or a part that someone chose.
+    """Return how many slices are missing before the first number, and why; where most are, someone numbered on or
+    chose.
     """
     low = int(numbers.min())
     absent = low - 1 - sum(1 <= number < low for number in census.numbers)

@@ -1,7 +1,6 @@
 """The certificate of a DICOM series, without patient data: its origin and geometry, and the gates that it must meet.
 
-People put names into file names and series descriptions: warnings and reports contain neither, only counts and
-positions.
+Warnings and reports hold no file names and descriptions, into which people put names, only counts and positions.
 
 A gate covers a fact that moves a surface in the patient or changes its level, without the user of the mesh seeing it.
 Everything else that is unusual gives only a warning; docs/certificate.md lists both, with the reasons.
@@ -56,8 +55,7 @@ from clrecon.system.records import Gate, at_most, none_of, unmeasured
 from clrecon.system.text import count_of, hash_uid
 
 GAP_THICKNESSES = 2.0
-"""Largest gap in units of the slice thickness.  Beyond it more is left out than measured: a high-resolution lung scan
-has 10, and no usable surface."""
+"""Largest gap in slice thicknesses.  Beyond it more is left out than measured: 10 in a high-resolution lung scan."""
 SLOPES, INTERCEPTS = (1e-3, 100.0), (-40_000.0, 40_000.0)
 """Ranges of slope and intercept.  Scanners write the slope 1, a fraction of 1 or a few; below 0 bone would be dark.
 Stored 16-bit values in the middle of their range need an intercept of 32768."""
@@ -71,14 +69,10 @@ def judge_series(
     likeness: Likeness | None = None,
     value_gates: Sequence[Gate] | None = None,
 ) -> list[Gate]:
-    """Judge a series by the gates.
+    """Judge a series by the gates; those on what is None are not measured.
 
     stack: Its slices as they are or would be read.
-    facts: Figures of its pixels; without them the gates on pixels are not measured.
-    likeness: Likeness of its slices; also None where they are too few or too small.
     value_gates: Gates of the values of the voxels, see `clrecon.reading.common.plausibility.examine_voxels`.
-
-    Returns: See `clrecon.system.records.Gate`.  The texts hold no file names.
     """
     refused = len(series.problems)
     gates = [
@@ -159,8 +153,8 @@ def _judge_hu(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> Gate:
 
 
 def _judge_one_volume(series: Series, likeness: Likeness | None) -> Gate:
-    """Judge whether neighbours differ more than slices farther apart, and whether an element alternates from slice to
-    slice.
+    """Judge whether neighbours differ more than slices farther apart, and whether an element alternates along the
+    slices.
     """
     doubts = 0 if series.stack is None or series.find_doubt() == "" else 1
     what = "signs of several volumes between each other: a header that alternates, neighbours less alike than others"
@@ -343,11 +337,9 @@ def certify(
 ) -> Certificate:
     """Build the certificate of a series: the report of its volume, and what ``clrecon info`` shows.
 
-    series, stack: The series that was or would be read, and its stack.
-    facts: None: the pixels were not read, and entries that depend on them are None.
-    affine: ndarray, shape (4, 4), or None. None: the series is refused.
-    likeness: Likeness of the slices; None: the pixels were not read, or there are too few slices.
-    findings: What the voxels say of their values; None: the pixels were not read.
+    facts, findings: None: the pixels were not read, and entries that depend on them are None.
+    affine: None: the series is refused.
+    likeness: None: the pixels were not read, or there are too few slices.
     """
     headers, first, line = stack.slices, stack.slices[0], stack.line
     stated = next((h.stated_gap_mm for h in headers if h.stated_gap_mm is not None), None)

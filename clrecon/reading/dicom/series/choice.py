@@ -18,8 +18,7 @@ from clrecon.system.text import count_of, hash_uid, join_names
 _DIRECTIONS = ("sagittal", "coronal", "axial")
 """Names of slices whose normal lies nearest to x, y, z of the patient."""
 _NOT_ORIGINAL = ("DERIVED", "SECONDARY")
-"""Words of ImageType: pixels computed from other images, or images made after the examination (DICOM PS3.3
-C.7.6.1.1.2)."""
+"""Words of ImageType: computed from other images, or made after the examination (DICOM PS3.3 C.7.6.1.1.2)."""
 
 
 class Rank(NamedTuple):
@@ -74,8 +73,8 @@ def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> C
     wanted: Number in the listing, SeriesInstanceUID, its hash, the start of one of these (`SHORTEST_START` characters),
         or the description (whole, or a part that only one series has).  None takes the CT stack with most slices.  Of
         those with a similar number (`SIMILAR`) original images come before derived ones, then the thinnest slices, then
-        most slices; of equal ones the usable one is taken.  With CT stacks of several patients, or with similar ones in
-        different directions, there is no such choice.
+        most slices; of equal ones the usable one.  Several patients, or similar stacks in different directions, leave
+        no choice.
     """
     if wanted is None:
         ct = [series for series in found if series.kind != "other"]

@@ -1,9 +1,8 @@
 """Files that are not DICOM: what they are, so that a message can say what to do, and which may be lost slices.
 
 A slice lost at an end of a stack leaves no hole.  Its file often remains: empty, blank, packed, or with a damaged
-start, under a name without suffix as usual on CDs.  So other files beside slices are compared with them: a name that
-continues their numbering, their size, bytes of a DICOM header.  A licence, a viewer, a list or a preview has none of
-these.
+start, under a name without suffix as usual on CDs.  So other files beside slices are compared with them by names that
+continue their numbering, size, and bytes of a DICOM header: a licence, a viewer, a list or a preview has none of these.
 """
 
 from __future__ import annotations
@@ -154,10 +153,7 @@ def _pattern(name: str) -> str:
 
 
 def describe_start(start: bytes) -> str:
-    """Describe a file by its first bytes, which lack the mark of DICOM.
-
-    start: Some kB, or the whole file.
-    """
+    """Describe a file by its first bytes (some kB, or the whole file), which lack the mark of DICOM."""
     if not start:
         return EMPTY
     if _META_ELEMENT.match(start, META_START):
@@ -173,12 +169,9 @@ def describe_start(start: bytes) -> str:
 
 
 def find_remains(strangers: Sequence[Stranger], slices: Iterable[tuple[str, int | None]]) -> list[tuple[Path, str]]:
-    """Find the files that may be remains of a slice.
+    """Find the files that may be remains of a slice, each with the reason, which contains no names.
 
-    slices: iterable of (str, int or None). Path and bytes of the files that hold CT slices; None where they are no
-        measure for others.
-
-    Returns: list of (Path, str). Each file with the reason; the reasons contain no names.
+    slices: Path and bytes of the files that hold CT slices; None where they are no measure for others.
     """
     if not strangers:
         return []

@@ -1,9 +1,8 @@
 """Several slices at one place: copies of each other, or the phases of a series that holds more than one volume.
 
-Copies are slices with the same pixels and the same geometry; one of them is kept.  Other slices at one place are
-distinguished by an element of the headers (a temporal position, an acquisition, a time, a reconstruction kernel): the
-first one that divides the slices into stacks with one slice at each place.  Slices of several volumes may also lie
-between each other at different places: see `clrecon.reading.dicom.stack.mixtures`. No phase is chosen here.
+Copies are slices with the same pixels and the same geometry; one of them is kept.  Others are distinguished by the
+first element of the headers (a temporal position, an acquisition, a time, a reconstruction kernel) that divides them
+into stacks with one slice at each place.  Slices of several volumes may also lie between each other (`mixtures`).
 """
 
 from __future__ import annotations
@@ -51,8 +50,7 @@ class Phase:
     """One of several volumes in a series.
 
     number: From 1; the value that ``phase=`` takes.
-    keyword, value: The element that distinguishes the phases, and its value for this phase; times count from the first
-        phase.
+    keyword, value: The element that distinguishes the phases, and its value for this one; times count from the first.
     """
 
     number: int
@@ -86,11 +84,7 @@ class Places:
 
 
 def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHeader, SliceHeader], bool]) -> Places:
-    """Leave out copies and find phases.
-
-    places: The slices at each place, in the order of the places.
-    same: Function that is true for two slices with the same pixels.
-    """
+    """Leave out copies and find phases of the slices at each place; `same` is true for two slices with the same pixels."""
     sorted_out = [_sort_copies(slices, same) for slices in places]
     kept = [[copies[0] for copies in found] for found in sorted_out]
     count = sum(map(len, places))
@@ -150,10 +144,7 @@ def _describe_one_place(count: int, headers: Sequence[SliceHeader], phases: Sequ
 
 
 def part_alternating(places: Places, found: Alternation) -> Places:
-    """Divide the same slices into phases by an alternation along them; the phases share no place.
-
-    places: Places with one slice each.
-    """
+    """Divide slices, one at each place, into phases by an alternation along them; the phases share no place."""
     members = [tuple(places.headers[k] for k in group) for group in found.groups]
     if not found.tag:
         shown = [f"{number} of {len(members)}" for number in range(1, len(members) + 1)]
@@ -174,10 +165,7 @@ def part_alternating(places: Places, found: Alternation) -> Places:
 
 
 def lie_alike(one: SliceHeader, other: SliceHeader) -> bool:
-    """True when two slices at one place along the normal have the same geometry, in the same frame of reference.
-
-    This is needed because empty slices have equal pixels at every place.
-    """
+    """True when two slices at one place have the same geometry: empty slices have equal pixels at every place."""
     return (
         one.frame_of_reference == other.frame_of_reference
         and _is_near(one.position_mm, other.position_mm, SAME_POSITION_MM)
@@ -260,8 +248,8 @@ def _keyword_choices(places: Sequence[Sequence[SliceHeader]]) -> Iterator[tuple[
 
 
 def _rank_by_time(places: Sequence[Sequence[SliceHeader]]) -> tuple[Phase, ...]:
-    """Rank slices by time where every place was visited equally often and each visit has a time: first visits, second
-    visits...
+    """Rank slices by time, first visits, second visits and so on, where all places were equally often visited at known
+    times.
     """
     most = max(map(len, places))
     if any(len(slices) != most for slices in places):

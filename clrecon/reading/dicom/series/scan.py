@@ -1,19 +1,16 @@
 """Scan of a folder or file: the header of every DICOM file in it is read.
 
-Names, extensions and DICOMDIR files do not decide what is read.  They only make a file that is not DICOM a suspect of
-being the remains of a slice (`remains`). Only regular files are opened; devices and pipes are skipped and counted.  A
-link into the folder is skipped too, because its target is found at its own place.  A link out of the folder is followed
-only on request: in an archive from a stranger it may lead to any file of the machine.  A link that is not followed may
-stand for a slice, as an unreadable file may.
+Names, extensions and DICOMDIR files do not decide what is read; they only make a file that is not DICOM a suspect of
+being the remains of a slice.  Only regular files are opened; devices and pipes are skipped and counted.  A link into
+the folder is skipped too, because its target is found at its own place.  A link out of the folder is followed only on
+request: in an archive from a stranger it may lead to any file of the machine.  One that is not followed may stand for a
+slice, as an unreadable file may.
 
-The disk may be slow or hang.
-
-The calls that can hang (listing a folder, opening a file, reading its start) run in threads of their own, for two
-reasons.  A network drive that does not answer cannot be interrupted, neither by us nor with Ctrl-C: so the caller waits
-in another thread, reports after `NOTICE_S` what it waits for, and gives up after `GIVE_UP_S` with an error that names
-it.  The threads are daemons, so that a hanging one does not delay the end of the process.  And where a file takes
-longer than `SLOW_FILE_S`, the delay lies in the connection to the disk: then several threads wait at once.  On a warm
-cache one thread is fastest, since the parser beside it needs the interpreter's lock.
+The calls that can hang (listing a folder, opening a file, reading its start) run in daemon threads.  A network drive
+that does not answer cannot be interrupted, not even with Ctrl-C: the caller waits in another thread, reports after
+`NOTICE_S` what it waits for, and gives up after `GIVE_UP_S` with an error that names it.  And where a file takes longer
+than `SLOW_FILE_S`, the delay lies in the connection to the disk: then several threads wait at once.  On a warm cache
+one thread is fastest, since the parser beside it needs the interpreter's lock.
 """
 
 from __future__ import annotations
@@ -57,13 +54,7 @@ MOST_THREADS = 16
 
 
 class DiskReader:
-    """Reads in separate threads while the caller waits; for use in a ``with`` statement.
-
-    progress: Called by the thread of the caller as ``progress("no answer yet from NAME", done, total)`` where the disk
-        hangs.
-
-    touched: Path that was read last, for the message when it hangs.
-    """
+    """Reads in separate threads while the caller waits and reports; `touched` is the path that was read last."""
 
     def __init__(self, progress: Progress | None = None):
         self._progress = progress
@@ -182,14 +173,11 @@ class CorruptFile:
 
 @dataclass
 class Scan:
-    """The contents of a folder.
+    """The contents of a folder, slices in the order of their paths.
 
-    slices: Valid CT slices, in the order of their paths.
-    others: DICOM objects that are not CT slices.
     skipped: Maps a reason to the number of files (or folders) passed over.
     corrupt: Files that claim to be DICOM but cannot be parsed; files and folders that cannot be read at all.
-    suspects: Files that are not DICOM by their content, but look like remains of a slice; links that are not followed
-        or lead nowhere.
+    suspects: Files that are not DICOM, but look like remains of a slice; links that are not followed or lead nowhere.
     strangers: All other files that are not DICOM.
     rescale: Slope and intercept that the user gave for all slices.
     is_file: The path names one file and no folder.
@@ -207,11 +195,9 @@ class Scan:
 
 
 def scan_path(path: Path, progress: Progress | None = None, force: bool = False, follow_links: bool = False) -> Scan:
-    """Read the headers of all DICOM files at `path`.
+    """Read the headers of all DICOM files at `path`, a file or a folder with its subfolders; progress in
+    `PROGRESS_STEPS`.
 
-    path: A folder, searched with its subfolders, or one file.
-    progress: Called as ``progress("scan", done, total)``, about `PROGRESS_STEPS` times in all, and as ``progress("no
-        answer yet from NAME", done, total)`` where the disk hangs.
     force: Also accept data sets without preamble or meta header.
     follow_links: Also read the files and folders that links out of the folder lead to.
     """

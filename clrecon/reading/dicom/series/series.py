@@ -35,8 +35,7 @@ With smaller differences they are one stack, and the gate reports the difference
 
 
 class Planes:
-    """Pairs of directions, numbered in the order of arrival; pairs within `SPLIT_ANGLE_RAD` of an earlier one get its
-    number.
+    """Pairs of directions, numbered as they arrive; pairs within `SPLIT_ANGLE_RAD` of an earlier one get its number.
 
     A series may have as many planes as files: beyond the first few they are looked up in a grid of cells of that size.
     """
@@ -69,10 +68,7 @@ def _are_near(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
 
 
 def describe_missing_parts(slices: Iterable[SliceHeader]) -> list[str]:
-    """Describe missing files of concatenations: at an end of the stack they would leave no hole.
-
-    slices: All slices of a series.
-    """
+    """Describe missing files of concatenations of a series: at an end of the stack they would leave no hole."""
     found: dict[str, set[Concatenation]] = defaultdict(set)
     for header in slices:
         if header.concatenation is not None:
@@ -116,9 +112,9 @@ class Series:
     others: Its files that cannot be slices.
     corrupt: Files and folders that cannot be read and may be or contain slices of it.
     lost: Descriptions of missing files that leave no hole: parts of concatenations.
-    census: Numbers and counts of all parts of the series.
+    census: Of all parts of the series.
     number: Place in the listing, from 1.
-    patient, study: Numbers of the patient and the study among those scanned, from 1; 0 where the files do not tell.
+    patient, study: Numbers among those scanned, from 1; 0 where the files do not tell.
     phase: Number of the wanted phase.
     allow_gaps: Missing slices give a warning and are not a problem.
     is_file: One file was named, and not the folder of the series.
@@ -199,9 +195,8 @@ class Series:
     def choose(self, phase: int | None = None, allow_gaps: bool = False) -> Series:
         """Return the series with a phase chosen and gaps allowed, after a closer examination.
 
-        Interleaved volumes are found by any element that alternates in the headers, which are read again for this.
-        Where the alternation may occur within one volume, or a phase is wanted that no header distinguishes, the pixels
-        are compared as well.
+        Interleaved volumes are found by any element that alternates in the headers, which are read again for this;
+        where it may within one volume, or a phase is wanted that no header distinguishes, by the pixels as well.
         """
         chosen = replace(self, phase=phase, allow_gaps=allow_gaps)
         try:
@@ -285,8 +280,7 @@ def group_series(scan: Scan) -> list[Series]:
 
     One SeriesInstanceUID (where it was removed: one folder) gives one `Series`, or several where it mixes planes,
     localizers or secondary captures with a stack.  Numbers follow (patient, study, SeriesNumber, SeriesInstanceUID,
-    larger part first) so they do not depend on file names; patients and studies come in the order of their first
-    series, unknown ones last.
+    larger part first), not file names; patients and studies come in the order of their first series, unknown ones last.
     """
     slices: dict[str, list[SliceHeader]] = defaultdict(list)
     others: dict[str, list[OtherImage]] = defaultdict(list)
@@ -355,9 +349,9 @@ def _owner_key(found: Sequence[Series]) -> Callable[[Series], tuple[float, float
 def _blame_corrupt_files(found: Sequence[Series], scan: Scan) -> None:
     """Give every stack the unreadable files that may belong to it: a lost slice at its end would leave no hole.
 
-    A corrupt or unreadable file may belong to any stack, unless its folder holds slices of other series only.  A
-    suspect may belong to a stack with slices in its folder, or to one whose slices lie in several folders where its
-    own folder holds no slices at all.
+    A corrupt file may belong to any stack, unless its folder holds slices of other series only.  A suspect may belong
+    to a stack with slices in its folder, or to one with slices in several folders where its own folder holds none at
+    all.
     """
     holders: dict[Path, set[str]] = defaultdict(set)  # from folder to the series, by UID, with slices in it
     for series in found:

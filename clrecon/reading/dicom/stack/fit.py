@@ -39,14 +39,11 @@ ORIENTATION_SPREAD_RAD = 1e-4
 
 @dataclass(frozen=True)
 class Directions:
-    """Mean directions of a stack.
+    """Mean directions of a stack, orthonormal (3,), LPS; x and y, for sorting, where a slice exceeds
+    `ORIENTATION_LIMIT`.
 
-    row, column: ndarray, shape (3,), float64. Orthonormal, LPS.  Where a slice exceeds `ORIENTATION_LIMIT`, x and y,
-        used only for sorting.
-    deviations: ndarray, shape (n,), float64. Deviation of each slice's stored directions from unit length and right
-        angle.
-    angles_rad: ndarray, shape (n,), float64. Angle between the directions of each slice and the mean; NaN where there
-        is no mean.
+    deviations: Of each slice's stored directions (n,) from unit length and right angle.
+    angles_rad: Between the directions of each slice (n,) and the mean; NaN where there is no mean.
     """
 
     row: Float64Array
@@ -65,9 +62,7 @@ class Directions:
 
     @property
     def spread_allowed_rad(self) -> float:
-        """Largest allowed angle: skew is removed from every slice alike, so it does not count as a difference between
-        slices.
-        """
+        """Skew is removed from every slice alike, so it does not count as a difference between slices."""
         return ORIENTATION_SPREAD_RAD + self.deviation
 
 
@@ -102,10 +97,9 @@ PIXEL_SPACING_TOLERANCE = 1e-5
 
 @dataclass(frozen=True)
 class Line:
-    """Evenly spaced places fitted to the slices, and the distances of the slices from them.  Figures are None for one
-    slice.
+    """Evenly spaced places fitted to the slices, and the distances of the slices from them; None for one slice.
 
-    step, origin: ndarray, shape (3,), float64. LPS mm, by least squares.
+    step, origin: (3,), LPS mm, by least squares.
     gap_min_mm, gap_max_mm, gap_median_mm: Distances of neighbours along the normal.
     residual_max_mm, residual_rms_mm: Distance of the positions from their places.
     tolerance_mm: Largest residual that counts as rounding; the unit of the last digit where few digits were written.
@@ -127,14 +121,12 @@ class Line:
 
 @dataclass(frozen=True)
 class Stack:
-    """The measured geometry of one stack of slices.
+    """The measured geometry of one stack of slices; it is refused where it has problems.
 
     slices: Sorted by ascending position along the normal.
-    positions_mm: ndarray, shape (n, 3), float64. LPS mm.
-    distances_mm: ndarray, shape (n,), float64. Positions along the normal.
-    affine: ndarray, shape (4, 4), float64, or None. Index (i, j, k) to LPS mm; None for a stack with problems.
+    positions_mm, distances_mm: (n, 3) LPS, and along the normal (n,).
+    affine: Index (i, j, k) to LPS mm; None for a stack with problems.
     tilt_deg: See `signed_tilt`; None where there is no affine.
-    problems, warnings: A stack with problems is refused.
     missing: Number of missing slices, computed from the usual gap; they are either allowed or one of the problems.
     """
 
@@ -155,12 +147,9 @@ class Stack:
 
 
 def measure_stack(headers: Sequence[SliceHeader], allow_gaps: bool = False) -> Stack:
-    """Sort slices, find their problems, and fit the affine.
+    """Sort slices, at most one at each place, find their problems, which raise no error, and fit the affine.
 
-    headers: One or more, with at most one slice at each place.
     allow_gaps: Missing slices give a warning and are not a problem.
-
-    Returns: Bad geometry raises no error; it is described in ``problems``.
     """
     problems = find_mixed_values(headers)
     warnings: list[str] = []
@@ -369,10 +358,10 @@ def measure_extent(stack: Stack) -> list[float] | None:
 
 
 def summarise_gaps(distances: Float64Array) -> list[dict[str, Any]]:
-    """Return the runs of equal gaps between sorted positions (mm along the normal), in order.
+    """Return the runs of equal gaps between sorted positions (mm along the normal), in order: ``count``, mean
+    ``gap_mm``.
 
-    Returns: ``count`` gaps of ``gap_mm``, their mean; a gap belongs to a run as long as it equals the first of it
-        within the tolerance of an even stack.
+    A gap belongs to a run as long as it equals the first of it within the tolerance of an even stack.
     """
     runs: list[list[float]] = []
     for gap in np.diff(distances).tolist():
@@ -394,12 +383,10 @@ def _thicknesses(headers: Sequence[SliceHeader]) -> list[float]:
 
 
 def facts_of_thickness(headers: Sequence[SliceHeader], distances: Float64Array) -> dict[str, Any] | None:
-    """Compare SliceThickness with the distances of the slices along the normal.
+    """Compare SliceThickness with the distances of the slices; None unless there are two and each states a thickness.
 
-    Returns: ``min_mm``, ``max_mm``, ``median_mm`` of the thickness; ``overlap_mm``: ``min``, ``max`` and ``median`` of
-        what neighbouring slices share, (t_k + t_k+1) / 2 less their distance, below zero where tissue between them was
-        not measured; ``overlap_percent``: its median in percent of the median distance.  None unless every slice states
-        a thickness and there are two slices.
+    ``overlap_mm`` is what neighbouring slices share, (t_k + t_k+1) / 2 less their distance, below zero where tissue
+    between them was not measured; ``overlap_percent`` its median in percent of the median distance.
     """
     thickness = np.array(_thicknesses(headers))
     if len(thickness) != len(headers) or len(headers) < 2:

@@ -3,12 +3,11 @@
 Two reconstructions half a gap apart, or two acquisitions that overlap, share no place.  Sorted by position they look
 like one stack that alternates between two volumes, evenly spaced or not.
 
-Any element may distinguish two such volumes: a time, the contrast medium, an acquisition number that only one of them
-has, a private element.  So all headers of the stack to be read are read again completely.  Every element whose values
-repeat in a fixed order along the stack is found: ABAB, ABCABC, AABB. Within one volume values stay, count on, or change
-at single places; or they alternate with the turns of the gantry.  So in an even stack only elements that are constant
-within a volume, for the reason given here, make phases.  Of all others the pixels decide.  docs/geometry.md has the
-same table.
+Any element may distinguish them: a time, the contrast medium, an acquisition number that only one of them has, a
+private element.  So all headers of the stack are read again completely, for every element whose values repeat in a
+fixed order along it: ABAB, ABCABC, AABB. Within one volume values stay, count on, or change at single places; or they
+alternate with the turns of the gantry.  So in an even stack only elements that are constant within a volume, for the
+reason given here, make phases; of all others the pixels decide.  docs/geometry.md has the same table.
 """
 
 from __future__ import annotations
@@ -50,8 +49,8 @@ CODING: dict[str, Callable[[SliceHeader], float]] = {
     "HighBit": lambda header: header.high_bit,
     "PixelRepresentation": lambda header: header.signed,
 }
-"""Numbers that turn stored values into HU.  A slice may have its own, but then each has: where most agree, one that
-differs is doubtful."""
+"""Numbers that turn stored values into HU.  A slice may have its own, but where most agree, one that differs is
+doubtful."""
 
 
 def values_of(header: SliceHeader, keywords: Sequence[str]) -> tuple[str, ...]:
@@ -63,12 +62,9 @@ def values_of(header: SliceHeader, keywords: Sequence[str]) -> tuple[str, ...]:
 def find_mixture(
     headers: Sequence[SliceHeader],
 ) -> tuple[tuple[str, ...], Mapping[tuple[str, ...], Sequence[SliceHeader]]] | None:
-    """Find the element that divides a stack into volumes whose slices lie between each other.
+    """Find the element that divides a stack, with one slice at each place, into volumes that lie between each other.
 
-    headers: One slice for each place, in the order of the places.
-
-    Returns: (keywords, groups) or None. The slices by their value of the keyword: each group has at least three slices
-        and all have a value.
+    Returns: The keyword, and the slices by their value of it: each group has at least three, and all have a value.
     """
     for keyword, values in _values_along(headers, (*CERTAIN, *POSSIBLE)):
         groups = _find_interleaved(values, headers)
@@ -105,12 +101,7 @@ def _is_even(headers: Sequence[SliceHeader]) -> bool:
 
 
 def describe_differences(headers: Sequence[SliceHeader]) -> Iterator[tuple[str, Callable[[SliceHeader], bool]]]:
-    """Describe values that differ within a stack but should be equal, and the slices that differ from the first one.
-
-    headers: In the order of their places.
-
-    Yields: (text, is_so). Keywords and slices, without values that could tell of the patient.
-    """
+    """Yield descriptions of values that differ within a stack but should not, and which slices differ from the first."""
     first = headers[0]
     for keyword, values in _values_along(headers, ("KVP", *ALTERNATING)):
         if keyword == "KVP":
@@ -150,8 +141,8 @@ Verdict = Literal["phases", "pixels", "nothing"]
 class ElementKind:
     """Elements that alternate for one reason.
 
-    verdict: {"phases", "pixels", "nothing"}. What follows from an alternation in an even stack: phases; phases if the
-        pixels show two volumes, else a doubt; or nothing, since one volume alternates in it.
+    verdict: What follows in an even stack: phases; phases if the pixels show two volumes, else a doubt; or nothing,
+        since one volume alternates in it.
     """
 
     verdict: Verdict
@@ -261,7 +252,7 @@ class Alternation:
 
     tag: 0 where the groups do not come from an element.
     groups: The places, from 0, of each volume, in the order of the values.
-    certain: The element is constant within one volume, see `clrecon.reading.dicom.stack.mixtures`.
+    certain: The element is constant within one volume.
     heaps: The groups are heaps of close numbers, and each slice has its own number.
     absent: The group that lacks the element.
     """
@@ -283,9 +274,8 @@ class Alternation:
 
 
 def find_alternation(headers: Sequence[SliceHeader], even: bool) -> Alternation | None:
-    """Find an element that alternates along a stack; reads the headers of its files again.
+    """Find an element that alternates along a stack of one slice at each place; reads the headers of its files again.
 
-    headers: One slice for each place, in the order of the places.
     even: All gaps are equal.  Fewer elements are certain then, and in a long stack some windows are examined first.
 
     Returns: A certain one before a doubtful one.  None for multi-frame images too, whose frames share one header.
@@ -301,9 +291,7 @@ def find_alternation(headers: Sequence[SliceHeader], even: bool) -> Alternation 
 
 
 def alternate_places(count: int, period: int) -> Alternation:
-    """Deal `count` slices in turn to `period` volumes, for period 4 in pairs to two volumes: groups that no header
-    shows.
-    """
+    """Deal `count` slices in turn to `period` volumes, for period 4 in pairs to two: groups that no header shows."""
     if period == 4:
         return Alternation(0, tuple(tuple(k for k in range(count) if k // 2 % 2 == half) for half in (0, 1)), False)
     return Alternation(0, tuple(tuple(range(first, count, period)) for first in range(period)), False)
@@ -347,9 +335,7 @@ def _read_columns(headers: Sequence[SliceHeader]) -> dict[int, list[bytes]]:
 
 
 def _read_values(header: SliceHeader) -> dict[int, bytes]:
-    """Read the elements of one file that are compared: none if it has changed since the scan, which reading its pixels
-    reports.
-    """
+    """Read the elements of a file that are compared: none if it changed since the scan, as reading its pixels reports."""
     try:
         # A file that needed `force` is read with it again; for other files it changes nothing.
         values = read_elements(header.file, None, force=True).values
@@ -407,8 +393,7 @@ def _number(raw: bytes) -> float | None:
 def alternates(codes: Sequence[int], gaps: Sequence[float]) -> bool:
     """True where values repeat in a fixed order, along the whole stack or where its slices are closer together.
 
-    codes: A number for the value of each slice.
-    gaps: Distances to the next slice, mm; one fewer than slices.
+    codes, gaps: A number for the value of each slice, and the distances in mm to the next one.
     """
     counts = Counter(codes)
     if len(counts) < 2 or min(counts.values()) < SMALLEST_VOLUME:

@@ -1,7 +1,5 @@
 """Steps from slice to slice: gaps too wide for their neighbours, and positions written with few digits.
 
-Rounded positions: even steps that were written with few digits look like gaps, or like missing slices.
-
 Steps of 0.0105 mm written with two digits are 0.01 mm, and every twentieth 0.02 mm.  A slice that is missing leaves the
 same gap.  The two are told apart by the digits and by a distance that the headers state beside the positions: where all
 positions are even steps of that distance, each rounded to its last digit, none is missing.
@@ -20,10 +18,7 @@ from clrecon.reading.dicom.headers.slice_header import SliceHeader
 
 
 def median(values: Sequence[float] | NDArray[Any]) -> float:
-    """Return the same as `numpy.median` of one or more values.
-
-    `numpy.median` loads numpy's masked arrays, 10 ms at every start of the program, and is slow for few values.
-    """
+    """Return what `numpy.median` does, which is slow for few values and loads masked arrays, 10 ms at every start."""
     ordered = np.sort(values)
     middle = len(ordered) // 2
     return float(ordered[middle] if len(ordered) % 2 else (ordered[middle - 1] + ordered[middle]) / 2)
@@ -37,17 +32,15 @@ RUN_TOLERANCE = 0.05
 """A gap over 1.5 times the usual gap means missing slices, unless it belongs to a run: at least 3 consecutive gaps that
 are equal within 5 %. A run is a change of feed, a hole is not.  The usual gap is the median, with an even count the
 smaller of the two in the middle, so that equally many holes and whole gaps do not make the holes usual.  Beside a run
-the usual gap is that of the run (of two runs, the coarser), so that a hole where the feed is fine is found however
-coarse it is elsewhere."""
+it is that of the run (of two, the coarser): a hole where the feed is fine is found however coarse it is elsewhere."""
 PLACES_SHOWN = 4
 
 
 @dataclass(frozen=True)
 class Holes:
-    """Gaps in a stack that are too wide, by the rule at `MISSING_RATIO`.
+    """Gaps in a stack that are too wide, by the rule at `MISSING_RATIO`; gap k lies between the slices k and k + 1.
 
-    places: The gap k lies between the slices k and k + 1.
-    ends_mm: tuple of (float, float). Positions along the normal of the slices before and after the gap.
+    ends_mm: Positions along the normal of the slices before and after each gap.
     usual_mm: The gap that would be there without a hole.
     """
 
@@ -124,11 +117,9 @@ WHOLE = 1e-3
 
 @dataclass(frozen=True)
 class Rounding:
-    """Even steps that explain the written positions.
+    """Even steps of `stated_mm` by an element (`keyword`) that explain the written positions.
 
-    unit_mm: Unit of the last digit, along the normal.
-    digits: Number of decimals of the positions.
-    keyword: The element that states the distance of the slices.
+    unit_mm: Of the last of `digits` decimals of the positions, along the normal.
     """
 
     unit_mm: float
@@ -156,11 +147,9 @@ def measure_unit(headers: Sequence[SliceHeader], normal: Float64Array) -> tuple[
 def find_rounding(
     headers: Sequence[SliceHeader], distances: Float64Array, normal: Float64Array, tolerance: float
 ) -> Rounding | None:
-    """Explain uneven positions by their digits.
+    """Explain uneven positions along the normal (3,) by their digits.
 
-    headers: In the order of their places.
-    distances: ndarray, shape (n,). Positions along the normal, mm, n >= 2.
-    normal: ndarray, shape (3,)
+    distances: Of the slices in the order of their places (n,), mm, n >= 2.
     tolerance: Largest distance in mm that counts as rounding anyway.
 
     Returns: None where positions have digits enough, no distance is stated, or a stated one does not explain them.
