@@ -66,11 +66,7 @@ _airs: WeakKeyDictionary[Any, tuple[NDArray[np.bool_], NDArray[Any]]] = WeakKeyD
 
 
 def warn_of_face(volume: Volume, values: Iterable[float | None], what: str) -> list[str]:
-    """Return the warning about a surface or picture that shows one of some HU, if that can be a face.
-
-    values: HU; None is ignored.
-    what: "surface" or "picture".
-    """
+    """Return the warning about a "surface" or "picture" (`what`) that shows one of some HU, if that can be a face."""
     if not any(value is not None and shows_face(volume, value) for value in values):
         return []
     return [SAID.format(what)]
@@ -84,13 +80,10 @@ def warn_of_skin(volume: Volume, vertices: NDArray[Any], triangles: NDArray[Any]
 
 
 def measure_skin(volume: Volume, vertices: NDArray[Any], triangles: NDArray[Any]) -> float:
-    """Measure the area of a surface that lies beside the air around a patient, in cm2.
+    """Measure the area of a surface, whose triangles face outwards, that lies beside the air around a patient, in cm2.
 
-    vertices: ndarray, shape (v, 3). LPS mm, in the frame of the volume.
-    triangles: ndarray of int, shape (t, 3). They face outwards.
-
-    Returns: Right to some cm2: the air is told once for each volume, on a grid of about 2 mm and without passages
-        narrower than `OPEN_MM`, and at most `MOST_SAMPLES` triangles stand for all.
+    Right to some cm2: the air is told once for each volume, on a grid of about 2 mm and without passages narrower than
+    `OPEN_MM`, and at most `MOST_SAMPLES` triangles stand for all.
     """
     if volume not in _airs:
         _airs[volume] = _outer_air(volume)
@@ -128,10 +121,7 @@ def _outer_air(volume: Volume) -> tuple[NDArray[np.bool_], NDArray[Any]]:
 
 
 def shows_face(volume: Volume, hu: float) -> bool:
-    """Tell whether the outermost surface of a scan at a level can show a face.
-
-    False also where the air around the patient was left out (`clrecon.anatomy.surroundings`), and with it the skin.
-    """
+    """Tell whether the outermost surface of a scan at a level can show a face; not where the air was left out."""
     if not SKIN_HU[0] <= hu <= SKIN_HU[1] or volume.report.get("outside_air") is not None:
         return False
     head = find_head(volume)

@@ -44,8 +44,7 @@ CONTRAST_MEDIUM_HU = 600
 REACH = 8
 """Longest walk in steps: at a blur of 2 voxels it reaches the plateau."""
 FLAT = 4
-"""A plateau is flat when the values stay level for this many steps beyond the maximum.  Vessels do; cortex falls off
-into marrow."""
+"""A plateau is flat when values stay level for so many steps beyond the maximum, as vessels do; cortex falls off."""
 FLAT_SIGMAS = 3.5
 LARGEST_FLAT_SHARE = 0.75
 """When more than this share of the contrast ends in flat plateaus, these are bone (a homogeneous body)."""
@@ -99,11 +98,11 @@ def measure_edges(voxels: NDArray[Any], sampled: range, background: Background) 
 
 
 def _measure_slice(padded: NDArray[Any], axis: int, background: Background) -> tuple[NDArray[Any], ...]:
-    """Measure bone, tissue, steepest step and flatness of the edges of one slice along one axis.
+    """Measure bone, tissue, steepest step and flatness of the edges of one slice along the columns (axis 0) or rows
+    (1).
 
-    padded: ndarray, shape (nj + 2 p, ni + 2 p). The slice with its border values continued by p = `REACH` + `FLAT`
-        voxels, where every walk ends because values are constant.
-    axis: {0, 1}. Along the columns (j) or along the rows (i).
+    padded: (nj + 2 p, ni + 2 p). The slice with its border values continued by p = `REACH` + `FLAT` voxels, where every
+        walk ends because values are constant.
     """
     border = REACH + FLAT
     inside = padded >= background.seed
@@ -162,8 +161,7 @@ def _walk(
 def leave_contrast_medium(edges: BoneEdges) -> tuple[BoneEdges, float, float]:
     """Leave out edges that end in flat, faint plateaus (contrast medium), unless most edges do.
 
-    Returns: Share of the contrast that was left out.
-    Returns: Share of the contrast that is flat and faint, left out or not.
+    Returns: Also the shares of the contrast that were left out, and that are flat and faint, left out or not.
     """
     total = edges.contrast.sum()
     share = float(edges.contrast[edges.flat].sum() / total) if total else 0.0
@@ -217,20 +215,17 @@ class IsoChoice:
 
     iso_value: HU, half way between `bone_hu` and `tissue_hu`; a whole number where it was measured.
     bone_hu, tissue_hu: The plateaus on both sides of the edge of bone, HU.
-    method: {"auto", "half"}. "auto": measured.  "half": computed from given plateaus.
+    method: "auto": measured.  "half": computed from given plateaus; then `background` and all that follows is None.
     reason: The choice in words, one line.
-    background: {"soft tissue", "air"} or None. The material that the bone lies in.  This and all that follows is None
-        where the plateaus were given.
+    background: {"soft tissue", "air"}. The material that the bone lies in.
     background_mode_hu, noise_hu: The mode of the background in the histogram and its width, HU.
-    edges: Number of edges measured.
     spread_hu: Half the interquartile range of the half-way levels of single edges.
     steepness_hu_per_voxel: Median of the steepest step of an edge along a row or column: `spread_hu` / this is what the
         spread means in voxels, at most.
     faint_share: Share of the edges whose bone stays below the iso value.  That bone, thin, poor in mineral or touched
         in passing by a slice, is lost.
     contrast_medium_share: Share of the contrast left out because it ends in a flat plateau below `CONTRAST_MEDIUM_HU`.
-    flat_share: Share of the contrast in flat plateaus before that decision: where it is above three quarters they are
-        not left out but taken for bone.
+    flat_share: The same before that decision: where it is above three quarters, flat plateaus are taken for bone.
     slices, slice_step: Number of slices examined, and the distance from one to the next in slices.
     """
 
@@ -252,7 +247,6 @@ class IsoChoice:
     slice_step: int | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all attributes by name."""
         return dataclasses.asdict(self)
 
     def measurements(self) -> dict[str, Any]:
@@ -358,9 +352,7 @@ class _OwnScale(NamedTuple):
 
 
 def _describe(background: Background, edges: BoneEdges, flat: tuple[float, float], sampled: range) -> IsoChoice:
-    """Make the choice that follows from the edges; `flat` holds the shares of contrast that were left out and that were
-    flat.
-    """
+    """Make the choice that follows from the edges; `flat` are the shares of contrast left out, and flat at all."""
     left_out, flat_share = flat
     bone, tissue = _median(edges.bone, edges.contrast), _median(edges.tissue, edges.contrast)
     iso_value = float(math.floor((bone + tissue) / 2.0 + 0.5))
@@ -406,9 +398,7 @@ def _no_bone(background: Background, edges: BoneEdges, histogram: Float64Array, 
 
 
 def _count_values(voxels: NDArray[Any], sampled: range) -> Float64Array:
-    """Count the voxels of each whole HU from `LOWEST_HU` on.  Lower values are padding; higher than `HIGHEST_HU` count
-    as that.
-    """
+    """Count the voxels of each whole HU from `LOWEST_HU`, below which is padding, to `HIGHEST_HU` and more."""
     low = LOWEST_HU - 1
     counts = np.zeros(HIGHEST_HU - low + 1, dtype=np.int64)
     for k in sampled:

@@ -10,17 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 BLOCK_MM, FINE_MM = 2.0, 1.0
 """Side of the blocks by which the width of a space is measured, and near the limit."""
 BLOCKS_OFF, FINE_BLOCKS_OFF = 2.0, 0.75
-"""Blocks by which the width can be wrong, and by which that of a ball can be too low: its middle need not be that of a
-block."""
+"""Blocks by which the width can be wrong, and that of a ball too low, as its middle need not be that of a block."""
 
 
 def holds_ball(
     body: NDArray[np.bool_], ends: tuple[tuple[bool, bool], ...], steps: tuple[float, float, float], radius_mm: float
 ) -> bool:
-    """Tell whether a ball fits into a body: true for every ball of this radius, for a smaller one by a voxel or 1 mm.
-
-    body, ends, steps: As for `measure_width`.
-    """
+    """Tell whether a ball of this radius, or one smaller by a voxel or 1 mm, fits into a body; see `measure_width`."""
     width = measure_width(body, ends, steps)
     if abs(width - radius_mm) > BLOCKS_OFF * max(BLOCK_MM, *steps):
         return width > radius_mm
@@ -34,11 +30,10 @@ def measure_width(
     steps: tuple[float, float, float],
     block_mm: float = BLOCK_MM,
 ) -> float:
-    """Return the radius of the largest ball that fits into a body, mm, right to about `block_mm`.
+    """Return the radius of the largest ball that fits into a body (nk, nj, ni), mm, right to about `block_mm`.
 
     Where an end of the volume cuts the body, a disc in that end counts as a ball: of a skull only the cap may be there.
 
-    body: ndarray, shape (nk, nj, ni), bool. Without room around it.
     ends: For each axis of the array whether its first and its last layer lie at an end of the volume: the body goes on
         there as it is.  All else around it is outside.
     steps: Of the voxels along k, j, i, mm.

@@ -3,15 +3,15 @@
 In slices across the patient every place is compared with what the middle of the spinal canal looks like.  It is soft.
 Cortical bone encloses it in all directions (within 24 mm of height, so that arches close the gaps between them).  There
 is a vertebral body in front and nothing but muscle behind, and the left mirrors the right.  Dynamic programming finds
-the path through the slices that agrees best.  The path is the canal where it agrees over enough height; elsewhere it is
-followed as long as all but the mirror image agrees.  Each slice's point is then moved to the middle of the space that
-the bone encloses, and the line is smoothed.
+the path through the slices that agrees best.  The path is the canal where it agrees over enough height.  Each slice's
+point is then moved to the middle of the space that the bone encloses, and the line is smoothed.
 
 Beyond the sure slices the place of the canal is known, so less is needed of the next slice: left and right may differ,
 as in a scan that is cropped at one side.  All other traits stay: without the vertebral body in front the way would go
 on in the soft tissue before the sacrum.
 
-The search is meant for the spine of an adult, in a scan whose axes are those of the patient."""
+The search is meant for the spine of an adult, in a scan whose axes are those of the patient.
+"""
 
 from __future__ import annotations
 
@@ -63,10 +63,9 @@ LOOKED_AT = 9
 
 @dataclass(frozen=True)
 class SpineEnd:
-    """An end of the line that was found.
+    """An end of the line that was found; without a reason it is that of the scan.
 
-    z_mm: Height of the last slice of the line, LPS mm.
-    lost_mm: Height of the first slice in which it was not found again; None where the scan ends there.
+    z_mm, lost_mm: Height of the last slice of the line, and of the first in which it was not found again, LPS mm.
     because: What was found there instead; empty where the scan ends.
     """
 
@@ -76,12 +75,9 @@ class SpineEnd:
 
 
 def follow(likeness: Likeness, path: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Follow the canal beyond both ends of a path.
+    """Follow the canal beyond both ends of a path (n, 3) of cells (k, j, i) of the likeness, one a slice, k ascending.
 
-    path: ndarray, shape (n, 3). Cells (k, j, i) of the likeness, one a slice, k ascending.
-
-    Returns: ndarray, shape (m, 3). The longer path; its new slices have the traits of `STILL`, but for gaps up to
-        `GAP_MM` between them.
+    New slices have the traits of `STILL`, but for gaps up to `GAP_MM` between them.
     """
     below = _beyond(likeness, path[0], -1)[::-1]
     above = _beyond(likeness, path[-1], 1)
@@ -109,11 +105,7 @@ def _beyond(likeness: Likeness, last: NDArray[np.int64], step: int, stop: bool =
 
 
 def look_beyond(cells: SpineCells, likeness: Likeness, last: NDArray[np.int64], step: int) -> SpineEnd:
-    """Return the end of a path at its last cell: whether the scan ends there, or what was found instead of the canal.
-
-    last: ndarray, shape (3,). Cell (k, j, i) of the likeness.
-    step: {-1, 1}. Downwards or upwards.
-    """
+    """Return a path's end at its last cell (k, j, i), downwards (step -1) or upwards (1), and what was found there."""
     z_mm = float(cells.origin[2] + last[0] * CELL_MM[2])
     left = len(likeness.worth) - 1 - int(last[0]) if step > 0 else int(last[0])
     if left * CELL_MM[2] <= GAP_MM:
@@ -173,12 +165,11 @@ CANAL_WIDTH_MM = 11.0
 class SpineLine:
     """The middle of the spinal canal.
 
-    points: ndarray, shape (n, 3), float64. LPS mm, from the head downwards, about 10 mm apart.
+    points: (n, 3). LPS mm, from the head downwards, about 10 mm apart.
     sure_share: Share of the slices of the line whose traits are all sure, see `clrecon.anatomy.spine_cells.SURE`.
     searched_mm: Height of the volume; the line may be shorter.
     sure_mm: Heights between which its slices are sure, but for gaps, z of the upper and the lower end.
-    upper, lower: Its ends: those of the scan, or where it was lost and why; None where only the sure part was asked
-        for.
+    upper, lower: Its ends: those of the scan, or where it was lost; None where only the sure part was asked for.
     """
 
     points: Float64Array
@@ -275,9 +266,7 @@ def _describe_run(cells: SpineCells, run: NDArray[np.int64], searched: float) ->
 
 
 def _depths(cells: SpineCells, path: NDArray[np.int64]) -> tuple[float, float | None]:
-    """Return the median depth of tissue in front of a path and behind it, mm; None behind where the volume ends within
-    it.
-    """
+    """Return the median depth of tissue before and behind a path, mm; None behind where the volume ends within it."""
     k, j, i = path.T
     layers = ((cells.values[n : n + 1] > -300.0).astype(np.float32) for n in k)
     thick = (disc_mean(layer, BODY_RADIUS)[0] > 0.6 for layer in layers)  # the table is thinner
@@ -302,11 +291,9 @@ def _longest_run(sure: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def _best_path(gain: Field) -> NDArray[np.int64]:
-    """Return the path with the highest sum: cells (n, 3) as (k, j, i), one a slice, at most one cell aside from slice
-    to slice.
+    """Return the path with the highest sum: cells (n, 3) as (k, j, i), one a slice, each at most one cell aside.
 
-    It begins and ends where the sum is best, so that slices that count against it lie only between slices that count
-    for it.
+    It begins and ends where the sum is best: slices that count against it lie only between slices that count for it.
     """
     steps = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     sums = gain[0].copy()
@@ -337,9 +324,7 @@ def _best_path(gain: Field) -> NDArray[np.int64]:
 
 
 def _centre_points(cells: SpineCells, path: NDArray[np.int64]) -> Float64Array:
-    """Return the middle of the space that bone encloses in each slice of a path, smoothed, from the upper end to the
-    lower.
-    """
+    """Return the middle of the space that bone encloses in each slice of a path, smoothed, from the upper end down."""
     from scipy.ndimage import gaussian_filter1d
 
     middles = path[:, 1:].astype(np.float64)

@@ -4,10 +4,10 @@ Voxels below an iso value are air around the patient, or lung, airway, sinus or 
 (`clrecon.anatomy.body`) tells what is outside: its cavities belong to it.  An airway that is open to the outside, at
 nostrils or mouth, is cut a little under the skin, and the area of the cut is reported.
 
-A projection of the lowest values leaves out the air around the body, table and blankets, and masked voxels.  All of it
-is at least as low as what such a picture is made for (airways, emphysema, gas), so a ray that counted it would show
-nothing else.  Voxels that are left out get a value above all others: the lowest value along a ray then never is theirs,
-and a ray that meets nothing else is empty."""
+A projection of the lowest values leaves out the air around the body, table and blankets, and masked voxels, at least as
+low as what such a picture is made for (airways, emphysema, gas): a ray that counted them would show nothing else.  They
+get a value above all others, which is never the lowest along a ray; a ray that meets nothing else is empty.
+"""
 
 from __future__ import annotations
 
@@ -42,15 +42,12 @@ OWN_STEPS = 6
 
 
 def leave_outside_air(volume: Volume, levels: Sequence[float], *, progress: Progress | None = None) -> Volume:
-    """Raise the air around the patient above the iso values, so that no surface of air includes it.
+    """Raise the air around the patient above the iso values (HU), so that no surface of air includes it.
 
-    levels: Iso values, HU.  What is denser than -300 HU is never left out.
-    progress: Called as ``progress("mask", steps done, steps)``.
-
-    Returns: A volume with the same places.  Air outside gets a value as far above the highest level as air is below it,
-        so that a surface between it and air of the body lies half way.  ``report["outside_air"]`` has ``left_out_ml``,
-        ``kept_ml`` (below the highest level), ``opening_mm2`` (area where the two kinds of air meet, as far as it was
-        measured) and ``filled_hu`` (the new value).
+    Air outside, never what is denser than -300 HU, gets a value as far above the highest level as air is below it, so
+    that a surface between it and air of the body lies half way.  ``report["outside_air"]`` has ``left_out_ml``,
+    ``kept_ml`` (below the highest level), ``opening_mm2`` (area where the two kinds of air meet, as far as it was
+    measured) and ``filled_hu`` (the new value).
     """
     level = min(max(levels), TISSUE_HU)
     steps = Steps(progress, "mask", count_cells(volume)[0] + BODY_STEPS + OWN_STEPS)
@@ -188,19 +185,16 @@ LEFT_OUT_SKIN_MM = 3.0
 """What is left out reaches at least so far under the surface of the body: values mix there with those of the air."""
 
 LEAST_ROOM = 2.0
-"""The value of what is left out lies at least so many times the range of the other values above them.  Between it and
-a voxel beside it, the share of a voxel that can be mistaken for something else is then at most a third."""
+"""The value of what is left out lies so many times the range of the others above them: of a voxel beside it at most a
+third can then be mistaken for something else."""
 
 
 def leave_out_surroundings(volume: Volume, *, progress: Progress | None = None) -> Volume:
-    """Give the voxels outside of the body a value above all others.
+    """Give the voxels outside of the body, those that a mask has turned into air too, a value above all others.
 
-    volume: A scan in HU.  Voxels that a mask has turned into air lie outside of what is found to be the body.
-    progress: Called as ``progress("mask", steps done, steps)``.
-
-    Returns: With the same places, of the same type where that has room above the values, else float32.
-        ``report["left_out"]`` has ``highest_hu``, the highest value that counts: voxels above it are left out;
-        ``value_hu``, which they get; and ``body``: whether a body was found.  Without one nothing is left out.
+    The type stays where it has room above the values, else it is float32.  ``report["left_out"]`` has ``highest_hu``,
+    the highest value that counts: voxels above it are left out; ``value_hu``, which they get; and ``body``: whether a
+    body was found.  Without one nothing is left out.
     """
     voxels, dtype = volume.voxels, volume.voxels.dtype
     low, high = float(np.nanmin(voxels)), float(np.nanmax(voxels))
@@ -230,11 +224,7 @@ def leave_out_surroundings(volume: Volume, *, progress: Progress | None = None) 
 
 
 def count_left_out(volume: Volume) -> dict[str, Any] | None:
-    """Count the voxels that a volume leaves out.
-
-    Returns: ``voxels``, their ``share`` of all, ``body``: whether a body was found, and ``region``: whether a region
-        was applied too; None for another volume.
-    """
+    """Count the voxels that a volume leaves out, and say whether a body was found and a region applied; else None."""
     facts = volume.report.get(LEFT_OUT)
     if facts is None:
         return None

@@ -14,22 +14,19 @@ _MOST_STEPS_APART = 64
 
 
 def as_stored(points: NDArray[Any]) -> NDArray[np.floating]:
-    """Convert coordinates to the type in which a `Mesh` keeps them.
+    """Convert coordinates (n, 3) in mm to the type in which a `Mesh` keeps them, C-contiguous.
 
-    points: ndarray, shape (n, 3), mm
-
-    Returns: ndarray, shape (n, 3), C-contiguous. float32; float64 where they are not float32 already and lie so far
-        from the origin that float32 would round them by more than 2e-4 mm, see `clrecon.geometry.vertices`.
+    float32; float64 where they are not float32 already and lie so far from the origin that float32 would round them by
+    more than 2e-4 mm, see `clrecon.geometry.vertices`.
     """
     dtype = np.float64 if points.dtype != np.float32 and is_far(points) else np.float32
     return np.ascontiguousarray(points, dtype=dtype)
 
 
 def rounding_step(vertices: NDArray[np.floating]) -> float:
-    """Return the step, in mm, to which coordinates of vertices have been rounded.
+    """Return the step, in mm, to which coordinates of vertices have been rounded: that of float32 at the largest one.
 
-    Returns: The step of float32 at the largest coordinate.  float64 vertices were computed in float32 relative to a
-        point near their centre: the step there.
+    float64 vertices were computed in float32 relative to a point near their centre: the step there.
     """
     if len(vertices) == 0:
         return 0.0
@@ -39,12 +36,9 @@ def rounding_step(vertices: NDArray[np.floating]) -> float:
 
 
 def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Find the vertices that coincide with another vertex.
+    """Return the vertices that coincide with another vertex, (k,), all of each such place, in order of its coordinates.
 
-    When a file without indices, such as STL, is read, these are joined: a surface that is closed by index can then be
-    open.
-
-    Returns: ndarray, shape (k,), int64. All vertices of each such place, in order of the place's coordinates.
+    When a file without indices, such as STL, is read, they are joined: a surface closed by index can then be open.
     """
     mixed = _scramble(vertices)
     ordered = np.sort(mixed)
@@ -60,9 +54,7 @@ def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
 def find_places(vertices: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Number the places at which vertices lie, in the order in which they occur first.
 
-    Returns:
-    first: ndarray, shape (p,), int64. The first vertex at each place.
-    place: ndarray, shape (n,), int64. The place of each vertex.
+    Returns: The first vertex at each place, (p,), and the place of each vertex, (n,).
     """
     mixed = _scramble(vertices)
     _, first, place = np.unique(mixed, return_index=True, return_inverse=True)
@@ -88,9 +80,9 @@ def _scramble(vertices: NDArray[np.floating]) -> NDArray[np.uint64]:
 def rounded_apart(vertices: NDArray[np.floating]) -> NDArray[np.float32]:
     """Round vertices to float32 so that no two coincide unless they did before.
 
-    Returns: ndarray, shape (n, 3), float32. The nearest values; where several places round to one, all but the first
-        are moved by steps of float32, each with all of its vertices.  That keeps about 1,000 places apart that round to
-        one; of more some may coincide.
+    Returns: The nearest values; where several places round to one, all but the first are moved by steps of float32,
+        each with all of its vertices.  That keeps about 1,000 places apart that round to one; of more some may
+        coincide.
     """
     rounded = vertices.astype(np.float32)
     if vertices.dtype == np.float32:

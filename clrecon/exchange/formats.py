@@ -3,11 +3,9 @@
 A writer estimates the size of the file (exactly for STL, PLY and GLB, rather too small for the others), writes to a
 binary stream, and reads the file back.  VTP is written by VTK.  The other formats are written here and not by a
 library; each module says why: headers, comments and matrices that name frame and unit, a full disk that must be
-noticed, time and memory.
+noticed, time and memory.  The same mesh or cloud gives the same bytes.  No file holds patient data, a date or a path.
 
 Nothing here loads numpy or the module of a format before a file is written or read: help texts name the extensions.
-
-The same mesh or cloud gives the same bytes every time.  No file holds patient data, a date or a path.
 """
 
 from __future__ import annotations
@@ -87,11 +85,7 @@ def list_extensions(extensions: Sequence[str]) -> str:
 def stage_content(
     content: PointContent | Assembly, path: str | os.PathLike[str], chosen: FileFormat, counted: str, others: str
 ) -> AbstractContextManager[StagedFile]:
-    """Write contents under a temporary name; see `clrecon.system.files.stage_file`.
-
-    counted: What it holds, for example "12 triangles", for a message.
-    others: Formats without a limit, for a message.
-    """
+    """Write contents under a temporary name (`stage_file`); `counted`, `others` are words in a message of its limit."""
     code = chosen.code
     expected_bytes = code.estimate(content)
     if expected_bytes > chosen.most_bytes:
@@ -159,10 +153,7 @@ def describe_rounding(mesh: Writable, extension: str) -> list[str]:
 
 
 def write_mesh(mesh: Writable, path: str | os.PathLike[str], space: str = "lps", *, keep_ids: bool = False) -> int:
-    """Write a mesh to a file; what `Mesh.save` does.
-
-    Returns: Size of the file in bytes.
-    """
+    """Write a mesh to a file, as `Mesh.save` does; return its size in bytes."""
     with stage_mesh(mesh, path, space, keep_ids=keep_ids) as staged:
         staged.commit()
     return staged.size
@@ -223,10 +214,7 @@ def describe_cloud_losses(content: PointContent, extension: str) -> list[str]:
 def write_cloud(
     cloud: WritableCloud, path: str | os.PathLike[str], space: str = "lps", *, keep_ids: bool = False
 ) -> int:
-    """Write a cloud to a file; what `PointCloud.save` does.
-
-    Returns: Size of the file in bytes.
-    """
+    """Write a cloud to a file, as `PointCloud.save` does; return its size in bytes."""
     with stage_cloud(cloud, path, space, keep_ids=keep_ids) as staged:
         staged.commit()
     return staged.size

@@ -21,13 +21,9 @@ UNIT_TOLERANCE = 1e-3
 
 @dataclass
 class RawCloud:
-    """A file's points, in the file's own frame.
+    """A file's points (n, 3) of any real type, perhaps not finite, in mm in the file's own frame.
 
-    kind: "PLY", "XYZ", "NPZ", "VTP" or "LAS".
-    points: ndarray, shape (n, 3), of any real type. mm; perhaps not finite.
-    columns: dict of str to ndarray, shape (n,). Further values of each point by the name that the file gives them, in
-        the order of the file.
-    affine: ndarray, shape (4, 4), or None
+    columns: Further values of each point (n,) by the name that the file gives them, in the order of the file.
     """
 
     kind: str
@@ -137,9 +133,8 @@ def say_cut(name: str, error: object) -> RefusedInputError:
 
 @dataclass(frozen=True)
 class Part:
-    """An object of a file: its triangles follow those of the part before it.
+    """An object of a file, its name perhaps empty: its triangles follow those of the part before it.
 
-    name: Empty where the file gives none.
     color: Red, green and blue, 0 to 1, as on a screen (sRGB).
     """
 
@@ -150,12 +145,9 @@ class Part:
 
 @dataclass
 class RawMesh:
-    """A file's triangles, in the file's own frame.
+    """A file's triangles, perhaps of vertices that are not there, in the file's own frame.
 
-    kind: "STL", "PLY", "OBJ", "GLB", "3MF" or "VTP".
-    vertices: ndarray, shape (n, 3), of any real type. mm, placed as the file says; perhaps not finite.
-    triangles: ndarray, shape (m, 3), integer. Perhaps of vertices that are not there.
-    unit: Unit of the lengths in the file.
+    vertices: (n, 3) of any real type, in `unit`, placed as the file says; perhaps not finite.
     parts: Empty where the file has no objects.
     """
 
@@ -186,10 +178,7 @@ _SNAP = 1e-12
 
 @dataclass(frozen=True)
 class Shape:
-    """Triangles in a frame of their own.
-
-    triangles: ndarray, shape (m, 3), integer. Perhaps of vertices that are not there.
-    """
+    """Triangles (m, 3) in a frame of their own, perhaps of vertices that are not there."""
 
     vertices: NDArray[np.floating]
     triangles: NDArray[np.integer]
@@ -198,8 +187,6 @@ class Shape:
 
 @dataclass
 class PlacedShapes:
-    """Collects shapes at their places."""
-
     parts: list[Part] = field(default_factory=list)
     _vertices: list[NDArray[np.floating]] = field(default_factory=list)
     _triangles: list[NDArray[np.int64]] = field(default_factory=list)

@@ -48,7 +48,6 @@ def crop_box(
 
 
 def _box_of(name: str, given: Sequence[float | None]) -> Box:
-    """Return the corners of one box."""
     count, form = _COUNTS[name]
     named = name_parameter(name)
     everywhere = math.inf

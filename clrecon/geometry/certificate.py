@@ -19,29 +19,12 @@ class Certificate(Record):
     Lengths are mm, angles degrees.  None means that the file does not tell, that it was refused, or that only pixels
     tell and they were not read.
 
-    format: "DICOM", or the kind of the file.
-    series: ``number``, ``uid_hash`` (None without an identifier) and ``modality``.
-    phase: ``number``, ``of``, ``keyword`` and ``value`` of the phase that was read, if there are several.
     extent_mm: Size of the box of whole voxels along rows, columns and the slice normal.
-    affine_ijk_to_lps_mm: nested list (4, 4) or None
-    orientation: Directions of the axes in the patient.
-    anatomical_orientation: "QUADRUPED": the letters of `orientation` are those of an animal on four legs.
-    grid_residual_max_mm, grid_residual_rms_mm, grid_tolerance_mm: Distances of slice positions from the affine, and
-        their bound.
     gap_mm: ``min``, ``max`` and ``median`` distance of neighbouring slices along the normal.
-    gap_runs: Runs of equal gaps, where they are uneven.
-    slice_positions_mm: nested list (slices, 3) or None. LPS mm, where slices are uneven.
+    slice_positions_mm: (slices, 3), LPS mm, where slices are uneven.
     slice_thickness_mm, stated_gap_mm: As the headers state them; not used for the geometry.
-    thickness: Thickness and overlap of the slices.
-    numbering: ``first``, ``last`` and ``step`` of InstanceNumber along the stack; ``images`` and ``files`` of the
-        series, and what its headers state of them.
-    padding_share: Share of the voxels that hold no measurement.
-    padding_hu: HU of these voxels in the volume.
-    rescale: ``slope`` and ``intercept``, lowest and highest each, and ``type``.
-    hu_range: [float, float] or None. Lowest and highest value in the volume, padding included.
-    files: ``found``, ``used`` and ``skipped`` (reason to count).
-    dropped: Reason to number of slices left out.
-    warnings, problems: Doubts, and reasons to refuse.
+    padding_share, padding_hu: Of the voxels that hold no measurement, and their HU in the volume.
+    hu_range: Lowest and highest value in the volume, padding included.
     masked: Facts about what was done after reading: parts that were turned into air (``remove_table``,
         ``field_of_view``, ``outside_air``) and filters (``filtered``); each is an entry of its own.
     """
@@ -108,8 +91,7 @@ def without_ids(report: Mapping[str, Any]) -> dict[str, Any]:
 def amend(report: dict[str, Any], **changes: Any) -> dict[str, Any]:
     """Return the report of a volume with some entries changed or added; a certificate stays a certificate.
 
-    report: ``volume.report``.
-    **changes: For a certificate: its fields, and entries of `Certificate.masked`.
+    Of a certificate its fields are changed, other entries are added to `Certificate.masked`.
     """
     if not isinstance(report, Certificate):
         return {**report, **changes}

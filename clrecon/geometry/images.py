@@ -29,12 +29,7 @@ Taken = tuple[NDArray[Any], Float64Array]
 
 
 class Image(NamedTuple):
-    """Voxels that an image can hold.
-
-    voxels: ndarray, shape (nk, nj, ni). Those of the volume, where it is not resampled.
-    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm.
-    resampled: Why they are resampled.
-    """
+    """Voxels (nk, nj, ni) that an image can hold, those of the volume unless `resampled` says why they are others."""
 
     voxels: NDArray[Any]
     affine: Float64Array
@@ -109,10 +104,7 @@ SCANNER = 1
 
 
 def place_in_header(header: Any, affine: Float64Array) -> None:
-    """Write the place of the voxels into a header of nibabel.
-
-    affine: ndarray, shape (4, 4). Index (i, j, k) to LPS mm.
-    """
+    """Write the place of the voxels, given their affine to LPS mm, into a header of nibabel."""
     ras = lps_affine_from_ras(affine)
     header.set_xyzt_units(MM)
     header.set_sform(ras, SCANNER)
@@ -171,9 +163,7 @@ def _affine_of(image: Any) -> Float64Array:
 
 
 def _as_whole_numbers(values: NDArray[Any], stored: np.dtype[Any]) -> NDArray[Any]:
-    """Return values in the type that `read_volume` gives them: stored whole numbers that slope and intercept left whole
-    are whole numbers.
-    """
+    """Return values in the type of `read_volume`: whole if stored so, and slope and intercept left them."""
     if values.dtype.kind != "f" or stored.kind == "f":
         return values
     low, high = values.min(), values.max()

@@ -1,7 +1,4 @@
-"""The iso rule: which samples of a volume are inside, where the surface lies, and what the border is closed with.
-
-The device operators and their numpy twins all use this one statement of the rule.
-"""
+"""The iso rule: which samples of a volume are inside, where the surface lies, and what the border is closed with."""
 
 from __future__ import annotations
 
@@ -45,7 +42,7 @@ Level = float | Sequence[float]
 
 @dataclass(frozen=True)
 class IsoRule:
-    """How one iso value, or a range of HU, divides one volume.
+    """How one iso value, or a range of HU, divides one volume; for the device operators and their numpy twins.
 
     iso_value: As asked for, HU; for a range its lower end.
     lowest_inside: A sample is inside when its value is >= this.  For integer voxels the lowest integer >= the iso
@@ -59,12 +56,9 @@ class IsoRule:
         or joined where the trilinear interpolation of the samples joins them.
     inside: {"above", "below", "between"}. The samples that the surface encloses.  "above": those >= `lowest_inside`.
         "below": the others; the surface is that of "above" turned round, and `outside` lies above the level.
-        "between": those of a range.
-    upper_value: For a range: the upper end as asked for, HU, which belongs to the range.
-    highest_inside: For a range: a sample is inside when its value is also <= this.  For integer voxels the highest
-        integer <= the upper end.
-    upper_level: For a range: where the surface lies between an inside sample and one above the range.  For integer
-        voxels and an integer end k it is k + 0.5.
+    upper_value: Upper end of a range as asked for, HU, which belongs to the range.
+    highest_inside: A sample is inside a range when its value is also <= this; for integer voxels the highest integer.
+    upper_level: Where the surface lies between a sample inside and one above a range; k + 0.5 for integers.
     vertex_rule: {"linear", "golden", "golden-search"}
     """
 
@@ -92,7 +86,6 @@ class IsoRule:
         return (self.iso_level,) if self.upper_level is None else (self.iso_level, self.upper_level)
 
     def mark_inside(self, values: NDArray[Any]) -> NDArray[np.bool_]:
-        """Mark the values that are inside."""
         if self.inside == "below":
             return values < self.lowest_inside
         marked = values >= self.lowest_inside
@@ -111,8 +104,8 @@ class IsoRule:
     def as_report(self) -> dict[str, Any]:
         """Return the entries of a mesh's report: what is inside, and where the surface lies, HU.
 
-        ``iso_value_hu`` and ``iso_level_hu`` are None for a range; ``inside_hu`` and ``inside_levels_hu`` are
-        ``[low, high]``, None for the end that is open.
+        ``iso_value_hu`` and ``iso_level_hu`` are None for a range; ``inside_hu`` and ``inside_levels_hu`` are ``[low,
+        high]``, None for the end that is open.
         """
         value, level = self.iso_value, self.iso_level
         ends: dict[str, tuple[list[float | None], list[float | None]]] = {
@@ -132,7 +125,6 @@ class IsoRule:
 
 
 def data_range(volume: Volume) -> tuple[float, float]:
-    """Return the lowest and the highest value of the volume."""
     low, high = math.inf, -math.inf
     for k, voxels in enumerate(volume.voxels):
         lowest, highest = float(voxels.min()), float(voxels.max())
@@ -155,10 +147,7 @@ def _lowest_value(volume: Volume) -> float:
 
 
 class ValueRange:
-    """The range of a volume's values, as an iso rule needs it; each figure is found when first asked for and then kept.
-
-    volume: Its voxels must not change afterwards.
-    """
+    """The range of a volume's values, for an iso rule; each figure is kept, so the voxels must not change any more."""
 
     def __init__(self, volume: Volume):
         self._volume = volume
@@ -186,12 +175,9 @@ def choose_iso_rule(
 ) -> IsoRule:
     """Decide what is inside and where the surface lies.
 
-    iso_value: float or (float, float). HU.  A sample is inside when its value is >= `iso_value`; of a range, when it
-        lies within, both ends included.
+    iso_value: HU.  A sample is inside when its value is >= this; of a range, when it lies within, both ends included.
     closed: Surround the volume with outside.
-    topology: {"separated", "trilinear"}
     below: A sample is inside when its value is < `iso_value`: the same surface, turned round.
-    vertex_rule: {"linear", "golden", "golden-search"}
     values: Those of this volume; given where several rules for one volume are chosen.
     """
     iso_value, upper_value = _checked_level(iso_value, below)
@@ -305,14 +291,12 @@ LARGEST_MARGIN = 0.25
 
 
 def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
-    """Smallest distance of a vertex from a sample along i, j, k, in index steps.
+    """Smallest distance of a vertex from a sample along i, j, k, in index steps; along k that of the thinnest layer.
 
     Vertices are float32 millimetres from `find_vertex_origin`.  Two vertices near one sample could be rounded to the
     same point, and a triangle between them would have no area.  So each stays at least four units in the last place of
     the volume's largest coordinate away from the sample; a vertex that belongs closer is moved by less than that.
-
-    Returns: ndarray, shape (3,), float64. Typically 2e-4 of a step, eight times the rounding error of the coordinates.
-        Along k the margin of the thinnest layer, see `layer_margins`.
+    Typically it is 2e-4 of a step, eight times the rounding error of the coordinates.
     """
     largest, unit = _largest_and_unit(volume, border)
     steps = np.array(volume.spacing)
@@ -329,11 +313,9 @@ def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
 def layer_margins(volume: Volume, border: int) -> NDArray[np.float64]:
     """Smallest distance of a vertex from a sample along k, for each layer of cells, in steps of that layer.
 
-    Each layer has its own: the margin of a layer a few micrometres thick would be tenths of a millimetre in a thick
-    one.
+    The margin of a layer a few micrometres thick would be tenths of a millimetre in a thick one.
 
-    Returns: ndarray, shape (nk + 2 * border,), float64. From the layer at slice ``-border``; the last is the layer
-        beyond the last slice.
+    Returns: (nk + 2 * border,). From the layer at slice ``-border``; the last is the layer beyond the last slice.
     """
     if not volume.uneven:
         return np.full(volume.shape_ijk[2] + 2 * border, vertex_margin(volume, border)[2])
@@ -352,19 +334,16 @@ def slice_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
 
     Gradients are central differences, so the step along k is the mean of the steps to both neighbours.  This is exact
     for a linear field, even with uneven slices.
-
-    Returns: ndarray, shape (nk + 2 * border, 3, 3), float64
     """
     origins = volume.slice_origins(border + 1)
     return _normal_matrices(volume, border, 0.5 * (origins[2:] - origins[:-2]))
 
 
 def layer_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
-    """Return the same matrices for the layers of cells, each between slice k and k + 1, k from ``-border``.
+    """Return the same for the layers of cells, of which each lies between slice k and k + 1, k from ``-border``.
 
-    Gradients are those of the trilinear field within a cell, per step of that cell.
-
-    Returns: ndarray, shape (nk + 2 * border, 3, 3), float64. The last is the layer beyond the last slice.
+    Gradients are those of the trilinear field within a cell, per step of that cell; the last lies beyond the last
+    slice.
     """
     return _normal_matrices(volume, border, np.diff(volume.slice_origins(border + 1), axis=0)[1:])
 
@@ -372,8 +351,7 @@ def layer_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
 def takes_parts(volume: Volume, ray_step: float) -> bool:
     """True where ray steps of `ray_step` mm pass through every cell on their way: no index changes by more than 1.
 
-    Between two samples of this kind the values are nearly linear, so volume rendering may divide the segment between
-    them into parts.
+    Between two samples of this kind values are nearly linear: volume rendering may divide the segment between them.
     """
     steps_per_mm = np.linalg.norm(layer_normal_matrices(volume, border=0), axis=1)
     return bool(ray_step * steps_per_mm.max() <= 1.0)

@@ -53,10 +53,7 @@ def find_inside(places: Float64Array, grid: Grid) -> NDArray[np.bool_]:
 def sample_onto(
     volume: BaseVolume, target: BaseVolume, air: float, progress: Progress = ignore_progress
 ) -> NDArray[Any]:
-    """Resample a volume (trilinear) at the voxel centres of another, slice by slice; `air` beyond its voxels.
-
-    Returns: ndarray, shape (nk, nj, ni) of the target. In the type of the volume's voxels; whole numbers are rounded.
-    """
+    """Resample a volume (trilinear, whole numbers rounded) at the voxel centres of another, by slices; `air` beyond."""
 
     nk = target.shape_ijk[2]
     values = np.full(target.shape, air, volume.dtype)

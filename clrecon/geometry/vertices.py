@@ -4,11 +4,9 @@ A table far from the origin of the frame, or the frame of another machine, can p
 mm the step of float32 is 8e-3 mm.  Vertices of such volumes are computed in float32 relative to a point near the
 volume's centre, and that point is added in float64.
 
-References
-----------
-Lorensen and Cline 1987 (linear); Liu et al. 2019, "Vertebrae CT Images 3D Reconstruction with Improve Marching Cubes
-Algorithm", J. Harbin Inst. Technol. (New Series) 26(6), eq. 6-11 (golden section); Catmull and Rom 1974; Kiefer 1953
-(golden-section search).
+Sources: Lorensen and Cline 1987 (linear); Liu et al. 2019, "Vertebrae CT Images 3D Reconstruction with Improve Marching
+Cubes Algorithm", J. Harbin Inst. Technol. (New Series) 26(6), eq. 6-11 (golden section); Catmull and Rom 1974; Kiefer
+1953 (golden-section search).
 """
 
 from __future__ import annotations
@@ -69,22 +67,14 @@ def golden_fraction(value: ArrayLike) -> NDArray[np.float64]:
 
 
 def point_on_edge(corner: ArrayLike, axis: int, fraction: ArrayLike) -> NDArray[np.float64]:
-    """Return the point at a fraction of the edge from a corner (x, y, z) along an axis.
-
-    Eq. 6, 7 and 8 for the axes 0, 1 and 2, with the golden constant as the fraction: (x + g, y, z), (x, y + g, z),
-    (x, y, z + g).
-    """
+    """Return the point at a fraction of the edge from a corner (x, y, z) along an axis: eq. 6 to 8 for `GOLDEN`."""
     placed = np.array(corner, np.float64)
     placed[..., axis] += np.asarray(fraction, np.float64)
     return placed
 
 
 def normal_on_edge(normal: ArrayLike, next_normal: ArrayLike, fraction: ArrayLike) -> NDArray[np.float64]:
-    """Return the normal at a fraction of an edge, between those at its corners: eq. 9-11, N0 + t (N1 - N0), not yet of
-    length 1.
-
-    The paper writes one equation for each axis of edges; they differ in the second corner alone.
-    """
+    """Return the normal at a fraction of an edge, not yet of length 1: eq. 9 to 11, N0 + t (N1 - N0), one an axis."""
     first = np.asarray(normal, np.float64)
     return np.asarray(first + np.asarray(fraction)[..., None] * (np.asarray(next_normal, np.float64) - first))
 
@@ -104,8 +94,7 @@ def search_fraction(
 ) -> NDArray[np.float64]:
     """Return where the cubic through four values crosses the level between the middle two, by golden sections.
 
-    Each step cuts what is left of the edge by the golden section and keeps the part whose ends lie on both sides of the
-    level, so that a crossing is found even where the cubic has three.
+    Each step keeps the part of the edge whose ends lie on both sides of the level: one of three crossings is found too.
     """
     levels, rises = np.asarray(level), np.asarray(next_value) > np.asarray(value)
     low = np.zeros(np.broadcast(value, levels).shape)
@@ -118,8 +107,7 @@ def search_fraction(
 
 
 FAR_MM = 4096.0
-"""Coordinates from here on count as far.  Below, the step of float32 is at most 2.4e-4 mm; from here on it is 4.9e-4 mm
-or more."""
+"""Coordinates from here on count as far: the step of float32, at most 2.4e-4 mm below, is 4.9e-4 mm or more."""
 
 
 def is_far(points: NDArray[np.floating]) -> bool:
@@ -153,10 +141,9 @@ def warnings_of_far(volume: Volume) -> list[str]:
 
 
 def find_vertex_origin(volume: Volume) -> Float64Array | None:
-    """Return the point in LPS mm that float32 vertices of a volume are counted from; None for the origin of the frame.
+    """Return the point (3,) in LPS mm that float32 vertices are counted from; None for the origin of the frame.
 
-    Returns: ndarray, shape (3,), float64, or None. Whole millimetres near the centre of a volume that reaches `FAR_MM`
-        or more.
+    Whole millimetres near the centre of a volume that reaches `FAR_MM` or more.
     """
     if largest_coordinate(volume) < FAR_MM:
         return None

@@ -93,9 +93,7 @@ def _note(image: Any, name: str) -> str | None:
 
 
 def _reversed(voxels: NDArray[Any], affine: Float64Array) -> Taken:
-    """Return the voxels with their slices in reverse order (a copy: VTK needs positive steps), and the affine that
-    counts slices from the last one.
-    """
+    """Return voxels with their slices in reverse order, a copy as VTK needs positive steps, and the affine of these."""
     turned = affine.copy()
     turned[:3, 3] += (len(voxels) - 1) * affine[:3, 2]
     turned[:3, 2] *= -1.0

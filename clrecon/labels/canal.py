@@ -30,8 +30,7 @@ STEEPEST = 1.0
 """Largest shift of the canal from slice to slice, mm per mm: 45 degrees."""
 
 SPREAD_MM = 4.0
-"""The canal is at most so much wider than in the nearest slice in which the arch is closed; what lies farther out are
-gaps of a mask beside it."""
+"""The canal is at most so much wider than in the nearest closed slice; beyond are gaps of a mask beside it."""
 
 ROUNDS = 3
 """Times that the direction of the canal is found with the wall that follows from the one before."""
@@ -53,18 +52,13 @@ class Canal:
 
 
 def find_canal(solid: Bits, volume: Volume) -> Canal | None:
-    """Find the canal beside the solid bone of a vertebra.
+    """Find the canal beside the solid bone of a vertebra (nk, nj, ni), its holes filled; None where no arch is closed.
 
-    In each slice the largest hole of the arch is looked for that is open above and below; where no slice has one, in so
-    many neighbouring slices together as it takes.  In slices above and below it the pedicles still join the body with
-    the arch, but there is a gap behind: with a wall across the middle of the canal its front half is closed there too.
-    These slices are the pedicles' height.  In them the back half goes on from the nearest closed slice, in the
-    direction of the canal.
-
-    solid: ndarray, shape (nk, nj, ni), bool. Solid bone of one vertebra, its holes filled.
-    volume: Where its voxels are; the slices are axial within 45 degrees.
-
-    Returns: None where the arch is closed nowhere.
+    In each slice, axial within 45 degrees, the largest hole of the arch is looked for that is open above and below;
+    where no slice has one, in so many neighbouring slices together as it takes.  In slices above and below it the
+    pedicles still join the body with the arch, but there is a gap behind: with a wall across the middle of the canal
+    its front half is closed there too.  These slices are the pedicles' height.  In them the back half goes on from the
+    nearest closed slice, in the direction of the canal.
     """
     places = _Places(volume)
     main, together = _join_holes(solid, places)
@@ -170,8 +164,8 @@ def _large_sections(holes: Bits, least: float) -> Bits:
 def _largest_open(holes: Bits, solid: Bits, places: _Places) -> Bits | None:
     """Return the largest hole, joined over the slices, that goes on above and below; None without one.
 
-    A hollow endplate is a ring in the slices through its rim, but bone lies on one side of its hole.  Gaps of a mask
-    in the body lie in front of the middle of all bone, the canal behind it.
+    A hollow endplate is a ring in the slices through its rim, but bone lies on one side of its hole.  Gaps of a mask in
+    the body lie in front of the middle of all bone, the canal behind it.
     """
     from scipy.ndimage import find_objects
     from scipy.ndimage import label as find_components
@@ -195,9 +189,7 @@ def _largest_open(holes: Bits, solid: Bits, places: _Places) -> Bits | None:
 
 
 def _find_front(solid: Bits, main: Bits, places: _Places) -> tuple[Bits, Float64Array, Bits]:
-    """Return the front half of the canal in the slices of the pedicles, the canal's shift in x and y per mm of height,
-    and the wall behind.
-    """
+    """Return the canal's front half in the pedicles' slices, its shift in x and y per mm of height, the wall behind."""
     from scipy.ndimage import label as find_components
 
     middle = float(np.mean(places.heights[np.nonzero(main)[0]]))

@@ -30,13 +30,10 @@ a ring so thin holds hardly a pixel centre."""
 
 
 def fill_contours(contours: Iterable[NDArray[np.float64]], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return the pixels of one slice whose centres lie inside of contours.
+    """Return the pixels (nj, ni) of one slice whose centres lie inside of contours by the even-odd rule.
 
-    contours: iterable of ndarray, shape (n, 2), float64. Corners (i, j) in pixels, 0 at the centre of the first; the
-        last corner is joined to the first.
+    contours: Corners (i, j) of each, (n, 2), in pixels, 0 at the centre of the first; the last is joined to the first.
     shape: (nj, ni).
-
-    Returns: ndarray, shape (nj, ni), bool
     """
     nj, ni = shape
     inside = np.zeros(shape, dtype=bool)
@@ -71,9 +68,8 @@ def _cross_rows(corners: NDArray[np.float64], nj: int) -> tuple[NDArray[np.int64
 
 @dataclass(frozen=True)
 class United:
-    """The pixels inside of the contours of a slice, and what was done to find them.
+    """The pixels (nj, ni) inside of the contours of a slice, and what was done to find them.
 
-    inside: ndarray, shape (nj, ni), bool
     repeated: Contours that equal another, or nearly, and do not count.
     crossing: Pairs of contours that cross.
     """
@@ -112,12 +108,10 @@ class _Patch:
 def unite_contours(
     contours: Sequence[NDArray[np.float64]], shape: tuple[int, int], pixel_mm: tuple[float, float]
 ) -> United:
-    """Return the pixels inside of the CLOSED_PLANAR contours of one slice.
+    """Return the pixels inside of the CLOSED_PLANAR contours of one slice; contours and shape as of `fill_contours`.
 
     Two contours cross if both hold some pixel centre, and each holds one that is beyond the other.
 
-    contours: sequence of ndarray, shape (n, 2), float64. As of `fill_contours`.
-    shape: (nj, ni).
     pixel_mm: Spacing (di, dj).
     """
     unique = list({_canonical(corners, pixel_mm): corners for corners in contours}.values())
@@ -147,10 +141,7 @@ def _paint(
     nested: Sequence[tuple[int, int]],
     shape: tuple[int, int],
 ) -> NDArray[np.bool_]:
-    """Fill contours from the outer to the inner ones: one within an odd number of regions is a hole.
-
-    Contours that cross are one region.
-    """
+    """Fill contours from the outer to the inner ones: one within an odd number of regions, or crossing, is a hole."""
     region = _join(len(contours), crossing)
     around: list[set[int]] = [set() for _ in contours]
     for outer, inner in nested:

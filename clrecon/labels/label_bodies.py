@@ -1,7 +1,4 @@
-"""Labels as bodies: the samples around them, parts and holes inside that are filled, and volumes in ml.
-
-A volume is the sum over the voxels, each as large as the spacing of its own slice makes it.
-"""
+"""Labels as bodies: the samples around them, parts and holes inside that are filled, and volumes in ml."""
 
 from __future__ import annotations
 
@@ -27,9 +24,8 @@ class Growth:
     """The growth of labels on one grid.
 
     grow_mm: Distance of growth; None: one voxel in each direction.
-    offsets: ndarray, shape (n, 3), int32. (di, dj, dk) to the samples around, without (0, 0, 0), nearest in mm first,
-        shear included.
-    shells: ndarray, shape (n,), int32. Shell numbers from 0; offsets of equal length have the same.
+    offsets: (n, 3). (di, dj, dk) to the samples around, without (0, 0, 0), nearest in mm first, shear included.
+    shells: (n,). Shell numbers from 0; offsets of equal length have the same.
     """
 
     grow_mm: float | None
@@ -38,7 +34,6 @@ class Growth:
 
     @classmethod
     def of(cls, volume: Volume, grow_mm: float | None) -> Growth:
-        """Make the growth by `grow_mm` on the grid of a volume."""
         steps = volume.affine[:3, :3]
         if grow_mm is None:
             return cls(None, *_sort(_offsets_within((1, 1, 1)), steps))
@@ -98,9 +93,7 @@ Box = tuple[slice, slice, slice]
 
 
 def find_boxes(labels: NDArray[Any], numbers: tuple[int, ...], reach: tuple[int, int, int]) -> dict[int, Box]:
-    """Find the box (k, j, i) of each number's samples, grown by `reach` (i, j, k) samples and one more, within the
-    grid.
-    """
+    """Find the box (k, j, i) of each number's samples in the grid, `reach` (i, j, k) samples and one more around."""
     from scipy.ndimage import find_objects
 
     found = find_objects(labels, max_label=max(numbers, default=0))
@@ -116,7 +109,7 @@ def find_boxes(labels: NDArray[Any], numbers: tuple[int, ...], reach: tuple[int,
 
 
 def fill_solid(solid: NDArray[Any], labels: NDArray[Any], number: int, box: Box, closed: bool) -> int:
-    """Make the inside of one label solid, in place.
+    """Make the inside of one label solid, in place; return the number of samples that were filled.
 
     A sample becomes inside of the label when one of these is true:
 
@@ -128,12 +121,10 @@ def fill_solid(solid: NDArray[Any], labels: NDArray[Any], number: int, box: Box,
     layer of the mask, the HU decide there: they place the outer surface.  Pores of the cortex are too narrow for a
     path.
 
-    solid: ndarray, shape (nk, nj, ni). For each sample the label that it is inside of, 0 for none; changed in place.
-    labels: ndarray, shape (nk, nj, ni). The mask, not grown.
+    solid: (nk, nj, ni). For each sample the label that it is inside of, 0 for none; changed in place.
+    labels: (nk, nj, ni). The mask, not grown.
     box: Box of the label and at least one sample around it, as `find_boxes` returns it.
     closed: Everything beyond the border of the volume is outside.
-
-    Returns: Number of samples that were filled.
     """
     from scipy.ndimage import binary_dilation, binary_erosion
 
@@ -180,10 +171,6 @@ def label_ml(labels: LabelMap, number: int) -> float:
 
 
 def count_ml(voxels: NDArray[Any], number: int, box: Box, voxel_ml: NDArray[np.float64]) -> float:
-    """Return the volume of the voxels of a grid that carry `number`, ml.
-
-    box: Slices along k, j, i, around all voxels of the label.
-    voxel_ml: ndarray, shape (nk,). See `slice_voxel_ml`.
-    """
+    """Return the ml of the voxels with a number, which all lie in the box; `voxel_ml` is that of `slice_voxel_ml`."""
     counts = np.count_nonzero(voxels[box] == number, axis=(1, 2))
     return float(counts @ voxel_ml[box[0]])

@@ -1,9 +1,7 @@
 """Label maps in grid files: NIfTI with a label table, NRRD with 3D Slicer's segments and layers, MetaImage.
 
-A folder of masks, one file a structure, as TotalSegmentator writes it, is one map with the names of the files.
-
-nibabel writes the header of NIfTI-1 (.nii, .nii.gz).  The names are a label table as Caret and Connectome Workbench
-write it, which `read_labels` and other programs read.
+A folder of masks, one file a structure, as TotalSegmentator writes it, is one map with the names of the files. NIfTI-1
+(.nii, .nii.gz) is written, by nibabel, with the names in a label table as other programs have it.
 
 Source: 3D Slicer's segmentation file format; the label table of Caret and Connectome Workbench.
 """
@@ -46,11 +44,7 @@ class _Segment:
 
 
 def read_grid_labels(grid: GridFile, wanted: Wanted, progress: Progress = ignore_progress) -> LabelMap:
-    """Read a label map or a segmentation.
-
-    wanted: Of segments in layers only the others may overlap.
-    progress: Called as ``progress("read", slices done, all slices)``.
-    """
+    """Read a label map or a segmentation; of segments in layers only those that are not wanted may overlap."""
     segments, said = _read_segments(grid)
     ni, nj, nk = grid.shape_ijk
     voxels = empty_labels(grid.name, (nk, nj, ni))
@@ -137,9 +131,7 @@ def _read_numbers(grid: GridFile, segments: Iterable[int], key: str) -> dict[int
 
 
 def _read_names(extension: bytes) -> dict[int, str]:
-    """Return the names of a label table as Caret, Connectome Workbench and TotalSegmentator write it into a NIfTI
-    header.
-    """
+    """Return the names of a label table of Caret, Connectome Workbench or TotalSegmentator in a NIfTI header."""
     names = {}
     for match in _LABEL.finditer(extension):
         text = (match[2] or match[3] or b"").decode("utf-8", "replace")
@@ -184,12 +176,9 @@ def open_masks(folder: Path) -> dict[str, GridFile]:
 
 
 def read_masks(folder: Path, masks: dict[str, GridFile], wanted: Wanted, progress: Progress) -> LabelMap:
-    """Read the masks of a folder as one map; the first has number 1.
+    """Read the masks of a folder, as `open_masks` returns them, as one map; the first has number 1.
 
     A voxel of several masks belongs to the first of them in alphabetical order, wanted ones before others.
-
-    masks: As `open_masks` returns them.
-    progress: Called as ``progress("read", masks done, all masks)``.
     """
     names = dict(enumerate(masks, start=1))
     chosen = set(names) if wanted.labels is None else {find_number(one, names, names) for one in wanted.labels}
@@ -255,10 +244,7 @@ def load_nibabel() -> Any:
 
 
 def encode_nifti(labels: LabelMap, *, packed: bool) -> bytes:
-    """Return the bytes of the file; the same labels give the same bytes.
-
-    packed: Gzip, as in .nii.gz.
-    """
+    """Return the bytes of the file, for .nii.gz packed; the same labels give the same bytes."""
     nibabel = load_nibabel()
     image = nibabel.Nifti1Image(np.asarray(labels.voxels).transpose(2, 1, 0), None)
     place_in_header(image.header, labels.affine)

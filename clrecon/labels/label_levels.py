@@ -3,9 +3,7 @@
 The occupancy of a sample is the sum over the 5 x 5 x 5 samples around it that carry the label, weighted by [1 4 6 4 1]
 / 16 along each axis (two rounds of [1 2 1] / 4); beyond the map its outermost samples are repeated.
 
-Labels that other labels enclose: which they are, and the levels at which all of them keep their volumes.
-
-A label of this kind has little or no free surface.  Its level also moves the borders that it shares with its
+A label that others enclose has little or no free surface.  Its level also moves the borders that it shares with its
 neighbours, and changes their volumes.  So the levels of all of them are found together.
 """
 
@@ -41,14 +39,13 @@ VOLUME_SHARE = 3e-4
 """Accepted error, as a share of the label's volume: a level with this error or less is kept."""
 
 MOST_TRIALS = 14
-"""Most levels that are tried.  Large bodies need 2 or 3; tiny ones, whose vertices reach the ends of their edges, need
-more."""
+"""Most levels that are tried: for large bodies 2 or 3, for tiny ones, whose vertices reach the ends of edges, more."""
 
 
 def next_level(tried: Sequence[tuple[int, float]], wanted: float, rise: float) -> int:
     """Return the level to try next: by Newton's method, then the secant method, then interpolation between two levels.
 
-    tried: sequence of (int, float). Levels and their volumes, in the order of the trials.
+    tried: Levels and their volumes, in the order of the trials.
     rise: Approximate change of the volume when the level rises by one: below 0.
 
     Returns: The next level; or the best of the tried levels, where no further trial is useful.
@@ -78,20 +75,14 @@ FACES_PER_AREA = 1.5
 """Mean number of voxel faces at a border for one face's area of the border, over all directions."""
 
 MOST_SWEEPS = 16
-"""Most rounds of the search.  Three or four are enough, but tiny labels, whose vertices reach the ends of their edges,
-need more."""
+"""Most rounds of the search: three or four, for tiny labels, whose vertices reach the ends of their edges, more."""
 
 DRIFT = 1e-4
-"""Share by which the diagonal is increased: where enclosed labels fill a whole map, the equations would have no unique
-solution."""
+"""Share by which the diagonal is increased: where labels fill a whole map, the equations would not be unique."""
 
 
 def count_faces(labels: NDArray[Any]) -> NDArray[np.int64]:
-    """Count the faces of each label's voxels, shape (highest number + 1, 2): towards no label, and towards other
-    labels.
-
-    Faces at the ends of the map are in neither column.
-    """
+    """Count each label's faces (highest number + 1, 2) towards no label and towards others, but at the map's ends."""
     faces = np.zeros((int(labels.max(initial=0)) + 1, 2), np.int64)
     for axis in range(3):
         size = labels.shape[axis]
@@ -107,7 +98,6 @@ def find_enclosed(
 ) -> tuple[int, ...]:
     """Return the labels that share more faces with other labels than they have free, and the labels that touch them.
 
-    labels: ndarray, shape (nk, nj, ni)
     faces: The table of `count_faces`.
     boxes: Box of each label and the samples around it; None: the whole map.
     """
@@ -145,12 +135,10 @@ def level_biases(levels: dict[int, int], size: int) -> NDArray[np.int32]:
 class Borders:
     """How the volumes of enclosed labels change with their levels.
 
-    voxels: ndarray, shape (n,). Number of voxels of each label.
-    slopes: scipy.sparse array, shape (n, n). Number of voxels that label `row` loses when the level of label `column`
-        rises by one.
-    parts: ndarray, shape (n,). Number of the group of each label; labels that touch, directly or through others, form a
-        group.
-    filled: ndarray, shape (n,). True for labels of a group that is bounded by the ends of the map alone.
+    voxels: (n,). Number of voxels of each label.
+    slopes: scipy.sparse, (n, n). Number of voxels that label `row` loses when the level of label `column` rises by one.
+    parts: (n,). The group of each label; labels that touch, directly or through others, form a group.
+    filled: (n,). True for labels of a group that is bounded by the ends of the map alone.
     """
 
     numbers: tuple[int, ...]
@@ -189,10 +177,7 @@ class Borders:
         return cls(tuple(numbers), np.array(counts), slopes, parts, ~open_parts[parts])
 
     def share_rest(self, short: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the volumes that labels lack, less an equal share for labels of groups that fill a whole map.
-
-        No levels can bring a group of this kind more volume in total.
-        """
+        """Return the volumes that labels lack; less an equal share where a group fills the map and cannot get more."""
         weights = np.where(self.filled, self.voxels, 0.0)
         rest = np.bincount(self.parts, np.where(self.filled, short, 0.0))
         share = rest / np.maximum(np.bincount(self.parts, weights), 1.0)

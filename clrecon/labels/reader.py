@@ -98,14 +98,11 @@ def read_all_labels(
     volume: Grid | None = None,
     progress: Progress | None = None,
 ) -> LabelMap:
-    """Read a label map as `read_labels` does, with all its labels: those of `first` get the voxels that they share with
-    others, which tell a surface where its label ends.
-    """
+    """Read a label map with all labels, which tell a surface where its own ends; `first` get voxels of several."""
     return _read(Path(path), Wanted(check_wanted(first)), volume, progress)
 
 
 def _keep(labels: LabelMap, numbers: Sequence[int]) -> LabelMap:
-    """Return a map with these labels alone."""
     if {*labels.numbers, *labels.names} <= set(numbers):
         return labels
     table = np.zeros(LARGEST_NUMBER + 1, labels.voxels.dtype)

@@ -20,8 +20,8 @@ from clrecon.system.text import format_ml
 log = get_logger(__name__)
 
 LEAST_SHARE_INSIDE = 0.01
-"""Least share of the labelled voxels inside the volume.  The labels of a whole body have a larger share in a scan of
-one joint; labels of another scan have less."""
+"""Least share of the labelled voxels inside the volume: labels of a whole body have more in a scan of one joint, of
+another scan less."""
 
 ON_GRID = 0.01
 """Tolerance in index steps: grids are the same when no voxel is further off than this."""
@@ -37,8 +37,7 @@ TIES = 1e-6
 class ResampledLabels:
     """A label map on the grid of a volume.
 
-    voxels: ndarray, shape (nk, nj, ni), uint8 or uint16. On the grid of the volume.  Do not change it: it may be the
-        map's own array.
+    voxels: (nk, nj, ni), uint8 or uint16.  Do not change it: it may be the map's own array.
     exact: Every voxel of the volume coincides with a voxel of the map or lies outside the map.
     inside: For each number its share of labelled voxels that lie inside the volume, 0 to 1.
     """
@@ -90,7 +89,7 @@ def warn_of_place(labels: LabelMap, volume: Volume, voxels: NDArray[Any] | None 
     Where only the order or direction of the axes differs, as after a careful turn, there is none unless the labels lie
     better in bone at the same indices.
 
-    voxels: ndarray, shape (nk, nj, ni). The map on the grid of the volume; None: it is brought there if it is needed.
+    voxels: The map on the grid of the volume; None: it is brought there if it is needed.
     """
     if labels.shape_ijk != volume.shape_ijk:
         return []
@@ -140,10 +139,7 @@ def _take(labels: LabelMap, volume: Volume, progress: Progress) -> tuple[NDArray
 
 
 def check_together(labels: LabelMap, volume: Volume) -> dict[int, float]:
-    """Refuse a label map that cannot belong to this scan.
-
-    Returns: For each number its share of labelled voxels that lie inside the volume, 0 to 1.
-    """
+    """Refuse a map of another scan; return for each number its share of labelled voxels inside the volume, 0 to 1."""
     if not labels.numbers:
         raise RefusedInputError("the label map is empty: no voxel has a label")
     _check_frame_of_reference(labels, volume)
@@ -162,11 +158,7 @@ def _check_frame_of_reference(labels: LabelMap, volume: Volume) -> None:
 
 
 def _take_aligned(labels: LabelMap, volume: Volume) -> NDArray[Any] | None:
-    """Return the labels if both grids have the same voxel places, else None; the directions and ends of the axes may
-    differ.
-
-    The array is not copied if it needs no change.
-    """
+    """Return the labels, copied if need be; None unless both grids have the same places up to directions and ends."""
     inverse = np.asarray(np.linalg.inv(labels.affine), dtype=np.float64)
     starts = apply_affine(inverse, volume.slice_origins())
     steps = inverse[:3, :3] @ volume.affine[:3, :3]  # columns: steps in the map per step along i, j, k

@@ -1,7 +1,7 @@
 """DICOM SEG (Segmentation and Label Map Segmentation): every frame is placed by its own position.
 
-The frames form a stack of evenly spaced slices, with holes where no frame was written.  Writers leave out frames
-without a labelled pixel, so a hole is a slice without labels, not an error.
+The frames form a stack of evenly spaced slices.  Writers leave out frames without a labelled pixel, so a hole is a
+slice without labels, not an error.
 
 Source: DICOM PS3.3 A.51 and C.8.20 (Segmentation), C.7.6.16 (multi-frame functional groups), PS3.5 8.1.1 (one-bit
 pixels are packed without a gap between frames, lowest bit first).
@@ -45,11 +45,7 @@ _UNSAID = "says neither SpacingBetweenSlices nor SliceThickness"
 
 @dataclass(frozen=True)
 class FrameStack:
-    """The evenly spaced stack that frames form.
-
-    places: Slice index k of each frame.
-    warnings: What the header leaves open about the step between slices.
-    """
+    """The evenly spaced stack that frames form; `places` are the slice index k of each frame."""
 
     affine: Float64Array
     places: list[int]
@@ -72,11 +68,7 @@ def _group(shared: Any, group: Any, sequence: str) -> Any:
 
 
 def place_frames(shared: Any, groups: list[Any], name: str) -> FrameStack:
-    """Place the frames of a SEG by their own positions.
-
-    shared: Shared functional groups.
-    groups: Per-frame functional groups.
-    """
+    """Place the frames of a SEG by their own positions, from its shared and its per-frame functional groups."""
     directions = np.stack(
         [_numbers(_group(shared, g, "PlaneOrientationSequence").ImageOrientationPatient, 6) for g in groups]
     )
@@ -206,10 +198,8 @@ class _Layout:
 def read_segmentation(
     path: Path, wanted: Wanted, progress: Progress = ignore_progress, check: Check | None = None
 ) -> LabelMap:
-    """Read a DICOM SEG of binary segments or of a label map.
+    """Read a DICOM SEG of binary segments, of which only those that are not wanted may overlap, or of a label map.
 
-    wanted: Only the other segments may overlap.
-    progress: Called as ``progress("read", frames done, all frames)``.
     check: See `Check`; its errors are those of this function.
     """
     with warnings.catch_warnings():
@@ -426,7 +416,6 @@ class _FramePixels:
 
 
 def _frames_in_order(numbers: list[int], order: Sequence[int], segments: Collection[int], name: str) -> list[int]:
-    """Return the frames of the segments in `order`."""
     unknown = sorted(set(numbers) - set(segments))
     if unknown:
         raise RefusedInputError(f"{name} is corrupt: a frame belongs to segment {unknown[0]}, which it does not list")

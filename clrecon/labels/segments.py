@@ -1,7 +1,4 @@
-"""Label numbers read slice by slice, and segments stored separately that become one map.
-
-The numbers are read within the memory of this computer.  An overlap is either refused or settled by a rule.
-"""
+"""Label numbers read slice by slice, and segments stored separately that become one map."""
 
 from __future__ import annotations
 
@@ -59,23 +56,17 @@ def _as_labels(stored: NDArray[Any], name: str, where: str) -> NDArray[Any]:
 
 
 class Wanted(NamedTuple):
-    """The labels that are wanted, None for all, and whether the others are read too.
-
-    The others tell a surface where its label ends.
-    """
+    """The labels that are wanted, None for all, and whether others, which tell where a label ends, are read."""
 
     labels: tuple[str | int, ...] | None = None
     others: bool = True
 
 
 class Painter:
-    """Writes segments into one map.
+    """Writes segments into one map (nk, nj, ni) of zeros.
 
     No two wanted segments may overlap.  A voxel of a wanted and another segment goes to the wanted one; a voxel of
     several others goes to the lowest number.
-
-    voxels: ndarray, shape (nk, nj, ni), uint16. Zeros, to be written.
-    names: The segments.
     """
 
     def __init__(self, file: str, voxels: NDArray[Any], names: Mapping[int, str], wanted: Wanted):

@@ -38,8 +38,7 @@ class LabelFigures(Record):
     label_ml: Volume of the label on the map's own grid, which may go beyond the scan.
     inside_share: Share of the label's voxels that lie inside the scan, 0 to 1.
     unmeasured: Voxels without a finite value; the figures of HU leave them out.
-    mean_hu, sd_hu: Mean and standard deviation over the volume (divided by the whole, not by one voxel less); None
-        without voxels.
+    mean_hu, sd_hu: Over the volume (divided by the whole, not by one voxel less); None without voxels.
     percentiles_hu: ``{"5": ...}``: the least HU up to which at least this percentage of the volume lies.
     """
 

@@ -1,9 +1,7 @@
 """DICOM RT Structure Set (RTSTRUCT): contours in mm, rasterised on the slices of the scan they were drawn on.
 
-An uneven stack gets an even grid of thin slices, each with the labels of the nearest slice of the scan.
-
-A label map has one affine.  Slices of a quarter of the smallest gap give every voxel of the scan the label of its own
-slice, and a label the volume that its voxels have: each slice reaches half way to its neighbours.
+A label map has one affine: an uneven stack gets an even grid of thin slices.  A quarter of the smallest gap gives every
+voxel of the scan the label of its own slice, and a label the volume that its voxels have, half way to the neighbours.
 
 Source: DICOM PS3.3 C.8.8.5 (Structure Set) and C.8.8.6 (ROI Contour).
 """
@@ -40,11 +38,7 @@ MOST_ASIDE = 0.4
 
 
 class LabelSlices(NamedTuple):
-    """The slices of a label map of a scan.
-
-    affine: ndarray, shape (4, 4). Index (i, j, k) of the map to LPS mm.
-    nearest: ndarray, shape (slices,), int64. For each slice of the map the slice of the scan whose labels it has.
-    """
+    """The slices of a label map of a scan, and for each (slices,) the slice of the scan whose labels it has."""
 
     affine: Float64Array
     nearest: NDArray[np.int64]
@@ -128,14 +122,12 @@ class _Structure:
 def read_structures(
     path: Path, volume: Volume | None, wanted: Wanted, progress: Progress = ignore_progress
 ) -> LabelMap:
-    """Read the ROIs of an RTSTRUCT as labels on the slices of its scan.
+    """Read the ROIs of an RTSTRUCT as labels on the slices of its scan, thinner ones of an uneven scan.
 
     A voxel has the label of an ROI where its centre is inside of the closed contours of its slice, see
-    `clrecon.labels.contours`.  The label's number is the ROI's.  Of an uneven scan the map has thinner slices, see
-    `clrecon.labels.structures`.
+    `clrecon.labels.contours`.  The label's number is the ROI's.
 
     wanted: Only the other ROIs may overlap, and only the wanted ones have to fit the scan.
-    progress: Called as ``progress("read", ROIs done, all ROIs)``.
     """
     name = escape_text(path.name)
     if volume is None:
@@ -314,7 +306,6 @@ def _points_of(contour: _Contour, file: str, shown: str) -> NDArray[np.float64]:
 
 
 def _parse(path: Path, name: str) -> dict[int, _Structure]:
-    """Return the ROIs by their numbers."""
     from pydicom.filereader import read_file_meta_info
 
     try:

@@ -30,10 +30,9 @@ _DATE, _TIME = "19700101", "000000"
 
 
 def encode_segmentation(labels: LabelMap, slices: Sequence[SourceSlice], *, label: str = "VERTEBRAE") -> bytes:
-    """Return the bytes of the file; the same labels and slices give the same bytes.
+    """Return the bytes of the file; the same labels, on the grid of the scan, and slices give the same bytes.
 
-    labels: On the grid of the scan.
-    slices: sequence of (path, frame, frames). The slices of the scan, slice k of the label map at place k.
+    slices: Of the scan, slice k of the label map at place k.
     label: Content label: upper case letters, digits and underscores, at most 16.
     """
     from pydicom.sequence import Sequence as Items

@@ -25,23 +25,13 @@ REASON = "ghost slice"
 
 @dataclass(frozen=True)
 class GhostSlices:
-    """The result of the slice test.
+    """The result of the slice test, ghosts ascending; of untested slices and without voxels to compare figures are NaN.
 
-    slices: The ghosts, ascending.
-    points: ndarray, shape (nk,), int64. Voxels of the band in each slice.
-    nearest: ndarray, shape (nk,), float64. The higher one of Dice's coefficients with the slice before and the one
-        behind.
-    around: ndarray, shape (nk,), float64. Dice's coefficient of these two slices with each other.
-    within: ndarray, shape (nk,), float64. Share of a slice's voxels that lie within one of its neighbours, the larger
-        one of both, corrected for chance: 0 where it is the share that the neighbour takes of its whole slice, 1 where
-        all of them lie within.
-    hu: The band.
-    warnings: A line each.
-
-    Notes
-    -----
-    `nearest`, `around` and `within` are NaN in the first and the last slice, which are not tested, and where there is
-    no voxel in the band to compare.
+    points: (nk,). Voxels of the band `hu` in each slice.
+    nearest: (nk,). The higher one of Dice's coefficients with the slice before and the one behind.
+    around: (nk,). Dice's coefficient of these two slices with each other.
+    within: (nk,). Share of a slice's voxels that lie within one of its neighbours, the larger one of both, corrected
+        for chance: 0 where it is the share that the neighbour takes of its whole slice, 1 where all of them lie within.
     """
 
     slices: tuple[int, ...]
@@ -90,11 +80,9 @@ def judge_slices(
 ) -> GhostSlices:
     """Tell the ghosts from the counts of voxels.
 
-    counts: ndarray, shape (3, nk), int64. Voxels of each slice, and those that it has in common with the next slice and
-        with the one after.
+    counts: (3, nk). Voxels of each slice, and those that it has in common with the next slice and with the one after.
     area: All voxels of a slice.
     hu: Band of the voxels.
-    warnings: Given on.
     """
     points, nk = counts[0], counts.shape[1]
     nearest, around, within = np.full((3, nk), np.nan)

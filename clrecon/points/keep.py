@@ -32,12 +32,9 @@ LEAST_RUN = 4
 
 @dataclass(frozen=True)
 class ClusterFigures:
-    """The clusters of a cloud, an entry of each array for each.
+    """The clusters of a cloud, an entry of each array for each: points, centres (c, 3), boxes (c, 2, 3) in LPS mm.
 
-    points: ndarray, shape (c,), int64. Number of points.
-    centres: ndarray, shape (c, 3), float64. Mean of the points, LPS mm.
-    boxes: ndarray, shape (c, 2, 3), float64. Lowest and highest coordinates, LPS mm.
-    deviations: ndarray, shape (c, 3), float64. Standard deviations along the principal axes, mm, ascending.
+    deviations: (c, 3). Standard deviations along the principal axes, mm, ascending.
     """
 
     points: NDArray[np.int64]

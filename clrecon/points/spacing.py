@@ -1,8 +1,7 @@
 """Distances in a cloud: its mean spacing, and paper B's grid of cells and ratio of distances D_i with its threshold D0.
 
-The mean spacing follows from the number of small cubes that the points occupy.  Of paper B's equations of a grid,
-equation 1 prints the margin as "natural constant 2.71828", equation 2 has none: here both begin at the lowest
-coordinates less the same small margin.
+Of paper B's (Liu et al. 2019) equations of a grid, equation 1 prints the margin as "natural constant 2.71828", equation
+2 has none: here both begin at the lowest coordinates less the same small margin.
 """
 
 from __future__ import annotations
@@ -22,15 +21,11 @@ ROUNDS = 8
 
 
 def mean_spacing(points: NDArray[np.floating]) -> float:
-    """Estimate the distance between neighbouring points of a surface.
+    """Estimate the distance in mm between neighbouring points (n, 3) of a surface; 0 for clouds without extent.
 
     A cloud of n points that occupies c cells of edge e covers an area of about ``c * e ** 2``, so that its spacing is
     ``e / sqrt(n / c)``.  The edge is chosen so that a cell holds about four points.  Of points that fill a body it is
     about four fifths of their spacing.
-
-    points: ndarray, shape (n, 3), floating. Millimetres.
-
-    Returns: Mm; 0 for clouds without extent, and for fewer than two points.
     """
     if len(points) < 2:
         return 0.0
@@ -78,15 +73,7 @@ MARGIN = 1e-3
 
 
 def count_cells(points: NDArray[np.floating], edge: float) -> tuple[int, int, int]:
-    """Return the number of cells along each axis: ``int(((max + e) - (min - e)) / edge) + 1``.
-
-    points: ndarray, shape (n, 3). mm; at least one.
-    edge: Edge of the cells in mm.
-
-    References
-    ----------
-    Liu et al. 2019, equation 1.
-    """
+    """Return the cells along each axis: ``int(((max + e) - (min - e)) / edge) + 1``, equation 1 of paper B."""
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     margin = MARGIN * edge
     nx, ny, nz = (((high + margin) - (low - margin)) / edge).astype(np.int64) + 1
@@ -94,17 +81,7 @@ def count_cells(points: NDArray[np.floating], edge: float) -> tuple[int, int, in
 
 
 def find_cell_numbers(points: NDArray[np.floating], edge: float) -> NDArray[np.int64]:
-    """Return the number of the cell of each point: ``a + nx (b + ny c)`` with ``a = int((x - (min - e)) / edge)``.
-
-    points: ndarray, shape (n, 3). mm; at least one.
-    edge: Edge of the cells in mm.
-
-    Returns: ndarray, shape (n,), int64
-
-    References
-    ----------
-    Liu et al. 2019, equation 2.
-    """
+    """Return the cell of each point: ``a + nx (b + ny c)`` with ``a = int((x - (min - e)) / edge)``, by equation 2."""
     nx, ny, _ = count_cells(points, edge)
     a, b, c = ((points - (points.min(axis=0).astype(np.float64) - MARGIN * edge)) / edge).astype(np.int64).T
     return np.asarray(a + nx * (b + ny * c))
@@ -123,13 +100,11 @@ def distance_ratios(
     """Return D_i of paper B, section 2.2, for each point: mean distance to its neighbours over the cell's spacing.
 
     The paper's "mean point distance" of the cell is read as the mean distance of its points to their nearest ones.
+    Infinite where all points of a cell coincide with others and the neighbours do not, 0 where these do too.
 
-    means: ndarray, shape (n,), mm. Mean distance of each point to its neighbours, itself not among them.
-    nearest: ndarray, shape (n,), mm. Distance of each point to the nearest other one.
-    cells: ndarray, shape (n,), whole numbers from 0. Cell of each point.
-
-    Returns: ndarray, shape (n,), float64. Infinite where all points of a cell coincide with others and the neighbours
-        do not, 0 where these do too.
+    means: Mean distance of each point (n,) to its neighbours, itself not among them, mm.
+    nearest: Distance of each point to the nearest other one, mm.
+    cells: Cell of each point, from 0.
     """
     counts = np.bincount(cells)
     spacing = np.bincount(cells, nearest) / np.maximum(counts, 1)

@@ -27,10 +27,7 @@ PLACES = 9
 class Lattice:
     """Where the voxels of a volume lie, without the volume.
 
-    shape_ijk: (ni, nj, nk)
-    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm.
-    origins: ndarray, shape (nk, 3), float64, or None. LPS mm of voxel (0, 0, k) of each slice where the slices are
-        uneven; the affine then says nothing about k.
+    origins: LPS mm of voxel (0, 0, k) of each slice (nk, 3) where slices are uneven; the affine then says nothing of k.
     """
 
     shape_ijk: tuple[int, int, int]
@@ -39,7 +36,6 @@ class Lattice:
 
     @classmethod
     def of(cls, volume: Volume) -> Lattice:
-        """Return the lattice of a volume."""
         return cls(volume.shape_ijk, volume.affine, volume.slice_origins() if volume.uneven else None)
 
     @property
@@ -76,13 +72,11 @@ class Lattice:
 class Stencil:
     """Offsets of the voxels within eps of a voxel, row by row of the volume.
 
-    rows: ndarray, shape (m, 4), int32. dj, dk, lowest di and highest di of each row, nearest rows first, of one table
-        after the other.
-    tables: ndarray, shape (nk, 2), int32. First row of the table of each slice, and the one after its last.
+    rows: (m, 4). dj, dk, lowest di and highest di of each row, nearest rows first, of one table after the other.
+    tables: (nk, 2). First row of the table of each slice, and the one after its last.
     in_plane: Members of the stencil in its own slice, the voxel itself included.
-    members: Fewest and most members over all slices that have neighbours as far as the stencil reaches; equal in an
-        even stack.
-    reach: Largest \\|di\\|.
+    members: Fewest and most over all slices that have neighbours as far as the stencil reaches; equal in an even stack.
+    reach: Largest di, without its sign.
     """
 
     rows: NDArray[np.int32]
@@ -130,19 +124,16 @@ class Stencil:
 
 
 def checked_eps(eps: float) -> float:
-    """Return `eps` as a float."""
     if isinstance(eps, bool) or not isinstance(eps, (int, float, np.number)) or not 0.0 < float(eps) < math.inf:
         raise UsageError(f"eps is {eps!r}: a distance above 0 mm is needed")
     return float(eps)
 
 
 def make_stencil(lattice: Lattice, eps: float) -> Stencil:
-    """Find the voxels within `eps` of a voxel, for each slice of a lattice.
+    """Find the voxels within `eps` mm (see `SLACK`) of a voxel, for each slice of a lattice.
 
-    Where the slices are uneven, the places of both slices count and the affine says nothing about k.  Offsets that lead
-    out of the volume from every voxel are left out.
-
-    eps: mm; see `SLACK`.
+    Where slices are uneven, the places of both count.  Offsets that lead out of the volume from everywhere are left
+    out.
     """
     eps = checked_eps(eps)
     nk = lattice.shape_ijk[2]

@@ -1,8 +1,9 @@
 """The corridors of one labelled vertebra: the widest straight line of each pedicle, or why there is none.
 
-A line is a pass point in the pedicle's narrowest coronal section and two angles.  What counts is its least distance to
-the outside of the solid bone, from the coronal plane through the canal's axis to `BODY_SHARE` of the body's depth.
-Behind that plane a screw has to leave the bone, and every line would end at zero."""
+What counts of a line is its least distance to the outside of the solid bone, from the coronal plane through the canal's
+axis to `BODY_SHARE` of the body's depth.  Behind that plane a screw has to leave the bone, and every line would end at
+zero.
+"""
 
 from __future__ import annotations
 
@@ -55,8 +56,7 @@ SAME_MM = 0.1
 """Lines whose radius is less than this below the widest are as good: the angles' ranges are theirs."""
 
 EVENNESS = 0.02
-"""Weight of the mean depth along a line beside its least distance: of lines with one least distance the deeper one is
-taken."""
+"""Weight of the mean depth along a line beside its least distance: of lines alike in that the deeper one is taken."""
 
 QUICK_OFF_MM = 1.0
 """Quick distances are right to this much."""
@@ -73,12 +73,7 @@ product is too small for threads of BLAS, whose waiting for each other can take 
 
 @dataclass(frozen=True)
 class Span:
-    """Where the distance of lines counts on one side, mm in the vertebra's frame.
-
-    side: 1 left, -1 right.
-    back, tip: y of the coronal planes at both ends.
-    pass_y: y of the coronal section in which the pedicle is narrowest.
-    """
+    """The coronal planes (y, mm in the frame) between which lines of a side (1 left, -1 right) count; the narrowest."""
 
     side: float
     back: float
@@ -88,9 +83,8 @@ class Span:
 
 @dataclass(frozen=True)
 class Line:
-    """A line on one side, in the vertebra's frame.
+    """A line on one side, in the vertebra's frame, by the point where it passes ``y = span.pass_y``, mm.
 
-    x, z: Pass point in the plane ``y = span.pass_y``, mm.
     medial_deg, sagittal_deg: Angles of its projections: on the axial plane towards the midline, on the sagittal plane
         towards cranial.
     radius: Its least distance from the surface, mm.
@@ -124,13 +118,7 @@ def line_points(lines: Float64Array, span: Span) -> Float64Array:
 
 
 def segment_distances(first: Float64Array, last: Float64Array, points: Float64Array) -> Float64Array:
-    """Return the least distance of each segment from some points.
-
-    first, last: ndarray, shape (n, 3). Ends of the segments.
-    points: ndarray, shape (m, 3)
-
-    Returns: ndarray, shape (n,). Infinite where there are no points.
-    """
+    """Return the least distance (n,) of segments between ends (n, 3) from points (m, 3); infinite without points."""
     least = np.full(len(first), np.inf)
     if not len(points):
         return least
@@ -162,11 +150,7 @@ def segment_distances(first: Float64Array, last: Float64Array, points: Float64Ar
 
 @dataclass(frozen=True)
 class _Judge:
-    """Scores of lines on one side.
-
-    depth: Quick distances at points.
-    surface: ndarray, shape (n, 3). Points of the surface, mm in the frame.
-    """
+    """Scores of lines on one side, by quick distances and by points (n, 3) of the surface, mm in the frame."""
 
     depth: Depth
     surface: Float64Array
@@ -184,10 +168,9 @@ class _Judge:
         return segment_distances(points[:, 0], points[:, -1], self.surface)
 
     def score(self, lines: Float64Array, above: Float64Array | None = None) -> Float64Array:
-        """Return what is made largest: the radius with a little of the mean.
+        """Return what is made largest: the radius with a little of the mean; below 0 for lines that leave the bone.
 
-        It is below 0 for lines that leave the bone, and for those whose quick distance tells that their score is not
-        `above` some others (n,).
+        So it is for those that by their quick distance do not score `above` some others (n,).
         """
         least, mean = self.quick(lines)
         score = np.minimum(least, 0.0) - 1.0
@@ -219,14 +202,10 @@ def _thin(points: Float64Array) -> Float64Array:
 
 
 def find_line(depth: Depth, surface: Float64Array, frame: VertebraFrame, side: float) -> tuple[Line | None, Span]:
-    """Find the widest line of one side.
+    """Find the widest line of one side (1 left, -1 right); None where no line stays inside of the bone.
 
     depth: Quick distances, for the many lines of the first search; 0 or less outside.
     surface: ndarray, shape (n, 3). Points of the surface, mm in the frame: exact distances, for the best lines.
-    side: 1 left, -1 right.
-
-    Returns:
-    line: None where no line stays inside of the bone.
     """
     back = frame.canal[1]
     tip = frame.body_y[1] - BODY_SHARE * (frame.body_y[1] - frame.body_y[0])
@@ -274,13 +253,7 @@ def find_line(depth: Depth, surface: Float64Array, frame: VertebraFrame, side: f
 def _refine(
     judge: _Judge, lines: Float64Array, free: NDArray[np.bool_], steps: tuple[tuple[float, float], ...] = FINE_STEPS
 ) -> tuple[Float64Array, Float64Array, int]:
-    """Move lines to higher scores, in ever finer steps of the `free` columns; all lines at once.
-
-    Returns:
-    lines: ndarray, shape (n, 4)
-    score: ndarray, shape (n,)
-    tried: Lines that were judged.
-    """
+    """Move lines (n, 4) to higher scores (n,), together, in ever finer steps of `free` columns; count those judged."""
     lines = lines.copy()
     score = judge.score(lines)
     tried = len(lines)
@@ -413,13 +386,7 @@ def find_corridors(volume: Volume, labels: LabelMap, label: int | str, iso_value
 
 
 def measure_corridors(volume: Volume, labels: NDArray[Any], number: int, level: float, name: str) -> VertebraCorridors:
-    """Find the corridors through the pedicles of a vertebra whose labels lie on the grid of the volume.
-
-    labels: ndarray, shape (nk, nj, ni). Labels on the grid of the volume, see `clrecon.labels.resample_labels`.
-    number: Label of the vertebra.
-    level: HU at which the bone's surface lies.
-    name: Name of the label, for messages.
-    """
+    """Find the corridors of a vertebra, label `number` on the volume's own grid; `name` is for messages."""
     bone = fill_vertebra(volume, labels, number, level, name)
     try:
         frame = find_frame(bone, name)
@@ -527,9 +494,7 @@ def _distance(points: Float64Array, first: Float64Array, last: Float64Array) -> 
 def _walls(
     bone: SolidBone, frame: VertebraFrame, surface: Float64Array, first: Float64Array, last: Float64Array, radius: float
 ) -> tuple[float, float, float]:
-    """Return the distance of the nearest wall, the corridor's width in voxels across it, and the share of the walls'
-    points that HU place.
-    """
+    """Return the distance of the nearest wall, its width in voxels, and the share of the walls that HU place."""
     way = last - first
     share = np.clip((surface - first) @ way / (way @ way), 0.0, 1.0)
     offsets = surface - first - share[:, None] * way

@@ -1,10 +1,9 @@
 """The course of the spine, and the discs between vertebral bodies, found together in the scan along the canal.
 
-The course is the line of the canal, a place every mm, with a frame, and the scan seen along it.
-
 A disc is a plane that is darker than the planes on either side of it: the marrow and end plates in its middle, and the
 cortex around it.  Planes of all tilts are tried, because the discs of the loin stand askew to the canal.  Dynamic
-programming then chooses the planes that agree best as a row: 15 to 46 mm apart, and neighbouring gaps alike."""
+programming then chooses the planes that agree best as a row: 15 to 46 mm apart, and neighbouring gaps alike.
+"""
 
 from __future__ import annotations
 
@@ -34,11 +33,8 @@ ASIDE_MM = np.arange(-42.0, 43.0)
 
 @dataclass(frozen=True)
 class Course:
-    """Places along the spinal canal, 1 mm apart, from the head downwards.
+    """Places along the spinal canal, 1 mm apart, from the head downwards: arrays (n, 3) in LPS mm and of unit vectors.
 
-    canal: ndarray, shape (n, 3), float64. LPS mm.
-    down, ahead, aside: ndarray, shape (n, 3), float64. Unit vectors at each place: along the canal, to the front, and
-        to the patient's left.
     known: ndarray, shape (n,), bool. False where the line of the canal was only continued.
     reaches: True where the first, and the last, place is the border of the scan.
     """
@@ -59,10 +55,7 @@ class Course:
 
 
 def follow_canal(points: Float64Array, volume: Grid) -> Course:
-    """Follow the middle of the canal, and beyond the ends of its line as far as the scan goes.
-
-    points: ndarray, shape (m, 3), float64. LPS mm from the head downwards, see `clrecon.anatomy.spine_line.SpineLine`.
-    """
+    """Follow the canal's middle (m, 3), LPS mm from the head downwards, and beyond its ends as far as the scan goes."""
     from scipy.interpolate import PchipInterpolator
     from scipy.ndimage import gaussian_filter1d
 
@@ -100,12 +93,9 @@ def _inside(volume: Grid, places: Float64Array) -> NDArray[np.bool_]:
 def sample_course(
     grid: Grid, course: Course, ahead_mm: Float64Array = AHEAD_MM, aside_mm: Float64Array = ASIDE_MM, order: int = 1
 ) -> Field:
-    """Return a scan or label map in planes across the canal.
+    """Return a scan or label map in planes across the canal, (places, ahead, aside); NaN outside of the grid.
 
-    ahead_mm, aside_mm: Places of the rows and columns of a plane.
     order: 1: trilinear interpolation; 0: the nearest voxel.
-
-    Returns: ndarray, shape (n, len(ahead_mm), len(aside_mm)), float32. NaN outside of the grid.
     """
     from scipy.ndimage import map_coordinates
 
@@ -148,8 +138,7 @@ BODY_BACK_MM = 10.0
 """Planes are looked at from here on in front of the canal: behind it lies the back wall of the body."""
 CORE_ASIDE_MM = 7.0
 WALL_SHARE = 0.2
-"""Share of the side walls in the brightness of a plane; the rest is the median of its middle from back to front, since
-bony spurs bridge the rim of a disc."""
+"""Share of the side walls in a plane's brightness; the rest is the median of its middle: spurs bridge a disc's rim."""
 WALL_MARGIN_MM = 3.0
 """The walls of a body are looked for from the core to so far beyond its sides: heads of ribs lie farther out."""
 HALF_THICKNESS_MM = (1, 2, 3, 4, 6)
@@ -165,8 +154,7 @@ BONE_HU, FAT_HU = 100.0, 0.0
 SOFT_HU = 40.0
 """HU of muscle and vessels beside a body."""
 LEAST_USUAL, REACH_MM = 0.4, 30
-"""Where no disc within the second, mm, is as deep as a usual one of the scan, shallower ones are usual; at least the
-first as a share."""
+"""Where no disc within the second, mm, is as deep as a usual one, shallower ones are; the first is the least share."""
 WORTH = 0.3
 """Depth of a disc that counts neither for nor against it, as a share of a usual one."""
 UNLIKE_COST = 2.0
@@ -175,14 +163,13 @@ UNLIKE_COST = 2.0
 
 @dataclass(frozen=True)
 class Looks:
-    """The scan along the canal, as far as discs show in it.
+    """The scan along the canal, as far as discs show in it: arrays of (places, tilts or columns ahead), HU, and walls
+    in mm.
 
-    brightness: ndarray, shape (n, tilts), float32. HU of the plane at each place and tilt: core and side walls.
-    core: ndarray, shape (n, ahead), float32. HU of the middle of each plane, from side to side.
-    depth: ndarray, shape (n, tilts), float32. How much darker the plane is than those beside it, on the side where it
-        is less so, HU.
-    middle_mm: ndarray, shape (n,), float64. Middle of the body in front of the canal.
-    front_mm, side_mm: ndarray, shape (n,), float64. Front wall of the body, and its side walls.
+    brightness: Of the plane at each place and tilt: core and side walls.
+    core: Of the middle of each plane, from side to side.
+    depth: How much darker the plane is than those beside it, on the side where it is less so.
+    middle_mm, front_mm, side_mm: Of the body in front of the canal.
     """
 
     brightness: Field
@@ -195,13 +182,7 @@ class Looks:
 
 @dataclass(frozen=True)
 class Bound:
-    """A plane at which a vertebra begins or ends.
-
-    at: Place along the canal.
-    tilt: Index into `TILTS_DEG`.
-    depth_hu: How much darker it is than what lies beside it.
-    is_disc: False: bone ends there and no other vertebra follows.
-    """
+    """A plane at which a vertebra begins or ends, `depth_hu` darker than beside it; no disc if just the bone ends."""
 
     at: int
     tilt: int
@@ -210,10 +191,7 @@ class Bound:
 
 
 def _edge(image: Field, first: int, least: int, most: int) -> NDArray[np.float64]:
-    """Return the column at which the bodies end, smoothed along the canal: there their brightness falls by half.
-
-    `first` is a column within all bodies; the edge lies between columns `least` and `most`.
-    """
+    """Return the column in `least` to `most` where the bodies' brightness falls by half; `first` is within them all."""
     from scipy.ndimage import gaussian_filter1d
 
     known = np.isfinite(image)
@@ -227,10 +205,7 @@ def _edge(image: Field, first: int, least: int, most: int) -> NDArray[np.float64
 
 
 def look_at_bodies(scan: Field) -> Looks:
-    """Measure at each place and tilt how much a plane looks like a disc.
-
-    scan: ndarray, shape (n, ahead, aside), float32. See `clrecon.spine.discs.sample_course`.
-    """
+    """Measure at each place and tilt of a scan by `sample_course` how much a plane looks like a disc."""
     clipped = np.clip(scan, -200.0, 900.0)
     core = _mean(clipped[:, :, np.abs(ASIDE_MM) <= CORE_ASIDE_MM], axis=2)
     front = _edge(core, int(BODY_BACK_MM), 18, 46)
@@ -311,11 +286,7 @@ def _lines(image: Field, along: NDArray[np.float64], ahead: NDArray[np.float64])
 
 
 def choose_discs(looks: Looks) -> tuple[list[Bound], NDArray[np.float64]]:
-    """Choose the discs together.
-
-    Returns: From the head downwards; empty where nothing looks like a disc.
-    Returns: ndarray, shape (n,), float64. Depth of a usual disc at each place, HU.
-    """
+    """Choose the discs together, none where nothing looks like one; also the depth of a usual one at each place, HU."""
     depth = np.nan_to_num(looks.depth, nan=-1e3)
     usual = _usual_depth(depth.max(axis=1))
     if not usual.any():
@@ -364,11 +335,7 @@ def discs_between(looks: Looks, seeds: list[int]) -> tuple[list[Bound], NDArray[
 
 
 def end_of_bone(looks: Looks, bound: Bound, gap: float, sign: int) -> Bound | None:
-    """Return where the bone beyond the first (`sign` -1) or last disc ends, None where it does not end in time.
-
-    bound: That disc.
-    gap: Distance of neighbouring discs there, mm.
-    """
+    """Return where bone ends beyond the first (`sign` -1) or last disc, None if not in time; `gap` is of discs, mm."""
     flat = looks.brightness[:, len(TILTS_DEG) // 2]
     first, last = (int(bound.at + sign * share * gap) for share in END_SHARES)
     best: Bound | None = None
@@ -387,9 +354,7 @@ def end_of_bone(looks: Looks, bound: Bound, gap: float, sign: int) -> Bound | No
 
 
 def _best_row(score: NDArray[np.floating], body_depth_mm: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the places of the row of discs with the highest sum; gaps as `GAPS_MM` allows, and about as long as a body
-    is deep.
-    """
+    """Return the row of discs with the highest sum; gaps as `GAPS_MM` allows, and about as long as a body is deep."""
     least, most = GAPS_MM
     gaps = np.arange(least, most + 1)
     unlike = UNLIKE_COST * np.log(gaps[:, None] / gaps[None, :]) ** 2

@@ -28,8 +28,7 @@ WIDEST_LEAN_DEG, WIDEST_ROLL_DEG = 50.0, 40.0
 COARSE_DEG = 8.0
 
 LEAST_CANAL_RADIUS_MM = 3.0
-"""A hole narrower than this is no vertebral canal: real ones are 11 mm wide or more, but a slanted arch narrows what
-is seen through it."""
+"""A narrower hole is no canal: real ones are 11 mm wide or more, but a slanted arch narrows what is seen through it."""
 WIDEST_CANAL_RADIUS_MM = 20.0
 
 CORE_SHARE = 0.6
@@ -136,10 +135,6 @@ def _look_through(points: Float64Array) -> tuple[float, Float64Array, Float64Arr
 
 
 def find_frame(bone: SolidBone, what: str) -> VertebraFrame:
-    """Find the frame of a vertebra.
-
-    what: Name of the label, for messages.
-    """
     from scipy.ndimage import distance_transform_edt
 
     thin = np.pad(bone.mask[::STRIDE, ::STRIDE, ::STRIDE], 1)
@@ -203,13 +198,7 @@ def _halve(
 
 
 def _fit_plates(local: Float64Array, axes: Float64Array, what: str) -> tuple[Float64Array, float, float]:
-    """Fit planes to the upper and lower ends of the columns of the body.
-
-    Returns:
-    up: ndarray, shape (3,). Mean of both normals, LPS.
-    shift: Height of the middle between both planes, mm.
-    height: Distance of both planes at the axis.
-    """
+    """Fit planes to both ends of the body's columns; return their mean normal, LPS, middle height and distance, mm."""
     near = local[np.hypot(local[:, 0], local[:, 1]) <= PLATE_RADIUS_MM]
     place = np.floor(near[:, :2] / 1.5).astype(np.intp) + 20
     key = place[:, 0] * 64 + place[:, 1]

@@ -1,8 +1,4 @@
-"""Measures of a line in a vertebra, and grades of given screws.
-
-Of a line: entry and tip, margins by direction, the canal, the wall's bias, angles.
-
-Of a screw: how far a cylinder lies outside of the bone, and in which direction."""
+"""Measures of a line in a vertebra, and grades of given screws: how far they lie outside of the bone, and where."""
 
 from __future__ import annotations
 
@@ -36,8 +32,8 @@ CANAL_SAMPLES = 16
 class Bias:
     """How far the surface at the level lies outside of the half maximum of the pedicle's own wall.
 
-    median_mm, low_mm, high_mm: Median and quartiles over the rays; positive: the level lies outside, and distances are
-        too large.
+    median_mm, low_mm, high_mm: Median and quartiles over the rays; positive: the level lies outside, distances are too
+        large.
     half_hu: Median of the levels half way between the wall's peak and the tissue beside it.
     rays: Rays with a wall that is dense enough.
     """
@@ -52,8 +48,7 @@ class Bias:
 def line_angles(direction: Float64Array, side: float) -> tuple[float, float]:
     """Return the medial and the sagittal angle of a direction (left, posterior, cranial) that runs forward, degrees.
 
-    The medial angle is that of its projection on the axial plane towards the midline, the sagittal one that on the
-    sagittal plane towards cranial.
+    They are those of its projections, on the axial plane towards the midline, on the sagittal plane towards cranial.
     """
     x, y, z = (float(part) for part in direction)
     return float(np.degrees(np.arctan2(-side * x, -y))), float(np.degrees(np.arctan2(z, -y)))
@@ -76,12 +71,7 @@ def sector_names(offsets: Float64Array, direction: Float64Array, side: float) ->
 
 
 def margins(surface: Float64Array, first: Float64Array, last: Float64Array, side: float) -> dict[str, float | None]:
-    """Return the least distance of a segment from the surface in each quarter, mm; None where there is none.
-
-    surface: ndarray, shape (n, 3). Points in the frame.
-    first, last: ndarray, shape (3,). Ends of the segment, in the frame.
-    side: 1 left, -1 right.
-    """
+    """Return a segment's least distance from points (n, 3) in the frame in each quarter, mm; None where none lies."""
     way = last - first
     share = np.clip((surface - first) @ way / (way @ way), 0.0, 1.0)
     offsets = surface - first - share[:, None] * way
@@ -121,11 +111,10 @@ def find_exit(bone: SolidBone, start: Float64Array, direction: Float64Array, rea
 
 
 def measure_bias(bone: SolidBone, frame: VertebraFrame, first: Float64Array, last: Float64Array) -> Bias | None:
-    """Measure how far the surface lies from the half maximum of the pedicle's wall, on rays square to a line.
+    """Measure how far the surface lies from the half maximum of the pedicle's wall, on rays square to a line in the
+    frame.
 
-    first, last: ndarray, shape (3,). Ends of the part of the line that lies in the pedicle, in the frame.
-
-    Returns: None where less than a quarter of the rays meets a wall that HU show.
+    Returns None where less than a quarter of the rays meets a wall that HU show.
     """
     medial, up = _across(last - first, 1.0)
     turns = np.linspace(0.0, 2.0 * np.pi, RAYS, endpoint=False)
@@ -177,12 +166,7 @@ LONGEST_MM, WIDEST_MM = 150.0, 15.0
 
 @dataclass(frozen=True)
 class Screw:
-    """A given screw.
-
-    entry, tip: ndarray, shape (3,). Ends of its axis, LPS mm.
-    diameter: mm.
-    label: Name or number of the vertebra that it belongs to.
-    """
+    """A given screw: ends of its axis, LPS mm, diameter, mm, and name or number of the vertebra that it belongs to."""
 
     entry: Float64Array
     tip: Float64Array
@@ -230,13 +214,11 @@ def grade_breach(breach_mm: float) -> str:
 
 
 def grade_screw(bone: SolidBone, frame: VertebraFrame, screw: Screw, what: str) -> ScrewGrade:
-    """Grade a screw in a vertebra.
+    """Grade a screw in a vertebra, named `what` in messages.
 
     Graded is the part between the coronal plane through the canal's axis and the middle of the body, and behind that
     plane what lies in the canal.  Farther back the screw has to leave the bone, and farther in front the original scale
     does not look.
-
-    what: Name of the vertebra, for messages.
     """
     first, last = frame.to_frame(np.stack((screw.entry, screw.tip)))
     if first[1] < last[1]:

@@ -59,17 +59,13 @@ ARCH_DOWN = 0.3
 
 @dataclass(frozen=True)
 class Part:
-    """The part of a volume round the spine, and where each of its voxels lies from the canal.
+    """The part of a volume round the spine, from voxel (k, j, i) on, and where each of its voxels lies from the canal.
 
-    first: (k, j, i). First voxel of the part in the volume.
-    values: ndarray, shape (nk, nj, ni), float32. HU.
-    ahead, aside: ndarray, shape (nk, nj, ni), float32. mm in front of the canal and to its left, in the plane across
-        the canal.
-    place: ndarray, shape (nk, nj, ni), float32. Place along the course of that plane.
-    within: ndarray, shape (nk, nj, ni), bool. Near enough to the canal to be a vertebra, or a rib beside it.
-    body: ndarray, shape (nk, nj, ni), bool. Within the walls of the bodies.
-    beside: ndarray, shape (nk, nj, ni), bool. Where ribs lie: beside the bodies, in front of the transverse processes,
-        and beyond them.
+    ahead, aside: mm in front of the canal and to its left, in the plane across the canal.
+    place: Place along the course of that plane.
+    within: Near enough to the canal to be a vertebra, or a rib beside it.
+    body: Within the walls of the bodies.
+    beside: Where ribs lie: beside the bodies, in front of the transverse processes, and beyond them.
     spacing: (dk, dj, di). mm.
     """
 
@@ -85,7 +81,6 @@ class Part:
 
     @property
     def where(self) -> tuple[slice, slice, slice]:
-        """The part of the volume as slices of its voxels."""
         k, j, i = (slice(n, n + size) for n, size in zip(self.first, self.values.shape, strict=True))
         return k, j, i
 
@@ -162,9 +157,7 @@ def _ball(spacing: tuple[float, float, float]) -> Mask:
 
 
 def fill_bone(part: Part, level: float) -> Mask:
-    """Return the bone of a part: from the level on, and as far as vertebrae reach closed, without holes in its slices
-    but the canal.
-    """
+    """Return bone from the level on, closed as far as vertebrae reach, without holes in slices but the canal."""
     from scipy.ndimage import binary_closing, binary_fill_holes, label
 
     dense = (part.values >= level) & part.within
@@ -197,18 +190,15 @@ def _find_ribs(part: Part, bone: Mask) -> Mask:
 def divide(
     part: Part, bone: Mask, bounds: list[Bound], planes: Planes, volume: Volume
 ) -> tuple[NDArray[np.uint8], Float64Array, Float64Array]:
-    """Divide bone into the pieces between planes.
+    """Divide bone into the pieces between planes: 1 above the first plane, and so on.
 
     Two watersheds from the same markers are compared.  That of the distance field keeps arches together that touch in
     facet joints, that of the brightness follows the dark gap of a joint which the closing has filled.  In both there
     are ridges between arches at the heights of the discs.  Where they differ, a group of voxels in front of the canal
     goes to the vertebra at whose height it lies, and an arch to the one that is a little higher.
 
-    Returns:
-    pieces: ndarray, shape (nk, nj, ni), uint8. 0 outside of bone; 1 above the first plane, and so on.
-    doubtful: ndarray, shape (pieces + 1,), float64. Share of each piece that the two watersheds give to different ones.
-    rim: ndarray, shape (pieces + 1,), float64. Share of each piece in voxels of its surface: of those partial volume
-        makes the place uncertain.
+    Returns also the share of each piece that the two give to different ones, and that in voxels of its surface: of
+    those partial volume makes the place uncertain.
     """
     from scipy.ndimage import distance_transform_edt, gaussian_filter
     from skimage.segmentation import watershed
@@ -358,10 +348,8 @@ WALL_DIRECTIONS = np.radians(np.arange(-130.0, 131.0, 15.0))
 
 @dataclass(frozen=True)
 class Piece:
-    """The bone between two planes.
+    """The bone between two planes, at places along the canal; a plane is None where the scan ends first.
 
-    upper, lower: None where the scan ends first.
-    begin, end: Places along the canal.
     largest_share: Share of its voxels in its largest connected part.
     doubtful_share: Share of its voxels that two ways of dividing the bone give to different vertebrae.
     rim_share: Share of its voxels in its surface.
@@ -408,8 +396,7 @@ def judge(
     """Judge a piece.
 
     gaps: Heights of the whole pieces beside it, up to two above and two below, mm.
-    scan: See `clrecon.spine.discs.sample_course`.
-    usual: ndarray, shape (n,). Depth of a usual disc at each place, HU.
+    usual: Depth of a usual disc at each place, HU.
     """
     height = piece.end - piece.begin
     traits: Traits = {}

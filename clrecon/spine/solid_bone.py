@@ -35,12 +35,7 @@ LARGEST_MM = 250.0
 
 @dataclass(frozen=True)
 class Lattice:
-    """Points in even steps along the axes of LPS.
-
-    origin: ndarray, shape (3,). LPS mm of the first point.
-    step: mm.
-    shape: Points along z, y, x, as of an array.
-    """
+    """Points in steps of mm along the axes of LPS, from `origin`; the shape is along z, y, x."""
 
     origin: Float64Array
     step: float
@@ -84,9 +79,7 @@ def label_box(labels: NDArray[Any], number: int, margin: tuple[int, int, int]) -
 
 
 def _own(labels: NDArray[Any], number: int, volume: Volume) -> NDArray[np.bool_]:
-    """Mark the voxels of a label, grown by one voxel each way into voxels of no label that no other label is nearer
-    to.
-    """
+    """Mark a label's voxels, and those of no label one voxel from it that no other label is nearer to."""
     grown = labels.copy()
     for di, dj, dk in Growth.of(volume, None).offsets:
         shifted = np.zeros_like(labels)
@@ -101,19 +94,14 @@ def _own(labels: NDArray[Any], number: int, volume: Volume) -> NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class SolidBone:
-    """The solid bone of one vertebra.
+    """The solid bone of one vertebra: arrays of the lattice, and points (n, 3) of the surface, LPS mm, about a step
+    apart.
 
-    hu: ndarray, shape of the lattice, float32. HU at the points of the lattice within `MARGIN_MM` of the label;
-        elsewhere `AIR_HU`.
-    solid: ndarray, shape of the lattice, bool. True inside.
-    mask: ndarray, shape of the lattice, bool. True in the label itself, whatever the HU.
-    surface: ndarray, shape (n, 3). Points of the surface, LPS mm, about one step apart.
-    by_hu: ndarray, shape (n,), bool. True where HU cross the level there; False where the label alone ends or fills the
-        bone.
-    level: HU.
-    steps: ndarray, shape (3, 3). Columns: the steps of the scan's voxels along i, j, k, mm.
-    cut: ndarray, shape (m, 3). Voxels of the label in the outermost layer of the scan, LPS mm: beyond them the vertebra
-        may go on.
+    hu: At the points of the lattice within `MARGIN_MM` of the label; elsewhere `AIR_HU`.
+    mask: True in the label itself, whatever the HU.
+    by_hu: True where HU cross the level at a point of the surface; False where the label ends or fills the bone.
+    steps: Columns: the steps of the scan's voxels along i, j, k, mm.
+    cut: Voxels (m, 3) of the label in the outermost layer of the scan, LPS mm: beyond them the vertebra may go on.
     """
 
     lattice: Lattice
@@ -184,15 +172,11 @@ class SolidBone:
 
 
 def fill_vertebra(volume: Volume, labels: NDArray[Any], number: int, level: float, what: str) -> SolidBone:
-    """Make the solid bone of one label.
+    """Make the solid bone of one label on the volume's own grid; `what` names it in messages.
 
-    Inside is what has the level or more and is the label's own (within the label, or one voxel beyond it), and what it
+    Inside is what has the level, HU, or more and is the label's own (within it, or one voxel beyond), and what it
     encloses: see `clrecon.labels.label_bodies.fill_solid`.  The vertebral canal is open above and below, and so stays
     outside.
-
-    labels: ndarray, shape (nk, nj, ni). Labels on the grid of the volume.
-    level: HU.
-    what: Name of the label, for messages.
     """
     spacing = np.array(volume.spacing)
     margin = tuple(int(np.ceil(MARGIN_MM / step)) + 1 for step in spacing[::-1])
@@ -238,10 +222,9 @@ def _sample(
     lattice: Lattice,
     level: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Resample HU and label, and decide which points of the lattice are solid, plane by plane.
+    """Resample HU and label, plane by plane, and decide which points of the lattice are solid.
 
-    `parts` are the voxels of the label, those that are its own, those that are solid, and those of them that are filled
-    and not dense.
+    `parts` are the voxels of the label, its own, the solid ones, and those that are filled and not dense.
     """
     from scipy.ndimage import map_coordinates
 

@@ -68,10 +68,7 @@ def check_landmark(name_at: tuple[Sequence[float], str] | None, first: str | Non
 
 
 def name_levels(count: int, given: tuple[int, str] | None) -> dict[int, str]:
-    """Return the number in the label map and the name of each of `count` vertebrae, from the head downwards.
-
-    given: Place of a vertebra, from 0, and its level.  Without it they are ``vertebra_1`` and so on.
-    """
+    """Return numbers and names of `count` vertebrae from the head down, ``vertebra_1`` on if no place is `given`."""
     if given is None:
         return {n: f"vertebra_{n}" for n in range(1, count + 1)}
     place, level = given
@@ -205,8 +202,6 @@ ARCH_BEHIND_MM, ARCH_ASIDE_MM = 13.0, 8.0
 
 @dataclass(frozen=True)
 class _Found:
-    """What was found along the canal."""
-
     course: Course
     scan: Field
     looks: Looks

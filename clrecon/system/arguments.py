@@ -1,15 +1,14 @@
 """Arguments of public functions: the words by which a message names them, and which one is of a wrong kind.
 
-A parameter is named by Python's word, or by that of the command line when it runs.
+A parameter is named by Python's word, or on the command line by the option of the running command (`clrecon.cli.main`).
 
 >>> name_parameter("keep_largest", "N")
 'keep_largest=N'
 
-On the command line the same call returns the option of the running command: see `clrecon.cli.main`.
-
 Where a function fails on an argument of a wrong kind, the error names the parameter.  What is wanted is read from the
 annotations, so that it stands once.  Only kinds are told apart (a number, a text, a `Volume`); what a function checks
-by itself it says by itself, with ranges and shapes."""
+by itself it says by itself, with ranges and shapes.
+"""
 
 from __future__ import annotations
 
@@ -43,9 +42,8 @@ _speaker: Speaker = in_python
 
 
 def name_parameter(parameter: str, value: object = None) -> str:
-    """Name a parameter, with a value if one is given, in Python's words or those of the command line.
+    """Name a parameter of Python in its words or those of the command line, with a value if one is given.
 
-    parameter: As Python calls it, such as ``"keep_largest"``.
     value: True, a number, a text, or capital letters that stand for one: ``"N"``.
     """
     return _speaker(parameter, value)

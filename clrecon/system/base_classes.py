@@ -68,10 +68,7 @@ class _Packed:
 
 
 class MappedArray(_Packed):
-    """An array in a memory-mapped file while it is being sent.
-
-    A deep copy shares a read-only mapping, and copies any other into memory.
-    """
+    """An array in a memory-mapped file while it is sent; a deep copy shares a read-only mapping and copies others."""
 
     def __init__(self, array: NDArray[Any], mapping: Mapping):
         super().__init__(array)

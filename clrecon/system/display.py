@@ -86,12 +86,7 @@ class Display:
 
 
 class DisplayProbe:
-    """The child that tries the display; it runs while the caller prepares something else.
-
-    Notes
-    -----
-    No child is started where there is no display by the environment, or the system is one whose windows need none.
-    """
+    """The child that tries the display while the caller prepares something else; none where the answer is known."""
 
     def __init__(self) -> None:
         self._child: subprocess.Popen[bytes] | None = None
@@ -146,11 +141,7 @@ class DisplayProbe:
 
 
 def read_words(told: bytes, code: int) -> Display:
-    """Return what the words and the end of a child mean.
-
-    told: Lines of JSON, each with more than the one before.
-    code: Its exit status; negative or above 128 where it was ended by a signal.
-    """
+    """Return what the words of a child (lines of JSON, each with more than the one before) and its exit status mean."""
     try:
         facts = json.loads(told.decode().splitlines()[-1])
     except (ValueError, IndexError):

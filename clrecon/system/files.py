@@ -5,9 +5,8 @@ name), flushed to the disk, checked, and only then renamed over the target.  Aft
 `KeyboardInterrupt` included, the temporary file is removed and an older target is unchanged.  A killed process cannot
 clean up: the next process that writes into the same folder removes its temporary files.
 
-A target that is a symbolic link is followed: the file that it points to is replaced and the link stays.
-
-A folder is made under a temporary name beside its place, then renamed."""
+Of a symbolic link the file that it points to is replaced.  A folder is made under a temporary name beside its place.
+"""
 
 from __future__ import annotations
 
@@ -51,8 +50,8 @@ _FILES_OF_OTHERS = 200
 _TEMPORARY = re.compile(r"\.clrecon-[0-9a-f]{16}\.(?:tmp|folder)")
 
 _own_names: set[str] = set()
-"""Names of the temporary files and folders that this process is writing.  They are not examined: with a thousand of
-them that would be slow."""
+"""Names of the temporary files and folders that this process is writing, which are not examined: a thousand take
+long."""
 
 
 def _log() -> logging.Logger:
@@ -68,15 +67,13 @@ def replace_file(
     *,
     expected_bytes: int = 0,
 ) -> int:
-    """Write a file as a whole or not at all.
+    """Write a file as a whole or not at all; return its size in bytes.
 
-    path: The target.  A regular file of that name is replaced; its permissions are kept.  A new file gets the
-        permissions that the umask allows.
+    path: A regular file of that name is replaced; its permissions are kept.  A new file gets those that the umask
+        allows.
     write: Gets a binary stream, open for writing, and writes the contents.
     verify: Gets the path of the finished temporary file and raises `OutputError` if its contents are wrong.
     expected_bytes: Expected size of the file; checked against the free space before anything is written.
-
-    Returns: Size of the file in bytes.
     """
     with stage_file(path, write, verify, expected_bytes=expected_bytes) as staged:
         staged.commit()
@@ -94,10 +91,7 @@ class Staged(Protocol):
 
 
 class StagedFile:
-    """A finished file under a temporary name beside its target.
-
-    size: Bytes.
-    """
+    """A finished file of `size` bytes under a temporary name beside its target."""
 
     def __init__(self, path: str | os.PathLike[str], temporary: Path, target: Path, stream: BinaryIO, size: int):
         self._path, self._temporary, self._target, self._stream = path, temporary, target, stream
@@ -105,7 +99,6 @@ class StagedFile:
         self.size = size
 
     def commit(self) -> None:
-        """Rename the file over its target."""
         if sys.platform == "win32":
             with system_errors(self._path):
                 self._stream.close()  # Windows cannot rename an open file.
@@ -153,8 +146,7 @@ def stage_file(
 def hold_interrupts() -> Iterator[None]:
     """Hold back Ctrl-C, and other signals that this process handles, until the ``with`` block is done.
 
-    For the moment in which several files are put into their places together.  Python interrupts the main thread only,
-    so other threads need nothing of this.
+    For the moment in which several files are put into their places together.  Python interrupts the main thread only.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -192,8 +184,6 @@ def check_writable(path: str | os.PathLike[str], *, expected_bytes: int = 0) -> 
     """Raise `OutputError` if `replace_file` to this path would surely fail: a check before hours of work.
 
     Creates an empty temporary file beside the target and removes it at once; the target is not touched.
-
-    expected_bytes: Expected size of the file, if it is known.
     """
     target = checked_target(path)
     with system_errors(path):
@@ -310,9 +300,7 @@ def _sweep(folder: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Write the rename itself to the disk, where the system can.  Without this the file is still either the old or the
-    new one.
-    """
+    """Write the rename itself to the disk, where the system can; without, it is still the old or the new file."""
     if sys.platform == "win32":
         return
     with contextlib.suppress(OSError):
@@ -363,10 +351,7 @@ def _check_existing(path: str | os.PathLike[str], folder: Path, own: re.Pattern[
 
 
 class StagedFolder:
-    """A finished folder under a temporary name beside its place.
-
-    size: Total size of its files in bytes.
-    """
+    """A finished folder, with files of `size` bytes, under a temporary name beside its place."""
 
     def __init__(self, path: str | os.PathLike[str], made: Path, folder: Path, size: int):
         self._path, self._made, self._folder = path, made, folder

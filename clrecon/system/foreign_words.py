@@ -1,9 +1,8 @@
 """Words of libraries, which are kept off the result of a command and out of its messages.
 
-Libraries in C write to the file descriptors behind Python's streams: VTK a line to standard output,
-MetaIO several to standard error for one bad header.  The command line owns the streams of its process and leaves
-such words out: the log says that there were some, not which, for they can quote a header.  A caller in Python keeps
-his streams.
+Libraries in C write to the file descriptors behind Python's streams: VTK a line to standard output, MetaIO several to
+standard error for one bad header.  The command line owns the streams of its process and leaves such words out: the log
+says that there were some, not which, for they can quote a header.  A caller in Python keeps his streams.
 """
 
 from __future__ import annotations

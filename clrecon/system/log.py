@@ -2,10 +2,8 @@
 
 Python's own `logging` is used, under the names of the modules: ``clrecon...``.  Silent unless the caller listens.
 DEBUG: findings, and the time of each stage.  INFO: choices, written files, and unusual ways of working.  WARNING: only
-the warnings of the report.  No text contains names of files or other text that people write: those may name a patient.
-
-Importing `logging` takes milliseconds: only modules that are loaded for work have a logger, not `import clrecon` and
-not the help of the command line.
+the warnings of the report.  Importing `logging` takes milliseconds: only modules that are loaded for work have a
+logger, not `import clrecon` and not the help of the command line.
 """
 
 from __future__ import annotations
@@ -17,7 +15,6 @@ logging.getLogger("clrecon").addHandler(logging.NullHandler())  # otherwise Pyth
 
 
 def get_logger(name: str) -> logging.Logger:
-    """Return the logger of a module, given its ``__name__``."""
     return logging.getLogger(name)
 
 

@@ -1,8 +1,8 @@
 """Memory for voxels, checked before it is taken: a small file that claims huge dimensions cannot fill the computer.
 
-What may be taken is also limited by a container or service (Linux control groups).
-
-Voxels in a memory-mapped file can be released from memory, and found in their file."""
+A container or service (Linux control groups) has a limit too.  Voxels in a memory-mapped file can be released from
+memory, and found in their file.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def available_memory_bytes(proc: Path = Path("/proc"), groups: Path = Path("/sys
     """Return the bytes that can be taken without swapping: all memory, or infinity, where the system does not tell.
 
     Linux shows a container the memory of the whole computer, but kills a process that exceeds the container's own
-    limit; the smaller of both counts.
+    limit.
     """
     container = free_bytes_of_container(proc, groups)
     try:
@@ -50,11 +50,7 @@ def physical_memory_bytes() -> float:
 
 
 def allocate_voxels(shape: Sequence[int], dtype: DTypeLike, name: str = "") -> NDArray[Any]:
-    """Return an uninitialised array for a volume, see `aligned_empty`.
-
-    shape: (nk, nj, ni)
-    name: Name of the file, for the message.
-    """
+    """Return an uninitialised array for a volume (nk, nj, ni), see `aligned_empty`; `name` is that of the file."""
     needed = math.prod(shape) * np.dtype(dtype).itemsize
     available = available_memory_bytes()
     size = " x ".join(map(str, reversed(shape)))
@@ -74,10 +70,7 @@ _FILES = {  # Of a version of control groups: the files of limit and use, and th
 
 
 def free_bytes_of_container(proc: Path, groups: Path) -> float:
-    """Return the bytes that this process may still take before it is killed; infinity without a limit.
-
-    proc, groups: Folders of processes and of control groups: ``/proc`` and ``/sys/fs/cgroup``.
-    """
+    """Return the bytes that this process may take before it is killed, by ``/proc`` or ``/sys/fs/cgroup``; or inf."""
     return min(_group_bytes(proc, groups), default=math.inf)
 
 
@@ -117,8 +110,7 @@ def _free_in(folder: Path, limit: str, used: str, reclaimable: str) -> int | Non
 def aligned_empty(shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
     """Return an uninitialised C-contiguous array that begins at the start of a memory page.
 
-    CPU drivers use the memory of such an array directly (Intel's copies any other array), and kernels may read it as
-    vectors.
+    CPU drivers use the memory of such an array directly (Intel's copies others), and kernels may read it as vectors.
     """
     dtype = np.dtype(dtype)
     size = int(np.prod(shape, dtype=object)) * dtype.itemsize
@@ -131,7 +123,6 @@ def aligned_empty(shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
 class FilePlace:
     """The place of a C-contiguous array in a file, and the state of the file at that time.
 
-    path: Absolute.
     offset: Bytes before the first value.
     dtype: With the byte order, as ``numpy.dtype.str`` has it.
     file_bytes, changed_ns: Size of the file, and when it was changed last (ns since 1970).
@@ -166,9 +157,7 @@ class FilePlace:
 class Mapping:
     """A memory mapping of a file.
 
-    address: Address of its first byte in memory.
-    path: Path of the file, if it is known.
-    start: Offset in the file at which the mapping begins, bytes.
+    address, start: Of its first byte in memory, and in the file.
     identity: Device and number of the file when the mapping was found: another file may take its name later.
     """
 
@@ -180,10 +169,7 @@ class Mapping:
     writeable: bool
 
     def release(self, part: NDArray[Any]) -> None:
-        """Let the whole pages of `part`, a C-contiguous view of the mapping, leave memory.
-
-        They stay in the system's file cache while it has room, and are read again when they are used.
-        """
+        """Let the whole pages of `part`, a C-contiguous view, leave memory; they are read again when they are used."""
         begin = part.ctypes.data - self.address
         first = -(-begin // mmap.PAGESIZE) * mmap.PAGESIZE
         end = (begin + part.nbytes) // mmap.PAGESIZE * mmap.PAGESIZE
@@ -191,10 +177,9 @@ class Mapping:
             self.file.madvise(mmap.MADV_DONTNEED, first, end - first)
 
     def place(self, part: NDArray[Any]) -> FilePlace | None:
-        """Return where `part`, a C-contiguous view of the mapping, is in the file; changes are written to the file
-        first.
+        """Return where `part`, a C-contiguous view of the mapping, is in the file, to which changes are written first.
 
-        Returns: None where the path no longer names the mapped file.
+        None where the path no longer names the mapped file.
         """
         if self.path is None or self.identity is None:
             return None

@@ -13,10 +13,8 @@ _READERS = {"int": int, "int | None": int, "float": float, "float | None": float
 
 
 class Option(NamedTuple):
-    """How a field of settings is given on the command line.
+    """How a field of settings is given on the command line; the first flag is its name in messages.
 
-    name: Of the field.
-    flags: The first is its name in messages.
     how: Keywords of `clrecon.cli.common.Parser.add_argument`.
     """
 
@@ -82,10 +80,7 @@ def parse_numbers(text: str, *, ends: bool = False) -> tuple[float, ...] | None:
 
 
 def numbers_reader(count: int | None, fault: str, *, ends: bool = False) -> Callable[[str], tuple[float, ...]]:
-    """Return what reads so many numbers, or any count of them, see `parse_numbers`.
-
-    fault: What a refusal says behind the text.
-    """
+    """Return what reads so many numbers, or any count, see `parse_numbers`; refusals say `fault` behind the text."""
 
     def read(text: str) -> tuple[float, ...]:
         found = parse_numbers(text, ends=ends)

@@ -1,10 +1,9 @@
 """Paths of files and folders: what may be opened, and targets, where something is put.
 
-Only regular files are opened, no pipes or devices, for which a reader might wait without end.
-
-A target is checked before the work, and put in its place by the last step.  With `keep_existing` nothing that exists is
-replaced: the check before the work refuses it, and so does the last step, for what another process has put there
-meanwhile."""
+Only regular files are opened, no pipes or devices, for which a reader might wait without end.  A target is checked
+before the work, and put in its place by the last step.  With `keep_existing` both refuse to replace what exists, also
+what another process has put there meanwhile.
+"""
 
 from __future__ import annotations
 
@@ -33,9 +32,8 @@ def extension_of(path: str | os.PathLike[str]) -> str:
 
 
 def find_extension(path: str | os.PathLike[str], known: Iterable[str], noun: str, hint: str = "") -> str:
-    """Return the extension of a file to write, which is one of those that are known.
+    """Return the extension of a file to write, which is one of those known; the file holds a `noun` such as "mesh".
 
-    noun: What the file holds, such as "mesh".
     hint: What a refusal says of the extension.
     """
     try:
@@ -243,9 +241,8 @@ def final_mode(target: Path, new: int = 0o666) -> int:
 
 
 def place_file(temporary: Path, target: Path, path: str | os.PathLike[str], *, keep: bool) -> None:
-    """Rename a finished file to its target.
+    """Rename a finished file to its target in the same folder.
 
-    temporary, target: In the same folder.
     path: The target as the user named it, for messages.
     keep: Fail if the target exists, also if it came into being a moment ago.
     """
@@ -283,7 +280,7 @@ def _link_new(temporary: Path, target: Path) -> None:
 def place_folder(made: Path, folder: Path, path: str | os.PathLike[str], *, keep: bool) -> None:
     """Rename a finished folder to its place; an older one gets the temporary name, and its owner removes it.
 
-    Parameters and errors as in `place_file`.  An empty folder is replaced in any case.
+    As `place_file`, but an empty folder is replaced in any case.
     """
     with system_errors(path):
         if keep:

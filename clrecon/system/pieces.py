@@ -32,9 +32,8 @@ def in_threads(
 ) -> None:
     """Call a function with slices that cover ``range(count)``, several at a time; numpy runs side by side in threads.
 
-    work: What it raises is raised here.
-    count, size: Length of the range, and of the slices.
-    done: Called in the thread of the caller with each slice that is finished, in order.  What it raises ends the work.
+    done: Called in the thread of the caller with each slice that is finished, in order.  What either raises ends the
+        work and is raised here.
     """
     pieces = list(chunks(count, size))
     threads = count_readers(len(pieces), _MOST_THREADS)
@@ -60,10 +59,7 @@ _Other = TypeVar("_Other")
 
 
 def side_by_side(one: Callable[[], _One], other: Callable[[], _Other]) -> tuple[_One, _Other]:
-    """Call two functions at the same time, the first in a thread of its own, and return what both return.
-
-    What one of them raises is raised here, after both have ended.
-    """
+    """Call two functions at once, the first in a thread; what one of them raises is raised after both have ended."""
     with ThreadPoolExecutor(1) as pool:
         first = pool.submit(one)
         second = other()
@@ -79,10 +75,7 @@ def find_bounds(points: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDA
 
 
 def local_origin(vertices: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the centre of the bounds, shape (3,), float64.
-
-    Patient coordinates can be far from zero.  Products of them would lose the digits that a volume integral needs.
-    """
+    """Return the centre of the bounds (3,): products of coordinates far from zero lose digits that integrals need."""
     if len(vertices) == 0:
         return np.zeros(3)
     low, high = find_bounds(vertices)

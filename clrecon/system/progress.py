@@ -1,8 +1,8 @@
 """Long work: functions that receive its progress, Ctrl-C while kernels are built, and the time limit of a device.
 
-Ctrl-C is held back while threads build kernels.  LLVM, the compiler within PoCL, answers a SIGINT by taking its
-unfinished files away and complaining on the console, whatever thread is meant.  A signal that all threads hold back
-reaches nobody: the one that waits for it asks."""
+LLVM, the compiler within PoCL, answers a SIGINT by taking its unfinished files away and complaining on the console,
+whatever thread is meant.  A signal that all threads hold back reaches nobody: the one that waits for it asks.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from contextlib import contextmanager
 from clrecon.errors import UsageError
 
 Progress = Callable[[str, int, int], None]
-"""Called as ``progress(stage, done, total)``; ``total`` is 0 where the end is not known.
+"""Called as ``progress(stage, done, total)`` in the thread of the caller; ``total`` is 0 where the end is not known.
 
-It is called between stages, slabs, frames, labels and files, in the thread of the caller.  What it raises ends the work
-and reaches the caller as it is; `clrecon.errors.Cancelled` is there for that.
-"""
+It is called between stages, slabs, frames, labels and files.  What it raises ends the work and reaches the caller as it
+is; `clrecon.errors.Cancelled` is there for that."""
 
 
 def ignore_progress(stage: str, done: int = 0, total: int = 0) -> None:
@@ -25,11 +24,7 @@ def ignore_progress(stage: str, done: int = 0, total: int = 0) -> None:
 
 
 class Steps:
-    """Counts the steps of work that several functions share, and reports each.
-
-    progress: None reports nothing.
-    total: All steps.
-    """
+    """Counts the steps of work that several functions share, `total` in all, and reports each."""
 
     def __init__(self, progress: Progress | None, stage: str, total: int) -> None:
         self.done, self.total = 0, total

@@ -1,10 +1,9 @@
 """Records: results as frozen dataclasses with typed fields, which are also the entries of JSON reports; and gates.
 
 A record is also a read-only dict: code that used results as dicts (``quality["closed"]``, ``json.dumps(report)``) works
-until version 1.0. `Record.as_dict` returns a dict that can be changed.
-
-A gate is a record of a measured figure, its bound, and whether the figure keeps the bound.  Gates of meshes and of
-volumes have the same form, so one reader of reports understands both."""
+until version 1.0. A gate is a record of a measured figure, its bound, and whether the figure keeps the bound; of meshes
+and of volumes they have the same form.
+"""
 
 from __future__ import annotations
 
@@ -63,11 +62,9 @@ def _as_plain(value: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Gate(Record):
-    """A figure and its bound.
+    """A figure and its bound; `measured` and `ok` are None where it was not measured.
 
-    measured: None: not measured.
     unit: None for counts, shares and flags.
-    ok: None: not measured.
     text: One line without patient data.
     """
 

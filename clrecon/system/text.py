@@ -25,10 +25,7 @@ def escape_text(text: str, limit: int = TEXT_LIMIT) -> str:
 
 
 def guess_word(word: object, known: Iterable[str]) -> str:
-    """Return `` (did you mean X?)`` with the known word that is most like `word`; empty if none is like it.
-
-    word: What was given; upper and lower case count alike.
-    """
+    """Return `` (did you mean X?)`` with the known word that is most like `word` in any case; empty if none is."""
     if not isinstance(word, str) or len(word) > TEXT_LIMIT:
         return ""
     from difflib import get_close_matches  # only where something was misspelt
@@ -50,10 +47,7 @@ def count_of(number: int, noun: str, several: str | None = None) -> str:
 
 
 def format_digits(value: float, digits: int = 3) -> str:
-    """Return a number with so many significant digits, never with an exponent: ``10,000``, ``0.0039``, ``-312``.
-
-    Digits before the point are all there, as in ``12,346``.
-    """
+    """Return a number with so many significant digits, never an exponent: ``12,346`` whole, ``0.0039``, ``-312``."""
     if value == 0.0:
         return "0"
     if not math.isfinite(value) or abs(value) >= LARGEST_WRITTEN:
@@ -98,10 +92,7 @@ def format_share(share: float, places: int = 0) -> str:
 
 @lru_cache(1024)
 def hash_uid(uid: str) -> str | None:
-    """Return the first 16 hexadecimal digits of the SHA-256 of a UID: a name that does not reveal the UID.
-
-    None for an empty UID.
-    """
+    """Return the first 16 hexadecimal digits of the SHA-256 of a UID, which do not reveal it; None for an empty one."""
     if not uid:
         return None
     return hashlib.sha256(uid.encode("utf-8", "replace")).hexdigest()[:16]

@@ -63,9 +63,7 @@ class ValueSample:
         return float(found[counts.argmax()]), float(counts.max()) / len(self.values)
 
     def without_spikes(self, low: float, high: float) -> ValueSample | None:
-        """Return the sample without values that stand out of those beside them outside of a range; None if too few are
-        left.
-        """
+        """Leave out values outside of a range that stand out of those beside them; None where too few are left."""
         found, counts = np.unique(self.values, return_counts=True)
         before, after = np.pad(counts, (1, 0))[:-1], np.pad(counts, (0, 1))[1:]
         beside = (before + after) / 2.0

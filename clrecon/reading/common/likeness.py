@@ -86,9 +86,7 @@ class Likeness:
 
 
 def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool | None = False) -> Likeness | None:
-    """Apply `measure_likeness` to slices (n, rows, columns); to many where it is most suspicious.  An unknown tilt is
-    None.
-    """
+    """Apply `measure_likeness` to slices (n, rows, columns); to many where it is worst.  An unknown tilt is None."""
     parts = tilt_deg is not None and abs(tilt_deg) <= TILT_REPORT_DEG
     count = len(voxels)
     if uneven or count <= WINDOW * WINDOWS:
@@ -135,7 +133,7 @@ def measure_likeness(voxels: NDArray[Any], parts: bool = True) -> Likeness | Non
 
 
 def _ratios(differences: Sequence[NDArray[np.float32]], noise: float) -> NDArray[np.float32]:
-    """Return for each stretch of slices the largest mean difference over fewer steps than its length, over that of all."""
+    """Return for each stretch of slices the largest mean difference over fewer steps than its length, over the last."""
     period = len(differences)
     count = len(differences[-1])
     nearer = []

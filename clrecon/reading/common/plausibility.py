@@ -35,9 +35,7 @@ parts.  A densest voxel below -900 is air; 16 bits end at 65535."""
 
 
 def judge_steps(pixels_mm: Sequence[float], gap_mm: float | None) -> Gate:
-    """Judge whether pixels and gaps have sizes of real scanners: a mesh a thousand times too large looks like any
-    other.
-    """
+    """Judge whether pixels and gaps are those of scanners: a mesh a thousand times too large looks like any other."""
     (low, high), (gap_low, gap_high) = PIXEL_MM, GAP_MM
     odd = [f"pixels of {mm:g} mm" for mm in sorted(set(pixels_mm)) if not low <= mm <= high]
     if gap_mm is not None and not gap_low <= gap_mm <= gap_high:

@@ -58,12 +58,10 @@ class Rescale(NamedTuple):
     intercept: float
 
     def __str__(self) -> str:
-        """One line for warnings."""
         return f"HU are {self.slope:g} x the stored value {self.intercept:+g}, as given: not what the files say"
 
 
 def check_rescale(given: Any) -> Rescale | None:
-    """Check two numbers; None stays None."""
     if given is None:
         return None
     try:

@@ -38,7 +38,6 @@ from clrecon.system.text import escape_text, hash_uid, join_names
 
 
 def make_entry(series: Series, warnings: Iterable[str] = ()) -> SeriesEntry:
-    """Make the listing entry of a series."""
     stack = series.stack
     affine = stack.affine if stack is not None and not series.problems else None
     first = stack.slices[0] if stack is not None else None
@@ -123,9 +122,7 @@ def read_series(path: str | os.PathLike[str], selection: Selection, progress: Pr
 
 
 def list_slices(path: str | os.PathLike[str], selection: Selection) -> list[tuple[Path, int, int]]:
-    """List the slices of which `read_series` makes a volume: file, frame there from 0, and number of frames of the
-    file.
-    """
+    """List the slices of the volume of `read_series`: file, frame there from 0, and number of frames of the file."""
     with _quiet_warnings():
         _, found = _scan_and_group(path, selection, None)
         choice = choose_series(found, selection.series)

@@ -161,7 +161,6 @@ def describe_shear(volume: Volume) -> str | None:
 
 
 def check_holds(volume: Volume, extension: str) -> None:
-    """Refuse a volume that the format cannot hold."""
     shear = shear_degrees(volume.affine)
     if volume.uneven:
         fault = f"no {extension} file can hold it: {describe_unevenness(volume.slice_origins())}"

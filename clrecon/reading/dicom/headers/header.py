@@ -65,9 +65,7 @@ def _share_halves(orientation: tuple[float, ...]) -> tuple[tuple[float, float, f
 def read_headers(
     path: Path, start: FileStart | None = None, force: bool = False
 ) -> list[SliceHeader] | OtherImage | None:
-    """Read and validate one file (see `read_elements`): a header for each frame, or None for a DICOMDIR, which only
-    lists.
-    """
+    """Read one file as `read_elements` does: a header for each frame, or None for a DICOMDIR, which only lists."""
     elements = read_elements(path, WANTED_TAGS, start, force)
     values = Values(elements)
     if elements.media_class == DICOMDIR_CLASS:

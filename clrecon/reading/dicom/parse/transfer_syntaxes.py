@@ -145,7 +145,7 @@ def read_pieces(file: BinaryIO, pieces: Pieces) -> bytes:
 
 
 def _walk_items(file: BinaryIO, start: int, file_bytes: int, most: int) -> tuple[tuple[int, int], Pieces, int]:
-    """Return the offset table, the fragments, and the offset of the byte after them.  A cut codestream still decodes."""
+    """Return the offset table, the fragments, and the offset of the byte after them; a cut stream would decode too."""
     items: Pieces = []
     place = start
     file.seek(start)

@@ -86,7 +86,7 @@ class DecoderPool(Closing):
         self._watchdog: threading.Thread | None = None
 
     def decode(self, data: bytes, decoder: str, out: NDArray[Any]) -> None:
-        """Decode one codestream into `out` (rows, columns), C-contiguous, of the type that the decoder returns for it."""
+        """Decode one codestream into `out` (rows, columns), C-contiguous and of the type that the decoder returns."""
         request = {
             "decoder": decoder,
             "length": len(data),
@@ -121,7 +121,6 @@ class DecoderPool(Closing):
             worker.process.kill()
 
     def close(self) -> None:
-        """End all processes and wait for them."""
         self._stopping.set()
         with self._lock:
             workers, self._workers, self._idle = self._workers, [], []
@@ -312,9 +311,7 @@ def _lift(number: int) -> int:
 
 
 def _find_modules() -> list[str]:
-    """Return the folders to look for modules: ours without the current one, which may hold any files, if not numpy
-    itself.
-    """
+    """Return where the process looks for modules: not in the current folder, which may hold any, if without numpy."""
     try:
         here = {os.getcwd()} - {str(Path(np.__file__).parents[1])}
     except OSError:

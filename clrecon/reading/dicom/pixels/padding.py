@@ -66,7 +66,6 @@ class PaddingMasks:
 
     @property
     def count(self) -> int:
-        """Number of voxels that are padding."""
         return sum(self._counts.values())
 
     def fill(self, run: Map = map) -> float | None:
@@ -161,7 +160,7 @@ def _is_disc(picture: NDArray[Any], value: Any, distance: NDArray[np.float64]) -
 
 
 def count_masked_tissue(header: SliceHeader, stored: NDArray[Any], padding: NDArray[np.bool_]) -> int:
-    """Count voxels of the padding of a slice (rows, columns) that are tissue by value and place, before it is replaced."""
+    """Count voxels of the padding of a slice (rows, columns) that are tissue by their stored value and place."""
     assert header.padding is not None
     low, high = header.padding
     # Padding below air is the usual case and needs no search.  NaN is not above air either.

@@ -129,9 +129,7 @@ FLOAT_LIMIT = 1e9
 
 
 class _SliceFacts(NamedTuple):
-    """Figures of one slice: packed padding, lowest and highest measured HU, unusual bits, padding that looks like
-    tissue.
-    """
+    """Figures of one slice: packed padding, range of measured HU, unusual bits, padding that looks like tissue."""
 
     padding: tuple[bytes, int] | None
     low: float
@@ -207,7 +205,6 @@ def _fill_volume(
 
 
 def _fill_slice(source: StoredPixels, header: SliceHeader, out: NDArray[Any]) -> _SliceFacts:
-    """Read one slice into `out`."""
     stored = source.load(header, out)
     whole_cell = header.padding is not None and not header.float_pixels and not _fits_stored_bits(header)
     padding = _find_padding(header, stored) if whole_cell else None  # padding may fill unused bits too
@@ -286,7 +283,6 @@ def _fits_stored_bits(header: SliceHeader) -> bool:
 
 
 def _find_padding(header: SliceHeader, stored: NDArray[Any]) -> NDArray[np.bool_] | None:
-    """Return the mask of the padding; None without padding."""
     assert header.padding is not None
     low, high = header.padding
     if header.float_pixels:

@@ -149,9 +149,7 @@ def _judge_steps(census: Census, stack: Stack, numbers: NDArray[np.int64]) -> tu
 
 
 def _judge_start(census: Census, numbers: NDArray[np.int64]) -> tuple[int, str]:
-    """Return how many slices are missing before the first number, and why; where most are, someone numbered on or
-    chose.
-    """
+    """Return how many slices are missing before the first number, and why; none if most are: numbered on, or a part."""
     low = int(numbers.min())
     absent = low - 1 - sum(1 <= number < low for number in census.numbers)
     in_ones = int(np.gcd.reduce(np.abs(np.diff(numbers)))) == 1
