@@ -1,12 +1,12 @@
 """The affine from voxel indices (i, j, k) to patient millimetres, what follows from it, and patient frames.
 
-An affine is always a 4x4 float64 array that maps column vectors (i, j, k, 1) to (x, y, z, 1) in LPS mm:
-its columns are the step from one column of a slice to the next, from one row to the next, from one slice to
-the next, and the centre of voxel (0, 0, 0).  The slice step is a full vector: with a tilted gantry it is not
-parallel to the slice normal, and the affine is then an exact shear.
+An affine is always a 4x4 float64 array that maps column vectors (i, j, k, 1) to (x, y, z, 1) in LPS mm: its columns are
+the step from one column of a slice to the next, from one row to the next, from one slice to the next, and the centre of
+voxel (0, 0, 0).  The slice step is a full vector: with a tilted gantry it is not parallel to the slice normal, and the
+affine is then an exact shear.
 
-Inside clrecon everything is LPS mm; RAS exists only at the border, under its own name.  LPS: x to the patient's left,
-y to the posterior, z to the superior (DICOM).  RAS: x right, y anterior (NIfTI).
+Inside clrecon everything is LPS mm; RAS exists only at the border, under its own name.  LPS: x to the patient's left, y
+to the posterior, z to the superior (DICOM).  RAS: x right, y anterior (NIfTI).
 
 Source: DICOM PS3.3 C.7.6.2.1.1 (Image Position and Image Orientation), with the slice step added.
 """
@@ -33,12 +33,9 @@ _LONG_AXIS = 0.5
 
 
 def compose_affine(i_step: ArrayLike, j_step: ArrayLike, k_step: ArrayLike, origin: ArrayLike) -> Float64Array:
-    """Build the affine from its three steps and the position of voxel (0, 0, 0).
+    """Build the affine (4, 4) from its three steps and the position of voxel (0, 0, 0), LPS mm.
 
-    i_step, j_step, k_step, origin: array_like, shape (3,). LPS mm.  `i_step` is the row cosines times PixelSpacing[1],
-        `j_step` the column cosines times PixelSpacing[0].
-
-    Returns: ndarray, shape (4, 4), float64
+    `i_step` is the row cosines times PixelSpacing[1], `j_step` the column cosines times PixelSpacing[0].
     """
     affine = np.eye(4)
     for column, vector in enumerate((i_step, j_step, k_step, origin)):
@@ -69,13 +66,7 @@ def checked_affine(affine: ArrayLike) -> Float64Array:
 
 
 def apply_affine(affine: Float64Array, points: ArrayLike) -> Float64Array:
-    """Map points through an affine, in float64.
-
-    affine: ndarray, shape (4, 4)
-    points: array_like, shape (n, 3)
-
-    Returns: ndarray, shape (n, 3), float64
-    """
+    """Map points (n, 3) through an affine, in float64."""
     return checked_points(points) @ affine[:3, :3].T + affine[:3, 3]
 
 
@@ -90,13 +81,17 @@ def checked_points(points: ArrayLike) -> Float64Array:
     return checked
 
 
-def map_points(mapping: Callable[[Float64Array], Float64Array], points: ArrayLike) -> Any:
+def map_points(mapping: Callable[[Float64Array], Float64Array], points: ArrayLike) -> Float64Array:
     """Apply what takes points (n, 3) to points, or to one point (3,), whose result then stands alone."""
     try:
         is_one = np.ndim(points) == 1  # type: ignore[arg-type]
     except ValueError:  # rows of several lengths: they are refused below
         is_one = False
-    return mapping(checked_points(np.asarray(points)[None]))[0] if is_one else mapping(checked_points(points))
+    placed = mapping(checked_points(np.asarray(points)[None] if is_one else points))
+    if not is_one:
+        return placed
+    alone: Float64Array = placed[0]
+    return alone
 
 
 def column_spacing(affine: Float64Array) -> tuple[float, float, float]:
@@ -144,9 +139,8 @@ def facts_of_orientation(affine: Float64Array) -> dict[str, Any]:
     """Describe the directions of index space in the patient.
 
     Returns: ``row``, ``column``, ``normal``: unit vectors in LPS along i, along j, and row x column.  ``axes``: for i,
-        j and the normal, the letter of the patient direction nearest to it (L left, R right, P posterior, A anterior, S
+        j and the normal, the letter of the nearest patient direction (L left, R right, P posterior, A anterior, S
         superior, I inferior).  ``off_axis_deg``: angle between the normal and the nearest patient axis.
-        ``right_handed``: the determinant of the affine is above zero.
     """
     row, column = (affine[:3, axis] / np.linalg.norm(affine[:3, axis]) for axis in (0, 1))
     normal = slice_normal(affine)
@@ -168,10 +162,7 @@ SPACES = ("lps", "ras")
 
 
 def frame_from_lps(space: str) -> NDArray[np.float64]:
-    """Return the 3x3 rotation from LPS mm to `space`.
-
-    space: {"lps", "ras"}. Upper or lower case.
-    """
+    """Return the 3x3 rotation from LPS mm to `space`, "lps" or "ras" in upper or lower case."""
     name = str(space).lower()
     if name == "lps":
         return np.eye(3)
@@ -181,12 +172,7 @@ def frame_from_lps(space: str) -> NDArray[np.float64]:
 
 
 def lps_affine_from_ras(affine: ArrayLike) -> NDArray[np.float64]:
-    """Turn an affine to RAS mm (NIfTI, FreeSurfer) into one to LPS mm; its own inverse.
-
-    affine: array_like, shape (4, 4). Index (i, j, k) to RAS mm.
-
-    Returns: ndarray, shape (4, 4), float64
-    """
+    """Turn an affine (4, 4) to RAS mm (NIfTI, FreeSurfer) into one to LPS mm; its own inverse."""
     return np.asarray(np.diag((-1.0, -1.0, 1.0, 1.0)) @ np.asarray(affine, dtype=np.float64), dtype=np.float64)
 
 

@@ -23,10 +23,7 @@ ON_EDGE_MM = 1e-6
 
 
 class Block(NamedTuple):
-    """Voxels first to end - 1 along each axis.
-
-    first, end: Indices (i, j, k).
-    """
+    """Voxels first to end - 1 along each axis, (i, j, k)."""
 
     first: tuple[int, int, int]
     end: tuple[int, int, int]
@@ -41,9 +38,8 @@ class Block(NamedTuple):
 def find_block(grid: Grid, origins: Float64Array, low: ArrayLike, high: ArrayLike, margin: int = 0) -> Block | None:
     """Return the smallest block that holds every voxel whose centre lies in a box; None where no centre does.
 
-    origins: ndarray, shape (nk, 3). LPS mm of voxel (0, 0, k) of each slice.
-    low, high: array_like, shape (3,). Corners of the box along the axes of the patient, LPS mm; infinite numbers leave
-        a side open.
+    origins: LPS mm of voxel (0, 0, k) of each slice, (nk, 3).
+    low, high: Corners of the box along the axes of the patient, LPS mm; infinite numbers leave a side open.
     margin: Voxels more on each side, as far as the grid goes.
     """
     ni, nj, nk = grid.shape_ijk
@@ -76,9 +72,7 @@ def place_block(affine: Float64Array, origins: Float64Array, uneven: bool, block
     A block of uneven slices that are even among themselves, by the rule of the reader, has an affine alone: that which
     these slices have when they are read without the others.
 
-    affine: ndarray, shape (4, 4). Of the whole grid.
-    origins: ndarray, shape (nk, 3). LPS mm of voxel (0, 0, k) of each slice of the whole grid.
-    uneven: The slices of the whole grid lie elsewhere than its affine says.
+    affine, origins, uneven: Of the whole grid; LPS mm of voxel (0, 0, k) of each slice, (nk, 3).
     """
     placed = np.array(affine)
     aside = affine[:3, 0] * block.first[0] + affine[:3, 1] * block.first[1]
@@ -95,10 +89,7 @@ def place_block(affine: Float64Array, origins: Float64Array, uneven: bool, block
 
 
 def facts_of_place(report: Mapping[str, Any], volume: Any) -> dict[str, Any]:
-    """Return the entries of a report that change with the shape and the place of a volume, as far as it has them.
-
-    report: Of the volume that `volume` was made of.
-    """
+    """Return the entries of a report that change with the shape and the place of a volume, as far as it has them."""
     ni, nj, nk = volume.shape_ijk
     di, dj, dk = volume.spacing
     origins, normal = volume.slice_origins(), slice_normal(volume.affine)
@@ -127,21 +118,23 @@ def facts_of_place(report: Mapping[str, Any], volume: Any) -> dict[str, Any]:
     return {name: value for name, value in entries.items() if name in report}
 
 
+def take_report(made: BaseVolume, volume: BaseVolume, said: str, **facts: Any) -> None:
+    """Give a volume the report of the one that it was made of, with its own place, more facts, and a warning."""
+    warnings = [*volume.report.get("warnings", ()), said]
+    made.report = amend(volume.report, warnings=warnings, **facts, **facts_of_place(volume.report, made))
+
+
 Own = TypeVar("Own", bound=BaseVolume)
 
 
 def crop_volume(volume: Own, low: ArrayLike, high: ArrayLike, *, margin: int = 0, space: str = "lps") -> Own:
     """Crop a volume to the smallest block of whole voxels that holds every voxel centre in a box.
 
-    Voxels keep their places; slices of an uneven volume keep their own positions.  Where the volume lies oblique to the
-    patient, the block also holds voxels beyond the box.
+    Voxels keep their places, uneven slices too; they are a view where they can be.  Where the volume lies oblique to
+    the patient, the block also holds voxels beyond the box.  ``report["crop"]`` has the figures.
 
-    low, high: array_like, shape (3,). Corners of the box along the axes of the patient, mm of the frame `space`;
-        infinite numbers leave a side open.
+    low, high: Corners of the box, mm of the frame `space`; infinite numbers leave a side open.
     margin: Voxels more on each side, as far as the volume goes.
-    space: {"lps", "ras"}
-
-    Returns: Its voxels are a view of those of `volume` where they can be.  ``report["crop"]`` has the figures.
     """
     try:
         box = np.array([low, high], dtype=np.float64)
@@ -175,7 +168,6 @@ def cut_block(volume: Own, block: Block) -> Own:
 
 def _certify(volume: Own, cropped: Own, block: Block, box: np.ndarray, space: str) -> Own:
     every, kept = math.prod(volume.shape_ijk), math.prod(cropped.shape_ijk)
-    place = facts_of_place(volume.report, cropped)
     size = [n * step for n, step in zip(cropped.shape_ijk, cropped.spacing, strict=True)]
     whole = [n * step for n, step in zip(volume.shape_ijk, volume.spacing, strict=True)]
     facts = {
@@ -190,8 +182,7 @@ def _certify(volume: Own, cropped: Own, block: Block, box: np.ndarray, space: st
         f"cropped to {_describe_box(box)} mm ({space.upper()}): {kept:,} of {every:,} voxels stay"
         f" ({100.0 * kept / every:.3g} %), {_describe_size(size)} of {_describe_size(whole)} mm"
     )
-    warnings = [*volume.report.get("warnings", ()), said]
-    cropped.report = amend(volume.report, crop=facts, warnings=warnings, **place)
+    take_report(cropped, volume, said, crop=facts)
     return cropped
 
 
@@ -248,12 +239,10 @@ def slice_volume(volume: Own, key: Any) -> Own:
     """Return a part of a volume with the affine, and the slice positions where they are uneven, of that part.
 
     The rules are those of nibabel's ``image.slicer``, in the order of the array: ``volume[key].voxels`` is
-    ``volume.voxels[key]``.
+    ``volume.voxels[key]``, a view where it can be.  ``report["sliced"]`` has the figures.
 
     key: Along k, j, i; ``...`` stands for whole axes.  A step of 2 takes every other voxel and doubles the spacing,
         without smoothing.  A step below zero turns an axis round: index space may become left-handed.
-
-    Returns: Its voxels are a view of those of `volume` where they can be.  ``report["sliced"]`` has the figures.
     """
     slices = _checked_slices(key)
     ranges = [range(*one.indices(size)) for one, size in zip(slices, volume.shape, strict=True)]
@@ -272,16 +261,12 @@ def slice_volume(volume: Own, key: Any) -> Own:
     placed, positions = place_block(affine, origins, volume.uneven, Block((0, 0, 0), shape))  # type: ignore[arg-type]
     made = type(volume)(volume.voxels[slices], placed, None, positions)
     said = f"sliced to {', '.join(map(_slice_text, slices))} of k, j, i: {made.voxels.size:,} of {volume.voxels.size:,}"
-    made.report = amend(
-        volume.report,
-        sliced={
-            "first_ijk": [kept.start for kept in along_ijk],
-            "step_ijk": [kept.step for kept in along_ijk],
-            "shape_ijk_before": list(volume.shape_ijk),
-        },
-        warnings=[*volume.report.get("warnings", ()), f"{said} voxels stay"],
-        **facts_of_place(volume.report, made),
-    )
+    facts = {
+        "first_ijk": [kept.start for kept in along_ijk],
+        "step_ijk": [kept.step for kept in along_ijk],
+        "shape_ijk_before": list(volume.shape_ijk),
+    }
+    take_report(made, volume, f"{said} voxels stay", sliced=facts)
     return made
 
 

@@ -1,8 +1,8 @@
 """Where voxels lie: `Grid` by an affine, `UnevenStack` by the place of each slice, and `BaseVolume`, which has both.
 
-Rows and columns of an uneven stack run in the same directions in every slice, and slice k is the plane through its own
-position.  Between slices k and k + 1 every point moves along the step from one position to the next.  So the map is
-linear in each layer, continuous across slices, and exact at every voxel.
+Rows and columns of an uneven stack run in the same directions in every slice.  Between slices k and k + 1 every point
+moves along the step from one position to the next: the map is linear in each layer, continuous across slices, and exact
+at every voxel.
 """
 
 from __future__ import annotations
@@ -31,13 +31,11 @@ from clrecon.system.memory import find_mapping
 
 
 class Grid(Message):
-    """Voxels and their affine: the base class of `Volume` and of `clrecon.labels.LabelMap`.
+    """Voxels (nk, nj, ni) and their affine, checked by the subclass: the base of `Volume` and
+    `clrecon.labels.LabelMap`.
 
     It pickles and copies as `clrecon.system.base_classes` says: memory-mapped voxels are sent as their place in the
-    file.
-
-    voxels: ndarray, shape (nk, nj, ni). Checked by the subclass.
-    affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm, checked too; it becomes read-only.
+    file.  The affine, index (i, j, k) to LPS mm, becomes read-only.
     """
 
     def __init__(self, voxels: NDArray[Any], affine: Float64Array):
@@ -68,7 +66,6 @@ class Grid(Message):
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Type of the voxels."""
         return self._voxels.dtype
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
@@ -98,13 +95,11 @@ class Grid(Message):
 
     def ijk_to_lps(self, points: ArrayLike) -> Float64Array:
         """Map index coordinates (n, 3) or (3,), fractions allowed, to LPS mm of that shape, float64."""
-        placed: Float64Array = map_points(lambda ijk: apply_affine(self._affine, ijk), points)
-        return placed
+        return map_points(lambda ijk: apply_affine(self._affine, ijk), points)
 
     def lps_to_ijk(self, points: ArrayLike) -> Float64Array:
         """Map LPS mm (n, 3) or (3,) to index coordinates of that shape, float64; the inverse of `ijk_to_lps`."""
-        placed: Float64Array = map_points(lambda lps: apply_affine(self._inverse, lps), points)
-        return placed
+        return map_points(lambda lps: apply_affine(self._inverse, lps), points)
 
 
 POSITION_TOLERANCE_MM = 0.01
@@ -126,11 +121,10 @@ def fit_line(positions: Float64Array) -> tuple[Float64Array, Float64Array]:
 
 
 def fit_even(positions: Float64Array, normal: Float64Array) -> tuple[Float64Array, Float64Array, bool]:
-    """Fit even places to slices at positions (n, 3), n >= 2.
+    """Return step and origin (3,), LPS mm, of even places fitted to slices at positions (n, 3), n >= 2, and whether all
+    are so.
 
-    Returns:
-    step, origin: ndarray, shape (3,). LPS mm.
-    is_even: No position is further off than `position_tolerance` of the median gap along the normal.
+    None may be further off than `position_tolerance` of the median gap along the normal.
     """
     step, origin = fit_line(positions)
     off = np.linalg.norm(positions - (origin + np.arange(len(positions))[:, None] * step), axis=1)
@@ -142,9 +136,9 @@ def fit_even(positions: Float64Array, normal: Float64Array) -> tuple[Float64Arra
 class UnevenStack(Message):
     """Positions of all slices, with the in-plane steps that they share.
 
-    in_plane: ndarray, shape (3, 2), float64. Steps along i and j, mm.
-    positions: ndarray, shape (nk, 3), float64. Centre of voxel (0, 0, k), LPS mm.
-    normal: ndarray, shape (3,), float64. Unit length, towards larger k.
+    in_plane: (3, 2). Steps along i and j, mm.
+    positions: (nk, 3). Centre of voxel (0, 0, k), LPS mm.
+    normal: (3,). Unit length, towards larger k.
     """
 
     in_plane: Float64Array
@@ -209,9 +203,7 @@ DEVICE_DTYPES = tuple(np.dtype(name) for name in ("int8", "uint8", "int16", "uin
 
 
 def _device_ready(voxels: NDArray[Any]) -> NDArray[Any]:
-    """Return `voxels` C-contiguous, in native byte order and in one of `DEVICE_DTYPES`; refuse values outside its
-    range.
-    """
+    """Return `voxels` C-contiguous, in native byte order and one of `DEVICE_DTYPES`; refuse those outside its range."""
     dtype = voxels.dtype.newbyteorder("=")
     if dtype == np.bool_:
         dtype = np.dtype(np.uint8)
@@ -300,38 +292,24 @@ class BaseVolume(Grid):
 
     def ijk_to_lps(self, points: ArrayLike) -> Float64Array:
         """Map index coordinates (n, 3) or (3,), fractions allowed, to LPS mm, float64; exact for uneven slices too."""
-        if self._stack is not None:
-            placed: Float64Array = map_points(self._stack.ijk_to_lps, points)
-            return placed
-        return super().ijk_to_lps(points)
+        return super().ijk_to_lps(points) if self._stack is None else map_points(self._stack.ijk_to_lps, points)
 
     def lps_to_ijk(self, points: ArrayLike) -> Float64Array:
         """Map LPS mm (n, 3) or (3,) to index coordinates of that shape, float64; the inverse of `ijk_to_lps`."""
-        if self._stack is not None:
-            placed: Float64Array = map_points(self._stack.lps_to_ijk, points)
-            return placed
-        return super().lps_to_ijk(points)
+        return super().lps_to_ijk(points) if self._stack is None else map_points(self._stack.lps_to_ijk, points)
 
     def slice_origins(self, border: int = 0) -> Float64Array:
-        """Positions in LPS mm of voxel (0, 0, k) for k from ``-border`` to ``nk - 1 + border``.
-
-        border: Number of further positions beyond either end, in the steps of the ends.
-
-        Returns: ndarray, shape (nk + 2 * border, 3), float64
-        """
+        """LPS mm (n, 3) of voxel (0, 0, k), k from ``-border`` to ``nk - 1 + border``, in the steps of the ends."""
         k = np.arange(-border, self._voxels.shape[0] + border, dtype=np.float64)
         if self._stack is not None:
             return self._stack.origins_at(k)
         return self._affine[:3, 3] + k[:, None] * self._affine[:3, 2]
 
     def with_voxels(self: Own, voxels: ArrayLike, report: dict[str, Any] | None = None) -> Own:
-        """Return a volume with other values at the same places.
+        """Return a volume with other values (nk, nj, ni) at the same places.
 
-        ``hu_range`` of the copied report is that of the new values.  Its other entries about voxels, such as
-        ``padding_share`` and ``padding_hu``, still describe the series as it was read.
-
-        voxels: array_like, shape (nk, nj, ni)
-        report: In place of a copy of this volume's.
+        ``hu_range`` of the copied report, which a given one replaces, is that of the new values.  Its other entries
+        about voxels, such as ``padding_share`` and ``padding_hu``, still describe the series as it was read.
         """
         array = _as_array(voxels)
         if array.shape != self._voxels.shape:
@@ -346,9 +324,6 @@ class BaseVolume(Grid):
         return type(self)(array, self._affine, report, positions, hu_range=found)
 
     def release_slices(self, first: int, end: int) -> None:
-        """Let slices ``first`` to ``end - 1`` of a memory-mapped volume leave memory, because they are not needed soon.
-
-        The values stay the same: the slices are read again when they are used.  Other volumes are not affected.
-        """
+        """Let slices ``first`` to ``end - 1`` of a memory-mapped volume leave memory until they are used again."""
         if self._mapping is not None:
             self._mapping.release(self._voxels[first:end])

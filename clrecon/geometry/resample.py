@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.affine import Float64Array, apply_affine
-from clrecon.geometry.blocks import facts_of_place, find_extent
-from clrecon.geometry.certificate import amend
+from clrecon.geometry.blocks import find_extent, take_report
 from clrecon.geometry.grid import AIR_HU, BaseVolume, Grid
 from clrecon.geometry.sampling import sample_onto
 from clrecon.system.progress import Progress, ignore_progress
@@ -27,10 +26,7 @@ ON_GRID = 1e-6
 
 
 class RegularGrid(NamedTuple):
-    """Points in even steps along axes at right angles.
-
-    affine: ndarray, shape (4, 4), float64. Index to LPS mm, right-handed.
-    """
+    """Points in even steps along axes at right angles, right-handed."""
 
     affine: Float64Array
     shape_ijk: tuple[int, int, int]
@@ -56,8 +52,7 @@ def regular_grid(grid: Grid, origins: Float64Array, steps_mm: float | Sequence[f
     steps of the grid and k the smallest distance of slices along the normal: where a volume is sheared but even, the
     planes are those of its slices.
 
-    origins: ndarray, shape (nk, 3). LPS mm of voxel (0, 0, k) of each slice.
-    steps_mm: Step along all three axes, or one for each.
+    origins: LPS mm of voxel (0, 0, k) of each slice, (nk, 3).
     """
     di, dj, _ = grid.spacing
     first = grid.affine[:3, 0] / di
@@ -79,10 +74,7 @@ def regular_grid(grid: Grid, origins: Float64Array, steps_mm: float | Sequence[f
 
 
 def resample_grid(grid: Grid, regular: RegularGrid, air: float, progress: Progress = ignore_progress) -> NDArray[Any]:
-    """Resample a grid (trilinear) at the points of a regular one, plane by plane; `air` beyond its voxels.
-
-    Returns: ndarray, shape (nk, nj, ni). In the type of the voxels; integers are rounded.
-    """
+    """Resample a grid (trilinear, integers rounded) at the points of a regular one, by planes; `air` beyond it."""
     ni, nj, nk = regular.shape_ijk
     dtype = grid.voxels.dtype
     values = np.full((nk, nj, ni), air, dtype)
@@ -113,12 +105,7 @@ def _slice_at(grid: Grid, k: float) -> NDArray[np.float32]:
 def _sample_plane(
     values: NDArray[np.float32], first: Float64Array, columns: Float64Array, rows: Float64Array, shape: tuple[int, int]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """A slice (bilinear, its outer values beyond it) at ``first + column * columns + row * rows``.
-
-    Returns:
-    found: ndarray of `shape`, float32
-    inside: ndarray of `shape`, bool. At most half a voxel beyond the outer centres.
-    """
+    """Sample a slice (bilinear) at ``first + column * columns + row * rows``; mark all up to half a voxel beyond."""
     from scipy import ndimage
 
     matrix = np.array([[rows[1], columns[1]], [rows[0], columns[0]]])
@@ -139,7 +126,6 @@ MOST_VOXELS = 2**31
 
 
 def check_step(step_mm: float) -> None:
-    """Refuse a step that no regular grid has."""
     number = isinstance(step_mm, int | float | np.integer | np.floating)
     if not (number and math.isfinite(step_mm) and step_mm >= SMALLEST_STEP_MM):
         shown = f"{step_mm:g}" if number else repr(step_mm)[:40]
@@ -147,10 +133,7 @@ def check_step(step_mm: float) -> None:
 
 
 def check_count(regular: RegularGrid, steps: str) -> None:
-    """Refuse a grid that is too large.
-
-    steps: What its steps are, for the message.
-    """
+    """Refuse a grid that is too large; `steps` says for the message what its steps are."""
     if math.prod(regular.shape_ijk) > MOST_VOXELS:
         shape = " x ".join(f"{n:,}" for n in regular.shape_ijk)
         raise RefusedInputError(
@@ -186,12 +169,7 @@ def resample_volume(volume: Own, to: float | Sequence[float] | BaseVolume, *, pr
         made = type(volume)(resample_grid(volume, regular, air, report), regular.affine)
     before = " x ".join(f"{step:.4g}" for step in volume.spacing)
     said = f"resampled (trilinear) from {'uneven slices' if volume.uneven else f'{before} mm'} to {what}"
-    made.report = amend(
-        volume.report,
-        resampled=figures,
-        warnings=[*volume.report.get("warnings", ()), said],
-        **facts_of_place(volume.report, made),
-    )
+    take_report(made, volume, said, resampled=figures)
     return made
 
 

@@ -18,14 +18,14 @@ from clrecon.geometry.images import image_of, make_nibabel, make_sitk, take_niba
 from clrecon.geometry.resample import resample_volume
 from clrecon.geometry.sampling import sample_volume
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.packages import public_function
+from clrecon.system.packages import ShownAsHtml, public_function
 from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress
 
 Own = TypeVar("Own", bound="Volume")
 
 
-class Volume(BaseVolume):
+class Volume(BaseVolume, ShownAsHtml):
     """Voxels in HU with the affine that places them in the patient.
 
     ``np.asarray(volume)`` are its voxels, without a copy.  ``volume[k0:k1, j0:j1, i0:i1]`` is a part of it at its own
@@ -344,11 +344,6 @@ class Volume(BaseVolume):
         """
         given = {"iso_value": iso_value, "device": device}
         public_function("show")(self, **{name: value for name, value in given.items() if value is not None})
-
-    def _repr_html_(self) -> str | None:
-        """Return the HTML that a notebook shows: three slices and the certificate; None where it shows the text."""
-        html: str | None = public_function("to_html")(self)
-        return html
 
     def __repr__(self) -> str:
         ni, nj, nk = self.shape_ijk

@@ -1,7 +1,6 @@
 """`LabelMap`: one whole number for each voxel, the affine that places the voxels, and the names of the numbers.
 
-Names are found in any spelling.  They come from files that strangers wrote: in messages they are escaped, in file names
-they are letters and digits.
+Names come from files that strangers wrote: in messages they are escaped, in file names they are letters and digits.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Grid
 from clrecon.geometry.affine import checked_affine
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.packages import public_function
+from clrecon.system.packages import ShownAsHtml
 from clrecon.system.text import escape_text
 
 SUFFIX_LENGTH = 40
@@ -49,10 +48,7 @@ def _parts(name: str) -> list[str]:
 
 
 def _level(text: str) -> str | None:
-    """Return the level of the spine that a name says, ``l3`` of ``L3``, ``vertebrae_L3``, ``Vertebra L03``, ``Th12``.
-
-    None where it says no level or several.
-    """
+    """Return the level of the spine that a name says, ``l3`` of ``vertebrae_L3``, ``Vertebra L03``; None if several."""
     levels = {(match[1][0], int(match[2])) for part in _parts(text) if (match := _LEVEL.fullmatch(part))}
     others = [part for part in _parts(text) if not _LEVEL.fullmatch(part) and part not in _VERTEBRA]
     if len(levels) != 1 or others:
@@ -62,8 +58,8 @@ def _level(text: str) -> str | None:
 
 
 def find_number(label: str | int, names: Mapping[int, str], present: Collection[int]) -> int:
-    """Return the number of `label`: a number itself, else the exact name, else the only name that says the same
-    level of the spine, else the only one that contains it as a part.
+    """Return the number of `label`: a number itself, else the exact name, else the only name that says the same level
+    of the spine, else the only one that contains it as a part.
 
     present: Numbers that occur in voxels.
     """
@@ -93,10 +89,7 @@ def find_number(label: str | int, names: Mapping[int, str], present: Collection[
 
 
 def label_suffix(name: str) -> str:
-    """Return a name as part of a file name: letters, digits, dot, hyphen and underscore, at most 40.
-
-    Dots and hyphens at either end are taken off; a name without any letter or digit gives ``label``.
-    """
+    """Return a name as part of a file name: letters, digits, dot, hyphen and underscore, at most 40; else ``label``."""
     safe = re.sub(r"[^A-Za-z0-9._-]+", "_", name)[:SUFFIX_LENGTH].strip("._-")
     return safe or "label"
 
@@ -112,7 +105,6 @@ def file_suffixes(names: Mapping[int, str]) -> dict[int, str]:
 
 
 def check_wanted(only: str | int | Iterable[str | int] | None) -> tuple[str | int, ...] | None:
-    """Return `only` as a tuple; None stays None."""
     if only is None:
         return None
     wanted = (only,) if isinstance(only, str | int) else tuple(only)
@@ -127,7 +119,7 @@ LARGEST_NUMBER = 65_535
 """Largest label number; numbers go to a device as 16 bits."""
 
 
-class LabelMap(Grid):
+class LabelMap(Grid, ShownAsHtml):
     """Whole numbers that tell to which structure each voxel belongs; 0 is no structure.
 
     ``voxels`` are uint8 or uint16 and cannot be written: an array that its owner can still change is copied, since the
@@ -224,11 +216,6 @@ class LabelMap(Grid):
         """
         wanted = check_wanted(labels)
         return self.numbers if wanted is None else tuple(dict.fromkeys(self.find(label) for label in wanted))
-
-    def _repr_html_(self) -> str | None:
-        """Return the HTML that a notebook shows: a table; None where it shows the text."""
-        html: str | None = public_function("to_html")(self)
-        return html
 
     def __repr__(self) -> str:
         ni, nj, nk = self.shape_ijk

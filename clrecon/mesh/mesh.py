@@ -15,11 +15,11 @@ from clrecon.mesh.base import BaseMesh
 from clrecon.mesh.components import select_components, split_components
 from clrecon.mesh.quality import MeshQuality, measure_quality, measure_triangles
 from clrecon.system.arguments import explains_arguments
-from clrecon.system.packages import import_package, public_function
+from clrecon.system.packages import ShownAsHtml, import_package, public_function
 from clrecon.system.pieces import find_bounds
 
 
-class Mesh(BaseMesh):
+class Mesh(BaseMesh, ShownAsHtml):
     """An indexed triangle surface in the patient frame LPS, millimetres.
 
     Parameters
@@ -229,11 +229,6 @@ class Mesh(BaseMesh):
             The mesh has no triangle, there is no display, or OpenGL does not work on it.
         """
         public_function("show")(self)
-
-    def _repr_html_(self) -> str | None:
-        """Return the HTML that a notebook shows: the page, or a picture; None where it shows the text."""
-        html: str | None = public_function("to_html")(self)
-        return html
 
     def __repr__(self) -> str:
         normals = "" if self.normals is None else ", with normals"

@@ -18,7 +18,7 @@ from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import choose_space
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.base_classes import Message
-from clrecon.system.packages import install_command, public_function
+from clrecon.system.packages import ShownAsHtml, install_command
 from clrecon.system.paths import keep_existing
 
 MOST_POINTS = 2**31 - 1
@@ -46,11 +46,10 @@ def _check_finite(points: NDArray[np.floating], name: str) -> None:
 
 
 def _take_values(values: NDArray[Any] | VoxelNumbers, numbers: NDArray[np.intp]) -> Any:
-    """Return the values of some points."""
     return values.take(numbers) if isinstance(values, VoxelNumbers) else values.take(numbers, axis=0)
 
 
-class PointCloud(Message):
+class PointCloud(Message, ShownAsHtml):
     """Points in the patient frame LPS, millimetres, with normals, HU, labels and voxel indices where they are known.
 
     Parameters
@@ -209,7 +208,6 @@ class PointCloud(Message):
         return self.select(key)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
-        """Return the points as an array, for ``numpy.asarray(cloud)``."""
         array = self._points if dtype is None else self._points.astype(dtype, copy=False)
         return array.copy() if copy else array
 
@@ -427,11 +425,6 @@ class PointCloud(Message):
                 cloud.point[name] = make_tensor(values)
         return cloud
 
-    def _repr_html_(self) -> str | None:
-        """Return the HTML that a notebook shows: a picture; None where it shows the text."""
-        html: str | None = public_function("to_html")(self)
-        return html
-
     def __repr__(self) -> str:
         known = [name for name in ("normals", "hu", "labels", "ijk") if getattr(self, name) is not None]
         return f"PointCloud({len(self)} points{', with ' if known else ''}{', '.join(known)}, LPS mm)"
@@ -439,11 +432,7 @@ class PointCloud(Message):
 
 @dataclass(frozen=True, eq=False)
 class VoxelNumbers:
-    """Voxels of a volume by number.
-
-    numbers: ndarray, shape (n,), uint32 or int64. ``i + ni * (j + nj * k)``.
-    shape_ijk: (ni, nj, nk)
-    """
+    """Voxels of a volume by number, ``i + ni * (j + nj * k)``, shape (n,), uint32 or int64."""
 
     numbers: NDArray[Any]
     shape_ijk: tuple[int, int, int]

@@ -19,12 +19,7 @@ from clrecon.errors import UsageError
 
 
 def import_package(module: str, what: str, package: str | None = None) -> Any:
-    """Import `module`.
-
-    module: As Python imports it.
-    what: What needs it, for the message.
-    package: As it is installed, where that is another name.
-    """
+    """Import a module; `what` needs it, for the message, and `package` is its name when it is installed."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -33,12 +28,10 @@ def import_package(module: str, what: str, package: str | None = None) -> Any:
 
 
 def install_command(*packages: str) -> str:
-    """Return a line for the shell that installs packages for this Python, wherever clrecon was installed from.
+    """Return a line for the shell that installs packages, by their names in indexes, for this Python.
 
     A bare ``pip`` may belong to another Python, and an extra of clrecon can be named only where an index has clrecon.
     Environments without pip, as uv makes them, get uv's own command.
-
-    *packages: Names as package indexes have them.
     """
     python = [sys.executable or "python3"]
     if importlib.util.find_spec("pip") is None and shutil.which("uv") is not None:
@@ -51,3 +44,11 @@ def install_command(*packages: str) -> str:
 def public_function(name: str) -> Any:
     """Return a public function, ``clrecon.NAME``; its module is imported when it is first asked for."""
     return getattr(sys.modules["clrecon"], name)
+
+
+class ShownAsHtml:
+    """Base of classes that a notebook shows as HTML, where ``clrecon.to_html`` makes some of the object."""
+
+    def _repr_html_(self) -> str | None:
+        html: str | None = public_function("to_html")(self)
+        return html

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Protocol
 
 from clrecon.errors import ClreconError
 from clrecon.geometry.certificate import Certificate
-from clrecon.system.packages import public_function
+from clrecon.system.packages import ShownAsHtml
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class SeriesEntry:
 
 
 @dataclass(frozen=True)
-class SeriesListing:
+class SeriesListing(ShownAsHtml):
     """The series at a path.
 
     chosen: Number of the series that `read_volume` reads for the same ``series``; None where it would not choose.
@@ -109,8 +109,3 @@ class SeriesListing:
     warnings: list[str]
     certificate: Certificate | None = None
     refusal: ClreconError | None = None
-
-    def _repr_html_(self) -> str | None:
-        """Return the HTML that a notebook shows: a table; None where it shows the text."""
-        html: str | None = public_function("to_html")(self)
-        return html
