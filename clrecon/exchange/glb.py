@@ -10,11 +10,9 @@ The head is up and the face is towards the viewer.  The matrix is a rotation tim
 ``asset.extras`` has the inverse matrix (column-major, as glTF writes matrices), the frame, the unit and the
 certificate.  Own code, because this matrix and the extras matter most and the format takes only a page.
 
-The reader takes the meshes of a scene, placed by their nodes, of any program.
-
-Ours name the patient frame, and the matrix from the scene to it.  In files of others the scene is as glTF has it
-(metres, Y up, the front facing +Z), of a patient who stands: (L, P, S) = 1000 (X, -Z, Y) mm.  There corners that
-coincide are joined, because vertices are split where normals or colours have an edge.
+The reader takes the meshes of a scene, placed by their nodes, of any program.  Ours name the patient frame, and the
+matrix from the scene to it.  In files of others the scene is as glTF has it, of a patient who stands: (L, P, S) = 1000
+(X, -Z, Y) mm.  There corners that coincide are joined, as vertices are split where normals or colours have an edge.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
-from clrecon.exchange.content import BONE_COLOR, Assembly, Content, parts_of, refuse_file
+from clrecon.exchange.content import BONE_COLOR, Assembly, Content, check_same, parts_of, refuse_file
 from clrecon.exchange.coordinates import find_places
 from clrecon.exchange.raw_content import MOST_LEVELS, Part, PlacedShapes, RawMesh, Shape, say_cut
 from clrecon.system.paths import open_regular
@@ -117,37 +115,27 @@ def _describe_part(
     content: Content, number: int, start: int, views: list[dict[str, Any]], accessors: list[dict[str, Any]]
 ) -> tuple[dict[str, Any], int]:
     """Add the views and accessors of a mesh that begins at byte `start`; return its primitive, and where it ends."""
+
+    def add(kind: str, count: int, component: int = _FLOAT, target: int = _VERTEX_DATA, **limits: list[float]) -> int:
+        nonlocal start
+        length = 4 * _WIDTHS[kind] * count
+        view = len(views)
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": length, "target": target})
+        accessors.append({"bufferView": view, "componentType": component, "count": count, "type": kind, **limits})
+        start += length
+        return view
+
     low, high = (
         np.float32(end - _origin(content)) for end in (content.vertices.min(axis=0), content.vertices.max(axis=0))
     )
-    count, indices = len(content.vertices), content.triangles.size
-    attributes = {"POSITION": len(views)}
-    views.append({"buffer": 0, "byteOffset": start, "byteLength": 12 * count, "target": _VERTEX_DATA})
-    accessors.append(
-        {
-            "bufferView": len(views) - 1,
-            "componentType": _FLOAT,
-            "count": count,
-            "type": "VEC3",
-            "min": low.tolist(),
-            "max": high.tolist(),
-        }
-    )
-    start += 12 * count
+    count = len(content.vertices)
+    attributes = {"POSITION": add("VEC3", count, min=low.tolist(), max=high.tolist())}
     if content.normals is not None:
-        attributes["NORMAL"] = len(views)
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": 12 * count, "target": _VERTEX_DATA})
-        accessors.append({"bufferView": len(views) - 1, "componentType": _FLOAT, "count": count, "type": "VEC3"})
-        start += 12 * count
+        attributes["NORMAL"] = add("VEC3", count)
     for name in content.values:
-        attributes[f"_{name.upper()}"] = len(views)
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": 4 * count, "target": _VERTEX_DATA})
-        accessors.append({"bufferView": len(views) - 1, "componentType": _FLOAT, "count": count, "type": "SCALAR"})
-        start += 4 * count
-    views.append({"buffer": 0, "byteOffset": start, "byteLength": 4 * indices, "target": _INDEX_DATA})
-    accessors.append({"bufferView": len(views) - 1, "componentType": _UINT32, "count": indices, "type": "SCALAR"})
-    primitive = {"attributes": attributes, "indices": len(views) - 1, "material": number, "mode": 4}
-    return primitive, start + 4 * indices
+        attributes[f"_{name.upper()}"] = add("SCALAR", count)
+    indices = add("SCALAR", content.triangles.size, _UINT32, _INDEX_DATA)
+    return {"attributes": attributes, "indices": indices, "material": number, "mode": 4}, start
 
 
 def _json_chunk(content: Content | Assembly) -> bytes:
@@ -188,18 +176,15 @@ def write(stream: BinaryIO, content: Content | Assembly) -> None:
 def verify(path: Path, content: Content | Assembly) -> None:
     """Check lengths, matrix and counts of a finished file."""
     size = path.stat().st_size
-    if size != estimate(content):
-        raise refuse_file("bytes", size, estimate(content))
+    check_same("bytes", size, estimate(content))
     with path.open("rb") as stream:
         magic, _, length, text_length, kind = struct.unpack("<4sIII4s", stream.read(20))
-        if (magic, length, kind) != (b"glTF", size, _JSON_CHUNK):
-            raise refuse_file("in the header", (magic, length, kind), (b"glTF", size, _JSON_CHUNK))
+        check_same("in the header", (magic, length, kind), (b"glTF", size, _JSON_CHUNK))
         text = stream.read(text_length)
         binary = struct.unpack("<I4s", stream.read(8))
     if text != _json_chunk(content):
         raise refuse_file("bytes of JSON differ", len(text), "none")
-    if binary != (_binary_length(content), _BINARY_CHUNK):
-        raise refuse_file("in the second chunk", binary, (_binary_length(content), _BINARY_CHUNK))
+    check_same("in the second chunk", binary, (_binary_length(content), _BINARY_CHUNK))
 
 
 _LONGEST_JSON = 1 << 26
@@ -212,13 +197,10 @@ _LPS_FROM_SCENE = np.array([(1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0,
 
 
 class _File:
-    """The two chunks of a file."""
-
     def __init__(self, document: dict[str, Any], binary: bytes):
         self.document, self.binary = document, binary
 
     def entry(self, kind: str, number: Any) -> dict[str, Any]:
-        """Return an object of one of the lists."""
         entries = self.document.get(kind, [])
         if type(number) is not int or not 0 <= number < len(entries) or not isinstance(entries[number], dict):
             raise ValueError(f"{kind} has no number {number!r:.40}")

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from clrecon.errors import OutputError, RefusedInputError, UsageError
-from clrecon.exchange.content import PointContent, refuse_file
+from clrecon.exchange.content import PointContent, check_same, refuse_file
 from clrecon.exchange.raw_content import RawCloud, read_remarks, say_cut
 from clrecon.system.packages import install_command
 from clrecon.system.text import escape_text
@@ -91,10 +91,8 @@ def verify(path: Path, content: PointContent) -> None:
     if len(head) < _HEAD_BYTES or head[:4] != b"LASF":
         raise refuse_file("in the header", repr(head[:4]), "LASF")
     start, stored, count = _sizes(head)
-    if (stored, count) != (length, len(content.vertices)):
-        raise refuse_file("bytes a point and points", (stored, count), (length, len(content.vertices)))
-    if path.stat().st_size != start + length * count:
-        raise refuse_file("bytes", path.stat().st_size, start + length * count)
+    check_same("bytes a point and points", (stored, count), (length, len(content.vertices)))
+    check_same("bytes", path.stat().st_size, start + length * count)
 
 
 def _sizes(head: bytes) -> tuple[int, int, int]:

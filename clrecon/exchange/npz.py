@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
-from clrecon.exchange.content import PointContent, refuse_file
+from clrecon.exchange.content import PointContent, check_same, refuse_file
 from clrecon.exchange.raw_content import RawCloud, columns_of, say_cut
 from clrecon.system.text import escape_text
 
@@ -81,8 +81,7 @@ def verify(path: Path, content: PointContent) -> None:
     if broken is not None:
         raise refuse_file("in the archive", escape_text(broken), "whole entries")
     forms = {name: (values.shape, values.dtype) for name, values in expected.items()}
-    if found != forms:
-        raise refuse_file("in the archive", found, forms)
+    check_same("in the archive", found, forms)
 
 
 def _open_array(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
@@ -97,10 +96,7 @@ def _open_array(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], n
 
 
 def read_cloud(path: Path) -> RawCloud:
-    """Read points and what is known of them.
-
-    The points are the entry ``points``, ``xyz``, ``pos`` or ``arr_0``, the others as this module writes them.
-    """
+    """Read points, the entry ``points``, ``xyz``, ``pos`` or ``arr_0``, and the others as this module writes them."""
     name = escape_text(path.name)
     try:
         with zipfile.ZipFile(path) as archive:
@@ -137,18 +133,19 @@ def _describe(name: str, found: dict[str, NDArray[Any]]) -> RawCloud:
     n = len(points)
     columns: dict[str, NDArray[Any]] = {}
     warnings = []
-    for entry, names in (("normals", ("nx", "ny", "nz")), ("ijk", ("i", "j", "k"))):
+    for entry, shape, names in (
+        ("normals", "(n, 3)", ("nx", "ny", "nz")),
+        ("ijk", "(n, 3)", ("i", "j", "k")),
+        ("hu", "(n,)", ("hu",)),
+        ("labels", "(n,)", ("labels",)),
+    ):
         values = found.get(entry)
-        if values is not None and values.shape == (n, 3) and values.dtype.kind in "fiu":
-            columns |= columns_of(values, names)
-        elif values is not None:
-            warnings.append(f"{entry} of shape {values.shape} and type {values.dtype} are left out: (n, 3) is needed")
-    for entry in ("hu", "labels"):
-        values = found.get(entry)
-        if values is not None and values.shape == (n,) and values.dtype.kind in "fiu":
-            columns[entry] = values
-        elif values is not None:
-            warnings.append(f"{entry} of shape {values.shape} and type {values.dtype} are left out: (n,) is needed")
+        if values is None:
+            continue
+        if values.shape == ((n,) if len(names) == 1 else (n, 3)) and values.dtype.kind in "fiu":
+            columns |= columns_of(values.reshape(n, len(names)), names)
+        else:
+            warnings.append(f"{entry} of shape {values.shape} and type {values.dtype} are left out: {shape} is needed")
     space, affine, iso_value = found.get("space"), found.get("affine"), found.get("iso_value_hu")
     certificate = found.get("certificate")
     is_text = certificate is not None and certificate.dtype.kind == "U" and certificate.nbytes <= _SMALL

@@ -1,12 +1,10 @@
 """Wavefront OBJ, text, with the frame, the unit, the iso value and the certificate in comments.
 
 Own code because vtkOBJWriter has no comments and reports success on a full disk, and trimesh builds the text in memory.
-Coordinates have nine digits, enough to get back the same float32, and fifteen far from the origin; normals have six
-decimals.
+Coordinates have nine digits, enough to get back the same float32, and fifteen far from the origin; normals have six.
 
-The reader takes vertices, their normals and colours, faces of three corners and names of objects of any program.
-
-Own code because common readers join vertices, drop the comments that name frame and unit, or split objects.
+The reader takes vertices, their normals and colours, faces of three corners and names of objects of any program: common
+readers join vertices, drop the comments that name frame and unit, or split objects.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
-from clrecon.exchange.content import Assembly, Content, parts_of, refuse_file
+from clrecon.exchange.content import Assembly, Content, check_same, parts_of, refuse_file, write_lines
 from clrecon.exchange.raw_content import Part, RawCloud, RawMesh, columns_of, plain_lines, read_remarks, say_cut
 from clrecon.system.paths import open_regular
 from clrecon.system.pieces import chunks
@@ -36,7 +34,6 @@ def _header(content: Content | Assembly) -> bytes:
 
 
 def estimate(content: Content | Assembly) -> int:
-    """Estimate the size of the file in bytes."""
     parts = parts_of(content)
     digits = len(str(sum(len(part.vertices) for part in parts)))
     return len(_header(content)) + sum(_estimate_part(part, digits) for part in parts)
@@ -52,8 +49,8 @@ def _estimate_part(content: Content, digits: int) -> int:
 def write(stream: BinaryIO, content: Content | Assembly) -> None:
     """Write vertices, normals (if there are any) and faces; indices count from 1 and go on from object to object.
 
-    Each mesh of several is an object by its name.  Colours stand behind the coordinates of vertices, as MeshLab,
-    Blender and others read and write them: a file of materials would be a second file.
+    Colours stand behind the coordinates of vertices, as MeshLab, Blender and others read and write them: a file of
+    materials would be a second file.
     """
     stream.write(_header(content))
     before = normals_before = 1
@@ -74,21 +71,16 @@ def _name(part: Content, number: int) -> str:
 def _write_part(stream: BinaryIO, part: Content, before: int, normals_before: int) -> None:
     color = "" if part.color is None else " " + " ".join(f"{value:.4f}" for value in part.color)
     line = f"v {part.number} {part.number} {part.number}{color}\n"
-    # One % for many lines takes two thirds of the time of one % for each line.
-    for where in chunks(len(part.vertices), _CHUNK):
-        rows = part.vertices[where]
-        stream.write((line * len(rows) % tuple(rows.ravel().tolist())).encode("ascii"))
+    write_lines(stream, line, part.vertices)
     face = "f %d %d %d\n"
     if part.normals is not None:
         face = "f %d//%d %d//%d %d//%d\n"
-        for where in chunks(len(part.normals), _CHUNK):
-            rows = part.normals[where]
-            stream.write(("vn %.6f %.6f %.6f\n" * len(rows) % tuple(rows.ravel().tolist())).encode("ascii"))
+        write_lines(stream, "vn %.6f %.6f %.6f\n", part.normals)
     for where in chunks(len(part.triangles), _CHUNK):
         corners = part.triangles[where].astype(np.int64) + before
         if part.normals is not None:
             corners = np.stack((corners, corners - before + normals_before), axis=2)
-        stream.write((face * len(corners) % tuple(corners.ravel().tolist())).encode("ascii"))
+        write_lines(stream, face, corners)
 
 
 def verify(path: Path, content: Content | Assembly) -> None:
@@ -103,9 +95,7 @@ def verify(path: Path, content: Content | Assembly) -> None:
     counts = dict.fromkeys(expected, 0)
     header = _header(content)
     with path.open("rb") as stream:
-        found = stream.read(len(header))
-        if found != header:
-            raise refuse_file("in the header", repr(found), repr(header))
+        check_same("in the header", stream.read(len(header)), header)
         tail = b"\n"
         while piece := stream.read(_PIECE):
             for words, (mark, _) in expected.items():
@@ -114,8 +104,7 @@ def verify(path: Path, content: Content | Assembly) -> None:
                 counts[words] += (tail[-(len(mark) - 1) :] + piece).count(mark)
             tail = piece[-3:]
     for words, (_, count) in expected.items():
-        if counts[words] != count:
-            raise refuse_file(words, counts[words], count)
+        check_same(words, counts[words], count)
     if tail[-1:] != b"\n":
         raise refuse_file("at the end", repr(tail), "a line end")
 

@@ -2,17 +2,14 @@
 
 The page turns, clips, hides, colours and measures in parallel projection.  Its Content-Security-Policy names its own
 script and style by their hashes and allows nothing else, so a browser loads and sends nothing.  Besides the surface it
-holds the names of the parts, the iso value, the certificate's lines, and how far it rounds the vertices.
+holds the names of the parts, the iso value, the certificate's lines, and how far it rounds the vertices.  Exported
+pages of libraries are three times as large, ask other servers for icons, and lose the parallel projection.
 
-Own code, because exported pages of libraries are three times as large, ask other servers for icons, and lose the
-parallel projection.
-
-The surface is coded as bytes; decoding is the twin of what ``page.js`` does.
-
-Vertices are numbered in the order of their first use, so that most indices are near to the highest one so far.
-Positions are 16-bit steps within the bounding box.  Differences of neighbours are small; signs are folded into the
-lowest bit (zigzag), and bytes of equal weight stand together (byte planes), which deflate packs best: planes of x, y, z
-of the positions (low bytes, then high bytes), of x, y, z of the normals, and four of the indices.
+The surface is coded as bytes; decoding is the twin of what ``page.js`` does.  Vertices are numbered in the order of
+their first use, so that most indices are near to the highest one so far. Positions are 16-bit steps within the bounding
+box.  Differences of neighbours are small; signs are folded into the lowest bit (zigzag), and bytes of equal weight
+stand together (byte planes), which deflate packs best: planes of x, y, z of the positions (low bytes, then high bytes),
+of x, y, z of the normals, and four of the indices.
 """
 
 from __future__ import annotations
@@ -35,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.exchange.content import BONE_COLOR, Assembly, Content, parts_of, refuse_file
+from clrecon.exchange.content import BONE_COLOR, Assembly, Content, check_same, parts_of, refuse_file
 from clrecon.version import package_version
 
 STEPS = 65_535
@@ -48,9 +45,8 @@ _LEVEL = 6
 
 @dataclass(frozen=True, eq=False)
 class CodedSurface:
-    """A surface as a page holds it.
+    """A surface as a page holds it: counts of vertices that triangles use, and of triangles.
 
-    vertices, triangles: Counts; vertices that no triangle uses are left out.
     low_mm, step_mm: Lowest corner of the bounding box, and the step of a coordinate along each axis.
     data: gzip of the byte planes.
     """
@@ -70,11 +66,7 @@ class CodedSurface:
 def encode_surface(
     vertices: NDArray[np.floating], normals: NDArray[np.float32], triangles: NDArray[np.integer]
 ) -> CodedSurface:
-    """Code a surface of at least one triangle.
-
-    normals: ndarray, shape (n, 3), float32. Unit vectors.
-    triangles: ndarray, shape (m, 3), integer. Their order stays.
-    """
+    """Code a surface of at least one triangle, whose order stays; normals (n, 3) are unit vectors."""
     order, corners = _renumber(triangles, len(vertices))
     places = vertices[order].astype(np.float64)
     low, high = places.min(axis=0), places.max(axis=0)
@@ -167,7 +159,6 @@ _BLOCK = re.compile(r'<script id="(facts|surface)" type="[a-z/]+">([^<]*)</scrip
 
 
 def estimate(content: Content | Assembly) -> int:
-    """Return the least bytes of the file."""
     own = len(read_page_code("page.html")) + len(read_page_code("page.css")) + len(_script())
     return own + int(_LEAST_BYTES_A_TRIANGLE * sum(len(part.triangles) for part in parts_of(content)))
 
@@ -177,7 +168,6 @@ def write(stream: BinaryIO, content: Content | Assembly) -> None:
 
 
 def compose_page(content: Content | Assembly) -> bytes:
-    """Return the page of one or several meshes."""
     meshes = parts_of(content)
     count = sum(len(mesh.triangles) for mesh in meshes)
     if count > MOST_TRIANGLES:
@@ -235,9 +225,7 @@ def verify(path: Path, content: Content | Assembly) -> None:
         _, _, triangles = decode_surface(coded)
     except ValueError as error:
         raise refuse_file(f"({error})", "no page", "a page") from error
-    expected = sum(len(part.triangles) for part in parts_of(content))
-    if len(triangles) != expected:
-        raise refuse_file("triangles", len(triangles), expected)
+    check_same("triangles", len(triangles), sum(len(part.triangles) for part in parts_of(content)))
 
 
 def _join_parts(meshes: Sequence[Content]) -> tuple[CodedSurface, list[dict[str, Any]]]:

@@ -8,10 +8,8 @@ nothing.  HU is the property ``scalar_HU`` of type ``float``, other numbers at v
 ``scalar_thickness_mm``: CloudCompare takes only names with ``scalar_`` by itself, and Open3D skips ``short``.
 
 The readers take ASCII and binary of either byte order, the element ``vertex`` with properties of any number, and of
-meshes ``face`` with lists of three corners.
-
-Own code because Open3D leaves out properties, trimesh comments and VTK both, and because a harmed header must not take
-memory: it is short, its counts are compared with the size of the file.
+meshes ``face`` with lists of three corners: Open3D leaves out properties, trimesh comments and VTK both, and a harmed
+header must not take memory: it is short, its counts are compared with the size of the file.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, RefusedInputError
-from clrecon.exchange.content import Content, PointContent, refuse_file
+from clrecon.exchange.content import Content, PointContent, check_same
 from clrecon.exchange.raw_content import Part, RawCloud, RawMesh, read_remarks, say_cut
 from clrecon.system.paths import open_regular
 from clrecon.system.pieces import chunks
@@ -49,16 +47,12 @@ def _header(content: PointContent) -> bytes:
         *(f"property float {name}" for name in ("nx", "ny", "nz") if content.normals is not None),
         *(["property float scalar_HU"] if content.hu is not None else []),
         *(["property int label"] if content.labels is not None else []),
-        *(f"property float scalar_{name}" for name in _values(content)),
+        *(f"property float scalar_{name}" for name in content.values),
         *(f"property uchar {name}" for name in ("red", "green", "blue") if _color(content) is not None),
     ]
     if isinstance(content, Content):
         lines += [f"element face {len(content.triangles)}", "property list uchar int vertex_indices"]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
-
-
-def _values(content: PointContent) -> Mapping[str, NDArray[np.float32]]:
-    return content.values if isinstance(content, Content) else {}
 
 
 def _color(content: PointContent) -> NDArray[np.uint8] | None:
@@ -81,7 +75,7 @@ def _columns(content: PointContent) -> dict[str, tuple[NDArray[Any], str, tuple[
         columns["hu"] = (content.hu, "<f4", ())
     if content.labels is not None:
         columns["label"] = (content.labels, "<i4", ())
-    for name, values in _values(content).items():
+    for name, values in content.values.items():
         columns[f"scalar_{name}"] = (values, "<f4", ())
     if (color := _color(content)) is not None:
         columns["color"] = (np.broadcast_to(color, (len(content.vertices), 3)), "u1", (3,))
@@ -104,35 +98,29 @@ def write(stream: BinaryIO, content: PointContent) -> None:
     if len(content.vertices) > 2**31:
         raise OutputError(f"{len(content.vertices)} vertices are too many for a PLY file, at most {2**31}")
     stream.write(_header(content))
-    columns = _columns(content)
-    rows = np.empty(_CHUNK, dtype=_vertex(content))
-    for where in chunks(len(content.vertices), _CHUNK):
+    columns = {name: values for name, (values, _, _) in _columns(content).items()}
+    _write_rows(stream, np.empty(_CHUNK, dtype=_vertex(content)), columns, len(content.vertices))
+    if isinstance(content, Content):
+        faces = np.empty(_CHUNK, dtype=_FACE)
+        faces["count"] = 3
+        _write_rows(stream, faces, {"corners": content.triangles}, len(content.triangles))
+
+
+def _write_rows(stream: BinaryIO, rows: NDArray[Any], columns: Mapping[str, NDArray[Any]], count: int) -> None:
+    """Write `count` rows of columns by way of `rows`, which hold those of a chunk."""
+    for where in chunks(count, _CHUNK):
         piece = rows[: where.stop - where.start]
-        for name, (values, _, _) in columns.items():
+        for name, values in columns.items():
             piece[name] = values[where]
         stream.write(piece.view(np.uint8).data)
-    if isinstance(content, Content):
-        _write_faces(stream, content.triangles)
-
-
-def _write_faces(stream: BinaryIO, triangles: NDArray[np.uint32]) -> None:
-    faces = np.empty(_CHUNK, dtype=_FACE)
-    faces["count"] = 3
-    for where in chunks(len(triangles), _CHUNK):
-        part = faces[: where.stop - where.start]
-        part["corners"] = triangles[where]
-        stream.write(part.view(np.uint8).data)
 
 
 def verify(path: Path, content: PointContent) -> None:
     """Check header (with its counts) and size of a finished file."""
     expected = _header(content)
     with path.open("rb") as stream:
-        found = stream.read(len(expected))
-    if found != expected:
-        raise refuse_file("in the header", repr(found), repr(expected))
-    if path.stat().st_size != estimate(content):
-        raise refuse_file("bytes", path.stat().st_size, estimate(content))
+        check_same("in the header", stream.read(len(expected)), expected)
+    check_same("bytes", path.stat().st_size, estimate(content))
 
 
 _TYPES = {
@@ -156,11 +144,6 @@ class Element:
     count: int
     types: dict[str, str] = field(default_factory=dict)
     lists: dict[str, tuple[str, str]] = field(default_factory=dict)
-
-    @property
-    def has_list(self) -> bool:
-        """True where rows have no fixed length."""
-        return bool(self.lists)
 
 
 @dataclass
@@ -239,11 +222,11 @@ def skip_to_vertices(stream: BinaryIO, header: Header, name: str) -> Element:
     for element in header.elements:
         if element.name == "vertex":
             missing = [axis for axis in ("x", "y", "z") if axis not in element.types]
-            if missing or element.has_list:
-                fault = "a list" if element.has_list else f"no {', '.join(missing)}"
+            if missing or element.lists:
+                fault = "a list" if element.lists else f"no {', '.join(missing)}"
                 raise RefusedInputError(f"the vertices of {name} have {fault}: x, y, z and single numbers are needed")
             return element
-        if element.has_list and element.count:
+        if element.lists and element.count:
             raise RefusedInputError(f"{name} has lists of '{escape_text(element.name)}' before its vertices: not read")
         if header.order:
             stream.seek(element.count * sum(int(kind[1]) for kind in element.types.values()), io.SEEK_CUR)
@@ -265,7 +248,6 @@ def _check_room(vertex: Element, row_bytes: int, left: int, name: str) -> None:
 def read_binary(
     stream: BinaryIO, header: Header, vertex: Element, name: str, file_bytes: int
 ) -> dict[str, NDArray[Any]]:
-    """Read the columns of vertices from a binary file."""
     row = np.dtype([(own, header.order + kind) for own, kind in vertex.types.items()])
     _check_room(vertex, row.itemsize, file_bytes - stream.tell(), name)
     columns = {own: np.empty(vertex.count, kind) for own, kind in vertex.types.items()}
@@ -277,7 +259,6 @@ def read_binary(
 
 
 def read_text(stream: BinaryIO, vertex: Element, name: str, file_bytes: int) -> dict[str, NDArray[Any]]:
-    """Read the columns of vertices from a text file."""
     _check_room(vertex, 2 * len(vertex.types), file_bytes - stream.tell() + 1, name)
     if vertex.count == 0:
         return {own: np.zeros(0) for own in vertex.types}

@@ -4,8 +4,8 @@
 text variant.  Own code because VTK, which can set the header, writes to a named file only and deletes it when the disk
 is full, and trimesh leaves the header empty, builds the file in memory and took five times as long.
 
-The reader joins the corners of facets where they coincide.  Own code because the frame is in the header, which common
-readers drop, and because a harmed count must not take memory.
+The reader joins the corners of facets where they coincide: common ones drop the frame in the header, and a harmed count
+must not take memory.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
-from clrecon.exchange.content import Content, refuse_file
+from clrecon.exchange.content import Content, check_same, refuse_file
 from clrecon.exchange.coordinates import find_places, rounded_apart
 from clrecon.exchange.raw_content import MARK, RawMesh, plain_lines, say_cut
 from clrecon.system.paths import open_regular
@@ -85,10 +85,8 @@ def verify(path: Path, content: Content) -> None:
     if head[:80] != _header(content) or len(head) != _HEAD:
         raise refuse_file("in the header", repr(head[:80]), repr(_header(content)))
     (count,) = struct.unpack("<I", head[80:])
-    if count != len(content.triangles):
-        raise refuse_file("triangles", count, len(content.triangles))
-    if path.stat().st_size != estimate(content):
-        raise refuse_file("bytes", path.stat().st_size, estimate(content))
+    check_same("triangles", count, len(content.triangles))
+    check_same("bytes", path.stat().st_size, estimate(content))
 
 
 _FACET = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("unused", "<u2")])
@@ -138,12 +136,6 @@ def _make(corners: NDArray[np.floating], said: re.Match[bytes] | None) -> RawMes
 
 
 def join_corners(corners: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
-    """Join corners that coincide.
-
-    corners: ndarray, shape (3 m, 3)
-
-    Returns:
-    vertices: ndarray, shape (n, 3). In the order in which they occur first.
-    """
+    """Join corners (3 m, 3) that coincide; vertices stand in the order in which they occur first."""
     first, place = find_places(corners)
     return corners[first], place.reshape(-1, 3)

@@ -3,10 +3,9 @@
 Own code because trimesh keeps the whole document in memory and needs two more libraries for it, and VTK has no 3MF. The
 entries of the ZIP are dated 1980-01-01, the earliest date of the format, which `ZipFile.open` sets.
 
-The reader takes objects of triangles and of components, placed by the build, in the unit of the model.
-
-Own code because readers were seen that drop the unit, components or transforms.  The XML is read piece by piece and
-declares no document type, so that it cannot grow; what it may unpack to is bounded by the size of the file.
+The reader takes objects of triangles and of components, placed by the build, in the unit of the model; others were seen
+that drop the unit, components or transforms.  The XML is read piece by piece and declares no document type, so that it
+cannot grow; what it may unpack to is bounded by the size of the file.
 """
 
 from __future__ import annotations
@@ -26,14 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, RefusedInputError
-from clrecon.exchange.content import Assembly, Content, parts_of, refuse_file
+from clrecon.exchange.content import BONE_COLOR, Assembly, Content, check_same, parts_of, write_lines
 from clrecon.exchange.raw_content import MOST_LEVELS, Part, PlacedShapes, RawMesh, Shape, read_remarks, say_cut
 from clrecon.system.paths import open_regular
-from clrecon.system.pieces import chunks
 from clrecon.system.text import escape_text
 
-BONE_COLOR = (0.89, 0.86, 0.78)
-_CHUNK = 1 << 14
 _PIECE_OUT = 1 << 22
 _MODEL = "3D/3dmodel.model"
 _DECLARATION = '<?xml version="1.0" encoding="UTF-8"?>\n'
@@ -87,14 +83,9 @@ def write(stream: BinaryIO, content: Content | Assembly) -> None:
 
 
 def _write_mesh(model: IO[bytes], part: Content) -> None:
-    vertex = _vertex(part)
-    for where in chunks(len(part.vertices), _CHUNK):
-        rows = part.vertices[where]
-        model.write((vertex * len(rows) % tuple(rows.ravel().tolist())).encode("ascii"))
+    write_lines(model, _vertex(part), part.vertices)
     model.write(b"</vertices>\n<triangles>\n")
-    for where in chunks(len(part.triangles), _CHUNK):
-        corners = part.triangles[where]
-        model.write((_TRIANGLE * len(corners) % tuple(corners.ravel().tolist())).encode("ascii"))
+    write_lines(model, _TRIANGLE, part.triangles)
     model.write(b"</triangles>\n</mesh>\n</object>\n")
 
 
@@ -166,16 +157,13 @@ def verify(path: Path, content: Content | Assembly) -> None:
         sum(len(each) for each in of)
         for of in zip(*((p.vertices, p.triangles) for p in parts_of(content)), strict=True)
     ]
-    if vertices != expected[0]:
-        raise refuse_file("vertices", vertices, expected[0])
-    if triangles != expected[1]:
-        raise refuse_file("triangles", triangles, expected[1])
+    check_same("vertices", vertices, expected[0])
+    check_same("triangles", triangles, expected[1])
 
 
 _CORE = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
 _MATERIAL = "http://schemas.microsoft.com/3dmanufacturing/material/2015/02"
 _MODEL_TYPE = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
-_USUAL_MODEL = "3D/3dmodel.model"
 _RELATIONS = "_rels/.rels"
 _MM = {"micron": 0.001, "millimeter": 1.0, "centimeter": 10.0, "inch": 25.4, "foot": 304.8, "meter": 1000.0}
 _UNITS = {"micron": "um", "millimeter": "mm", "centimeter": "cm", "meter": "m"}
@@ -235,7 +223,7 @@ def _find_model(package: zipfile.ZipFile, name: str) -> str:
 
     if _RELATIONS in entries:
         _parse(package, _RELATIONS, start)
-    model = targets[0] if targets else _USUAL_MODEL
+    model = targets[0] if targets else _MODEL
     if model not in entries:
         raise RefusedInputError(f"{name} is a zip archive without a 3D model: it is no 3MF file")
     return model
@@ -263,12 +251,8 @@ def _parse(
     parser.CharacterDataHandler = text
     parser.EndElementHandler = end
     with package.open(info) as stream:
-        _feed(parser, stream)
-
-
-def _feed(parser: Any, stream: IO[bytes]) -> None:
-    while piece := stream.read(_PIECE_IN):
-        parser.Parse(piece)
+        while piece := stream.read(_PIECE_IN):
+            parser.Parse(piece)
     parser.Parse(b"", True)
 
 

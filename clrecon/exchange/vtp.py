@@ -4,12 +4,9 @@ VTK writes to a string, which is then written to our stream: VTK itself leaves a
 field arrays ``SPACE``, ``UNIT``, ``ISO_VALUE_HU``, ``AFFINE_IJK_TO_LPS_MM`` (16 numbers, row by row) and
 ``CERTIFICATE`` (one text for each fact) tell what the coordinates are; 3D Slicer reads ``SPACE``.
 
-The readers take files of any program; of meshes each polygon is a triangle.
-
-Own code because VTK crashes on harmed files: it follows offsets and counts wherever they lead.  Arrays may be text,
-base64 or raw bytes after the XML, plain or packed by zlib (VTK's "XML file formats").  Several pieces become one cloud.
-
-VTK's layout of points, triangles and point arrays is handled in `make_polydata` alone.
+The readers take files of any program; of meshes each polygon is a triangle.  Own code because VTK crashes on harmed
+files: it follows offsets and counts wherever they lead.  Arrays may be text, base64 or raw bytes after the XML, plain
+or packed by zlib (VTK's "XML file formats").  Several pieces become one cloud.
 """
 
 from __future__ import annotations
@@ -17,11 +14,11 @@ from __future__ import annotations
 import binascii
 import re
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 from xml.etree import ElementTree
 
 import numpy as np
@@ -42,17 +39,14 @@ def make_polydata(
     labels: NDArray[np.int32] | None = None,
     values: Mapping[str, NDArray[np.float32]] = MappingProxyType({}),
 ) -> Any:
-    """Build a ``vtkPolyData`` that shares the memory of the arrays.
+    """Build a ``vtkPolyData`` that shares the memory of the arrays, which are C-contiguous.
 
-    VTK counts in signed integers: indices are seen as int32 without a copy below 2**31 vertices and are copied to
-    int64 above.
+    VTK counts in signed integers: indices are seen as int32 without a copy below 2**31 vertices and are copied to int64
+    above.
 
-    vertices: ndarray, shape (n, 3), float32 or float64, C-contiguous
-    triangles: ndarray, shape (m, 3), uint32, C-contiguous, every index below n, or None. None: a cloud, each point a
-        cell of its own, without which nothing of it is drawn.
-    normals: ndarray, shape (n, 3), float32, C-contiguous, or None. They become the active normals, named ``Normals``.
-    hu, labels: ndarray, shape (n,), float32 and int32. The point arrays ``HU``, which becomes the active scalars, and
-        ``label``.
+    triangles: Every index below n; None: a cloud, each point a cell of its own, without which nothing of it is drawn.
+    normals: They become the active normals, named ``Normals``.
+    hu, labels: The point arrays ``HU``, which becomes the active scalars, and ``label``.
     values: Further point arrays by name, (n,) each.
     """
     from vtkmodules.util.numpy_support import numpy_to_vtk
@@ -115,22 +109,22 @@ def estimate(content: PointContent | Assembly) -> int:
     """Return the size of the data in bytes, without the XML: the indices and an offset for each triangle or point."""
     if isinstance(content, Assembly):
         return sum(estimate(part) + 7 * len(part.triangles) for part in content.parts)
-    arrays = (content.vertices, content.normals, content.hu, content.labels, *_values(content).values())
+    arrays = (content.vertices, content.normals, content.hu, content.labels, *content.values.values())
     cells = 16 * len(content.triangles) if isinstance(content, Content) else 8 * len(content.vertices)
     return sum(array.nbytes for array in arrays if array is not None) + cells
 
 
 def write(stream: BinaryIO, content: PointContent | Assembly) -> None:
-    """Write the surface or cloud with its field arrays; each triangle of several meshes has the number of its mesh.
+    """Write the surface or cloud with its field arrays.
 
-    The numbers are the cell array ``PART``, from 0 on, the colours the cell array ``COLOR``; the field array
-    ``PART_NAMES`` has the names in this order.
+    Each triangle of several meshes has the number of its mesh, from 0 on, in the cell array ``PART``, and its colour in
+    ``COLOR``; the field array ``PART_NAMES`` has the names in this order.
     """
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
     assembly, content = content, _join(content)
     polydata = make_polydata(
-        content.vertices, _triangles(content), content.normals, content.hu, content.labels, _values(content)
+        content.vertices, _triangles(content), content.normals, content.hu, content.labels, content.values
     )
     for array in _field_arrays(content):
         polydata.GetFieldData().AddArray(array)
@@ -176,10 +170,6 @@ def _strings(name: str, texts: Sequence[str]) -> Any:
     for text in texts:
         strings.InsertNextValue(text)
     return strings
-
-
-def _values(content: PointContent) -> Mapping[str, NDArray[np.float32]]:
-    return content.values if isinstance(content, Content) else {}
 
 
 def _triangles(content: PointContent) -> NDArray[np.uint32] | None:
@@ -236,6 +226,7 @@ _ZLIB = "vtkZLibDataCompressor"
 _MOST_BLOCKS = 1 << 24
 _MOST_COMPONENTS = 64
 _LONGEST_TEXT = 1 << 20
+Raw = TypeVar("Raw", RawCloud, RawMesh)
 
 
 @dataclass
@@ -252,11 +243,20 @@ class Document:
 
 def read_cloud(path: Path) -> RawCloud:
     """Read the points, the point arrays and the field arrays ``SPACE``, ``ISO_VALUE_HU`` and so on."""
+    return _read(path, _collect_points)
+
+
+def read_mesh(path: Path) -> RawMesh:
+    """Read the triangles of a VTP file; those of one number in the cell array ``PART`` are a part."""
+    return _read(path, _collect_triangles)
+
+
+def _read(path: Path, collect: Callable[[Document, str], Raw]) -> Raw:
     name = escape_text(path.name)
     try:
         with open_regular(path) as stream:
             document = parse_document(stream.read(), name)
-        return _collect_points(document, name)
+        return collect(document, name)
     except (OSError, ValueError, OverflowError, MemoryError, ElementTree.ParseError, zlib.error) as error:
         raise say_cut(name, error) from error
 
@@ -414,7 +414,6 @@ class _From64:
         self._text, self._start, self._taken = text, 0, 0
 
     def take(self, count: int) -> bytes:
-        """Return the next bytes of this part."""
         first, last = self._taken // 3 * 4, -(-(self._taken + count) // 3) * 4
         if last > len(self._text) - self._start:
             raise ValueError(f"an array has {count:,} bytes and {len(self._text):,} characters are there")
@@ -449,17 +448,6 @@ def _unpack(document: Document, source: _Raw | _From64) -> bytes:
         if len(parts[-1]) != expected:
             raise ValueError(f"a block of {expected:,} bytes has {len(parts[-1]):,}")
     return b"".join(parts)
-
-
-def read_mesh(path: Path) -> RawMesh:
-    """Read the triangles of a VTP file; those of one number in the cell array ``PART`` are a part."""
-    name = escape_text(path.name)
-    try:
-        with open_regular(path) as stream:
-            document = parse_document(stream.read(), name)
-        return _collect_triangles(document, name)
-    except (OSError, ValueError, OverflowError, MemoryError, ElementTree.ParseError, zlib.error) as error:
-        raise say_cut(name, error) from error
 
 
 def _collect_triangles(document: Document, name: str) -> RawMesh:

@@ -14,7 +14,7 @@ from typing import BinaryIO
 import numpy as np
 
 from clrecon.errors import RefusedInputError
-from clrecon.exchange.content import PointContent, refuse_file
+from clrecon.exchange.content import PointContent, check_same, refuse_file, write_lines
 from clrecon.exchange.raw_content import RawCloud, columns_of, read_remarks, say_cut
 from clrecon.system.paths import open_regular
 from clrecon.system.pieces import chunks
@@ -50,22 +50,19 @@ def write(stream: BinaryIO, content: PointContent) -> None:
         rows = content.vertices[where]
         if content.hu is not None:
             rows = np.column_stack([rows, content.hu[where]])
-        stream.write((form * len(rows) % tuple(rows.ravel().tolist())).encode("ascii"))
+        write_lines(stream, form, rows)
 
 
 def verify(path: Path, content: PointContent) -> None:
     """Check the head and count the lines of a finished file."""
     header = _header(content)
     with path.open("rb") as stream:
-        found = stream.read(len(header))
-        if found != header:
-            raise refuse_file("in the header", repr(found), repr(header))
+        check_same("in the header", stream.read(len(header)), header)
         lines, end = 0, b""
         while piece := stream.read(_PIECE):
             lines += piece.count(b"\n")
             end = piece[-1:]
-    if lines != len(content.vertices):
-        raise refuse_file("points", lines, len(content.vertices))
+    check_same("points", lines, len(content.vertices))
     if end != b"\n":
         raise refuse_file("at the end", repr(end), "a line end")
 
@@ -74,9 +71,8 @@ def read_cloud(path: Path) -> RawCloud:
     """Read a table of numbers: three columns or more, parted by blanks, tabulators, commas or semicolons.
 
     Lines that begin with ``#``, ``//`` or ``%`` are comments.  The last line before the first point names the columns
-    if it has a word for each of them, with or without a mark of a comment: ``//X Y Z scalar_HU``.  Columns
-    without names beyond the third are left out.  Another line there with words and numbers is refused if a number comes
-    first, else warned of.
+    if it has a word for each of them, also as a comment: ``//X Y Z scalar_HU``.  Columns without names beyond the third
+    are left out.  Another line there with words and numbers is refused if a number comes first, else warned of.
     """
     name = escape_text(path.name)
     head: list[str] = []
