@@ -365,7 +365,7 @@ def _collect_warnings(grid: GridFile, values: GridValues | None, findings: Voxel
 def list_grid(
     path: Path, kind: str, *, rescale: Rescale | None = None, pixels: bool = False, progress: Progress | None = None
 ) -> SeriesListing:
-    """List the one volume of a file, with its certificate, as `read_grid` reads it; with `pixels` also by its voxels."""
+    """List the one volume of a file, with its certificate, for `pixels` also by its voxels; see `read_grid`."""
     grid = _open(path, kind, rescale)
     values = read_values(grid, progress) if pixels else None
     findings = None if values is None else _examine(grid, values)

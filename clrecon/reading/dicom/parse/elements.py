@@ -73,7 +73,7 @@ def describe_way_out() -> str:
 
 
 def find_program(start: bytes) -> str:
-    """Return the kind of program that a file begins with, since the preamble is free for any use (PS3.10 7.1); or ""."""
+    """Return the kind of program that a file begins with, or "": the preamble is free for any use (PS3.10 7.1)."""
     return next((name for mark, name in PROGRAMS.items() if start.startswith(mark)), "")
 
 

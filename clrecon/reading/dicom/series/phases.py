@@ -84,7 +84,7 @@ class Places:
 
 
 def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHeader, SliceHeader], bool]) -> Places:
-    """Leave out copies and find phases of the slices at each place; `same` is true for two slices with the same pixels."""
+    """Leave out copies and find phases of the slices at each place; `same` tells whether two have the same pixels."""
     sorted_out = [_sort_copies(slices, same) for slices in places]
     kept = [[copies[0] for copies in found] for found in sorted_out]
     count = sum(map(len, places))

@@ -101,7 +101,7 @@ def _is_even(headers: Sequence[SliceHeader]) -> bool:
 
 
 def describe_differences(headers: Sequence[SliceHeader]) -> Iterator[tuple[str, Callable[[SliceHeader], bool]]]:
-    """Yield descriptions of values that differ within a stack but should not, and which slices differ from the first."""
+    """Yield descriptions of values that differ within a stack but should not, and which slices have another one."""
     first = headers[0]
     for keyword, values in _values_along(headers, ("KVP", *ALTERNATING)):
         if keyword == "KVP":
@@ -335,7 +335,7 @@ def _read_columns(headers: Sequence[SliceHeader]) -> dict[int, list[bytes]]:
 
 
 def _read_values(header: SliceHeader) -> dict[int, bytes]:
-    """Read the elements of a file that are compared: none if it changed since the scan, as reading its pixels reports."""
+    """Read the elements of a file that are compared: none if it changed since the scan, which its pixels will tell."""
     try:
         # A file that needed `force` is read with it again; for other files it changes nothing.
         values = read_elements(header.file, None, force=True).values
