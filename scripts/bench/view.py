@@ -55,7 +55,7 @@ def _steps(view: Any, hu: float) -> Iterator[tuple[str, Callable[[], Any]]]:
 
     def turn(mode: str, side: int, moving: bool) -> Callable[[], None]:
         def step() -> None:
-            if view.model.mode != mode:
+            if view.model.state.mode != mode:
                 view.do({"do": "set_mode", "name": mode})
             view.do({"do": "turn", "dx": next(turns), "dy": 0.0})
             ask(side, moving)
@@ -70,13 +70,13 @@ def _steps(view: Any, hu: float) -> Iterator[tuple[str, Callable[[], Any]]]:
 
     def release() -> None:
         view.do({"do": "set_iso", "hu": next(levels)})
-        (mesh,) = view.painter.mesh_of_shown(view.model.snapshot())
+        (mesh,) = view.painter.mesh_of_shown(view.model.state)
         mesh.to_pyvista()
 
     def parts() -> None:
         view.do({"do": "set_iso", "hu": next(levels)})
         view.painter._found.clear()  # what is known already would be taken
-        view.painter.find_parts(view.model.snapshot())
+        view.painter.find_parts(view.model.state)
 
     yield "slider", slider
     yield "release", release
@@ -95,7 +95,7 @@ def _steps(view: Any, hu: float) -> Iterator[tuple[str, Callable[[], Any]]]:
     def hide() -> None:
         view.do({"do": "set_mode", "name": "surface"})
         view.do({"do": "set_iso", "hu": hu})
-        view.model.take_parts(view.painter.find_parts(view.model.snapshot()))
+        view.model.take_parts(view.painter.find_parts(view.model.state))
         view.do({"do": "show", "key": "1/1", "visible": False})
         hidden()
 
@@ -117,10 +117,10 @@ def measure_picks(job: Job) -> dict[str, Any]:
     model = ViewModel(objects, iso_value=job.hu)
     places, size, seconds = [], (SIDE, SIDE), 0.0
     with Painter(objects, device=job.device) as painter:
-        (mesh,) = painter.mesh_of_shown(model.snapshot())
+        (mesh,) = painter.mesh_of_shown(model.state)
         for view in ("anterior", "left", "40,25"):
             model.look(view)
-            state = model.snapshot()
+            state = model.state
             rows, columns = np.nonzero(painter.picture(state, size).image[..., 3])
             chosen = np.linspace(0, len(rows) - 1, PICKS // 3).astype(int)
             start = time.perf_counter()

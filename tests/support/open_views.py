@@ -46,7 +46,7 @@ def open_sessions(device: Any) -> Iterator[Callable[..., ViewSession]]:
 
 def find(model: ViewModel, painter: Painter) -> None:
     """Find the parts of a model."""
-    model.take_parts(painter.find_parts(model.snapshot()))
+    model.take_parts(painter.find_parts(model.state))
 
 
 def shown_pixels(picture: Rendering) -> int:

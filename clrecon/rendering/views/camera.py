@@ -14,6 +14,7 @@ from clrecon.geometry.affine import Float64Array, checked_points
 from clrecon.geometry.grid import Grid
 from clrecon.rendering.views.directions import (
     DEFAULT_SIZE,
+    as_point,
     checked_size,
     checked_vector,
     find_up,
@@ -169,7 +170,8 @@ class Camera:
         middle = np.concatenate([corners[:4], corners[-4:]]).mean(axis=0)
         radius = float(np.linalg.norm(corners - middle, axis=1).max())
         parallel = view_angle is None
-        near = cls(_triple(middle + towards), _triple(middle), _triple(up_lps), view_angle, 1.0 if parallel else None)
+        scale = 1.0 if parallel else None
+        near = cls(as_point(middle + towards), as_point(middle), as_point(up_lps), view_angle, scale)
         turns = range(0, 360, TURN_STEP) if turning else (0,)
         needs = [near.orbit(turn)._room_for(corners - middle, width / height) for turn in turns]
         position = middle + (RADII_AWAY * radius if parallel else max(needs)) * towards
@@ -179,7 +181,7 @@ class Camera:
             # A parallel camera stays outside of the volume, and a perspective one at its distance.
             away = max(0.0, float(moved @ -towards)) * towards if parallel else 0.0
             middle, position = middle + moved, position + moved + away
-        return cls(_triple(position), _triple(middle), _triple(up_lps), view_angle, scale).zoomed(zoom)
+        return cls(as_point(position), as_point(middle), as_point(up_lps), view_angle, scale).zoomed(zoom)
 
     def _room_for(self, points: Float64Array, aspect: float) -> float:
         """Return the parallel scale, or the distance of a perspective camera, at which points about the focus fit."""
@@ -340,9 +342,9 @@ class Camera:
         """
         if not np.isfinite([number_or_nan(azimuth), number_or_nan(elevation)]).all():
             raise UsageError(f"a camera orbits by finite angles in degrees, not by {azimuth!r} and {elevation!r}")
-        turn = _rotation((0.0, 0.0, 1.0), azimuth) @ _rotation(self.basis().right, -elevation)
+        turn = rotation_about((0.0, 0.0, 1.0), azimuth) @ rotation_about(self.basis().right, -elevation)
         offset = turn @ np.subtract(self.position, self.focal_point)
-        return replace(self, position=_triple(self.focal_point + offset), up=_triple(turn @ self.up))
+        return replace(self, position=as_point(self.focal_point + offset), up=as_point(turn @ self.up))
 
     @explains_arguments
     def zoomed(self, zoom: float) -> Camera:
@@ -363,12 +365,7 @@ class Camera:
         return replace(self, view_angle=float(2.0 * np.degrees(np.arctan(self.half_height() / factor))))
 
 
-def _triple(vector: Float64Array) -> tuple[float, float, float]:
-    x, y, z = vector.tolist()
-    return x, y, z
-
-
-def _rotation(axis: ArrayLike, degrees: float) -> Float64Array:
+def rotation_about(axis: ArrayLike, degrees: float) -> Float64Array:
     """Return the right-handed rotation about a unit axis, shape (3, 3) (Rodrigues 1840)."""
     x, y, z = np.asarray(axis, dtype=np.float64)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

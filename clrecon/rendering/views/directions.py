@@ -40,6 +40,12 @@ def number_or_nan(value: Any) -> float:
         return math.nan
 
 
+def as_point(vector: Any) -> tuple[float, float, float]:
+    """Return three numbers as floats."""
+    x, y, z = (float(value) for value in vector)
+    return x, y, z
+
+
 def checked_vector(what: str, value: ArrayLike) -> tuple[float, float, float]:
     """Return three finite numbers as floats."""
     try:

@@ -27,7 +27,7 @@ from clrecon.geometry.grid import Grid
 from clrecon.geometry.volume import Volume
 from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.rendering.views.centre_line import Curve, rotation_minimising_normals
-from clrecon.rendering.views.directions import DIRECTIONS, checked_size, number_or_nan
+from clrecon.rendering.views.directions import DIRECTIONS, as_point, checked_size, number_or_nan
 from clrecon.system.text import unknown_name
 
 MOST_SAMPLES = 65536
@@ -152,10 +152,6 @@ def find_plane(
     return replace(camera, parallel_scale=half).zoomed(zoom)
 
 
-def _triple(vector: Float64Array) -> tuple[float, float, float]:
-    return float(vector[0]), float(vector[1]), float(vector[2])
-
-
 def checked_thickness(thickness: float) -> float:
     """Check the thickness of a slice in mm and return it as a float."""
     size = number_or_nan(thickness)
@@ -192,7 +188,7 @@ def plane_sheet(camera: Camera, size: Sequence[int], offset_mm: float = 0.0) -> 
     shift = checked_offset(offset_mm) * forward
     centre = np.add(camera.focal_point, shift)
     position = np.add(camera.position, shift)
-    own = Camera(_triple(position), _triple(centre), camera.up, parallel_scale=0.5 * height * pixel)
+    own = Camera(as_point(position), as_point(centre), camera.up, parallel_scale=0.5 * height * pixel)
     above = 0.5 * height - 0.5 - np.arange(height)
     first = centre + (0.5 - 0.5 * width) * pixel * right
     origins = first + (pixel * above)[:, None] * up

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
@@ -22,14 +22,14 @@ from clrecon.points import PointCloud
 from clrecon.rendering import Rendering
 from clrecon.rendering.pictures.styles import CurveCut, Projection, SlicesInSpace, Style, VolumeLook
 from clrecon.rendering.views.camera import Camera
-from clrecon.rendering.views.directions import checked_size
+from clrecon.rendering.views.directions import as_point, checked_size
 from clrecon.rendering.views.reformation import PLANES, find_plane
 from clrecon.system.progress import Progress
 from clrecon.system.text import unknown_name
 from clrecon.viewer.drawing.looks import LEAST_OPACITY, LabelledLook, Looks, to_voxels
 from clrecon.viewer.drawing.shown_meshes import coarsen_mesh, make_meshes
 from clrecon.viewer.drawing.stage import Stage, take_strips, warm_kernels
-from clrecon.viewer.model.changes import pixel_camera
+from clrecon.viewer.model.changes import pixel_camera, shift_camera
 from clrecon.viewer.model.objects import (
     ShownCloud,
     ShownLabels,
@@ -39,7 +39,8 @@ from clrecon.viewer.model.objects import (
     ViewMode,
     find_modes,
 )
-from clrecon.viewer.model.state import Pick, ShownPart, ViewState, as_point
+from clrecon.viewer.model.parts import number_at
+from clrecon.viewer.model.state import Pick, ShownPart, ViewState
 
 SMALLEST_SIDE = 64
 """Pixels of the shorter side of a coarse picture."""
@@ -145,11 +146,7 @@ class Painter(Stage):
         camera = find_plane(grid, plane, size)
         forward = camera.basis().forward
         shift = float(forward @ np.subtract(state.cross, camera.focal_point)) * forward
-        return replace(
-            camera,
-            position=as_point(np.add(camera.position, shift)),
-            focal_point=as_point(np.add(camera.focal_point, shift)),
-        )
+        return shift_camera(camera, shift)
 
     # Places
 
@@ -198,12 +195,7 @@ class Painter(Stage):
         return key or str(drawn.number)
 
     def _number_at(self, resident: DeviceVolume, labelled: LabelledLook, point: tuple[float, float, float]) -> int:
-        voxels = self.labels_on(resident, labelled)
-        ijk = np.rint(resident.volume.lps_to_ijk([point])[0]).astype(np.int64)
-        if (ijk < 0).any() or (ijk >= resident.volume.shape_ijk).any():
-            return 0
-        i, j, k = ijk
-        return int(voxels[k, j, i])
+        return number_at(resident.volume, self.labels_on(resident, labelled), point)
 
     def mesh_of_shown(self, state: ViewState, progress: Progress | None = None) -> list[Mesh]:
         """Make the meshes of what is shown, see `clrecon.viewer.drawing.saving`."""

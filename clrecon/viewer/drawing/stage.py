@@ -29,6 +29,7 @@ from clrecon.rendering.views.camera import Camera
 from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.viewer.drawing.looks import LabelledLook
+from clrecon.viewer.model.changes import shift_camera
 from clrecon.viewer.model.objects import ShownLabels, ShownMesh, ShownObject, ShownScan
 from clrecon.viewer.model.parts import FoundParts, find_clusters
 from clrecon.viewer.model.state import Point, ViewState
@@ -54,12 +55,7 @@ def take_strips(
     for first in range(0, height, rows):
         end = min(first + rows, height)
         shift = (0.5 * height - 0.5 * (first + end)) * pixel * up
-        own = replace(
-            camera,
-            position=_moved(camera.position, shift),
-            focal_point=_moved(camera.focal_point, shift),
-            parallel_scale=0.5 * (end - first) * pixel,
-        )
+        own = shift_camera(camera, shift, parallel_scale=0.5 * (end - first) * pixel)
         strips.append(take(own, (width, end - first)))
     joined: dict[str, Any] = {
         name: np.concatenate([getattr(strip, name) for strip in strips])
@@ -68,11 +64,6 @@ def take_strips(
     }
     report = {**strips[-1].report, "strips": len(strips)}
     return replace(strips[0], camera=camera, report=report, **joined)
-
-
-def _moved(point: tuple[float, float, float], shift: Any) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in point + shift)
-    return x, y, z
 
 
 SIDE = 20

@@ -17,13 +17,13 @@ from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.operators.rays.mesh_pictures import box_around
 from clrecon.rendering.pictures.label_style import distinct_colors
-from clrecon.rendering.views.camera import Camera
-from clrecon.rendering.views.directions import DIRECTIONS, checked_vector
+from clrecon.rendering.views.camera import Camera, rotation_about
+from clrecon.rendering.views.directions import DIRECTIONS, as_point, checked_vector
 from clrecon.rendering.views.reformation import PLANES
 from clrecon.system.text import unknown_name
 from clrecon.viewer.model.objects import ShownObject, ShownScan
 from clrecon.viewer.model.parts import FoundParts, carry_looks
-from clrecon.viewer.model.state import Color, ShownPart, ViewState, as_point
+from clrecon.viewer.model.state import Color, ShownPart, ViewState
 
 FIT_PIXELS = 1000
 """Height of the picture that a camera is fitted for; only its ratio to the width counts."""
@@ -60,7 +60,7 @@ MOST_MM, LEAST_MM = 1e5, 1e-2
 def turn_camera(camera: Camera, dx: float, dy: float) -> Camera:
     """Turn about the focal point as if the pointer held what is seen there, as pyvista's trackball does."""
     right, up, _ = camera.basis()
-    turn = _rotation(up, -dx * TURN_DEGREES) @ _rotation(right, -dy * TURN_DEGREES)
+    turn = rotation_about(up, -dx * TURN_DEGREES) @ rotation_about(right, -dy * TURN_DEGREES)
     away = turn @ np.subtract(camera.position, camera.focal_point)
     return replace(camera, position=as_point(np.add(camera.focal_point, away)), up=as_point(turn @ up))
 
@@ -68,7 +68,13 @@ def turn_camera(camera: Camera, dx: float, dy: float) -> Camera:
 def roll_camera(camera: Camera, degrees: float) -> Camera:
     """Turn about the view; positive degrees turn the picture clockwise."""
     _, up, forward = camera.basis()
-    return replace(camera, up=as_point(_rotation(forward, -degrees) @ up))
+    return replace(camera, up=as_point(rotation_about(forward, -degrees) @ up))
+
+
+def shift_camera(camera: Camera, shift: Float64Array, **changes: Any) -> Camera:
+    """Return a camera that is moved by a vector, LPS mm, and changed otherwise."""
+    position, focal_point = as_point(camera.position + shift), as_point(camera.focal_point + shift)
+    return replace(camera, position=position, focal_point=focal_point, **changes)
 
 
 def pan_camera(camera: Camera, dx: float, dy: float) -> Camera:
@@ -76,11 +82,7 @@ def pan_camera(camera: Camera, dx: float, dy: float) -> Camera:
     right, up, _ = camera.basis()
     height = _height_mm(camera)
     shift = height * (dy * up - dx * right)
-    return replace(
-        camera,
-        position=as_point(np.add(camera.position, shift)),
-        focal_point=as_point(np.add(camera.focal_point, shift)),
-    )
+    return shift_camera(camera, shift)
 
 
 def zoom_camera(camera: Camera, factor: float, at: tuple[float, float] = (0.0, 0.0)) -> Camera:
@@ -111,12 +113,7 @@ def pixel_camera(camera: Camera, size: tuple[int, int], x: float, y: float) -> C
     pixel = 2.0 * camera.half_height() / height
     offset = (x - 0.5 * width) * pixel * right + (0.5 * height - y) * pixel * up
     if camera.is_parallel:
-        return replace(
-            camera,
-            position=as_point(np.add(camera.position, offset)),
-            focal_point=as_point(np.add(camera.focal_point, offset)),
-            parallel_scale=0.5 * pixel,
-        )
+        return shift_camera(camera, offset, parallel_scale=0.5 * pixel)
     along = forward + offset
     along /= np.linalg.norm(along)
     angle = max(1e-3, math.degrees(pixel))
@@ -126,13 +123,6 @@ def pixel_camera(camera: Camera, size: tuple[int, int], x: float, y: float) -> C
 def _height_mm(camera: Camera) -> float:
     """Return the height of the picture at the focal point."""
     return 2.0 * camera.half_height() * (1.0 if camera.is_parallel else camera.distance)
-
-
-def _rotation(axis: Float64Array, degrees: float) -> Float64Array:
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    radians = math.radians(degrees)
-    return np.asarray(np.eye(3) + math.sin(radians) * cross + (1.0 - math.cos(radians)) * cross @ cross)
 
 
 MOST_UNDO = 200

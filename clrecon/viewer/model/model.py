@@ -15,7 +15,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.rendering.pictures.annotations import edge_letters
 from clrecon.rendering.pictures.styles import DEFAULT_ISO_VALUE
 from clrecon.rendering.views.clip import Clip
-from clrecon.rendering.views.directions import checked_vector
+from clrecon.rendering.views.directions import as_point, checked_vector
 from clrecon.rendering.views.reformation import PLANES
 from clrecon.system.text import format_hu, unknown_name
 from clrecon.viewer.model.changes import ChangingView, checked_numbers, fit_camera, plane_step
@@ -36,10 +36,7 @@ from clrecon.viewer.model.state import (
     ClipPlane,
     Measure,
     Pick,
-    Point,
-    ShownPart,
     ViewState,
-    as_point,
     clip_direction,
     measure_points,
 )
@@ -104,47 +101,6 @@ class ViewModel(ChangingView):
             return {name: mode for name, mode in every.items() if name != "labels" or self.label_maps}
         return {"labels": every["labels"]} if self.label_maps else {"surface": every["surface"]}
 
-    @property
-    def mode(self) -> str:
-        return self.state.mode
-
-    @property
-    def iso_value(self) -> float:
-        """HU of the surfaces of all scans."""
-        return self.state.iso_value
-
-    @property
-    def cross(self) -> Point:
-        """Where the three slices go through, LPS mm."""
-        return self.state.cross
-
-    @property
-    def parts(self) -> list[ShownPart]:
-        """All parts, those of a scan once they are found."""
-        return list(self.state.parts)
-
-    @property
-    def tool(self) -> str | None:
-        """The tool that takes the next points."""
-        return self.state.tool
-
-    @property
-    def measures(self) -> list[Measure]:
-        return list(self.state.measures)
-
-    @property
-    def clips(self) -> list[ClipPlane]:
-        return list(self.state.clips)
-
-    @property
-    def clip(self) -> Clip | None:
-        """The part of space that is shown; None: all."""
-        return self.state.clip
-
-    def snapshot(self) -> ViewState:
-        """Return the state, which is frozen."""
-        return self.state
-
     # What is shown of scans
 
     def set_iso(self, hu: float) -> None:
@@ -157,23 +113,23 @@ class ViewModel(ChangingView):
             raise UsageError(
                 f"the iso value runs from {format_hu(low)} to {format_hu(high)} HU here, not to {format_hu(value)}"
             )
-        self._change("iso", f"the iso value {format_hu(self.iso_value)} HU", iso_value=value)
+        self._change("iso", f"the iso value {format_hu(self.state.iso_value)} HU", iso_value=value)
 
     def step_iso(self, by: float) -> None:
         """Move the iso value by HU, to the end of the slider at most."""
         (step,) = checked_numbers("a step of the iso value", by)
         low, high = self.iso_range
-        self.set_iso(min(max(self.iso_value + step, low), high))
+        self.set_iso(min(max(self.state.iso_value + step, low), high))
 
     def set_mode(self, name: str) -> None:
         if name not in self.modes:
             raise UsageError(unknown_name("mode", name, self.modes))
-        self._change("mode", f"the mode {self.mode}", mode=name, picture_window=None)
+        self._change("mode", f"the mode {self.state.mode}", mode=name, picture_window=None)
 
     def step_mode(self, steps: int) -> None:
         """Go to a mode further down the list, behind the last one to the first."""
         names = list(self.modes)
-        self.set_mode(names[(names.index(self.mode) + steps) % len(names)])
+        self.set_mode(names[(names.index(self.state.mode) + steps) % len(names)])
 
     def set_window(self, low: float, high: float, of: str = "slices") -> None:
         """Set the HU that are black and white, of the three slices or of the projection ("picture")."""
@@ -181,9 +137,9 @@ class ViewModel(ChangingView):
         if not low < high:
             raise UsageError(f"a window runs from black to white, the lower HU first, not from {low:g} to {high:g}")
         if of == "picture":
-            mode = self.modes[self.mode]
+            mode = self.modes[self.state.mode]
             if mode.kind not in ("projection", "slices"):
-                raise UsageError(f"the mode {self.mode} has no window: mip, minip, drr and slices have one")
+                raise UsageError(f"the mode {self.state.mode} has no window: mip, minip, drr and slices have one")
             self._change("picture window", "the window", picture_window=(low, high))
         elif of == "slices":
             self._change("window", "the window", window=(low, high))
@@ -203,7 +159,7 @@ class ViewModel(ChangingView):
         (count,) = checked_numbers("steps", steps)
         step = plane_step(self.scans, plane)
         low, high = self._span()
-        moved = np.clip(np.array(self.cross) + count * step, low, high)
+        moved = np.clip(np.array(self.state.cross) + count * step, low, high)
         self._change(f"scroll {plane}", "the slice", cross=as_point(moved))
 
     def set_cross(self, point: Sequence[float]) -> None:
@@ -250,11 +206,6 @@ class ViewModel(ChangingView):
 
     def clear_measures(self) -> None:
         self._change("clear measures", "the measures", measures=(), points=())
-
-    @property
-    def curve(self) -> list[Point]:
-        """Points of the curve that is being made, else of the last one; LPS mm."""
-        return list(self.state.curve)
 
     # Clips
 
@@ -305,7 +256,7 @@ class ViewModel(ChangingView):
             return
         low, high = self._span(self.objects)
         half = 0.5 * BOX_SHARE * (high - low)
-        middle = np.clip(np.array(self.cross), low + half, high - half)
+        middle = np.clip(np.array(self.state.cross), low + half, high - half)
         self.set_clip_box((middle - half).tolist(), (middle + half).tolist())
 
     # What panels show

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -19,7 +19,8 @@ from clrecon.points import PointCloud
 from clrecon.rendering.looks.presets import PRESETS
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.views.camera import box_corners
-from clrecon.viewer.model.state import ShownPart, as_point
+from clrecon.rendering.views.directions import as_point
+from clrecon.viewer.model.state import ShownPart
 
 if TYPE_CHECKING:
     from clrecon.jobs.view.inputs import OpenedInput
@@ -76,14 +77,10 @@ class ShownObject:
     said: What has to be said of it, such as that it was turned from RAS.
     """
 
+    kind: ClassVar[str]
     number: int
     name: str
     said: tuple[str, ...] = ()
-
-    @property
-    def kind(self) -> str:
-        """ "scan", "mesh", "cloud" or "labels"."""
-        raise NotImplementedError
 
     @property
     def corners(self) -> Float64Array:
@@ -95,11 +92,8 @@ class ShownObject:
 class ShownScan(ShownObject):
     """A scan: shown as a surface, by volume rendering, as a projection or in slices."""
 
+    kind = "scan"
     volume: Volume
-
-    @property
-    def kind(self) -> str:
-        return "scan"
 
     @property
     def corners(self) -> Float64Array:
@@ -110,11 +104,8 @@ class ShownScan(ShownObject):
 class ShownMesh(ShownObject):
     """A mesh; it has normals, so that they are not made again for each picture."""
 
+    kind = "mesh"
     mesh: Mesh
-
-    @property
-    def kind(self) -> str:
-        return "mesh"
 
     @property
     def corners(self) -> Float64Array:
@@ -125,11 +116,8 @@ class ShownMesh(ShownObject):
 class ShownCloud(ShownObject):
     """A cloud of points."""
 
+    kind = "cloud"
     cloud: PointCloud
-
-    @property
-    def kind(self) -> str:
-        return "cloud"
 
     @property
     def corners(self) -> Float64Array:
@@ -140,12 +128,9 @@ class ShownCloud(ShownObject):
 class ShownLabels(ShownObject):
     """A label map: it colours and divides the scan of number `within`, or is shown alone."""
 
+    kind = "labels"
     labels: LabelMap
     within: int | None = None
-
-    @property
-    def kind(self) -> str:
-        return "labels"
 
     @property
     def corners(self) -> Float64Array:

@@ -74,13 +74,14 @@ class FoundParts:
     placed: ResampledLabels
     parts: tuple[ShownPart, ...]
 
-    def number_at(self, place: Point) -> int:
-        """Return the number of the part whose voxel is nearest to a place in LPS mm; 0 outside."""
-        ijk = np.rint(self.volume.lps_to_ijk([place])[0]).astype(np.int64)
-        if (ijk < 0).any() or (ijk >= self.volume.shape_ijk).any():
-            return 0
-        i, j, k = ijk
-        return int(self.labels.voxels[k, j, i])
+
+def number_at(volume: Volume, numbers: NDArray[Any], place: Point) -> int:
+    """Return the number of the voxel that is nearest to a place in LPS mm; 0 outside of the volume."""
+    ijk = np.rint(volume.lps_to_ijk([place])[0]).astype(np.int64)
+    if (ijk < 0).any() or (ijk >= volume.shape_ijk).any():
+        return 0
+    i, j, k = ijk
+    return int(numbers[k, j, i])
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +231,10 @@ def carry_looks(old: Sequence[ShownPart], found: FoundParts) -> list[ShownPart]:
             continue
         number = 0
         if part.kind == "cluster":
-            number = SMALLER if part.number == SMALLER else 0 if part.inside is None else found.number_at(part.inside)
+            if part.number == SMALLER:
+                number = SMALLER
+            elif part.inside is not None:
+                number = number_at(found.volume, found.labels.voxels, part.inside)
         known = fresh.get(number)
         if known is not None and known.is_plain and (number == 0) == (part.kind == "rest"):
             fresh[number] = replace(known, color=part.color, opacity=part.opacity, visible=part.visible)

@@ -139,12 +139,6 @@ def clip_direction(direction: str | Sequence[float]) -> tuple[Point, str]:
     return (x, y, z), f"{x:.2f}, {y:.2f}, {z:.2f}"
 
 
-def as_point(vector: Any) -> Point:
-    """Return three numbers as floats."""
-    x, y, z = (float(value) for value in vector)
-    return x, y, z
-
-
 @dataclass(frozen=True, kw_only=True)
 class ShownPart:
     """A part that can be switched: an object as a whole, a cluster of a scan's voxels, or a label.

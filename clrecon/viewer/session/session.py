@@ -112,11 +112,11 @@ class ViewSession(Closing):
         width, height = checked_size(size)
         self.fit(size)
         with self._lock:
-            state = self.model.snapshot()
+            state = self.model.state
 
         def take(job: Job) -> None:
             with self._lock:
-                now, share = self.model.snapshot() if moving else state, self._share
+                now, share = self.model.state if moving else state, self._share
             made = self.painter.picture(now, (width, height), sharp=not moving, share=share, cancelled=job.cancelled)
             if moving:
                 self._steer(made, (width, height))
@@ -143,7 +143,7 @@ class ViewSession(Closing):
 
     def picture_key(self, view: str) -> Hashable:
         """Return what the picture of a view depends on, see `clrecon.viewer.session.picture_facts`."""
-        return picture_key(self.model.snapshot(), view)
+        return picture_key(self.model.state, view)
 
     def slice(self, plane: str, size: Sequence[int], then: Callable[[Rendering], None]) -> None:
         """Ask for a slice through the cross: "axial", "coronal" or "sagittal"; the latest of each plane wins."""
@@ -151,7 +151,7 @@ class ViewSession(Closing):
 
         def take(job: Job) -> None:
             with self._lock:
-                state = self.model.snapshot()
+                state = self.model.state
             made = self.painter.slice(state, plane, checked)
             if not job.cancelled():
                 then(made)
@@ -162,7 +162,7 @@ class ViewSession(Closing):
         """Ask for the picture along the curve."""
         checked = checked_size(size)
         with self._lock:
-            state = self.model.snapshot()
+            state = self.model.state
         self._pictures.ask(
             "curve", lambda job: then(self.painter.curve_picture(state, checked)), rank=2, gives_way=False
         )
@@ -204,7 +204,7 @@ class ViewSession(Closing):
     def rest(self) -> None:
         """Say that nothing moves: parts are found where those in the list are outdated."""
         with self._lock:
-            state = self.model.snapshot()
+            state = self.model.state
             wanted = bool(self.model.scans) and not self._parts_failed
             known = self.model.parts_known and self.painter.has_parts(state)
         if wanted and not known and "parts" not in self._work.busy:
@@ -215,7 +215,7 @@ class ViewSession(Closing):
 
         def find(job: Job) -> None:
             with self._lock:
-                state = self.model.snapshot()
+                state = self.model.state
             found = self.painter.find_parts(state, job.progress)
             with self._lock:
                 if job.cancelled():
@@ -315,7 +315,7 @@ class ViewSession(Closing):
         """
         checked = checked_size(size)
         with self._lock:
-            state = self.model.snapshot()
+            state = self.model.state
         check_target(path, self.painter, state)
 
         def write(job: Job) -> None:
@@ -354,7 +354,7 @@ class ViewSession(Closing):
         width, height = checked_size(size)
         if not (0.0 <= x <= width and 0.0 <= y <= height):
             raise UsageError(f"the pixel {x:g}, {y:g} lies outside of a picture of {width} x {height}")
-        state = self.model.snapshot()
+        state = self.model.state
         if plane is not None:
             return self.painter.pick_slice(state, plane, (width, height), x, y)
         return self.painter.pick(state, (width, height), x, y)

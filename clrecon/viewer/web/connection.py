@@ -12,11 +12,11 @@ import json
 import secrets
 import shutil
 import threading
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import ClreconError, UsageError
 from clrecon.system.log import get_logger
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from aiohttp import web
 
     from clrecon.rendering import Rendering
-    from clrecon.viewer.model.model import ViewModel
+    from clrecon.viewer.session.session import ViewSession
 
 
 @dataclass(frozen=True)
@@ -97,24 +97,6 @@ def ignore_line(line: str) -> None:
     """Drop a line that is said."""
 
 
-class Session(Protocol):
-    """What a connection needs of `clrecon.viewer.session.session.ViewSession`."""
-
-    model: ViewModel
-
-    def do(self, command: Mapping[str, Any]) -> dict[str, Any]: ...
-    def facts(self) -> dict[str, Any]: ...
-    def fit(self, size: tuple[int, int]) -> None: ...
-    def picture_key(self, view: str) -> Hashable: ...
-    def picture(self, size: tuple[int, int], moving: bool, then: Callable[[Rendering], None]) -> None: ...
-    def slice(self, plane: str, size: tuple[int, int], then: Callable[[Rendering], None]) -> None: ...
-    def curve_picture(self, size: tuple[int, int], then: Callable[[Rendering], None]) -> None: ...
-    def rest(self) -> None: ...
-    def save(self, path: Path, then: Callable[[list[str]], None], size: tuple[int, int]) -> None: ...
-    def dismiss(self) -> None: ...
-    def close(self) -> None: ...
-
-
 class Connection:
     """One browser.
 
@@ -127,7 +109,7 @@ class Connection:
 
     def __init__(
         self,
-        open_session: Callable[[Callable[[], None]], Session],
+        open_session: Callable[[Callable[[], None]], ViewSession],
         socket: web.WebSocketResponse,
         folder: Path,
         *,

@@ -42,7 +42,8 @@ from clrecon.system.log import get_logger
 from clrecon.system.progress import Progress
 from clrecon.viewer.drawing.saving import check_names
 from clrecon.viewer.session.opening import OpenedView, open_view
-from clrecon.viewer.web.connection import Connection, Download, Session, ignore_line
+from clrecon.viewer.session.session import ViewSession
+from clrecon.viewer.web.connection import Connection, Download, ignore_line
 
 if TYPE_CHECKING:
     from aiohttp import web
@@ -183,7 +184,7 @@ _MOST_REASON = 120
 """Bytes of the reason for closing a WebSocket."""
 
 Handler = Callable[[Any], Awaitable[Any]]
-OpenSession = Callable[[Callable[[], None]], Session]
+OpenSession = Callable[[Callable[[], None]], ViewSession]
 
 
 class WebServer:

@@ -32,8 +32,8 @@ def test_every_mode_makes_a_picture_sharp_and_coarse(view):
     model, painter = view(scenes.make_scan(), scenes.make_mesh(), scenes.make_cloud(), scenes.make_labels())
     for mode in model.modes:
         model.set_mode(mode)
-        sharp = painter.picture(model.snapshot(), SIZE)
-        coarse = painter.picture(model.snapshot(), SIZE, sharp=False, share=0.5)
+        sharp = painter.picture(model.state, SIZE)
+        coarse = painter.picture(model.state, SIZE, sharp=False, share=0.5)
         assert sharp.size == SIZE and shown_pixels(sharp) > 100, mode
         assert sharp.report["sharp"] and sharp.report["ms"] > 0.0
         assert coarse.size == (77, 64) and not coarse.report["sharp"], mode  # the shorter side has 64 pixels at least
@@ -42,7 +42,7 @@ def test_every_mode_makes_a_picture_sharp_and_coarse(view):
 
 def test_a_surface_picture_is_that_of_render(view, device):
     model, painter = view()
-    mine = painter.picture(model.snapshot(), SIZE)
+    mine = painter.picture(model.state, SIZE)
     other = render(
         model.objects[0].volume, "surface", iso_value=scenes.ISO, camera=model.camera, size=SIZE,
         background="transparent", device=device,
@@ -57,9 +57,9 @@ def test_a_large_picture_in_strips_is_the_same(view, monkeypatch, mode):
     model, painter = view()
     model.set_mode(mode)
     model.turn(0.1, 0.05)
-    whole = painter.picture(model.snapshot(), SIZE)
+    whole = painter.picture(model.state, SIZE)
     monkeypatch.setattr(stage, "STRIP_PIXELS", 96 * 32)
-    parts = painter.picture(model.snapshot(), SIZE)
+    parts = painter.picture(model.state, SIZE)
     assert parts.report.get("strips", 1) == (1 if mode == "drr" else 3) and parts.camera == whole.camera
     apart = np.abs(parts.image.astype(int) - whole.image.astype(int)).max(axis=2)
     assert (apart > 3).mean() < (0.3 if mode == "bone" else 0.002)  # samples of volume rendering lie at random places
@@ -70,34 +70,34 @@ def test_a_large_picture_in_strips_is_the_same(view, monkeypatch, mode):
     if mode != "drr":
         asked = []
         with pytest.raises(Cancelled):
-            painter.picture(model.snapshot(), SIZE, cancelled=lambda: bool(asked.append(1)) or len(asked) > 3)
+            painter.picture(model.state, SIZE, cancelled=lambda: bool(asked.append(1)) or len(asked) > 3)
 
 
 def test_a_cancelled_picture_raises(view):
     model, painter = view()
     asked = []
     with pytest.raises(Cancelled):
-        painter.picture(model.snapshot(), SIZE, cancelled=lambda: bool(asked.append(1)) or len(asked) > 1)
+        painter.picture(model.state, SIZE, cancelled=lambda: bool(asked.append(1)) or len(asked) > 1)
     assert len(asked) == 2  # before it begins, and when the device is about to work
 
 
 def test_nothing_shown_is_an_empty_picture(view):
     model, painter = view()
     model.show("1", False)
-    picture = painter.picture(model.snapshot(), SIZE)
+    picture = painter.picture(model.state, SIZE)
     assert shown_pixels(picture) == 0 and np.isnan(picture.depth).all()
     with pytest.raises(NoSurfaceError, match="nothing"):
-        painter.mesh_of_shown(model.snapshot())
+        painter.mesh_of_shown(model.state)
 
 
 def test_picks_lie_on_the_mesh(view):
     model, painter = view()
-    (mesh,) = painter.mesh_of_shown(model.snapshot())
-    picture = painter.picture(model.snapshot(), SIZE)
+    (mesh,) = painter.mesh_of_shown(model.state)
+    picture = painter.picture(model.state, SIZE)
     rows, columns = np.nonzero(picture.image[..., 3])
     picks = []
     for place in np.random.default_rng(3).choice(len(rows), 60, replace=False):
-        pick = painter.pick(model.snapshot(), SIZE, columns[place] + 0.5, rows[place] + 0.5)
+        pick = painter.pick(model.state, SIZE, columns[place] + 0.5, rows[place] + 0.5)
         assert pick is not None and pick.object == 1 and pick.part == "1"
         picks.append(pick.point)
         depth = float(picture.depth[rows[place], columns[place]])
@@ -115,16 +115,16 @@ def test_a_pick_takes_the_nearest_object_and_none_beside(view):
         for number, point in ((1, scenes.middle(2)), (2, scenes.middle(0) + (0.0, -25.0, 0.0)))
     }
     for number, (x, y) in spots.items():
-        pick = painter.pick(model.snapshot(), SIZE, x, y)
+        pick = painter.pick(model.state, SIZE, x, y)
         assert pick is not None and pick.object == number and pick.part == str(number)
-    assert painter.pick(model.snapshot(), SIZE, 0.5, 0.5) is None
+    assert painter.pick(model.state, SIZE, 0.5, 0.5) is None
     model.set_perspective(True)
     x, y = model.camera.project([scenes.middle(0) + (0.0, -25.0, 0.0)], SIZE)[0][0]
-    assert painter.pick(model.snapshot(), SIZE, x, y).object == 2
+    assert painter.pick(model.state, SIZE, x, y).object == 2
     cloud = scenes.make_cloud()
     model, painter = view(cloud)
     nearest = cloud.points[np.argmin(cloud.points[:, 1])]
-    pick = painter.pick(model.snapshot(), SIZE, *model.camera.project([nearest], SIZE)[0][0])
+    pick = painter.pick(model.state, SIZE, *model.camera.project([nearest], SIZE)[0][0])
     assert pick.object == 1 and pick.point == pytest.approx(nearest, abs=0.2) and pick.hu is None
 
 
@@ -132,39 +132,40 @@ def test_slices_map_pixels_to_the_patient_and_show_the_scan(view):
     model, painter = view()
     model.set_cross(tuple(scenes.middle(0)))
     for plane, normal in (("axial", (0, 0, 1)), ("coronal", (0, 1, 0)), ("sagittal", (1, 0, 0))):
-        picture = painter.slice(model.snapshot(), plane, SIZE)
+        picture = painter.slice(model.state, plane, SIZE)
         (pixel,), (depth,) = picture.camera.project([scenes.middle(0)], SIZE)
         assert picture.values[int(pixel[1]), int(pixel[0])] > 900.0
         assert abs(np.dot(np.subtract(picture.camera.focal_point, scenes.middle(0)), normal)) < 1e-6
         assert depth > 0.0
-        pick = painter.pick_slice(model.snapshot(), plane, SIZE, *pixel)
+        pick = painter.pick_slice(model.state, plane, SIZE, *pixel)
         assert pick.point == pytest.approx(scenes.middle(0), abs=1e-6) and pick.hu > 900.0
-        edge = painter.slice_camera(model.snapshot(), plane, SIZE)
+        edge = painter.slice_camera(model.state, plane, SIZE)
         assert edge.focal_point == pytest.approx(picture.camera.focal_point)
     with pytest.raises(UsageError, match="axial"):
-        painter.slice(model.snapshot(), "oblique", SIZE)
+        painter.slice(model.state, "oblique", SIZE)
 
 
 def test_a_slice_without_a_scan_is_empty_and_one_of_labels_is_not(view):
     model, painter = view(scenes.make_mesh())
-    assert shown_pixels(painter.slice(model.snapshot(), "axial", SIZE)) == 0
+    assert shown_pixels(painter.slice(model.state, "axial", SIZE)) == 0
     model, painter = view(scenes.make_labels())
-    picture = painter.slice(model.snapshot(), "axial", SIZE)
+    picture = painter.slice(model.state, "axial", SIZE)
     assert np.ptp(picture.image[..., :3].astype(int), axis=2).max() > 20  # coloured
 
 
 def test_a_whole_scan_is_translucent_before_its_parts_are_known(view):
     model, painter = view()
     model.set_opacity("1", 0.4)
-    image = painter.picture(model.snapshot(), SIZE).image
+    image = painter.picture(model.state, SIZE).image
     assert 0 < image[..., 3][image[..., 3] > 0].min() < 200
 
 
 def test_a_clip_cuts_picture_and_mesh_flat_and_closed(view, device):
     model, painter = view()
     model.add_clip("left")
-    model.move_clip(0, (scenes.middle(0)[0] - model.clips[0].low) / (model.clips[0].high - model.clips[0].low))
-    state = model.snapshot()
+    (clip,) = model.state.clips
+    model.move_clip(0, (scenes.middle(0)[0] - clip.low) / (clip.high - clip.low))
+    state = model.state
     (mesh,) = painter.mesh_of_shown(state)
     assert mesh.quality()["closed"] and mesh.bounds[1, 0] == pytest.approx(scenes.middle(0)[0], abs=0.02)
     half = 2 / 3 * np.pi * scenes.BALLS[0][1] ** 3 / 1000.0
@@ -177,8 +178,8 @@ def test_a_clip_cuts_picture_and_mesh_flat_and_closed(view, device):
 def test_an_oblique_clip_of_a_mesh_cuts_its_triangles_at_the_plane(view):
     model, painter = view(scenes.make_mesh())
     model.add_clip((1.0, 2.0, 0.5))
-    (mesh,) = painter.mesh_of_shown(model.snapshot())
-    (*normal, offset) = model.clip.planes[0]
+    (mesh,) = painter.mesh_of_shown(model.state)
+    (*normal, offset) = model.state.clip.planes[0]
     heights = mesh.vertices @ normal - offset
     assert heights.min() == pytest.approx(0.0, abs=1e-4) and mesh.triangle_count > 100
     assert mesh.area == pytest.approx(0.5 * scenes.make_mesh().area, rel=0.02)
@@ -189,33 +190,33 @@ def test_a_large_mesh_is_coarse_while_it_moves(view, monkeypatch):
 
     monkeypatch.setattr(module, "COARSE_TRIANGLES", 400)
     model, painter = view(scenes.make_mesh())
-    full = painter.picture(model.snapshot(), SIZE)
+    full = painter.picture(model.state, SIZE)
     painter.make_coarse()
-    coarse = painter.picture(model.snapshot(), SIZE, sharp=False)
+    coarse = painter.picture(model.state, SIZE, sharp=False)
     assert 50 < coarse.report["triangles"] < 900 < full.report["triangles"]
-    assert np.array_equal(painter.picture(model.snapshot(), SIZE).image, full.image)
+    assert np.array_equal(painter.picture(model.state, SIZE).image, full.image)
     assert shown_pixels(coarse) == pytest.approx(shown_pixels(full), rel=0.2)
 
 
 def test_a_translucent_mesh_is_opaque_while_it_moves(view):
     model, painter = view(scenes.make_mesh())
     model.set_opacity("1", 0.3)
-    assert painter.picture(model.snapshot(), SIZE).image[..., 3].max() < 250
-    assert painter.picture(model.snapshot(), SIZE, sharp=False).image[..., 3].max() == 255
+    assert painter.picture(model.state, SIZE).image[..., 3].max() < 250
+    assert painter.picture(model.state, SIZE, sharp=False).image[..., 3].max() == 255
     asked = []
     with pytest.raises(Cancelled):  # between its layers
-        painter.picture(model.snapshot(), SIZE, cancelled=lambda: bool(asked.append(1)) or len(asked) > 4)
-    assert painter.pick(model.snapshot(), SIZE, 48, 40).point[1] < scenes.middle(0)[1] - 28.0
+        painter.picture(model.state, SIZE, cancelled=lambda: bool(asked.append(1)) or len(asked) > 4)
+    assert painter.pick(model.state, SIZE, 48, 40).point[1] < scenes.middle(0)[1] - 28.0
 
 
 def test_a_curve_straightens_the_scan(view):
     model, painter = view()
     with pytest.raises(UsageError, match="two points"):
-        painter.curve_picture(model.snapshot(), SIZE)
+        painter.curve_picture(model.state, SIZE)
     model.start_tool("curve")
     for number in (0, 1):
         model.add_point(Pick(point=tuple(scenes.middle(number))))
-    picture = painter.curve_picture(model.snapshot(), SIZE)
+    picture = painter.curve_picture(model.state, SIZE)
     assert picture.size == SIZE and np.nanmax(picture.values) > 900.0
 
 
@@ -232,13 +233,13 @@ def test_without_the_table_another_volume_is_shown(view, monkeypatch):
         return made
 
     monkeypatch.setattr(body, "remove_table", remove)
-    before = shown_pixels(painter.picture(model.snapshot(), SIZE))
+    before = shown_pixels(painter.picture(model.state, SIZE))
     assert not painter.knows_table
     assert painter.remove_table()[1]["dense_voxels_removed"] == 7 and painter.knows_table
     model.set_table(False)
-    assert 0 < shown_pixels(painter.picture(model.snapshot(), SIZE)) < before
+    assert 0 < shown_pixels(painter.picture(model.state, SIZE)) < before
     model.undo()
-    assert shown_pixels(painter.picture(model.snapshot(), SIZE)) == before
+    assert shown_pixels(painter.picture(model.state, SIZE)) == before
 
 
 def test_two_views_share_a_painter_without_disturbing_each_other(view):
@@ -248,10 +249,10 @@ def test_two_views_share_a_painter_without_disturbing_each_other(view):
     find(other, painter)
     one.show("1/1", False)
     other.set_color("1/1", (0.0, 0.0, 1.0))
-    pictures = [painter.picture(each.snapshot(), SIZE).image for each in (one, other)]
+    pictures = [painter.picture(each.state, SIZE).image for each in (one, other)]
     for _ in range(2):
         for each, before in zip((one, other), pictures, strict=True):
-            assert np.array_equal(painter.picture(each.snapshot(), SIZE).image, before)
+            assert np.array_equal(painter.picture(each.state, SIZE).image, before)
     assert not np.array_equal(*pictures)
 
 
@@ -259,7 +260,7 @@ def test_a_scan_in_slabs_is_shown_too(device):
     objects = show_objects([scenes.make_scan()])
     model = ViewModel(objects, iso_value=scenes.ISO)
     with Painter(objects, device=device) as whole, Painter(objects, device=device, memory=80_000) as slabs:
-        pictures = [each.picture(model.snapshot(), (24, 20)) for each in (whole, slabs)]
+        pictures = [each.picture(model.state, (24, 20)) for each in (whole, slabs)]
         assert pictures[1].report["slabs"] > 1
         assert np.array_equal(pictures[0].image, pictures[1].image)
 

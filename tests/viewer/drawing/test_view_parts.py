@@ -35,7 +35,7 @@ def test_parts_lie_over_their_bone_in_slices_of_an_uneven_scan(view, plane):
     model.set_color("1/1", (1.0, 0.0, 0.0))
     at = painter.objects[0].volume.ijk_to_lps([scenes.BALLS[0][0]])[0]
     model.set_cross(tuple(at))
-    picture = painter.slice(model.snapshot(), plane, (200, 200))
+    picture = painter.slice(model.state, plane, (200, 200))
     tinted = picture.image[..., 0].astype(int) - picture.image[..., 1] > 30
     bone = np.nan_to_num(picture.values, nan=-1000.0) >= scenes.ISO
     assert tinted[bone].mean() > 0.97 and bone[tinted].mean() > 0.6  # parts are grown by a voxel
@@ -44,7 +44,7 @@ def test_parts_lie_over_their_bone_in_slices_of_an_uneven_scan(view, plane):
 def test_parts_are_the_balls_with_their_size(view):
     model, painter = view()
     find(model, painter)
-    parts = {each.key: each for each in model.parts}
+    parts = {each.key: each for each in model.state.parts}
     assert list(parts) == ["1", "1/1", "1/2", "1/3", "1/0"]
     for number, (_, radius) in enumerate(scenes.BALLS):
         part = parts[f"1/{number + 1}"]
@@ -54,8 +54,8 @@ def test_parts_are_the_balls_with_their_size(view):
             high >= scenes.middle(number) + radius - 1.5
         ).all()
         assert np.linalg.norm(np.subtract(part.inside, scenes.middle(number))) < radius
-    assert model.parts_known and painter.has_parts(model.snapshot())
-    assert painter.find_parts(model.snapshot())[0] is painter.find_parts(model.snapshot())[0]
+    assert model.parts_known and painter.has_parts(model.state)
+    assert painter.find_parts(model.state)[0] is painter.find_parts(model.state)[0]
 
 
 def test_many_parts_are_twenty_and_the_rest_together(view):
@@ -64,12 +64,12 @@ def test_many_parts_are_twenty_and_the_rest_together(view):
     voxels[1, 1, 1:3] = 700
     model, painter = view(Volume(voxels, np.eye(4)))
     find(model, painter)
-    clusters = [each for each in model.parts if each.kind == "cluster"]
+    clusters = [each for each in model.state.parts if each.kind == "cluster"]
     count = 3 * 10 * 13
     assert len(clusters) == 21 and clusters[0].count == 2
     assert clusters[-1].name == f"{count - 20} smaller parts" and clusters[-1].count == count - 20
     model.only("1/1")
-    (mesh,) = painter.mesh_of_shown(model.snapshot())
+    (mesh,) = painter.mesh_of_shown(model.state)
     assert mesh.bounds[1] - mesh.bounds[0] == pytest.approx([2.0, 1.0, 1.0], abs=0.4)
 
 
@@ -83,7 +83,7 @@ def test_parts_and_looks_of_long_ago_are_dropped(view, monkeypatch):
         model.set_iso(float(hu))
         find(model, painter)
         model.set_color("1/1", (1.0, 0.1 * hu / 100.0, 0.0))
-        painter.picture(model.snapshot(), SIZE)
+        painter.picture(model.state, SIZE)
     assert [key[1] for key in painter._found] == [500.0, 600.0, 700.0]
     kept = [style for style in painter._looks._kept.values() if getattr(style, "labels", None) is not None]
     assert [style.iso_value for style in kept] == [600.0, 700.0]
@@ -96,7 +96,7 @@ def test_parts_and_looks_of_long_ago_are_dropped(view, monkeypatch):
 def test_no_voxel_at_the_iso_value_is_no_part(view):
     model, painter = view(Volume(np.full((4, 5, 6), -900, np.int16), np.eye(4)))
     find(model, painter)
-    assert [each.kind for each in model.parts] == ["scan", "rest"]
+    assert [each.kind for each in model.state.parts] == ["scan", "rest"]
 
 
 @pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
@@ -111,7 +111,7 @@ def test_hidden_parts_are_neither_in_the_picture_nor_in_the_mesh(view, device, h
     model, painter = view(scan)
     find(model, painter)
     model.show(f"1/{hidden}", False)
-    state = model.snapshot()
+    state = model.state
     (kept,) = painter.mesh_of_shown(state)
     whole = extract_isosurface(scan, scenes.ISO, device=device)
     pieces = sorted(whole.components(), key=lambda each: -each.area)
@@ -120,7 +120,7 @@ def test_hidden_parts_are_neither_in_the_picture_nor_in_the_mesh(view, device, h
     assert kept.quality()["closed"]
     for view_name in ("anterior", "left", "superior"):
         model.look(view_name)
-        picture = painter.picture(model.snapshot(), SIZE)
+        picture = painter.picture(model.state, SIZE)
         mesh = render([(kept, MeshLook())], camera=model.camera, size=SIZE, background="transparent", device=device)
         both = (picture.image[..., 3] > 0) != (mesh.image[..., 3] > 0)
         assert both.mean() < 0.004  # the edges of the silhouette
@@ -132,9 +132,9 @@ def test_volume_rendering_leaves_hidden_parts_out_with_their_edges(view):
     model, painter = view()
     find(model, painter)
     model.set_mode("bone")
-    before = shown_pixels(painter.picture(model.snapshot(), SIZE))
+    before = shown_pixels(painter.picture(model.state, SIZE))
     model.only("1/3")
-    picture = painter.picture(model.snapshot(), SIZE)
+    picture = painter.picture(model.state, SIZE)
     rows, columns = np.nonzero(picture.image[..., 3] > 8)
     spot = model.camera.project([scenes.middle(2)], SIZE)[0][0]
     assert 0 < len(rows) < 0.3 * before
@@ -144,34 +144,34 @@ def test_volume_rendering_leaves_hidden_parts_out_with_their_edges(view):
 def test_a_colour_and_an_opacity_of_a_part_are_seen(view):
     model, painter = view()
     find(model, painter)
-    plain = painter.picture(model.snapshot(), SIZE)
+    plain = painter.picture(model.state, SIZE)
     model.set_color("1/1", (1.0, 0.0, 0.0))
-    red = painter.picture(model.snapshot(), SIZE)
+    red = painter.picture(model.state, SIZE)
     x, y = model.camera.project([scenes.middle(0)], SIZE)[0][0].astype(int)
     assert red.image[y, x, 0] > 60 and red.image[y, x, 1] < 70 < plain.image[y, x, 1]
     model.set_opacity("1/1", 0.5)
-    assert 90 < painter.picture(model.snapshot(), SIZE).image[y, x, 3] < 240
-    parts = painter.mesh_of_shown(model.snapshot())
+    assert 90 < painter.picture(model.state, SIZE).image[y, x, 3] < 240
+    parts = painter.mesh_of_shown(model.state)
     assert [each.report["part_name"] for each in parts] == ["part 1", "scan 1"]
     assert parts[0].report["color"] == [1.0, 0.0, 0.0]
     model.undo()
     model.undo()
-    assert np.array_equal(painter.picture(model.snapshot(), SIZE).image, plain.image)
+    assert np.array_equal(painter.picture(model.state, SIZE).image, plain.image)
 
 
 def test_a_label_map_divides_the_scan_that_it_lies_in(view):
     model, painter = view(scenes.make_scan(), scenes.make_labels())
-    assert painter.find_parts(model.snapshot()) == [] and model.parts_known
+    assert painter.find_parts(model.state) == [] and model.parts_known
     left = model.camera.project([scenes.middle(0)], SIZE)[0][0]
     right = model.camera.project([scenes.middle(1)], SIZE)[0][0]
-    assert painter.pick(model.snapshot(), SIZE, *left).part == "2/1"
-    assert painter.pick(model.snapshot(), SIZE, *right).part == "2/2"
+    assert painter.pick(model.state, SIZE, *left).part == "2/1"
+    assert painter.pick(model.state, SIZE, *right).part == "2/2"
     model.show("2/2", False)
-    assert painter.pick(model.snapshot(), SIZE, *right) is None
-    meshes = painter.mesh_of_shown(model.snapshot())
+    assert painter.pick(model.state, SIZE, *right) is None
+    meshes = painter.mesh_of_shown(model.state)
     assert [each.report["part_name"] for each in meshes] == ["one"]
     model.set_mode("labels")
-    assert [each.report["part_name"] for each in painter.mesh_of_shown(model.snapshot())] == ["one"]
+    assert [each.report["part_name"] for each in painter.mesh_of_shown(model.state)] == ["one"]
 
 
 @pytest.mark.unit

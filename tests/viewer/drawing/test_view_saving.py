@@ -35,17 +35,17 @@ def test_what_is_shown_is_saved_to_every_mesh_format(session, tmp_path, name):
     assert facts["error"] is None and f"{name}: 2 meshes" in facts["said"]
     assert (tmp_path / name).stat().st_size > 1000
     if name.endswith((".stl", ".ply")):
-        shown = view.painter.mesh_of_shown(view.model.snapshot())
+        shown = view.painter.mesh_of_shown(view.model.state)
         assert read_mesh(tmp_path / name).triangle_count == sum(each.triangle_count for each in shown)
 
 
 @pytest.mark.opencl
 def test_what_comes_behind_a_hidden_object_is_saved(session):
     view = session()
-    before = view.painter.mesh_of_shown(view.model.snapshot())
+    before = view.painter.mesh_of_shown(view.model.state)
     assert len(before) == 2
     view.do({"do": "show", "key": "1", "visible": False})
-    (left,) = view.painter.mesh_of_shown(view.model.snapshot())
+    (left,) = view.painter.mesh_of_shown(view.model.state)
     assert np.array_equal(left.vertices, before[1].vertices)
 
 
@@ -63,7 +63,7 @@ def test_a_cloud_of_a_scan_is_the_vertices_of_its_surface(session, tmp_path):
     view = session(scenes.make_scan())
     view.do({"do": "save", "path": str(tmp_path / "a.npz")})
     assert view.wait(PATIENCE) and view.facts()["error"] is None
-    (mesh,) = view.painter.mesh_of_shown(view.model.snapshot())
+    (mesh,) = view.painter.mesh_of_shown(view.model.state)
     assert np.array_equal(read_points(tmp_path / "a.npz").points, mesh.vertices)
 
 

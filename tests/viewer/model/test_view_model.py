@@ -74,11 +74,11 @@ CHANGES = {
 def test_every_change_grows_the_version_and_can_be_undone(change):
     model = make_model()
     model.take_parts([found()])
-    before, version = model.snapshot(), model.version
+    before, version = model.state, model.version
     change(model)
-    assert model.snapshot() != before and model.version == version + 1
+    assert model.state != before and model.version == version + 1
     assert isinstance(model.undo(), str)
-    assert model.snapshot() == before and model.version == version + 2
+    assert model.state == before and model.version == version + 2
     assert model.undo() is None
 
 
@@ -111,24 +111,24 @@ def test_every_change_grows_the_version_and_can_be_undone(change):
 )
 def test_a_wrong_value_is_refused_and_changes_nothing(change, words):
     model = make_model()
-    before, version = model.snapshot(), model.version
+    before, version = model.state, model.version
     with pytest.raises(UsageError, match=words):
         change(model)
-    assert model.snapshot() == before and model.version == version and model.undo() is None
+    assert model.state == before and model.version == version and model.undo() is None
 
 
 def test_moves_of_one_gesture_are_one_step_of_undo():
     clock = iter([0.0, 0.1, 0.2, 5.0, 5.1])
     model = ViewModel(show_objects([scenes.make_scan()]), clock=lambda: next(clock))
-    first = model.snapshot()
+    first = model.state
     for _ in range(3):
         model.turn(0.1, 0.0)
-    later = model.snapshot()
+    later = model.state
     model.turn(0.1, 0.0)
     model.pan(0.1, 0.0)
-    assert [model.undo() for _ in range(2)] == ["the shift", "the turn"] and model.snapshot() == later
+    assert [model.undo() for _ in range(2)] == ["the shift", "the turn"] and model.state == later
     model.undo()
-    assert model.snapshot() == first
+    assert model.state == first
 
 
 def test_facts_are_json_and_say_what_is_there():
@@ -150,7 +150,7 @@ def test_facts_are_json_and_say_what_is_there():
 def test_without_a_scan_only_what_means_something_is_there():
     meshes, labels = make_model(scenes.make_mesh()), make_model(scenes.make_labels())
     assert list(meshes.modes) == ["surface"] and meshes.facts()["iso"] is None
-    assert list(labels.modes) == ["labels"] and labels.mode == "labels"
+    assert list(labels.modes) == ["labels"] and labels.state.mode == "labels"
     for change in (lambda m: m.set_iso(200.0), lambda m: m.set_table(False)):
         with pytest.raises(UsageError, match="no scan"):
             change(meshes)
@@ -183,15 +183,15 @@ def test_measures_are_made_of_points_in_mm():
     for x in range(4):
         assert model.add_point(Pick(point=(float(x), 0.0, 0.0))) is None
     made = model.end_tool()
-    assert made.value == pytest.approx(3.0) and len(model.curve) == 4 and model.tool is None
+    assert made.value == pytest.approx(3.0) and len(model.state.curve) == 4 and model.state.tool is None
     model.start_tool("seed")
     assert model.add_point(Pick(point=(1.0, 2.0, 3.0))).value is None
-    assert [each.kind for each in model.measures] == ["distance", "angle", "curve", "seed"]
+    assert [each.kind for each in model.state.measures] == ["distance", "angle", "curve", "seed"]
     assert model.facts()["measures"][3]["text"] == "1.0, 2.0, 3.0 mm LPS"
     model.undo()
-    assert len(model.measures) == 3
+    assert len(model.state.measures) == 3
     model.clear_measures()
-    assert model.measures == [] and model.undo() == "the measures" and len(model.measures) == 3
+    assert model.state.measures == () and model.undo() == "the measures" and len(model.state.measures) == 3
 
 
 def test_an_angle_of_points_in_one_place_is_refused():
@@ -209,14 +209,14 @@ def test_clip_planes_keep_the_other_side_and_turn_round():
     corners = model.objects[0].corners
     low, high = corners[:, 0].min(), corners[:, 0].max()
     inside, outside = (low + 1.0, 0.0, 0.0), (high - 1.0, 0.0, 0.0)
-    assert model.clip.contains([inside, outside]).tolist() == [True, False]
+    assert model.state.clip.contains([inside, outside]).tolist() == [True, False]
     model.flip_clip(0)
-    assert model.clip.contains([inside, outside]).tolist() == [False, True]
+    assert model.state.clip.contains([inside, outside]).tolist() == [False, True]
     model.flip_clip(0)
     model.move_clip(0, 1.0)
-    assert model.clip.contains([inside, outside]).all()
+    assert model.state.clip.contains([inside, outside]).all()
     model.remove_clip(0)
-    assert model.clip is None and model.clips == []
+    assert model.state.clip is None and model.state.clips == ()
 
 
 def test_a_view_fits_what_is_shown():
@@ -238,11 +238,11 @@ def test_only_and_show_all_switch_every_part():
     model = make_model(scenes.make_scan(), scenes.make_mesh())
     model.take_parts([found()])
     model.only("1/2")
-    assert {each.key for each in model.parts if each.visible} == {"1", "1/2"}
+    assert {each.key for each in model.state.parts if each.visible} == {"1", "1/2"}
     model.only("1")
-    assert {each.key for each in model.parts if each.visible} == {"1", "1/1", "1/2", "1/0"}
+    assert {each.key for each in model.state.parts if each.visible} == {"1", "1/1", "1/2", "1/0"}
     model.show_all()
-    assert all(each.visible for each in model.parts)
+    assert all(each.visible for each in model.state.parts)
 
 
 def test_looks_of_parts_go_over_to_another_iso_value_by_their_place():
@@ -270,13 +270,13 @@ def test_slices_begin_in_the_middle_of_the_scan_whatever_lies_beside_it():
     far = scenes.make_mesh(np.array([500.0, 0.0, 0.0]))
     corners = make_model(scenes.make_scan(), far).objects[0].corners
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-    assert make_model(far, scenes.make_scan()).cross == pytest.approx(middle)
+    assert make_model(far, scenes.make_scan()).state.cross == pytest.approx(middle)
 
 
 def test_slices_scroll_by_voxels_and_stay_within():
     model = make_model(scenes.make_scan())
-    before = model.cross[2]
+    before = model.state.cross[2]
     model.scroll("axial", 1)
-    assert model.cross[2] - before == pytest.approx(1.4, abs=0.01)
+    assert model.state.cross[2] - before == pytest.approx(1.4, abs=0.01)
     model.scroll("axial", 10_000)
-    assert model.cross[2] == pytest.approx(model.objects[0].corners[:, 2].max())
+    assert model.state.cross[2] == pytest.approx(model.objects[0].corners[:, 2].max())

@@ -45,7 +45,7 @@ def test_a_line_on_the_surface_and_one_beside_the_picture_are_seen():
 
 
 def changed_views(**changes: object) -> set[str]:
-    state = ViewModel(show_objects([scenes.make_scan(), scenes.make_mesh()])).snapshot()
+    state = ViewModel(show_objects([scenes.make_scan(), scenes.make_mesh()])).state
     made = replace(state, **changes)
     return {view for view in VIEWS if picture_key(state, view) != picture_key(made, view)}
 
@@ -66,5 +66,5 @@ def test_a_picture_is_stale_by_what_it_shows(changes, views):
 
 
 def test_in_mode_slices_the_cross_leaves_the_picture():
-    state = replace(ViewModel(show_objects([scenes.make_scan()])).snapshot(), mode="slices")
+    state = replace(ViewModel(show_objects([scenes.make_scan()])).state, mode="slices")
     assert picture_key(state, "scene") == picture_key(replace(state, cross=(1.0, 2.0, 3.0)), "scene")

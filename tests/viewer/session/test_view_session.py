@@ -102,13 +102,13 @@ def test_every_command_is_done_and_undone(session):
     view.do({"do": "find_parts"})
     assert view.wait(PATIENCE)
     for name, arguments in RIGHT.items():
-        before = view.model.snapshot()
+        before = view.model.state
         json.dumps(view.do({"do": name, **arguments}))
         settle(view)
-        after = view.model.snapshot()
+        after = view.model.state
         if after != before and name != "undo":
             view.do({"do": "undo"})
-            assert view.model.snapshot() == before, name
+            assert view.model.state == before, name
             view.do({"do": name, **arguments})
             settle(view)
         assert view.facts()["error"] is None
@@ -150,10 +150,10 @@ def test_every_command_is_done_and_undone(session):
 )
 def test_a_wrong_command_is_refused_and_changes_nothing(session, command, words):
     view = session()
-    before, version = view.model.snapshot(), view.model.version
+    before, version = view.model.state, view.model.version
     with pytest.raises(UsageError, match=words):
         view.do(command)
-    assert view.model.snapshot() == before and view.model.version == version and view.facts()["error"] is None
+    assert view.model.state == before and view.model.version == version and view.facts()["error"] is None
 
 
 @pytest.mark.opencl
@@ -193,7 +193,7 @@ def test_a_part_at_a_pixel_is_hidden_once_the_parts_are_found(session):
     assert view.wait(PATIENCE)
     assert view.model.state.part("1/3").visible is False and view.model.state.part("1/1").visible
     view.do({"do": "only_at", **pixel(view, 1)})
-    assert [each.key for each in view.model.parts if each.visible] == ["1", "1/2"]
+    assert [each.key for each in view.model.state.parts if each.visible] == ["1", "1/2"]
     assert view.do({"do": "pick", **pixel(view, 0)})["pick"] is None
     view.do({"do": "undo"})
     view.do({"do": "undo"})
@@ -212,7 +212,7 @@ def test_parts_are_found_again_at_another_iso_value_when_nothing_moves(session):
     assert view.wait(PATIENCE)
     assert view.facts()["parts_known"] and view.model.state.part("1/1").visible is False
     view.do({"do": "undo"})
-    assert view.wait(PATIENCE) and view.facts()["parts_known"] and view.model.iso_value == scenes.ISO
+    assert view.wait(PATIENCE) and view.facts()["parts_known"] and view.model.state.iso_value == scenes.ISO
 
 
 @pytest.mark.opencl
@@ -225,7 +225,7 @@ def test_points_of_a_tool_are_picks_in_picture_and_slices(session):
     for number in (0, 1):
         facts = view.do({"do": "add_point", **pixel(view, number)})
     assert facts["measure"]["unit"] == "mm" and facts["measures"][0]["text"].endswith(" mm")
-    camera = view.painter.slice_camera(view.model.snapshot(), "axial", SIZE)
+    camera = view.painter.slice_camera(view.model.state, "axial", SIZE)
     x, y = camera.project([scenes.middle(0)], SIZE)[0][0]
     view.do({"do": "start_tool", "name": "seed"})
     facts = view.do({"do": "add_point", "x": x, "y": y, **AT, "plane": "axial"})
