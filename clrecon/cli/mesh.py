@@ -24,9 +24,9 @@ from clrecon.cli.common import (
     pick,
 )
 from clrecon.cli.console import Console, printable
+from clrecon.jobs.mesh.choices import LabelChoice, is_label_seed
 from clrecon.jobs.mesh.purposes import settings_for
-from clrecon.jobs.mesh.seeds import is_label_seed
-from clrecon.jobs.mesh.settings import GATE_FAILED, SCAN_GATE_FAILED, LabelChoice, MeshSettings
+from clrecon.jobs.mesh.settings import GATE_FAILED, SCAN_GATE_FAILED, MeshSettings
 from clrecon.jobs.outputs import MESH_FILES
 from clrecon.jobs.presets import PRESETS
 from clrecon.system.text import count_of, format_digits, format_ml, format_volume

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from clrecon.errors import Cancelled, ClreconError, DeviceError
 from clrecon.jobs.outputs import check_files, check_kept, commit_all
@@ -118,9 +117,7 @@ class DeviceOpening:
     def __enter__(self) -> DeviceOpening:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         is_interrupted = error is not None and not isinstance(error, Exception)  # nobody waits for a compiler then
         try:
             if isinstance(error, Exception) and not isinstance(error, Cancelled):
@@ -155,11 +152,7 @@ def stage_report(path: str | Path, report: Mapping[str, Any]) -> AbstractContext
     from clrecon.system.files import stage_file
 
     content = (to_json(report) + "\n").encode("ascii")
-
-    def write(stream: BinaryIO) -> None:
-        stream.write(content)
-
-    return stage_file(path, write)
+    return stage_file(path, lambda stream: stream.write(content))
 
 
 def error_as_dict(error: ClreconError) -> dict[str, Any]:
@@ -259,10 +252,8 @@ class Run(Laps):
     def __enter__(self) -> Run:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._stack.__exit__(kind, error, traceback)
+    def __exit__(self, *error: Any) -> None:
+        self._stack.__exit__(*error)
 
     def keeping(self) -> AbstractContextManager[None]:
         """In the ``with`` block, files that exist stay if the run was asked for it.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clrecon.errors import RefusedInputError
-from clrecon.jobs.cloud.settings import CloudSettings
+from clrecon.jobs.cloud.settings import CloudSettings, Clustering
 from clrecon.jobs.presets import DEFAULT_PRESET, find_iso_preset
 from clrecon.jobs.run import trial_cube
 from clrecon.points.cloud import count_numbers
@@ -68,7 +68,7 @@ def _extract_cloud(
 ) -> CloudSteps:
     from clrecon.operators.points.point_extraction import extract_points
 
-    began = CloudSteps.clock()
+    began = time.perf_counter()
     what: dict[str, Any] = {"hu": settings.hu} if settings.is_band else {"iso_value": iso_value_of(settings)}
     cloud = extract_points(
         resident, **what, kind=settings.kind, labels=labels, label=settings.label, paper=settings.paper,
@@ -99,18 +99,40 @@ def run_steps(
 ) -> None:
     """Run the steps that are asked for, from the clusters to the spacing; `resident` is the volume of a scan."""
     shared: dict[str, Any] = {"device": device.current, "memory": settings.memory, "progress": progress}
-    for run in (_cluster_points, _remove_sparse, _remove_outliers, _denoise_points, _find_normals, _thin_points):
-        steps.start()
-        run(steps, settings, resident, shared)
+    if settings.clustering is not None:
+        _cluster_points(steps, settings, settings.clustering, resident, shared)
+    if "grid" in settings.denoise:  # what paper B's grid takes for noise
+        from clrecon.operators.points.thinning import remove_sparse_cells
+
+        steps.add("sparse cells", remove_sparse_cells(steps.cloud, **shared), takes_noise=True)
+    if settings.outliers is not None:
+        from clrecon.operators.points.denoising import remove_outliers
+
+        steps.add("outliers", remove_outliers(steps.cloud, deviations=settings.outliers, **shared), takes_noise=True)
+    if "bilateral" in settings.denoise:
+        from clrecon.operators.points.denoising import denoise_points
+
+        steps.add("bilateral", denoise_points(steps.cloud, paper=settings.paper, **shared))
+    # Points of a surface have the normals of its field until they move.
+    if settings.normals and steps.cloud.normals is None:
+        from clrecon.operators.points.normals import estimate_normals
+
+        inside = None if settings.viewpoint is None else in_lps(settings.viewpoint, settings.space)
+        steps.add("normals", estimate_normals(steps.cloud, viewpoint=inside, **_with_volume(resident, shared)))
+    if settings.spacing is not None:
+        from clrecon.operators.points.thinning import thin_points
+
+        steps.add("spacing", thin_points(steps.cloud, settings.spacing, **shared))
 
 
 def _cluster_points(
-    steps: CloudSteps, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]
+    steps: CloudSteps,
+    settings: CloudSettings,
+    chosen: Clustering,
+    resident: DeviceVolume | None,
+    shared: dict[str, Any],
 ) -> None:
     """Cluster the points; drop noise and the clusters that no keep rule names."""
-    chosen = settings.clustering
-    if chosen is None:
-        return
     from clrecon.operators.points.clusters import cluster_points
     from clrecon.points.keep import keep_clusters
 
@@ -121,7 +143,6 @@ def _cluster_points(
         eps, volume = Lattice.of(resident.volume).default_eps if eps is None else eps, None
     found = cluster_points(steps.cloud, eps, chosen.min_samples, **_with_volume(volume, shared))
     steps.add("clusters", found)
-    steps.start()
     rules = rules_in_lps(settings)
     steps.add("keep", keep_clusters(found.cloud, rules, cores=found.cores, figures=found.figures), takes_noise=True)
 
@@ -151,59 +172,6 @@ def rules_in_lps(settings: CloudSettings) -> list[str]:
     return rules
 
 
-def _remove_sparse(
-    steps: CloudSteps, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]
-) -> None:
-    """Remove what paper B's grid takes for noise."""
-    if "grid" not in settings.denoise:
-        return
-    from clrecon.operators.points.thinning import remove_sparse_cells
-
-    steps.add("sparse cells", remove_sparse_cells(steps.cloud, **shared), takes_noise=True)
-
-
-def _remove_outliers(
-    steps: CloudSteps, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]
-) -> None:
-    if settings.outliers is None:
-        return
-    from clrecon.operators.points.denoising import remove_outliers
-
-    steps.add("outliers", remove_outliers(steps.cloud, deviations=settings.outliers, **shared), takes_noise=True)
-
-
-def _denoise_points(
-    steps: CloudSteps, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]
-) -> None:
-    if "bilateral" not in settings.denoise:
-        return
-    from clrecon.operators.points.denoising import denoise_points
-
-    steps.add("bilateral", denoise_points(steps.cloud, paper=settings.paper, **shared))
-
-
-def _find_normals(
-    steps: CloudSteps, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]
-) -> None:
-    """Estimate normals where the points have none: those of a surface have the normals of its field until they move."""
-    if not settings.normals or steps.cloud.normals is not None:
-        return
-    from clrecon.operators.points.normals import estimate_normals
-
-    inside = None if settings.viewpoint is None else in_lps(settings.viewpoint, settings.space)
-    steps.add("normals", estimate_normals(steps.cloud, viewpoint=inside, **_with_volume(resident, shared)))
-
-
-def _thin_points(
-    steps: CloudSteps, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]
-) -> None:
-    if settings.spacing is None:
-        return
-    from clrecon.operators.points.thinning import thin_points
-
-    steps.add("spacing", thin_points(steps.cloud, settings.spacing, **shared))
-
-
 MOST_NAMED = 10
 """Most slices that a warning names."""
 
@@ -220,7 +188,6 @@ def drop_ghosts(steps: CloudSteps, found: GhostSlices, volume: Volume) -> None:
     """Remove the points of ghost slices."""
     from clrecon.points.ghost_slices import drop_ghost_slices
 
-    steps.start()
     step = drop_ghost_slices(steps.cloud, found, volume=volume)
     steps.add("ghost slices", step, takes_noise=True)
 
@@ -244,16 +211,8 @@ LEAST_KEPT = 0.5
 """Least share of its points that a step must keep which is there to take noise away."""
 
 _EXTRACTED = (
-    "kind",
-    "iso_value_hu",
-    "band_hu",
-    "voxels",
-    "voxels_in_band",
-    "share",
-    "label",
-    "paper",
-    "slabs",
-    "device_bytes",
+    *("kind", "iso_value_hu", "band_hu", "voxels", "voxels_in_band"),
+    *("share", "label", "paper", "slabs", "device_bytes"),
 )
 """Entries of the first cloud's report that its step tells."""
 
@@ -264,7 +223,7 @@ _TAKEN_BY_RULE = ("small cluster", "other cluster")
 class CloudSteps:
     """The points of a job, from the first cloud to the last.
 
-    began: When the extraction began, see `clock`; None for a cloud that was read.
+    began: When the extraction began, by `perf_counter`; None for a cloud that was read.
     fate: ndarray, shape (n,), uint8. For each point of the first cloud 0, or r where it went by ``reasons[r - 1]``.
     """
 
@@ -282,17 +241,11 @@ class CloudSteps:
             facts = {name: cloud.report[name] for name in _EXTRACTED if name in cloud.report}
             self.entries.append({"step": "points", "points_after": len(cloud), **facts, "seconds": self._seconds()})
 
-    @staticmethod
-    def clock() -> float:
-        """Return the time from which the seconds of the first step count."""
-        return time.perf_counter()
-
     def _seconds(self) -> float:
-        return round(time.perf_counter() - self._lap, 4)
-
-    def start(self) -> None:
-        """Begin to count the time of a step."""
-        self._lap = time.perf_counter()
+        """Return the seconds since the last step ended."""
+        now = time.perf_counter()
+        elapsed, self._lap = now - self._lap, now
+        return round(elapsed, 4)
 
     def add(self, name: str, step: PointStep, *, takes_noise: bool = False) -> None:
         """Take the result of a step over; one that `takes_noise` is judged by the share of points that it took."""

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.geometry.iso_rule import IsoRule
     from clrecon.mesh import Mesh
+    from clrecon.mesh.compare.walls import WallLook
     from clrecon.mesh.components import Labelled
 
 CONTRAST_SHARE = 0.04
@@ -38,19 +39,14 @@ def find_bone(
     without_table: The table was already removed, so the message does not advise it.
     Returns: ndarray, shape (count,), bool
     """
-    import numpy as np
 
     from clrecon.mesh.compare.iso_distance import rule_of_report
-    from clrecon.mesh.compare.walls import find_rails, judge_components, looks_like_bone
 
     rule = rule_of_report(mesh.report)
     if rule is None:
         raise UsageError("bone is told from an iso surface of HU only")
     count, labels = labelled
-    judged = judge_components(mesh, volume, rule, count, labels)
-    like_bone = np.array([looks_like_bone(one) for one in judged], dtype=bool)
-    rails = find_rails(mesh, volume, labels, like_bone)
-    bone = like_bone & ~rails
+    judged, bone, rails = _tell_bone(mesh, volume, rule, labelled)
     if bone.any():
         if rails.any():
             away = name_parameter("remove_table", True)
@@ -62,8 +58,8 @@ def find_bone(
         return bone
     bone = _holds_spine(mesh, volume, count, labels)
     if not bone.any():
-        told = [one for one, is_rail in zip(judged, rails, strict=True) if one is not None and not is_rail]
-        why = f"{_describe_none(told, count, int(rails.sum()))}{_describe_other_values(volume)}"
+        others = [one for one, is_rail in zip(judged, rails, strict=True) if one is not None and not is_rail]
+        why = f"{_describe_none(others, count, int(rails.sum()))}{_describe_other_values(volume)}"
         raise NoSurfaceError(f"at {surface.describe()}: {why} ({advice})")
     mesh.report.setdefault("warnings", []).append(
         f"at {surface.describe()} no component has walls like bone: the one round the spinal canal was kept"
@@ -71,12 +67,26 @@ def find_bone(
     return bone
 
 
-def _describe_none(told: Sequence[dict[str, Any]], count: int, rails: int) -> str:
+def _tell_bone(
+    mesh: Mesh, volume: Volume, rule: IsoRule, labelled: Labelled
+) -> tuple[list[WallLook | None], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Judge the components of a surface; say which are bone, and which would be, but are rails of a table."""
+    import numpy as np
+
+    from clrecon.mesh.compare.walls import find_rails, judge_components, looks_like_bone
+
+    judged = judge_components(mesh, volume, rule, *labelled)
+    like_bone = np.array([looks_like_bone(one) for one in judged], dtype=bool)
+    rails = find_rails(mesh, volume, labelled[1], like_bone)
+    return judged, like_bone & ~rails, rails
+
+
+def _describe_none(judged: Sequence[dict[str, Any]], count: int, rails: int) -> str:
     but = f"; {_describe_rails(rails)}" if rails else ""
-    if not told:
+    if not judged:
         others = "all others" if rails else "all of them"
         return f"nothing that could be bone: {count_of(count, 'component')}, {others} crumbs{but}"
-    largest = max(told, key=lambda one: int(one["samples"]))
+    largest = max(judged, key=lambda one: int(one["samples"]))
     return (
         f"nothing here looks like bone: of {count_of(count, 'component')} the largest {_looks(largest)};"
         f" those of bone reach 600 at 5 % and more of it{but}"
@@ -169,16 +179,11 @@ def judge_surfaces(parts: Sequence[Part], volume: Volume, settings: MeshSettings
 
 def _count_bones(mesh: Mesh, volume: Volume, rule: IsoRule) -> Bones:
     """Count the bone components of a surface that as a whole does not look like bone."""
-    import numpy as np
-
-    from clrecon.mesh.compare.walls import find_rails, judge_components, looks_like_bone
     from clrecon.mesh.connectivity import label_components
 
-    count, labels = label_components(mesh.triangles, mesh.vertex_count)
-    judged = judge_components(mesh, volume, rule, count, labels)
-    like_bone = np.array([looks_like_bone(one) for one in judged], dtype=bool)
-    rails = find_rails(mesh, volume, labels, like_bone)
-    return Bones(count, int(np.count_nonzero(like_bone & ~rails)), int(np.count_nonzero(rails)))
+    labelled = label_components(mesh.triangles, mesh.vertex_count)
+    _, bone, rails = _tell_bone(mesh, volume, rule, labelled)
+    return Bones(labelled[0], int(bone.sum()), int(rails.sum()))
 
 
 def _is_of_bone(surface: Surface, lowest: float) -> bool:

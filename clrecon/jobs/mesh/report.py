@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 _OF_ONE = ("quality", "walls", "iso_distance", "cortex", "refinement", "print", "cells", "growing")
 """Entries of a mesh that are also at the top of the report if there is only one mesh."""
 
+_OF_LEVEL = ("iso_value_hu", "iso_level_hu", "inside", "inside_hu", "inside_levels_hu")
+"""Entries of a mesh that are also at the top where all meshes have them in common."""
+
 _SAID_ABOVE = ("vertices", "triangles", "closed", "manifold", "components", "area_mm2", "volume_ml", "bounds_mm")
 
 
@@ -37,19 +40,11 @@ def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], 
     return {
         "name": part.name or None,
         "label": part.surface.label,
-        "iso_value_hu": origin.get("iso_value_hu"),
-        "iso_level_hu": origin.get("iso_level_hu"),
-        "inside": origin.get("inside"),
-        "inside_hu": origin.get("inside_hu"),
-        "inside_levels_hu": origin.get("inside_levels_hu"),
+        **{name: origin.get(name) for name in _OF_LEVEL},
         "vertices": part.mesh.vertex_count,
         "triangles": part.mesh.triangle_count,
-        "closed": quality.get("closed"),
-        "manifold": quality.get("manifold"),
-        "components": quality.get("components"),
-        "components_found": origin.get("components_found"),
-        "components_kept": origin.get("components_kept"),
-        "seed_distances_mm": origin.get("seed_distances_mm"),
+        **{name: quality.get(name) for name in ("closed", "manifold", "components")},
+        **{name: origin.get(name) for name in ("components_found", "components_kept", "seed_distances_mm")},
         "area_mm2": quality.get("area_mm2"),
         "volume_ml": quality.get("volume_ml") if quality.get("closed") else None,
         "bounds_mm": _bounds(part.mesh, space),
@@ -142,7 +137,6 @@ def report_of(
     settings: MeshSettings = run.settings
     parts = made.parts
     level, level_warnings = describe_level(made.solid, settings, made.choice)
-    common = ("iso_value_hu", "iso_level_hu", "inside", "inside_hu", "inside_levels_hu")
     preset = settings.preset_used
     of_one: dict[str, Any] = {name: meshes[0][name] if len(meshes) == 1 else None for name in _OF_ONE}
     for part in _DEVICE_PARTS:
@@ -153,7 +147,7 @@ def report_of(
         made.solid,
         on=made.device.current,
         affine_ijk_to_lps_mm=made.solid.affine.tolist(),
-        **{name: _common(mesh[name] for mesh in meshes) for name in common},
+        **{name: _common(mesh[name] for mesh in meshes) for name in _OF_LEVEL},
         outside_hu=_common(part.mesh.report.get("outside_hu") for part in parts),
         **level,
         preset=preset,
@@ -196,16 +190,12 @@ def _warn_of_meshes(parts: Sequence[Part], meshes: Sequence[dict[str, Any]]) -> 
 def _describe_all(parts: Sequence[Part], meshes: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return sums over all meshes, and properties that are true for each."""
     of_surface = {part.surface: mesh for part, mesh in zip(parts, meshes, strict=True)}.values()
+    sums = ("vertices", "triangles", "components", "area_mm2", "volume_ml")
     return {
-        "vertices": sum(mesh["vertices"] for mesh in meshes),
-        "triangles": sum(mesh["triangles"] for mesh in meshes),
-        "closed": _unless_unknown(all, (mesh["closed"] for mesh in meshes)),
-        "manifold": _unless_unknown(all, (mesh["manifold"] for mesh in meshes)),
-        "components": _unless_unknown(sum, (mesh["components"] for mesh in meshes)),
+        **{name: _unless_unknown(sum, (mesh[name] for mesh in meshes)) for name in sums},
+        **{name: _unless_unknown(all, (mesh[name] for mesh in meshes)) for name in ("closed", "manifold")},
         "components_found": _unless_unknown(sum, (mesh["components_found"] for mesh in of_surface)),
         "components_kept": _unless_unknown(sum, (mesh["components_kept"] for mesh in of_surface)),
-        "area_mm2": _unless_unknown(sum, (mesh["area_mm2"] for mesh in meshes)),
-        "volume_ml": _unless_unknown(sum, (mesh["volume_ml"] for mesh in meshes)),
         "bounds_mm": _unless_unknown(_around, (mesh["bounds_mm"] for mesh in meshes)),
     }
 

@@ -1,22 +1,18 @@
-"""Settings of the mesh job, validated on construction, and the choice of labels that become meshes."""
+"""Settings of the mesh job, validated on construction."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import MISSING, dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
 
 from clrecon.errors import UsageError
-from clrecon.jobs.mesh.seeds import LABEL_SEED, check_growing, check_point, is_label_seed
+from clrecon.jobs.mesh.choices import LABEL_SEED, LabelChoice, check_growing, check_point, is_label_seed
 from clrecon.jobs.options import (
     LEVELS_HELP,
     InputSettings,
     closed_option,
-    label_map_option,
     parse_hu,
-    parse_label_color,
     parse_levels,
     parse_point,
     preset_option,
@@ -26,10 +22,6 @@ from clrecon.jobs.outputs import OBJECT_FILES
 from clrecon.jobs.presets import DEFAULT_PRESET, PURPOSES, Purpose, find_iso_preset, find_purpose
 from clrecon.system.arguments import name_parameter
 from clrecon.system.options import option
-
-if TYPE_CHECKING:
-    from clrecon.labels import LabelMap
-
 
 _ITERATIONS = 20
 
@@ -485,77 +477,3 @@ class MeshSettings(InputSettings):
         if self.keep is not None:
             return True
         return self.split or bool(self.seeds) or self.keep_largest is not None or self.min_volume_ml is not None
-
-
-@dataclass(frozen=True)
-class LabelChoice:
-    """The labels of a map, by numbers or names, that become meshes, and the kind of their surfaces.
-
-    only: Empty means all that have a surface.
-    solid: Fill less dense parts within a label.
-    """
-
-    path: str | Path = label_map_option(default=MISSING)
-    only: tuple[str | int, ...] = option(
-        "--label NAME|N", "this label only; may be given again (default: all)", default=(), action="append"
-    )
-    hidden: tuple[str | int, ...] = option(
-        "--hide-label NAME|N", "not this label; may be given again", default=(), action="append"
-    )
-    colors: tuple[tuple[str | int, str], ...] = option(
-        "--label-color LABEL=COLOUR",
-        "colour of a label in .ply and in the formats of several objects, such as L3=orange; may be given again",
-        default=(),
-        parse=parse_label_color,
-        action="append",
-    )
-    surface: str = "hu"
-    grow_mm: float | None = option(
-        "--grow MM", "dense voxels this near to a label are its own (default: one voxel each way)"
-    )
-    solid: bool = False
-
-    def __post_init__(self) -> None:
-        from clrecon.rendering.looks.colors import find_color  # numpy: not loaded before a job starts
-
-        for _, color in self.colors:
-            find_color(color)
-        if self.surface not in ("hu", "mask"):
-            raise UsageError(f"labels have no surface {self.surface!r}: it is hu or mask")
-        if self.surface == "mask" and (self.solid or self.grow_mm is not None):
-            raise UsageError(
-                f"the surface of a mask is solid and does not grow: leave out {name_parameter('solid')} and"
-                f" {name_parameter('grow_mm')}"
-            )
-
-    def numbers_of(self, labels: LabelMap) -> list[int]:
-        """Return the numbers of the labels that become meshes."""
-        hidden = {labels.find(label) for label in self.hidden}
-        wanted = [labels.find(label) for label in self.only] or list(labels.numbers)
-        left = [number for number in wanted if number not in hidden]
-        if not left:
-            raise UsageError("all labels are hidden: there is no mesh to make")
-        return left
-
-    def colors_of(
-        self, labels: LabelMap, numbers: Sequence[int], distinct: bool
-    ) -> dict[int, tuple[float, float, float]]:
-        """Return the colours of labels: those given, and where wanted distinct ones for all others."""
-        from clrecon.rendering.looks.colors import find_color
-        from clrecon.rendering.pictures.label_style import distinct_colors
-
-        given = {}
-        for label, color in self.colors:
-            number = labels.find(label)
-            if number in given:
-                raise UsageError(f"label {number} {labels.name(number)} has two colours")
-            given[number] = _as_tuple(find_color(color))
-        if not distinct:
-            return given
-        own = distinct_colors(len(numbers))
-        return {number: _as_tuple(color) for number, color in zip(numbers, own, strict=True)} | given
-
-
-def _as_tuple(color: Any) -> tuple[float, float, float]:
-    red, green, blue = (float(value) for value in color)
-    return red, green, blue

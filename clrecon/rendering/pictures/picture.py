@@ -361,10 +361,7 @@ def encode_floats(array: NDArray[np.float32], extension: str, pixel_mm: float | 
 
 
 def _replace_image(path: str | os.PathLike[str], content: bytes) -> int:
-    def write(stream: Any) -> None:
-        stream.write(content)
-
-    return replace_file(path, write, expected_bytes=len(content))
+    return replace_file(path, lambda stream: stream.write(content), expected_bytes=len(content))
 
 
 def _resolution(pixel_mm: float | None) -> dict[str, Any]:

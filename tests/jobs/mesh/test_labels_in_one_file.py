@@ -11,7 +11,7 @@ import pytest
 
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
-from clrecon.jobs.mesh.settings import LabelChoice
+from clrecon.jobs.mesh.choices import LabelChoice
 from clrecon.labels import LabelMap
 from clrecon.labels.label_grids import encode_nifti
 
