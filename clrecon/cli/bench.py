@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_device, add_no_clobber, add_report, table
+from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.system.text import format_digits
 
@@ -25,12 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("input", metavar="INPUT", nargs="?", help="DICOM folder or file (default: a made-up spine)")
     parser.add_argument("--hu", type=float, metavar="N", help="iso value in HU (default: the preset bone)", first=True)
     parser.add_argument("--series", metavar="S", help='number or hash of the series, see "clrecon info"')
-    add_device(parser, memory=False)
+    common.add_device(parser, memory=False)
     parser.add_argument(
         "--runs", type=int, default=_RUNS, metavar="N", help=f"timed pairs (default: {_RUNS})", first=True
     )
-    add_report(parser, "the figures")
-    add_no_clobber(parser, with_ids=False)
+    common.add_report(parser, "the figures")
+    common.add_no_clobber(parser, with_ids=False)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -102,7 +102,7 @@ def _describe_device(entry: dict[str, Any]) -> list[str]:
     voxels, triangles = (format_digits(entry[name], 2) for name in ("mvoxels_per_s", "mtriangles_per_s"))
     rates = f"{voxels} Mvoxel/s, {triangles} Mtriangle/s"
     counts = f"{entry['vertices']:,} vertices, {entry['triangles']:,} triangles"
-    return [head, *(f"  {line}" for line in table(rows, right=(1,))), f"  {counts}, {rates}"]
+    return [head, *(f"  {line}" for line in common.table(rows, right=(1,))), f"  {counts}, {rates}"]
 
 
 def _seconds(value: float) -> str:

@@ -6,22 +6,7 @@ import argparse
 import math
 from typing import Any
 
-from clrecon.cli.common import (
-    GRID_FILE,
-    SCAN_FOLDER,
-    add_device,
-    add_fields,
-    add_input,
-    add_masking,
-    add_no_clobber,
-    add_output,
-    add_reading,
-    add_report,
-    describe_times,
-    make_settings,
-    megabytes,
-    show_report,
-)
+from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.jobs.cloud.settings import STEPS, CloudSettings, Clustering
@@ -57,18 +42,18 @@ def _epilog() -> str:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _epilog()
     kinds = ", ".join(CLOUD_INPUTS)
-    add_input(parser, f"{SCAN_FOLDER}; {GRID_FILE}; or a cloud of points ({kinds})")
-    add_output(parser, "cloud file: .ply .vtp .npz .xyz or .las")
-    add_fields(parser, CloudSettings)
-    add_reading(parser)
-    add_masking(parser, crop=True)
-    add_fields(parser.add_argument_group("points"), CloudSettings, "points")
+    common.add_input(parser, f"{common.SCAN_FOLDER}; {common.GRID_FILE}; or a cloud of points ({kinds})")
+    common.add_output(parser, "cloud file: .ply .vtp .npz .xyz or .las")
+    common.add_fields(parser, CloudSettings)
+    common.add_reading(parser)
+    common.add_masking(parser, crop=True)
+    common.add_fields(parser.add_argument_group("points"), CloudSettings, "points")
     steps = parser.add_argument_group("steps")
-    add_fields(steps, CloudSettings, "steps")
+    common.add_fields(steps, CloudSettings, "steps")
     steps.add_argument(
         "--surface", metavar="FILE", help="write a closed mesh around the points too, which need normals for it"
     )
-    add_device(parser.add_argument_group("device"))
+    common.add_device(parser.add_argument_group("device"))
     checks = parser.add_argument_group("files and checks")
     checks.add_argument(
         "--removed",
@@ -76,24 +61,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write the points before any of them went, each with the number of the reason why it went as label (0:"
         " kept)",
     )
-    add_fields(checks, CloudSettings, "checks")
-    add_no_clobber(checks)
-    add_report(checks, "the figures of each step, device and times")
+    common.add_fields(checks, CloudSettings, "checks")
+    common.add_no_clobber(checks)
+    common.add_report(checks, "the figures of each step, device and times")
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.cloud.job import CloudFiles, make_cloud
 
     clusters = None if options.clusters is None else Clustering(**options.clusters)
-    settings = make_settings(CloudSettings, options, clusters=clusters)
+    settings = common.make_settings(CloudSettings, options, clusters=clusters)
     files = CloudFiles(options.output, options.removed, options.surface, options.report)
     report = make_cloud(options.input, files, settings, no_clobber=options.no_clobber, progress=console.progress)
     paths, space = {"cloud": options.output, "removed": options.removed, "surface": options.surface}, report["space"]
     written = [
-        f"wrote    {printable(paths[entry['what']])}, {megabytes(entry['bytes'])}, {space.upper()} mm"
+        f"wrote    {printable(paths[entry['what']])}, {common.megabytes(entry['bytes'])}, {space.upper()} mm"
         for entry in report["outputs"]
     ]
-    show_report(report, describe_cloud_job(report) + written, options, console)
+    common.show_report(report, describe_cloud_job(report) + written, options, console)
     return 0
 
 
@@ -106,7 +91,7 @@ def describe_cloud_job(report: dict[str, Any]) -> list[str]:
         f"cloud    {count_of(report['points'], 'point')}{_describe_known(report)}",
         *_describe_surface(report["surface"]),
         f"device   {printable(report['device'])}",
-        f"time     {describe_times(report['seconds'])}",
+        f"time     {common.describe_times(report['seconds'])}",
     ]
 
 

@@ -6,20 +6,7 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
-from clrecon.cli.common import (
-    GRID_FILE,
-    SCAN_FOLDER,
-    add_device,
-    add_fields,
-    add_input,
-    add_masking,
-    add_no_clobber,
-    add_output,
-    add_reading,
-    pick,
-    show_report,
-    table,
-)
+from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.errors import UsageError
@@ -50,22 +37,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "  clrecon compare CT_FOLDER -o report --paper --region tube:40",
         )
     )
-    add_input(parser, f"{SCAN_FOLDER}; or {GRID_FILE}")
-    add_output(parser, "folder for the page: new, empty, or of a comparison")
-    add_fields(parser.add_argument_group("comparison"), CompareSettings, "comparison")
-    add_reading(parser)
-    add_masking(parser)
+    common.add_input(parser, f"{common.SCAN_FOLDER}; or {common.GRID_FILE}")
+    common.add_output(parser, "folder for the page: new, empty, or of a comparison")
+    common.add_fields(parser.add_argument_group("comparison"), CompareSettings, "comparison")
+    common.add_reading(parser)
+    common.add_masking(parser)
     surface = parser.add_argument_group("surface")
-    add_fields(surface.add_mutually_exclusive_group(), CompareSettings, "level")
-    add_fields(surface, CompareSettings, "surface")
-    add_device(parser.add_argument_group("device"))
-    add_no_clobber(parser.add_argument_group("files and checks"))
+    common.add_fields(surface.add_mutually_exclusive_group(), CompareSettings, "level")
+    common.add_fields(surface, CompareSettings, "surface")
+    common.add_device(parser.add_argument_group("device"))
+    common.add_no_clobber(parser.add_argument_group("files and checks"))
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.proof.compare.job import make_comparison
 
-    given = pick(options, CompareSettings)
+    given = common.pick(options, CompareSettings)
     given |= given.pop("iso_value", {})  # one of two fields
     levels = given.get("iso_value")
     if levels is not None:
@@ -79,7 +66,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     named = [method[which] for method in report["methods"] for which in ("picture", "difference")]
     pictures = sum(name is not None for name in named) + 2 * len(report["slices"])
     written = f"wrote    {printable(options.output)}: index.html, report.json and {pictures} pictures"
-    show_report(report, [*_describe(report), written], options, console)
+    common.show_report(report, [*_describe(report), written], options, console)
     return PARTLY_DONE if any(_is_missed(method, settings.methods) for method in report["methods"]) else 0
 
 
@@ -112,7 +99,7 @@ def _describe(report: dict[str, Any]) -> list[str]:
         f"level    {report['iso_value_hu']:g} HU: {report['iso_value_reason']}",
         f"device   {printable(report['device'])}",
         "",
-        *table(rows, right=range(1, 8)),
+        *common.table(rows, right=range(1, 8)),
         "",
         *report["findings"],
         f"time     {report['seconds']['total']:.1f} s",

@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass, field
 from importlib import import_module
 
-from clrecon.cli.common import Parser, add_common
+from clrecon.cli import common
 from clrecon.cli.console import Console
 from clrecon.errors import UsageError
 from clrecon.system.text import guess_word
@@ -67,9 +67,9 @@ def _survey() -> dict[str, _Words]:
 
     found = {}
     for name, command in COMMANDS.items():
-        parser = Parser(prog=name)
+        parser = common.Parser(prog=name)
         import_module(command.module).add_arguments(parser)
-        add_common(parser)
+        common.add_common(parser)
         found[name] = _Words(command.help, [_describe(action) for action in parser._actions if action.option_strings])
     found["completion"].first = list(SHELLS)
     found[HELP] = _Words("show all options of a command", first=list(COMMANDS))

@@ -5,18 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import (
-    add_device,
-    add_fields,
-    add_input,
-    add_no_clobber,
-    add_output,
-    add_reading,
-    add_report,
-    make_settings,
-    megabytes,
-    show_report,
-)
+from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.jobs.outputs import MESH_FILES
@@ -38,8 +27,8 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
-    add_input(parser)
-    add_fields(parser, CorridorSettings)
+    common.add_input(parser)
+    common.add_fields(parser, CorridorSettings)
     screws = parser.add_argument_group("given screws, which are graded (Gertzbein-Robbins, A to E)")
     screws.add_argument(
         "--screw",
@@ -51,15 +40,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     screws.add_argument("--screws", dest="file", metavar="FILE", help="screws as JSON or CSV, see docs/corridor.md")
     output = parser.add_argument_group("files")
-    add_output(output, f"meshes: OUT_L3, OUT_L3_left and OUT_L3_right; {MESH_FILES}", required=False)
+    common.add_output(output, f"meshes: OUT_L3, OUT_L3_left and OUT_L3_right; {MESH_FILES}", required=False)
     output.add_argument(
         "--picture", metavar="FILE", help="slices through each corridor: .png, .jpg or .tif", first=True
     )
-    add_report(output, "all figures")
-    add_fields(output, CorridorSettings, "space")
-    add_no_clobber(output)
-    add_reading(parser)
-    add_device(parser.add_argument_group("device, for the mesh of the vertebra alone"))
+    common.add_report(output, "all figures")
+    common.add_fields(output, CorridorSettings, "space")
+    common.add_no_clobber(output)
+    common.add_reading(parser)
+    common.add_device(parser.add_argument_group("device, for the mesh of the vertebra alone"))
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -71,14 +60,14 @@ def run(options: argparse.Namespace, console: Console) -> int:
         screws += read_screws(options.file, space)
     report = make_corridors(
         options.input,
-        make_settings(CorridorSettings, options, screws=screws),
+        common.make_settings(CorridorSettings, options, screws=screws),
         CorridorFiles(options.output, options.picture, options.report),
         no_clobber=options.no_clobber,
         progress=console.progress,
     )
     files = _name_files(report, options.output, options.picture)
-    written = [f"wrote    {printable(path)}, {megabytes(size)}" for path, size in files]
-    show_report(report, describe_report(report) + written, options, console)
+    written = [f"wrote    {printable(path)}, {common.megabytes(size)}" for path, size in files]
+    common.show_report(report, describe_report(report) + written, options, console)
     refused = [side for each in report["vertebrae"] for side in each["corridors"] if side["refused"]]
     return PARTLY_DONE if refused else 0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_device, add_no_clobber
+from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_mesh
 
@@ -17,8 +17,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "A second run replaces the first."
     )
     parser.add_argument("output", metavar="OUT", nargs="?", help="folder (default: clrecon-demo)")
-    add_device(parser, memory=False)
-    add_no_clobber(parser, with_ids=False)
+    common.add_device(parser, memory=False)
+    common.add_no_clobber(parser, with_ids=False)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_device, megabytes, table
+from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 
 
@@ -15,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "others, then the most compute units. One that failed the check at its first use, and a simulator (Oclgrind),\n"
         "are used only when they are named."
     )
-    add_device(parser, computes=False, memory=False)
+    common.add_device(parser, computes=False, memory=False)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -38,9 +38,9 @@ def _describe_survey(survey: dict[str, Any]) -> list[str]:
         mark = "*" if device["chosen"] else " "
         kind = "simulator" if device["simulator"] else device["type"]
         own = " of its own" if device["has_own_memory"] else ""
-        memory = f"{megabytes(device['memory_bytes'])}{own}, largest buffer {megabytes(device['max_allocation_bytes'])}"
+        memory, largest = (common.megabytes(device[name]) for name in ("memory_bytes", "max_allocation_bytes"))
         lines.append(f"{mark} {device['index']}  {kind:<11}  {printable(device['name'])}")
-        lines.append(f"{'':18}{device['compute_units']} compute units, {memory}")
+        lines.append(f"{'':18}{device['compute_units']} compute units, {memory}{own}, largest buffer {largest}")
         driver = f"{device['platform']}, {device['version']}, driver {device['driver']}"
         lines.append(f"{'':18}{printable(driver)}")
         if device["shortcoming"]:
@@ -50,5 +50,5 @@ def _describe_survey(survey: dict[str, Any]) -> list[str]:
     if survey["platforms"]:
         lines += ["", "platforms:"]
         rows = [(printable(p["name"]), printable(p["note"]), printable(p["version"])) for p in survey["platforms"]]
-        lines += [f"  {line}" for line in table(rows)]
+        lines += [f"  {line}" for line in common.table(rows)]
     return lines

@@ -5,17 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import (
-    add_device,
-    add_fields,
-    add_no_clobber,
-    add_output,
-    add_report,
-    make_settings,
-    megabytes,
-    show_report,
-    table,
-)
+from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.jobs.inputs import MESH_INPUTS
 from clrecon.jobs.settings import DistanceSettings
@@ -36,16 +26,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("mesh", metavar="A", help=f"mesh: {', '.join(MESH_INPUTS)}")
     parser.add_argument("reference", metavar="B", help="mesh that it is measured against")
-    add_fields(parser, DistanceSettings)
+    common.add_fields(parser, DistanceSettings)
     output = parser.add_argument_group("files")
-    add_output(output, "write A coloured by its distance from B: .ply", metavar="PLY", required=False)
+    common.add_output(output, "write A coloured by its distance from B: .ply", metavar="PLY", required=False)
     output.add_argument(
         "--picture", metavar="FILE", help="picture of it with its scale: .png, .jpg or .tif", first=True
     )
-    add_fields(output, DistanceSettings, "picture")
-    add_report(output, "all figures")
-    add_no_clobber(output, with_ids=False)
-    add_device(parser.add_argument_group("device, for the picture alone"))
+    common.add_fields(output, DistanceSettings, "picture")
+    common.add_report(output, "all figures")
+    common.add_no_clobber(output, with_ids=False)
+    common.add_device(parser.add_argument_group("device, for the picture alone"))
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -55,11 +45,11 @@ def run(options: argparse.Namespace, console: Console) -> int:
         options.mesh,
         options.reference,
         DistanceFiles(options.output, options.picture, options.report),
-        make_settings(DistanceSettings, options),
+        common.make_settings(DistanceSettings, options),
         no_clobber=options.no_clobber,
         progress=console.progress,
     )
-    show_report(report, _describe(report), options, console)
+    common.show_report(report, _describe(report), options, console)
     return 0
 
 
@@ -72,7 +62,7 @@ def _describe(report: dict[str, Any]) -> list[str]:
     for words, side in sides.items():
         figures.append([words, *(_mm(report[f"{side}_mm"][name]) for name in ("mean", "rms", "p95", "max"))])
     figures.append(["both", _mm(report["assd_mm"]), "", _mm(report["hd95_mm"]), _mm(report["hausdorff_mm"])])
-    lines += ["", *table(figures, right=range(1, 5))]
+    lines += ["", *common.table(figures, right=range(1, 5))]
     signed = {words: report[f"{side}_signed_mm"] for words, side in sides.items()}
     if any(signed.values()):
         figures = [["signed mm", "mean", "5 %", "50 %", "95 %", "outside"]]
@@ -80,7 +70,7 @@ def _describe(report: dict[str, Any]) -> list[str]:
             if own is not None:
                 cells = [_mm(own[name], "+") for name in ("mean", "p5", "median", "p95")]
                 figures.append([words, *cells, f"{100.0 * own['outside_share']:.0f} %"])
-        lines += ["", *table(figures, right=range(1, 6))]
+        lines += ["", *common.table(figures, right=range(1, 6))]
     lines.append("")
     if report["colors"] is not None:
         end = f"{report['colors']['range_mm']:g}"
@@ -89,9 +79,9 @@ def _describe(report: dict[str, Any]) -> list[str]:
             f"colours  {span} mm, beyond them {100.0 * report['colors']['beyond_share']:.1f} % of A's vertices"
         )
     lines.append(f"time     {report['seconds']['total']:.2f} s")
-    return lines + [
-        f"wrote    {each['kind']} {printable(each['name'])}, {megabytes(each['bytes'])}" for each in report["outputs"]
-    ]
+    for each in report["outputs"]:
+        lines.append(f"wrote    {each['kind']} {printable(each['name'])}, {common.megabytes(each['bytes'])}")
+    return lines
 
 
 def _describe_mesh(letter: str, entry: dict[str, Any]) -> list[str]:

@@ -5,19 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import (
-    add_device,
-    add_fields,
-    add_input,
-    add_masking,
-    add_no_clobber,
-    add_output,
-    add_reading,
-    add_report,
-    make_settings,
-    megabytes,
-    show_report,
-)
+from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.jobs.settings import ExportSettings
@@ -41,15 +29,15 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
-    add_input(parser)
-    add_output(parser, "volume file: .nii.gz, .nii, .nrrd or .mha")
-    add_fields(parser, ExportSettings)
-    add_reading(parser)
-    add_masking(parser, crop=True)
-    add_device(parser.add_argument_group("device", "for --region and --preprocess only"))
+    common.add_input(parser)
+    common.add_output(parser, "volume file: .nii.gz, .nii, .nrrd or .mha")
+    common.add_fields(parser, ExportSettings)
+    common.add_reading(parser)
+    common.add_masking(parser, crop=True)
+    common.add_device(parser.add_argument_group("device", "for --region and --preprocess only"))
     checks = parser.add_argument_group("checks")
-    add_no_clobber(checks)
-    add_report(checks, "affine, crop, certificate, values and times", first=False)
+    common.add_no_clobber(checks)
+    common.add_report(checks, "affine, crop, certificate, values and times", first=False)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -58,15 +46,15 @@ def run(options: argparse.Namespace, console: Console) -> int:
     report = export_volume(
         options.input,
         options.output,
-        make_settings(ExportSettings, options),
+        common.make_settings(ExportSettings, options),
         report_path=options.report,
         no_clobber=options.no_clobber,
         progress=console.progress,
     )
     output = report["output"]
-    size, space = megabytes(output["bytes"]), output["space"].upper()
+    size, space = common.megabytes(output["bytes"]), output["space"].upper()
     written = f"wrote    {printable(options.output)}, {size}, HU as {output['type']}, {space} mm"
-    show_report(report, [*_describe(report), written], options, console)
+    common.show_report(report, [*_describe(report), written], options, console)
     return 0
 
 

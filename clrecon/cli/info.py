@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from clrecon.cli.common import add_fields, add_input, add_reading, make_settings
+from clrecon.cli import common
 from clrecon.cli.console import Console, is_terminal, printable
 from clrecon.jobs.settings import InfoSettings
 
@@ -386,15 +386,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "there is a series that can be used, 4 when the series found are refused (their problems are listed) or a\n"
         "gate failed with --strict, 2 when there is no CT series."
     )
-    add_input(parser)
-    add_fields(parser, InfoSettings)
-    add_reading(parser)
+    common.add_input(parser)
+    common.add_fields(parser, InfoSettings)
+    common.add_reading(parser)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.info import describe_input
 
-    found = describe_input(options.input, make_settings(InfoSettings, options), progress=console.progress)
+    found = describe_input(options.input, common.make_settings(InfoSettings, options), progress=console.progress)
     console.result(found.listing)
     if not options.json and not options.quiet:
         lines = render_listing(found.listing, describe_certificate(found.listing["certificate"]), found.refused)

@@ -5,19 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import (
-    add_device,
-    add_fields,
-    add_input,
-    add_no_clobber,
-    add_output,
-    add_reading,
-    add_report,
-    describe_space,
-    make_settings,
-    megabytes,
-    show_report,
-)
+from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.jobs.outputs import MESH_FILES
@@ -41,9 +29,9 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
-    add_input(parser)
-    add_output(parser, f"mesh files: {MESH_FILES}")
-    add_fields(parser, InsideSettings)
+    common.add_input(parser)
+    common.add_output(parser, f"mesh files: {MESH_FILES}")
+    common.add_fields(parser, InsideSettings)
     pictures = parser.add_argument_group("pictures")
     pictures.add_argument(
         "--picture",
@@ -52,13 +40,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " inside_canal.png and so on",
         first=True,
     )
-    add_fields(pictures, InsideSettings, "pictures")
-    add_fields(parser.add_argument_group("parts"), InsideSettings, "parts")
-    add_reading(parser)
+    common.add_fields(pictures, InsideSettings, "pictures")
+    common.add_fields(parser.add_argument_group("parts"), InsideSettings, "parts")
+    common.add_reading(parser)
     device = parser.add_argument_group("device")
-    add_device(device)
-    add_no_clobber(device)
-    add_report(device, "volumes, thickness, certificate, device, times")
+    common.add_device(device)
+    common.add_no_clobber(device)
+    common.add_report(device, "volumes, thickness, certificate, device, times")
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -67,19 +55,19 @@ def run(options: argparse.Namespace, console: Console) -> int:
     report = make_inside(
         options.input,
         options.output,
-        make_settings(InsideSettings, options),
+        common.make_settings(InsideSettings, options),
         picture=options.picture,
         report_path=options.report,
         no_clobber=options.no_clobber,
         progress=console.progress,
     )
     files = [mesh for vertebra in report["vertebrae"] for mesh in vertebra["meshes"]]
-    size = megabytes(sum(mesh["bytes"] for mesh in files))
-    space = describe_space(options.output, report["space"])
+    size = common.megabytes(sum(mesh["bytes"] for mesh in files))
+    space = common.describe_space(options.output, report["space"])
     written = [f"wrote    {_name_files(options.output, report, 'meshes')}, {size}, {space}"]
     if options.picture:
         written.append(f"picture  {_name_files(options.picture, report, 'pictures')}")
-    show_report(report, describe_inside(report) + written, options, console)
+    common.show_report(report, describe_inside(report) + written, options, console)
     return 0
 
 

@@ -6,23 +6,7 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
-from clrecon.cli.common import (
-    GRID_FILE,
-    SCAN_FOLDER,
-    add_device,
-    add_fields,
-    add_input,
-    add_masking,
-    add_no_clobber,
-    add_output,
-    add_reading,
-    add_report,
-    describe_space,
-    describe_times,
-    make_part,
-    megabytes,
-    pick,
-)
+from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.jobs.mesh.choices import LabelChoice, is_label_seed
 from clrecon.jobs.mesh.purposes import settings_for
@@ -72,46 +56,46 @@ def _epilog() -> str:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _epilog()
-    add_input(parser, f"{SCAN_FOLDER}; or {GRID_FILE}")
-    add_output(parser, f"mesh file: {MESH_FILES}")
-    add_fields(parser, MeshSettings, "purpose")
-    add_reading(parser)
-    add_masking(parser, crop=True)
-    add_fields(add_levels(parser, "surface"), MeshSettings, "kind", "surface")
+    common.add_input(parser, f"{common.SCAN_FOLDER}; or {common.GRID_FILE}")
+    common.add_output(parser, f"mesh file: {MESH_FILES}")
+    common.add_fields(parser, MeshSettings, "purpose")
+    common.add_reading(parser)
+    common.add_masking(parser, crop=True)
+    common.add_fields(add_levels(parser, "surface"), MeshSettings, "kind", "surface")
     method = parser.add_argument_group("method", "marching cubes as papers compare them: see docs/methods.md")
-    add_fields(method, MeshSettings, "method")
-    add_fields(parser.add_argument_group("components"), MeshSettings, "selection", "files")
+    common.add_fields(method, MeshSettings, "method")
+    common.add_fields(parser.add_argument_group("components"), MeshSettings, "selection", "files")
     add_labels(parser)
-    add_fields(parser.add_argument_group("refinement"), MeshSettings, "refinement")
-    add_device(parser.add_argument_group("device"))
+    common.add_fields(parser.add_argument_group("refinement"), MeshSettings, "refinement")
+    common.add_device(parser.add_argument_group("device"))
     checks = parser.add_argument_group("checks")
-    add_fields(checks, MeshSettings, "strict")
-    add_no_clobber(checks)
-    add_report(checks, "affine, counts, quality, device and times")
+    common.add_fields(checks, MeshSettings, "strict")
+    common.add_no_clobber(checks)
+    common.add_report(checks, "affine, counts, quality, device and times")
 
 
 def add_levels(parser: argparse.ArgumentParser, title: str) -> argparse._ArgumentGroup:
     """Add the options of which values a surface encloses, and whether what is enclosed is filled."""
     group = parser.add_argument_group(title)
-    add_fields(group.add_mutually_exclusive_group(), MeshSettings, "level")
-    add_fields(group, MeshSettings, "inside")
+    common.add_fields(group.add_mutually_exclusive_group(), MeshSettings, "level")
+    common.add_fields(group, MeshSettings, "inside")
     return group
 
 
 def add_labels(parser: argparse.ArgumentParser) -> None:
     """Add the options for label maps."""
     about = "one mesh a label: the label picks the cells, HU place the vertices"
-    add_fields(parser.add_argument_group("labels", about), LabelChoice)
+    common.add_fields(parser.add_argument_group("labels", about), LabelChoice)
 
 
 def mesh_fields(options: argparse.Namespace) -> dict[str, Any]:
     """Return the fields of `MeshSettings` that the options give."""
-    given = pick(options, MeshSettings)
+    given = common.pick(options, MeshSettings)
     given |= given.pop("iso_value", {})  # one of two fields
     needs = "says how labels become meshes: give their file with --labels FILE"
     if given.get("surface") == "cortex":  # labels pick the cells, as with hu
         options = argparse.Namespace(**{**vars(options), "surface": "hu"})
-    labels = make_part(LabelChoice, options, options.path, needs)
+    labels = common.make_part(LabelChoice, options, options.path, needs)
     if labels is not None:
         given["labels"] = labels
         if given.get("solid") and not any(map(is_label_seed, given.get("grow_from", ()))):
@@ -160,7 +144,7 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
         *describe_refinement(report["meshes"]),
         *describe_purposes(report["meshes"]),
         f"device   {printable(report['device'])}{_describe_slabs(report)}",
-        f"time     {describe_times(report['seconds'], _PARTS)}",
+        f"time     {common.describe_times(report['seconds'], _PARTS)}",
     ]
 
 
@@ -194,7 +178,7 @@ def _describe_slabs(report: dict[str, Any]) -> str:
     """Give the number of slabs, if the volume did not fit as a whole."""
     if report["slabs"] == 1:
         return ""
-    return f", {report['slabs']} slabs of at most {megabytes(sum(report['device_bytes'].values()))}"
+    return f", {report['slabs']} slabs of at most {common.megabytes(sum(report['device_bytes'].values()))}"
 
 
 def _describe_choice(report: dict[str, Any]) -> str:
@@ -245,7 +229,7 @@ def _describe_files(output: str, report: dict[str, Any], *, together: bool) -> s
     paths = [output] if together else name_outputs(output, [mesh["name"] or "" for mesh in report["meshes"]])
     names = [printable(str(path)) for path in (paths[0], paths[-1])]
     files = {1: names[0], 2: " and ".join(names)}.get(len(paths), f"{names[0]} to {names[1]}, {len(paths):,} files")
-    return f"{files}, {megabytes(report['output']['bytes'])}, {describe_space(output, report['space'])}"
+    return f"{files}, {common.megabytes(report['output']['bytes'])}, {common.describe_space(output, report['space'])}"
 
 
 def _describe_quality(report: dict[str, Any]) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_fields, add_no_clobber, make_settings
+from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.proof.phantom.settings import KINDS, PhantomSettings
 from clrecon.system.paths import keep_existing
@@ -23,10 +23,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  clrecon phantom phantom/ --levels C1-L5 --scoliosis 35 --facet-gap 0.3 --spacing 0.7 0.7 1"
     )
     parser.add_argument("output", metavar="OUT", help="folder for the series")
-    add_fields(parser, PhantomSettings)
-    add_fields(parser.add_argument_group("of a spine"), PhantomSettings, "spine")
-    add_fields(parser, PhantomSettings, "missing", "seed")
-    add_no_clobber(parser, with_ids=False)
+    common.add_fields(parser, PhantomSettings)
+    common.add_fields(parser.add_argument_group("of a spine"), PhantomSettings, "spine")
+    common.add_fields(parser, PhantomSettings, "missing", "seed")
+    common.add_no_clobber(parser, with_ids=False)
 
 
 def _list_kinds() -> str:
@@ -36,7 +36,7 @@ def _list_kinds() -> str:
 def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.proof.phantom import write_phantom
 
-    settings = make_settings(PhantomSettings, options)
+    settings = common.make_settings(PhantomSettings, options)
     with keep_existing(options.no_clobber):
         truth = write_phantom(options.output, settings, progress=console.progress)
     console.result(truth)

@@ -9,23 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from clrecon.cli.common import (
-    GRID_FILE,
-    SCAN_FOLDER,
-    add_cropping,
-    add_device,
-    add_fields,
-    add_input,
-    add_masking,
-    add_no_clobber,
-    add_output,
-    add_reading,
-    add_report,
-    describe_times,
-    make_part,
-    megabytes,
-    show_report,
-)
+from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.errors import UsageError
@@ -236,7 +220,7 @@ def add_meshes(parser: argparse.ArgumentParser) -> None:
         help=f"show a mesh too ({', '.join(MESH_INPUTS)}), in modes dvr, surface, slices, points and mesh; may be given"
         " again",
     )
-    add_fields(group, RenderSettings, "meshes")
+    common.add_fields(group, RenderSettings, "meshes")
 
 
 def add_motion(parser: argparse.ArgumentParser) -> None:
@@ -248,33 +232,33 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
         help="turn round the patient: .mp4, .gif, .apng, or a folder of PNG files",
         first=True,
     )
-    add_fields(group, Turntable)
+    common.add_fields(group, Turntable)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _epilog()
     others = f"a cloud of points ({', '.join(CLOUD_INPUTS)}); or a mesh ({', '.join(MESH_INPUTS)}; of .ply and .vtp say"
-    text = f"{SCAN_FOLDER}; {GRID_FILE}; {others} --mode mesh); may be left out with --mesh"
-    add_input(parser, text, nargs="?")
-    add_output(parser, "picture: .png, .jpg or .tif; may be left out with --turntable", required=False)
-    add_fields(parser.add_argument_group("what is shown"), Looks)
+    text = f"{common.SCAN_FOLDER}; {common.GRID_FILE}; {others} --mode mesh); may be left out with --mesh"
+    common.add_input(parser, text, nargs="?")
+    common.add_output(parser, "picture: .png, .jpg or .tif; may be left out with --turntable", required=False)
+    common.add_fields(parser.add_argument_group("what is shown"), Looks)
     camera = parser.add_argument_group("camera and picture")
-    add_fields(camera, RenderSettings, "camera")
+    common.add_fields(camera, RenderSettings, "camera")
     kinds = ".npy or .tif, float32"
     camera.add_argument("--depth", metavar="FILE", help=f"write mm along the ray to the first hit: {kinds}")
     camera.add_argument("--values", metavar="FILE", help=f"write the HU of modes that show HU: {kinds}")
-    add_cropping(parser, "of the patient (LPS)")
-    add_fields(parser.add_argument_group("clipping, in mm of the patient (LPS)"), Looks, "clipping")
-    add_fields(parser.add_argument_group("slices and curved reformations"), Looks, "slices")
-    add_fields(parser.add_argument_group("labels"), LabelLook)
+    common.add_cropping(parser, "of the patient (LPS)")
+    common.add_fields(parser.add_argument_group("clipping, in mm of the patient (LPS)"), Looks, "clipping")
+    common.add_fields(parser.add_argument_group("slices and curved reformations"), Looks, "slices")
+    common.add_fields(parser.add_argument_group("labels"), LabelLook)
     add_meshes(parser)
     add_motion(parser)
-    add_reading(parser)
-    add_masking(parser)
+    common.add_reading(parser)
+    common.add_masking(parser)
     device = parser.add_argument_group("device")
-    add_device(device)
-    add_no_clobber(device)
-    add_report(device, "camera, settings, certificate, device, times", first=False)
+    common.add_device(device)
+    common.add_no_clobber(device)
+    common.add_report(device, "camera, settings, certificate, device, times", first=False)
 
 
 def render_settings(options: argparse.Namespace) -> RenderSettings:
@@ -288,9 +272,9 @@ def render_settings(options: argparse.Namespace) -> RenderSettings:
         "views": tuple(view for views in options.views or () for view in views),
         "thickness": options.thickness or None,  # 0 is the same as no thickness
         "offset_mm": options.offset_mm or None,
-        "labels": make_part(LabelLook, options, options.path, look),
+        "labels": common.make_part(LabelLook, options, options.path, look),
         "meshes": tuple(MeshFile(*given) for given in options.meshes),
-        "turntable": make_part(Turntable, options, options.turntable, turn),
+        "turntable": common.make_part(Turntable, options, options.turntable, turn),
     }
     return RenderSettings.of(**{name: value for name, value in given.items() if value is not None})
 
@@ -308,7 +292,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     report = make_pictures(
         options.input, files, render_settings(options), no_clobber=options.no_clobber, progress=console.progress
     )
-    show_report(report, describe_report(report) + _describe_files(report, files), options, console)
+    common.show_report(report, describe_report(report) + _describe_files(report, files), options, console)
     return 0
 
 
@@ -337,7 +321,7 @@ def describe_report(report: dict[str, Any]) -> list[str]:
         *(f"         {line}" for line in _describe_labels(report["pictures"])),
         *(f"mesh     {line}" for line in map(_describe_mesh, report["meshes"][report["mode"] == "mesh" :])),
         f"device   {printable(report['device'])}",
-        f"time     {describe_times(report['seconds'], _PARTS)}",
+        f"time     {common.describe_times(report['seconds'], _PARTS)}",
     ]
 
 
@@ -426,7 +410,9 @@ def _describe_files(report: dict[str, Any], files: Any) -> list[str]:
         for picture in report["pictures"]:
             if path is not None and what in picture:
                 named = path_of(path, picture["name"] or "")
-                lines.append(f"wrote    {printable(named)}, {megabytes(picture[what]['bytes'])}")
+                lines.append(f"wrote    {printable(named)}, {common.megabytes(picture[what]['bytes'])}")
     if report["turntable"]:
-        lines.append(f"wrote    {printable(files.turntable)}, {megabytes(report['turntable']['output']['bytes'])}")
+        lines.append(
+            f"wrote    {printable(files.turntable)}, {common.megabytes(report['turntable']['output']['bytes'])}"
+        )
     return lines

@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_device
+from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.errors import DeviceError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "Runs every kernel on small volumes and compares with plain numpy. Exit code 5 when one differs."
-    add_device(parser, memory=False)
+    common.add_device(parser, memory=False)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:

@@ -8,16 +8,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from clrecon.cli.common import (
-    add_fields,
-    add_input,
-    add_no_clobber,
-    add_reading,
-    add_report,
-    make_settings,
-    show_report,
-    table,
-)
+from clrecon.cli import common
 from clrecon.cli.console import Console, is_terminal, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.jobs.settings import StatsSettings
@@ -37,13 +28,13 @@ _LEAST_NAME = 8
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
-    add_input(parser)
-    add_fields(parser, StatsSettings)
+    common.add_input(parser)
+    common.add_fields(parser, StatsSettings)
     output = parser.add_argument_group("files")
     output.add_argument("--csv", metavar="FILE", help="write the figures as a table, one line a label", first=True)
-    add_report(output, "figures, certificate of the scan and warnings")
-    add_no_clobber(output)
-    add_reading(parser)
+    common.add_report(output, "figures, certificate of the scan and warnings")
+    common.add_no_clobber(output)
+    common.add_reading(parser)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -51,7 +42,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
     report = measure_stats(
         options.input,
-        make_settings(StatsSettings, options),
+        common.make_settings(StatsSettings, options),
         report_path=options.report,
         csv_path=options.csv,
         no_clobber=options.no_clobber,
@@ -66,7 +57,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         f"time     {report['seconds']['total']:.2f} s",
         *([f"wrote    {printable(options.csv)}"] if options.csv is not None else []),
     ]
-    show_report(report, lines, options, console)
+    common.show_report(report, lines, options, console)
     return 0
 
 
@@ -100,7 +91,7 @@ def _fit(names: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> lis
 
 
 def _name_rows(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    return table(
+    return common.table(
         [(name, *row) for name, row in zip(names, rows, strict=True)], right=range(1, 1 + len(rows[0]))
     )  # fmt: skip
 

@@ -5,18 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import (
-    add_fields,
-    add_input,
-    add_no_clobber,
-    add_output,
-    add_reading,
-    add_report,
-    make_settings,
-    megabytes,
-    show_report,
-    table,
-)
+from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.jobs.settings import VertebraeSettings
@@ -41,25 +30,25 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
-    add_input(parser)
-    add_output(parser, "label map: .nii.gz, .nii, or .dcm (DICOM SEG)")
+    common.add_input(parser)
+    common.add_output(parser, "label map: .nii.gz, .nii, or .dcm (DICOM SEG)")
     parser.add_argument(
         "--picture",
         metavar="PNG",
         help="picture of discs and labels (default: beside the map, with its name)",
         first=True,
     )
-    add_reading(parser)
-    add_fields(parser.add_argument_group("vertebrae"), VertebraeSettings, "vertebrae")
+    common.add_reading(parser)
+    common.add_fields(parser.add_argument_group("vertebrae"), VertebraeSettings, "vertebrae")
     checks = parser.add_argument_group("checks")
-    add_no_clobber(checks)
-    add_report(checks, "vertebrae, confidence, discs and times")
+    common.add_no_clobber(checks)
+    common.add_report(checks, "vertebrae, confidence, discs and times")
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.vertebrae import make_vertebrae, picture_beside
 
-    settings = make_settings(VertebraeSettings, options)
+    settings = common.make_settings(VertebraeSettings, options)
     with_picture = options.picture is not None or not getattr(options, "streams_output", False)  # beside what?
     report = make_vertebrae(
         options.input,
@@ -74,10 +63,10 @@ def run(options: argparse.Namespace, console: Console) -> int:
     lines = _describe(report)
     if settings.name_at is None and settings.first is None:
         lines.append(f"names    {_NAMING}")
-    lines.append(f"wrote    {printable(options.output)}, {megabytes(report['output']['bytes'])}")
+    lines.append(f"wrote    {printable(options.output)}, {common.megabytes(report['output']['bytes'])}")
     if with_picture:
         lines.append(f"picture  {printable(options.picture or picture_beside(options.output))}: look at it")
-    show_report(report, lines, options, console)
+    common.show_report(report, lines, options, console)
     return PARTLY if report["low_confidence"] else 0
 
 
@@ -93,7 +82,7 @@ def _describe(report: dict[str, Any]) -> list[str]:
         f"found    {found} vertebra{'e' * (found != 1)}, {report['low_confidence']} of low confidence,"
         f" {count_of(len(report['discs']), 'disc')};"
         f" bone is {report['level_hu']:.0f} HU and more",
-        *(f"         {line}" for line in table(rows, right=(1, 2, 3, 4))),
+        *(f"         {line}" for line in common.table(rows, right=(1, 2, 3, 4))),
         *(f"         {text}" for text in report["left_out"]),
         f"time     {report['seconds']['total']:.2f} s",
     ]

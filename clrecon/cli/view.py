@@ -5,17 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import (
-    add_device,
-    add_fields,
-    add_masking,
-    add_no_clobber,
-    add_reading,
-    make_settings,
-    megabytes,
-    show_report,
-    table,
-)
+from clrecon.cli import common
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import add_labels, add_levels, describe_volume, mesh_fields
 from clrecon.errors import UsageError
@@ -69,15 +59,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " numbered where it exists; repeat it for several (default: a download)",
         first=True,
     )
-    add_fields(shown, ViewSettings)
+    common.add_fields(shown, ViewSettings)
     shown.add_argument("--space", type=str.lower, metavar="lps|ras", help="frame of picked points (default: lps)")
-    add_no_clobber(shown)
-    add_reading(parser)
-    add_masking(parser, crop=True)
-    add_fields(add_levels(parser, "surface of a scan"), MeshSettings, "kind")
-    add_fields(parser.add_argument_group("components of a scan"), MeshSettings, "selection")
+    common.add_no_clobber(shown)
+    common.add_reading(parser)
+    common.add_masking(parser, crop=True)
+    common.add_fields(add_levels(parser, "surface of a scan"), MeshSettings, "kind")
+    common.add_fields(parser.add_argument_group("components of a scan"), MeshSettings, "selection")
     add_labels(parser)
-    add_device(parser.add_argument_group("device, for scans"))
+    common.add_device(parser.add_argument_group("device, for scans"))
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -92,12 +82,12 @@ def run(options: argparse.Namespace, console: Console) -> int:
     report = write_view(
         options.inputs, options.html, settings, no_clobber=options.no_clobber, progress=console.progress
     )
-    show_report(report, _describe(report, options.html), options, console)
+    common.show_report(report, _describe(report, options.html), options, console)
     return 0
 
 
 def _settings(options: argparse.Namespace) -> ViewSettings:
-    return make_settings(ViewSettings, options, scan=MeshSettings(**mesh_fields(options)))
+    return common.make_settings(ViewSettings, options, scan=MeshSettings(**mesh_fields(options)))
 
 
 def _check_faces(options: argparse.Namespace) -> None:
@@ -178,12 +168,12 @@ def _describe(report: dict[str, Any], output: str) -> list[str]:
         for part in report["parts"][:_SHOWN_PARTS]
     ]
     if len(report["parts"]) > 1:
-        lines += [f"         {printable(row)}" for row in table(rows, right=(1, 2))]
+        lines += [f"         {printable(row)}" for row in common.table(rows, right=(1, 2))]
     if len(report["parts"]) > _SHOWN_PARTS:
         lines.append(f"         and {len(report['parts']) - _SHOWN_PARTS:,} more")
     if report["device"]:
         lines.append(f"device   {printable(report['device'])}")
-    size = f"{megabytes(report['output']['bytes'])}, vertices moved by at most {report['half_step_mm']:.2g} mm"
+    size = f"{common.megabytes(report['output']['bytes'])}, vertices moved by at most {report['half_step_mm']:.2g} mm"
     return [*lines, f"wrote    {printable(output)}, {size}", f"time     {report['seconds']['total']:.2f} s"]
 
 
