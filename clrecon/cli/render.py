@@ -17,6 +17,7 @@ from clrecon.jobs.inputs import CLOUD_INPUTS, MESH_INPUTS, is_cloud_file, is_onl
 from clrecon.jobs.render.settings import (
     COLORS,
     CURVED_KINDS,
+    MESH_COLORS,
     POINT_COLORS,
     SHEET_SLICES,
     WINDOWS,
@@ -131,8 +132,9 @@ class Looks:
     color: str | None = option(
         "--color C",
         "colour of a surface or of points, such as orange or #ff8000 (default: bone); of points also"
-        f" {', '.join(POINT_COLORS)} (default: label, else hu, where points have them)",
-        words=COLORS,
+        f" {', '.join(POINT_COLORS)} (default: label, else hu, where points have them); of a mesh with numbers at its"
+        f" vertices {', '.join(MESH_COLORS)}, with a scale in mm",
+        words=(*COLORS, *MESH_COLORS),
     )
     radius_mm: float | None = option("--point-radius MM", "of points, which are discs (default: their mean spacing)")
     opacity: float | None = option("--opacity SHARE", "of the mesh in mode mesh (default: 1)")
@@ -263,7 +265,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def render_settings(options: argparse.Namespace) -> RenderSettings:
     """Make settings from the options of the command."""
-    named = options.color in POINT_COLORS
+    named = options.color in (*POINT_COLORS, *MESH_COLORS)
     look = "says how a label looks: give the label map with --labels FILE"
     turn = "says how a picture moves: name it with --turntable OUT"
     given = {name: getattr(options, name, None) for name in RenderSettings.keywords()} | {
@@ -285,6 +287,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
     if options.input is None:
         _show_meshes_alone(options)
     files = PictureFiles(options.output, options.depth, options.values, options.turntable, options.report)
+    if options.mode is None and options.color in MESH_COLORS:
+        options.mode = "mesh"
     if options.mode is None and is_cloud_file(options.input):
         options.mode = "points"
     if options.mode is None and is_only_mesh(options.input):

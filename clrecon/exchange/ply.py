@@ -278,7 +278,7 @@ _CORNERS = ("vertex_indices", "vertex_index")
 
 
 def read_mesh(path: Path) -> RawMesh:
-    """Read the vertices, their normals and the triangles of a PLY file."""
+    """Read the triangles of a PLY file, its vertices with their normals, and the numbers ``scalar_NAME`` at them."""
     name = escape_text(path.name)
     try:
         with open_regular(path) as stream:
@@ -301,7 +301,10 @@ def read_mesh(path: Path) -> RawMesh:
     said = read_remarks(header.comments)
     color = _one_color(found)
     parts = [] if color is None else [Part("", len(triangles), color)]
-    return RawMesh("PLY", points, triangles, normals, warnings=cloud.warnings, parts=parts, **said)
+    named = {own[7:]: column for own, column in found.items() if own.startswith("scalar_") and own.isascii()}
+    with np.errstate(all="ignore"):  # harmed bits
+        values = {own: column.astype(np.float32) for own, column in named.items() if own.isidentifier()}
+    return RawMesh("PLY", points, triangles, normals, warnings=cloud.warnings, parts=parts, values=values, **said)
 
 
 def _one_color(columns: Mapping[str, NDArray[Any]]) -> tuple[float, float, float] | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -149,6 +149,7 @@ class RawMesh:
 
     vertices: (n, 3) of any real type, in `unit`, placed as the file says; perhaps not finite.
     parts: Empty where the file has no objects.
+    values: Of each vertex, by name.
     """
 
     kind: str
@@ -161,6 +162,7 @@ class RawMesh:
     warnings: list[str] = field(default_factory=list)
     unit: str = "mm"
     parts: Sequence[Part] = ()
+    values: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
 
 
 MOST_LEVELS = 32

@@ -133,7 +133,7 @@ class BaseMesh(Message):
                     f"values[{name!r}] are {array.dtype} of shape {array.shape}: one number a vertex is needed,"
                     f" ({self.vertex_count},)"
                 )
-            if not isinstance(name, str) or not name.isidentifier():
+            if not isinstance(name, str) or not (name.isascii() and name.isidentifier()):
                 raise UsageError(f"values have names of letters, digits and _ that begin with a letter, not {name!r}")
             checked[name] = np.ascontiguousarray(array, np.float32)
         return checked

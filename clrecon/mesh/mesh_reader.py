@@ -40,7 +40,8 @@ def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh
         In LPS mm.  Entries of ``report["file"]``: ``kind``, ``space``, ``space_from`` ("file", "argument" or
         "assumed"), ``unit`` (of the file), ``triangles``, ``parts`` (``name``, ``triangles`` and ``color`` of each
         object, whose triangles follow one another) and ``warnings``.  The name and the colour of a file's only object
-        are the mesh's own: ``report["part_name"]``, ``report["color"]``.
+        are the mesh's own: ``report["part_name"]``, ``report["color"]``.  Numbers ``scalar_NAME`` at the vertices of a
+        PLY file are ``values[NAME]``.
 
     Raises
     ------
@@ -83,6 +84,7 @@ def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh
         mesh = Mesh(vertices, raw.triangles, normals, report)
     except UsageError as error:
         raise RefusedInputError(f"{name} is corrupt: {error}") from error
+    mesh.values = dict(raw.values)
     log.info("%s file read: %d triangles", raw.kind, mesh.triangle_count)
     log_warnings(log, warnings)
     return mesh

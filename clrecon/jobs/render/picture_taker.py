@@ -11,7 +11,7 @@ from clrecon.jobs.render.settings import SPINES, LabelLook, RenderSettings
 from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.looks.presets import find_preset
 from clrecon.rendering.pictures.label_style import NO_LABEL
-from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
+from clrecon.rendering.pictures.object_looks import MESH_COLORS, MeshLook, PointLook
 from clrecon.rendering.pictures.styles import SPINE, CurveCut, SlicesInSpace, Style, SurfaceLook, VolumeLook
 from clrecon.rendering.views.clip import check_center
 from clrecon.rendering.views.directions import default_view
@@ -152,7 +152,13 @@ class PictureTaker(Closing):
         else:
             picture = self._open_volume().render(self.style, background=settings.background, **place)
         letters = settings.letters and not settings.is_sheet  # each slice of a sheet has its own
-        return picture.annotated(letters=letters, scale_bar=settings.scale_bar, caption=settings.caption)
+        picture = picture.annotated(letters=letters, scale_bar=settings.scale_bar, caption=settings.caption)
+        if not isinstance(self.style, MeshLook) or self.style.color_by is None:
+            return picture
+        from clrecon.rendering.pictures.sheets import add_scale
+
+        scale, _ = self.style.find_scale(cast("Mesh", self._subject).values)
+        return add_scale(picture, scale, MESH_COLORS[self.style.color_by])
 
     def _open_volume(self) -> Any:
         from clrecon.operators.rays.render import VolumeRenderer

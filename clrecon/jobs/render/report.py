@@ -209,10 +209,13 @@ def _describe_meshes(
     described = []
     for mesh, look in [*shown, *zip(taker.meshes, settings.mesh_looks(), strict=True)]:
         assert isinstance(look, MeshLook)
+        scale = None if look.color_by is None else look.find_scale(mesh.values)[0]
         described.append(
             {
                 "triangles": mesh.triangle_count,
                 "color": [round(float(share), 4) for share in look.rgb],
+                "color_by": look.color_by,
+                "range_mm": None if scale is None else [scale.low, scale.limit],
                 "opacity": look.opacity,
                 "file": mesh.report.get("file"),
             }

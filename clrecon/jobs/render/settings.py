@@ -26,6 +26,7 @@ from clrecon.rendering.movies import turntable_cameras
 from clrecon.rendering.pictures.annotations import SMALLEST_SIDE
 from clrecon.rendering.pictures.label_style import NO_LABEL, distinct_colors
 from clrecon.rendering.pictures.modes import MODES, check_known, choose_mode, keywords_of, make_style
+from clrecon.rendering.pictures.object_looks import MESH_COLORS as MESH_COLORS
 from clrecon.rendering.pictures.object_looks import POINT_COLORS as POINT_COLORS
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.sheets import SHEET_SIZE

@@ -212,8 +212,8 @@ def make_part(mesh: Mesh, look: MeshLook) -> MeshPart:
     if mesh.triangle_count > MOST_TRIANGLES:
         raise UsageError(f"a picture shows at most {MOST_TRIANGLES:,} triangles, the mesh has {mesh.triangle_count:,}")
     colors: NDArray[np.uint8] | None = None
-    if look.vertex_colors is not None:
-        given = np.asarray(look.vertex_colors)
+    given = look.colors_at(mesh.checked_values())
+    if given is not None:
         if len(given) != mesh.vertex_count:
             raise UsageError(f"{len(given)} colours for {mesh.vertex_count} vertices: one a vertex is needed")
         colors = np.full((len(given), 4), 255, np.uint8)

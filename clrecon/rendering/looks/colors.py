@@ -73,6 +73,9 @@ _FROM_ZERO = np.array(
 )
 """ColorBrewer's YlOrRd, its lightest and darkest classes spread over seven."""
 
+_UNKNOWN = (128, 128, 128)
+"""Colour of NaN."""
+
 
 def round_up(value: float) -> float:
     """Return the least number of the form 1, 2 or 5 x 10^n that is not below a positive number."""
@@ -105,5 +108,6 @@ class ColorScale:
         """Return red, green and blue of numbers, shape (n, 3)."""
         table = _ABOUT_ZERO if self.signed else _FROM_ZERO
         places = (np.asarray(values, dtype=np.float64) - self.low) / (self.limit - self.low) * (len(table) - 1)
-        known = np.arange(len(table))
-        return np.stack([np.rint(np.interp(places, known, column)) for column in table.T], axis=-1).astype(np.uint8)
+        known, unknown = np.arange(len(table)), np.isnan(places)[..., None]
+        found = np.stack([np.interp(places, known, column) for column in table.T], axis=-1)
+        return np.rint(np.where(unknown, _UNKNOWN, found)).astype(np.uint8)

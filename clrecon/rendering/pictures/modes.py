@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from clrecon.errors import UsageError
 from clrecon.rendering.looks.presets import find_preset
-from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
+from clrecon.rendering.pictures.object_looks import MESH_COLORS, MeshLook, PointLook
 from clrecon.rendering.pictures.styles import (
     CurveCut,
     PlaneCut,
@@ -87,8 +87,9 @@ def check_known(mode: str, keyword: str, called: str | None = None) -> None:
 def choose_mode(mode: str | None = None, preset: str | None = None, **look: object) -> str:
     """Choose the mode that names and keywords ask for: a name of `MODES`, by default volume rendering.
 
-    Without `mode` an iso value means a surface, a curve means a curved reformation, a sheet means slices, a radius of
-    points or what they are coloured by means points, and a preset means its own mode.
+    Without `mode` an iso value means a surface, a curve means a curved reformation, a sheet means slices, what vertices
+    are coloured by means a mesh, a radius of points or what they are coloured by means points, and a preset means its
+    own mode.
     """
     if mode is not None:
         if not isinstance(mode, str) or mode not in MODES:
@@ -100,6 +101,8 @@ def choose_mode(mode: str | None = None, preset: str | None = None, **look: obje
         return "cpr"
     if look.get("sheet") is not None:
         return "slice"
+    if look.get("color_by") in MESH_COLORS:
+        return "mesh"
     if look.get("color_by") is not None or look.get("radius_mm") is not None:
         return "points"
     return "dvr" if preset is None else find_preset(preset).mode

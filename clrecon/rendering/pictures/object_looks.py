@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from typing import Any, ClassVar
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
-from clrecon.rendering.looks.colors import find_color
+from clrecon.rendering.looks.colors import ColorScale, find_color, round_up
 from clrecon.rendering.looks.lighting import Lighting
 from clrecon.rendering.looks.window import checked_window
 from clrecon.rendering.pictures import style_checks as checks
@@ -37,6 +37,12 @@ def _vertex_colors(value: Any) -> NDArray[np.uint8]:
     return given.astype(np.uint8)
 
 
+MESH_COLORS = {"thickness": "mm thick", "error": "mm of error", "distance": "mm away"}
+"""Numbers at vertices that colours show, ``thickness_mm`` and so on, with the title of their scale."""
+
+_LEAST_LIMIT_MM = 1e-3
+
+
 @dataclass(frozen=True)
 class MeshLook(Style):
     """The triangles of a mesh, shaded; both sides of a surface are lit.
@@ -52,6 +58,9 @@ class MeshLook(Style):
         none, those of its vertices' triangles.
     vertex_colors : array_like, shape (n, 3), optional
         A colour for each vertex, interpolated between them, in place of ``color``: uint8, or floats from 0 to 1.
+    color_by : {"thickness", "error", "distance"}, optional
+        Colour vertices by ``mesh.values["thickness_mm"]``, ``["error_mm"]`` (see `clrecon.fit_cortex`) or
+        ``["distance_mm"]``, grey where they are NaN.
     lighting : Lighting, optional
         Default: ``Lighting()``.
     clip : Clip, optional
@@ -67,13 +76,16 @@ class MeshLook(Style):
     )
     flat: bool = style_field(False, partial(checks.flag, "flat"))
     vertex_colors: ArrayLike | None = field(default=None, compare=False, metadata={"check": _vertex_colors})
+    color_by: str | None = style_field(
+        None, checks.one_of(tuple(MESH_COLORS), f"meshes are coloured by one of {', '.join(MESH_COLORS)}")
+    )
     lighting: Lighting | None = style_field(None, checks.instance_of("lighting", Lighting))
     clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.color is not None and self.vertex_colors is not None:
-            raise UsageError("a mesh has one colour or a colour for each vertex, not both")
+        if sum(given is not None for given in (self.color, self.vertex_colors, self.color_by)) > 1:
+            raise UsageError("a mesh has one colour, a colour for each vertex, or is coloured by numbers at them")
 
     @property
     def light(self) -> Lighting:
@@ -84,6 +96,23 @@ class MeshLook(Style):
     def rgb(self) -> Float64Array:
         """The colour: red, green and blue, each from 0 to 1."""
         return find_color(DEFAULT_COLOR if self.color is None else self.color)
+
+    def find_scale(self, values: Mapping[str, NDArray[np.floating]]) -> tuple[ColorScale, NDArray[np.floating]]:
+        """Return the scale of `color_by` for a mesh with these numbers at its vertices, and those that it shows."""
+        name = f"{self.color_by}_mm"
+        known = np.abs(values[name][np.isfinite(values[name])]) if name in values else np.zeros(0)
+        if not len(known):
+            whose = "coloured by its distance" if self.color_by == "distance" else "fitted to the cortex"
+            raise UsageError(f"the mesh has no {name} at its vertices: a mesh {whose} has them, in memory and as PLY")
+        limit = round_up(max(float(np.percentile(known, 95.0)), _LEAST_LIMIT_MM))
+        return ColorScale(limit, bool((values[name] < 0.0).any())), values[name]
+
+    def colors_at(self, values: Mapping[str, NDArray[np.floating]]) -> NDArray[np.uint8] | None:
+        """Return the colours of a mesh's vertices with these numbers; None where all have one colour."""
+        if self.color_by is None:
+            return None if self.vertex_colors is None else np.asarray(self.vertex_colors)
+        scale, shown = self.find_scale(values)
+        return scale.colors(shown)
 
 
 POINT_COLORS = ("hu", "label", "removed")

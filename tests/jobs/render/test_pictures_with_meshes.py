@@ -15,6 +15,8 @@ from clrecon.cli.main import main
 from clrecon.errors import UsageError
 from clrecon.jobs.render.job import PictureFiles, make_pictures
 from clrecon.jobs.render.settings import MeshFile, RenderSettings
+from clrecon.rendering.looks.colors import ColorScale
+from clrecon.rendering.looks.lighting import UNSHADED
 
 
 @pytest.fixture
@@ -85,6 +87,42 @@ def test_meshes_lie_in_a_scan(device: Any, files: dict[str, Path], tmp_path: Pat
     assert any("plain.stl names no patient frame" in text for text in report.warnings)
     assert report.meshes[0]["color"] != report.meshes[1]["color"]
     assert report.pictures[0]["hit_share"] > 0.02
+
+
+def test_a_mesh_is_coloured_by_numbers_at_its_vertices(
+    device: Any, files: dict[str, Path], tmp_path: Path, capsys: Any
+) -> None:
+    """Walls from 0.5 mm at the patient's right, the picture's left, to 1.5 mm; nothing is known of the lower half."""
+    mesh = clrecon.read_mesh(files["lps.stl"])
+    thickness = 1.0 + 0.1 * mesh.vertices[:, 0].astype(float)
+    thickness[mesh.vertices[:, 2] < -1.0] = np.nan
+    mesh.values = {"thickness_mm": thickness, "distance_mm": thickness - 1.0}
+    named = tmp_path / "walls.ply"
+    mesh.save(named)
+    read = clrecon.read_mesh(named)
+    assert np.array_equal(read.values["thickness_mm"], thickness.astype(np.float32), equal_nan=True)
+    out, report = tmp_path / "out.png", tmp_path / "report.json"
+    words = ["render", str(named), "-o", str(out), "--size", "200", "--color", "thickness", "--light", "none"]
+    assert main([*words, "--report", str(report)]) == 0, capsys.readouterr().err
+    shown = json.loads(report.read_text())["meshes"][0]
+    assert shown["color_by"] == "thickness" and shown["range_mm"] == [0.0, 2.0]
+    picture = clrecon.render(read, color_by="thickness", size=(200, 200), lighting=UNSHADED, device=device)
+    image = picture.image.astype(int)
+    from PIL import Image
+
+    drawn = np.array(Image.open(out))
+    assert drawn.shape[1] > 220 and np.array_equal(drawn[:, :200, :3], image[..., :3])
+    scale = ColorScale(2.0, signed=False)
+    for column, value in ((30, 0.57), (100, 1.0), (170, 1.43)):
+        assert np.abs(image[80, column, :3] - scale.colors([value])[0]).max() < 12
+    assert image[160, 100, :3].tolist() == [128, 128, 128]
+    look = clrecon.MeshLook(color_by="distance", lighting=UNSHADED)
+    signed = clrecon.render(read, look, size=(200, 200), device=device)
+    assert np.abs(signed.image[80, 100, :3].astype(int) - 222).max() < 12
+    with pytest.raises(UsageError, match="no error_mm at its vertices"):
+        clrecon.render(read, color_by="error", device=device)
+    assert main(["render", str(files["lps.stl"]), "-o", str(out), "--color", "thickness"]) == 3
+    assert "a mesh fitted to the cortex has them" in capsys.readouterr().err
 
 
 def test_a_turntable_of_a_mesh(device: Any, files: dict[str, Path], tmp_path: Path) -> None:

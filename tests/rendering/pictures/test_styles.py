@@ -95,6 +95,7 @@ WRONG: dict[type[Style], Wrong] = {
         "color": [("octarine", "unknown colour 'octarine'"), (TWO, "colour")],
         "opacity": [(0.0, "opacity of a mesh"), (1.5, "not at 1.5"), (np.nan, "opacity"), ("all", "opacity")],
         "flat": [("no", "flat is True or False, not 'no'"), (1, "flat")],
+        "color_by": [("hu", "one of thickness, error, distance, not 'hu'"), (TWO, "coloured by")],
         "vertex_colors": [(TWO, "colours of vertices"), ([[2.0, 0.0, 0.0]], "floats from 0 to 1"), ("red", "shape")],
         "lighting": LABELLED["lighting"],
         "clip": RAYS["clip"],
