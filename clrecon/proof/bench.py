@@ -56,7 +56,6 @@ class FlyingEdges:
 
     @property
     def version(self) -> str:
-        """VTK's version."""
         from vtkmodules.vtkCommonCore import vtkVersion
 
         return str(vtkVersion.GetVTKVersion())

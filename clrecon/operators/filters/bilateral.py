@@ -50,12 +50,10 @@ class SlicesThere:
 
     @property
     def rows(self) -> int:
-        """Rows that are there."""
         return self.nj * self.count
 
     @property
     def core_rows(self) -> int:
-        """Rows that are worked on."""
         return self.nj * self.core_count
 
 
@@ -71,7 +69,6 @@ def mixed_group_bytes(ni: int, rows: int, core_rows: int) -> int:
 
 
 def prepare_near_level(device: Device, dtype: DTypeLike = np.int16) -> Program:
-    """Build the kernels for volumes of `dtype`."""
     prepare_compact(device)
     return load_program(device, "filters/near_level.cl", voxel_variants(dtype))
 
@@ -119,7 +116,6 @@ TAPS_A_LAUNCH = 1 << 32
 
 
 def prepare_bilateral(device: Device, dtype: DTypeLike = np.int16) -> Program:
-    """Build the kernels for volumes of `dtype`."""
     variants = {**voxel_variants(dtype), "LANES": device.kernel_variants["LANES"]}
     return load_program(device, "filters/bilateral.cl", variants)
 
@@ -281,7 +277,6 @@ class _Run:
         self.strips = self.row_groups - (self.inner_end - self.inner)
 
     def needs(self, slices: int) -> dict[str, int]:
-        """Return the bytes on the device for a slab of so many slices."""
         there = self.nk if slices == self.nk else min(slices + 2 * self.halo, self.nk)
         window = self.settings.window
         strip = (GROUP + 2 * self.reach) * self.dtype.itemsize
@@ -296,7 +291,6 @@ class _Run:
         return needs
 
     def run(self, slices: int) -> Filtered:
-        """Filter with so many slices in a slab."""
         device, stopwatch = self.resident.device, self.stopwatch
         with stopwatch.timed("build"):
             self.program = prepare_bilateral(device, self.dtype)

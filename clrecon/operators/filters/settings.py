@@ -45,7 +45,6 @@ class Window:
 
     @property
     def taps(self) -> int:
-        """Number of taps."""
         return len(self.offsets)
 
     @property
@@ -229,7 +228,6 @@ class BilateralSettings:
         ]
 
     def as_report(self) -> dict[str, Any]:
-        """Return the entries of a volume's report."""
         reach = self.window.reach[: self.dimensions]
         return {
             "filter": "bilateral",

@@ -50,7 +50,6 @@ class Spaces:
 
     @property
     def count(self) -> int:
-        """Number of spaces."""
         return len(self.numbers)
 
     def choose(self, wanted: NDArray[np.bool_]) -> Mask:

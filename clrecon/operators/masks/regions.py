@@ -42,7 +42,6 @@ class RowSpans:
 
 
 def checked_mm(mm: float, what: str) -> float:
-    """Return a length as a float."""
     if isinstance(mm, bool) or not isinstance(mm, (int, float, np.number)) or not 0.0 < float(mm) < np.inf:
         raise UsageError(f"{what} is {mm!r}: a number of mm above 0 is needed")
     return float(mm)

@@ -22,7 +22,6 @@ PARTS_PER_CORE = 4
 
 
 def prepare_runs(device: Device) -> Program:
-    """Build the kernels."""
     prepare_scan(device)
     prepare_components(device)
     return load_program(device, "masks/runs.cl")
@@ -37,13 +36,11 @@ class StencilTable:
 
     @classmethod
     def of(cls, device: Device, stencil: Stencil) -> StencilTable:
-        """Upload a stencil."""
         rows = stencil.rows if len(stencil.rows) else np.zeros((1, 4), np.int32)  # OpenCL has no empty buffers
         return cls(upload(device, rows), upload(device, stencil.tables))
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Arguments of kernels."""
         return {"stencil": self.rows_d, "tables": self.tables_d}
 
 
@@ -80,7 +77,6 @@ def count_runs(device: Device, mask: VoxelMask, bits_d: Any, *, lone: bool = Fal
 
 
 def list_runs(device: Device, mask: VoxelMask, bits_d: Any, counted: RowRuns) -> RowRuns:
-    """List the runs that were counted."""
     runs_d = allocate(device, 4 * counted.count)
     launch(
         device, prepare_runs(device)["list_row_runs"], mask.rows, bits=bits_d, row_extents=mask.row_extents_d,
@@ -182,7 +178,6 @@ class RunList:
 
     @property
     def lengths(self) -> NDArray[np.int64]:
-        """Voxels of each run."""
         return self.last - self.first + 1
 
     def where(self, which: NDArray[np.bool_]) -> RunList:
@@ -190,7 +185,6 @@ class RunList:
         return RunList(self.j[which], self.k[which], self.first[which], self.last[which], self.numbers[which])
 
     def of(self, number: int) -> RunList:
-        """Return the runs of one component."""
         return self.where(self.numbers == number)
 
     def sum_ml(self, volume: Volume, count: int) -> NDArray[np.float64]:

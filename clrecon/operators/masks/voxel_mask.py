@@ -67,11 +67,9 @@ class VoxelMask:
 
     @property
     def rows(self) -> int:
-        """Number of rows (j, k)."""
         return self.shape_ijk[1] * self.shape_ijk[2]
 
     def needs(self) -> dict[str, int]:
-        """Return the bytes of the buffers."""
         return mask_bytes(self.shape_ijk, self.pad)
 
 
@@ -177,7 +175,6 @@ class _Marking:
         self.stopwatch, self.progress = stopwatch, progress
 
     def mark(self, slices: int) -> VoxelMask:
-        """Make the mask with so many slices in a slab."""
         resident, device = self.resident, self.resident.device
         ni, nj, nk = resident.volume.shape_ijk
         mask_d, extents_d = allocate(device, 4 * self.words * nj * nk), allocate(device, 4 * nj * nk)
@@ -254,7 +251,6 @@ OPERATIONS = {
 
 
 def prepare_logic(device: Device, dtype: DTypeLike = np.int16) -> Program:
-    """Build the kernels; `dtype` is that of voxels."""
     return load_program(device, "masks/logic.cl", voxel_variants(dtype))
 
 

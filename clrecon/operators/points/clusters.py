@@ -185,7 +185,6 @@ class _Request:
         return cls(lattice, used, samples, stencil, tuple(warnings))
 
     def describe(self, search: ClusterSearch) -> dict[str, Any]:
-        """Return the facts of parameters and counts."""
         return {
             "eps_mm": self.eps,
             "min_samples": self.samples,
@@ -199,7 +198,6 @@ class _Request:
         self, cloud: PointCloud, labels: NDArray[np.int32], cores: NDArray[np.bool_], search: ClusterSearch,
         stopwatch: Stopwatch, device: Device, told: list[str],
     ) -> Clustering:  # fmt: skip
-        """Put the result together."""
         labelled = cloud.changed(labels=labels)
         figures = measure_clusters(labelled)
         warnings = [*told, *self.warnings]

@@ -49,7 +49,6 @@ class DistanceMeasure:
 
     @staticmethod
     def needs(points: int) -> dict[str, int]:
-        """Return the bytes for a cloud of so many points."""
         return {"mean distances": 8 * points}
 
     def measure(self, part: Part, neighbours_d: Any) -> None:
@@ -242,7 +241,6 @@ class _Settings:
 
     @classmethod
     def checked(cls, k: int, range_factor: float, iterations: int, features: str | None, paper: bool) -> _Settings:
-        """Check the parameters of `denoise_points`."""
         if isinstance(range_factor, bool) or not isinstance(range_factor, (int, float)):
             raise UsageError(f"range_factor is a positive number, not {range_factor!r}")
         if not 0.0 < range_factor < math.inf:

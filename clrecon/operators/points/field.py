@@ -57,7 +57,6 @@ class Masks:
         return self.words * self.rows
 
     def make(self) -> Any:
-        """Return a buffer for another mask."""
         return allocate(self.device, 4 * self.total)
 
     def fetch(self, mask_d: Any) -> NDArray[np.uint32]:
@@ -105,7 +104,6 @@ class _Decision:
         self._lines = {"words": masks.words, "rows": masks.rows}
 
     def run(self, kernel: str, items: int, **arguments: Any) -> None:
-        """Launch a kernel over `items` work-items."""
         launch(self.device, self._program[kernel], items, **arguments)
 
     def _check(self, what: str, size: int) -> None:
@@ -114,7 +112,6 @@ class _Decision:
             raise DeviceMemoryError(f"the inside of the cloud cannot be found: {shortage}")
 
     def find_runs(self) -> _Runs:
-        """List the runs of far nodes."""
         masks, rows = self.masks, self.masks.rows
         along = {"nx": masks.shape[0], **self._lines}
         counts_d = allocate(self.device, 4 * rows)
@@ -250,7 +247,6 @@ class Nodes:
 
     @property
     def count(self) -> int:
-        """Number of nodes."""
         return math.prod(self.shape)
 
     @property
@@ -260,12 +256,10 @@ class Nodes:
 
     @property
     def rows(self) -> int:
-        """Rows of nodes."""
         return self.shape[1] * self.shape[2]
 
     @property
     def mask_bytes(self) -> int:
-        """Bytes of a mask of nodes."""
         return 4 * self.words * self.rows
 
     @property
@@ -381,7 +375,6 @@ class NodeField:
 
     @cached_property
     def _where(self) -> dict[str, Any]:
-        """Arguments that kernels have in common."""
         origin = self.grid.origin_and_scale
         return {"nodes": self.nodes.corner_and_spacing, "origin": origin, "within": self._within}
 

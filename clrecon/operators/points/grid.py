@@ -137,7 +137,6 @@ class PointGrid:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the grid on the device."""
         return 16 * self.n + 12 * PADDING + 4 * (self.cells + 1) + 8 * self.words * self.shape[1] * self.shape[2]
 
 
@@ -194,7 +193,6 @@ def _count_cells(box: NDArray[np.float32], corner: NDArray[np.float32], edge: np
 
 
 def prepare_grid(device: Device) -> Program:
-    """Build the kernels of `make_grid`."""
     prepare_sort(device)
     return load_program(device, "points/grid.cl", {"LANES": device.kernel_variants["LANES"]})
 

@@ -230,12 +230,10 @@ class NeighbourSearch:
 
     @property
     def most_places(self) -> int:
-        """Points of the largest part."""
         return max(part.place_count for part in self.parts)
 
     @property
     def coordinates(self) -> dict[str, Any]:
-        """The arguments x, y and z of kernels."""
         return {"x": self.grid.x_d, "y": self.grid.y_d, "z": self.grid.z_d}
 
     def _launch(self, part: Part, by_place: bool, neighbours_d: Any, distances_d: Any) -> None:

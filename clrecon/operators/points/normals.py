@@ -134,7 +134,6 @@ class PlaneFits:
         return {"planes of a part": 16 * points}
 
     def fit(self, part: Part) -> None:
-        """List the neighbours of a part and fit their planes."""
         search = self._search
         search.list_places(part, self.neighbours_d)
         lanes = int(search.device.kernel_variants["LANES"])
@@ -245,7 +244,6 @@ class _Run:
     def step(
         self, viewpoint: NDArray[np.float64] | None = None, gradients: NDArray[np.float32] | None = None
     ) -> PointStep:
-        """Estimate and orient all normals."""
         device, stopwatch, points = self.device, self.stopwatch, self.cloud.points
         n = len(points)
         results = {"normals": 13 * n, "gradients": 0 if gradients is None else 12 * n}

@@ -72,7 +72,6 @@ class Selection:
 
 
 def prepare_voxels(device: Device, dtype: DTypeLike, labels: DTypeLike | None = None) -> Program:
-    """Build the kernels for volumes of `dtype` and label maps of type `labels`."""
     prepare_scan(device)
     prepare_classify(device, dtype, "between")
     own = {} if labels is None else label_variants(labels)
@@ -116,7 +115,6 @@ class VoxelEmission:
 
     @property
     def volume(self) -> Volume:
-        """The volume."""
         return self.resident.volume
 
     @property
@@ -125,7 +123,6 @@ class VoxelEmission:
         return "shell of voxels" if self.selection.shell else "voxels"
 
     def run(self, progress: Progress = ignore_progress) -> Points:
-        """Make the points of the whole volume."""
         labels = self.selection.labels
         with self.stopwatch.timed("build"):
             prepare_voxels(self.resident.device, self.volume.voxels.dtype, None if labels is None else labels.dtype)
@@ -269,7 +266,6 @@ class VoxelEmission:
             self.largest[what] = max(self.largest[what], size)
 
     def describe(self) -> dict[str, Any]:
-        """Return the entries of the report about the device and the work."""
         device = self.resident.device
         return {
             "device": device.label,

@@ -31,7 +31,6 @@ LARGEST_WORK = 1e11
 
 
 def checked_min_samples(min_samples: int) -> int:
-    """Return `min_samples`."""
     whole = isinstance(min_samples, (int, np.integer)) and not isinstance(min_samples, bool)
     if not whole or not 1 <= min_samples <= MOST_SAMPLES:
         raise UsageError(

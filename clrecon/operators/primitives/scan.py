@@ -28,7 +28,6 @@ class Scanned:
 
 
 def prepare_scan(device: Device) -> None:
-    """Build the kernels of `exclusive_scan`."""
     _load_scan(device)
 
 
@@ -81,7 +80,6 @@ class Compacted:
 
 
 def prepare_compact(device: Device) -> None:
-    """Build the kernels of `compact`."""
     prepare_scan(device)
     _load_compact(device)
 
@@ -131,7 +129,6 @@ class Sorted:
 
 
 def prepare_sort(device: Device) -> Program:
-    """Build the kernels of `radix_sort`."""
     prepare_scan(device)
     variants = {"LANES": device.kernel_variants["LANES"], "RADIX_GROUP": str(device.group_size)}
     return load_program(device, "primitives/radix_sort.cl", variants)

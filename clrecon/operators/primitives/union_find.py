@@ -112,7 +112,6 @@ class _Rounds:
         self._passes = 0
 
     def run(self, kernel: str, items: int, **arguments: Any) -> None:
-        """Launch a kernel over `items` work-items."""
         launch(self._device, self._program[kernel], items, **arguments)
 
     def start(self) -> None:

@@ -61,7 +61,6 @@ class MeshPart:
 
     @property
     def device_bytes(self) -> int:
-        """Bytes that its buffers take on a device."""
         beside = (0 if self.normals is None else 12) + (0 if self.colors is None else 4)
         return (24 + beside) * len(self.vertices) + 16 * len(self.triangles)
 
@@ -77,7 +76,6 @@ class LayerKeys:
 
     @classmethod
     def of(cls, device: Device, pixels: int) -> LayerKeys:
-        """Allocate them."""
         return cls(*(allocate(device, 4 * pixels) for _ in range(4)))
 
     def go_behind(self) -> None:
@@ -87,7 +85,6 @@ class LayerKeys:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Arguments for the kernels that draw."""
         return {
             "keys": self.keys_d,
             "numbers": self.numbers_d,

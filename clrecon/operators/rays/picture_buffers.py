@@ -214,7 +214,6 @@ class PictureBuffers:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Arguments for kernels that blend."""
         return {
             "states": self.states_d,
             "image": self.image_d,
@@ -235,7 +234,6 @@ class PictureBuffers:
 
     @property
     def tiles(self) -> int:
-        """Number of tiles of the picture."""
         width, height = self.size
         return -(-width // TILE) * -(-height // TILE)
 

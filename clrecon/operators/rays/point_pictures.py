@@ -319,7 +319,6 @@ class PointPictures(Closing):
         background: str | Sequence[float] | None = None,
         progress: Progress | None = None,
     ) -> Rendering:
-        """Take one picture."""
         radius = self._radius(style)
         colors = self._colors_of(style)
         cloud, points = self.cloud, self._points
@@ -379,7 +378,6 @@ def _warn_of_radius(radius: float, camera: Camera, size: tuple[int, int]) -> lis
 
 
 def _color_points(cloud: PointCloud, style: PointLook) -> _Colors:
-    """Choose the colour of each point."""
     by = style.color_by
     if by is None and style.color is None:
         if cloud.labels is not None:

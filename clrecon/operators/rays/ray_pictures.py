@@ -108,7 +108,6 @@ class TransferTables:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Arguments for the kernel."""
         first_shown, last_shown = self.shown_ends
         return {
             "colors": self.colors_d,
@@ -186,7 +185,6 @@ class MainWay:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Arguments for kernels."""
         return {"main_axis": self.axis, "ahead": self.ahead, "eye": self.eye, "aside": self.aside}
 
 

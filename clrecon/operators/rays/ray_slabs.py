@@ -87,7 +87,6 @@ class RaySlab:
 
     @property
     def is_whole(self) -> bool:
-        """True where the slab is the whole volume."""
         return self.stage == 3
 
     @property

@@ -242,7 +242,6 @@ class CutJob:
             self.warnings += [*self.look.labels.warnings, *warn_of_place(self.look.labels, resident.volume)]
 
     def sample(self, sheet: Sheet) -> Reformation:
-        """Return the values of a sheet."""
         return sample_sheet(
             self.resident, sheet, self.samples, self.style.combine,
             stopwatch=self.stopwatch, progress=self.progress, warnings=self.warnings,
@@ -276,7 +275,6 @@ class CutJob:
         return seen if is_transparent(background) else seen.with_background(background)
 
     def describe(self, made: Reformation, pixel_mm: float) -> dict[str, Any]:
-        """Return the report of a picture."""
         return {
             "pixel_mm": pixel_mm,
             "thickness_mm": self.style.thickness,

@@ -53,7 +53,6 @@ class FieldFrame:
 
     @classmethod
     def of(cls, volume: Volume) -> FieldFrame:
-        """Return the frame of a volume."""
         if volume.uneven:
             origin = volume.slice_origins()[0]
             normal = slice_normal(volume.affine)
@@ -105,7 +104,6 @@ class StackTable:
 
     @classmethod
     def of(cls, volume: Volume, device: Device) -> StackTable:
-        """Make the table of a volume on the device."""
         slope = np.zeros(4, np.float32)
         if not volume.uneven:
             return cls({}, slope)
@@ -172,7 +170,6 @@ def brick_bytes(shape_ijk: tuple[int, int, int], dtype: np.dtype[Any]) -> int:
 
 
 def prepare_bricks(device: Device, dtype: np.dtype[Any]) -> Program:
-    """Build the kernels for volumes of `dtype`."""
     return load_program(device, "resident/bricks.cl", voxel_variants(dtype))
 
 

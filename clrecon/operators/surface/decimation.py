@@ -81,7 +81,6 @@ class CrossingPlan:
     edges: Float32Array
 
     def needs(self) -> dict[str, int]:
-        """Return the bytes on the device by what they are for."""
         tables = ("vertices", "corners", "low", "high", "starts", "levels", "edges")
         return {"triangles in rows": sum(getattr(self, name).nbytes for name in tables), "marks": len(self.order) // 8}
 
@@ -198,7 +197,6 @@ class DeviceBounds(SurfaceBounds):
 
     @property
     def slack(self) -> float:
-        """As of the twin."""
         return self._slack
 
     @cached_property
@@ -211,7 +209,6 @@ class DeviceBounds(SurfaceBounds):
 
     @cached_property
     def _surface(self) -> dict[str, Any]:
-        """The arguments of the kernels that are the surface."""
         arrays = {
             "places": self._vertices.astype(np.float32),
             "faces": self._triangles,
@@ -226,14 +223,12 @@ class DeviceBounds(SurfaceBounds):
         }
 
     def find_upper_bounds(self, points: Float64Array, near: IntArray) -> tuple[Float64Array, NDArray[np.int64]]:
-        """As `NearDistance.find_upper_bounds`."""
         length, rows = self.find_bounds(points, near[:, None], 0.0)
         return length.astype(np.float64), rows.astype(np.int64)
 
     def find_bounds(
         self, points: Float64Array, near: IntArray, limit: float, walks: int = 0
     ) -> tuple[Float32Array, IntArray]:
-        """As `SurfaceBounds.find_bounds`."""
         device, surface = self._device, self._surface
         squares = np.empty(len(points), np.float32)
         rows = np.empty(len(points), np.int32)
@@ -255,7 +250,6 @@ class DeviceBounds(SurfaceBounds):
     def find_witnesses(
         self, places: Float32Array, triangles: IntArray, names: IntArray, beside: IntArray, limit: float
     ) -> tuple[IntArray, NDArray[np.uint8]]:
-        """As `SurfaceBounds.find_witnesses`."""
         device = self._device
         witnesses: NDArray[np.int32] = np.empty((WITNESSES, len(triangles)), np.int32)
         left = np.empty(len(triangles), np.uint8)

@@ -112,7 +112,6 @@ SUMS = {
 
 
 def prepare_choosing(device: Device) -> Program:
-    """Build the kernels."""
     return load_program(device, "surface/choosing.cl")
 
 
@@ -176,7 +175,6 @@ class Components:
 def choose_components(
     device: Device, grid: SampleGrid, classified: Classified, runs: Runs, components: Components, seeds: Seeds,
 ) -> None:  # fmt: skip
-    """Choose the components that hold a seed, and sum up all."""
     program, (gi, gj, gk) = prepare_choosing(device), grid.shape
     sizes = {"gi": gi, "gj": gj, "gk": gk, "words": grid.words}
 
@@ -213,7 +211,6 @@ def choose_components(
 
 
 def sum_components(device: Device, runs: Runs, components: Components) -> None:
-    """Sum up the components."""
     launch(
         device, prepare_choosing(device)["sum_components"], runs.total,
         run_cells=components.cells_d, sums=components.sums_d, runs=runs.total, **components.places,
@@ -224,7 +221,6 @@ MOST_RUNS = 2**31
 
 
 def prepare_growing(device: Device) -> Program:
-    """Build the kernels."""
     prepare_scan(device)
     load_cells(device, grown=True)
     prepare_choosing(device)
@@ -288,7 +284,6 @@ class _Search:
         launch(self.device, self.program[kernel], items, **arguments)
 
     def find_runs(self) -> Runs:
-        """Find the runs of all rows."""
         bits = 4 * self.rows * self.grid.words
         active_d, starts_d, words_d = (allocate(self.device, size) for size in (bits, bits, bits // 2))
         counts_d, extents_d = allocate(self.device, 4 * self.rows), allocate(self.device, 4 * self.rows)

@@ -171,7 +171,6 @@ class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
         return first, min(self.labels.shape_ijk[2], max(box[0].stop for box in boxes.values()) + SPARE_SLICES)
 
     def needs(self, first: int, end: int) -> dict[str, int]:
-        """Return the bytes on the device for these slices."""
         samples = self.labels.voxels[first:end].size
         return {
             "labels": samples * self.labels.voxels.itemsize,
@@ -285,7 +284,6 @@ class MaskExtraction(ExtractionByLabel[HeldMap, tuple[Part, int]]):
         return started.emission.download(), level
 
     def describe(self) -> dict[str, Any]:
-        """Return the report entries that all labels share."""
         return {
             "surface": "mask",
             "closed_at_border": self.grid.rule.closed,

@@ -111,7 +111,6 @@ class ExtractionByLabel(Generic[Held, Made]):
         raise NotImplementedError
 
     def needs(self, first: int, end: int) -> dict[str, int]:
-        """Return the bytes on the device for these slices."""
         raise NotImplementedError
 
     def hold(self, boxes: dict[int, Box]) -> Held:
@@ -119,7 +118,6 @@ class ExtractionByLabel(Generic[Held, Made]):
         raise NotImplementedError
 
     def extract_one(self, held: Held, number: int, box: Box) -> Made:
-        """Return the surface of one label."""
         raise NotImplementedError
 
     def group(self, boxes: dict[int, Box]) -> list[dict[int, Box]]:
@@ -306,7 +304,6 @@ class LabelExtraction(ExtractionByLabel[HeldSlices, "Part | None"]):
         return part
 
     def describe(self) -> dict[str, Any]:
-        """Return the report entries that all labels share."""
         rule = self.rule
         return {
             **rule.as_report(),

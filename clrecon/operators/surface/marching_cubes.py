@@ -312,11 +312,9 @@ class Emission:
 
     @property
     def output(self) -> dict[str, Any]:
-        """The buffers of the mesh."""
         return {"positions": self.positions_d, "normals": self.normals_d, "triangles": self.triangles_d}
 
     def download(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
-        """Download positions, normals and triangles."""
         with self._stopwatch.timed("download"):
             download_all(
                 self._device, (self._positions, self.positions_d, 0), (self._normals, self.normals_d, 0),

@@ -78,7 +78,6 @@ class Slab:
 
     @property
     def is_whole(self) -> bool:
-        """True where the slab is the whole grid."""
         return self.slices == self.grid.shape[2]
 
     @property

@@ -36,7 +36,6 @@ Float32Array = NDArray[np.float32]
 
 
 def prepare_smoothing(device: Device) -> Program:
-    """Build the kernels of `DeviceFilter`."""
     return load_program(device, "surface/smoothing.cl")
 
 
@@ -56,11 +55,9 @@ class DeviceFilter(Filter):
         return {name: upload(self._device, array) for name, array in arrays.items()}
 
     def label(self, triangles: NDArray[np.uint32]) -> tuple[int, NDArray[np.int64]]:
-        """As of the twin."""
         return label_components(self._device, triangles, self._count) if self._fits else super().label(triangles)
 
     def measure_bends(self, places: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """As of the twin."""
         if not self._fits:
             return super().measure_bends(places)
         device, count = self._device, self._count
@@ -73,7 +70,6 @@ class DeviceFilter(Filter):
         return bends[:, :3], normals[:, :3]
 
     def find_steps(self, bends: Float32Array, terms: Sequence[Term]) -> Float32Array:
-        """As of the twin."""
         if not self._fits:
             return super().find_steps(bends, terms)
         device, count = self._device, self._count

@@ -30,7 +30,6 @@ class CellVertices:
 
 
 def prepare_trilinear(device: Device, dtype: DTypeLike) -> Program:
-    """Build the kernels for volumes of `dtype`."""
     return load_program(device, "surface/trilinear.cl", voxel_variants(dtype))
 
 

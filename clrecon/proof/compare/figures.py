@@ -435,6 +435,5 @@ def collect_figures(figures: Figures, records: Sequence[MethodRecord]) -> None:
 
 
 def draw_figures(figures: Figures, folder: Path) -> None:
-    """Write all pictures as PNG."""
     for name, image in figures.images.items():
         save_png(image, folder / f"{name}.png")

@@ -38,7 +38,6 @@ def share(value: float) -> str:
 
 
 def signed(value: float, digits: int = 3) -> str:
-    """Write a number with its sign."""
     return f"{value:+.{digits}f}"
 
 

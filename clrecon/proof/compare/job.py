@@ -250,7 +250,6 @@ def _refuse_nothing(told: dict[str, dict[str, Any]]) -> None:
 def _measure(
     told: dict[str, dict[str, Any]], figures: Figures, settings: CompareSettings, truth: str | None, progress: Progress
 ) -> dict[str, dict[str, Any]]:
-    """Measure what the methods made."""
     sizes = {
         name: int(each["triangles"] or each["points"] or 0) for name, each in told.items() if each["state"] == "done"
     }

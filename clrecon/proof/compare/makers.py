@@ -38,7 +38,6 @@ def draw_mesh(mesh: Mesh, camera: Camera, size: tuple[int, int], *, device: Devi
 
 
 def draw_points(cloud: PointCloud, camera: Camera, size: tuple[int, int], *, device: Device | None = None) -> Image:
-    """Draw a cloud as discs."""
     from clrecon.operators.rays.point_pictures import PointPictures
     from clrecon.rendering.pictures.object_looks import PointLook
 

@@ -283,7 +283,6 @@ class Lattice:
 
     @property
     def shape_ijk(self) -> tuple[int, int, int]:
-        """Number of points along each axis."""
         ni, nj, nk = (cells * self.finer for cells in self.cells_ijk)
         return ni, nj, nk
 

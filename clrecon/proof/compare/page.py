@@ -227,7 +227,6 @@ def _finish(figure: Any, name: str) -> str:
 
 
 def make_page(report: CompareReport, figures: Figures) -> str:
-    """Return the page."""
     parts = (
         _section("What the numbers say", _findings(report)),
         _section("All methods", _main(report)),

@@ -93,7 +93,6 @@ def load_array(folder: Path, name: str, what: str) -> NDArray[Any] | None:
 
 
 def save_mesh(folder: Path, name: str, mesh: Mesh) -> None:
-    """Write the arrays of a mesh."""
     save_arrays(folder, name, vertices=mesh.vertices, triangles=mesh.triangles, normals=mesh.normals)
 
 

@@ -109,11 +109,9 @@ class Sphere:
 
     @property
     def bounds_mm(self) -> Float64Array:
-        """Lowest and highest corner, shape (2, 3)."""
         return np.array((self.center - self.radius, self.center + self.radius))
 
     def describe(self) -> dict[str, Any]:
-        """Parameters, area and volume as plain JSON types."""
         return {
             "kind": "sphere",
             "center_lps_mm": _listed(self.center),
@@ -153,12 +151,10 @@ class Torus:
 
     @property
     def bounds_mm(self) -> Float64Array:
-        """Lowest and highest corner, shape (2, 3)."""
         reach = self.major * np.sqrt(np.maximum(1.0 - self.axis**2, 0.0)) + self.minor
         return np.array((self.center - reach, self.center + reach))
 
     def describe(self) -> dict[str, Any]:
-        """Parameters, area and volume as plain JSON types."""
         return {
             "kind": "torus",
             "center_lps_mm": _listed(self.center),
@@ -197,12 +193,10 @@ class Cylinder:
 
     @property
     def bounds_mm(self) -> Float64Array:
-        """Lowest and highest corner, shape (2, 3)."""
         reach = np.abs(self.axis) * self.length / 2.0 + self.radius * np.sqrt(np.maximum(1.0 - self.axis**2, 0.0))
         return np.array((self.center - reach, self.center + reach))
 
     def describe(self) -> dict[str, Any]:
-        """Parameters, area and volume as plain JSON types."""
         return {
             "kind": "cylinder",
             "center_lps_mm": _listed(self.center),
@@ -261,12 +255,10 @@ class Box:
 
     @property
     def bounds_mm(self) -> Float64Array:
-        """Lowest and highest corner, shape (2, 3)."""
         reach = (self.size / 2.0) @ np.abs(self._axes)
         return np.array((self.center - reach, self.center + reach))
 
     def describe(self) -> dict[str, Any]:
-        """Parameters, area and volume as plain JSON types."""
         width, height, thickness = _listed(self.size)
         return {
             "kind": "plane",
