@@ -18,6 +18,7 @@ from clrecon.rendering import Lighting
 from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.looks.lighting import LEAST_SOFT_GRADIENT
 from clrecon.rendering.views.camera import Camera, box_corners
+from clrecon.system.progress import Progress, ignore_progress
 
 TILE = kernel_constant("rays/view.h", "TILE")
 """Pixels along each side of a tile."""
@@ -158,6 +159,19 @@ def count_queues(device: Device) -> int:
     return max(1, device.compute_units) if device.type == "cpu" else 1
 
 
+Pixels = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]
+"""Image, depths and means."""
+
+
+class Shot(NamedTuple):
+    """A picture that is asked for beside its look: from where, how large, before what."""
+
+    camera: Camera
+    size: tuple[int, int]
+    background: str | Sequence[float] | None = None
+    progress: Progress = ignore_progress
+
+
 @dataclass
 class Between:
     """The part of the rays between two layers, for a ray caster that adds a volume to their states, (h, w, 2) float4,
@@ -172,11 +186,11 @@ class Between:
 class DrawnVolume(NamedTuple):
     """A volume for a picture of layers, whose rays begin at `near_mm`, see `VIEW_NEAR` in cl/rays/view.h.
 
-    `sample` adds what it shows between two layers to the states of the rays, and waits.
+    `sample` adds what it shows between two layers to the states of the rays, and waits; without a volume it is None.
     """
 
     device: Device
-    sample: Callable[[Between], None]
+    sample: Callable[[Between], None] | None
     near_mm: float
     stopwatch: Stopwatch
     warnings: list[str]
@@ -237,7 +251,7 @@ class PictureBuffers:
         width, height = self.size
         return -(-width // TILE) * -(-height // TILE)
 
-    def download(self) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
+    def download(self) -> Pixels:
         """Wait for the device and return image, depths and means."""
         download_all(
             self.device, (self.image, self.image_d, 0), (self.depths, self.depths_d, 0), (self.means, self.means_d, 0)

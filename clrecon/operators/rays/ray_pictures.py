@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -22,6 +22,7 @@ from clrecon.operators.rays.picture_buffers import (
     DrawnVolume,
     PictureBuffers,
     RayView,
+    Shot,
     count_queues,
     highlight_table,
 )
@@ -30,11 +31,10 @@ from clrecon.operators.rays.ray_slabs import (
     RAYS,
     LeapMap,
     RaySlab,
-    entry_slice,
+    SlabPicture,
     find_leaps,
     measure_cells,
     plan_ray_slabs,
-    ray_slabs,
     slab_labels,
 )
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -51,7 +51,6 @@ from clrecon.rendering.looks.window import (
 from clrecon.rendering.pictures.label_style import LabelStyle
 from clrecon.rendering.pictures.styles import Projection, VolumeLook
 from clrecon.rendering.views.camera import Camera
-from clrecon.system.progress import Progress, ignore_progress
 
 NODES = kernel_constant("rays/steep_segments.h", "NODES")
 """Entries of a transfer function's table."""
@@ -295,28 +294,18 @@ def project_slab(resident: DeviceVolume, slab: RaySlab, view: RayView, mode: str
 _NO_BODY = "no body was found in the scan: the lowest values are those of all of it, the air around included"
 
 
-def take_picture(
-    resident: DeviceVolume,
-    style: VolumeLook | Projection,
-    camera: Camera,
-    size: tuple[int, int],
-    ray_step: float,
-    background: str | Sequence[float] | None = None,
-    progress: Progress = ignore_progress,
-) -> Rendering:
+def take_picture(resident: DeviceVolume, style: VolumeLook | Projection, shot: Shot, ray_step: float) -> Rendering:
     """Take one picture of a volume on a device."""
-
     for attempt in resident.with_fallback():
         with attempt as (_, warnings):
-            made = _Job(resident, style, camera, size, ray_step, background, progress, warnings).run()
+            made = _Job(resident, style, shot, ray_step, warnings).run()
     return made
 
 
 def take_with_layers(
     resident: DeviceVolume,
     style: VolumeLook,
-    camera: Camera,
-    size: tuple[int, int],
+    shot: Shot,
     ray_step: float,
     beside: Mapping[str, int],
     draw: Callable[[DrawnVolume], Rendering],
@@ -328,7 +317,7 @@ def take_with_layers(
 
     for attempt in resident.with_fallback():
         with attempt as (device, warnings):
-            job = _Job(resident, style, camera, size, ray_step, None, ignore_progress, warnings)
+            job = _Job(resident, style, shot, ray_step, warnings)
             planned = plan_ray_slabs(resident, beside, {}, job.labels)
             for slabs in resident.attempts(RAYS, planned, job.warnings):
                 with slabs as slices:
@@ -337,67 +326,32 @@ def take_with_layers(
     return made
 
 
-class _Job:
+class _Job(SlabPicture):
     def __init__(
-        self,
-        resident: DeviceVolume,
-        style: VolumeLook | Projection,
-        camera: Camera,
-        size: tuple[int, int],
-        ray_step: float,
-        background: str | Sequence[float] | None,
-        progress: Progress,
-        warnings: list[str],
+        self, resident: DeviceVolume, style: VolumeLook | Projection, shot: Shot, ray_step: float, warnings: list[str]
     ):
-        self.resident, self.style, self.camera, self.size = resident, style, camera, size
-        self.ray_step, self.background, self.progress = ray_step, background, progress
         label_style = style.label_style if isinstance(style, VolumeLook) else None
-        self.labels = None if label_style is None else resident.bring(label_style.labels)
-        self.warnings = [*warnings, *([] if self.labels is None else self.labels.warnings)]
+        super().__init__(resident, shot, ray_step, label_style, warnings)
+        self.style = style
         self.lighting = style.light if isinstance(style, VolumeLook) else Lighting()
-        self.stopwatch = Stopwatch()
         self.box = volume_box(resident.volume)
         self.planes = None if style.clip is None else style.clip.planes
 
-    def run(self) -> Rendering:
-        """Take the picture, with thinner slabs if the device has no room for the planned ones."""
-        planned = plan_ray_slabs(self.resident, *PictureBuffers.needs(self.size), self.labels)
-        for attempt in self.resident.attempts(RAYS, planned, self.warnings):
-            with attempt as slices:
-                made = self._take(slices)
-        return made
-
-    def _take(self, slices: int) -> Rendering:
-        """Go through the slabs and collect the picture."""
-        resident, style, stopwatch = self.resident, self.style, self.stopwatch
-        device, nk = resident.device, resident.volume.shape_ijk[2]
-        output = PictureBuffers(device, self.size, self.background, slices < nk)
-        slabs = 0
-        self.progress("slabs", 0, nk)
-        for slab in ray_slabs(resident, slices, entry_slice(resident.volume, self.camera), stopwatch):
-            slabs += 1
-            if isinstance(style, Projection):
-                with stopwatch.running(device):  # wait: CPU devices read host arrays
-                    project_slab(resident, slab, self._view(self.box), style.kind, output)
-            else:
-                self._composite(slab, style, output)
-            self.progress("slabs", min(slabs * slices, nk), nk)
-        with stopwatch.timed("download"):
-            image, depths, means = output.download()
-        report = {
-            "mode": style.mode,
-            "device": device.label,
-            "driver": device.driver,
-            "ray_step_mm": self.ray_step,
-            "slabs": slabs,
-            "seconds": dict(stopwatch.seconds),
-            "kernel_seconds": dict(stopwatch.by_kernel),
-            "warnings": [*device.warnings, *self.warnings],
-        }
+    def take(self, slices: int) -> Rendering:
+        style = self.style
+        (image, depths, means), slabs = self.draw_slabs(slices)
+        report = self.describe(style.mode, slabs)
         if isinstance(style, Projection):
             return self._finish_projection(style, means, depths, report)
         report["unit_distance_mm"] = style.function.unit_distance
-        return Rendering(image, depths, means, self.camera, None, style.mode, report)
+        return Rendering(image, depths, means, self.shot.camera, None, style.mode, report)
+
+    def draw(self, slab: RaySlab, output: PictureBuffers) -> None:
+        if isinstance(self.style, VolumeLook):
+            self._composite(slab, self.style, output)
+            return
+        with self.stopwatch.running(self.resident.device):  # wait: CPU devices read host arrays
+            project_slab(self.resident, slab, self._view(self.box), self.style.kind, output)
 
     @property
     def near_mm(self) -> float:
@@ -406,10 +360,10 @@ class _Job:
 
     def sample_between(self, slices: int, between: Between) -> None:
         """Add what the volume shows between two layers to the states of the rays."""
-        resident, style = self.resident, self.style
+        style = self.style
         assert isinstance(style, VolumeLook)
-        output = PictureBuffers.of_states(resident.device, self.size, between.states_d)
-        for slab in ray_slabs(resident, slices, entry_slice(resident.volume, self.camera), self.stopwatch):
+        output = PictureBuffers.of_states(self.resident.device, self.shot.size, between.states_d)
+        for slab in self.slabs(slices):
             self._composite(slab, style, output, between)
 
     def _composite(
@@ -446,11 +400,11 @@ class _Job:
         image = grey_image(values, window)
         if is_water:
             image[values <= 0.0, 3] = 0  # nothing attenuates there, inside the volume or beside it
-        made = Rendering(image, depths, depths.copy(), self.camera, values, style.kind, report)
-        return made if self.background is None else made.with_background(self.background)
+        made = Rendering(image, depths, depths.copy(), self.shot.camera, values, style.kind, report)
+        return made if self.shot.background is None else made.with_background(self.shot.background)
 
     def _view(self, focus: tuple[Float64Array, Float64Array]) -> RayView:
         return RayView.of(
-            self.resident.volume, self.camera, self.size, self.ray_step,
+            self.resident.volume, self.shot.camera, self.shot.size, self.ray_step,
             lighting=self.lighting, planes=self.planes, box=self.box, focus=focus,
         )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,8 +15,11 @@ from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels import ResampledLabels
 from clrecon.opencl import Stopwatch, allocate, check_budget, download, kernel_constant, launch, upload
+from clrecon.operators.rays.picture_buffers import PictureBuffers, Pixels, Shot
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import BOX_BORDER, enclose
+from clrecon.rendering import Rendering
+from clrecon.rendering.pictures.label_style import LabelStyle
 from clrecon.rendering.views.camera import Camera
 
 BRICK_CELLS = kernel_constant("rays/leap.h", "BRICK_CELLS")
@@ -291,3 +295,62 @@ def _find_box(volume: Volume, marked: NDArray[np.bool_], slab: RaySlab) -> tuple
     high[2] += slab.first_k
     # Bricks at the ends extend to the border of the volume.
     return enclose(volume, low - BOX_BORDER, high + BOX_BORDER)
+
+
+class SlabPicture(ABC):
+    """A picture of a volume whose slabs are drawn one after the other."""
+
+    def __init__(
+        self, resident: DeviceVolume, shot: Shot, ray_step: float, style: LabelStyle | None, warnings: list[str]
+    ):
+        self.resident, self.shot, self.ray_step = resident, shot, ray_step
+        self.labels = None if style is None else resident.bring(style.labels)
+        self.warnings = [*warnings, *([] if self.labels is None else self.labels.warnings)]
+        self.stopwatch = Stopwatch()
+
+    @abstractmethod
+    def take(self, slices: int) -> Rendering:
+        """Take the picture with so many slices in a slab."""
+
+    @abstractmethod
+    def draw(self, slab: RaySlab, output: PictureBuffers) -> None:
+        """Add a slab to the picture, and wait."""
+
+    def run(self) -> Rendering:
+        """Take the picture, with thinner slabs if the device has no room for the planned ones."""
+        planned = plan_ray_slabs(self.resident, *PictureBuffers.needs(self.shot.size), self.labels)
+        for attempt in self.resident.attempts(RAYS, planned, self.warnings):
+            with attempt as slices:
+                made = self.take(slices)
+        return made
+
+    def slabs(self, slices: int) -> Iterator[RaySlab]:
+        entry_k = entry_slice(self.resident.volume, self.shot.camera)
+        return ray_slabs(self.resident, slices, entry_k, self.stopwatch)
+
+    def draw_slabs(self, slices: int) -> tuple[Pixels, int]:
+        """Return image, depths and means, and the number of slabs."""
+        nk, tell, number = self.resident.volume.shape_ijk[2], self.shot.progress, 0
+        output = PictureBuffers(self.resident.device, self.shot.size, self.shot.background, slices < nk)
+        tell("slabs", 0, nk)
+        for slab in self.slabs(slices):
+            number += 1
+            self.draw(slab, output)
+            tell("slabs", min(number * slices, nk), nk)
+        with self.stopwatch.timed("download"):
+            return output.download(), number
+
+    def describe(self, mode: str, slabs: int, **own: Any) -> dict[str, Any]:
+        """Return the report of the picture."""
+        device = self.resident.device
+        return {
+            "mode": mode,
+            "device": device.label,
+            "driver": device.driver,
+            **own,
+            "ray_step_mm": self.ray_step,
+            "slabs": slabs,
+            "seconds": dict(self.stopwatch.seconds),
+            "kernel_seconds": dict(self.stopwatch.by_kernel),
+            "warnings": [*device.warnings, *self.warnings],
+        }

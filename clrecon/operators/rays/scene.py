@@ -43,7 +43,7 @@ from clrecon.operators.rays.mesh_pictures import (
     make_part,
     mesh_corners,
 )
-from clrecon.operators.rays.picture_buffers import Between, DrawnVolume
+from clrecon.operators.rays.picture_buffers import Between, DrawnVolume, Shot
 from clrecon.operators.rays.point_pictures import PointPictures, cloud_box, eye_table
 from clrecon.operators.rays.volume_renderer import VolumeRenderer, shown_box
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -345,24 +345,19 @@ class ScenePictures(Closing):
                 renderer = self._taker(place)
                 assert isinstance(renderer, VolumeRenderer)
                 translucent = renderer, style
-        finish = partial(self._finish, drawn, camera, size, background, tell)
+        shot = Shot(camera, size, background, tell)
+        finish = partial(self._finish, drawn, shot)
         if translucent is None:
             for attempt in with_fallback(self._device):
                 with attempt as (device, warnings):
-                    made = finish(device, Stopwatch(), warnings, None)
+                    made = finish(DrawnVolume(device, None, 0.0, Stopwatch(), warnings))
         else:
             renderer, look = translucent
             beside = {
                 "picture": PIXEL_BYTES * size[0] * size[1],
                 "triangles": sum(part.device_bytes for part in self._parts),
             }
-            made = renderer.render_with_layers(
-                look,
-                camera,
-                size,
-                beside,
-                lambda volume: finish(volume.device, volume.stopwatch, volume.warnings, volume),
-            )
+            made = renderer.render_with_layers(look, shot, beside, finish)
         tell("render", len(self._objects), len(self._objects))
         return made
 
@@ -392,25 +387,15 @@ class ScenePictures(Closing):
             return taker.take(style, camera, size, None)
         return taker.render(style, camera=camera, size=size, background="transparent")
 
-    def _finish(
-        self,
-        drawn: list[Rendering],
-        camera: Camera,
-        size: tuple[int, int],
-        background: str | Sequence[float] | None,
-        progress: Progress,
-        device: Device,
-        stopwatch: Stopwatch,
-        told: list[str],
-        volume: DrawnVolume | None,
-    ) -> Rendering:
+    def _finish(self, drawn: list[Rendering], shot: Shot, volume: DrawnVolume) -> Rendering:
         """Draw all layers on a device."""
+        device, stopwatch = volume.device, volume.stopwatch
         found = draw_layers(
-            device, self._parts, camera, size, still=_join_stills(drawn),
-            volume=None if volume is None else volume.sample, near_mm=0.0 if volume is None else volume.near_mm,
-            background=background, memory=self.memory, stopwatch=stopwatch, progress=progress,
+            device, self._parts, shot.camera, shot.size, still=_join_stills(drawn), volume=volume.sample,
+            near_mm=volume.near_mm, background=shot.background, memory=self.memory, stopwatch=stopwatch,
+            progress=shot.progress,
         )  # fmt: skip
-        warnings = [*device.warnings, *told]
+        warnings = [*device.warnings, *volume.warnings]
         for each in drawn:
             warnings += [text for text in each.report["warnings"] if text not in warnings]
         if found.open_pixels:
@@ -430,7 +415,7 @@ class ScenePictures(Closing):
             "kernel_seconds": dict(stopwatch.by_kernel),
             "warnings": warnings,
         }
-        return Rendering(found.image, found.depth, found.expected_depth, camera, None, modes[0], report)
+        return Rendering(found.image, found.depth, found.expected_depth, shot.camera, None, modes[0], report)
 
 
 def _box_of(objects: Sequence[tuple[Subject, Style]]) -> Grid:

@@ -13,14 +13,21 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.opencl import Stopwatch, check_budget, kernel_constant, launch, load_program, upload
-from clrecon.operators.rays.picture_buffers import NEAR_ROW, Between, DrawnVolume, PictureBuffers, RayView, count_queues
+from clrecon.operators.rays.picture_buffers import (
+    NEAR_ROW,
+    Between,
+    DrawnVolume,
+    PictureBuffers,
+    RayView,
+    Shot,
+    count_queues,
+)
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import FieldFrame, volume_box, voxel_variants
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.window import checked_window
 from clrecon.rendering.pictures.styles import SlicesInSpace
 from clrecon.rendering.views.camera import Camera
-from clrecon.system.progress import Progress, ignore_progress
 
 DEFAULT_COUNT = 12
 """Number of slices shown by default: enough to see the body, few enough to see each slice."""
@@ -52,37 +59,27 @@ def choose_slices(volume: Volume, slices: int | Sequence[int] | None = None) -> 
     return sorted(slices)
 
 
-def overlay_slices(
-    resident: DeviceVolume,
-    style: SlicesInSpace,
-    camera: Camera,
-    size: tuple[int, int],
-    background: str | Sequence[float] | None = None,
-    progress: Progress = ignore_progress,
-) -> Rendering:
+def overlay_slices(resident: DeviceVolume, style: SlicesInSpace, shot: Shot) -> Rendering:
     """Show slices of a volume in space, each translucent at its own place, with the depth of the first visible one:
     sheared and uneven stacks too.
 
     A volume that is already on the device is read there.  Else only the shown slices are uploaded, in parts if they do
     not fit together.
     """
-    chosen = choose_slices(resident.volume, style.slices)
-
     for attempt in resident.with_fallback():
         with attempt as (_, warnings):
-            overlay = _Overlay(resident, style, camera, size, chosen, progress, warnings)
-            planned = overlay.plan(*PictureBuffers.needs(size))
+            overlay = _Overlay(resident, style, shot, warnings)
+            planned = overlay.plan(*PictureBuffers.needs(shot.size))
             for slabs in resident.attempts(SLICES, planned, overlay.warnings):
                 with slabs as slices:
-                    made = overlay.take(slices, background)
+                    made = overlay.take(slices)
     return made
 
 
 def overlay_with_layers(
     resident: DeviceVolume,
     style: SlicesInSpace,
-    camera: Camera,
-    size: tuple[int, int],
+    shot: Shot,
     beside: Mapping[str, int],
     draw: Callable[[DrawnVolume], Rendering],
 ) -> Rendering:
@@ -90,11 +87,9 @@ def overlay_with_layers(
 
     `draw` is called again where the device has no room, or another one takes over.
     """
-    chosen = choose_slices(resident.volume, style.slices)
-
     for attempt in resident.with_fallback():
         with attempt as (device, warnings):
-            overlay = _Overlay(resident, style, camera, size, chosen, ignore_progress, warnings)
+            overlay = _Overlay(resident, style, shot, warnings)
             near_mm = float(overlay.view.table[NEAR_ROW, 0])
             for slabs in resident.attempts(SLICES, overlay.plan(beside, {}), overlay.warnings):
                 with slabs as slices:
@@ -149,22 +144,14 @@ def _warn(volume: Volume, camera: Camera) -> list[str]:
 class _Overlay:
     """One picture: part after part of the slices, in the order in which rays cross them."""
 
-    def __init__(
-        self,
-        resident: DeviceVolume,
-        style: SlicesInSpace,
-        camera: Camera,
-        size: tuple[int, int],
-        chosen: list[int],
-        progress: Progress,
-        warnings: list[str],
-    ):
-        self.resident, self.chosen, self.style, self.progress = resident, chosen, style, progress
+    def __init__(self, resident: DeviceVolume, style: SlicesInSpace, shot: Shot, warnings: list[str]):
+        self.resident, self.style, self.shot, camera = resident, style, shot, shot.camera
+        self.chosen = choose_slices(resident.volume, style.slices)
         self.colors = _Colors.of(style)
-        self.order = _sort_slices(resident.volume, camera, chosen)
+        self.order = _sort_slices(resident.volume, camera, self.chosen)
         box = volume_box(resident.volume)
         planes = None if style.clip is None else style.clip.planes
-        self.view = RayView.of(resident.volume, camera, size, 1.0, planes=planes, box=box, focus=box)
+        self.view = RayView.of(resident.volume, camera, shot.size, 1.0, planes=planes, box=box, focus=box)
         self.stopwatch = Stopwatch()
         self.warnings = [*warnings, *_warn(resident.volume, camera)]
 
@@ -191,15 +178,15 @@ class _Overlay:
         for first in range(0, len(self.order), slices):
             self._draw(self.order[first : first + slices], 0, output, between)
 
-    def take(self, slices: int, background: str | Sequence[float] | None) -> Rendering:
+    def take(self, slices: int) -> Rendering:
         """Take the picture, so many slices at a time."""
         stopwatch, device = self.stopwatch, self.resident.device
         parts = [self.order[first : first + slices] for first in range(0, len(self.order), slices)]
-        output = PictureBuffers(device, self.view.size, background, len(parts) > 1)
-        self.progress("slabs", 0, len(self.order))
+        output = PictureBuffers(device, self.shot.size, self.shot.background, len(parts) > 1)
+        self.shot.progress("slabs", 0, len(self.order))
         for number, part in enumerate(parts):
             self._draw(part, (number == 0) + 2 * (number == len(parts) - 1), output)
-            self.progress("slabs", min((number + 1) * slices, len(self.order)), len(self.order))
+            self.shot.progress("slabs", min((number + 1) * slices, len(self.order)), len(self.order))
         with stopwatch.timed("download"):
             image, depths, means = output.download()
         report = {

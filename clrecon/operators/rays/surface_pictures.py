@@ -12,38 +12,20 @@ from clrecon.errors import DeviceError, DeviceFailedError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.labels.label_bodies import Growth
-from clrecon.opencl import Stopwatch, launch, memory_limits, upload
-from clrecon.operators.rays.picture_buffers import PictureBuffers, RayView, count_queues, highlight_table
-from clrecon.operators.rays.ray_slabs import (
-    RAYS,
-    LeapMap,
-    RaySlab,
-    entry_slice,
-    find_leaps,
-    plan_ray_slabs,
-    ray_slabs,
-    slab_labels,
-)
+from clrecon.opencl import launch, memory_limits, upload
+from clrecon.operators.rays.picture_buffers import PictureBuffers, RayView, Shot, count_queues, highlight_table
+from clrecon.operators.rays.ray_slabs import LeapMap, RaySlab, SlabPicture, find_leaps, slab_labels
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import FieldFrame, enclose, label_variants
 from clrecon.rendering import Rendering
 from clrecon.rendering.pictures.styles import SurfaceLook
-from clrecon.rendering.views.camera import Camera, box_corners
-from clrecon.system.progress import Progress, ignore_progress
+from clrecon.rendering.views.camera import box_corners
 
 CLOSED_BORDER = 1.0
 """Index steps beyond the outermost voxel centres within which the closed field falls to its outside value."""
 
 
-def cast_surface(
-    resident: DeviceVolume,
-    style: SurfaceLook,
-    camera: Camera,
-    size: tuple[int, int],
-    ray_step: float,
-    background: str | Sequence[float] | None = None,
-    progress: Progress = ignore_progress,
-) -> Rendering:
+def cast_surface(resident: DeviceVolume, style: SurfaceLook, shot: Shot, ray_step: float) -> Rendering:
     """Show where the field first reaches an iso value along each ray; ``depth`` is that of the first hit.
 
     The field is that of the closed mesh of `extract_isosurface`, so that depths are those of the mesh: surrounded by a
@@ -59,86 +41,47 @@ def cast_surface(
     ray_step: Distance of samples, mm.  If the volume is processed in slabs, at most one slice.
     """
     rule = choose_iso_rule(resident.volume, style.iso_value, values=resident.values)
-
     for attempt in resident.with_fallback():
         with attempt as (_, warnings):
-            made = _Job(resident, rule, style, camera, size, float(ray_step), progress, warnings).run(background)
+            made = _Job(resident, rule, style, shot, float(ray_step), warnings).run()
     return made
 
 
-class _Job:
+class _Job(SlabPicture):
     """One picture, slab after slab."""
 
     def __init__(
-        self,
-        resident: DeviceVolume,
-        rule: IsoRule,
-        style: SurfaceLook,
-        camera: Camera,
-        size: tuple[int, int],
-        ray_step: float,
-        progress: Progress,
-        warnings: list[str],
+        self, resident: DeviceVolume, rule: IsoRule, look: SurfaceLook, shot: Shot, ray_step: float, warnings: list[str]
     ):
-        self.resident, self.rule, self.look, self.progress = resident, rule, style, progress
-        self.camera, self.size, self.ray_step = camera, size, ray_step
-        self.planes = np.empty((0, 4)) if style.clip is None else style.clip.planes
-        self.style = style.label_style
-        self.labels = None if self.style is None else resident.bring(self.style.labels)
-        self.warnings = [*warnings, *([] if self.labels is None else self.labels.warnings)]
-        self.stopwatch = Stopwatch()
+        super().__init__(resident, shot, ray_step, look.label_style, warnings)
+        self.rule, self.look, self.style = rule, look, look.label_style
+        self.planes = np.empty((0, 4)) if look.clip is None else look.clip.planes
         self.frame = FieldFrame.of(resident.volume)
 
-    def run(self, background: str | Sequence[float] | None) -> Rendering:
-        """Take the picture, with thinner slabs if the device has no room for the planned ones."""
-        planned = plan_ray_slabs(self.resident, *PictureBuffers.needs(self.size), self.labels)
-        for attempt in self.resident.attempts(RAYS, planned, self.warnings):
-            with attempt as slices:
-                made = self._take(slices, background)
-        return made
-
-    def _take(self, slices: int, background: str | Sequence[float] | None) -> Rendering:
-        resident, device, nk = self.resident, self.resident.device, self.resident.volume.shape_ijk[2]
+    def take(self, slices: int) -> Rendering:
+        resident, nk = self.resident, self.resident.volume.shape_ijk[2]
         if slices < nk:
             if self.look.shadows:
-                limits = memory_limits(device, resident.memory)
+                limits = memory_limits(resident.device, resident.memory)
                 raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
                     f"shadows need the whole volume on the device, {slices} of its {nk} slices fit:"
                     f" {limits.describe()}; give more memory or leave the shadows out"
                 )
-            self._shorten_steps(self.warnings)
-        output = PictureBuffers(device, self.size, background, slices < nk)
-        slabs = 0
-        self.progress("slabs", 0, nk)
-        for slab in ray_slabs(resident, slices, entry_slice(resident.volume, self.camera), self.stopwatch):
-            slabs += 1
-            self._trace(slab, output)
-            self.progress("slabs", min(slabs * slices, nk), nk)
-        with self.stopwatch.timed("download"):
-            image, depths, means = output.download()
-        report = {
-            "mode": "surface",
-            "device": device.label,
-            "driver": device.driver,
-            "iso_value_hu": self.rule.iso_value,
-            "ray_step_mm": self.ray_step,
-            "slabs": slabs,
-            "seconds": dict(self.stopwatch.seconds),
-            "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": [*device.warnings, *self.warnings],
-        }
-        return Rendering(image, depths, means, self.camera, None, "surface", report)
+            self._shorten_steps()
+        pixels, slabs = self.draw_slabs(slices)
+        report = self.describe("surface", slabs, iso_value_hu=self.rule.iso_value)
+        return Rendering(*pixels, self.shot.camera, None, "surface", report)
 
-    def _shorten_steps(self, warnings: list[str]) -> None:
+    def _shorten_steps(self) -> None:
         """Limit the step to a slice, because a slab holds only one slice before its own."""
         longest = 1.0 / _slices_per_mm(self.resident.volume)
         if self.ray_step > longest:
-            warnings.append(
+            self.warnings.append(
                 f"the volume goes through in slabs: the ray step is {longest:.3g} mm in place of {self.ray_step:.3g}"
             )
             self.ray_step = longest
 
-    def _trace(self, slab: RaySlab, output: PictureBuffers) -> None:
+    def draw(self, slab: RaySlab, output: PictureBuffers) -> None:
         resident, rule, look = self.resident, self.rule, self.look
         device, volume = resident.device, resident.volume
         lanes, queues = int(device.kernel_variants["LANES"]), count_queues(device)
@@ -188,7 +131,7 @@ class _Job:
                 margin = np.array([CLOSED_BORDER, CLOSED_BORDER, 0.0]) + aside
             focus = leaps.box[0] - margin, leaps.box[1] + margin
         return RayView.of(
-            volume, self.camera, self.size, self.ray_step,
+            volume, self.shot.camera, self.shot.size, self.ray_step,
             lighting=self.look.light, planes=self.planes, box=box, focus=focus,
         )  # fmt: skip
 
@@ -203,9 +146,9 @@ class _Job:
         """Return the depth of full brightness, 1 / mm from it to the farthest corner, and the brightness lost there."""
         if not self.look.depth_cue:
             return _float4()
-        corners = box_corners(self.resident.volume) - self.camera.position
-        if self.camera.is_parallel:
-            depths = corners @ self.camera.basis().forward
+        corners = box_corners(self.resident.volume) - self.shot.camera.position
+        if self.shot.camera.is_parallel:
+            depths = corners @ self.shot.camera.basis().forward
         else:
             depths = np.linalg.norm(corners, axis=1)
         return _float4(depths.min(), 1.0 / max(float(np.ptp(depths)), 1e-6), self.look.depth_cue)

@@ -17,7 +17,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.grid import AIR_HU, Grid
 from clrecon.labels import resample_labels
 from clrecon.opencl import Device
-from clrecon.operators.rays.picture_buffers import DrawnVolume
+from clrecon.operators.rays.picture_buffers import DrawnVolume, Shot
 from clrecon.operators.rays.ray_pictures import take_picture, take_with_layers
 from clrecon.operators.rays.slices import choose_slices, overlay_slices, overlay_with_layers
 from clrecon.operators.rays.surface_pictures import cast_surface
@@ -197,7 +197,7 @@ class VolumeRenderer(Closing):
         place = Place.checked(style, camera, seen_from, up, zoom, view_angle, center)
         progress = progress or ignore_progress
         if isinstance(style, CurveCut):
-            return self._reformat(style, place, size, background, progress)
+            return take_curve(self._resident, style, place.view, place.up, size, background, progress)
         is_sheet = isinstance(style, PlaneCut) and style.sheet is not None
         size = checked_size((SHEET_SIZE if is_sheet else DEFAULT_SIZE) if size is None else size)
         if isinstance(style, Projection) and style.leaves_out and LEFT_OUT not in self.volume.report:
@@ -208,15 +208,14 @@ class VolumeRenderer(Closing):
         if isinstance(style, PlaneCut):
             return self._cut(style, place, size, background, progress)
         camera = place.camera or place.camera_for(self.frame(style), size)
-        ground = None if is_transparent(background) else background
-        if isinstance(style, SurfaceLook):
-            step = self._checked_step(style.ray_step)
-            return cast_surface(self._resident, style, camera, size, step, ground, progress)
+        shot = Shot(camera, size, None if is_transparent(background) else background, progress)
         if isinstance(style, SlicesInSpace):
-            return overlay_slices(self._resident, style, camera, size, ground, progress)
-        assert isinstance(style, VolumeLook | Projection)
+            return overlay_slices(self._resident, style, shot)
+        assert isinstance(style, VolumeLook | Projection | SurfaceLook)
         step = self._checked_step(style.ray_step)
-        return take_picture(self._resident, style, camera, size, step, ground, progress)
+        if isinstance(style, SurfaceLook):
+            return cast_surface(self._resident, style, shot, step)
+        return take_picture(self._resident, style, shot, step)
 
     def _within(self, progress: Progress) -> VolumeRenderer:
         """Return the renderer of the volume without what lies outside of the body, which is kept."""
@@ -242,8 +241,7 @@ class VolumeRenderer(Closing):
     def render_with_layers(
         self,
         style: VolumeLook | SlicesInSpace,
-        camera: Camera,
-        size: tuple[int, int],
+        shot: Shot,
         beside: Mapping[str, int],
         draw: Callable[[DrawnVolume], Rendering],
     ) -> Rendering:
@@ -257,9 +255,8 @@ class VolumeRenderer(Closing):
             Draws the picture; it is called again where the device has no room, or another one takes over.
         """
         if isinstance(style, SlicesInSpace):
-            return overlay_with_layers(self._resident, style, camera, size, beside, draw)
-        step = self._checked_step(style.ray_step)
-        return take_with_layers(self._resident, style, camera, size, step, beside, draw)
+            return overlay_with_layers(self._resident, style, shot, beside, draw)
+        return take_with_layers(self._resident, style, shot, self._checked_step(style.ray_step), beside, draw)
 
     def _cut(
         self,
@@ -280,16 +277,6 @@ class VolumeRenderer(Closing):
         if style.sheet is not None:
             return take_contact_sheet(self._resident, style, plane, self.frame(style), size, background, progress)
         return take_cut(self._resident, style, plane, size, background, progress)
-
-    def _reformat(
-        self,
-        style: CurveCut,
-        place: Place,
-        size: Sequence[int] | None,
-        background: str | Sequence[float],
-        progress: Progress,
-    ) -> Rendering:
-        return take_curve(self._resident, style, place.view, place.up, size, background, progress)
 
     def _checked_step(self, ray_step: float | None) -> float:
         smallest = min(self.volume.spacing)

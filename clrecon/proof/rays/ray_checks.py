@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.opencl import Device, Stopwatch, download, upload
-from clrecon.operators.rays.picture_buffers import TILE, PictureBuffers, RayView
+from clrecon.operators.rays.picture_buffers import TILE, PictureBuffers, RayView, Shot
 from clrecon.operators.rays.point_pictures import draw_splats
 from clrecon.operators.rays.ray_pictures import MainWay, enter_tiles, look_ahead, take_picture
 from clrecon.operators.rays.ray_slabs import (
@@ -229,7 +229,7 @@ def _check_composite(device: Device, scenes: tuple[tuple[str, TransferFunction, 
         camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, options.get("perspective", True))
         step = options.get("step", 0.5 * min(volume.spacing))
         style = VolumeLook(function, lighting=lighting, jitter=jitter, clip=clip)
-        found = take_picture(DeviceVolume(volume, device=device), style, camera, SIZE, step)
+        found = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
         twin = cast_rays(volume, function, camera, SIZE, step, lighting, clip, "dvr", jitter)
         image = 255.0 * np.clip(twin.rgba, 0.0, 1.0)
         worst = max(worst, _compare(found, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}"))
@@ -259,7 +259,7 @@ def _check_composite_labels(device: Device) -> str:
         style = VolumeLook(
             grey, lighting=UNSHADED, labels=labels, label_colors={3: "red"}, label_opacity={1: 0.25, 3: 0.5}
         )
-        found = take_picture(DeviceVolume(volume, device=device), style, camera, SIZE, 0.3)
+        found = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), 0.3)
         require_whole(found.report)
         column = np.arange(SIZE[0]) // 8 % 4
         factor = np.choose(column, (1.0, 0.25, 1.0, 0.5))
@@ -281,7 +281,7 @@ def _check_projections(device: Device, kinds: tuple[str, ...], uneven: bool) -> 
             camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=dtype != "uint8")
             step = 0.5 * min(volume.spacing)
             style = Projection(kind, clip=clip)
-            found = take_picture(DeviceVolume(volume, device=device), style, camera, SIZE, step)
+            found = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
             twin = cast_rays(volume, None, camera, SIZE, step, None, clip, kind)
             what = f"{kind} of {dtype} voxels{' of uneven slices' * uneven}"
             require_whole(found.report)
@@ -302,7 +302,7 @@ def _check_surfaces(device: Device, uneven: bool) -> str:
         camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=dtype == "float32")
         step = 0.5 * min(volume.spacing)
         style = SurfaceLook(iso_value, color="white", shadows=shadows, lighting=FIXED, clip=clip)
-        found = cast_surface(DeviceVolume(volume, device=device), style, camera, SIZE, step)
+        found = cast_surface(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
         twin = surface_twin(volume, iso_value, camera, SIZE, step, FIXED, clip, shadows=shadows)
         image = 255.0 * np.clip(twin.rgba, 0.0, 1.0)
         worst = max(worst, _compare(found, image, twin.depth, f"{dtype} voxels{' of uneven slices' * uneven}"))
@@ -317,7 +317,7 @@ def _check_surface_labels(device: Device) -> str:
             50.0, color="white", lighting=Lighting(1.0, 0.0, 0.0), labels=labels,
             label_colors={1: "red", 2: "blue"}, label_opacity={3: 0.4},
         )  # fmt: skip
-        found = cast_surface(DeviceVolume(volume, device=device), style, camera, SIZE, 0.2)
+        found = cast_surface(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), 0.2)
         require_whole(found.report)
         column = np.arange(SIZE[0]) // 8 % 4
         colors = 255.0 * np.array([(1, 1, 1, 1), (1, 0, 0, 1), (0, 0, 1, 1), (0.4, 0.4, 0.4, 0.4)])
@@ -339,7 +339,7 @@ def _check_slices(device: Device) -> str:
         camera, chosen = look_at(volume, (0.4, 0.8, -0.7), 7.0, perspective=uneven), [1, 4, 7, 12]
         clip = _cut(volume) if uneven else None
         style = SlicesInSpace(chosen, opacity=0.4, lowest_hu=-300.0, window=window, clip=clip)
-        found = overlay_slices(DeviceVolume(volume, device=device), style, camera, SIZE)
+        found = overlay_slices(DeviceVolume(volume, device=device), style, Shot(camera, SIZE))
         rgba, depth = overlay_twin(
             volume, camera, SIZE, chosen, 0.4, -300.0, grey, None if clip is None else clip.planes
         )

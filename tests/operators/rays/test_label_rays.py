@@ -11,6 +11,7 @@ from ray_scenes import STEPS, centre_of, look, make_volume, positions, premultip
 
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
+from clrecon.operators.rays.picture_buffers import Shot
 from clrecon.operators.rays.surface_pictures import cast_surface
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.proof.surface.labels import find_solid
@@ -30,7 +31,7 @@ def cast(
 ) -> Rendering:
     style = SurfaceLook(300.0, **{"lighting": UNLIT, "color": "white", **(labels or {}), **settings})
     resident = DeviceVolume(volume, device=device, memory=memory)
-    return cast_surface(resident, style, camera, size, 0.5 * min(volume.spacing))
+    return cast_surface(resident, style, Shot(camera, size), 0.5 * min(volume.spacing))
 
 
 def labelled(labels: LabelMap, colors: dict | None = None, opacity: dict | None = None) -> dict[str, Any]:

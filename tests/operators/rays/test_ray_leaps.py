@@ -180,7 +180,7 @@ def test_slabs_in_the_order_of_rays_that_run_almost_along_the_slices(device, mon
     camera = Camera((7.5, -50.0, 31.5 - 69.5 * tilt), (7.5, 19.5, 31.5), (0.0, 0.0, 1.0), parallel_scale=32.0)
     settings = {"size": (8, 64), "ray_step": 0.5}  # rows at whole k
     whole = take(volume, device, camera, **settings)
-    monkeypatch.setattr(ray_pictures, "plan_ray_slabs", lambda *_, **__: 8)
+    monkeypatch.setattr(ray_slabs, "plan_ray_slabs", lambda *_, **__: 8)
     parts = take(volume, device, camera, **settings)
     assert parts.report["slabs"] == 8
     assert_same(parts, whole)

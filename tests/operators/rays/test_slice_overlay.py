@@ -11,6 +11,7 @@ import clrecon
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.operators.rays import slices as operator
+from clrecon.operators.rays.picture_buffers import Shot
 from clrecon.operators.rays.slices import choose_slices
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.proof.rays.surface import overlay_slices as overlay_twin
@@ -29,7 +30,7 @@ def grey(hu: np.ndarray) -> np.ndarray:
 
 
 def overlay_slices(resident, camera, size, *, background=None, **look):
-    return operator.overlay_slices(resident, SlicesInSpace(**look), camera, size, background)
+    return operator.overlay_slices(resident, SlicesInSpace(**look), Shot(camera, size, background))
 
 
 def assert_twin(device, volume, camera, slices, clip=None, opacity=0.4, lowest=-300.0, **settings):
@@ -204,5 +205,5 @@ def test_each_slice_is_told(device):
     style = SlicesInSpace(slices=[1, 4, 7], opacity=0.4, lowest_hu=-300.0, window=WINDOW)
     camera = look(volume, (0.4, 0.8, -0.7), 14.0, False)
     resident = DeviceVolume(volume, device=device)
-    operator.overlay_slices(resident, style, camera, SIZE, None, progress=lambda *said: told.append(said))
+    operator.overlay_slices(resident, style, Shot(camera, SIZE, progress=lambda *said: told.append(said)))
     assert told == [("slabs", 0, 3), ("slabs", 3, 3)]

@@ -10,6 +10,7 @@ from variants import daily
 
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
+from clrecon.operators.rays.picture_buffers import Shot
 from clrecon.operators.rays.surface_pictures import cast_surface
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.extract import extract_isosurface
@@ -31,7 +32,7 @@ def cast(device, volume: Volume, iso_value: float, camera: Camera, size=SIZE, me
     background = settings.pop("background", None)
     style = SurfaceLook(iso_value, **{"lighting": UNLIT, "color": "white", **settings})
     resident = DeviceVolume(volume, device=device, memory=memory)
-    return cast_surface(resident, style, camera, size, step, background)
+    return cast_surface(resident, style, Shot(camera, size, background), step)
 
 
 def ball(points: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from clrecon.geometry import Volume
 from clrecon.opencl.arrays import download, empty_output, upload
 from clrecon.opencl.buffers import raw
 from clrecon.opencl.sources import read_kernel_source
-from clrecon.operators.rays import ray_pictures
+from clrecon.operators.rays import ray_slabs
 from clrecon.operators.resident import device_volume as resident
 from clrecon.rendering import Lighting, TransferFunction
 
@@ -134,7 +134,7 @@ def test_slabs_with_a_single_slice_at_the_end_take_no_sample_of_their_neighbours
     volume = noise_volume((13, 20, 40))
     view = {"camera": look(volume, towards, 6.0), "size": (48, 41), "lighting": Lighting(), "ray_step": 0.2}
     whole = DeviceCaster(windows)(volume, "dvr", FUNCTION, **view)
-    monkeypatch.setattr(ray_pictures, "plan_ray_slabs", lambda *_, **__: slices)
+    monkeypatch.setattr(ray_slabs, "plan_ray_slabs", lambda *_, **__: slices)
     parts = DeviceCaster(windows)(volume, "dvr", FUNCTION, **view)
     assert whole.image[..., 3].max() > 100
     assert np.abs(premultiplied(whole.image) - premultiplied(parts.image)).max() <= tolerances.RAY_SAME_255
