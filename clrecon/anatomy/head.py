@@ -129,10 +129,10 @@ def shows_face(volume: Volume, hu: float) -> bool:
 
 
 def find_head(volume: Volume) -> bool | None:
-    """Tell whether a scan shows a head, from its voxels; the answer is kept for each volume.
+    """Tell, once for each volume, whether a scan shows a head: True where slices show the vault of a skull.
 
-    Returns: True: slices show the vault of a skull.  False: every slice with a body shows that of a trunk, or one that
-        fills the slice, so that no skin shows.  None: neither, such as a leg, or a face without the vault.
+    False: every slice with a body shows a trunk, or fills the slice, so that no skin shows.  None: neither, such as a
+        leg.
     """
     try:
         return _judged[volume]

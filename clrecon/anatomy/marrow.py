@@ -32,11 +32,8 @@ def measure_width(
 ) -> float:
     """Return the radius of the largest ball that fits into a body (nk, nj, ni), mm, right to about `block_mm`.
 
-    Where an end of the volume cuts the body, a disc in that end counts as a ball: of a skull only the cap may be there.
-
-    ends: For each axis of the array whether its first and its last layer lie at an end of the volume: the body goes on
-        there as it is.  All else around it is outside.
-    steps: Of the voxels along k, j, i, mm.
+    Where an end of the volume cuts the body, as `ends` say of both ends of each axis, a disc there counts as a ball: of
+    a skull only the cap may be there.  `steps` are along k, j, i, mm.
     """
     from scipy.ndimage import distance_transform_edt
 

@@ -60,10 +60,6 @@ def measure_noise(volume: Volume) -> Noise:
     ----------
     volume : Volume
 
-    Returns
-    -------
-    Noise
-
     Raises
     ------
     UsageError

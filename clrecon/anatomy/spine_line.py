@@ -63,11 +63,7 @@ LOOKED_AT = 9
 
 @dataclass(frozen=True)
 class SpineEnd:
-    """An end of the line that was found; without a reason it is that of the scan.
-
-    z_mm, lost_mm: Height of the last slice of the line, and of the first in which it was not found again, LPS mm.
-    because: What was found there instead; empty where the scan ends.
-    """
+    """An end of the line: its height, and that at which it is lost, LPS mm, because of what; empty at a scan's end."""
 
     z_mm: float
     lost_mm: float | None = None
@@ -203,10 +199,6 @@ def find_spine_line(volume: Volume, *, sure_only: bool = False, progress: Progre
         right alone are not alike.
     progress : callable, optional
         Called as ``progress("curve", slices done, slices)``, over the slices of three passes.
-
-    Returns
-    -------
-    SpineLine
 
     Raises
     ------

@@ -42,10 +42,7 @@ _AXES = re.compile(r"[LRPASI]{3}")
 def certificate_lines(report: Mapping[str, Any], *, keep_ids: bool = False) -> tuple[str, ...]:
     """Return the lines for a file from ``volume.report`` (docs/contract.md); none if nothing is known.
 
-    keep_ids: With the hash of the frame of reference.
-
-    Returns: At most `LINE_LENGTH` printable ASCII characters each, none of them ``=``: readers look for ``SPACE=``
-        anywhere.
+    They are printable ASCII, at most `LINE_LENGTH`, without ``=``: readers look for ``SPACE=`` anywhere.
     """
     return tuple(_plain(line) for line in (*_facts(report, keep_ids), *_faults(report)))
 
@@ -170,10 +167,7 @@ class PointContent:
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Parts of a mesh, for a format that shows them one by one, with the volume that each encloses.
-
-    of_triangle: (m,). The part of each triangle, from 0.
-    """
+    """Parts of a mesh, for a format that shows them one by one: that of each triangle (m,), the volume of each."""
 
     of_triangle: NDArray[np.integer]
     names: tuple[str, ...]
@@ -182,12 +176,10 @@ class Pieces:
 
 @dataclass(frozen=True, kw_only=True)
 class Content(PointContent):
-    """A mesh as it goes into a file.
+    """A mesh as it goes into a file, with name, colour (red, green, blue, 0 to 1) and pieces where a format has them.
 
-    name: Of the object, for formats that have names.
-    color: Red, green and blue, 0 to 1, for formats that have colours; None: the colour of the format's writer.
+    color: None: the colour of the format's writer.
     vertex_colors: (n, 3). A colour for each vertex, in PLY, in place of `color`.
-    pieces: For pages.
     """
 
     triangles: NDArray[np.uint32]
@@ -217,13 +209,10 @@ def parts_of(content: Content | Assembly) -> tuple[Content, ...]:
 
 
 def facts_for_file(report: Mapping[str, Any], space: str, *, keep_ids: bool = False) -> dict[str, Any]:
-    """Return the entries of a `PointContent` that come from the report of a mesh or cloud and from the frame.
-
-    Nothing else of the report is ever written.
+    """Return entries of a `PointContent`: of the frame and a report of mesh or cloud, of which nothing else is written.
 
     report: ``iso_value_hu``, ``inside_hu``, ``affine_ijk_to_lps_mm``, and ``certificate`` (the report of a volume) or
         ``certificate_lines`` (those of a file that was read).
-    space: {"lps", "ras"}
     keep_ids: With the hash of the frame of reference.
     """
     iso_value, affine = report.get("iso_value_hu"), report.get("affine_ijk_to_lps_mm")

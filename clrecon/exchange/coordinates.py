@@ -24,9 +24,9 @@ def as_stored(points: NDArray[Any]) -> NDArray[np.floating]:
 
 
 def rounding_step(vertices: NDArray[np.floating]) -> float:
-    """Return the step, in mm, to which coordinates of vertices have been rounded: that of float32 at the largest one.
+    """Return the step, mm, to which coordinates are rounded: that of float32 at the largest one.
 
-    float64 vertices were computed in float32 relative to a point near their centre: the step there.
+    Those in float64 were computed in float32 relative to a point near their centre: the step there.
     """
     if len(vertices) == 0:
         return 0.0
@@ -52,10 +52,7 @@ def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
 
 
 def find_places(vertices: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Number the places at which vertices lie, in the order in which they occur first.
-
-    Returns: The first vertex at each place, (p,), and the place of each vertex, (n,).
-    """
+    """Return the first vertex at each place, (p,), in the order of vertices, and the place of each vertex, (n,)."""
     mixed = _scramble(vertices)
     _, first, place = np.unique(mixed, return_index=True, return_inverse=True)
     if not np.array_equal(vertices[first][place], vertices):  # two places with one sum, or NaN

@@ -35,11 +35,10 @@ NO_LIMIT = 2**62
 class FileFormat:
     """A format of meshes, of clouds or of both, and the module of this package that writes and reads its files.
 
-    The module is imported when a file is written or read.  It has `estimate` (bytes of a file, exact or rather too
-    small), `write`, `verify` (reads the file back and raises `OutputError` unless sizes and counts are those of the
-    contents), and `read_mesh` and `read_cloud`.
+    The module, imported when it is needed, has `estimate` (bytes of a file, exact or rather too small), `write`,
+    `verify` (reads the file back, and raises `OutputError` unless sizes and counts are those of the contents),
+    `read_mesh` and `read_cloud`.
 
-    holds_many: Several named meshes can stand in a file.
     most_bytes: Largest file that the format, or common readers of it, can handle.
     """
 

@@ -45,11 +45,7 @@ _LEVEL = 6
 
 @dataclass(frozen=True, eq=False)
 class CodedSurface:
-    """A surface as a page holds it: counts of vertices that triangles use, and of triangles.
-
-    low_mm, step_mm: Lowest corner of the bounding box, and the step of a coordinate along each axis.
-    data: gzip of the byte planes.
-    """
+    """A surface as a page holds it: counts, lowest corner and steps of coordinates, mm, and gzip of the byte planes."""
 
     vertices: int
     triangles: int

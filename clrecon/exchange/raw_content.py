@@ -21,10 +21,7 @@ UNIT_TOLERANCE = 1e-3
 
 @dataclass
 class RawCloud:
-    """A file's points (n, 3) of any real type, perhaps not finite, in mm in the file's own frame.
-
-    columns: Further values of each point (n,) by the name that the file gives them, in the order of the file.
-    """
+    """A file's points (n, 3) of any real type, perhaps not finite, mm in its own frame, and its named columns (n,)."""
 
     kind: str
     points: NDArray[Any]
@@ -133,10 +130,7 @@ def say_cut(name: str, error: object) -> RefusedInputError:
 
 @dataclass(frozen=True)
 class Part:
-    """An object of a file, its name perhaps empty: its triangles follow those of the part before it.
-
-    color: Red, green and blue, 0 to 1, as on a screen (sRGB).
-    """
+    """An object of a file, perhaps unnamed: its triangles follow those before; red, green, blue, 0 to 1, sRGB."""
 
     name: str
     triangles: int
@@ -145,12 +139,7 @@ class Part:
 
 @dataclass
 class RawMesh:
-    """A file's triangles, perhaps of vertices that are not there, in the file's own frame.
-
-    vertices: (n, 3) of any real type, in `unit`, placed as the file says; perhaps not finite.
-    parts: Empty where the file has no objects.
-    values: Of each vertex, by name.
-    """
+    """A file's triangles, perhaps of absent vertices; these, in `unit`, of any real type, may not be finite."""
 
     kind: str
     vertices: NDArray[Any]

@@ -136,11 +136,11 @@ def normal_matrix(affine: Float64Array) -> Float64Array:
 
 
 def facts_of_orientation(affine: Float64Array) -> dict[str, Any]:
-    """Describe the directions of index space in the patient.
+    """Describe index space in the patient: ``row``, ``column``, ``normal``, unit vectors in LPS along i, j, and row x
+    column.
 
-    Returns: ``row``, ``column``, ``normal``: unit vectors in LPS along i, along j, and row x column.  ``axes``: for i,
-        j and the normal, the letter of the nearest patient direction (L left, R right, P posterior, A anterior, S
-        superior, I inferior).  ``off_axis_deg``: angle between the normal and the nearest patient axis.
+    ``axes``: for i, j and the normal, the letter of the nearest direction (L left, R right, P posterior, A anterior, S
+    superior, I inferior).  ``off_axis_deg``: angle between the normal and the nearest patient axis.
     """
     row, column = (affine[:3, axis] / np.linalg.norm(affine[:3, axis]) for axis in (0, 1))
     normal = slice_normal(affine)
@@ -177,12 +177,7 @@ def lps_affine_from_ras(affine: ArrayLike) -> NDArray[np.float64]:
 
 
 def choose_space(asked: str | None, named: object, what: str) -> str:
-    """Return ``LPS`` or ``RAS``: the patient frame of what another library holds.
-
-    asked: That of the caller; None: that which `named` says, else LPS.
-    named: What the data themselves say, None where they say nothing.
-    what: The data, for messages.
-    """
+    """Return ``LPS`` or ``RAS``, the frame of what another library holds: as `asked`, as `named` there, or LPS."""
     if asked is not None:
         frame_from_lps(asked)
     if named is None:

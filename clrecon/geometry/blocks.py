@@ -36,11 +36,9 @@ class Block(NamedTuple):
 
 
 def find_block(grid: Grid, origins: Float64Array, low: ArrayLike, high: ArrayLike, margin: int = 0) -> Block | None:
-    """Return the smallest block that holds every voxel whose centre lies in a box; None where no centre does.
+    """Return the smallest block of all voxel centres in a box, LPS mm, with a margin; None without such a centre.
 
     origins: LPS mm of voxel (0, 0, k) of each slice, (nk, 3).
-    low, high: Corners of the box along the axes of the patient, LPS mm; infinite numbers leave a side open.
-    margin: Voxels more on each side, as far as the grid goes.
     """
     ni, nj, nk = grid.shape_ijk
     low, high = np.asarray(low, np.float64) - ON_EDGE_MM, np.asarray(high, np.float64) + ON_EDGE_MM
@@ -69,10 +67,8 @@ def find_block(grid: Grid, origins: Float64Array, low: ArrayLike, high: ArrayLik
 def place_block(affine: Float64Array, origins: Float64Array, uneven: bool, block: Block) -> tuple[Any, Any]:
     """Return the affine of a block, and the positions (n, 3) of its slices where they are uneven, else None.
 
-    A block of uneven slices that are even among themselves, by the rule of the reader, has an affine alone: that which
-    these slices have when they are read without the others.
-
-    affine, origins, uneven: Of the whole grid; LPS mm of voxel (0, 0, k) of each slice, (nk, 3).
+    Slices of an uneven grid that are even among themselves, by the rule of the reader, have an affine alone: that which
+    they have when they are read without the others.
     """
     placed = np.array(affine)
     aside = affine[:3, 0] * block.first[0] + affine[:3, 1] * block.first[1]
@@ -128,13 +124,12 @@ Own = TypeVar("Own", bound=BaseVolume)
 
 
 def crop_volume(volume: Own, low: ArrayLike, high: ArrayLike, *, margin: int = 0, space: str = "lps") -> Own:
-    """Crop a volume to the smallest block of whole voxels that holds every voxel centre in a box.
+    """Crop a volume to the smallest block of whole voxels that holds every voxel centre in a box, and a margin.
 
     Voxels keep their places, uneven slices too; they are a view where they can be.  Where the volume lies oblique to
     the patient, the block also holds voxels beyond the box.  ``report["crop"]`` has the figures.
 
     low, high: Corners of the box, mm of the frame `space`; infinite numbers leave a side open.
-    margin: Voxels more on each side, as far as the volume goes.
     """
     try:
         box = np.array([low, high], dtype=np.float64)

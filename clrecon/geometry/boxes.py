@@ -24,11 +24,10 @@ _COUNTS = {
 def crop_box(
     clip_box: Sequence[float | None] | None, between: Sequence[float | None] | None, around: Sequence[float] | None
 ) -> Box | None:
-    """Return the box that is in all of those that are given; None without any.
+    """Return the box, mm, that is in all of those that are given; None without any.  None or infinity leaves a side
+    open.
 
-    clip_box: (x0, x1, y0, y1, z0, z1). A box in mm; None, or an infinite number, leaves a side open.
-    between: (z0, z1). Heights in mm, one of them may be None.
-    around: (x, y, z, r). A point and half the side of the cube around it, mm.
+    They are (x0, x1, y0, y1, z0, z1), heights (z0, z1), and a point with half the side of the cube around (x, y, z, r).
     """
     boxes = []
     for name, values in (("clip_box", clip_box), ("between", between), ("around", around)):

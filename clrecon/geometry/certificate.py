@@ -89,10 +89,7 @@ def without_ids(report: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def amend(report: dict[str, Any], **changes: Any) -> dict[str, Any]:
-    """Return the report of a volume with some entries changed or added; a certificate stays a certificate.
-
-    Of a certificate its fields are changed, other entries are added to `Certificate.masked`.
-    """
+    """Return a report with entries changed or added; a certificate stays one, with others in `Certificate.masked`."""
     if not isinstance(report, Certificate):
         return {**report, **changes}
     own = {field.name for field in fields(report)}

@@ -31,11 +31,11 @@ from clrecon.system.memory import find_mapping
 
 
 class Grid(Message):
-    """Voxels (nk, nj, ni) and their affine, checked by the subclass: the base of `Volume` and
-    `clrecon.labels.LabelMap`.
+    """Voxels (nk, nj, ni) and their affine, checked by the subclass, which becomes read-only: index (i, j, k) to LPS
+    mm.
 
     It pickles and copies as `clrecon.system.base_classes` says: memory-mapped voxels are sent as their place in the
-    file.  The affine, index (i, j, k) to LPS mm, becomes read-only.
+    file.
     """
 
     def __init__(self, voxels: NDArray[Any], affine: Float64Array):
@@ -121,8 +121,7 @@ def fit_line(positions: Float64Array) -> tuple[Float64Array, Float64Array]:
 
 
 def fit_even(positions: Float64Array, normal: Float64Array) -> tuple[Float64Array, Float64Array, bool]:
-    """Return step and origin (3,), LPS mm, of even places fitted to slices at positions (n, 3), n >= 2, and whether all
-    are so.
+    """Return step and origin (3,), LPS mm, of even places fitted to positions (n, 3), n >= 2, and whether all are so.
 
     None may be further off than `position_tolerance` of the median gap along the normal.
     """
@@ -134,12 +133,7 @@ def fit_even(positions: Float64Array, normal: Float64Array) -> tuple[Float64Arra
 
 @dataclass(frozen=True)
 class UnevenStack(Message):
-    """Positions of all slices, with the in-plane steps that they share.
-
-    in_plane: (3, 2). Steps along i and j, mm.
-    positions: (nk, 3). Centre of voxel (0, 0, k), LPS mm.
-    normal: (3,). Unit length, towards larger k.
-    """
+    """Positions (nk, 3) of all slices, LPS mm, the steps along i and j that they share (3, 2), and their normal."""
 
     in_plane: Float64Array
     positions: Float64Array

@@ -37,12 +37,10 @@ class Image(NamedTuple):
 
 
 def image_of(volume: BaseVolume, resample: bool, method: str, *, holds_shear: bool = False) -> Image:
-    """Return a volume as an image has it.
+    """Return a volume as an image has it; `method` of `Volume` was called.
 
-    resample: A volume that no image can hold is resampled (trilinear) to a regular grid around all its voxels: i and j
-        in their own steps, k in the smallest step of the slices along their normal.
-    method: The method of `Volume` that was called, for messages.
-    holds_shear: The image's axes may lie at any angle.
+    `resample` what no image can hold, uneven or maybe sheared, to a regular grid (trilinear) around all its voxels: i
+    and j in their own steps, k in the smallest step of the slices along their normal.
     """
     fault = _fault_of(volume, holds_shear)
     if fault is None:

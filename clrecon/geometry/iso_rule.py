@@ -104,8 +104,7 @@ class IsoRule:
     def as_report(self) -> dict[str, Any]:
         """Return the entries of a mesh's report: what is inside, and where the surface lies, HU.
 
-        ``iso_value_hu`` and ``iso_level_hu`` are None for a range; ``inside_hu`` and ``inside_levels_hu`` are ``[low,
-        high]``, None for the end that is open.
+        Of a range ``inside_hu`` and ``inside_levels_hu`` are ``[low, high]``, None for an end that is open.
         """
         value, level = self.iso_value, self.iso_level
         ends: dict[str, tuple[list[float | None], list[float | None]]] = {
@@ -176,7 +175,6 @@ def choose_iso_rule(
     """Decide what is inside and where the surface lies.
 
     iso_value: HU.  A sample is inside when its value is >= this; of a range, when it lies within, both ends included.
-    closed: Surround the volume with outside.
     below: A sample is inside when its value is < `iso_value`: the same surface, turned round.
     values: Those of this volume; given where several rules for one volume are chosen.
     """
@@ -311,11 +309,10 @@ def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
 
 
 def layer_margins(volume: Volume, border: int) -> NDArray[np.float64]:
-    """Smallest distance of a vertex from a sample along k, for each layer of cells, in steps of that layer.
+    """Smallest distance of a vertex from a sample along k, (nk + 2 * border,) layers from ``-border`` on, in their
+    steps.
 
     The margin of a layer a few micrometres thick would be tenths of a millimetre in a thick one.
-
-    Returns: (nk + 2 * border,). From the layer at slice ``-border``; the last is the layer beyond the last slice.
     """
     if not volume.uneven:
         return np.full(volume.shape_ijk[2] + 2 * border, vertex_margin(volume, border)[2])
@@ -340,11 +337,7 @@ def slice_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
 
 
 def layer_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
-    """Return the same for the layers of cells, of which each lies between slice k and k + 1, k from ``-border``.
-
-    Gradients are those of the trilinear field within a cell, per step of that cell; the last lies beyond the last
-    slice.
-    """
+    """Return the same for layers of cells, from slice k to k + 1, k from ``-border``, by the trilinear field there."""
     return _normal_matrices(volume, border, np.diff(volume.slice_origins(border + 1), axis=0)[1:])
 
 

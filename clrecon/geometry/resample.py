@@ -46,13 +46,12 @@ def describe_unevenness(origins: Float64Array) -> str:
 
 
 def regular_grid(grid: Grid, origins: Float64Array, steps_mm: float | Sequence[float] | None = None) -> RegularGrid:
-    """Return the smallest regular grid that encloses all voxel centres of a grid.
+    """Return the smallest regular grid that encloses all voxel centres of a grid with slices at `origins` (nk, 3), LPS
+    mm.
 
     i runs as in the grid, j within the plane of the slices, k along their normal.  Without `steps_mm`, i and j have the
     steps of the grid and k the smallest distance of slices along the normal: where a volume is sheared but even, the
     planes are those of its slices.
-
-    origins: LPS mm of voxel (0, 0, k) of each slice, (nk, 3).
     """
     di, dj, _ = grid.spacing
     first = grid.affine[:3, 0] / di

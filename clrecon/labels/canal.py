@@ -38,11 +38,10 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class Canal:
-    """The canal of one vertebra.
+    """The canal of one vertebra, as high as the pedicles.
 
     closed_slices: Slices in which the arch is closed, alone or together with its neighbours.
     together: Slices that close the arch together; 1 where single ones do.
-    height_mm: Height of the slices of the canal: that of the pedicles.
     """
 
     voxels: Bits

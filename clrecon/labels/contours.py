@@ -33,7 +33,6 @@ def fill_contours(contours: Iterable[NDArray[np.float64]], shape: tuple[int, int
     """Return the pixels (nj, ni) of one slice whose centres lie inside of contours by the even-odd rule.
 
     contours: Corners (i, j) of each, (n, 2), in pixels, 0 at the centre of the first; the last is joined to the first.
-    shape: (nj, ni).
     """
     nj, ni = shape
     inside = np.zeros(shape, dtype=bool)
@@ -68,11 +67,7 @@ def _cross_rows(corners: NDArray[np.float64], nj: int) -> tuple[NDArray[np.int64
 
 @dataclass(frozen=True)
 class United:
-    """The pixels (nj, ni) inside of the contours of a slice, and what was done to find them.
-
-    repeated: Contours that equal another, or nearly, and do not count.
-    crossing: Pairs of contours that cross.
-    """
+    """The pixels (nj, ni) inside of a slice's contours, how many (nearly) equal another one, and pairs that cross."""
 
     inside: NDArray[np.bool_]
     repeated: int = 0
@@ -81,10 +76,7 @@ class United:
 
 @dataclass(frozen=True)
 class _Patch:
-    """One contour and the pixels inside of it, within its bounding box.
-
-    `surely` are the pixels that stay inside where the contour is moved by `NOISE_MM`, `maybe` those that come inside.
-    """
+    """One contour and the pixels inside, within its box; surely and maybe so where it is moved by `NOISE_MM`."""
 
     box: tuple[slice, slice]
     inside: NDArray[np.bool_]
@@ -110,9 +102,7 @@ def unite_contours(
 ) -> United:
     """Return the pixels inside of the CLOSED_PLANAR contours of one slice; contours and shape as of `fill_contours`.
 
-    Two contours cross if both hold some pixel centre, and each holds one that is beyond the other.
-
-    pixel_mm: Spacing (di, dj).
+    Two cross if both hold some pixel centre, and each one that is beyond the other; `pixel_mm` is the spacing (di, dj).
     """
     unique = list({_canonical(corners, pixel_mm): corners for corners in contours}.values())
     repeated = len(contours) - len(unique)

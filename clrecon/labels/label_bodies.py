@@ -21,9 +21,8 @@ SAME_DISTANCE = 1e-6
 
 @dataclass(frozen=True)
 class Growth:
-    """The growth of labels on one grid.
+    """The growth of labels on one grid by mm, or by one voxel in each direction.
 
-    grow_mm: Distance of growth; None: one voxel in each direction.
     offsets: (n, 3). (di, dj, dk) to the samples around, without (0, 0, 0), nearest in mm first, shear included.
     shells: (n,). Shell numbers from 0; offsets of equal length have the same.
     """

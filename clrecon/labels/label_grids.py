@@ -144,10 +144,7 @@ SAME_GRID_MM = 1e-3
 
 
 def open_masks(folder: Path) -> dict[str, GridFile]:
-    """Read the headers of the masks of a folder, by the names of their structures in alphabetical order.
-
-    Hidden files, folders and files of other kinds are left out.
-    """
+    """Read the headers of a folder's masks, by structure in alphabetical order; hidden and other files are left out."""
     shown = escape_text(folder.name)
     masks: dict[str, GridFile] = {}
     for path in sorted(folder.iterdir(), key=lambda path: path.name):
@@ -176,10 +173,7 @@ def open_masks(folder: Path) -> dict[str, GridFile]:
 
 
 def read_masks(folder: Path, masks: dict[str, GridFile], wanted: Wanted, progress: Progress) -> LabelMap:
-    """Read the masks of a folder, as `open_masks` returns them, as one map; the first has number 1.
-
-    A voxel of several masks belongs to the first of them in alphabetical order, wanted ones before others.
-    """
+    """Read the masks of `open_masks` as one map, the first as 1; a shared voxel is the first's, wanted ones lead."""
     names = dict(enumerate(masks, start=1))
     chosen = set(names) if wanted.labels is None else {find_number(one, names, names) for one in wanted.labels}
     order = [*sorted(chosen), *(sorted(set(names) - chosen) if wanted.others else ())]

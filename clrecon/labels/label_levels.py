@@ -43,12 +43,10 @@ MOST_TRIALS = 14
 
 
 def next_level(tried: Sequence[tuple[int, float]], wanted: float, rise: float) -> int:
-    """Return the level to try next: by Newton's method, then the secant method, then interpolation between two levels.
+    """Return the level to try next, by Newton's method, then the secant method, then interpolation between two levels.
 
-    tried: Levels and their volumes, in the order of the trials.
+    tried: Levels and their volumes, in the order of the trials; the best of them is returned where no other is useful.
     rise: Approximate change of the volume when the level rises by one: below 0.
-
-    Returns: The next level; or the best of the tried levels, where no further trial is useful.
     """
     if not tried:
         return START
@@ -96,11 +94,7 @@ def count_faces(labels: NDArray[Any]) -> NDArray[np.int64]:
 def find_enclosed(
     labels: NDArray[Any], faces: NDArray[Any], boxes: Mapping[int, tuple[slice, ...]] | None = None
 ) -> tuple[int, ...]:
-    """Return the labels that share more faces with other labels than they have free, and the labels that touch them.
-
-    faces: The table of `count_faces`.
-    boxes: Box of each label and the samples around it; None: the whole map.
-    """
+    """Return the labels with more faces to other labels than free (`count_faces`), and the labels that touch them."""
     enclosed = np.flatnonzero(faces[:, 1] > faces[:, 0])
     involved = set(enclosed.tolist())
     for number in enclosed:
@@ -121,10 +115,7 @@ def _count_between(part: NDArray[Any], number: int) -> NDArray[np.int64]:
 
 
 def level_biases(levels: dict[int, int], size: int) -> NDArray[np.int32]:
-    """Return the lead of each label over others where they touch, shape (size,), in units of the occupancy.
-
-    A label that is not in `levels` has no lead: its borders are those of the level `START`.
-    """
+    """Return each label's lead over others where they touch (size,), in units of occupancy; 0 if not in `levels`."""
     biases = np.zeros(size, np.int32)
     for number, level in levels.items():
         biases[number] = START - level
@@ -185,10 +176,7 @@ class Borders:
 
 
 def choose_levels(borders: Borders, measure: Callable[[dict[int, int]], dict[int, float]]) -> dict[int, int]:
-    """Choose the levels at which enclosed labels have, as nearly as possible, the volumes of their voxels.
-
-    measure: Function from the levels of all these labels to the volumes of their meshes, in voxels.
-    """
+    """Choose levels at which enclosed labels have the volumes of their voxels; `measure` returns those of meshes."""
     from scipy.sparse.linalg import spsolve
 
     levels = dict.fromkeys(borders.numbers, START)

@@ -58,10 +58,8 @@ def _level(text: str) -> str | None:
 
 
 def find_number(label: str | int, names: Mapping[int, str], present: Collection[int]) -> int:
-    """Return the number of `label`: a number itself, else the exact name, else the only name that says the same level
-    of the spine, else the only one that contains it as a part.
-
-    present: Numbers that occur in voxels.
+    """Return the number of `label`: itself, else that of the exact name, else of the only name that says the same level
+    of the spine, else of the only one that has it as a part; `present` are those that occur.
     """
     text = str(label).strip()
     wanted = text.casefold()

@@ -198,10 +198,7 @@ class _Layout:
 def read_segmentation(
     path: Path, wanted: Wanted, progress: Progress = ignore_progress, check: Check | None = None
 ) -> LabelMap:
-    """Read a DICOM SEG of binary segments, of which only those that are not wanted may overlap, or of a label map.
-
-    check: See `Check`; its errors are those of this function.
-    """
+    """Read a DICOM SEG of a label map or of binary segments; only those that are not wanted may overlap."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # pydicom's messages quote the file unescaped
         return _read(path, escape_text(path.name), wanted, progress, check)

@@ -78,11 +78,9 @@ class GhostSlices:
 def judge_slices(
     counts: NDArray[np.int64], area: int, hu: tuple[float, float], warnings: tuple[str, ...] = ()
 ) -> GhostSlices:
-    """Tell the ghosts from the counts of voxels.
+    """Tell the ghosts from the counts (3, nk) of voxels in each slice, in common with the next and with the one after.
 
-    counts: (3, nk). Voxels of each slice, and those that it has in common with the next slice and with the one after.
-    area: All voxels of a slice.
-    hu: Band of the voxels.
+    `area` counts all voxels of a slice.
     """
     points, nk = counts[0], counts.shape[1]
     nearest, around, within = np.full((3, nk), np.nan)

@@ -32,9 +32,8 @@ LEAST_RUN = 4
 
 @dataclass(frozen=True)
 class ClusterFigures:
-    """The clusters of a cloud, an entry of each array for each: points, centres (c, 3), boxes (c, 2, 3) in LPS mm.
-
-    deviations: (c, 3). Standard deviations along the principal axes, mm, ascending.
+    """The clusters of a cloud, an entry of each array for each: points, centres (c, 3), boxes (c, 2, 3) in LPS mm,
+    standard deviations along the principal axes (c, 3), mm, ascending.
     """
 
     points: NDArray[np.int64]

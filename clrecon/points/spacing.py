@@ -102,9 +102,7 @@ def distance_ratios(
     The paper's "mean point distance" of the cell is read as the mean distance of its points to their nearest ones.
     Infinite where all points of a cell coincide with others and the neighbours do not, 0 where these do too.
 
-    means: Mean distance of each point (n,) to its neighbours, itself not among them, mm.
-    nearest: Distance of each point to the nearest other one, mm.
-    cells: Cell of each point, from 0.
+    means, nearest: Mean distance of each point (n,) to its neighbours, itself not among them, and to the nearest, mm.
     """
     counts = np.bincount(cells)
     spacing = np.bincount(cells, nearest) / np.maximum(counts, 1)

@@ -93,10 +93,7 @@ def _inside(volume: Grid, places: Float64Array) -> NDArray[np.bool_]:
 def sample_course(
     grid: Grid, course: Course, ahead_mm: Float64Array = AHEAD_MM, aside_mm: Float64Array = ASIDE_MM, order: int = 1
 ) -> Field:
-    """Return a scan or label map in planes across the canal, (places, ahead, aside); NaN outside of the grid.
-
-    order: 1: trilinear interpolation; 0: the nearest voxel.
-    """
+    """Return a scan, or labels by order 0 (nearest), in planes across the canal (places, ahead, aside); NaN beyond."""
     from scipy.ndimage import map_coordinates
 
     offsets = ahead_mm[:, None, None], aside_mm[None, :, None]
@@ -163,8 +160,7 @@ UNLIKE_COST = 2.0
 
 @dataclass(frozen=True)
 class Looks:
-    """The scan along the canal, as far as discs show in it: arrays of (places, tilts or columns ahead), HU, and walls
-    in mm.
+    """The scan along the canal, as far as discs show in it: (places, tilts or columns ahead), HU, and walls, mm.
 
     brightness: Of the plane at each place and tilt: core and side walls.
     core: Of the middle of each plane, from side to side.

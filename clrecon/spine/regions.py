@@ -393,9 +393,8 @@ def _ramp(value: float, nothing: float, all_of_it: float) -> float:
 def judge(
     piece: Piece, gaps: Sequence[float], scan: Field, looks: Looks, course: Course, usual: NDArray[np.float64]
 ) -> Traits:
-    """Judge a piece.
+    """Judge a piece by itself and by `gaps`, the heights of whole ones beside it, up to two each way, mm.
 
-    gaps: Heights of the whole pieces beside it, up to two above and two below, mm.
     usual: Depth of a usual disc at each place, HU.
     """
     height = piece.end - piece.begin

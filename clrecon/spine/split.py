@@ -245,10 +245,6 @@ def split_vertebrae(
     progress : callable, optional
         Called as ``progress("canal" or "vertebrae", steps done, steps)``.
 
-    Returns
-    -------
-    VertebraSplit
-
     Raises
     ------
     UsageError

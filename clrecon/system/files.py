@@ -71,9 +71,8 @@ def replace_file(
 
     path: A regular file of that name is replaced; its permissions are kept.  A new file gets those that the umask
         allows.
-    write: Gets a binary stream, open for writing, and writes the contents.
     verify: Gets the path of the finished temporary file and raises `OutputError` if its contents are wrong.
-    expected_bytes: Expected size of the file; checked against the free space before anything is written.
+    expected_bytes: Checked against the free space before anything is written.
     """
     with stage_file(path, write, verify, expected_bytes=expected_bytes) as staged:
         staged.commit()
@@ -115,10 +114,11 @@ def stage_file(
     *,
     expected_bytes: int = 0,
 ) -> Iterator[StagedFile]:
-    """Write a file under a temporary name; `StagedFile.commit` in the ``with`` block puts it in place.
+    """Write a file under a temporary name, as `replace_file`; `StagedFile.commit` in the ``with`` block puts it in
+    place.
 
-    For files that belong together: stage all of them, then commit one after the other.  Files that are not committed
-    are removed at the end of the block.  Parameters and errors as in `replace_file`.
+    For files that belong together: stage all of them, then commit one after the other.  The others are removed at the
+    end.
     """
     target = checked_target(path)
     with contextlib.ExitStack() as stack:
@@ -144,10 +144,7 @@ def stage_file(
 
 @contextlib.contextmanager
 def hold_interrupts() -> Iterator[None]:
-    """Hold back Ctrl-C, and other signals that this process handles, until the ``with`` block is done.
-
-    For the moment in which several files are put into their places together.  Python interrupts the main thread only.
-    """
+    """Hold back Ctrl-C, and other signals that this process handles, while several files are put into their places."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -181,10 +178,7 @@ def allow_open_files(count: int) -> None:
 
 
 def check_writable(path: str | os.PathLike[str], *, expected_bytes: int = 0) -> None:
-    """Raise `OutputError` if `replace_file` to this path would surely fail: a check before hours of work.
-
-    Creates an empty temporary file beside the target and removes it at once; the target is not touched.
-    """
+    """Raise `OutputError` if `replace_file` will surely fail: an empty temporary file is made there and removed."""
     target = checked_target(path)
     with system_errors(path):
         _check_space(path, target.parent, expected_bytes)
@@ -312,11 +306,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def check_folder(path: str | os.PathLike[str], own: re.Pattern[str], what: str) -> Path:
-    """Return the folder that will be made or replaced.
-
-    own: Names of files that an earlier run can have written.
-    what: What will be in it, for messages: "frames".
-    """
+    """Return the folder to make or replace; `own` are files of earlier runs, `what` names what will be in it."""
     folder = resolve_target(path)
     with system_errors(path):
         if folder.exists():

@@ -27,8 +27,7 @@ MEMORY_SHARE = 0.9
 def available_memory_bytes(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup")) -> float:
     """Return the bytes that can be taken without swapping: all memory, or infinity, where the system does not tell.
 
-    Linux shows a container the memory of the whole computer, but kills a process that exceeds the container's own
-    limit.
+    Linux shows a container all memory of the computer, and kills a process that exceeds the container's own limit.
     """
     container = free_bytes_of_container(proc, groups)
     try:
@@ -121,9 +120,8 @@ def aligned_empty(shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class FilePlace:
-    """The place of a C-contiguous array in a file, and the state of the file at that time.
+    """The place of a C-contiguous array in a file, `offset` bytes in, and the state of the file at that time.
 
-    offset: Bytes before the first value.
     dtype: With the byte order, as ``numpy.dtype.str`` has it.
     file_bytes, changed_ns: Size of the file, and when it was changed last (ns since 1970).
     """
@@ -155,9 +153,8 @@ class FilePlace:
 
 @dataclass(frozen=True)
 class Mapping:
-    """A memory mapping of a file.
+    """A memory mapping of a file, from its first byte in memory and in the file on.
 
-    address, start: Of its first byte in memory, and in the file.
     identity: Device and number of the file when the mapping was found: another file may take its name later.
     """
 
@@ -196,10 +193,7 @@ class Mapping:
 
 
 def find_mapping(array: NDArray[Any]) -> Mapping | None:
-    """Return the file mapping that `array` is a view of, None where its values are ordinary memory.
-
-    Only a `numpy.memmap` that is shared with its file is accepted: changes to any other mapping would be lost.
-    """
+    """Return the mapping that `array` views, None for ordinary memory or one whose changes do not reach its file."""
     owner: Any = array
     while isinstance(owner, np.ndarray):
         base: Any = owner.base

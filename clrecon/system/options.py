@@ -13,10 +13,7 @@ _READERS = {"int": int, "int | None": int, "float": float, "float | None": float
 
 
 class Option(NamedTuple):
-    """How a field of settings is given on the command line; the first flag is its name in messages.
-
-    how: Keywords of `clrecon.cli.common.Parser.add_argument`.
-    """
+    """How a field of settings is given in a command, by `Parser.add_argument`; its first flag names it in messages."""
 
     name: str
     flags: list[str]
@@ -32,13 +29,11 @@ def option(
     parse: Callable[[str], Any] | None = None,
     **how: Any,
 ) -> Any:
-    """Declare a field of settings that is an option of the command line.
+    """Declare a field of settings that is an option of the command line, with its flags and a text for its value.
 
-    usage: Its flags, and what stands for its value in the help (for each of several values); a switch has none.
     group: Names those that stand together.
     default: Of the field; where the option is not given, the parser has None.
     parse: Reads the value from text; its ValueError is the refusal.  None: as the annotation of the field says.
-    **how: More keywords of `clrecon.cli.common.Parser.add_argument`.
     """
     flags = [word for word in usage.split() if word.startswith("-")]
     values = usage.split()[len(flags) :]

@@ -32,10 +32,7 @@ def extension_of(path: str | os.PathLike[str]) -> str:
 
 
 def find_extension(path: str | os.PathLike[str], known: Iterable[str], noun: str, hint: str = "") -> str:
-    """Return the extension of a file to write, which is one of those known; the file holds a `noun` such as "mesh".
-
-    hint: What a refusal says of the extension.
-    """
+    """Return the extension of a file to write, one of those known; a refusal names the `noun` ("mesh") and `hint`."""
     try:
         extension = extension_of(path)
     except TypeError as error:
@@ -241,11 +238,7 @@ def final_mode(target: Path, new: int = 0o666) -> int:
 
 
 def place_file(temporary: Path, target: Path, path: str | os.PathLike[str], *, keep: bool) -> None:
-    """Rename a finished file to its target in the same folder.
-
-    path: The target as the user named it, for messages.
-    keep: Fail if the target exists, also if it came into being a moment ago.
-    """
+    """Rename a finished file to its target in the same folder; `keep`: fail if it exists, even since a moment ago."""
     with system_errors(path):
         if not keep:
             os.replace(temporary, target)

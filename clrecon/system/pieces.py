@@ -32,8 +32,7 @@ def in_threads(
 ) -> None:
     """Call a function with slices that cover ``range(count)``, several at a time; numpy runs side by side in threads.
 
-    done: Called in the thread of the caller with each slice that is finished, in order.  What either raises ends the
-        work and is raised here.
+    done: Called in the caller's thread with each finished slice, in order.  What either raises is raised here.
     """
     pieces = list(chunks(count, size))
     threads = count_readers(len(pieces), _MOST_THREADS)

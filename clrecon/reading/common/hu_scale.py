@@ -186,8 +186,8 @@ def judge_scale(
 ) -> tuple[Gate, dict[str, float]]:
     """Judge the gate ``hu_scale``; where it fails, return the places of ``air`` and ``soft_tissue`` too.
 
-    slopes: Of the rescale.  Where all are 1, one that is too large cannot be told from a dry specimen.
-    known: False: the header does not say that the values are HU.  Then only a missing or doubled intercept is told.
+    Where all slopes of the rescale are 1, one that is too large cannot be told from a dry specimen.  Of values that are
+    not known to be HU only a missing or doubled intercept is told.
     """
     if sample is None or len(sample.values) < FEWEST_VALUES:
         return unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: too few voxels"), {}

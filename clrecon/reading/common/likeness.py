@@ -103,9 +103,8 @@ def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool |
 def measure_likeness(voxels: NDArray[Any], parts: bool = True) -> Likeness | None:
     """Compare slices (nk, nj, ni) of HU with their neighbours and those farther on; None for too few slices or pixels.
 
-    parts: Examine parts of the picture too.  Not for a tilted gantry: scanners that measure several slices in one turn
-        shift them against each other, which shows in objects that do not change along the table (a head holder) in real
-        scans.
+    `parts` of the picture are examined too, but not of a tilted gantry: scanners that measure several slices in one
+    turn shift them against each other, which shows in objects that do not change along the table (a head holder).
     """
     if len(voxels) < min(PERIODS) + LEAST_ALIKE:
         return None

@@ -142,10 +142,10 @@ def examine_voxels(
     known: bool,
     stored: Sequence[StoredValues] = (),
 ) -> VoxelFindings:
-    """Examine the values that were read.
+    """Examine the values that were read; of DICOM with the slices in the order of k, else as `stored` if those are
+    whole.
 
-    slices: In the order of k; empty for files other than DICOM, which have `stored` where their numbers are whole.
-    known: False: the header does not say that the values are HU, or they surely are not.
+    `known` is False where the header does not say that the values are HU, or where they surely are not.
     """
     if facts.hu_min == facts.hu_max:
         what = "padding" if facts.padding_share == 1.0 else f"{facts.hu_min:g} HU"

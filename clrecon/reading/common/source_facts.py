@@ -12,10 +12,8 @@ from clrecon.system.packages import ShownAsHtml
 
 @dataclass(frozen=True)
 class PixelFacts:
-    """Figures of the pixels that were read, padding included.
+    """Figures of the pixels that were read, padding included, which was filled with `padding_hu`, None without any.
 
-    padding_share: 0 to 1.
-    padding_hu: HU that padding was filled with; None without padding.
     stray: Number of values that lost bits of their own, see `clrecon.reading.dicom.pixels.voxels`.
     padding_text: Of padding that no header declares and that was found by its shape, or that masks tissue.
     """
@@ -100,7 +98,6 @@ class SeriesListing(ShownAsHtml):
     chosen: Number of the series that `read_volume` reads for the same ``series``; None where it would not choose.
     skipped: Maps a reason to the number of files passed over.
     certificate: Of the chosen series, even if it is refused; None where none of its slices has a valid header.
-    refusal: The reason why no series is chosen; `warnings` contains its text too.
     """
 
     series: list[SeriesEntry]

@@ -142,10 +142,7 @@ def _checked_phase(selection: Selection) -> int | None:
 def list_scan(
     path: str | os.PathLike[str], selection: Selection, pixels: bool = False, progress: Progress | None = None
 ) -> SeriesListing:
-    """List the series at a path with their geometry and problems, and the certificate of that which would be read.
-
-    pixels: Also read the pixels of the chosen series, for padding, range of HU and saturation, not only headers.
-    """
+    """List the series at a path with their problems, and the certificate of the chosen one, for `pixels` read too."""
     phase = _checked_phase(selection)
     with _quiet_warnings():
         scan, found = _scan_and_group(path, selection, progress)

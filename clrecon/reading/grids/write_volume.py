@@ -36,12 +36,7 @@ SAME_PLACE_MM = 1e-3
 
 @dataclass(frozen=True)
 class VolumeFormat:
-    """A format that volumes are written in.
-
-    kind: As `clrecon.reading.grids.reader.tell_kind` names it.
-    module: The library that writes it.
-    holds_shear: The axes of its voxels may lie at any angle.
-    """
+    """A format of volumes: its `tell_kind`, the library that writes it, whether axes may lie at any angle."""
 
     kind: str
     module: str

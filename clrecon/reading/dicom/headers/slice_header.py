@@ -42,13 +42,7 @@ CONCATENATION_TAGS = (UID, PART, PARTS, FIRST_FRAME)
 
 @dataclass(frozen=True)
 class Concatenation:
-    """The place of a file in one multi-frame image written as several, all of which must be present (PS3.3
-    C.7.6.16.1.1).
-
-    uid: Used only for comparison.
-    part, parts: InConcatenationNumber, from 1, and InConcatenationTotalNumber.
-    first_frame, frames: ConcatenationFrameOffsetNumber, and the number of frames in this file.
-    """
+    """The place of a file, from part 1, in an image of several, all of which must be there (PS3.3 C.7.6.16.1.1)."""
 
     uid: str
     part: int

@@ -75,11 +75,10 @@ def decode_uid(value: bytes | None) -> str:
 
 
 def read_pixel_head(head: bytes, start: int, implicit: bool, little: bool) -> tuple[int | None, int, int, str]:
-    """Read the head of the pixel data element: tag, offset and length of its value, VR (empty if implicit).
+    """Read from 12 bytes at `start`, fewer at the end: tag of the pixel data, offset and length of its value, VR.
 
-    The tag is None where this is another element, or the end; the length -1 where it is undefined.
-
-    head: 12 bytes of the data set from byte `start` on, fewer at its end.
+    The tag is None where this is another element, or the end; the length -1 where it is undefined; the VR empty if
+    implicit.
     """
     if len(head) < 8:
         return None, -1, 0, ""
@@ -152,9 +151,8 @@ class _Everything(dict[int, int]):
 
 
 def parse_plainly(data: bytes, size: int, wanted: tuple[int, ...] | None) -> DicomElements | None:
-    """Parse the start of a file; None where the header has another form, or its end is not in `data`.
+    """Parse the start of a file of `size` bytes; None where the header has another form, or its end is not in `data`.
 
-    size: Bytes of the whole file.
     wanted: Tags to keep; SpecificCharacterSet (0008,0005) is among them.  None keeps all of defined length.
     """
     try:
@@ -208,10 +206,7 @@ def _keys(tags: tuple[int, ...] | None) -> dict[int, int]:
 def _walk_explicit(
     data: bytes, place: int, wanted: dict[int, int], meta: bool = False
 ) -> tuple[dict[int, bytes], dict[int, str | None], int]:
-    """Walk to the pixel data, or to the end of the meta header; return values, their VRs and the offset of the end.
-
-    A value that ends beyond `data` is noticed at the head of the next element.
-    """
+    """Walk to the pixel data, or the meta header's end; return values, VRs and the offset, perhaps beyond `data`."""
     values: dict[int, bytes] = {}
     vrs: dict[int, str | None] = {}
     last = 0

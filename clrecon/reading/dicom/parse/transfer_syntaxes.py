@@ -109,10 +109,7 @@ _STARTS = (b"\xff\xd8\xff", b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP")
 
 
 def find_frames(file: BinaryIO, start: int, file_bytes: int, frames: int, transfer_syntax: str) -> list[Pieces]:
-    """Find the fragments of every frame, of as many as the header says, in a buffered file of `file_bytes`.
-
-    start: Offset of the first item, bytes.
-    """
+    """Find the fragments of all frames, as many as the header says, in a buffered file from byte `start` on."""
     table, fragments, _ = _walk_items(file, start, file_bytes, min(MAX_FRAGMENTS, FRAGMENTS_PER_FRAME * (frames + 1)))
     if not fragments:
         raise RefusedInputError("truncated: there are no compressed pixels")

@@ -69,11 +69,7 @@ class PaddingMasks:
         return sum(self._counts.values())
 
     def fill(self, run: Map = map) -> float | None:
-        """Set all padding to the value in HU of the air beside it, or to `AIR_HU` without such air; None without
-        padding.
-
-        run: Processes several slices at once: the ``map`` of a pool.
-        """
+        """Set all padding to the HU of the air beside it, `AIR_HU` if there is none; `run` is the ``map`` of a pool."""
         if not self._packed:
             return None
         bordered = [k for k in sorted(self._packed) if self._counts[k] < self._voxels[k].size]
@@ -115,8 +111,7 @@ and fewest values there."""
 def fill_disc_padding(voxels: NDArray[Any]) -> tuple[float, int, float] | None:
     """Fill, in place, the outside of a round field of view of one value above air, as declared padding is filled.
 
-    Returns: The value, the number of its voxels outside, and what they were filled with; None where there is no such
-        disc.
+    Returns the value, the number of its voxels outside, what they were filled with; None where there is no such disc.
     """
     nk, nj, ni = voxels.shape
     value = voxels[0, 0, 0]
@@ -135,9 +130,7 @@ def fill_disc_padding(voxels: NDArray[Any]) -> tuple[float, int, float] | None:
 
 
 def _measure_disc(measured: NDArray[np.bool_]) -> NDArray[np.float64] | None:
-    """Return the distance of each pixel from the centre of a disc, in radii; None where no disc ends as the middle row
-    and column do, or next to nothing is outside.
-    """
+    """Return each pixel's distance from a disc's centre, in radii; None if no disc ends as middle row and column do."""
     nj, ni = measured.shape
     row, column = np.flatnonzero(measured[nj // 2]), np.flatnonzero(measured[:, ni // 2])
     if not len(row) or not len(column):

@@ -42,10 +42,9 @@ OVERLAY_BITS = tuple(0x60000102 + (group << 16) for group in range(0, 32, 2))
 
 
 class StrayBits(NamedTuple):
-    """Figures about the bits of one slice before they are cut.
+    """The bits of a slice before they are cut: counts of odd values, with bits above HighBit that are neither sign nor
+    overlay, and of plain ones, which HighBit makes negative and which have none above it.
 
-    odd: Number of values with bits above HighBit that are neither sign nor overlay.
-    plain: Number of values that are negative if HighBit is their sign, but have no bits above it.
     signs: Some values have their sign extended to the highest bit, so the plain ones are large and not negative.
     example: The first odd value, else the first plain one, as stored and as read.
     """
@@ -57,10 +56,7 @@ class StrayBits(NamedTuple):
 
 
 def find_stray_bits(header: SliceHeader, stored: NDArray[Any], left_out: NDArray[np.bool_] | None) -> StrayBits | None:
-    """Examine the stored values of a slice (rows, columns) as they are in the file; None where no bit can be stray.
-
-    left_out: Padding that fills unused bits too.
-    """
+    """Examine stored values (rows, columns) of a file, but padding `left_out`; None where no bit can be stray."""
     spare = header.bits_allocated - 1 - header.high_bit
     if header.float_pixels or spare == 0:
         return None
@@ -145,10 +141,7 @@ class _RangeError(Exception):
 def read_voxels(
     slices: Sequence[SliceHeader], progress: Progress | None = None, source: StoredPixels | None = None
 ) -> tuple[NDArray[Any], PixelFacts]:
-    """Read the pixels of slices of one size, in the order of k, as HU (n, rows, columns): int16, int32 or float32.
-
-    source: An open source for these slices, which stays open; without it the call opens its own.
-    """
+    """Read slices of one size, sorted by k, as HU (n, rows, columns): int16, int32, float32; a `source` stays open."""
     integral = all(
         float(h.slope).is_integer() and float(h.intercept).is_integer() and not h.float_pixels for h in slices
     )
