@@ -291,13 +291,9 @@ def choose_iso_value(volume: Volume, *, progress: Progress | None = None) -> Iso
     """
     progress = progress or ignore_progress
     progress("choose", 0, 3)
-    voxels = volume.voxels
-    count = max(FEWEST_SLICES, SAMPLED_VOXELS // (voxels.shape[1] * voxels.shape[2]))
-    slice_step = -(-voxels.shape[0] // count)
-    sampled = range((voxels.shape[0] - 1) % slice_step // 2, voxels.shape[0], slice_step)
-    scale = _OwnScale.of(volume.report)
-    examined, places = (voxels, sampled) if scale is None else scale.to_hu(voxels, sampled)
-    histogram = _leave_padding(_count_values(examined, places), voxels[0].size * len(sampled), volume.report)
+    sampled, scale = _sample_slices(volume), _OwnScale.of(volume.report)
+    examined, places = (volume.voxels, sampled) if scale is None else scale.to_hu(volume.voxels, sampled)
+    histogram = _leave_padding(_count_values(examined, places), volume.voxels[0].size * len(sampled), volume.report)
     background = _find_background(histogram)
     progress("choose", 1, 3)
     edges = measure_edges(examined, places, background)
@@ -312,6 +308,23 @@ def choose_iso_value(volume: Volume, *, progress: Progress | None = None) -> Iso
         background, edges = scale.from_hu(background, edges)
     choice = _describe(background, edges, (left_out, flat_share), sampled)
     return choice if scale is None else dataclasses.replace(choice, reason=f"{choice.reason}; {scale}")
+
+
+def lies_in_air(volume: Volume) -> bool:
+    """Tell whether the histogram of a scan has a mode of air and none of soft tissue, as of a dry specimen."""
+    sampled = _sample_slices(volume)
+    counted = _count_values(volume.voxels, sampled)
+    try:
+        background = _find_background(_leave_padding(counted, volume.voxels[0].size * len(sampled), volume.report))
+    except NoSurfaceError:
+        return False
+    return background.name == "air"
+
+
+def _sample_slices(volume: Volume) -> range:
+    _, nj, ni = volume.shape
+    step = -(-len(volume.voxels) // max(FEWEST_SLICES, SAMPLED_VOXELS // (nj * ni)))
+    return range((len(volume.voxels) - 1) % step // 2, len(volume.voxels), step)
 
 
 class _OwnScale(NamedTuple):

@@ -93,6 +93,9 @@ def _digits(value: float) -> str:
     return text.removesuffix(".0")
 
 
+HIGHEST_DRY_HU, DRY_HU = -100, -200
+"""Thin walls of a dry specimen, in air, stay below the first; the second finds those of the phantoms."""
+
 THICK_SLICES_MM = 2.5
 """From this spacing on, thin walls across the slices are blurred so much that the half-way level can be too high: with
 slices of 2 mm it is as good as the best, with 3 mm it loses walls (docs/iso_value.md)."""
@@ -142,7 +145,7 @@ def describe_level(
     if choice is None:
         preset = settings.preset_used
         reason = "as given" if preset is None else f"preset {preset}: {find_iso_preset(preset).source}"
-        return {"iso_value_reason": reason, "iso_value_choice": None}, []
+        return {"iso_value_reason": reason, "iso_value_choice": None}, _warn_of_specimen(volume, settings)
     warnings = []
     low, high = volume.hu_range or (math.nan, math.nan)
     for material, hu in (("bone", choice.bone_hu), ("tissue", choice.tissue_hu)):
@@ -157,6 +160,19 @@ def describe_level(
             f" {choice.iso_value:g} HU; compare with a lower iso value, such as {name_parameter('preset', 'bone')}"
         )
     return {"iso_value_reason": choice.reason, "iso_value_choice": choice.measurements()}, warnings
+
+
+def _warn_of_specimen(volume: Volume, settings: MeshSettings) -> list[str]:
+    """Warn of thin walls of a dry specimen, which are fitted only where the level shows them."""
+    from clrecon.anatomy.iso_choice import lies_in_air
+
+    level = max((hu for hu in settings.levels if not isinstance(hu, tuple)), default=-math.inf)
+    if settings.surface != "cortex" or level <= HIGHEST_DRY_HU or not lies_in_air(volume):
+        return []
+    return [
+        f"the scan shows no soft tissue but air, as that of a dry specimen does: walls that stay below {level:g} HU are"
+        f" not in the surface and cannot be fitted; {name_parameter('iso_value', DRY_HU)} finds them"
+    ]
 
 
 def warn_of_contrast(choice: IsoChoice) -> list[str]:

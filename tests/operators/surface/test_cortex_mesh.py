@@ -163,6 +163,20 @@ def test_the_trial_run_launches_the_kernels_of_the_cortex(labels, device, monkey
     assert launched == {"sample_profiles", "fit_profiles", "mark_crossings"}
 
 
+def test_a_dry_specimen_wants_a_low_level(shell, tmp_path, capsys):
+    """The same shell in air, with air within it: at 200 HU a thin wall would be lost, which is said."""
+    dry = shell.voxels.astype(float)
+    dry = np.where(dry < 500, -1000.0 + 3.0 * (dry - 50.0), dry)
+    shell.with_voxels(np.clip(dry, -1010, 1100).astype(np.int16)).save(tmp_path / "dry.nii.gz")
+    shell.save(tmp_path / "ct.nii.gz")
+    for name, level, warned in (("dry", [], True), ("dry", ["--hu", "-200"], False), ("ct", [], False)):
+        given = (tmp_path / f"{name}.nii.gz", "-o", tmp_path / f"{name}{len(level)}.ply", "--surface", "cortex")
+        assert run(*given, *level) == 0
+        said = capsys.readouterr()
+        assert ("dry specimen" in said.out + said.err) == warned
+        assert not warned or "stay below 200 HU" in said.err and "--hu -200 finds them" in said.err
+
+
 def test_where_there_is_no_bone_it_is_said(shell, tmp_path, capsys):
     soft = shell.with_voxels(np.where(shell.voxels > 500, 250, shell.voxels // 2).astype(np.int16))
     soft.save(tmp_path / "ct.nii.gz")
