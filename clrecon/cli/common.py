@@ -308,7 +308,6 @@ SCAN = f"DICOM folder or file, or {GRID_FILE}"
 
 
 def add_input(parser: argparse.ArgumentParser, text: str = SCAN, nargs: str | None = None) -> None:
-    """Add the input."""
     parser.add_argument("input", metavar="INPUT", nargs=nargs, help=text)
 
 

@@ -73,7 +73,6 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 
 def describe_report(report: dict[str, Any]) -> list[str]:
-    """Describe a report for people."""
     lines = [
         f"input    {describe_volume(report['volume'])}",
         f"surface  {report['iso_value_hu']:g} HU, {report['iso_value_reason']}",

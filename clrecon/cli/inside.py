@@ -72,7 +72,6 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 
 def describe_inside(report: dict[str, Any]) -> list[str]:
-    """Describe a report for people."""
     lines = [f"input    {describe_volume(report['volume'])}"]
     for vertebra in report["vertebrae"]:
         lines += _describe_vertebra(vertebra)

@@ -83,7 +83,6 @@ def add_levels(parser: argparse.ArgumentParser, title: str) -> argparse._Argumen
 
 
 def add_labels(parser: argparse.ArgumentParser) -> None:
-    """Add the options for label maps."""
     about = "one mesh a label: the label picks the cells, HU place the vertices"
     common.add_fields(parser.add_argument_group("labels", about), LabelChoice)
 
@@ -149,7 +148,6 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
 
 
 def _describe_surfaces(report: dict[str, Any]) -> str:
-    """Describe what the surfaces enclose, and why."""
     inside = dict.fromkeys(tuple(mesh["inside_hu"] or ()) for mesh in report["meshes"])
     if () in inside:
         return "masks of labels, whatever their HU"

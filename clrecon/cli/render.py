@@ -226,7 +226,6 @@ def add_meshes(parser: argparse.ArgumentParser) -> None:
 
 
 def add_motion(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the turntable."""
     group = parser.add_argument_group("motion")
     group.add_argument(
         "--turntable",
@@ -264,7 +263,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def render_settings(options: argparse.Namespace) -> RenderSettings:
-    """Make settings from the options of the command."""
     named = options.color in (*POINT_COLORS, *MESH_COLORS)
     look = "says how a label looks: give the label map with --labels FILE"
     turn = "says how a picture moves: name it with --turntable OUT"

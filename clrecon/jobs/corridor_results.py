@@ -66,7 +66,6 @@ def _round_numbers(value: Any, digits: int = 3) -> Any:
 def describe_vertebra(
     found: VertebraCorridors, label: int, margin: float, space: str, screws: list[tuple[Screw, ScrewGrade]]
 ) -> dict[str, Any]:
-    """Return the entries of a vertebra."""
     place, frame, turn = _point_placer(space), found.frame, frame_from_lps(space)
     return {
         "name": found.name,
@@ -126,7 +125,6 @@ def _describe_bias(bias: Bias | None) -> dict[str, Any] | None:
 
 
 def describe_grade(screw: Screw, grade: ScrewGrade, space: str) -> dict[str, Any]:
-    """Return the entries of a given screw."""
     place = _point_placer(space)
     return {
         "name": screw.name,

@@ -362,7 +362,6 @@ def _parse_region_rule(rule: str) -> RegionRule:
 
 
 def _check_region_numbers(rule: str, kind: str, numbers: tuple[float, ...]) -> None:
-    """Refuse numbers that no region can have."""
     has_ends = kind in ("box", "hu")
     if any(math.isnan(number) or (math.isinf(number) and not has_ends) for number in numbers):
         raise UsageError(f"the region rule {rule!r:.200} needs finite numbers")

@@ -89,7 +89,6 @@ PURPOSES: dict[str, Purpose] = {
 
 
 def find_purpose(name: str) -> Purpose:
-    """Return the purpose of this name."""
     if name not in PURPOSES:
         raise UsageError(f"a mesh can be for {', '.join(PURPOSES)}, not for {name!r}{guess_word(name, PURPOSES)}")
     return PURPOSES[name]

@@ -270,7 +270,6 @@ class Run(Laps):
         check_kept(named, *inputs)
 
     def read(self, source: str | Path) -> Volume:
-        """Read the scan."""
         from clrecon.reading import read_selected
 
         return read_selected(source, self.settings, progress=self.progress)

@@ -73,7 +73,6 @@ class MeshQuality(Record):
 
 
 def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> MeshQuality:
-    """Measure a triangle surface."""
     vertex_count, triangle_count = len(vertices), len(triangles)
     if triangle_count and int(triangles.max()) >= vertex_count:
         raise UsageError(f"a triangle refers to vertex {int(triangles.max())}, the mesh has {vertex_count} vertices")

@@ -26,7 +26,6 @@ class LentBuffer:
 
     @property
     def flags(self) -> int:
-        """The flags of the buffer."""
         return int(self.buffer.flags)
 
 

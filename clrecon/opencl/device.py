@@ -283,7 +283,6 @@ class Device:
         return [*cache_warnings(), *self._remarks, *of_kernels]
 
     def remark(self, text: str) -> None:
-        """Add one of the `warnings`."""
         if text not in self._remarks:
             self._remarks.append(text)
 

@@ -48,7 +48,6 @@ class _Helper:
         threading.Thread(target=self._work, name="clrecon waiting", daemon=True).start()
 
     def begin(self, event: Any) -> None:
-        """Begin to wait for an event."""
         self.error = None
         self._events.put(event)
 

@@ -130,7 +130,6 @@ class Program:
 
     @property
     def kernel_names(self) -> list[str]:
-        """Names of the kernels of this file."""
         return sorted(self._kernels)
 
 

@@ -88,7 +88,6 @@ def _check_kind(settings: CloudSettings, is_cloud: bool) -> None:
 
 
 def _read_input(source: str | Path, is_cloud: bool, run: Run) -> tuple[Volume | PointCloud, LabelMap | None]:
-    """Read the cloud, or the scan and its labels."""
     settings: CloudSettings = run.settings
     if is_cloud:
         from clrecon.points.cloud_reader import read_points
@@ -119,7 +118,6 @@ def _mask_scan(
 
 
 def _reconstruct_surface(steps: CloudSteps, settings: CloudSettings, device: Device, progress: Progress) -> Mesh:
-    """Make the mesh around the points."""
     of_scan = any(step["step"] == "points" for step in steps.entries)
     if steps.cloud.normals is None:
         more = "" if of_scan else f", and name a point inside of the cloud ({name_parameter('viewpoint')})"

@@ -101,7 +101,6 @@ def is_label_seed(seed: object) -> bool:
 
 
 def check_point(seed: Sequence[float]) -> None:
-    """Refuse a seed that is no point."""
     if len(seed) != 3 or not all(map(math.isfinite, seed)):
         raise UsageError(f"a seed is a point of three numbers in mm, not {tuple(seed)}")
 

@@ -408,7 +408,6 @@ def warn_of_crumbs(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
 
 
 def _advise_without_bone(settings: MeshSettings) -> str:
-    """Return advice for a surface without bone."""
     if not settings.is_for_print:
         return f"{name_parameter('keep_largest', 'N')} keeps by size"
     purpose, largest = name_parameter("purpose", settings.purpose), name_parameter("keep_largest", 1)

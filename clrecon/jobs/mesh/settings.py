@@ -473,7 +473,6 @@ class MeshSettings(InputSettings):
 
     @property
     def selects(self) -> bool:
-        """True where components are selected."""
         if self.keep is not None:
             return True
         return self.split or bool(self.seeds) or self.keep_largest is not None or self.min_volume_ml is not None

@@ -101,7 +101,6 @@ def _check_kind(source: str | Path, settings: RenderSettings) -> None:
 
 
 def _read_input(source: str | Path, run: Run) -> tuple[Volume | PointCloud | Mesh, LabelMap | None]:
-    """Read the scan and its labels, the cloud or the mesh."""
     settings: RenderSettings = run.settings
     if settings.mode in _OTHER_INPUTS:
         run.progress("read", 0, 0)

@@ -140,7 +140,6 @@ class PictureTaker(Closing):
         return self._render(view=view, up=settings.up, size=settings.size)
 
     def take(self, camera: Camera) -> Rendering:
-        """Take the picture of a camera."""
         return self._render(camera=camera, size=self._settings.size_used)
 
     def _render(self, **place: Any) -> Rendering:

@@ -156,7 +156,6 @@ class MeshFile:
 
     @property
     def look(self) -> MeshLook:
-        """The style that it is shown in."""
         return MeshLook(self.color, opacity=self.opacity)
 
 
@@ -322,7 +321,6 @@ class RenderSettings(InputSettings):
 
     @property
     def mode(self) -> str:
-        """The mode of the style."""
         return self.style.mode
 
     @property
@@ -376,7 +374,6 @@ class RenderSettings(InputSettings):
 
     @property
     def is_sheet(self) -> bool:
-        """True for a contact sheet."""
         return isinstance(self.style, PlaneCut) and self.style.sheet is not None
 
     @property

@@ -63,7 +63,6 @@ class Walls:
     near_mm: float = NEAR_MM
 
     def where(self, rows: slice) -> Walls:
-        """Return the walls of some of the vertices."""
         return Walls(self.points[rows], self.wall[rows], self.flat[rows], self.near_mm)
 
 

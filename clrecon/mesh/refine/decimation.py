@@ -110,25 +110,9 @@ def decimate_mesh(
     make_bounds: MakeBounds = SurfaceBounds,
     find_crossings: FindCrossings = find_self_intersections,
 ) -> Mesh:
-    """Remove triangles by collapsing edges in order of their quadric error (Garland and Heckbert 1997).
+    """Remove triangles within a bound, see `clrecon.operators.surface.decimation.decimate_mesh`.
 
-    fast-simplification chooses the collapses and stops where the error reaches the bound.  The last collapses are
-    then undone where the result exceeds the bound, is not manifold, has faces without area, cuts itself, or has lost a
-    component or a tunnel.  So a closed and manifold surface stays closed and manifold, keeps all its components and, as
-    far as a collapse is the cause, their Euler numbers.  Further rounds follow until the share is reached or hardly any
-    more triangles can be removed within the bound.
-
-    fraction: Share of the triangles to remove, above 0 and below 1. The bound may allow only less.
-    max_deviation_mm: No vertex and no middle of an edge or a triangle of either surface lies farther than this from the
-        other. Default: a quarter of the shortest voxel step.
-    progress: Called as ``progress("decimate", triangles removed, triangles to remove)``, several times in a round.
-    make_bounds: `SurfaceBounds`, or what does the same elsewhere.
-    find_crossings: `find_self_intersections`, or what finds the same elsewhere.
-
-    Returns: Normals from the faces; the report is taken over, with ``refinement["decimate"]``: ``fraction`` (asked
-        for), ``reached``, ``ended_by`` (``"share"`` or ``"bound"``), ``rounds``, ``max_deviation_mm``,
-        ``triangles_before``, ``vertices_taken_back``, ``topology`` (measured:
-        `clrecon.mesh.refine.topology.TopologyChange`).
+    make_bounds, find_crossings: `SurfaceBounds` and `find_self_intersections`, or what does the same elsewhere.
     """
     check_share(fraction)
     bound = check_refinement(mesh, max_deviation_mm)

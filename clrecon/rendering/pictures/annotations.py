@@ -235,7 +235,6 @@ class _Page:
         self._write(at, line, "lt")
 
     def finish(self) -> np.ndarray:
-        """Return the image with all annotations."""
         from PIL import Image
 
         picture = self._picture

@@ -19,7 +19,6 @@ SPINE = "spine"
 
 
 def instance_of(what: str, kind: type) -> Callable[[Any], Any]:
-    """Make a check of the type."""
 
     def check(value: Any) -> Any:
         if isinstance(value, kind):
@@ -57,7 +56,6 @@ def number(text: str, is_fine: Callable[[float], bool]) -> Callable[[Any], float
 
 
 def flag(name: str, value: Any) -> bool:
-    """Check for True or False."""
     if isinstance(value, (bool, np.bool_)):
         return bool(value)
     raise UsageError(f"{name} is True or False, not {value!r:.60}")

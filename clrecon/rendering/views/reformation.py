@@ -53,7 +53,6 @@ class Sheet:
 
     @property
     def height(self) -> int:
-        """Number of rows."""
         return len(self.origins)
 
     def points(self, rows: slice = slice(None), depth: float = 0.0) -> Float64Array:

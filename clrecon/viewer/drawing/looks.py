@@ -72,7 +72,6 @@ class Looks:
         return self._keep(key, SurfaceLook(level, color=whole.color, **look))
 
     def mesh(self, state: ViewState, part: ShownPart, opaque: bool) -> MeshLook:
-        """Return the style of a mesh."""
         key = ("mesh", part, state.clip, opaque)
         opacity = 1.0 if opaque else max(part.opacity, LEAST_OPACITY)
         made = self._known(key) or self._keep(key, MeshLook(part.color, opacity=opacity, clip=state.clip))

@@ -174,7 +174,6 @@ class Painter(Stage):
             return Pick(point=point, object=drawn.number, part=part, hu=self.hu_at(point))
 
     def pick_slice(self, state: ViewState, plane: str, size: Sequence[int], x: float, y: float) -> Pick:
-        """Return the place at a pixel of a slice."""
         camera = self.slice_camera(state, plane, checked_size(size))
         spot = pixel_camera(camera, checked_size(size), x, y)
         point = spot.focal_point

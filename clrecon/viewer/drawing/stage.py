@@ -162,7 +162,6 @@ class Stage(Closing):
 
     @property
     def device(self) -> Device:
-        """The device that works."""
         return self._device.current
 
     # Parts

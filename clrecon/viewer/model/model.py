@@ -104,7 +104,6 @@ class ViewModel(ChangingView):
     # What is shown of scans
 
     def set_iso(self, hu: float) -> None:
-        """Set the iso value of all scans, HU."""
         (value,) = checked_numbers("the iso value", hu)
         low, high = self.iso_range
         if not self.scans:

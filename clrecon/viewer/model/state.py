@@ -169,7 +169,6 @@ class ShownPart:
 
     @property
     def is_whole(self) -> bool:
-        """True for an object as a whole."""
         return self.kind in ("scan", "mesh", "cloud", "labels")
 
     @property

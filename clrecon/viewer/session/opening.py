@@ -56,7 +56,6 @@ class OpenedView(Closing):
         )
 
     def close(self) -> None:
-        """Free what is on the device."""
         self.painter.close()
 
 

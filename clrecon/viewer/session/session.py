@@ -159,7 +159,6 @@ class ViewSession(Closing):
         self._pictures.ask(f"slice {plane}", take, rank=1, gives_way=False)
 
     def curve_picture(self, size: Sequence[int], then: Callable[[Rendering], None]) -> None:
-        """Ask for the picture along the curve."""
         checked = checked_size(size)
         with self._lock:
             state = self.model.state

@@ -208,7 +208,6 @@ class Connection:
             await self._waiting.put(message)
 
     async def _command(self) -> None:
-        """Do the commands, one after the other."""
         while True:
             message = await self._waiting.get()
             try:
