@@ -90,16 +90,23 @@ def select_components(
     if chosen.keep.all():
         mesh.report.update(chosen.facts)
         return mesh
-    triangles = mesh.triangles[chosen.keep[chosen.label_of_triangle]]
-    keep_vertex = np.zeros(mesh.vertex_count, dtype=bool)
-    keep_vertex[triangles.reshape(-1)] = True
-    number = np.cumsum(keep_vertex, dtype=np.int64) - 1
-    normals = None if mesh.normals is None else mesh.normals[keep_vertex]
-    kept = type(mesh)(
-        mesh.vertices[keep_vertex], number[triangles].astype(np.uint32), normals, {**mesh.report, **chosen.facts}
-    )
-    kept.values = {name: values[keep_vertex] for name, values in mesh.values.items()}
+    kept = keep_triangles(mesh, chosen.keep[chosen.label_of_triangle])
+    kept.report.update(chosen.facts)
     return kept
+
+
+def keep_triangles(mesh: Own, kept: NDArray[np.bool_]) -> Own:
+    """Return the mesh with some of its triangles, and the vertices that they need."""
+    triangles = mesh.triangles[kept]
+    used = np.zeros(mesh.vertex_count, dtype=bool)
+    used[triangles] = True
+    number = np.cumsum(used, dtype=np.int64) - 1
+    normals = None if mesh.normals is None else mesh.normals[used]
+    made = type(mesh)(
+        mesh.vertices[used], number[triangles].astype(np.uint32), normals, dict(mesh.report), trusted=True
+    )  # fmt: skip
+    made.values = {name: values[used] for name, values in mesh.values.items()}
+    return made
 
 
 def split_components(
@@ -112,14 +119,9 @@ def split_components(
     among: NDArray[np.bool_] | None = None,
     most: int | None = None,
 ) -> list[Own]:
-    """Split a surface into its components.
+    """Split a surface into its components, the largest area first (the first of equal ones); see `select_components`.
 
-    mesh, keep_largest, min_volume_ml, seeds, labelled, among: As in `select_components`; components that it would drop
-        are left out.
-    most: Refuse more components than this.
-
-    Returns: One mesh for each component, the largest area first (the first of equal ones). Vertices and triangles keep
-        their order, normals and report are taken over.
+    Vertices and triangles keep their order, normals and report are taken over.  More than `most` are refused.
     """
     chosen = _choose_components(mesh, keep_largest, min_volume_ml, seeds, labelled, among, rank=True)
     kept = np.flatnonzero(chosen.keep)

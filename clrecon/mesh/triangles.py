@@ -57,9 +57,11 @@ def cross_products(
         yield where, corner, cross_product(p, q)
 
 
-def enclosed_ml(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> float:
-    """Return the volume that a closed mesh encloses, in ml, signed: cavities count negative."""
-    pieces = cross_products(vertices, triangles, local_origin(vertices))
+def enclosed_ml(
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], origin: NDArray[np.float64] | None = None
+) -> float:
+    """Return the volume that a closed mesh encloses, in ml, signed: cavities count negative; `origin` is near it."""
+    pieces = cross_products(vertices, triangles, local_origin(vertices) if origin is None else origin)
     return float(sum(float(np.einsum("ij,ij->", corner, cross)) for _, corner, cross in pieces)) / 6000.0
 
 

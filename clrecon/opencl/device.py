@@ -401,21 +401,12 @@ class Device:
 
     def describe(self) -> dict[str, Any]:
         """Properties for listings and reports."""
-        return {
-            "index": self.index,
-            "name": self.name,
-            "platform": self.platform,
-            "type": self.type,
-            "version": self.version,
-            "driver": self.driver,
-            "platform_version": self.platform_version,
-            "memory_bytes": self.memory_bytes,
-            "max_allocation_bytes": self.max_allocation_bytes,
-            "compute_units": self.compute_units,
-            "has_own_memory": self.has_own_memory,
-            "simulator": self.is_simulator,
-            "shortcoming": self.shortcoming,
-        }
+        names = (
+            *("index", "name", "platform", "type", "version", "driver", "platform_version"),
+            *("memory_bytes", "max_allocation_bytes", "compute_units", "has_own_memory"),
+        )
+        own = {name: getattr(self, name) for name in names}
+        return own | {"simulator": self.is_simulator, "shortcoming": self.shortcoming}
 
     def __repr__(self) -> str:
         return f"Device({self.index}: {self.label}, {self.type})"

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh.mesh import Mesh
-from clrecon.mesh.triangles import cross_products
+from clrecon.mesh.triangles import cross_products, enclosed_ml
 from clrecon.mesh.vtk import CellLocator
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.pieces import local_origin
@@ -104,14 +104,6 @@ class MeshDistance(Record):
     samples: int
 
 
-def _enclosed_ml(mesh: Mesh, origin: NDArray[np.float64]) -> float:
-    six = sum(
-        float(np.einsum("ij,ij->", corner, cross))
-        for _, corner, cross in cross_products(mesh.vertices, mesh.triangles, origin)
-    )
-    return six / 6000.0
-
-
 @explains_arguments
 def compare_meshes(
     mesh: Mesh, reference: Mesh, samples: int = SAMPLES, *, progress: Progress | None = None
@@ -151,7 +143,7 @@ def compare_meshes(
         sides.append(summarise_distances(SurfaceDistance(other.vertices, other.triangles)(points)))
     progress("compare", 2, 2)
     origin = local_origin(reference.vertices)
-    volume, wanted = _enclosed_ml(mesh, origin), _enclosed_ml(reference, origin)
+    volume, wanted = (enclosed_ml(each.vertices, each.triangles, origin) for each in (mesh, reference))
     return MeshDistance(
         hd95_mm=max(side.p95 for side in sides),
         assd_mm=0.5 * (sides[0].mean + sides[1].mean),

@@ -153,8 +153,7 @@ class Painter(Stage):
     def pick(self, state: ViewState, size: Sequence[int], x: float, y: float) -> Pick | None:
         """Return what is seen at a place of the picture, None where nothing is: the nearest object on one ray.
 
-        x, y: Pixels from the top left corner of a picture of this (width, height); the first pixel's centre is (0.5,
-            0.5).
+        x, y: Pixels from the top left corner of a picture of this (width, height); the first centre is (0.5, 0.5).
         """
         camera = pixel_camera(state.camera, checked_size(size), x, y)
         nearest: tuple[float, _Drawn] | None = None

@@ -10,6 +10,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
+from clrecon.mesh.components import keep_triangles
 from clrecon.mesh.triangles import vertex_normals
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.label_masks import extract_label_masks
@@ -43,18 +44,6 @@ def coarsen_mesh(mesh: Mesh, triangles: int) -> Mesh:
     points = places.astype(mesh.vertices.dtype)
     used = kept.astype(np.uint32)
     return Mesh(points, used, vertex_normals(points, used), dict(mesh.report), trusted=True)
-
-
-def select_triangles(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
-    """Return the mesh with some of its triangles, and the vertices that they need."""
-    triangles = mesh.triangles[kept]
-    used = np.zeros(mesh.vertex_count, np.bool_)
-    used[triangles] = True
-    numbers = np.cumsum(used, dtype=np.int64) - 1
-    normals = None if mesh.normals is None else mesh.normals[used]
-    return Mesh(
-        mesh.vertices[used], numbers[triangles].astype(np.uint32), normals, dict(mesh.report), trusted=True
-    )  # fmt: skip
 
 
 def cut_mesh(mesh: Mesh, clip: Clip) -> Mesh:
@@ -101,7 +90,7 @@ def _cut(mesh: Mesh, plane: NDArray[np.float64]) -> Mesh:
     triangles = np.concatenate(made).astype(np.uint32)
     normals = None if mesh.normals is None else between(mesh.normals)
     joined = Mesh(between(mesh.vertices), triangles, normals, dict(mesh.report), trusted=True)
-    return select_triangles(joined, np.ones(len(triangles), np.bool_))
+    return keep_triangles(joined, np.ones(len(triangles), np.bool_))
 
 
 CUT_HU_PER_MM = 100.0
@@ -166,7 +155,7 @@ def _mesh_scan(
         (rest, whole.name, whole.color),
     ):
         if kept.any():
-            made.append(_named(select_triangles(mesh, kept), name, color))
+            made.append(_named(keep_triangles(mesh, kept), name, color))
     return made
 
 
