@@ -1,7 +1,4 @@
-"""The corridor job: a CT series and its label map in; corridors, grades, pictures and meshes out.
-
-Screws to be graded are six numbers and a diameter in a text, or a file of them (JSON or CSV).
-"""
+"""The corridor job: a CT series and its label map in; corridors, grades of screws, pictures and meshes out."""
 
 from __future__ import annotations
 
@@ -45,11 +42,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CorridorFiles:
-    """Outputs of the job.
-
-    output: Meshes: the vertebra and a cylinder a side, in files of its name with those of label and side.
-    picture: One for each vertebra.
-    """
+    """Outputs: meshes of the vertebra and a cylinder a side, named by label and side; a picture a vertebra."""
 
     output: str | Path | None = None
     picture: str | Path | None = None

@@ -9,11 +9,7 @@ from clrecon.errors import DeviceError
 
 
 def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError | None]:
-    """List every OpenCL platform and device, as docs/contract.md says, and which would be used, or why none would.
-
-    A fault is what is remembered of the check at the first use of a device, empty where it passed or was not checked
-    yet; nothing runs on any device.
-    """
+    """List every OpenCL platform and device, as docs/contract.md says, and which would be used, or why none would."""
     from clrecon.opencl import cache_warnings, choose_remembered, list_devices, list_platforms, remembered_fault
 
     devices = list_devices()

@@ -1,7 +1,4 @@
-"""The job that looks into vertebrae: a CT series and its labels in, meshes of the parts and their volumes out.
-
-Pictures show one part opaque and others faded.
-"""
+"""The job that looks into vertebrae: a CT series and its labels in, meshes of the parts and their volumes out."""
 
 from __future__ import annotations
 
@@ -95,8 +92,8 @@ def make_inside(
 ) -> InsideReport:
     """Read a CT series and its labels, look into vertebrae, and write the surfaces of their parts.
 
-    ``inside.stl`` becomes ``inside_solid.stl``, ``inside_dense.stl`` and so on, with several vertebrae
-    ``inside_L3_solid.stl``; pictures are named in the same way.
+    ``inside.stl`` becomes ``inside_solid.stl`` and so on, with several vertebrae ``inside_L3_solid.stl``; so do
+    pictures.
     """
     from clrecon.labels import file_suffixes
     from clrecon.operators.vertebrae.inside import PARTS

@@ -1,7 +1,4 @@
-"""Settings that every job shares: which scan, which parts of it become air, and which device.
-
-Nothing here loads numpy: help texts name the forms of region and preprocessing.
-"""
+"""Settings that every job shares: which scan, which parts of it become air, and which device; without numpy."""
 
 from __future__ import annotations
 
@@ -409,10 +406,8 @@ class PreprocessStep:
 def parse_preprocess(steps: str | Sequence[str]) -> tuple[PreprocessStep, ...]:
     """Read the steps of preprocessing, of the forms `PREPROCESS_FORMS`; they run in this order.
 
-    ``erode:MM``, ``dilate:MM``, ``open:MM`` and ``close:MM`` take a ball of this radius, ``fill`` and ``fill-slices``
-    fill
-    holes: all of the voxels at the level of the job and above, or of ``level:HU`` if that stands before.  ``region`` is
-        the place of the region of interest, which else comes first.
+    Morphology, by a ball with a radius in mm, works on all voxels at the level of the job and above, or of ``level:HU``
+    if that stands before; ``region`` is the place of the region of interest, which else comes first.
     """
     words = steps.split(",") if isinstance(steps, str) else [str(step) for step in steps]
     parsed = tuple(_parse_step(word.strip()) for word in words)

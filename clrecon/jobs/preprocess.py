@@ -1,8 +1,4 @@
-"""What happens to a scan before anything is made of it: masking, the region of interest, and steps of preprocessing.
-
-Masking and region turn what lies outside into air.  Steps are filters of HU, and morphology of what lies at the level
-and above.
-"""
+"""What happens to a scan before anything is made of it: masking, the region of interest, and preprocessing."""
 
 from __future__ import annotations
 

@@ -99,8 +99,7 @@ class DeviceOpening:
     The order of errors does not depend on which side is faster: if both the block and the device fail, the device's
     error is raised.  Only a cancellation by the caller is passed on in any case.
 
-    trial: Builds the kernels: it runs the steps of the job on something small, such as `trial_cube`, and its result is
-        dropped.
+    trial: Builds the kernels by the steps of the job on something small, such as `trial_cube`; its result is dropped.
     """
 
     def __init__(self, name: str | int | Device | None, trial: Callable[[Device], object]):

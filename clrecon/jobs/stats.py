@@ -38,15 +38,7 @@ def measure_stats(
     csv_path: str | Path | None = None,
     **how: Any,
 ) -> StatsReport:
-    """Read a scan and its label map, and measure each label.
-
-    No device is needed.
-
-    source: DICOM folder or file, or a file of another format, see `clrecon.read_volume`.
-    report_path: File for the report as JSON.
-    csv_path: File for the figures, one line a label.
-    **how: See `Run`.
-    """
+    """Read a scan and its label map, and measure each label."""
     with Run(settings, **how) as run:
         run.check([("the report", report_path), ("the table", csv_path)], source, settings.labels)
         only = tuple(settings.only) or None

@@ -165,8 +165,7 @@ NAMES_MM = 62
 def draw_vertebrae(split: VertebraSplit) -> bytes:
     """Return the picture as PNG: from the side, names and confidence, and from the front.
 
-    The spine is straightened along the canal; a row is a millimetre of it.  Vertebrae of low confidence are hatched in
-    red.
+    The spine is straightened along the canal, a row a millimetre; vertebrae of low confidence are hatched in red.
     """
     load_pillow()
     from PIL import Image, ImageDraw

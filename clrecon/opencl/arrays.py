@@ -3,9 +3,8 @@
 All buffers of an operator are summed and compared with the device before any is allocated.  On a CPU device they use
 numpy's memory without a copy.
 
-When a kernel first writes to a new page, the system has to find and clear it.  For the mesh of a CT series this takes
-as long as computing the mesh.  So arrays made here return their pages when their last view is gone, and a later result
-of the same process uses them.
+When a kernel first writes to a new page, the system has to find and clear it, which for the mesh of a CT series takes
+as long as computing it.  So arrays made here return their pages when their last view is gone, for a later result.
 """
 
 from __future__ import annotations

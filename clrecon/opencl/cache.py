@@ -7,8 +7,8 @@ the others keep nothing.
 
 Programs of drivers that keep none lie in a folder of clrecon.  A file is named by a hash of everything that its binary
 depends on, and contains that name and a hash of name and binary together: a program is built again if its file was cut,
-changed, or takes the place of another.  The folder belongs to the user alone, since
-its contents are executed."""
+changed, or takes the place of another.
+"""
 
 from __future__ import annotations
 

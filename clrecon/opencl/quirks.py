@@ -1,7 +1,4 @@
-"""Quirks: every exception that a driver or pyopencl needs, each with its reason.
-
-One has its own file: `clrecon.opencl.pocl`.
-"""
+"""Quirks: every exception that a driver or pyopencl needs, each with its reason; PoCL's own are in `pocl`."""
 
 from __future__ import annotations
 

@@ -163,11 +163,7 @@ def _write_files(
 
 @dataclass(frozen=True)
 class CloudFiles:
-    """Files that a cloud job writes.
-
-    removed: The points as they were extracted, each labelled with the number of the reason why it went; 0 is kept.
-    surface: A closed mesh around the cloud.
-    """
+    """Files that a cloud job writes; in `removed` each point is labelled with the number of the reason why it went."""
 
     output: str | Path
     removed: str | Path | None = None

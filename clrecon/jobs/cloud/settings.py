@@ -97,8 +97,6 @@ def _parse_denoisers(text: str) -> tuple[str, ...]:
 class CloudSettings(InputSettings):
     """Settings of the cloud job; options say in their help what they do.
 
-    hu: float or (low, high).
-    label: Number or name.
     keep: They need clusters, which then have the default parameters.
     """
 

@@ -1,7 +1,4 @@
-"""The points of a cloud job on their way: from a scan or a file, and through the steps, in their one order.
-
-Foreign slices inside the stack (ghosts) are found before anything is masked.
-"""
+"""The points of a cloud job on their way: from a scan or a file, and through the steps, in their one order."""
 
 from __future__ import annotations
 

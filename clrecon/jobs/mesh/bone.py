@@ -34,10 +34,9 @@ SPINE_MM = 20.0
 def find_bone(
     mesh: Mesh, volume: Volume, surface: Surface, labelled: Labelled, *, without_table: bool = False, advice: str
 ) -> NDArray[np.bool_]:
-    """Find the components that look like bone or, if none does, the one that holds the spinal canal.
+    """Return which components (count,) look like bone or, if none does, the one that holds the spinal canal.
 
     without_table: The table was already removed, so the message does not advise it.
-    Returns: ndarray, shape (count,), bool
     """
 
     from clrecon.mesh.compare.iso_distance import rule_of_report

@@ -19,11 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LabelChoice:
-    """The labels of a map, by numbers or names, that become meshes, and the kind of their surfaces.
-
-    only: Empty means all that have a surface.
-    solid: Fill less dense parts within a label.
-    """
+    """The labels of a map, by numbers or names, that become meshes; without `only` all that have a surface."""
 
     path: str | Path = label_map_option(default=MISSING)
     only: tuple[str | int, ...] = option(

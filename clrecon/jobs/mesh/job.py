@@ -38,9 +38,8 @@ def make_mesh(
 ) -> MeshReport:
     """Read a CT series, extract its surfaces, select components, measure them and write them.
 
-    One mesh is written to `output`.  Several, of several iso values or split into components, get a name between
-    stem and extension: ``bone_200hu.stl``, ``bone_001.stl``, ``bone_200hu_001.stl``, ``bone_T12.stl``.
-    Outputs that cannot be written are refused first, then a missing device, then the input.
+    Several meshes, of several iso values or split into components, get a name between stem and extension:
+    ``bone_200hu.stl``, ``bone_001.stl``, ``bone_200hu_001.stl``, ``bone_T12.stl``.
 
     measure: Measure the meshes, which costs time; without it those entries are None.  Default: with a `report_path`.
     """

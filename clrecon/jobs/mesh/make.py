@@ -218,8 +218,7 @@ def fill_solid(
 ) -> Volume:
     """Return the volume with what the only surface encloses filled.
 
-    At levels of bone, spaces that are too wide for marrow stay open, and such that hold air; at others, as that of
-    skin, all is filled.
+    At levels of bone, spaces that are too wide for marrow stay open, and such that hold air.
     """
     from clrecon.operators.masks.enclosed import LARGEST_MARROW_MM, fill_enclosed
 

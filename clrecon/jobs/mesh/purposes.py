@@ -100,8 +100,8 @@ def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
 def describe_print(mesh: Mesh, found: dict[str, float], kept: dict[str, float]) -> dict[str, Any]:
     """Return ``print`` of the report for a mesh as it is written.
 
-    found, kept: `measure_pieces` of the surface as it was extracted, and of what was kept of it.  Cavities that are
-        left out are filled; what is no bone is None where that was not asked.
+    found, kept: `measure_pieces` of the surface as it was extracted, and of what was kept; cavities left out are
+        filled.
     """
     from clrecon.mesh.compare.distances import measure_walls
 

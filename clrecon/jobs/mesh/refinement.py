@@ -103,8 +103,7 @@ def measure_parts(
 ) -> None:
     """Measure the `quality` of each part, and with `strict` the triangles that cut each other.
 
-    The device looks for these while the host measures all else, the distance from the scan too; without a device the
-    host finds the same.
+    The device looks for these while the host measures all else, the distance from the scan too.
     """
     if not settings.strict:
         steps = Steps(progress, "measure", len(parts))

@@ -215,7 +215,6 @@ class PictureFiles:
     """Paths of the outputs of a job; with several views each picture gets its own file names.
 
     depth, values: .npy or .tif, with the distances to the first hit in mm, and with HU.
-    turntable: See `clrecon.rendering.movies.check_animation`.
     """
 
     picture: str | Path | None = None

@@ -251,8 +251,7 @@ class RenderSettings(InputSettings):
     ) -> RenderSettings:
         """Make settings from the keywords of `clrecon.rendering.pictures.modes.make_style`.
 
-        clip_planes: sequence of (px, py, pz, nx, ny, nz). Planes by point and normal; the side to which the normal
-            points is kept.
+        clip_planes: Planes by point and normal, six numbers each; the side to which the normal points is kept.
         **given: Fields of `RenderSettings`, and of the mode's style.  The box of `clip_box`, `between` and `around`
             crops a scan, and where the style can be clipped it ends exactly at the box; clouds and meshes are clipped
             alone.

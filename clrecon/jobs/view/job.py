@@ -48,8 +48,7 @@ def write_view(
 ) -> ViewReport:
     """Write a page that shows scans and meshes together, each in its place.
 
-    The surface of one mesh without labels is divided into its components, which can be switched; of several meshes each
-    is a part.
+    One mesh without labels is divided into its components, which can be switched; of several meshes each is a part.
     """
     settings = settings or ViewSettings()
     with Run(settings.scan, **how) as run:

@@ -52,9 +52,8 @@ def judge_mesh(
 
 
 def judge_label_volume(mesh_ml: float | None, label_ml: float, advice: str = "", *, by_hu: bool = True) -> Gate:
-    """Compare the volume of a label's mesh with that of its voxels, which is above 0.
+    """Compare the volume of a label's mesh (None: it is open at the border of the scan) with that of its voxels.
 
-    mesh_ml: None: the mesh is open at the border of the scan and encloses no volume.
     advice: For the message where they differ by more than the bound.
     by_hu: True: HU place the surface.  False: it is the label's own surface, which should have the label's volume.
     """

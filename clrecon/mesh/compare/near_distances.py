@@ -1,7 +1,4 @@
-"""Distances from points to the triangles around a vertex near them, and to single triangles.
-
-Upper bounds of them in float32 are several times as fast as the distances themselves.
-"""
+"""Distances from points to the triangles around a vertex near them, their upper bounds, and to single triangles."""
 
 from __future__ import annotations
 

@@ -188,8 +188,7 @@ def _with_volumes(
 ) -> tuple[NDArray[np.floating], NDArray[np.uint32], int]:
     """Return the surface of clusters as it is stored, each closed component with its original volume.
 
-    Where the shift that a component needs for it is longer than `longest`, collapses are undone, and their number is
-    returned as well.
+    Where a component needs a shift longer than `longest` for it, collapses are undone; their number is returned too.
     """
     count, labels, border = clusters.components()
     wanted = measure_volumes(mesh.vertices - origin, mesh.triangles, count, labels, border)

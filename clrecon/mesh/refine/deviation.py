@@ -77,12 +77,9 @@ class SurfaceBounds(NearDistance):
         of the triangle and of its edges are compared with the triangles nearest to the corners, then with all around
         the names.
 
-        places, triangles: The other surface, and its triangles that are examined.
-        names, beside: For each of its vertices a vertex of this surface near it, and a triangle that is within the
-            limit, -1 where there is none. Returns:
-        witnesses: ndarray, shape (7, k), int32. For the corners, the middle and the middles of the edges of each; -1
-            for corners without one.
-        left: ndarray, shape (k,), uint8. Bit b says that nothing shows middle b of `MIDDLES` to be within the limit.
+        names, beside: For each vertex of the other surface one of this near it, and a triangle within the limit, or -1.
+        Returns: Of each triangle witnesses for the corners, the middle and the middles of the edges, shape (7, k), -1
+            for corners without one; and bits that say that nothing shows a middle of `MIDDLES` to be within the limit.
             Triangles that have a corner without witness are not examined.
         """
         witnesses: NDArray[np.int32] = np.empty((WITNESSES, len(triangles)), dtype=np.int32)
@@ -134,7 +131,7 @@ class SurfaceBounds(NearDistance):
     ) -> None:
         """Look at the middles of triangles and edges, see `find_witnesses`, of the triangles `rest` of a piece.
 
-        corners, near, names: Places in columns, faces nearest to them, shape (3, k), names, shape (k, 3).
+        near, names: Faces nearest to the corners, shape (3, k), names, shape (k, 3).
         witnesses, left: Of this piece; changed in place.
         """
         one, two, three = (corner[:, rest] for corner in corners)

@@ -93,7 +93,6 @@ def restore_volumes(
     volume were 0.03 voxel.
 
     step: ndarray, shape (n, 3), mm. Changed in place; no step becomes longer than `longest`.
-    labels: Component of `wanted` that each vertex belongs to, -1 for none.
     """
     count = len(wanted.mm3)
     moving = np.flatnonzero((labels >= 0) & ~np.append(wanted.is_open, True)[labels])

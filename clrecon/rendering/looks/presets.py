@@ -20,9 +20,7 @@ DEFAULT_PRESET = "bone"
 class Preset:
     """A way to make a picture that shows one tissue well.
 
-    mode: The mode that it is made for: "dvr", "mip", "minip" or "drr". It is used unless the caller names another one,
-        so that ``x-ray`` alone gives a radiograph.
-    transfer_function: Transfer function with its `lighting`; used in "dvr".
+    mode: "dvr", "mip", "minip" or "drr"; used unless the caller names another: ``x-ray`` alone gives a radiograph.
     window: HU of black and of white in projections ("drr" has none); None: chosen from the picture's own values.
     source: Origin of the ranges.
     """

@@ -1,10 +1,9 @@
 """`load_transfer_function`: reads every kind of file with transfer functions.
 
-Our own form is JSON, described in docs/transfer_functions.md.  Of others it reads volume properties of 3D Slicer (.vp,
-.vp.json, presets.xml and scenes; documented in its developer guide, "Volume rendering") and opacity maps of ParaView
-(.json).  The functions that read them return the names in a text, and for each a function that makes the parameters of
-a `TransferFunction`: so faulty entries do no harm if they are not wanted.  JSON from unknown sources is read strictly:
-every refusal names the field and its place.
+Of other programs' it reads volume properties of 3D Slicer (.vp, .vp.json, presets.xml and scenes; documented in its
+developer guide, "Volume rendering") and opacity maps of ParaView (.json).  Readers return the names in a text, and for
+each a function that makes the parameters of a `TransferFunction`: faulty entries do no harm if they are not wanted.
+JSON from unknown sources is read strictly: every refusal names the field and its place.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""`TransferFunction`: the colour and opacity that each HU has in a picture.
-
-docs/transfer_functions.md describes its text, JSON of clrecon's own form.
-"""
+"""`TransferFunction`: the colour and opacity that each HU has in a picture; docs/transfer_functions.md has its text."""
 
 from __future__ import annotations
 

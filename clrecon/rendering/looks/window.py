@@ -80,10 +80,9 @@ def choose_mip_window(values: NDArray[Any]) -> tuple[float, float]:
 
 
 def choose_water_window(values: NDArray[Any]) -> tuple[float, float]:
-    """Choose a window from the 1st to the 99th percentile of the rays of a radiograph that meet the body.
+    """Choose a window from the 1st to the 99th percentile of mm of water along rays of a radiograph that meet the body.
 
-    values: Mm of water. Rays with less than `BODY_SHARE` of the largest value do not count.  If all others have the
-        same value, black is 0.
+    They have more than `BODY_SHARE` of the largest value; if all of them have the same, black is 0.
     """
     most = float(values.max(initial=0.0))
     if not most > 0.0:

@@ -1,7 +1,4 @@
-"""`PictureData`, the plain values of a picture, and what is written on it.
-
-Annotations are letters for the sides of the patient, a scale bar in mm, a line of text.
-"""
+"""`PictureData`, the plain values of a picture and what is written on it: letters, scale bar in mm, a line."""
 
 from __future__ import annotations
 

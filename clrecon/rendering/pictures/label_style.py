@@ -46,11 +46,9 @@ class LabelStyle(Message):
     ) -> LabelStyle:
         """Choose colours and opacities.
 
-        colors: Labels by number or name as `LabelMap.find` takes them, colours as `find_color` does.  Labels that are
-            not named keep the colour of the picture; without a mapping every label gets its own colour, see
-            `distinct_colors`.
-        opacity: 0 to 1: a factor on the opacity; labels that are not named keep theirs.  0 stands for all that has no
-            label.
+        colors: Labels by number or name as `LabelMap.find` takes them.  Labels that are not named keep the colour of
+            the picture; without a mapping every label gets its own, see `distinct_colors`.
+        opacity: 0 to 1: a factor on the opacity; labels that are not named keep theirs.  0 is all that has no label.
         """
         if not isinstance(labels, LabelMap):
             raise UsageError(f"labels are a LabelMap, see clrecon.read_labels, not {type(labels).__name__}")

@@ -39,11 +39,7 @@ class SheetLayout:
 
 
 def lay_out(count: int, mm: tuple[float, float], size: tuple[int, int], zoom: float = 1.0) -> SheetLayout:
-    """Place tiles so that each is as large as possible.
-
-    mm: Width and height that a tile shows at zoom 1.
-    size: Width and height of the picture; it is not exceeded.
-    """
+    """Place tiles, each of which shows this width and height in mm at zoom 1, so that they are as large as possible."""
     best: tuple[float, int, tuple[int, int]] | None = None
     for columns in range(1, count + 1):
         rows = -(-count // columns)
@@ -75,8 +71,7 @@ def lay_out(count: int, mm: tuple[float, float], size: tuple[int, int], zoom: fl
 def write_on_tile(image: NDArray[np.uint8], texts: tuple[str, ...], edges: Mapping[str, str]) -> NDArray[np.uint8]:
     """Write on a copy of a tile (h, w, 4): the first text that fits, else the last, at the top left.
 
-    edges: Letters of the sides of the patient at the ``left`` and ``right`` edge; tiles under `LEAST_LETTERED` pixels
-        have none.
+    edges: Sides of the patient at the ``left`` and ``right`` edge, for tiles of `LEAST_LETTERED` pixels and more.
     """
     load_pillow()
     from PIL import Image, ImageDraw
@@ -117,11 +112,7 @@ class Stroke:
 
 @dataclass(frozen=True)
 class Panel:
-    """A slice, in HU, with what is drawn over it.
-
-    captions: Lines of text at the top left.
-    edges: Letters at the left, right, top and bottom edge.
-    """
+    """A slice, in HU, with what is drawn over it; edges have the letters at the left, right, top and bottom."""
 
     values: NDArray[Any]
     pixel_mm: float

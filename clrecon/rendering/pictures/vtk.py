@@ -1,8 +1,4 @@
-"""Pictures as PyVista data sets in LPS mm, to be shown among meshes.
-
-There are two forms: points, one at the first hit of each ray, which are right from every side; and a plane with the
-picture on it.
-"""
+"""Pictures as PyVista data sets in LPS mm: points, right from every side, or a plane with the picture on it."""
 
 from __future__ import annotations
 

@@ -232,11 +232,10 @@ def _unit_vectors(vectors: Float64Array) -> Float64Array:
 def straightened_sheet(
     curve: Curve, across: Float64Array, size: tuple[int, int], pixel: float, angle: float = 0.0
 ) -> CurvedSheet:
-    """Make a sheet whose rows cross a curve, which becomes a straight line down the middle of the picture.
+    """Make a sheet (w, h) whose rows cross a curve, which becomes a straight line down the middle of the picture.
 
     across: ndarray, shape (3,). Direction in LPS that the rows follow as well as a frame without twist allows: the mean
         of their rotation from it, along the curve, is zero.
-    size: (w, h)
     pixel: mm.
     angle: Degrees by which all rows are turned about the curve: into the picture at the right.
     """
@@ -268,12 +267,7 @@ def straightened_sheet(
 
 
 def stretched_sheet(curve: Curve, across: Float64Array, size: tuple[int, int], pixel: float) -> CurvedSheet:
-    """Make a sheet of parallel rows through a curve, at equal distances on the surface that the rows form.
-
-    across: ndarray, shape (3,). Direction of all rows, LPS.
-    size: (w, h)
-    pixel: mm.
-    """
+    """Make a sheet (w, h) of parallel rows in a direction (3,) through a curve, even on the surface they form."""
     width, height = size
     direction = _unit_vectors(np.asarray(across, dtype=np.float64))
     arcs = _fine_arcs(curve.length, pixel)

@@ -1,7 +1,4 @@
-"""Cameras of VTK, and PyVista's among them, as the parameters of a `Camera` and back.
-
-VTK cameras have properties that a `Camera` has not; cameras that use them are refused.
-"""
+"""Cameras of VTK, and PyVista's among them, as the parameters of a `Camera` and back; special ones are refused."""
 
 from __future__ import annotations
 

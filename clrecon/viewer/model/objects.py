@@ -74,7 +74,6 @@ class ShownObject:
     """One input of a view, in LPS mm.  It does not change.
 
     name: Shown in lists.  No file name: it can hold the name of a patient.
-    said: What has to be said of it, such as that it was turned from RAS.
     """
 
     kind: ClassVar[str]

@@ -56,11 +56,8 @@ class ClusterMap(LabelMap):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FoundParts:
-    """The parts of a scan.
+    """The parts of a scan, with or without its table, by the number of the object.
 
-    scan: Number of the object.
-    iso_value: HU.
-    table: Of the scan with its table.
     labels: Clusters by number, grown by one voxel; 0 is all else.
     placed: The same, on the grid of the scan.
     parts: The clusters, the smaller ones together, and what lies below the iso value.

@@ -183,11 +183,10 @@ ISO_STEP = 5.0
 
 @dataclass(frozen=True)
 class Key:
-    """A key.
+    """A key; its name stands in the list of keys, where it is not what a browser calls the key.
 
     does: A command of `ViewSession.do`, or the name of something that the page does itself.
     at_pointer: The command gets the pixel under the pointer.
-    name: In the list of keys, where it is not what a browser calls the key.
     """
 
     words: str

@@ -54,9 +54,7 @@ class ViewSession(Closing):
 
     painter: Shared with other views of the same objects; it stays open.  None: one of its own.
     space: {"lps", "ras"}. Frame in which places are said and saved.
-    iso_value: HU at the start.
-    on_change: Called, in any thread, when something happened that was not asked for by the caller just now: work began
-        or ended, parts were found, an error came.
+    on_change: Called, in any thread, when something happened that was not asked for by the caller just now.
     """
 
     def __init__(
@@ -307,11 +305,7 @@ class ViewSession(Closing):
         then: Callable[[list[str]], None] | None = None,
         size: Sequence[int] = (1024, 1024),
     ) -> None:
-        """Write what is shown to a file, in the background; the extension says as what.
-
-        then: Called with lines that say what was written.
-        size: (width, height). Of a picture.
-        """
+        """Write what is shown at (width, height) to a file in the background; `then` gets lines about it."""
         checked = checked_size(size)
         with self._lock:
             state = self.model.state

@@ -44,7 +44,6 @@ class Worker:
     """A thread with one place for each kind of work.
 
     on_error: Called with the kind and the words of an error, in the thread.
-    on_change: Called when work begins and when it ends.
     """
 
     def __init__(self, name: str, on_error: Callable[[str, str], None], on_change: Callable[[], None] = lambda: None):
@@ -60,8 +59,7 @@ class Worker:
         """Ask for work; one of the same kind that waits is dropped, and one that runs is cancelled if it gives way.
 
         rank: Lower ones come first.
-        gives_way: False: once it runs it is finished, so that pictures are seen while requests come faster than
-            pictures.
+        gives_way: False: once it runs it is finished: pictures are seen while requests come faster than pictures.
         Returns: None after `close`.
         """
         job = Job(kind, work, rank, gives_way)

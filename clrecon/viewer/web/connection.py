@@ -100,8 +100,7 @@ def ignore_line(line: str) -> None:
 class Connection:
     """One browser.
 
-    open_session: Makes its session; called with a function that the session calls, in any thread, when something
-        happened.
+    open_session: Makes its session; called with a function that the session calls when something happened.
     save_as: Files on this computer that it may have written; numbered where they exist.
     wrote: Called with a line for each of these.
     quit: Ends the server.

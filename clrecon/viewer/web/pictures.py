@@ -95,12 +95,7 @@ MOVING_QUALITY, SHARP_QUALITY = 70, 92
 
 
 def encode_picture(picture: Rendering, ground: tuple[int, int, int], sharp: bool, facts: dict[str, Any]) -> bytes:
-    """Return the message of a picture.
-
-    ground: Red, green and blue of the page's ground, 0 to 255.
-    sharp: At rest: in high quality.
-    facts: What else the page is to know of it; size and camera are added.
-    """
+    """Return the message of a picture over a ground of red, green and blue; a `sharp` one is in high quality."""
     load_pillow()
     from PIL import Image
 

@@ -62,14 +62,10 @@ def make_secret() -> str:
 def refuse_request(
     host: str | None, origin: str | None, given: str | None, secret: str, *, by_page: bool = False
 ) -> str | None:
-    """Return why a request is refused, or None for one that is let in.
+    """Return why a request is refused, without anything of it, or None for one that is let in.
 
-    host, origin: The header fields of these names.
-    given: The secret of its address.
-    secret: The right one.
+    given, secret: The secret of its address, and the right one.
     by_page: True for what only scripts of pages ask for: a request without an Origin is refused too.
-
-    Returns: One line that holds nothing of the request.
     """
     if host is None or not _OWN_HOST.fullmatch(host):
         return "refused: this server answers to 127.0.0.1 and localhost alone"
