@@ -238,10 +238,7 @@ def make_settings(settings: type[Settings], options: argparse.Namespace, **more:
 
 
 def make_part(part: type[Settings], options: argparse.Namespace, owner: str | None, needs: str) -> Settings | None:
-    """Make settings that mean nothing without one option, whose value is `owner`; None where that has none.
-
-    needs: What a refusal of the others says behind their names: what they are about, and which option they need.
-    """
+    """Make settings that mean nothing without the option of `owner`, None where it has no value; `needs` says which."""
     if owner is not None:
         return make_settings(part, options)
     for own in options_of(part):

@@ -91,10 +91,9 @@ COMMANDS = {
 HELP = "help"
 
 UNUSED_MODULES = ("requests", "PIL")
-"""Modules that are hidden from pydicom, by ``None`` in `sys.modules`, which means "not installed".
-
-pydicom imports them if they are there, to download test files and for colour profiles.  Reading needs neither, and the
-import takes as long as reading a series.  `clrecon.rendering.pictures.pillow` makes Pillow available again."""
+"""Hidden from pydicom by ``None`` in `sys.modules`: reading does not need them, and their import takes as long as it.
+`clrecon.rendering.pictures.pillow` makes Pillow available again.
+"""
 
 _MOST_SECONDS_TO_END = 1.0
 """Time for the removal of temporary folders after a kernel has hung."""

@@ -1,7 +1,4 @@
-"""Inputs of jobs: clouds and meshes, told by the extension of their files, scans with label maps, and the crop.
-
-Nothing here loads numpy before it is called: help texts name the extensions.
-"""
+"""Inputs of jobs: clouds, meshes, scans with label maps, and the crop.  Help texts import this: numpy comes later."""
 
 from __future__ import annotations
 
@@ -74,10 +71,7 @@ def describe_cloud(cloud: PointCloud) -> dict[str, Any]:
 def read_with_labels(
     read_scan: Callable[[], Volume], path: str | Path | None, read_map: Callable[[Volume | None], LabelMap | None]
 ) -> tuple[Volume, LabelMap | None]:
-    """Read the labels, then the scan; but labels that take long to unpack after it, to be held against its grid.
-
-    read_map: Gets the scan if it was read first.
-    """
+    """Read the labels, then the scan; but labels that take long to unpack after it, to be held against its grid."""
     if path is None:
         return read_scan(), None
     from clrecon.labels.reader import is_large_map

@@ -19,14 +19,12 @@ if TYPE_CHECKING:
 
 
 REGION_FORMS = "box:X0,X1,Y0,Y1,Z0,Z1, hu:LO,HI, label:FILE:NAME, mask:FILE, seed:X,Y,Z, tube:MM and tube:MM:FILE"
-"""The forms of a region rule, for messages and help."""
 
 PREPROCESS_FORMS = (
     "bilateral[:MM[:HU]], bilateral-2d[:MM[:HU]], bilateral-near[:MM[:HU]], median[:MM], gaussian[:MM],"
     " curvature-flow[:N], non-local-means[:HU], level:HU, erode:MM, dilate:MM, open:MM, close:MM, fill, fill-slices"
     " and region"
 )
-"""The forms of a step, for messages and help."""
 
 
 parse_point = numbers_reader(3, "is no point: three numbers in mm with commas, X,Y,Z")

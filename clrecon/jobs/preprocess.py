@@ -99,10 +99,7 @@ Band = tuple[float, float]
 def restrict_volume(
     volume: Volume, settings: InputSettings, device: Device, bands: Sequence[Band], progress: Progress
 ) -> Volume:
-    """Crop the volume, and turn what lies outside of the region of interest into air where that is asked for here.
-
-    bands: What the job will take as inside, so that what lies outside of the region never is.
-    """
+    """Crop the volume and, if asked here, make what is outside of the region air that is in none of the `bands`."""
     volume = crop_scan(volume, settings.crop, settings.space_of_points, margin=settings.crop_margin)
     if not settings.region or settings.region_later:
         return volume
@@ -169,10 +166,7 @@ def value_outside(bands: Sequence[Band], dtype: np.dtype[Any]) -> float:
 def _find_region(
     resident: DeviceVolume, rules: Sequence[RegionRule], space: str
 ) -> tuple[Mask, dict[str, Any], list[str]]:
-    """Return the voxels of the region, facts, and warnings of label files.
-
-    Rules of one kind are united, those of different kinds intersected.
-    """
+    """Return the region's voxels, facts and warnings: rules of one kind are united, different kinds intersected."""
     facts: dict[str, Any] = {}
     warnings: list[str] = []
     by_kind: dict[str, Mask] = {}

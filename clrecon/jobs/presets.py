@@ -59,10 +59,7 @@ def find_iso_preset(name: str) -> IsoPreset:
 
 @dataclass(frozen=True)
 class Purpose:
-    """A name that stands for settings: fields of `MeshSettings` that it sets if they are not given.
-
-    is_for_print: The surface has to be closed and of bone, and what a printer needs to know of it is measured.
-    """
+    """A name for settings of meshes that it sets if they are not given; print needs a closed surface of bone."""
 
     name: str
     settings: dict[str, Any]

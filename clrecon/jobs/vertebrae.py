@@ -159,7 +159,6 @@ LOW_COLOR = (255, 40, 40)
 LINE_COLOR = (255, 230, 0)
 TEXT_MM = 6.0
 NAMES_MM = 62
-"""Width of the column with names, mm."""
 
 
 def draw_vertebrae(split: VertebraSplit) -> bytes:

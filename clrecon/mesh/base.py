@@ -108,10 +108,7 @@ class BaseMesh(Message):
         return len(self._triangles)
 
     def check(self) -> None:
-        """Check every number: indices have a vertex, coordinates and normals are finite.
-
-        A mesh is checked when it is made; this is for arrays that were changed since.
-        """
+        """Check every number, as when a mesh is made; this is for arrays that were changed since."""
         if self.triangle_count and int(self._triangles.max()) >= self.vertex_count:
             row = int(np.flatnonzero((self._triangles >= self.vertex_count).any(axis=1))[0])
             raise UsageError(

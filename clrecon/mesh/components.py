@@ -26,8 +26,7 @@ Labelled = tuple[int, NDArray[np.int64]]
 
 
 SEED_REACH_MM = 20.0
-"""Largest distance of a seed from a surface; farther seeds are mistakes.  The middle of a lumbar vertebral body (about
-50 x 35 x 30 mm) lies 15 mm from its wall."""
+"""Largest distance of a seed from a surface; the middle of a lumbar vertebral body lies 15 mm from its wall."""
 
 
 _CRUMB_ML = 0.1
@@ -35,8 +34,8 @@ _CRUMB_ML = 0.1
 
 _ROUNDING_OF_AREA = 4.0
 """Two components have equal area when they differ by less than this factor times the rounding step of the coordinates
-times the square root of the area.  Rounding moves each vertex independently and changes the area by about 0.3 of that
-product, by up to 1 where triangles are long and thin."""
+times the square root of the area; rounding changes it by 0.3 of that product, by 1 where triangles are long and thin.
+"""
 
 
 @dataclass(frozen=True)

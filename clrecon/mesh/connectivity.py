@@ -161,10 +161,7 @@ def opposite_half_edges(triangles: NDArray[np.uint32], edges: Edges) -> IntArray
 def find_split_vertices(
     triangles: NDArray[np.uint32], vertex_count: int, edges: Edges, opposite: IntArray | None = None
 ) -> IntArray:
-    """Find the vertices whose faces form several fans, for example the waist of an hourglass.
-
-    opposite: With it the faces around each vertex are counted by going round it once.
-    """
+    """Find vertices whose faces form several fans, as a waist; with `opposite`, by going round each once."""
     corners = triangles.reshape(-1)
     degree = np.bincount(corners, minlength=vertex_count)
     if opposite is None or (len(degree) and degree.max() > _MOST_STEPS):

@@ -109,10 +109,7 @@ def find_changed_intersections(
     changed: NDArray[np.bool_],
     find_crossings: FindCrossings = find_self_intersections,
 ) -> NDArray[np.int64]:
-    """Find the pairs of triangles that cut each other and of which one has changed; as of `find_self_intersections`.
-
-    find_crossings: Finds the same, perhaps elsewhere.  It is not needed where few have changed.
-    """
+    """Find the pairs of triangles that cut each other of which one changed; `find_crossings` is for many changed."""
     if not changed.any():
         return np.zeros((0, 2), dtype=np.int64)
     if np.count_nonzero(changed) > _FEW * len(triangles):

@@ -34,19 +34,16 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
 ROOM_BYTES = 64 << 20
-"""Room that a folder of built kernels must have.  All kernels for one device take 12 MB; PoCL ends the process when the
-disk is full."""
+"""Room that a folder of built kernels must have: all of a device take 12 MB; PoCL ends the process on a full disk."""
 
 LONGEST_FILE_BYTES = 1 << 20
 """Size that files of built kernels must be allowed to have: the longest has 0.2 MB."""
 
 _OWN = "clrecon"
-"""Name of the folder within PoCL's that holds the kernels of clrecon alone, so that each file in it can be accounted
-for (`clrecon.opencl.pocl`).  A process that this one starts inherits POCL_CACHE_DIR with it."""
+"""Folder within PoCL's for clrecon alone, so that each file in it can be accounted for (`clrecon.opencl.pocl`)."""
 
 _MESA_OFF = {"MESA_SHADER_CACHE_DISABLE": "true", "MESA_GLSL_CACHE_DISABLE": "true"}
-"""Environment that switches Mesa's cache off (before 22.1 by the last name): a thread of its own writes to it, even
-into a folder that is being removed."""
+"""Switches off Mesa's cache (before 22.1 by the last name): a thread writes to it, even into a folder being removed."""
 
 _RELATIVE = "is no absolute path"
 """Libraries differ in what they make of such a folder: pytools looks for one elsewhere, others take it as it is."""

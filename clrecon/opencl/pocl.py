@@ -302,7 +302,7 @@ CPU_NAMES: tuple[tuple[str, frozenset[str]], ...] = (
     ("x86-64", frozenset()),
 )
 """LLVM's names of CPUs, no longer than `UNKNOWN`, and the flags that each needs, as in /proc/cpuinfo; best first.  The
-kernels only distinguish AVX-512 and AVX2 (`cl/rays/window.h`), so more names would bring nothing.
+kernels only distinguish AVX-512 and AVX2 (`cl/rays/window.h`).
 """
 
 _STRUCT_BYTES = 2048

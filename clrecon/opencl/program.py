@@ -26,9 +26,9 @@ _TYPES: dict[str, Any] = {
 }  # fmt: skip
 
 LAUNCHES_BEFORE_TYPES = 8
-"""Number of launches after which pyopencl is told the types of a kernel's arguments.  It then writes code that sets all
-of them in 2 us, not 4 us each.  Writing takes as long as several launches, which a process with few launches should not
-wait for."""
+"""After so many launches pyopencl is told the types of a kernel's arguments: it then writes code that sets them in 2,
+not 4 us each, which takes as long as several launches.
+"""
 
 
 def _take_buffer(value: Any) -> Any:

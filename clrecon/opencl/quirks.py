@@ -11,15 +11,13 @@ from clrecon.errors import DeviceError
 from clrecon.opencl.cache import prepare_caches
 
 SIMULATOR_PLATFORMS = ("oclgrind",)
-"""Platforms of simulators, which claim to be fast devices (Oclgrind: CPU, GPU and accelerator at once) and are 1000
-times slower."""
+"""Platforms of simulators, which claim to be fast devices (Oclgrind: CPU, GPU and accelerator) and are not."""
 
 _THREAD_COUNTS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
 """Variables for the number of PoCL's threads, before version 4 and since."""
 
 _MOST_THREADS = 4096
-"""Threads that PoCL may be asked for: more than any processor has, and each takes a stack.  A device may get two for
-one that is asked for."""
+"""Threads that PoCL may be asked for, more than any processor has; a device may get two for one that is asked for."""
 
 
 @cache

@@ -152,8 +152,7 @@ def _key(device: Device) -> str:
 
 
 LEAST_ADDRESS_SPACE = 1_000_000_000
-"""Address space, in bytes, below which no driver is loaded.  Two versions of PoCL take 0.83 GB before anything is
-built; with less they show no device, wait for ever, or end the process."""
+"""Bytes of address space below which no driver is loaded: PoCL shows no device, waits for ever or ends the process."""
 
 
 def _address_space() -> int | None:

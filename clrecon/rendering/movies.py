@@ -54,7 +54,6 @@ FASTEST = {".mp4": 120.0, ".gif": 50.0, ".apng": 120.0, "": 120.0}
 """Most frames per second.  GIF counts hundredths of a second; browsers slow down frames shorter than two."""
 
 SLOWEST = 0.1
-"""Fewest frames per second."""
 
 
 @explains_arguments

@@ -17,7 +17,6 @@ from clrecon.system.options import option, parse_numbers
 DENOISERS = ("grid", "bilateral")
 
 GHOSTS = ("keep", "drop")
-"""What becomes of the points of ghost slices."""
 
 
 STEPS = {
@@ -45,11 +44,7 @@ LARGEST_MM = 1e4
 
 @dataclass(frozen=True)
 class Clustering:
-    """Parameters of DBSCAN, see `clrecon.cluster_points`.
-
-    eps: Mm.
-    min_samples: int or "plane+1"
-    """
+    """Parameters of DBSCAN (`eps` in mm), see `clrecon.cluster_points`; `min_samples` can be "plane+1"."""
 
     eps: float | None = None
     min_samples: int | str = 6
@@ -95,10 +90,7 @@ def _parse_denoisers(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class CloudSettings(InputSettings):
-    """Settings of the cloud job; options say in their help what they do.
-
-    keep: They need clusters, which then have the default parameters.
-    """
+    """Settings of the cloud job; options say in their help what they do.  `keep` alone has the default clusters."""
 
     space: str = space_option("patient frame of the written files and of seeds")
     input_space: str | None = option(

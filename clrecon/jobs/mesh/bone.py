@@ -34,10 +34,7 @@ SPINE_MM = 20.0
 def find_bone(
     mesh: Mesh, volume: Volume, surface: Surface, labelled: Labelled, *, without_table: bool = False, advice: str
 ) -> NDArray[np.bool_]:
-    """Return which components (count,) look like bone or, if none does, the one that holds the spinal canal.
-
-    without_table: The table was already removed, so the message does not advise it.
-    """
+    """Return which components (count,) look like bone or, if none does, the one that holds the spinal canal."""
 
     from clrecon.mesh.compare.iso_distance import rule_of_report
 
@@ -193,10 +190,7 @@ def _is_of_bone(surface: Surface, lowest: float) -> bool:
 
 
 def warn_of_walls(parts: Sequence[Part], settings: MeshSettings, choice: IsoChoice | None = None) -> list[str]:
-    """Return warnings for judged parts that should be bone but are contrast medium, joined to it, or something else.
-
-    choice: The choice of the iso value; warnings about contrast medium at its edges are included.
-    """
+    """Return warnings for judged parts that should be bone but are contrast medium, joined to it, or something else."""
     contrast = [] if choice is None else warn_of_contrast(choice)
     warnings = []
     for surface in dict.fromkeys(part.surface for part in parts):

@@ -111,10 +111,7 @@ def check_growing(
     has_labels: bool,
     makes_labels: bool,
 ) -> None:
-    """Check the seeds, the method and the vertex rule of a mesh job, each and with its other settings.
-
-    makes_labels: Labels of the map are named that become meshes.
-    """
+    """Check the seeds, the method and the vertex rule of a mesh job, each and with its other settings."""
     for seed in grow_from:
         if not isinstance(seed, str):
             check_point(seed)

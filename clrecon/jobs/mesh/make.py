@@ -57,10 +57,7 @@ class MadeParts:
 
 
 def make_parts(source: str | Path, run: Run, check_map: Callable[[LabelMap], None] | None = None) -> MadeParts:
-    """Read a scan, extract its surfaces and select components.
-
-    check_map: Called with the label map whose labels become meshes, before the device works.
-    """
+    """Read a scan, extract its surfaces and select components; `check_map` gets the label map before any work."""
     settings: MeshSettings = run.settings
     (volume, labels), device = _read_inputs(source, run, check_map)
     surfaces = plan_surfaces(settings.levels, below=settings.below is not None)

@@ -98,11 +98,7 @@ def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
 
 
 def describe_print(mesh: Mesh, found: dict[str, float], kept: dict[str, float]) -> dict[str, Any]:
-    """Return ``print`` of the report for a mesh as it is written.
-
-    found, kept: `measure_pieces` of the surface as it was extracted, and of what was kept; cavities left out are
-        filled.
-    """
+    """Return ``print`` of the report for a mesh as it is written, from `measure_pieces` before and after the choice."""
     from clrecon.mesh.compare.distances import measure_walls
 
     size = mesh.vertices.max(axis=0).astype(float) - mesh.vertices.min(axis=0)

@@ -101,10 +101,7 @@ def measure_parts(
     device: Device | None = None,
     progress: Progress = ignore_progress,
 ) -> None:
-    """Measure the `quality` of each part, and with `strict` the triangles that cut each other.
-
-    The device looks for these while the host measures all else, the distance from the scan too.
-    """
+    """Measure the `quality` of each part, and with `strict`, on the device meanwhile, triangles that cut each other."""
     if not settings.strict:
         steps = Steps(progress, "measure", len(parts))
         for part in parts:

@@ -97,8 +97,7 @@ HIGHEST_DRY_HU, DRY_HU = -100, -200
 """Thin walls of a dry specimen, in air, stay below the first; the second finds those of the phantoms."""
 
 THICK_SLICES_MM = 2.5
-"""From this spacing on, thin walls across the slices are blurred so much that the half-way level can be too high: with
-slices of 2 mm it is as good as the best, with 3 mm it loses walls (docs/iso_value.md)."""
+"""Spacing from which on the half-way level can be too high: at 3 mm it loses blurred thin walls (docs/iso_value.md)."""
 
 
 VALUE_GATES = ("hu_known", "hu_scale", "stored_sign")

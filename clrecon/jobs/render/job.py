@@ -212,10 +212,7 @@ OPAQUE_ONLY = (".jpg", ".jpeg", ".mp4", ".gif")
 
 @dataclass(frozen=True)
 class PictureFiles:
-    """Paths of the outputs of a job; with several views each picture gets its own file names.
-
-    depth, values: .npy or .tif, with the distances to the first hit in mm, and with HU.
-    """
+    """Paths of the outputs: `depth` has mm to the first hit, `values` HU; each view gets file names of its own."""
 
     picture: str | Path | None = None
     depth: str | Path | None = None

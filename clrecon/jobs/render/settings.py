@@ -109,10 +109,7 @@ class Turntable:
 
 @dataclass(frozen=True)
 class LabelLook:
-    """A label map and the look of its labels, by number or name.
-
-    opacities: Factor on the opacity; "0" stands for all that has no label.
-    """
+    """A label map and the look of its labels, by number or name; of opacities "0" is for all that has no label."""
 
     path: str = label_map_option(default=MISSING)
     colors: Mapping[str, str] = option(

@@ -72,10 +72,7 @@ def open_inputs(
     progress: Progress | None = None,
     ready: Callable[[OpenedInput], None] | None = None,
 ) -> list[OpenedInput]:
-    """Read the inputs of a view, and the label map of its settings as the last one.
-
-    ready: Called with each input as soon as it is read.
-    """
+    """Read the inputs of a view, the label map of its settings last; `ready` gets each input as soon as it is read."""
     settings, tell = settings or ViewSettings(), progress or ignore_progress
     labels = settings.scan.labels
     if not inputs and labels is None:

@@ -21,8 +21,7 @@ SAMPLES = 100_000
 """Most points; larger meshes are measured at every n-th vertex and triangle."""
 
 METAL_REACH = 2
-"""Voxels.  At an edge of thousands of HU a level of bone lies in the outermost voxels: the surface is a staircase,
-which smoothing leaves."""
+"""Voxels: at metal a level of bone lies in the outermost ones; the surface is a staircase, which smoothing leaves."""
 
 _STEPS = 12
 _ON_THE_SURFACE = 1e-3

@@ -14,14 +14,12 @@ DEVIATION_P95_VOXEL = 0.25
 DEVIATION_MEAN_VOXEL = 0.1
 VOLUME_CHANGE_PERCENT = 0.5
 MASK_VOLUME_PERCENT = 1.0
-"""Bound for the label's own surface, in percent of the label's volume.  Extraction alone changes 0.03 %; the rest is
-for refinement."""
+"""Bound for the label's own surface, in percent of its volume: extraction takes 0.03 %, the rest is for refinement."""
 
 LABEL_VOLUME_PERCENT = 15.0
-"""Bound for a surface placed by HU, in percent of the label's volume.  Solid surfaces of whole vertebrae differ from
-masks of a neural network by -7 to +11 % where the iso value fits the bone (150 to 226 HU at 2 mm, 150 HU at 3 mm), and
-by -14 to -29 % where it lies above thin cortex (3 mm, 200 to 226 HU). Hollow surfaces differ by -32 to -80 %, soft
-tissue by up to -100 %."""
+"""Bound for a surface placed by HU, in percent of the label's volume.  Solid surfaces of vertebrae differ by -7 to 11 %
+where the iso value fits the bone, and by -14 to -29 % above thin cortex; hollow ones by -32 to -80 %.
+"""
 
 
 def judge_mesh(
@@ -52,11 +50,7 @@ def judge_mesh(
 
 
 def judge_label_volume(mesh_ml: float | None, label_ml: float, advice: str = "", *, by_hu: bool = True) -> Gate:
-    """Compare the volume of a label's mesh (None: it is open at the border of the scan) with that of its voxels.
-
-    advice: For the message where they differ by more than the bound.
-    by_hu: True: HU place the surface.  False: it is the label's own surface, which should have the label's volume.
-    """
+    """Compare the volume of a label's mesh, None where it is open, with its voxels'; `by_hu`: HU placed the surface."""
     name, bound = "label_volume", LABEL_VOLUME_PERCENT if by_hu else MASK_VOLUME_PERCENT
     if mesh_ml is None:
         return unmeasured(name, bound, "%", "a surface that is open at the border of the scan encloses no volume")

@@ -182,10 +182,7 @@ def _perpendicular(points: Columns, a: Columns, b: Columns, c: Columns) -> NDArr
 
 
 def triangle_distances(points: Columns, a: Columns, b: Columns, c: Columns) -> NDArray[np.float64]:
-    """Return the distance of each point from its triangle: to the face by the perpendicular, else to the nearest edge.
-
-    points, a, b, c: ndarray, shape (3, k), float64, mm. One row each for x, y, z.
-    """
+    """Return the distance of each point (3, k) from its triangle: by the perpendicular, else to the nearest edge."""
     shortest = _perpendicular(points, a, b, c)
     beside = np.flatnonzero(np.isinf(shortest))
     points, a, b, c = (columns.take(beside, axis=1) for columns in (points, a, b, c))
@@ -201,8 +198,7 @@ def triangle_distances(points: Columns, a: Columns, b: Columns, c: Columns) -> N
 
 
 _ROUNDINGS = 16.0
-"""Units of the last place of the largest coordinate by which a bound may be too small; each of 16 steps rounds by half
-a unit of a number that is no larger."""
+"""Units of the last place of the largest coordinate by which a bound may be too small: 16 steps of half a unit."""
 
 
 def rounding_of_bounds(largest: float) -> float:
@@ -229,10 +225,7 @@ class FaceFrames:
         self.slack = rounding_of_bounds(float(np.abs(columns).max(initial=0.0)))
 
     def squares(self, points: NDArray[np.float32], rows: NDArray[np.integer]) -> NDArray[np.float32]:
-        """Return squares of distances, mm2, from points (3, k) to a point of their triangle, near the nearest one.
-
-        The square root is an upper bound of the distance, but for `slack` mm by rounding.
-        """
+        """Return squares of upper bounds, but for `slack` mm by rounding, of distances (k,) to triangles."""
         frames = np.ascontiguousarray(self._rows.take(rows, axis=0, mode="clip").T)
         away = points - frames[0:3]
         u = away[0] * frames[3]

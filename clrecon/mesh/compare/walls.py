@@ -25,17 +25,14 @@ from clrecon.system.records import Record
 COMPACT_HU = 600.0
 """Compact bone reaches this below its surface; contrast medium in heart and vessels does not."""
 WALL_MM = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
-"""Depths along the inward normal; the wall is the highest value at these depths.  They extend to 1.5 voxels if that is
-deeper."""
+"""Depths along the inward normal, to 1.5 voxels if that is deeper; the wall is the highest value at these depths."""
 FLAT_MM, FLAT_HU = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0), 120.0
-"""A wall is flat where the values at these depths, below the wall, differ by at most `FLAT_HU`. Depths are in voxels
-where these are larger than 1 mm along the normal."""
+"""A wall is flat where values at these depths below it, in voxels of above 1 mm, differ by at most `FLAT_HU`."""
 NEAR_MM, NEAR_STEPS = 15.0, 5.0
 """Bone has a compact wall within this distance, or this number of voxels, of every place; coarse voxels blur most."""
 LEAST_COMPACT = 0.05
 FAINT_HU, FAINT_SPREAD_HU = 500.0, 200.0
-"""Thin bone whose walls are blurred away: its densest places reach the first value, and exceed the median by the
-second.  Vessels of 400 HU and table shells have one value, within 140 HU."""
+"""Thin bone without walls reaches the first value, and exceeds the median by the second; vessels have one value."""
 LEAST_FLAT = 0.05
 MOST_SAMPLES = 8_000
 MOST_COMPONENT_SAMPLES = 500

@@ -47,8 +47,7 @@ _LEAST_ROOM = 0.0005
 """Share of the bound that is kept for the exact shift of a component: this many times the last estimate, and this."""
 
 _LESS = (1.0, 0.7, 0.5, 0.25)
-"""Where no shift gives a component its volume, its steps are multiplied by these in turn.  Specks of a few triangles,
-which the filter draws into a point, need it."""
+"""Factors of the steps, in turn, where no shift gives a component its volume, as of specks that become a point."""
 
 _NEWTON_STEPS = 8
 _VOLUME_SLACK = 1e-6

@@ -40,10 +40,7 @@ def is_transparent(background: Any) -> bool:
 
 
 def find_color(color: str | Sequence[float]) -> Float64Array:
-    """Return red, green and blue from 0 to 1 of a colour.
-
-    color: A name of `COLORS` (grey for gray is fine), ``#rgb``, ``#rrggbb``, or three numbers from 0 to 1.
-    """
+    """Return red, green and blue, 0 to 1, of a name of `COLORS`, ``#rgb``, ``#rrggbb`` or three such numbers."""
     if isinstance(color, str):
         text = color.strip().lower()
         digits = COLORS.get(text.replace("grey", "gray"), text.removeprefix("#") if text.startswith("#") else "")
@@ -74,7 +71,6 @@ _FROM_ZERO = np.array(
 """ColorBrewer's YlOrRd, its lightest and darkest classes spread over seven."""
 
 _UNKNOWN = (128, 128, 128)
-"""Colour of NaN."""
 
 
 def round_up(value: float) -> float:

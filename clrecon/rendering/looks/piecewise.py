@@ -112,8 +112,7 @@ DENSE = 0.7
 """Opacity of a ray step from which on only its front is visible."""
 
 STEEP_HU = 50.0
-"""Widest range of HU for the change `STEEP`. Over wider ranges, parts are no better than the samples alone, and cost
-time."""
+"""Widest range of HU for the change `STEEP`: over wider ones parts are no better than samples alone, and cost time."""
 
 
 @dataclass(frozen=True)

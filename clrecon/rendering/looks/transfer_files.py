@@ -191,8 +191,7 @@ Entry = tuple[str, Callable[[], dict[str, Any]]]
 """A name, empty where the file has none, and the function that makes the parameters."""
 
 GRADIENT_VOXEL_MM = 1.0
-"""Voxel size for gradients: VTK's are in HU per voxel, of a size that a file does not state, so they are taken as HU
-per mm."""
+"""Voxel size for gradients: VTK's are in HU per voxel of a size that no file states; they are taken as HU per mm."""
 
 _LINES = (
     "interpolation", "shade", "diffuse", "ambient", "specular", "specularPower", "scalarOpacity", "gradientOpacity",

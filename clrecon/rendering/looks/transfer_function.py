@@ -19,15 +19,13 @@ from clrecon.system.arguments import as_numbers, explains_arguments
 from clrecon.system.base_classes import Message
 
 UNIT_LIMIT_MM = 1e9
-"""Largest unit distance in mm; its inverse is the smallest.  float32 can hold all values that a ray step computes from
-them."""
+"""Largest unit distance; its inverse is the smallest.  float32 holds all that a ray step computes from them."""
 
 HU_LIMIT = 1e6
 """Largest HU, far beyond any scale of CT values; float32 still distinguishes whole HU there."""
 
 END_STEP_HU = 1.0
-"""Distance by which `TransferFunction.range_hu` extends beyond a step at its end, so that both sides of it are
-included."""
+"""How far `TransferFunction.range_hu` extends beyond a step at its end, so that both sides of it are included."""
 
 COLUMNS = ("red", "green", "blue", "opacity")
 
@@ -161,11 +159,7 @@ class TransferFunction(Message):
 
     @property
     def range_hu(self) -> tuple[float, float]:
-        """HU beyond which the function is constant: those of the first and last point, and ``END_STEP_HU`` more at a
-        step.
-
-        The first is always lower than the second.
-        """
+        """HU beyond which the function is constant, the lower first: ``END_STEP_HU`` more where it ends in a step."""
         hu = self._points[:, 0]
         low, high = float(hu[0]), float(hu[-1])
         alone = hu.size == 1
@@ -385,10 +379,7 @@ VERSION = 1
 def transfer_text(
     head: Mapping[str, Any], points: Sequence[Sequence[float]], gradient_opacity: Sequence[Sequence[float]] | None
 ) -> str:
-    """Return a transfer function as text; reading it gives the same function, bit for bit.
-
-    head: Name, description, unit distance and lighting, by the names of the format.
-    """
+    """Return a transfer function as text, its `head` first; reading it gives the same function, bit for bit."""
     first = {"format": FORMAT, "version": VERSION, **head}
     fields = [f'  "{key}": {json.dumps(value)}' for key, value in first.items()]
     fields.append(_rows_text("points", [{"hu": row[0], "color": row[1:4], "opacity": row[4]} for row in points]))

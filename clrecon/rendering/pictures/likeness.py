@@ -21,7 +21,6 @@ WINDOW = 7
 """Edge of the window of SSIM, pixels."""
 
 RANGE = 255.0
-"""Range of the values of pixels."""
 
 SHIFT = 5
 """Pixels by which the shifted control picture is moved."""

@@ -60,10 +60,7 @@ _BESIDE = {
     "turntable": _CAMERAS,
     "meshes": ("dvr", "surface", "slices", "points", "mesh"),
 }
-"""Keywords that are not fields of a style, and the modes in which each is allowed.
-
-They place the camera, ask for further outputs, or set a look for several pictures.  Some modes accept a look without
-using it."""
+"""Keywords that are not fields of a style, and the modes that allow each; some accept a look without using it."""
 
 
 _ALONE = {"keep_air": ("minip",)}

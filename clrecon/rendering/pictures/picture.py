@@ -115,10 +115,7 @@ class Rendering(PictureData):
 
     @explains_arguments
     def annotated(self, *, letters: bool = False, scale_bar: bool = False, caption: str | None = None) -> Rendering:
-        """Return the same picture with sides of the patient, a scale bar or a line of text.
-
-        See ``clrecon.rendering.pictures.annotations.annotate``.
-        """
+        """Return the same picture with sides, a scale bar or a line, see `clrecon.rendering.pictures.annotations`."""
         from clrecon.rendering.pictures.annotations import annotate
 
         image = annotate(self, letters=letters, scale_bar=scale_bar, caption=caption)
@@ -288,7 +285,6 @@ def _finite(depth: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 IMAGE_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".tif": "TIFF", ".tiff": "TIFF"}
-"""Pillow's name of the format, by extension."""
 
 FLOAT_FORMATS = (".npy", ".tif", ".tiff")
 

@@ -12,10 +12,7 @@ if TYPE_CHECKING:
 
 
 def load_pillow() -> None:
-    """Make ``from PIL import ...`` work from here on.
-
-    The command line hides Pillow by an entry of None in `sys.modules`, because pydicom would load it without need.
-    """
+    """Make ``from PIL import ...`` work from here on, where the command line hides Pillow from pydicom."""
     if sys.modules.get("PIL", load_pillow) is None:
         del sys.modules["PIL"]
     try:

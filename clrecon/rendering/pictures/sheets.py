@@ -99,11 +99,7 @@ BACKGROUND = 24
 
 @dataclass(frozen=True)
 class Stroke:
-    """A line or circle on a panel, in mm from the panel's centre: x to the right, y down.
-
-    points: ndarray, shape (n, 2). Corners of a line; of a circle its centre alone.
-    radius_mm: Of a circle; 0 for a line.
-    """
+    """A line, or a circle about a point, on a panel, in mm from the panel's centre: x to the right, y down."""
 
     points: NDArray[np.float64]
     color: tuple[int, int, int]
@@ -187,10 +183,7 @@ _TEXT_SHARE, _SMALLEST_TEXT = 1 / 36, 9.0
 
 
 def add_scale(picture: Rendering, scale: ColorScale, title: str) -> Rendering:
-    """Return an opaque picture with a strip at its right: the colours, their numbers and a title, such as ``mm``.
-
-    Only its image grows: depth and camera stay those of the left part.
-    """
+    """Return an opaque picture with a scale at the right of its image; depth and camera stay those of the left."""
     load_pillow()
     from PIL import Image, ImageDraw
 

@@ -44,7 +44,6 @@ DEFAULT_ISO_VALUE = 200.0
 """Iso value of surfaces in HU: bone, including the thin cortex of vertebrae."""
 
 DEFAULT_COLOR = "bone"
-"""Colour of surfaces without labels."""
 
 DEFAULT_OPACITY = 0.5
 """Opacity of a slice in space: the front slices are bright, and the third still gives an eighth of its light."""

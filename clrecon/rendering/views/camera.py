@@ -33,8 +33,7 @@ TURN_STEP = 5
 """Step in degrees between the tested directions of a turning camera."""
 
 RADII_AWAY = 2.0
-"""Distance of a parallel camera from the centre, in radii of the volume: outside it, but near, so that depths keep
-their digits."""
+"""Distance of a parallel camera from the centre, in radii of the volume: outside, but near, as depths lose digits."""
 
 
 class CameraBasis(NamedTuple):

@@ -26,7 +26,6 @@ DIRECTIONS: dict[str, tuple[float, float, float]] = {
 """Unit vectors in LPS, from the middle of the patient to each side; the view of that name is taken from there."""
 
 DEFAULT_SIZE = (1024, 1024)
-"""Width and height of a picture for which none are given."""
 
 LARGEST_SIDE = 16384
 """Largest number of pixels along a side of a picture; more is a typing error."""
@@ -132,18 +131,14 @@ def _find_angles(view: str | Sequence[float]) -> tuple[float, float]:
 ANTERIOR = "anterior"
 
 SLICES_VIEWS = ("30,30", "-60,30", "75,-30")
-"""Views of slices in space, the first of which shows slices across any axis of the patient.  No plane holds all three
-directions, so slices that are edge-on in one of them show in another."""
+"""Views of slices in space, the first for any axis.  Slices that are edge-on in one of them show in another."""
 
 LEAST_COSINE = 0.25
 """Slices are shown by a view where its cosine to their normal is at least this: a quarter of their height is seen."""
 
 
 def default_view(mode: str, grid: Grid) -> str:
-    """Return the view of a mode in `render`: anterior, and for slices in space one from which they show.
-
-    That is the first of `SLICES_VIEWS` that shows the slices of the volume well, else the one that shows them best.
-    """
+    """Return the view of a mode in `render`: anterior, and for slices in space one from which they show."""
     if mode != "slices":
         return ANTERIOR
     normal = np.cross(grid.affine[:3, 0], grid.affine[:3, 1])

@@ -113,8 +113,7 @@ def slab_samples(volume: Volume, thickness: float) -> SlabSamples:
 
 
 PLANES = {"axial": "inferior", "coronal": "anterior", "sagittal": "left"}
-"""The anatomical planes, and the views that show them as radiologists do: the patient's left is at the right of axial
-and coronal slices, the front at the left of sagittal ones."""
+"""Planes, and the views that show them as radiologists do: the patient's left or front at the right or left."""
 
 
 def find_plane(

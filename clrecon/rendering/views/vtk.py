@@ -13,8 +13,7 @@ from clrecon.rendering.views.directions import checked_size
 Point = Sequence[float]
 
 NEAR_AND_FAR = (0.01, 100.0)
-"""Clipping range of a PyVista camera in distances to its focal point, until the scene sets its own.  VTK's default ends
-at 1000 mm, in the middle of a patient."""
+"""Clipping range of a PyVista camera in distances to its focal point; VTK's default ends in the middle of a patient."""
 
 
 def parameters_from_vtk(source: Any, size: Sequence[int] | None = None) -> dict[str, Any]:

@@ -46,7 +46,6 @@ SMALLEST_SIDE = 64
 """Pixels of the shorter side of a coarse picture."""
 
 COARSE_STEP_VOXELS = 2.0
-"""Ray step of coarse pictures by volume rendering."""
 
 MOST_FOUND = 6
 """Sets of parts that are kept, of all views together."""
@@ -151,10 +150,7 @@ class Painter(Stage):
     # Places
 
     def pick(self, state: ViewState, size: Sequence[int], x: float, y: float) -> Pick | None:
-        """Return what is seen at a place of the picture, None where nothing is: the nearest object on one ray.
-
-        x, y: Pixels from the top left corner of a picture of this (width, height); the first centre is (0.5, 0.5).
-        """
+        """Return what is seen at a pixel (x, y) from the top left corner of a picture of this size, or None."""
         camera = pixel_camera(state.camera, checked_size(size), x, y)
         nearest: tuple[float, _Drawn] | None = None
         with self.lock:
@@ -211,10 +207,7 @@ class Painter(Stage):
             return renderer.render(CurveCut(list(state.curve), window=state.window), size=checked_size(size))
 
     def prepare(self, progress: Progress | None = None) -> None:
-        """Build the kernels of the surface picture, the slices and the extraction.
-
-        The second extraction from a volume uses bricks, whose kernels would be built at the first move of the slider.
-        """
+        """Build the kernels of surfaces, slices and extraction, and of bricks, which the second extraction uses."""
         warm_kernels(self.objects, self.device, progress)
 
     def make_coarse(self, cancelled: Callable[[], bool] = never) -> None:

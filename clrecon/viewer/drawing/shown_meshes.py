@@ -25,10 +25,7 @@ TRIANGLES_A_CELL = 2.0
 
 
 def coarsen_mesh(mesh: Mesh, triangles: int) -> Mesh:
-    """Return a mesh with about as many triangles: vertices that share a cell become one, in their mean place.
-
-    It is for pictures alone: thin walls close up, and it is not manifold (Rossignac and Borrel 1993).
-    """
+    """Return a coarse mesh for pictures: vertices that share a cell become one (Rossignac and Borrel 1993)."""
     vertices = mesh.vertices.astype(np.float64)
     cell = float(np.sqrt(TRIANGLES_A_CELL * mesh.area / triangles))
     low = vertices.min(axis=0)
@@ -207,10 +204,7 @@ def clip_volume(volume: Volume, clip: Clip, iso_value: float) -> Volume:
 
 
 def number_vertices(mesh: Mesh, volume: Volume, iso_value: float, voxels: NDArray) -> NDArray:
-    """Return for each vertex of an iso surface of `volume` the number of the voxel that is inside at its edge.
-
-    voxels: ndarray, shape (nk, nj, ni). Numbers.
-    """
+    """Return for each vertex of an iso surface of `volume` the number of the voxel that is inside at its edge."""
     level = choose_iso_rule(volume, iso_value).iso_level
     ijk = volume.lps_to_ijk(mesh.vertices)
     near = np.rint(ijk)

@@ -129,8 +129,7 @@ def _warm_mesh(device: Device) -> None:
 
 
 MOST_FOUND, MOST_FOUND_BYTES = 6, 1 << 29
-"""Sets of parts that are kept, of all views together, and the bytes of their label maps; two are kept whatever their
-size."""
+"""Sets of parts kept, of all views together, and bytes of their label maps; two are kept whatever their size."""
 
 
 class Stage(Closing):

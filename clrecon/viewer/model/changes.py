@@ -38,10 +38,7 @@ def fit_camera(
 
 
 def plane_step(scans: Sequence[ShownScan], plane: str) -> Float64Array:
-    """Return the step from one slice of a plane to the next, away from the eye: (3,) in mm.
-
-    It is the distance of the first scan's voxels along its axis that is nearest to the normal; 1 mm without a scan.
-    """
+    """Return the step (3,) in mm to a plane's next slice, away from the eye: a voxel of the first scan, or 1 mm."""
     normal = -np.array(DIRECTIONS[PLANES[plane]])
     if not scans:
         return normal
@@ -86,10 +83,7 @@ def pan_camera(camera: Camera, dx: float, dy: float) -> Camera:
 
 
 def zoom_camera(camera: Camera, factor: float, at: tuple[float, float] = (0.0, 0.0)) -> Camera:
-    """Show everything `factor` times as large; what is seen at a place of the picture stays there.
-
-    at: From the middle of the picture, in shares of its height.
-    """
+    """Show everything `factor` times as large; what is seen at a place, in heights from the middle, stays there."""
     if not (math.isfinite(factor) and factor > 0.0):
         raise UsageError(f"the factor of a zoom is a number above 0, not {factor!r}")
     before = _height_mm(camera)
@@ -104,10 +98,7 @@ def zoom_camera(camera: Camera, factor: float, at: tuple[float, float] = (0.0, 0
 
 
 def pixel_camera(camera: Camera, size: tuple[int, int], x: float, y: float) -> Camera:
-    """Return a camera whose picture of one pixel is seen along the ray of a place in this camera's picture.
-
-    x, y: Pixels from the top left corner; the first pixel's centre is (0.5, 0.5).
-    """
+    """Return a camera whose picture of one pixel is what this one sees at a place; the first pixel is at (0.5, 0.5)."""
     right, up, forward = camera.basis()
     width, height = size
     pixel = 2.0 * camera.half_height() / height
@@ -126,7 +117,6 @@ def _height_mm(camera: Camera) -> float:
 
 
 MOST_UNDO = 200
-"""Changes that can be taken back."""
 
 SAME_GESTURE_S = 1.0
 """Changes of one kind that follow each other within this time are one step of undo."""
@@ -265,10 +255,7 @@ class ChangingView:
         self._change_part(part, f"the opacity of {part.name}", f"opacity {key}", opacity=opacity)
 
     def take_parts(self, found: Sequence[FoundParts]) -> None:
-        """Take the parts of scans that were found; those that were hidden, coloured or translucent stay so.
-
-        This is not a step of undo: nothing else is seen than before.
-        """
+        """Take the parts that were found, with the looks of those that were there; not a step of undo."""
         numbers = {each.scan for each in found}
         kept = [each for each in self.state.parts if each.is_whole or each.object not in numbers]
         for one in found:

@@ -209,10 +209,7 @@ class ViewModel(ChangingView):
     # Clips
 
     def add_clip(self, direction: str | Sequence[float]) -> None:
-        """Cut with a plane half way along a direction; the side that the direction points to is taken away.
-
-        direction: A side of the patient, "view" for the side of the camera, or a vector in LPS.
-        """
+        """Cut half way along a direction: "view" (to the camera), a side or LPS; what is there is taken away."""
         if direction == "view":
             direction = (-self.camera.basis().forward).tolist()
         towards, name = clip_direction(direction)

@@ -71,10 +71,7 @@ def find_modes() -> dict[str, ViewMode]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShownObject:
-    """One input of a view, in LPS mm.  It does not change.
-
-    name: Shown in lists.  No file name: it can hold the name of a patient.
-    """
+    """One input of a view, in LPS mm.  Its name is shown and no file's, which can hold the name of a patient."""
 
     kind: ClassVar[str]
     number: int
@@ -146,10 +143,7 @@ def show_objects(
     names: Sequence[str] = (),
     said: Sequence[Sequence[str]] = (),
 ) -> list[ShownObject]:
-    """Number and name what was read or made; a label map belongs to the first scan, if there is one.
-
-    names: Those that are missing or empty are "scan 1", "mesh 2" and so on.
-    """
+    """Number and name what was read or made, "scan 1" by default; a label map belongs to the first scan."""
     if not subjects:
         raise UsageError("there is nothing to show")
     scan = next((number for number, each in enumerate(subjects, start=1) if isinstance(each, Volume)), None)

@@ -100,10 +100,7 @@ def find_clusters(
     *,
     lock: AbstractContextManager[Any] | None = None,
 ) -> FoundParts:
-    """Find the parts of a scan; voxels at the iso value and above are inside.
-
-    lock: Held while the device works, which is not most of the time.
-    """
+    """Find the parts of a scan, voxels at the iso value and above; `lock` is held while the device works."""
     tell, volume = progress or ignore_progress, resident.volume
     tell("parts", 0, STEPS)
     with lock or nullcontext():
@@ -217,11 +214,7 @@ def _box_of(volume: Volume, low: Sequence[int], high: Sequence[int]) -> Box:
 
 
 def carry_looks(old: Sequence[ShownPart], found: FoundParts) -> list[ShownPart]:
-    """Return found parts with the looks of those before them at another iso value.
-
-    A part is known again by a place within it; one that was hidden, coloured or translucent gives its look to the part
-    that holds this place now.
-    """
+    """Return found parts with the looks that parts had at another iso value, known again by a place within."""
     fresh = {part.number: part for part in found.parts}
     for part in sorted(old, key=lambda each: -(each.count or 0)):
         if part.is_plain:

@@ -68,10 +68,7 @@ def _or_none(check: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 @dataclass(frozen=True)
 class Command:
-    """A command, with the checks of arguments that it needs and takes.
-
-    call: Called with the session and the checked arguments; a mapping that it returns is added to the facts.
-    """
+    """A command, with the checks of its arguments; `call` gets the session and these, and may return further facts."""
 
     words: str
     needs: Mapping[str, Callable[[Any], Any]]
@@ -268,7 +265,6 @@ _HINTS = {
     "only": "Click the part to keep.",
     "hide": "Click the parts to hide, then end.",
 }
-"""What is to be done next, for each tool."""
 
 _SLICE_WINDOWS = ("bone", "soft", "lung", "brain")
 

@@ -37,10 +37,7 @@ def picture_key(state: ViewState, view: str) -> Hashable:
 
 
 def seen_pieces(rendering: Rendering, lines: Sequence[Float64Array], *, expected: bool) -> list[list[list[float]]]:
-    """Return the pieces of lines (n, 3) in LPS mm that nothing in a picture hides, each as its first and last point.
-
-    expected: True where the picture has no surface: the expected depth counts.
-    """
+    """Return the ends of the pieces of lines (n, 3) that nothing in a picture hides, by its depths or expected ones."""
     camera, size = rendering.camera, rendering.size
     assert camera is not None
     depth = rendering.expected_depth if expected else rendering.depth
