@@ -163,6 +163,15 @@ def test_the_trial_run_launches_the_kernels_of_the_cortex(labels, device, monkey
     assert launched == {"sample_profiles", "fit_profiles", "mark_crossings"}
 
 
+def test_a_print_lies_on_the_bone(shell, tmp_path, capsys):
+    """A ball with a radius of 13 mm, once marrow is filled; 200 HU makes it more than 10 % larger."""
+    shell.save(tmp_path / "ct.nii.gz")
+    given = (tmp_path / "ct.nii.gz", "-o", tmp_path / "a.stl", "--for", "print", "--surface", "cortex")
+    assert run(*given) == 0, capsys.readouterr().err
+    ball = 4.0 * np.pi / 3e3 * 13.0**3
+    assert clrecon.read_mesh(tmp_path / "a.stl").quality()["volume_ml"] == pytest.approx(ball, rel=0.02)
+
+
 def test_a_dry_specimen_wants_a_low_level(shell, tmp_path, capsys):
     """The same shell in air, with air within it: at 200 HU a thin wall would be lost, which is said."""
     dry = shell.voxels.astype(float)
