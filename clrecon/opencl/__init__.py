@@ -14,6 +14,7 @@ from clrecon.opencl.arrays import (
     download_all,
     empty_output,
     memory_limits,
+    require_room,
     result_pages,
     upload,
 )
@@ -65,6 +66,7 @@ __all__ = [
     "memory_limits",
     "read_kernel_source",
     "remembered_fault",
+    "require_room",
     "result_pages",
     "settle",
     "take_device",

@@ -94,6 +94,13 @@ def describe_shortage(limits: MemoryLimits, buffers: Mapping[str, int]) -> str:
     return f"this needs {_mib(total, up=True)} on the device ({parts}): {limits.describe()}"
 
 
+def require_room(limits: MemoryLimits, buffers: Mapping[str, int], consequence: str) -> None:
+    """Refuse work whose `buffers` do not fit; `consequence` says what cannot be done."""
+    shortage = describe_shortage(limits, buffers)
+    if shortage:
+        raise DeviceMemoryError(f"{consequence}: {shortage}")
+
+
 def check_budget(
     device: Device, buffers: Mapping[str, int], memory: int | None = None, *, less_may_fit: bool = False
 ) -> int:

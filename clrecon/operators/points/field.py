@@ -25,6 +25,7 @@ from clrecon.opencl import (
     launch,
     load_program,
     memory_limits,
+    require_room,
     result_pages,
     upload,
 )
@@ -107,9 +108,7 @@ class _Decision:
         launch(self.device, self._program[kernel], items, **arguments)
 
     def _check(self, what: str, size: int) -> None:
-        shortage = describe_shortage(self._limits, {"field": self._taken, what: size})
-        if shortage:
-            raise DeviceMemoryError(f"the inside of the cloud cannot be found: {shortage}")
+        require_room(self._limits, {"field": self._taken, what: size}, "the inside of the cloud cannot be found")
 
     def find_runs(self) -> _Runs:
         masks, rows = self.masks, self.masks.rows
@@ -359,9 +358,7 @@ class NodeField:
     def _check_first(self, device: Device, plan: GridPlan) -> None:
         n = len(plan.points)
         needs = {**plan.needs(device), **self._kept(n), "normals as given": 12 * n, "nodes": self.nodes.layer_bytes}
-        shortage = describe_shortage(self.limits, needs)
-        if shortage:
-            raise DeviceMemoryError(f"no surface can be made of the cloud: {shortage}")
+        require_room(self.limits, needs, "no surface can be made of the cloud")
 
     def _sort_normals(self, normals: NDArray[np.float32]) -> tuple[Any, Any, Any]:
         n = self.grid.n

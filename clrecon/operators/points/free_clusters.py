@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clrecon.errors import DeviceMemoryError, UsageError
+from clrecon.errors import UsageError
 from clrecon.opencl import (
     Device,
     Program,
     Stopwatch,
     allocate,
     check_memory,
-    describe_shortage,
     download,
     empty_output,
     kernel_constant,
     launch,
     load_program,
     memory_limits,
+    require_room,
     take_device,
     with_fallback,
 )
@@ -174,9 +174,8 @@ def find_clusters(
     The result does not depend on `per_chunk`, the cells of a chunk, a multiple of `CELLS_AN_ITEM`.
     """
     n = len(plan.points)
-    shortage = describe_shortage(memory_limits(device, memory), {**plan.needs(device), "clusters": 23 * n})
-    if shortage:
-        raise DeviceMemoryError(f"the clusters of the points cannot be found: {shortage}")
+    needs = {**plan.needs(device), "clusters": 23 * n}
+    require_room(memory_limits(device, memory), needs, "the clusters of the points cannot be found")
     grid = fill_grid(device, plan, memory=memory)
     progress("clusters", 1, 4)
     search = ClusterSearch(device, grid, eps, min_samples, per_chunk)

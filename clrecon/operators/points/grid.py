@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
+from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry.vertices import is_far
 from clrecon.opencl import (
     Device,
     Program,
     allocate,
-    describe_shortage,
     kernel_constant,
     kernel_number,
     launch,
     load_program,
     memory_limits,
+    require_room,
     upload,
     wait,
 )
@@ -204,9 +204,7 @@ def make_grid(device: Device, points: ArrayLike, edge: float, *, memory: int | N
 
 def fill_grid(device: Device, plan: GridPlan, *, memory: int | None = None) -> PointGrid:
     """Sort the points of a plan by cells; see `make_grid`."""
-    shortage = describe_shortage(memory_limits(device, memory), plan.needs(device))
-    if shortage:
-        raise DeviceMemoryError(f"the points cannot be sorted by cells: {shortage}")
+    require_room(memory_limits(device, memory), plan.needs(device), "the points cannot be sorted by cells")
     program, n, total = prepare_grid(device), len(plan.points), plan.total_words
     if device.most_steps is not None and n > device.most_steps // STEPS_A_POINT:
         device.remark(

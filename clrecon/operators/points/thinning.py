@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clrecon.errors import DeviceMemoryError, UsageError
+from clrecon.errors import UsageError
 from clrecon.opencl import (
     Device,
     Program,
     Stopwatch,
     allocate,
     check_memory,
-    describe_shortage,
     download,
     empty_output,
     launch,
     load_program,
     memory_limits,
+    require_room,
     take_device,
     upload,
     with_fallback,
@@ -42,9 +42,7 @@ REASON = "thinned"
 def choose_points(device: Device, plan: GridPlan, *, memory: int | None = None) -> NDArray[np.uint32]:
     """Return the number of the point nearest to the mean of each cell with points, in the order of the cells."""
     needs = {**plan.needs(device), "chosen points": 4 * len(plan.points)}
-    shortage = describe_shortage(memory_limits(device, memory), needs)
-    if shortage:
-        raise DeviceMemoryError(f"the cloud cannot be thinned: {shortage}")
+    require_room(memory_limits(device, memory), needs, "the cloud cannot be thinned")
     grid = fill_grid(device, plan, memory=memory)
     chosen, chosen_d = empty_output(device, (grid.cells,), np.uint32)
     program = load_program(device, "points/thin.cl")
@@ -153,9 +151,7 @@ def grow_cells(
 ) -> _Grown:
     """Find the cells that stay; parameters are those of `remove_sparse_cells`."""
     needs = {**plan.needs(device), "labels of cells": 9 * len(plan.points), "marks of points": len(plan.points)}
-    shortage = describe_shortage(memory_limits(device, memory), needs)
-    if shortage:
-        raise DeviceMemoryError(f"sparse cells cannot be found: {shortage}")
+    require_room(memory_limits(device, memory), needs, "sparse cells cannot be found")
     program = load_program(device, "points/sparse_cells.cl")
     grid = fill_grid(device, plan, memory=memory)
     labels = _label_cells(device, program, grid, fewest)

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.errors import DeviceMemoryError, UsageError
+from clrecon.errors import UsageError
 from clrecon.opencl import (
     Device,
     allocate,
-    describe_shortage,
     download,
     empty_output,
     launch,
     load_program,
     memory_limits,
+    require_room,
     upload,
 )
 from clrecon.operators.masks.runs import PARTS_PER_CORE, StencilTable, count_runs, join_runs, list_runs
@@ -117,9 +117,7 @@ class ClusterSearch:
 
     def _check_budget(self, more: dict[str, int]) -> None:
         needs = {**self._needs, **more}
-        shortage = describe_shortage(self._limits, needs)
-        if shortage:
-            raise DeviceMemoryError(f"the clusters of the voxels cannot be found: {shortage}")
+        require_room(self._limits, needs, "the clusters of the voxels cannot be found")
         self.device_bytes = max(self.device_bytes, sum(needs.values()))
 
     def _run(self, kernel: str, items: int, **arguments: Any) -> None:

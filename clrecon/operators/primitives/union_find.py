@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
+from clrecon.errors import DeviceError, UsageError
 from clrecon.opencl import (
     Device,
     Program,
     allocate,
-    describe_shortage,
     download,
     launch,
     load_program,
     memory_limits,
+    require_room,
     upload,
 )
 from clrecon.operators.primitives.scan import LARGEST_SCAN, Compacted, compact, exclusive_scan, prepare_compact
@@ -212,9 +212,7 @@ class _Search(_Rounds):
         super().__init__(device, allocate(device, labels), allocate(device, labels), vertex_count)
 
     def _check_budget(self, more: dict[str, int]) -> None:
-        shortage = describe_shortage(self._limits, {**self._buffers, **more})
-        if shortage:
-            raise DeviceMemoryError(f"the components of the mesh cannot be found: {shortage}")
+        require_room(self._limits, {**self._buffers, **more}, "the components of the mesh cannot be found")
 
     def find_roots(self) -> tuple[Any, Any]:
         """Run all rounds; return labels whose labels are all roots, and a free buffer, both (n,) uint32."""
