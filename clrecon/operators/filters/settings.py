@@ -34,7 +34,7 @@ class Window:
 
     offsets: ndarray, shape (n, 3), int32. Steps along i, j, k, the voxel itself among them.
     exponents: ndarray, shape (tables, n), float64. Logarithm to base 2 of the weight by distance: a row for each slice
-    where they are uneven, else one.
+        where they are uneven, else one.
     share: Weight of these taps over that of the `whole_taps` of the whole window.
     """
 

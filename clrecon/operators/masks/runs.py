@@ -50,7 +50,7 @@ class RowRuns:
 
     runs_d: buffer, (count, 2) uint16. First and last column, row by row; None before `list_runs`.
     row_counts_d: buffer, (2, rows + 1) uint32. First run of each row, and `count`; `count` and the voxels of all rows
-    before.
+        before.
     """
 
     runs_d: Any
@@ -99,7 +99,7 @@ def join_runs(
     listed: At least one run.
     forward: Rows behind the voxel, see `Stencil.forward`.
     check: Called with the number of pairs of runs in different parts before memory is taken for them: 12 bytes a pair
-    and 5 a run.
+        and 5 a run.
     parts_per_core: Of CPU devices; the numbers do not depend on it.
     """
     program = prepare_runs(device)

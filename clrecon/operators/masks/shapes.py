@@ -150,7 +150,7 @@ def spread_bits(device: Device, mask: VoxelMask, ball: Stencil, *, erode: bool =
     ball: For each slice the rows that its voxels look at; not only balls, but the voxel itself is among them.
     erode: Keep the voxels whose ball has no voxel that is not set; else set those whose ball has one that is set.
     beyond: What lies beyond the volume is set, else it is not.  The ball must then have its rows beyond, see
-    `whole_ball_of`, where it matters: of erosion with False, of dilation with True.
+        `whole_ball_of`, where it matters: of erosion with False, of dilation with True.
     """
     ni, nj, nk = mask.shape_ijk
     words = mask.words

@@ -56,7 +56,7 @@ class VoxelMask:
     mask_d: buffer, (nk, nj, words) uint32. Bit b of word w is voxel i = 32 w + b; the last `pad` words of a row are
         zeros.
     row_extents_d: buffer, (nk, nj, 2) uint16. First word of a row with a bit set, and the one after the last; 0, 0 in
-    rows without.
+        rows without.
     """
 
     mask_d: Any

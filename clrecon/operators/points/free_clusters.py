@@ -73,7 +73,7 @@ class FreeClusters:
     labels: ndarray, shape (n,), int32. Cluster of each point, numbered by the first core point; -1 is noise.
     cores: ndarray, shape (n,), bool.
     facts: For a report: eps, min_samples, clusters, core and noise points, edge and number of the grid's cells, the
-    device and the seconds of its kernels.
+        device and the seconds of its kernels.
     """
 
     labels: NDArray[np.int32]
@@ -121,8 +121,7 @@ def cluster_free_points(
     points; other points near core points take the lowest number among these; all others are noise, -1.
 
     points: Finite.  Distances are those of the points as float32, of far clouds relative to whole millimetres near
-        their
-    centre, and are compared as in exact arithmetic.
+        their centre, and are compared as in exact arithmetic.
     eps: mm.  Distances up to ``eps * (1 + 1e-6)`` are within.
     min_samples: From 1 on; 1 gives connected components.
     """

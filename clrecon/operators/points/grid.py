@@ -58,9 +58,9 @@ class GridPlan:
 
     points: ndarray, shape (n, 3), float32. mm relative to `base`.
     base: ndarray, shape (3,), float64. LPS mm: whole millimetres near the centre of a far cloud, see
-    `clrecon.geometry.vertices`, else zeros.
+        `clrecon.geometry.vertices`, else zeros.
     corner: ndarray, shape (3,), float32. Corner of cell (0, 0, 0) relative to `base`: the lowest coordinates less 1e-3
-    of the edge.
+        of the edge.
     edge: mm.
     shape: (nx, ny, nz)
     """
@@ -110,7 +110,7 @@ class PointGrid:
     order_d: buffer, (n,) uint32. Number of the point at each place of the sorted order; those of a cell as in the
         input.
     x_d, y_d, z_d: buffer, (n + PADDING,) float32. Sorted coordinates in mm relative to `base`; the last ones are
-    undefined, so that a vector can be read from any point on.
+        undefined, so that a vector can be read from any point on.
     """
 
     device: Device

@@ -59,7 +59,7 @@ class Selection:
 
     shell: Only those with one of six neighbours outside; beyond the volume all is outside.
     labels: ndarray, shape (nk, nj, ni), uint8 or uint16, or None. On the volume's grid: only voxels with `label`, or
-    with any number but 0 where it is 0.
+        with any number but 0 where it is 0.
     paper: Every slice is put where the first one lies.
     """
 

@@ -59,7 +59,7 @@ def join_parts(device: Device, labels_d: Any, spare_d: Any, n: int, links_d: Any
     Return their count, lone nodes counted, and the component of each node, (n,) int32, in order of the first node.
 
     labels_d: buffer, (n,) uint32. The smallest node of each node's component within its part, a root; of a lone node
-    its own number.  Overwritten.
+        its own number.  Overwritten.
     spare_d: buffer, (n,) uint32. The same of roots; all else is arbitrary.  Overwritten.
     links_d: buffer, (links, 3) uint32. Pairs (a, b, b) of roots that belong together.
     """
@@ -79,11 +79,11 @@ def hook_in_rounds(
     Return the same two buffers: labels that are all roots, the least node of each component, and a free one.
 
     labels_d: buffer, (n,) uint32. For each node a root, which is its own label, of its component and not above it; 2^32
-    - 1 for nodes that take no part.
+        - 1 for nodes that take no part.
     other_d: buffer, (n,) uint32. Overwritten.
     hook: Called with the labels, all of them roots; with a copy, in which it lowers the label of a root by atomic_min()
-    to another root of the same component; with two flags, of which it sets the second to the number that it is called
-    with where it finds such a root; and with that number.
+        to another root of the same component; with two flags, of which it sets the second to the number that it is
+        called with where it finds such a root; and with that number.
     """
     rounds = _Rounds(device, labels_d, other_d, n)
     rounds.start()

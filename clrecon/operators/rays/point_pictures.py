@@ -96,7 +96,7 @@ def draw_splats(
     points: ndarray, shape (n, 3), float32. Mm from `base`, else the origin, finite; at most 2^32 - 2.
     colors: ndarray, shape (n, 4), uint8. Red, green, blue, 255.
     normals: ndarray, shape (n, 3), float32. Unit vectors, LPS.  Without them points are shaded by what lies around
-    them, see cl/rays/splats.cl.
+        them, see cl/rays/splats.cl.
     radius_mm: Of the discs; on the picture it is at least 0.7 and at most 128 pixels.
     lighting: One that does not shade leaves the colours as they are.
     memory: A cloud over it goes through in parts, and gives the same picture.

@@ -76,8 +76,7 @@ class TransferTables:
     steepness: Steepness of `opacities_d`.
     low, scale: Nearest node to v: ``floor((v - low) * scale + 0.5)``.
     factors_d: buffer, (GRADIENT_NODES,). Factors on the opacity, by magnitude of the gradient times `factor_scale`;
-        used
-    if it is `weighed`.
+        used if it is `weighed`.
     steps_per_unit: Number of ray steps in the unit distance.
     """
 
@@ -157,9 +156,9 @@ class MainWay:
     """The main direction of a picture's rays through the bricks of a slab: `ahead` (1 or -1) along `axis`.
 
     eye: ndarray, shape (4,), float32. The camera in bricks, and 1; or the direction of all rays in bricks, 1 along
-    `axis`, and 0.
+        `axis`, and 0.
     aside: Distance in bricks from the camera, or drift to the side per brick ahead, from which on rays count as
-    drifting.
+        drifting.
     """
 
     axis: int

@@ -103,7 +103,7 @@ def draw_layers(
     """Draw triangles, with what lies before, between and behind them.
 
     parts: The first triangles of the first part have the lowest numbers: of triangles at the same depth they are
-    nearer.
+        nearer.
     still: A picture of the same camera: one further layer at its depth.
     volume: Adds what a volume shows between two layers to the states of the rays, and waits; called from front to back.
     near_mm: Where the volume's rays begin, see `VIEW_NEAR` in cl/rays/view.h.
@@ -281,10 +281,10 @@ class ScenePictures(Closing):
     shown by volume rendering or as slices.
 
     objects: sequence of (object, style). Mesh and MeshLook; PointCloud and PointLook; Volume or DeviceVolume and
-    VolumeLook, SlicesInSpace or SurfaceLook.  Their arrays must not change as long as this object is open.  Of
-    triangles at the same depth the first is seen.
+        VolumeLook, SlicesInSpace or SurfaceLook.  Their arrays must not change as long as this object is open.  Of
+        triangles at the same depth the first is seen.
     takers: What takes pictures of volumes and clouds alone, by the `id` of the object; the caller keeps it for its next
-    scenes and closes what is in it.  Objects are not looked at then, and there is no `box`.
+        scenes and closes what is in it.  Objects are not looked at then, and there is no `box`.
     """
 
     def __init__(

@@ -34,10 +34,10 @@ def cast_surface(resident: DeviceVolume, style: SurfaceLook, shot: Shot, ray_ste
     a clip plane with the plane's normal, so that cut bone is flat; at a camera inside, with the ray's direction.
 
     style: With `shadows`, a hit has only ambient light if the way from it to the fixed light meets something inside,
-    one ray step away or farther; translucent labels let their share through.  A hit in a label with opacity below 1 is
-    blended, and the ray continues: out of the inside to the next entry, or into the next label. The label of a hit is
-    that of the nearest inside voxel of its cell; as in meshes of labels, a voxel without one has that of the nearest of
-    the voxels around it.
+        one ray step away or farther; translucent labels let their share through.  A hit in a label with opacity below 1
+        is blended, and the ray continues: out of the inside to the next entry, or into the next label. The label of a
+        hit is that of the nearest inside voxel of its cell; as in meshes of labels, a voxel without one has that of the
+        nearest of the voxels around it.
     ray_step: Distance of samples, mm.  If the volume is processed in slabs, at most one slice.
     """
     rule = choose_iso_rule(resident.volume, style.iso_value, values=resident.values)

@@ -395,8 +395,8 @@ def take_contact_sheet(
     shown: The volume, or the box of what is left of it: slices beside it are left out, and tiles fit it.
 
     Returns: Without a camera and depths; ``report["pixel_mm"]`` and ``report["edges"]`` are those of all slices,
-    ``report["tiles"]`` has ``middle_lps_mm``, ``slice`` (number of its plane of voxels, or None), ``left`` and ``top``
-    (pixels) of each.
+        ``report["tiles"]`` has ``middle_lps_mm``, ``slice`` (number of its plane of voxels, or None), ``left`` and
+        ``top`` (pixels) of each.
     """
     job = CutJob(resident, style, ignore_progress)
     _, plane = plane_sheet(plane, size)

@@ -191,7 +191,7 @@ def compare_bricks(device: Device, ranges: BrickRanges, level: Any, ni: int, bor
 
     level: Lowest inside value.
     border: Word w begins at voxel ``32 * w - border``, and there are samples up to ``ni - 1 + border``. Samples beyond
-    the volume are ignored.
+        the volume are ignored.
     """
     _, bj, bk = ranges.shape
     words = -(-(ni + 2 * border) // 32)

@@ -58,16 +58,15 @@ class MethodRecord(Record):
     name, title, what, makes: See `clrecon.proof.compare.methods.Compared`.
     state: {"done", "failed", "declined", "missing"}
     first_s, warm_s: From voxels in memory to the result in memory, in a new process and again (median); no reading, no
-    drawing.
+        drawing.
     first_parts_s, warm_parts_s: By part: ``read``, ``build``, ``upload``, ``kernels``, ``host``, ``download``,
-    ``draw``.
+        ``draw``.
     kernels_ms: Of the warm run, as the device tells it; None without kernels.
     memory_bytes, memory_own_bytes: Most memory of its process, the interpreter and the scan included, and what of it
-        the
-    process did not have before it began.
+        the process did not have before it began.
     reasons: Why a measure is missing.
     small: Of ray casting: ``size``, ``first_s``, ``warm_s`` of a small picture, and ``scaled_s``, those of the full one
-    reckoned from it where it was not made.
+        reckoned from it where it was not made.
     """
 
     name: str

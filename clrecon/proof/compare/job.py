@@ -116,7 +116,7 @@ def make_comparison(
 
     source: See `clrecon.reading.read_volume`.
     output: Folder for ``index.html``, ``report.json`` and pictures: a new or empty one, or that of an earlier
-    comparison, which is replaced; with `no_clobber` a folder that holds anything stays and is an `OutputError`.
+        comparison, which is replaced; with `no_clobber` a folder that holds anything stays and is an `OutputError`.
     """
     settings = settings or CompareSettings()
     progress = progress or ignore_progress

@@ -35,7 +35,7 @@ def meets_box(corners: NDArray[np.float64], half: float) -> NDArray[np.bool_]:
     normal of the triangle, and the cross products of its edges with those of the cube.
 
     corners: ndarray, shape (n, 3, 3), float64. Triangle, corner, axis; relative to the middle of its cube, whose edges
-    are twice `half` long.
+        are twice `half` long.
     """
     x = np.ascontiguousarray(corners.transpose(1, 2, 0))  # corner, axis, triangle
     meets = ((x.min(axis=0) <= half) & (x.max(axis=0) >= -half)).all(axis=0)
@@ -139,7 +139,7 @@ class CellOverlap(Record):
 
     cells_outside: Cells of the surface outside of the grid and its border of one voxel.
     recall: Share of the reference's cells that the surface passes through: the repetition rate of characteristic voxels
-    of Liu et al. 2019.
+        of Liu et al. 2019.
     precision: Share of the surface's cells that are the reference's too.
     dice, jaccard: 2 common / (cells + reference cells); common / all cells of either.
     """

@@ -172,12 +172,13 @@ def make_phantom(
     Returns:
     voxels: ndarray, shape (nk, nj, ni), int16. HU; of several phases the first.
     affine: ndarray, shape (4, 4), float64. Index (i, j, k) to LPS mm, as the decimal strings of a written series give
-    it; of an uneven or gapped series that of the even one, and the truth has the positions.
+        it; of an uneven or gapped series that of the even one, and the truth has the positions.
     truth: Plain JSON types: ``kind, shape_ijk, affine_ijk_to_lps_mm, spacing_mm (di, dj, dk), tilt_deg, iso_value_hu``,
-    ``half_maximum_hu`` and ``surface`` (analytic shapes, else null), ``spine`` (centres of the vertebrae, the marker on
-    the patient's left and what is absent, else null), ``ghosts`` (the foreign slices, else null), ``parts`` (scenes:
-    each material with its label in `label_materials`, voxels, volume and voxels above 300 HU, else null), ``noise_hu,
-    point_spread_mm, seed, version, settings``; and ``series`` of one that is uneven, gapped or phased.
+        ``half_maximum_hu`` and ``surface`` (analytic shapes, else null), ``spine`` (centres of the vertebrae, the
+        marker on the patient's left and what is absent, else null), ``ghosts`` (the foreign slices, else null),
+        ``parts`` (scenes: each material with its label in `label_materials`, voxels, volume and voxels above 300 HU,
+        else null), ``noise_hu, point_spread_mm, seed, version, settings``; and ``series`` of one that is uneven, gapped
+        or phased.
     """
     placement = place_slices(settings)
     voxels, truth, _ = _make(settings, placement, progress)

@@ -101,7 +101,7 @@ class Part:
     """One solid of one of `MATERIALS`.
 
     distance: Takes x, y, z (float32, mm in the part's own frame) and gives the distance to the surface in mm, positive
-    inside.
+        inside.
     low, high: (x, y, z). Box that holds the part, in its own frame, mm.
     center: (x, y, z). Origin of the frame of the part, mm about the centre of the volume.
     axes: ndarray, shape (3, 3). Rows are the directions of that frame.

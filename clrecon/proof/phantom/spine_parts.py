@@ -107,7 +107,8 @@ class SpineChoice:
     """What is chosen of a spine: its levels, from top to bottom, its bend and its facets.
 
     kyphosis_deg, scoliosis_deg: Angle between the first and the last chosen level that is added to the natural one, in
-    the sagittal plane (positive: the back is round) and in the coronal plane (positive: the middle lies to the left).
+        the sagittal plane (positive: the back is round) and in the coronal plane (positive: the middle lies to the
+        left).
     facet_gap_mm: Distance of neighbouring vertebrae in their facet joints; None: the shapes' own, 2 mm and more.
     centred: True: the levels are put into the middle of the volume; False: T12 is, as without a choice.
     normal: (x, y, z). Normal of the slices.
@@ -268,7 +269,7 @@ class Vertebra:
     lumbar: 0 thoracic shape to 1 lumbar shape of the processes.
     waves: ndarray, shape (n, 5). Trabecular texture, see `clrecon.proof.phantom.fields.waves_at`.
     room: mm by which upper and lower articular processes lie farther apart than in a spine without a choice of levels,
-    in which neighbours nearly touch.
+        in which neighbours nearly touch.
     facets: ndarray, shape (m, 4). Balls (x, y, z, radius; local mm) that widen the upper articular processes.
     """
 
@@ -320,8 +321,7 @@ class Anatomy:
 
     half_width, half_depth: Half axes of the body outline about x = y = 0.
     curve_x, curve_y, curve_z: Polynomials (highest power first) in z / 100 mm: centre line of the vertebral bodies;
-        they
-    hold from the lower to the upper z of the last.
+        they hold from the lower to the upper z of the last.
     marker: Centre of the small metal ball on the patient's left.
     absent: Parts left out on purpose.
     centres: Middle of the body of every planned level, shown or not.

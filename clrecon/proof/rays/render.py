@@ -52,7 +52,7 @@ class RayPicture:
 
     rgba: Colours times opacity, and opacity; zero for modes that show values.
     depth: First hit, mm along the ray; NaN where nothing is hit.  In mip and minip the first place of the value; NaN in
-    mean and drr.
+        mean and drr.
     expected_depth: Mean depth, weighted by the opacity that each sample adds; in mip and minip the depth of the value.
     values: HU in mip, minip and mean, NaN outside of the volume; in drr mm of water, 0 there; NaN everywhere in dvr.
     """

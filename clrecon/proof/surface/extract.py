@@ -145,7 +145,7 @@ def extract_isosurface(
 
     closed: Surround the volume with outside.
     topology: {"separated", "trilinear"}. Keep inside corners apart that only meet across a face or cell, or join them
-    where the trilinear field does.
+        where the trilinear field does.
     vertex_rule: {"linear", "golden", "golden-search"}
     grown: Function from the samples that are inside, (gk, gj, gi), to the cells whose triangles are wanted; None: all.
     """
@@ -172,7 +172,7 @@ def extract_inside(
     others.
 
     hu_places: ndarray, shape (gk, gj, gi), bool. Where both samples of an edge are marked, HU place the vertex at the
-    iso level.  Elsewhere it lies half way, and its normal follows `inside`. None: HU place every vertex.
+        iso level.  Elsewhere it lies half way, and its normal follows `inside`. None: HU place every vertex.
     cells: ndarray, shape (gk - 1, gj - 1, gi - 1), bool. Cells whose triangles are wanted.
 
     Normals point down, and up where the surface ends a range at its upper end.
@@ -211,7 +211,7 @@ class CrossedEdges:
     """Edges of the sample grid between a sample inside and one outside, in the order of their vertices.
 
     numbers: ndarray, shape (gk, gj, gi, 3), int64. The vertex on the edge that a sample owns along each axis, where it
-    is crossed.
+        is crossed.
     near, far: tuple of three ndarray, shape (n,), int64. (k, j, i) of the owner and of the other end.
     """
 
@@ -251,9 +251,9 @@ def build_surface(
     """Place the vertices at the parts `t` of their edges, from the near end, and write the triangles.
 
     slope, next_slope: ndarray, shape (n, 3). Parts of the two ends in the gradient at the vertex, per step along i, j,
-    k; where their sum vanishes, the direction of the edge is used.
+        k; where their sum vanishes, the direction of the edge is used.
     cells_wanted: ndarray, shape (gk - 1, gj - 1, gi - 1), bool. Cells whose triangles are wanted, of the topology
-    "separated"; vertices of no triangle are left out then.
+        "separated"; vertices of no triangle are left out then.
     """
     (k, j, i), (k1, j1, i1), axis, numbers = edges.near, edges.far, edges.axis, edges.numbers
     slope, next_slope = slope.copy(), next_slope.copy()
