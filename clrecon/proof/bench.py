@@ -1,8 +1,6 @@
-"""The bench job: the speed of clrecon on this computer and this scan, stage by stage, beside VTK's flying edges.
-
-References
-----------
-Schroeder, Maynard and Geveci 2015 (10.1109/LDAV.2015.7348069); vtkFlyingEdges3D."""
+"""The bench job: the speed of clrecon on this computer and this scan, stage by stage, beside VTK's flying edges
+(Schroeder, Maynard and Geveci 2015, 10.1109/LDAV.2015.7348069; vtkFlyingEdges3D).
+"""
 
 from __future__ import annotations
 

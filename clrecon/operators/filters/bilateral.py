@@ -76,12 +76,11 @@ def prepare_near_level(device: Device, dtype: DTypeLike = np.int16) -> Program:
 def list_mixed_groups(
     device: Device, there: SlicesThere, dtype: DTypeLike, level: Any, reach: tuple[int, int, int]
 ) -> Compacted:
-    """List the groups of which some voxel has both sides of a level in the box around it: ``32 * row_words(ni) * (core
-    row) + group``, ascending.
+    """List the groups, ascending as ``32 * row_words(ni) * (core row) + group``, near which are both sides of a level.
 
     there: With all slices within reach of those that are worked on, as far as the volume has them.
     level: Lowest value inside; NaN is not.
-    reach: Half the size of the box along i, j, k, without the voxel in its middle; at most 16 along i.
+    reach: Half the size of the box around a voxel along i, j, k, without its middle; at most 16 along i.
     """
     program, words = prepare_near_level(device, dtype), row_words(there.ni)
     count, core_count = words * there.rows, words * there.core_rows

@@ -48,9 +48,8 @@ class StencilTable:
 class RowRuns:
     """Runs of set voxels along i, on a device; with `lone` each voxel is a run of its own.
 
-    runs_d: buffer, (count, 2) uint16. First and last column, row by row; None before `list_runs`.
-    row_counts_d: buffer, (2, rows + 1) uint32. First run of each row, and `count`; `count` and the voxels of all rows
-        before.
+    `runs_d`, (count, 2) uint16, are first and last columns, None before `list_runs`; `row_counts_d`, (2, rows + 1)
+    uint32, the first run of each row, and the voxels of all rows before, with both totals.
     """
 
     runs_d: Any
@@ -94,12 +93,10 @@ def join_runs(
     check: Callable[[int], None],
     parts_per_core: int = PARTS_PER_CORE,
 ) -> tuple[int, Any]:
-    """Number the components of runs that are neighbours by a stencil: (runs,) int32, in the order of their first runs.
+    """Number the components of runs, one at least, that are neighbours by a stencil: (runs,) int32, in their order.
 
-    listed: At least one run.
     forward: Rows behind the voxel, see `Stencil.forward`.
-    check: Called with the number of pairs of runs in different parts before memory is taken for them: 12 bytes a pair
-        and 5 a run.
+    check: Called with the number of pairs of runs in different parts before 12 bytes a pair and 5 a run are taken.
     parts_per_core: Of CPU devices; the numbers do not depend on it.
     """
     program = prepare_runs(device)
@@ -235,11 +232,7 @@ def mark_at_border(
 def mark_with_voxels(
     device: Device, found: Components, shape_ijk: tuple[int, int, int], voxels: NDArray[np.int32]
 ) -> tuple[Any, NDArray[np.int32]]:
-    """Return a buffer, (components,) uint8, with 1 for each component that holds one of `voxels`, and each voxel's
-    component, -1 where it is not set.
-
-    voxels: ndarray, shape (n, 3), int32. i, j, k within the volume.
-    """
+    """Mark the components, (components,) uint8, that hold one of `voxels`, i, j, k, and find that of each, or -1."""
     n = len(voxels)
     marks_d = zero_words(device, -(-found.count // 4))
     which, which_d = np.empty(n, np.int32), allocate(device, 4 * n)

@@ -54,10 +54,8 @@ ANY_NUMBER = 1 << 30
 
 
 def ball_of(volume: Volume, radius: float, *, by_slice: bool = False) -> Stencil:
-    """Return the voxels within ``radius * (1 + 1e-6)`` mm of a voxel, for each slice, as far as they are in the volume.
-
-    The places of the voxels count, those of oblique, tilted and uneven stacks too; with `by_slice` only the voxel's own
-    slice: a disc.
+    """Return the voxels within ``radius * (1 + 1e-6)`` mm of a voxel, by their places, in the volume or in its own
+    slice.
     """
     return _checked(make_stencil(Lattice.of(volume), radius), volume, radius, by_slice)
 

@@ -51,12 +51,10 @@ BAND = "voxels of a band"
 
 @dataclass(frozen=True)
 class VoxelMask:
-    """One bit for each voxel of a volume, on a device.
+    """One bit for each voxel of a volume, on a device; the last `pad` words of a row are zeros.
 
-    mask_d: buffer, (nk, nj, words) uint32. Bit b of word w is voxel i = 32 w + b; the last `pad` words of a row are
-        zeros.
-    row_extents_d: buffer, (nk, nj, 2) uint16. First word of a row with a bit set, and the one after the last; 0, 0 in
-        rows without.
+    `row_extents_d`, (nk, nj, 2) uint16, are the first word of a row with a bit set, and the one after the last, or 0,
+    0.
     """
 
     mask_d: Any

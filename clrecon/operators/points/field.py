@@ -179,8 +179,7 @@ class _Decision:
 def decide_signs(
     masks: Masks, limits: MemoryLimits, rounds: int, *, memory: int | None = None, taken: int = 0
 ) -> Signs:
-    """Decide which nodes are inside, signs flooding `rounds` nodes from a far one on; see its twin in
-    `clrecon.proof.points.field`.
+    """Decide which nodes are inside, signs flooding `rounds` nodes; see its twin in `clrecon.proof.points.field`.
 
     The `negative_d` of the masks is used up; `taken` are bytes that are taken already, those of the masks among them.
     """

@@ -68,12 +68,8 @@ CELLS_AN_ITEM = 32
 
 @dataclass(frozen=True, eq=False)
 class FreeClusters:
-    """The result of `cluster_free_points`.
-
-    labels: ndarray, shape (n,), int32. Cluster of each point, numbered by the first core point; -1 is noise.
-    cores: ndarray, shape (n,), bool.
-    facts: For a report: eps, min_samples, clusters, core and noise points, edge and number of the grid's cells, the
-        device and the seconds of its kernels.
+    """The result of `cluster_free_points`: clusters, numbered by their first core point, -1 for noise, and facts for a
+    report.
     """
 
     labels: NDArray[np.int32]
@@ -167,8 +163,7 @@ def find_clusters(
     memory: int | None = None,
     progress: Progress = ignore_progress,
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_], int, int]:
-    """Cluster the points of a plan that `plan_cells` made for `eps`; return labels (int32), cores (bool), the number of
-    clusters and that of cells with points.
+    """Return labels, cores, and the number of clusters and of cells of a plan that `plan_cells` made for `eps`.
 
     The result does not depend on `per_chunk`, the cells of a chunk, a multiple of `CELLS_AN_ITEM`.
     """

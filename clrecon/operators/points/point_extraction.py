@@ -88,9 +88,7 @@ def _double_float(values: NDArray[np.float64]) -> NDArray[np.float64]:
 class VoxelEmission:
     """The points of one volume, slab by slab, with fewer slices in a slab if the device has no room for more.
 
-    origin: ndarray, shape (3,), float64, or None. The point that positions are counted from, see `find_vertex_origin`.
-    marked: Voxels in the band, before labels and shells take some away.
-    largest: Bytes on the device of the largest slab: "volume", "scratch", "output".
+    `marked` voxels are in the band, before labels and shells take some away; positions are counted from `origin`.
     """
 
     resident: DeviceVolume

@@ -54,13 +54,10 @@ def label_components(
 
 
 def join_parts(device: Device, labels_d: Any, spare_d: Any, n: int, links_d: Any, links: int) -> tuple[int, Any]:
-    """Number the components of nodes that are joined within parts already, once the parts are joined by pairs.
+    """Number the components of nodes, (n,) int32, that are joined within parts, once the parts are joined by pairs.
 
-    Return their count, lone nodes counted, and the component of each node, (n,) int32, in order of the first node.
-
-    labels_d: buffer, (n,) uint32. The smallest node of each node's component within its part, a root; of a lone node
-        its own number.  Overwritten.
-    spare_d: buffer, (n,) uint32. The same of roots; all else is arbitrary.  Overwritten.
+    labels_d, spare_d: buffer, (n,) uint32. The smallest node of each node's component within its part, a root, or of a
+        lone node its own number; the same of roots, and anything else.  Overwritten.
     links_d: buffer, (links, 3) uint32. Pairs (a, b, b) of roots that belong together.
     """
     rounds = _Rounds(device, labels_d, spare_d, n)

@@ -35,11 +35,9 @@ ENDLESS = 1e30
 
 @dataclass(frozen=True)
 class RayView:
-    """The rays of a picture in the form for a device: a table, (rows, 4) float32, `planes` of whose rows are clip
-    planes.
+    """The rays of a picture for a device: a table, (rows, 4) float32, with `planes` rows of clip planes at its end.
 
-    `spread`, (3,) float64, is the largest distance in field coordinates between a ray of a tile and the one in its
-    middle, plus one ray step.
+    `spread` is the largest distance in field coordinates between a ray of a tile and its middle one, plus a ray step.
     """
 
     camera: Camera

@@ -155,10 +155,8 @@ class TransferTables:
 class MainWay:
     """The main direction of a picture's rays through the bricks of a slab: `ahead` (1 or -1) along `axis`.
 
-    eye: ndarray, shape (4,), float32. The camera in bricks, and 1; or the direction of all rays in bricks, 1 along
-        `axis`, and 0.
-    aside: Distance in bricks from the camera, or drift to the side per brick ahead, from which on rays count as
-        drifting.
+    eye: The camera in bricks, and 1; or the direction of all rays in bricks, 1 along `axis`, and 0.
+    aside: Distance in bricks from the camera, or drift a brick ahead, from which on rays count as drifting.
     """
 
     axis: int
@@ -200,10 +198,8 @@ def composite_slab(
     stopwatch: Stopwatch,
     between: Between | None = None,
 ) -> None:
-    """Blend one slab, with the view of its focus and its leaps, into a picture with the results of earlier slabs, and
-    wait.
-
-    Of a part of the rays, `between`, only the states of `output` are written.
+    """Blend one slab into a picture, and wait; of a part of the rays, `between`, only the states of `output` are
+    written.
     """
     device = resident.device
     variants = {"GRADIENT_OPACITY": "1"} if tables.weighed else {}

@@ -72,11 +72,8 @@ class LeapMap:
 class RaySlab:
     """Slices ``first_k`` to ``end_k - 1`` of a volume on the device, at least two along each axis.
 
-    shape_ijk: That of the buffer.
-    low_k, high_k: Samples with ``low_k <= k < high_k`` are this slab's.
-    stage: Bit 0: the first slab that a picture goes through, bit 1: the last.
-    ranges_d: See `measure_cells`.
-    maps: Leap maps by their keys.
+    Samples with ``low_k <= k < high_k`` are its own; bit 0 of `stage` is set in the first slab of a picture, 1 in the
+    last.
     """
 
     voxels_d: Any
@@ -244,8 +241,7 @@ def measure_cells(resident: DeviceVolume, slab: RaySlab) -> Any:
 def find_leaps(
     resident: DeviceVolume, slab: RaySlab, key: Any, shown: NDArray[np.bool_], low: float, scale: float
 ) -> LeapMap:
-    """Return the leap map for visible values, or the map that was made for `key`, which tells the source of `shown`,
-    before.
+    """Return the leap map for visible values, or the one that was made for `key`, which tells the source of `shown`.
 
     The visible nodes, (nodes,) bool, are those of a table; nearest to a value v is ``floor((v - low) * scale + 0.5)``.
     """

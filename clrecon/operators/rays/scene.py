@@ -102,13 +102,11 @@ def draw_layers(
 ) -> LayeredPicture:
     """Draw triangles, with what lies before, between and behind them.
 
-    parts: The first triangles of the first part have the lowest numbers: of triangles at the same depth they are
-        nearer.
+    parts: Of triangles at the same depth those of lower numbers are nearer, the first of the first part first.
     still: A picture of the same camera: one further layer at its depth.
     volume: Adds what a volume shows between two layers to the states of the rays, and waits; called from front to back.
     near_mm: Where the volume's rays begin, see `VIEW_NEAR` in cl/rays/view.h.
-    most: Most layers.
-    progress: Called as ``progress("layers", done, most)`` before each layer.
+    most: Most layers; there is progress before each.
     """
     needs = {"picture": PIXEL_BYTES * size[0] * size[1], "triangles": sum(part.device_bytes for part in parts)}
     check_budget(device, needs, memory)

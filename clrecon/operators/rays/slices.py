@@ -60,11 +60,10 @@ def choose_slices(volume: Volume, slices: int | Sequence[int] | None = None) -> 
 
 
 def overlay_slices(resident: DeviceVolume, style: SlicesInSpace, shot: Shot) -> Rendering:
-    """Show slices of a volume in space, each translucent at its own place, with the depth of the first visible one:
-    sheared and uneven stacks too.
+    """Show slices of a volume, sheared and uneven ones too, translucent at their own places, with the first visible
+    depth.
 
-    A volume that is already on the device is read there.  Else only the shown slices are uploaded, in parts if they do
-    not fit together.
+    A volume that is already on the device is read there; else the shown slices are uploaded, in parts if need be.
     """
     for attempt in resident.with_fallback():
         with attempt as (_, warnings):
@@ -117,10 +116,8 @@ class _Colors(NamedTuple):
 
 
 def _sort_slices(volume: Volume, camera: Camera, chosen: Sequence[int]) -> list[int]:
-    """Sort slices in the order in which rays cross them.
-
-    All rays share one order: parallel rays go up or down together; rays from a camera go away from its height, up or
-    down.
+    """Sort slices in the order in which rays cross them, all alike: parallel ones up or down, others away from the
+    camera.
     """
     heights = _heights(volume, volume.slice_origins()[list(chosen)])
     if camera.is_parallel:

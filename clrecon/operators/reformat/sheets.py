@@ -205,8 +205,7 @@ def sample_sheet(
     progress: Progress = ignore_progress,
     warnings: list[str] | None = None,
 ) -> Reformation:
-    """Return the values of all pixels of a sheet: the trilinear field, combined ("mean", "max", "min") through a thick
-    slice.
+    """Return the values of all pixels of a sheet: the trilinear field, combined through a thick slice.
 
     A volume that is already on the device is read there.  Else only the slices that the sheet meets are uploaded, some
     at a time if they do not fit.  Single samples, `max` and `min` are then equal bit for bit, means up to the rounding

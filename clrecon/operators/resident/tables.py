@@ -186,12 +186,11 @@ def measure_bricks(device: Device, voxels_d: Any, shape_ijk: tuple[int, int, int
 
 
 def compare_bricks(device: Device, ranges: BrickRanges, level: Any, ni: int, border: int) -> BrickStates:
-    """Classify each word of 32 samples by its bricks, all outside (0), all inside (1) or mixed (2), and find the extent
-    of each row of bricks: the first word that is not all outside, and the one after the last.
+    """Classify each word of 32 samples by its bricks, all outside (0), all inside (1) or mixed (2), with extents of
+    rows.
 
-    level: Lowest inside value.
-    border: Word w begins at voxel ``32 * w - border``, and there are samples up to ``ni - 1 + border``. Samples beyond
-        the volume are ignored.
+    The extent is the first word that is not all outside, and the one after the last; `level` is the lowest inside
+    value. Word w begins at voxel ``32 * w - border``, up to ``ni - 1 + border``; samples beyond the volume are ignored.
     """
     _, bj, bk = ranges.shape
     words = -(-(ni + 2 * border) // 32)

@@ -65,8 +65,7 @@ def each_label(
     extract: Callable[[Held, int, Box], Made],
     warnings: list[str],
 ) -> Iterator[tuple[int, Made]]:
-    """Yield labels with their results, in order: `hold` uploads what a group of labels shares, `extract` makes the
-    result of one.
+    """Yield labels with what `extract` makes of one, in order; `hold` uploads what a group of them shares.
 
     If the device has no room for a group, its remaining labels are processed one by one; a single label is tried once
     more, with nothing else on the device.

@@ -1,6 +1,5 @@
-"""Marching cubes: the passes of cl/surface/cells.cl and cl/surface/marching_cubes.cl on one slab of a volume.
-
-Those of cells.cl know bits and no voxels.
+"""Marching cubes: the passes of cl/surface/cells.cl, which know no voxels, and cl/surface/marching_cubes.cl on one
+slab.
 """
 
 from __future__ import annotations

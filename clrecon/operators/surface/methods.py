@@ -116,10 +116,8 @@ DECIMATED_SHARE = 0.9
 
 @dataclass(frozen=True)
 class Method:
-    """A method of marching cubes, `what` it is in words; `on_device` by the kernels, else in numpy, as a row for
-    comparisons.
-
-    It `decimates` "", "quadric" or "bounded".
+    """A method of marching cubes: by the kernels, or in numpy as a row for comparisons; it decimates "", "quadric",
+    "bounded".
     """
 
     name: str

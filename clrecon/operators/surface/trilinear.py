@@ -84,8 +84,7 @@ def emit_cells(
     output: dict[str, Any],
     first_vertex: int,
 ) -> None:
-    """Write the triangles of the slab and the vertices inside its cells, after `first_vertex` vertices of earlier
-    slabs.
+    """Write triangles and vertices inside cells, after `first_vertex` vertices of earlier slabs.
 
     `tables` are as emit_vertices takes them; `output` has the buffers ``positions``, ``normals`` and ``triangles``.
     """

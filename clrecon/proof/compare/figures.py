@@ -248,11 +248,7 @@ def middle_slice(volume: Volume, size: tuple[int, int], offset: int = 0) -> NDAr
 def measure_against_slice(
     volume: Volume, pictures: Mapping[str, NDArray[np.uint8]], size: tuple[int, int]
 ) -> dict[str, Any]:
-    """Compare pictures of methods, (height, width, 3) uint8, with the middle slice, and pictures that show what that is
-    worth.
-
-    Return ``window_hu``, ``slice``; ``methods`` and ``controls``: ``ssim`` and ``mse`` by name.
-    """
+    """Compare pictures of methods, and some that show what that is worth, with the middle slice: ssim and mse."""
     wanted = middle_slice(volume, size)
     controls = make_control_pictures(wanted, middle_slice(volume, size, 1))
 
@@ -345,12 +341,9 @@ COLORS = dict(
 
 @dataclass
 class Figures:
-    """The pictures of a comparison.
+    """The pictures of a comparison, of which `images` are written as PNG, by file name without extension.
 
-    work: Folder with the arrays of the methods.
-    box: As of `find_planes`.
     views, contours: The picture of each method from the one camera; for each plane the lines of each method.
-    images: What is written as PNG, by file name without extension.
     same: Methods whose surface is that of the reference.
     """
 

@@ -1,6 +1,4 @@
-"""The grid cells that a surface passes through, and how far two sets of them agree.
-
-Whether triangles meet boxes is told by separating axes, exactly.
+"""The grid cells that a surface passes through, told by separating axes, exactly, and how far two sets of them agree.
 
 Reference: Akenine-Moller 2001, "Fast 3D triangle-box overlap testing", Journal of Graphics Tools 6(1).
 """

@@ -264,10 +264,10 @@ Keys = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Lattice:
-    """Points that divide each cell between voxel centres alike, `finer` along each axis.
+    """Points that divide each cell between voxel centres alike, `finer` along each axis, from `offsets` (0 to below 1)
+    on.
 
-    They begin at `offsets` steps of the lattice, from 0 to below 1; `cells_ijk` are those along each axis, with
-    `border` layers of samples around the voxels.
+    `cells_ijk` are the cells along each axis, with `border` layers of samples around the voxels.
     """
 
     finer: int
@@ -314,8 +314,7 @@ def exclusive_or(one: Keys, other: Keys) -> Keys:
 
 
 def find_level_runs(volume: Volume, rule: IsoRule, lattice: Lattice, told: Callable[[int], None]) -> Keys:
-    """Find the ends of runs of points, (n,) int64, ascending, at which the trilinear HU reach the one level of a rule
-    or more.
+    """Find the ends of runs of points, (n,) int64, ascending, where the trilinear HU reach the one level of a rule.
 
     A trilinear field has its extremes at the corners of a cell: only cells with corners on both sides have points on
     both sides.  `told` is called with the number of layers of cells that are done.

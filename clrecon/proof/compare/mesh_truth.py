@@ -1,7 +1,4 @@
-"""A mesh against the true surface of a phantom: where it lies, how much it scatters, how its normals turn.
-
-The true surface is given as a signed distance, of which the grid cells are found that it cuts.
-"""
+"""A mesh against the true surface of a phantom: where it lies, how much it scatters, how its normals turn."""
 
 from __future__ import annotations
 

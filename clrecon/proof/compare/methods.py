@@ -17,10 +17,8 @@ MESH, CLOUD, PICTURE = "mesh", "cloud", "picture"
 
 @dataclass(frozen=True)
 class Compared:
-    """A method that is compared, by the user's name and by its title in tables and plots.
-
-    It makes a "mesh", "cloud" or "picture", by kernels on the device or on the CPU alone, by the library of a `peer`
-    or, if that is empty, by clrecon.
+    """A method that is compared; it makes a "mesh", "cloud" or "picture", on the device or not, by a `peer` or by
+    clrecon.
     """
 
     name: str

@@ -1,8 +1,6 @@
 """The processes of a comparison: one after another for methods, whose memory is their own; side by side for measures.
-
-They are told and tell plain values, and arrays in files of a folder.
-
-A crash of one becomes words."""
+They are told and tell plain values, and arrays in files of a folder; a crash of one becomes words.
+"""
 
 from __future__ import annotations
 
@@ -33,10 +31,7 @@ _VOXELS, _PLACE = "voxels.npy", "place.npz"
 class Request:
     """What one process does with a method: the volume is in `folder`, which gets the results.
 
-    repeat: Warm runs.
-    timeout: Seconds after which a device that finishes nothing hangs.
-    camera, size: Parameters of the `Camera` of the picture, and its width and height.
-    along: Camera and size of a picture along the slices, for the table of the paper.
+    Of `repeat` warm runs; `along` is a view along the slices, for the table of the paper.
     """
 
     method: str
@@ -161,11 +156,10 @@ def _describe_end(code: int) -> str:
 
 
 def measure_in_processes(told: Mapping[str, Any], methods: Mapping[str, int]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Measure what methods made in a process a core, and yield each name with its figures, see `Judge.measure`; only
-    ``reasons`` where the process ended before.
+    """Measure what methods made in a process a core, and yield names with figures, see `Judge`, or only with
+    ``reasons``.
 
-    told: See `clrecon.proof.compare.judge.Judge`.
-    methods: Names, and how much there is to measure of each.
+    `methods` tells by name how much there is to measure.
     """
     parts = _share(methods, min(usable_cores(), MOST_JUDGES))
     lines: queue.Queue[tuple[int, bytes]] = queue.Queue()

@@ -30,11 +30,10 @@ GROUPS = {"mesh": "surfaces", "cloud": "clouds", "picture": "pictures of the vox
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the main table: `take` gives the number of a row, or None, `write` its text.
+    """A column of the main table: `take` gives the number of a row, or None, `write` its text; one may need the
+    `truth`.
 
-    best: {"", "low", "high"}. Which end of the numbers of meshes is set in bold.
-    meaning: One line.
-    truth: Only with the truth of a phantom.
+    The "low" or "high" end of the numbers of meshes is set in bold, or none.
     """
 
     head: str

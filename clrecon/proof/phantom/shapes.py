@@ -209,8 +209,7 @@ class Cylinder:
 
 
 class Box:
-    """Oblique box: a slab with two large faces square to `normal`, of any length, along which it is `thickness` mm
-    thick.
+    """Oblique box: a slab, `thickness` mm thick, with two large faces square to `normal`, of any length.
 
     The width is along `edge`, less its part along `normal`; default: some direction square to `normal`.
     """

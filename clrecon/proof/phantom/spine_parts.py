@@ -162,12 +162,10 @@ def _stack(sizes: dict[str, Float64Array], frames: list[Float64Array], anchor: i
 
 
 def lay_chain(generator: np.random.Generator, seed: int, half_depth: float, choice: SpineChoice | None) -> Chain:
-    """Lay the levels out, the middle of T12 a little below the middle of the volume; without a choice T1 to L5,
-    straight.
+    """Lay the levels out, the middle of T12 a little below the middle of the volume; no choice: T1 to L5, straight.
 
-    The generator makes small changes of the curve of chest and loin, the seed those of the neck, which is planned where
-    a cervical level is chosen.  The tips of the spinous processes stay about 20 mm under the skin of a trunk of twice
-    `half_depth` mm.
+    The generator changes the curve of chest and loin a little, the seed that of the neck, which is planned for a
+    cervical level.  Spinous processes end about 20 mm under the skin of a trunk of twice `half_depth` mm.
     """
     count = len(THORACOLUMBAR)
     sizes = {key: np.interp(np.arange(count), _KEYS, values) for key, values in _SIZES.items()}
@@ -262,10 +260,8 @@ def plan_outline(chain: Chain, half_width: float, half_depth: float) -> Outline 
 
 @dataclass(frozen=True)
 class Vertebra:
-    """One level: its frame, rows of `axes` being the local left, posterior and superior directions, and its sizes in
-    mm.
+    """One level, rows of `axes` being the local left, posterior and superior directions, sizes in mm.
 
-    center: Middle of the vertebral body.
     lumbar: 0 thoracic shape to 1 lumbar shape of the processes.
     waves: ndarray, shape (n, 5). Trabecular texture, see `clrecon.proof.phantom.fields.waves_at`.
     room: mm by which upper and lower articular processes lie farther apart than in a spine without a choice of levels,
@@ -317,15 +313,12 @@ class Rib:
 
 @dataclass(frozen=True)
 class Anatomy:
-    """All parts of the spine phantom.
+    """All parts of the spine phantom, absent ones left out on purpose, `centres` of bodies shown or not.
 
-    half_width, half_depth: Half axes of the body outline about x = y = 0.
+    half_width, half_depth: Half axes of the body outline about x = y = 0, unless it is an `outline` of its own.
     curve_x, curve_y, curve_z: Polynomials (highest power first) in z / 100 mm: centre line of the vertebral bodies;
         they hold from the lower to the upper z of the last.
     marker: Centre of the small metal ball on the patient's left.
-    absent: Parts left out on purpose.
-    centres: Middle of the body of every planned level, shown or not.
-    outline: Where the body's outline is not that of a straight trunk.
     """
 
     vertebrae: list[Vertebra]

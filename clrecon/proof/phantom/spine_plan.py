@@ -244,11 +244,7 @@ def fit_slices(
     directions: tuple[float, tuple[float, float, float], bool],
     slices: int | None,
 ) -> int:
-    """Return the number of slices: the given one, if it holds the vertebral bodies, else as many as the bones need.
-
-    size, spacing: (columns, rows) and (dj, di, dk), mm.
-    directions: (tilt, oblique, prone)
-    """
+    """Return the number of slices: the given one, if it holds the vertebral bodies, else as many as the bones need."""
     dj, di, dk = spacing
     open_joints = dataclasses.replace(choice, facet_gap_mm=None)
     extent = size[0] * di, size[1] * dj

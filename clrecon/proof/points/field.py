@@ -45,11 +45,9 @@ def measure_field(
     reach: float,
     smoothing: float,
 ) -> FieldTwin:
-    """Average the distances from the planes of the points around each node, of a shape (nx, ny, nz) from `corner` on,
-    in mm.
+    """Average the distances from the planes of the points around each node, (nx, ny, nz) from `corner` on, in mm.
 
-    A point at distance d < R, the reach, has the weight ``(1 - d^2 / R^2)^2 / (d^2 + s^2)``, s being the smoothing in
-    mm.
+    A point at distance d < R, the reach, has the weight ``(1 - d^2 / R^2)^2 / (d^2 + s^2)``, s being the smoothing.
     """
     h, reach32 = np.float32(spacing), np.float32(reach)
     nx, ny, nz = shape
