@@ -131,7 +131,13 @@ def run_bench(
     watch.lap("make" if source is None else "read")
     hu = suggested if iso_value is None else iso_value
     result = {
-        "input": _facts_of_input(volume, source is None),
+        "input": {
+            "kind": "phantom" if source is None else "series",
+            "shape_ijk": volume.shape_ijk,
+            "spacing_mm": volume.spacing,
+            "voxels": volume.voxels.size,
+            "bytes": volume.voxels.nbytes,
+        },
         "iso_value_hu": hu,
         "runs": runs,
         "processor": processor_name(),
@@ -183,16 +189,6 @@ def _get_volume(source: str | Path | None, series: str | None, progress: Progres
     settings = PhantomSettings(kind="spine", size=PHANTOM_SIZE, slices=PHANTOM_SLICES, spacing=PHANTOM_SPACING)
     voxels, affine, truth = make_phantom(settings, progress)
     return Volume(voxels, affine), float(truth["iso_value_hu"])
-
-
-def _facts_of_input(volume: Volume, is_phantom: bool) -> dict[str, Any]:
-    return {
-        "kind": "phantom" if is_phantom else "series",
-        "shape_ijk": volume.shape_ijk,
-        "spacing_mm": volume.spacing,
-        "voxels": volume.voxels.size,
-        "bytes": volume.voxels.nbytes,
-    }
 
 
 def _measure_devices(

@@ -25,6 +25,7 @@ from clrecon.proof.checking import Check
 from clrecon.proof.points import cloud_checks, voxel_checks
 from clrecon.proof.rays import layer_checks, ray_checks
 from clrecon.proof.surface import decimation_checks, surface_checks
+from clrecon.proof.timing import usable_cores
 from clrecon.proof.volumes import volume_checks
 from clrecon.system.progress import Progress, device_seconds, ignore_progress
 
@@ -67,7 +68,7 @@ def run_selftest(
     line, they count as failed: each of them would take as long.  By default there is a process for each core, up to
     four.
     """
-    many = min(processes or _count_cores(), MOST_PROCESSES, len(checks))
+    many = min(processes or usable_cores(), MOST_PROCESSES, len(checks))
     if many <= 1:
         yield from _run_part(device, checks, silent_seconds, [], threading.Event())
         return
@@ -102,10 +103,6 @@ def run_selftest(
             child.end()
         for thread in threads:
             thread.join()
-
-
-def _count_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _run_part(

@@ -124,7 +124,7 @@ def remove_outliers(
             distances = DistanceMeasure(search, stopwatch)
             neighbours_d = allocate(current, 4 * k * search.most_places)
             for part in search.each_part("outliers", progress or ignore_progress):
-                search.list_places(part, neighbours_d)
+                search.find(part, neighbours_d)
                 distances.measure(part, neighbours_d)
             means = distances.read()[0].astype(np.float64)
             mean = float(means.mean())

@@ -236,8 +236,12 @@ class NeighbourSearch:
     def coordinates(self) -> dict[str, Any]:
         return {"x": self.grid.x_d, "y": self.grid.y_d, "z": self.grid.z_d}
 
-    def _launch(self, part: Part, by_place: bool, neighbours_d: Any, distances_d: Any) -> None:
-        grid, one_lane = self.grid, _has_one_lane(self.device)
+    def find(self, part: Part, neighbours_d: Any, distances_d: Any = None) -> None:
+        """Write the neighbours of the points of a part, (place_count, k), as places in the sorted order; with their
+        distances as numbers, both to the rows of these points in (n, k).
+        """
+        grid, one_lane, by_place = self.grid, _has_one_lane(self.device), distances_d is None
+        distances_d = neighbours_d if by_place else distances_d
         (nx, ny, nz), (x, y, z) = grid.shape, (float(value) for value in grid.origin - grid.base)
         launch(
             self.device, self._program["list_neighbours"],
@@ -246,14 +250,6 @@ class NeighbourSearch:
             distances=distances_d, nx=nx, ny=ny, nz=nz, words=grid.words, cells=grid.cells, points=grid.n,
             origin=(x, y, z, grid.edge), margin=self._margin, k=self.k, by_place=by_place, **part._asdict(),
         )  # fmt: skip
-
-    def list_places(self, part: Part, neighbours_d: Any) -> None:
-        """Write the neighbours of the points of a part, (place_count, k), as places in the sorted order."""
-        self._launch(part, True, neighbours_d, neighbours_d)
-
-    def list_numbers(self, part: Part, neighbours_d: Any, distances_d: Any) -> None:
-        """Write the neighbours of the points of a part as numbers, and their distances, to their rows of (n, k)."""
-        self._launch(part, False, neighbours_d, distances_d)
 
     def each_part(self, stage: str, progress: Progress) -> Iterator[Part]:
         """Yield the parts, and tell how many points are done."""
@@ -360,7 +356,7 @@ def find_neighbours(
             indices, indices_d = empty_output(current, (len(places), k), np.int32)
             distances, distances_d = empty_output(current, (len(places), k), np.float32)
             for part in search.each_part("neighbours", progress or ignore_progress):
-                search.list_numbers(part, indices_d, distances_d)
+                search.find(part, indices_d, distances_d)
             indices, distances = download(current, indices, indices_d), download(current, distances, distances_d)
             found = Neighbours(indices, distances, (*warnings, *told))
     return found

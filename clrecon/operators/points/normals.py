@@ -135,7 +135,7 @@ class PlaneFits:
 
     def fit(self, part: Part) -> None:
         search = self._search
-        search.list_places(part, self.neighbours_d)
+        search.find(part, self.neighbours_d)
         lanes = int(search.device.kernel_variants["LANES"])
         launch(
             search.device, self.program["fit_planes"], -(-part.place_count // lanes),

@@ -158,7 +158,8 @@ class _Layers:
     ) -> LayeredPicture:
         device, (width, height) = self.device, self.size
         with self.stopwatch.running(device):
-            self._launch("clear_rays", pixels=self.pixels, **self._rays, **self._floors)
+            floors = {"floor_keys": self.keys.floor_keys_d, "floor_numbers": self.keys.floor_numbers_d}
+            self._launch("clear_rays", pixels=self.pixels, **self._rays, **floors)
         open_pixels, drawn = self.pixels if self.triangles or self.has_still else 0, 0
         is_first = True
         while open_pixels and drawn < most:
@@ -227,10 +228,6 @@ class _Layers:
     @property
     def _rays(self) -> dict[str, Any]:
         return {"states": self.states_d, "marks": self.marks_d}
-
-    @property
-    def _floors(self) -> dict[str, Any]:
-        return {"floor_keys": self.keys.floor_keys_d, "floor_numbers": self.keys.floor_numbers_d}
 
     @property
     def _layer(self) -> dict[str, Any]:

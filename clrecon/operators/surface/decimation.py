@@ -195,12 +195,8 @@ class DeviceBounds(SurfaceBounds):
         """Bring the surface to the device, before threads use it."""
         assert self._surface
 
-    @property
-    def slack(self) -> float:
-        return self._slack
-
     @cached_property
-    def _slack(self) -> float:
+    def slack(self) -> float:  # type: ignore[override]
         return rounding_of_bounds(max(float(self._vertices.max(initial=0)), -float(self._vertices.min(initial=0))))
 
     @cached_property

@@ -307,11 +307,6 @@ def difference_of(picture: Image, reference: Image) -> Image:
     return np.asarray(np.minimum(4 * apart, 255), dtype=np.uint8)
 
 
-def save_png(image: Any, path: Path) -> None:
-    """Write a picture, an array or Pillow's, as PNG."""
-    _as_pillow(image).save(path, "PNG", optimize=True)
-
-
 def embed(image: Any) -> str:
     """Return a picture as the address of a WebP inside the page."""
     stream = io.BytesIO()
@@ -429,4 +424,4 @@ def collect_figures(figures: Figures, records: Sequence[MethodRecord]) -> None:
 
 def draw_figures(figures: Figures, folder: Path) -> None:
     for name, image in figures.images.items():
-        save_png(image, folder / f"{name}.png")
+        _as_pillow(image).save(folder / f"{name}.png", "PNG", optimize=True)

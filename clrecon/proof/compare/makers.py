@@ -218,18 +218,14 @@ def _cast(scene: Scene, camera: Camera, size: tuple[int, int]) -> Rendering:
 
 
 def _rays_cpu(scene: Scene) -> Product:
-    return _cast_twin(scene, TWIN_SIZE), [{}]
-
-
-def _cast_twin(scene: Scene, size: tuple[int, int]) -> Rendering:
     from clrecon.proof.rays.render import cast_rays
     from clrecon.rendering.looks.presets import find_preset
 
     camera, _ = scene.request.views()["view"]
     preset = find_preset(RAYS_PRESET)
-    found = cast_rays(scene.volume, preset.transfer_function, camera, size, lighting=preset.lighting)
+    found = cast_rays(scene.volume, preset.transfer_function, camera, TWIN_SIZE, lighting=preset.lighting)
     depth = found.depth.astype("float32")
-    return Rendering(found.image(), depth, depth, camera)
+    return Rendering(found.image(), depth, depth, camera), [{}]
 
 
 def _plain(scene: Scene) -> Product:

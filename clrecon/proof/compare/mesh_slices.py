@@ -9,7 +9,6 @@ even number of keys.  Memory grows with the surface, not with the lattice.
 
 from __future__ import annotations
 
-import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -119,7 +118,10 @@ def measure_slices(
     layers = lattices[0].cells_ijk[2]
     found = []
     for n, lattice in enumerate(lattices):
-        tell = functools.partial(_tell_slices, told, n * layers, 2 * layers)
+
+        def tell(done: int, before: int = n * layers) -> None:
+            told("slices", before + done, 2 * layers)
+
         found.append(_count_overlap(ijk, mesh.triangles, volume, rule, lattice, tell))
     fine, own = found
     told("slices", 2 * layers, 2 * layers)
@@ -132,10 +134,6 @@ def measure_slices(
         points_common=fine.common,
         rows_odd=fine.odd,
     )
-
-
-def _tell_slices(told: Progress, before: int, total: int, done: int) -> None:
-    told("slices", before + done, total)
 
 
 def _check_lattice(finer: int, offsets: Sequence[float]) -> tuple[float, float, float]:

@@ -18,40 +18,10 @@ from clrecon.proof.compare.findings import CompareReport, MethodRecord, join, se
 from clrecon.proof.compare.records import ALL_PARTS
 from clrecon.proof.compare.table import main_table, paper_table, shown_columns, small_table
 
-PAGE_TEMPLATE = Template("""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="generator" content="clrecon $version">
-<title>$title</title>
-<style>
-$style
-</style>
-</head>
-<body>
-<header>
-<h1>$title</h1>
-<p class="lead">$lead</p>
-<dl class="facts">
-$facts
-</dl>
-</header>
-<main>
-$body
-</main>
-<footer>
-<p>Made by clrecon $version. The numbers are in <code>report.json</code> beside this page, the pictures as PNG too.
-clrecon is a research tool and no medical device.</p>
-</footer>
-</body>
-</html>
-""")
 
-
-def read_style() -> str:
-    """Return the style of the page, from the file beside this one."""
-    return (files(__package__) / "page.css").read_text(encoding="utf-8").strip()
+def _read(name: str) -> str:
+    """Return a file beside this one."""
+    return (files(__package__) / name).read_text(encoding="utf-8")
 
 
 PART_COLORS = {
@@ -241,10 +211,10 @@ def make_page(report: CompareReport, figures: Figures) -> str:
     done = sum(record.is_done for record in report.methods)
     ni, nj, nk = report.shape_ijk
     of = f"{done} of {len(report.methods)}" if done < len(report.methods) else f"{done}"
-    return PAGE_TEMPLATE.substitute(
+    return Template(_read("page.html")).substitute(
         version=escape(report.version),
         title="Surfaces and clouds of one scan, compared",
-        style=read_style(),
+        style=_read("page.css").strip(),
         lead=escape(
             f"{of} methods on one scan of {ni} x {nj} x {nk} voxels at {report.iso_value_hu:g} HU, each in a process of"
             f" its own, compared with {_title_of(report, report.reference)}."
