@@ -29,7 +29,7 @@ from clrecon.reading.dicom.series.choice import choose_series, describe_left
 from clrecon.reading.dicom.series.foreign_files import advise_on, is_text
 from clrecon.reading.dicom.series.scan import BARE_DATA_SET, LINK_OUT, Scan, advise_on_links, scan_path
 from clrecon.reading.dicom.series.series import Series, group_series
-from clrecon.reading.dicom.stack.fit import Stack, measure_extent, median_thickness
+from clrecon.reading.dicom.stack.fit import measure_extent, median_thickness
 from clrecon.system.arguments import name_parameter
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.paths import open_regular
@@ -41,13 +41,14 @@ def make_entry(series: Series, warnings: Iterable[str] = ()) -> SeriesEntry:
     stack = series.stack
     affine = stack.affine if stack is not None and not series.problems else None
     first = stack.slices[0] if stack is not None else None
+    found = series.headers if stack is None or series.problems else stack.slices  # of a refused series all
     return SeriesEntry(
         number=series.number,
         uid_hash=hash_uid(series.identity.uid),
         description=series.identity.description,
         modality=series.identity.modality,
         slices=series.count,
-        shape_ijk=None if first is None or stack is None else [first.columns, first.rows, _count_slices(series, stack)],
+        shape_ijk=None if first is None else [first.columns, first.rows, len(found)],
         spacing_mm=None if affine is None else list(column_spacing(affine)),
         affine_ijk_to_lps_mm=None if affine is None else affine.tolist(),
         tilt_deg=None if stack is None or affine is None else stack.tilt_deg,
@@ -68,11 +69,6 @@ def make_entry(series: Series, warnings: Iterable[str] = ()) -> SeriesEntry:
         slice_thickness_mm=median_thickness(series.headers),
         dropped=series.dropped,
     )
-
-
-def _count_slices(series: Series, stack: Stack) -> int:
-    """Count the slices of the volume if it is known; of a refused series all slices found."""
-    return len(series.headers) if series.problems else len(stack.slices)
 
 
 def _list_phases(series: Series) -> list[dict[str, Any]]:

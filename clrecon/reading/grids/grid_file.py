@@ -46,9 +46,8 @@ _CHUNK = 2**18
 class VoxelBytes:
     """The place of a grid's numbers in the file itself, or in the one that its header names.
 
-    offset: Bytes in the file before the numbers, or before their compressed stream.
+    offset, skip: Bytes in the file before the numbers or their compressed stream; inflated bytes before the numbers.
     packing: {"raw", "gzip", "zlib"}
-    skip: Inflated bytes before the numbers.
     """
 
     path: Path
@@ -58,7 +57,6 @@ class VoxelBytes:
 
     @property
     def compressed(self) -> bool:
-        """True when the numbers are compressed."""
         return self.packing != "raw"
 
     @property
@@ -169,15 +167,9 @@ def file_beside(header: Path, named: str) -> Path:
     return found
 
 
-@dataclass(frozen=True)
-class Purpose:
-    """The purpose of reading a file, for messages: its noun."""
-
-    noun: str
-
-
-LABEL_MAP = Purpose("label map")
-VOLUME = Purpose("volume")
+LABEL_MAP = "label map"
+VOLUME = "volume"
+"""Purposes of reading a file, the nouns for messages."""
 
 
 @dataclass(frozen=True)
@@ -188,15 +180,13 @@ class GridFile:
     kind: "NIfTI-1", "NIfTI-2", "NRRD" or "MetaImage".
     layers: Numbers of one voxel, side by side in the file; 1 except for layered label maps.
     dtype: Type as stored, with its byte order.
-    slope, intercept: The value of a stored number is ``stored * slope + intercept``.
+    slope, intercept: The value of a stored number is ``stored * slope + intercept``; the user may have given them.
     warnings: Doubtful points of the header; they contain no names.
     extension: The bytes between the header and the voxels (NIfTI).
-    fields: All fields of the header (NRRD).
-    rescale: Slope and intercept that the user gave in place of those of the header.
     """
 
     name: str
-    purpose: Purpose
+    purpose: str
     kind: str
     shape_ijk: tuple[int, int, int]
     dtype: np.dtype[Any]
@@ -241,8 +231,8 @@ class GridFile:
 _PACKAGES = {"nrrd": "pynrrd"}
 
 
-def import_extra(module: str, purpose: Purpose) -> Any:
-    return import_package(module, f"this {purpose.noun}", _PACKAGES.get(module))
+def import_extra(module: str, purpose: str) -> Any:
+    return import_package(module, f"this {purpose}", _PACKAGES.get(module))
 
 
 PACKING = 1
@@ -251,10 +241,7 @@ PACKING = 1
 
 @dataclass(frozen=True, eq=False)
 class VolumeContent:
-    """What a volume file holds: voxels (nk, nj, ni) int16, int32 or float32, and their affine.
-
-    lines: The certificate, plain ASCII, one fact a line: name, blank, value.
-    """
+    """What a volume file holds: voxels (nk, nj, ni) int16, int32 or float32, affine, the certificate in ASCII lines."""
 
     voxels: NDArray[Any]
     affine: Float64Array

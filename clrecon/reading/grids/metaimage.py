@@ -26,15 +26,7 @@ import numpy as np
 from clrecon.errors import OutputError, RefusedInputError, UsageError
 from clrecon.geometry.affine import Float64Array, checked_affine
 from clrecon.geometry.images import make_sitk
-from clrecon.reading.grids.grid_file import (
-    VOLUME,
-    GridFile,
-    Purpose,
-    VolumeContent,
-    VoxelBytes,
-    file_beside,
-    import_extra,
-)
+from clrecon.reading.grids.grid_file import VOLUME, GridFile, VolumeContent, VoxelBytes, file_beside, import_extra
 from clrecon.system.foreign_words import hush
 from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
@@ -78,8 +70,7 @@ def is_metaimage(start: bytes) -> bool:
     return _START.match(start) is not None
 
 
-def open_metaimage(path: Path, purpose: Purpose) -> GridFile:
-    """Read the header."""
+def open_metaimage(path: Path, purpose: str) -> GridFile:
     name = escape_text(path.name)
     fields, end = _read_fields(path, name)
     header = _Header(fields, name, purpose)
@@ -95,7 +86,7 @@ def open_metaimage(path: Path, purpose: Purpose) -> GridFile:
         purpose=purpose,
         kind="MetaImage",
         shape_ijk=shape,
-        dtype=dtype.newbyteorder(">" if header.big_endian else "<"),
+        dtype=dtype.newbyteorder(">" if header.flag("ByteOrderMSB", False) else "<"),
         affine=affine,
         voxel_bytes=voxel_bytes,
         warnings=tuple(header.warnings),
@@ -129,7 +120,7 @@ def _read_fields(path: Path, name: str) -> tuple[dict[str, str], int]:
 class _Header:
     """The fields of a header, checked before any library sees them."""
 
-    def __init__(self, fields: dict[str, str], name: str, purpose: Purpose):
+    def __init__(self, fields: dict[str, str], name: str, purpose: str):
         self.fields, self.name, self.purpose = fields, name, purpose
         self.warnings: list[str] = []
 
@@ -138,14 +129,14 @@ class _Header:
         self._check_kind()
         axes = self.numbers("NDims", 1)[0]
         if axes not in (3, 4):
-            raise self.wrong("NDims", f"a {self.purpose.noun} has three axes")
+            raise self.wrong("NDims", f"a {self.purpose} has three axes")
         sizes = self.numbers("DimSize", int(axes))
         if min(sizes) < 1 or max(sizes) > 2**31 or any(n != int(n) for n in sizes):
             raise self.wrong("DimSize", "whole numbers from 1")
         if axes == 4 and sizes[3] != 1:
             shown = " x ".join(f"{n:g}" for n in sizes)
             raise RefusedInputError(
-                f"{self.name} has 4 axes ({shown}): a {self.purpose.noun} has three: {sizes[3]:g} of them,"
+                f"{self.name} has 4 axes ({shown}): a {self.purpose} has three: {sizes[3]:g} of them,"
                 " split it into one file each"
             )
         if min(self.numbers("ElementSpacing", int(axes))) <= 0:
@@ -160,7 +151,7 @@ class _Header:
         if self.text("ObjectType", "Image").lower() != "image":
             raise self.wrong("ObjectType", "Image")
         if self.text("ElementType").upper() not in ELEMENT_TYPES:
-            raise self.wrong("ElementType", f"a {self.purpose.noun} has one real number a voxel")
+            raise self.wrong("ElementType", f"a {self.purpose} has one real number a voxel")
         if not self.flag("BinaryData", True):
             raise self.wrong("BinaryData", "True: voxels written as text are not read")
         for key, only in PLAIN.items():
@@ -173,7 +164,6 @@ class _Header:
             self.warnings.append("the byte order is not said (BinaryDataByteOrderMSB): little endian is taken")
 
     def wrong(self, key: str, expected: str) -> RefusedInputError:
-        """Return the refusal of a field."""
         used = self._name_of(key)
         if used is None:
             return RefusedInputError(f"{self.name} is no usable MetaImage: {key} is missing, expected {expected}")
@@ -188,7 +178,6 @@ class _Header:
         return used[0] if used else None
 
     def text(self, key: str, default: str | None = None) -> str:
-        """Return the value of a field."""
         used = self._name_of(key)
         if used is None and default is None:
             raise self.wrong(key, "a value")
@@ -212,10 +201,6 @@ class _Header:
         if value not in ("true", "t", "1", "false", "f", "0"):
             raise self.wrong(key, "True or False")
         return value in ("true", "t", "1")
-
-    @property
-    def big_endian(self) -> bool:
-        return self.flag("ByteOrderMSB", False)
 
     def data_file(self, path: Path) -> Path:
         """Return the one file beside the header that holds the voxels."""

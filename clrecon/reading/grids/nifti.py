@@ -10,7 +10,6 @@ from __future__ import annotations
 import gzip
 import math
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -24,7 +23,6 @@ from clrecon.reading.grids.grid_file import (
     PACKING,
     VOLUME,
     GridFile,
-    Purpose,
     VolumeContent,
     VoxelBytes,
     file_beside,
@@ -65,8 +63,7 @@ def is_nifti(start: bytes) -> bool:
     return start[:4] in (*_FIRST, *_SECOND)
 
 
-def open_nifti(path: Path, purpose: Purpose) -> GridFile:
-    """Read the header."""
+def open_nifti(path: Path, purpose: str) -> GridFile:
     name = escape_text(path.name)
     with open_regular(path) as file:
         compressed = _is_gzip(file)
@@ -109,7 +106,7 @@ def _header_error() -> type[Exception]:
     return cast("type[Exception]", HeaderDataError)
 
 
-def _read_header(stream: BinaryIO, name: str, purpose: Purpose) -> _Header:
+def _read_header(stream: BinaryIO, name: str, purpose: str) -> _Header:
     nibabel = import_extra("nibabel", purpose)
     start = read_bytes(stream, 4, name, "its header")
     kind, size, magic = (nibabel.Nifti2Header, 540, b"2") if start in _SECOND else (nibabel.Nifti1Header, 348, b"1")
@@ -148,7 +145,7 @@ def _find_voxels(path: Path, compressed: bool, header: _Header) -> VoxelBytes:
     return VoxelBytes(path, offset=header.offset)
 
 
-def _shape(header: Any, name: str, purpose: Purpose) -> tuple[int, int, int]:
+def _shape(header: Any, name: str, purpose: str) -> tuple[int, int, int]:
     """Return (ni, nj, nk); further axes of length one are ignored."""
     shape = tuple(int(n) for n in header.get_data_shape())
     while len(shape) > 3 and shape[-1] == 1:
@@ -156,23 +153,21 @@ def _shape(header: Any, name: str, purpose: Purpose) -> tuple[int, int, int]:
     if len(shape) != 3:
         several = f": {math.prod(shape[3:])} of them, split it into one file each" if len(shape) > 3 else ""
         raise RefusedInputError(
-            f"{name} has {len(shape)} axes ({' x '.join(map(str, shape))}): a {purpose.noun} has three{several}"
+            f"{name} has {len(shape)} axes ({' x '.join(map(str, shape))}): a {purpose} has three{several}"
         )
     return shape[0], shape[1], shape[2]
 
 
-def _dtype(header: Any, name: str, purpose: Purpose) -> np.dtype[Any]:
+def _dtype(header: Any, name: str, purpose: str) -> np.dtype[Any]:
     dtype = cast("np.dtype[Any]", header.get_data_dtype())
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
         shown = "colours" if dtype.names else str(dtype)
-        raise RefusedInputError(f"{name} is not a {purpose.noun}: its voxels are {shown}; one real number each is read")
+        raise RefusedInputError(f"{name} is not a {purpose}: its voxels are {shown}; one real number each is read")
     return dtype
 
 
 def nifti_affine(header: Any, shape: tuple[int, int, int], name: str) -> tuple[Float64Array, list[str]]:
-    """Return the affine of a NIfTI header, the sform, else the qform, converted from RAS to LPS; warnings tell if they
-    differ.
-    """
+    """Return the affine of a header in LPS, the sform, else the qform, and warnings if they or pixdim disagree."""
     warnings = []
     sform = header.get_sform(coded=True)[0]
     try:
@@ -245,11 +240,6 @@ def _write_parts(stream: Any, content: VolumeContent) -> None:
     header.extensions.append(extension)
     header["vox_offset"] = header.single_vox_offset + header.extensions.get_sizeondisk()
     header.write_to(stream)
-    _write_slices(stream, (np.asarray(layer, dtype) for layer in content.voxels), content)
-
-
-def _write_slices(stream: Any, layers: Iterable[np.ndarray], content: VolumeContent) -> None:
-    count = len(content.voxels)
-    for k, layer in enumerate(layers):
-        stream.write(layer.tobytes())
-        content.progress("write", k + 1, count)
+    for k, layer in enumerate(content.voxels):
+        stream.write(np.asarray(layer, dtype).tobytes())
+        content.progress("write", k + 1, len(content.voxels))

@@ -24,7 +24,6 @@ from clrecon.reading.grids.grid_file import (
     PACKING,
     VOLUME,
     GridFile,
-    Purpose,
     VolumeContent,
     VoxelBytes,
     file_beside,
@@ -72,8 +71,7 @@ def is_nrrd(start: bytes) -> bool:
     return start[:4] == b"NRRD"
 
 
-def open_nrrd(path: Path, purpose: Purpose) -> GridFile:
-    """Read the header."""
+def open_nrrd(path: Path, purpose: str) -> GridFile:
     name = escape_text(path.name)
     with open_regular(path) as file:
         start = file.read(LARGEST_HEADER)
@@ -105,7 +103,7 @@ def open_nrrd(path: Path, purpose: Purpose) -> GridFile:
     )
 
 
-def _parse(text: bytes, name: str, purpose: Purpose) -> dict[str, Any]:
+def _parse(text: bytes, name: str, purpose: str) -> dict[str, Any]:
     nrrd = import_extra("nrrd", purpose)
     lines = [line + "\n" for line in text.decode("utf-8", "replace").splitlines()]
     try:
@@ -135,7 +133,7 @@ def _warnings(header: dict[str, Any]) -> tuple[str, ...]:
     return ()
 
 
-def _sizes(header: dict[str, Any], name: str, purpose: Purpose) -> tuple[int, tuple[int, int, int]]:
+def _sizes(header: dict[str, Any], name: str, purpose: str) -> tuple[int, tuple[int, int, int]]:
     """Return the number of layers, and (ni, nj, nk); a further axis of length one without a direction is ignored."""
     try:
         sizes = tuple(int(n) for n in header["sizes"])
@@ -143,15 +141,14 @@ def _sizes(header: dict[str, Any], name: str, purpose: Purpose) -> tuple[int, tu
     except (KeyError, TypeError, ValueError) as error:
         raise RefusedInputError(f"{name} has a corrupt NRRD header: no sizes") from error
     in_space = _space_axes(header, len(sizes))
-    layered = purpose is LABEL_MAP and len(sizes) == 4 and kinds[:1] == ["list"]
+    layered = purpose == LABEL_MAP and len(sizes) == 4 and kinds[:1] == ["list"]
     beside = [n for axis, n in enumerate(sizes) if axis not in in_space]
     single = len(in_space) == 3 and all(n == 1 for n in beside)
     if header.get("dimension") != len(sizes) or not (single or layered):
-        or_layers = ", or a list of layers before them" if purpose is LABEL_MAP else ""
+        or_layers = ", or a list of layers before them" if purpose == LABEL_MAP else ""
         several = f"; split it into one file each of the {np.prod(beside)}" if len(in_space) == 3 and beside else ""
         raise RefusedInputError(
-            f"{name} has {len(sizes)} axes ({' x '.join(map(str, sizes))}): a {purpose.noun} has three"
-            f"{or_layers}{several}"
+            f"{name} has {len(sizes)} axes ({' x '.join(map(str, sizes))}): a {purpose} has three{or_layers}{several}"
         )
     ni, nj, nk = sizes[-3:] if layered else (sizes[axis] for axis in in_space)
     return (sizes[0] if layered else 1), (ni, nj, nk)
@@ -168,11 +165,11 @@ def _space_axes(header: dict[str, Any], count: int) -> list[int]:
         return list(range(count))  # `nrrd_affine` reports the error
 
 
-def _dtype(header: dict[str, Any], name: str, purpose: Purpose) -> np.dtype[Any]:
+def _dtype(header: dict[str, Any], name: str, purpose: str) -> np.dtype[Any]:
     code = TYPES.get(str(header.get("type", "")).lower())
     if code is None:
         raise RefusedInputError(
-            f"{name} is not a {purpose.noun}: its voxels are '{escape_text(str(header.get('type')))}'; one real number"
+            f"{name} is not a {purpose}: its voxels are '{escape_text(str(header.get('type')))}'; one real number"
             " each is read"
         )
     endian = str(header.get("endian", "")).lower()
@@ -231,7 +228,6 @@ class _Undated(io.RawIOBase):
         self._in_header, self._done = True, 0
 
     def writable(self) -> bool:
-        """Return that it can be written to."""
         return True
 
     def write(self, data: Any) -> int:

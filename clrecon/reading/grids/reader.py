@@ -35,7 +35,7 @@ from clrecon.reading.common.plausibility import (
 )
 from clrecon.reading.common.selection import Rescale
 from clrecon.reading.common.source_facts import PixelFacts, SeriesEntry, SeriesListing, StoredRange
-from clrecon.reading.grids.grid_file import VOLUME, GridFile, Purpose
+from clrecon.reading.grids.grid_file import VOLUME, GridFile
 from clrecon.reading.grids.metaimage import is_metaimage, open_metaimage
 from clrecon.reading.grids.nifti import is_nifti, open_nifti
 from clrecon.reading.grids.nrrd import is_nrrd, open_nrrd
@@ -78,7 +78,7 @@ def name_of_grid(path: Path) -> str:
     return re.sub(r"(\.seg)?\.(nii|hdr|nrrd|nhdr|mha|mhd)(\.gz)?$", "", path.name, flags=re.IGNORECASE) or path.name
 
 
-def open_grid(path: Path, kind: str, purpose: Purpose) -> GridFile:
+def open_grid(path: Path, kind: str, purpose: str) -> GridFile:
     """Read the header of a file of one of the `kind` "NIfTI", "NRRD" and "MetaImage"."""
     opener = {"NIfTI": open_nifti, "NRRD": open_nrrd, "MetaImage": open_metaimage}[kind]
     return opener(path, purpose)
@@ -99,8 +99,7 @@ LEAST_SPAN = 100.0
 
 @dataclass(frozen=True)
 class GridValues:
-    """Voxels (nk, nj, ni) int16, int32 or float32, with facts about them, and reasons (`doubts`) why they may not be
-    HU.
+    """Voxels (nk, nj, ni) int16, int32 or float32, with facts, and reasons (`doubts`) why they may not be HU.
 
     `likeness` is that of the slices along the axis of the longest step; None where there are too few.
     """
@@ -113,10 +112,7 @@ class GridValues:
 
 
 def read_values(grid: GridFile, progress: Progress | None = None) -> GridValues:
-    """Read the voxels of a grid file, scaled as its header says.
-
-    NaN, which resampling writes where there was no image, becomes `AIR_HU` with a warning.
-    """
+    """Read the voxels of a grid file, scaled as its header says; NaN, where there was no image, becomes `AIR_HU`."""
     filling = _Filling(grid)
     for k, stored in enumerate(grid.iterate_slices()):
         filling.add(k, stored)
@@ -178,7 +174,6 @@ class _Filling:
             self._voxels[:k] = narrow[:k]
 
     def finish(self) -> GridValues:
-        """Return the volume with the facts about it."""
         voxels, low, high = self._voxels, self._low, self._high
         if self._holes == voxels.size:
             raise RefusedInputError(f"{self._grid.name} holds no values: all of its voxels are NaN")
@@ -236,24 +231,6 @@ MODALITY = "unknown"
 NOT_DICOM = "not DICOM: position, spacing and the meaning of the values are as the file says, nothing vouches for them"
 
 
-def collect_header_warnings(grid: GridFile) -> list[str]:
-    """Return warnings about a grid file that are known before its voxels are read."""
-    spacing = judge_spacing(grid)
-    unusual = [f"{spacing['text']}: maybe the file has other units than it says"] if spacing["ok"] is False else []
-    given = [] if grid.rescale is None else [str(grid.rescale)]
-    return [NOT_DICOM, *grid.warnings, *unusual, *given]
-
-
-def collect_value_warnings(values: GridValues) -> list[str]:
-    """Return warnings about the values that were read, in addition to those for the voxels of any volume."""
-    warnings = [*values.warnings, *values.doubts]
-    if values.likeness is not None and values.likeness.is_mixed:
-        warnings.append(str(values.likeness))
-    if not values.doubts and (odd := list_odd_values(values.facts)):
-        warnings.append(judge_figures(odd)["text"])
-    return warnings
-
-
 def judge_spacing(grid: GridFile) -> Gate:
     """Judge the gate ``plausible_spacing``.  Axes may be in any order; the longest step is that of the slices."""
     *pixels, gap = sorted(column_spacing(grid.affine))
@@ -299,8 +276,7 @@ def certify_grid(
 def judge_grid(grid: GridFile, values: GridValues | None, value_gates: Sequence[Gate] | None) -> list[Gate]:
     """Judge a grid by the gates of a DICOM volume that apply to it, and by its own header.
 
-    No file of this kind says that its values are HU: the gate ``hu_known`` fails if they are not, else it is
-    unmeasured.
+    No such file says that its values are HU: the gate ``hu_known`` fails if they are not, else it is unmeasured.
     """
     doubtful = "values that cannot be HU, or hardly"
     share = "share of voxels without a measurement (padding)"
@@ -355,11 +331,21 @@ def _examine(grid: GridFile, values: GridValues) -> VoxelFindings:
 
 
 def _collect_warnings(grid: GridFile, values: GridValues | None, findings: VoxelFindings | None) -> list[str]:
-    warnings = collect_header_warnings(grid)
-    if values is not None and findings is not None:
-        failed = [gate.text for gate in findings.gates if gate.ok is False]
-        warnings += [*collect_value_warnings(values), *findings.warnings, *failed]
-    return warnings
+    """Return warnings about the header, then about the values where they were read."""
+    warnings = [NOT_DICOM, *grid.warnings]
+    spacing = judge_spacing(grid)
+    if spacing.ok is False:
+        warnings.append(f"{spacing.text}: maybe the file has other units than it says")
+    if grid.rescale is not None:
+        warnings.append(str(grid.rescale))
+    if values is None or findings is None:
+        return warnings
+    warnings += [*values.warnings, *values.doubts]
+    if values.likeness is not None and values.likeness.is_mixed:
+        warnings.append(str(values.likeness))
+    if not values.doubts and (odd := list_odd_values(values.facts)):
+        warnings.append(judge_figures(odd).text)
+    return [*warnings, *findings.warnings, *(gate.text for gate in findings.gates if gate.ok is False)]
 
 
 def list_grid(

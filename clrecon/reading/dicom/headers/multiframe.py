@@ -41,6 +41,7 @@ from clrecon.reading.dicom.parse.values import (
     Values,
     decode_number,
     decode_text,
+    name_element,
     name_tag,
     read_sequences,
 )
@@ -124,10 +125,7 @@ COMPUTED_CONTRAST = (
 
 @dataclass(frozen=True)
 class Groups:
-    """The functional groups of one file, still undecoded.
-
-    dimensions: Index in DimensionIndexValues and name of each dimension that is not a place in the patient.
-    """
+    """The functional groups of a file, undecoded; index and name of the dimensions that are no place in the patient."""
 
     shared: Item
     frames: list[Item]
@@ -138,10 +136,7 @@ class Groups:
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame in the form of a classic image; with a problem its elements must not be used.
-
-    phase: Pairs of keyword and value, see `SliceHeader`.
-    """
+    """A frame in the form of a classic image, not to be used with a problem; `phase` is as in `SliceHeader`."""
 
     elements: DicomElements
     phase: tuple[tuple[str, str], ...]
@@ -314,8 +309,6 @@ def _describe_phase(frame: DicomElements, dimensions: tuple[tuple[int, str], ...
 
 
 def _name_dimensions(dimensions: list[Item], little: bool) -> Iterator[tuple[int, str]]:
-    from pydicom.datadict import keyword_for_tag
-
     for place, dimension in enumerate(dimensions):
         raw = dimension.values.get(DIMENSION_POINTER, b"")
         if len(raw) != 4:
@@ -323,7 +316,7 @@ def _name_dimensions(dimensions: list[Item], little: bool) -> Iterator[tuple[int
         group, element = struct.unpack("<HH" if little else ">HH", raw)
         pointer = group << 16 | element
         if pointer not in DIMENSIONS_OF_PLACE:
-            yield place, keyword_for_tag(pointer) or f"({group:04X},{element:04X})"
+            yield place, name_element(pointer)
 
 
 def _read_header_bytes(path: Path, elements: DicomElements) -> tuple[bytes, int]:
@@ -364,11 +357,7 @@ EXACT_DIGITS = 15
 
 @dataclass(frozen=True)
 class FramePlaces:
-    """Where the frames of one file lie: offsets (n,) from the first frame along the normal, and the element that says
-    so.
-
-    digits: Number of decimals with which they were written.
-    """
+    """Where the frames of a file lie: offsets (n,) from the first along the normal, their decimals and element."""
 
     offsets_mm: NDArray[np.float64]
     digits: int
@@ -407,7 +396,7 @@ def find_places(values: Values, sop_class: str, frames: int) -> FramePlaces:
     if not pointers <= PLACE_POINTERS:
         raise ValueProblem(
             f"{image}: FrameIncrementPointer (0028,0009) does not say that its frames are slices, but names "
-            f"{join_names(map(_name_tag, sorted(pointers - PLACE_POINTERS)))}: export one volume as single slices"
+            f"{join_names(map(name_element, sorted(pointers - PLACE_POINTERS)))}: export one volume as single slices"
         )
     if "GridFrameOffsetVector" in values:
         return _read_offsets(values, frames)
@@ -415,12 +404,6 @@ def find_places(values: Values, sop_class: str, frames: int) -> FramePlaces:
     if spacing == 0.0:
         raise values.wrong("SpacingBetweenSlices", f"the distance of {frames} frames, other than 0")
     return FramePlaces(spacing * np.arange(frames, dtype=np.float64), EXACT_DIGITS, "SpacingBetweenSlices")
-
-
-def _name_tag(tag: int) -> str:
-    from pydicom.datadict import keyword_for_tag
-
-    return keyword_for_tag(tag) or f"({tag >> 16:04X},{tag & 0xFFFF:04X})"
 
 
 def _read_offsets(values: Values, frames: int) -> FramePlaces:

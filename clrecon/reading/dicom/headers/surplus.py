@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
 from clrecon.reading.dicom.headers.slice_header import SliceHeader
+from clrecon.reading.dicom.parse.elements import inflate
 from clrecon.reading.dicom.parse.plain import PIXEL_TAGS, UNDEFINED_LENGTH, CorruptFileError, DicomElements
 from clrecon.reading.dicom.parse.transfer_syntaxes import find_end, is_encapsulated
 from clrecon.reading.dicom.parse.values import LONG_VRS, ValueProblem, skip_sequence
@@ -38,10 +39,7 @@ _CHUNK = 2**20
 
 
 def check_surplus(elements: DicomElements, header: SliceHeader, force: bool = False) -> tuple[str, ...]:
-    """Examine the surplus bytes of a file; `header` is its only or first slice.
-
-    force: Accept surplus bytes other than zeros as padding.
-    """
+    """Examine the surplus bytes of a file, by its first header; `force` takes other ones than zeros as padding."""
     if is_encapsulated(header.transfer_syntax):
         return _check_encapsulated(elements, header, force)
     expected = header.frames * header.pixel_bytes
@@ -202,19 +200,13 @@ def _was_sent_as_text(file: BinaryIO, start: int, size: int) -> bool:
 def _inflate(file: BinaryIO, start: int, needed: int) -> bytes:
     """Inflate a deflated data set: `needed` bytes of it and at most `LOOKED_AT_BYTES` more."""
     file.seek(start)
-    inflater = zlib.decompressobj(-zlib.MAX_WBITS)
-    inflated = bytearray()
     limit = needed + LOOKED_AT_BYTES
     try:
-        while len(inflated) <= limit and not inflater.eof:
-            deflated = inflater.unconsumed_tail or file.read(_CHUNK)
-            if not deflated:
-                break
-            inflated += inflater.decompress(deflated, limit + 1 - len(inflated))
+        inflated, behind = inflate(file.read, limit + 1, _CHUNK)
     except zlib.error as error:
         raise CorruptFileError("the deflated data set is damaged") from error
     if len(inflated) > limit:
         raise CorruptFileError(f"over {LOOKED_AT_BYTES} bytes follow the pixels of a deflated data set")
-    if inflater.unused_data.strip(b"\0"):
-        raise CorruptFileError(f"{len(inflater.unused_data)} bytes behind the deflated data set")
-    return bytes(inflated)
+    if behind.strip(b"\0"):
+        raise CorruptFileError(f"{len(behind)} bytes behind the deflated data set")
+    return inflated

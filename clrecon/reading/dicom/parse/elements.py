@@ -17,6 +17,7 @@ import os
 import stat
 import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, cast
 
@@ -37,6 +38,7 @@ from clrecon.reading.dicom.parse.plain import (
     parse_plainly,
     read_pixel_head,
 )
+from clrecon.reading.dicom.parse.values import name_tag
 from clrecon.system.arguments import name_parameter
 from clrecon.system.paths import open_regular
 
@@ -78,10 +80,7 @@ def find_program(start: bytes) -> str:
 
 
 def restore_start(data: bytes) -> Start | None:
-    """Return the standard start for a file that has none, given its first bytes.
-
-    None where it has a meta header after its preamble, or does not begin like a data set.
-    """
+    """Return the standard start for a file with these first bytes; None where it has one, or is no data set."""
     marked = data[128:MARK_END] == b"DICM"
     skip = MARK_END if marked else 4 if data[:4] == b"DICM" else 0
     if data[skip : skip + 2] == b"\x02\0" and data[skip + 4 : skip + 6].isalpha():
@@ -121,11 +120,7 @@ other values of undefined length it searches the whole rest of the file for the 
 
 
 def parse_carefully(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -> DicomElements:
-    """Parse a file, or the start of one, from the preamble on.
-
-    size: Bytes of the whole file.
-    wanted: Tags to keep; None keeps all.
-    """
+    """Parse a file of `size` bytes, or its start, from the preamble on; `wanted` are the tags to keep, None for all."""
     try:
         return _parse_file(cast(BinaryIO, _MeteredFile(file)), size, wanted)
     except CorruptFileError:
@@ -203,10 +198,7 @@ def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -> Di
 def _collect(
     file: BinaryIO, *, implicit: bool, little: bool, last_group: int | None, wanted: tuple[int, ...] | None
 ) -> tuple[dict[int, bytes], dict[int, str | None], list[str]]:
-    """Read elements up to the end of `last_group`, or to the pixel data: values, VRs, and remarks about their order.
-
-    pydicom's data sets silently keep the last of two elements of one tag; here each element is seen.
-    """
+    """Read values up to the end of `last_group` or the pixel data, VRs, and remarks on order, which pydicom hides."""
     from pydicom.filereader import data_element_generator
 
     def stop(tag: int, vr: str | None, length: int) -> bool:
@@ -247,10 +239,7 @@ class _Order:
         self._last = 0
 
     def add(self, tag: int, value: bytes) -> None:
-        """Add the next element."""
-        from pydicom.datadict import keyword_for_tag
-
-        place = f"{keyword_for_tag(tag)} ({tag >> 16:04X},{tag & 0xFFFF:04X})".lstrip()
+        place = name_tag(tag)
         value = value.rstrip(b" \0")
         if tag not in self._values:
             if tag < self._last:
@@ -266,9 +255,7 @@ class _Order:
 
 
 def _looks_implicit(file: BinaryIO, start: int) -> bool | None:
-    """Tell the encoding from the first element: explicit VR has two capital letters there.  None at the end of the
-    data.
-    """
+    """Tell the encoding from the first element: explicit VR has two capital letters.  None at the end of the data."""
     head = file.read(6)
     file.seek(start)
     if len(head) < 6:
@@ -278,19 +265,29 @@ def _looks_implicit(file: BinaryIO, start: int) -> bool | None:
 
 def _inflate_header(file: BinaryIO) -> bytes:
     """Inflate the start of a deflated data set: enough for its header, and never more than a fixed limit."""
-    inflater = zlib.decompressobj(-zlib.MAX_WBITS)
-    inflated = bytearray()
-    while len(inflated) < READ_LIMIT and not inflater.eof:
+
+    def read(count: int) -> bytes:
         try:
-            deflated = inflater.unconsumed_tail or file.read(INFLATE_STEP)
+            return file.read(count)
         except CorruptFileError:
-            break  # the limit is that of other files; data up to it are used
-        if not deflated:
-            break
-        inflated += inflater.decompress(deflated, READ_LIMIT - len(inflated))
+            return b""  # the limit is that of other files; data up to it are used
+
+    inflated, _ = inflate(read, READ_LIMIT, INFLATE_STEP)
     if not inflated:
         raise CorruptFileError("nothing in the deflated data set")
-    return bytes(inflated)
+    return inflated
+
+
+def inflate(read: Callable[[int], bytes], most: int, step: int) -> tuple[bytes, bytes]:
+    """Inflate raw Deflate up to `most` bytes, read `step` bytes at a time; also return what was read beyond its end."""
+    inflater = zlib.decompressobj(-zlib.MAX_WBITS)
+    inflated = bytearray()
+    while len(inflated) < most and not inflater.eof:
+        deflated = inflater.unconsumed_tail or read(step)
+        if not deflated:
+            break
+        inflated += inflater.decompress(deflated, most - len(inflated))
+    return bytes(inflated), inflater.unused_data
 
 
 PREFIX_BYTES = 16 * 1024
@@ -331,9 +328,8 @@ def has_dicom_mark(prefix: bytes) -> bool:
 def read_elements(
     path: Path, wanted: tuple[int, ...] | None, start: FileStart | None = None, force: bool = False
 ) -> DicomElements:
-    """Read the raw elements of one DICOM file.
+    """Read the raw elements of a DICOM file: of the wanted tags, or all whose length is defined.
 
-    wanted: Tags to keep; None keeps all whose length is defined.
     start: The result of `read_start` for this file, so that it is not read twice.
     force: Also read a data set without preamble or meta header.
     """

@@ -21,7 +21,7 @@ from functools import lru_cache
 from typing import Any, Literal
 
 from clrecon.errors import RefusedInputError
-from clrecon.reading.dicom.parse.elements import DicomElements
+from clrecon.reading.dicom.parse.plain import DicomElements
 from clrecon.system.text import escape_text
 
 RESCALE_TYPES = frozenset("HU HU_MOD OD US MGML Z_EFF ED EDW PCT".split())
@@ -161,9 +161,7 @@ class ValueProblem(RefusedInputError):
 
 
 class Values:
-    """Typed access to raw elements; every accessor checks what it returns.  `warnings` are of doubtful numbers among
-    them.
-    """
+    """Typed access to raw elements; every accessor checks what it returns, and adds doubts about it to `warnings`."""
 
     def __init__(self, elements: DicomElements):
         self.elements = elements
@@ -186,16 +184,12 @@ class Values:
         return ValueProblem(f"{place} is {shown}, expected {expected}")
 
     def text(self, keyword: str) -> str:
-        raw = self.elements.values.get(_TAGS[keyword])
-        if raw is None:
-            return ""
+        raw = self.elements.values.get(_TAGS[keyword], b"")
         return _known_text(raw) if len(raw) <= _KNOWN_BYTES else decode_text(raw)
 
     def word(self, keyword: str) -> str:
         """Return the text as one safe line."""
-        raw = self.elements.values.get(_TAGS[keyword])
-        if raw is None:
-            return ""
+        raw = self.elements.values.get(_TAGS[keyword], b"")
         return _known_word(raw) if len(raw) <= _KNOWN_BYTES else escape_text(decode_text(raw))
 
     def pairs(self, keywords: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
@@ -299,9 +293,8 @@ VR_NAMES = {name.encode(): name for name in "AE AS AT CS DA DS DT FD FL IS LO SH
 
 @dataclass(slots=True)
 class Item:
-    """The wanted elements of one item (or of the whole data set).
+    """The wanted elements, by tag, of one item (or of the whole data set) that are not empty.
 
-    values: Tag to undecoded value, of those that are not empty.
     vrs: Value representations of these elements; None in implicit VR.
     repeated: For the whole data set only: wanted tags that occur twice in one of its items, with the same value.
     """
@@ -334,8 +327,7 @@ _UNKNOWN = _make_encoding(implicit=True, little=True)
 def read_sequences(
     data: bytes, start: int, schema: Schema, *, implicit: bool, little_endian: bool, items_limit: int
 ) -> Item:
-    """Read the wanted values and sequences of one data set, from `start` up to its pixel data, within which `data` may
-    end.
+    """Read the wanted values and sequences of a data set, from `start` to its pixel data, within which `data` may end.
 
     items_limit: Most items that all wanted sequences may hold together.
     """
@@ -495,6 +487,11 @@ def name_tag(tag: int) -> str:
     from pydicom.datadict import keyword_for_tag
 
     return f"{keyword_for_tag(tag)} {_name_number(tag)}".lstrip()
+
+
+def name_element(tag: int) -> str:
+    """Keyword for a message; the tag of a private or unknown element."""
+    return name_tag(tag).partition(" ")[0]
 
 
 def _name_number(tag: int) -> str:

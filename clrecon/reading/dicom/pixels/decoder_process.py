@@ -18,6 +18,7 @@ import struct
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, BinaryIO
 
 REPLY = "<BQ"
@@ -36,6 +37,13 @@ def decode_by_openjpeg(data: bytes, request: dict[str, Any]) -> Any:
     from openjpeg import decode
 
     return decode(data, 0)
+
+
+def decode_by_imagecodecs(function: str, data: bytes, request: dict[str, Any]) -> Any:
+    """Decode what one function of imagecodecs does: `jpeg8_decode` JPEG lossless, by libjpeg-turbo."""
+    import imagecodecs
+
+    return getattr(imagecodecs, function)(data)
 
 
 def decode_by_jpeg_ls(data: bytes, request: dict[str, Any]) -> Any:
@@ -57,34 +65,14 @@ def decode_by_rle(data: bytes, request: dict[str, Any]) -> Any:
     return np.frombuffer(pixels, f"<u{bits // 8}").reshape(request["rows"], request["columns"])
 
 
-def decode_by_imagecodecs_jpeg(data: bytes, request: dict[str, Any]) -> Any:
-    """Decode JPEG lossless by libjpeg-turbo."""
-    from imagecodecs import jpeg8_decode
-
-    return jpeg8_decode(data)
-
-
-def decode_by_imagecodecs_jpeg_ls(data: bytes, request: dict[str, Any]) -> Any:
-    from imagecodecs import jpegls_decode
-
-    return jpegls_decode(data)
-
-
-def decode_by_imagecodecs_jpeg_2000(data: bytes, request: dict[str, Any]) -> Any:
-    """Decode JPEG 2000, as `decode_by_openjpeg` does."""
-    from imagecodecs import jpeg2k_decode
-
-    return jpeg2k_decode(data)
-
-
 # Decoders import at the start: before memory is limited, and where a missing package can be reported.
 DECODERS: dict[str, tuple[Decoder, tuple[str, ...]]] = {
     "openjpeg": (decode_by_openjpeg, ("openjpeg",)),
     "jpeg_ls": (decode_by_jpeg_ls, ("jpeg_ls",)),
     "rle": (decode_by_rle, ("rle.rle",)),
-    "imagecodecs jpeg": (decode_by_imagecodecs_jpeg, ("imagecodecs", "imagecodecs._jpeg8")),
-    "imagecodecs jpeg_ls": (decode_by_imagecodecs_jpeg_ls, ("imagecodecs", "imagecodecs._jpegls")),
-    "imagecodecs jpeg_2000": (decode_by_imagecodecs_jpeg_2000, ("imagecodecs", "imagecodecs._jpeg2k")),
+    "imagecodecs jpeg": (partial(decode_by_imagecodecs, "jpeg8_decode"), ("imagecodecs", "imagecodecs._jpeg8")),
+    "imagecodecs jpeg_ls": (partial(decode_by_imagecodecs, "jpegls_decode"), ("imagecodecs", "imagecodecs._jpegls")),
+    "imagecodecs jpeg_2000": (partial(decode_by_imagecodecs, "jpeg2k_decode"), ("imagecodecs", "imagecodecs._jpeg2k")),
 }
 
 
@@ -110,7 +98,6 @@ def take_standard_output() -> BinaryIO:
 
 
 def send(sink: BinaryIO, status: int, body: Any = b"") -> None:
-    """Write one reply."""
     body = memoryview(body).cast("B")
     for part in (memoryview(struct.pack(REPLY, status, len(body))), body):
         done = 0
@@ -137,9 +124,7 @@ def limit_memory(more_bytes: int) -> None:
 
 
 def limit_time(seconds: float, orphan: bool) -> None:
-    """End this process when the next frame takes too long, as the parent does too, by the wall clock if it is an
-    orphan.
-    """
+    """End this process when the next frame takes too long, as the parent does; an orphan by the wall clock too."""
     try:
         import resource
     except ImportError:
@@ -153,10 +138,7 @@ def limit_time(seconds: float, orphan: bool) -> None:
 
 
 def end_with(lifeline: int) -> None:
-    """Let the system end this process (by SIGIO), even while a decoder runs, when its parent's end of a pipe closes.
-
-    Where the system has no such signal, the alarm ends an orphan.
-    """
+    """Let the system end this process (SIGIO, else the alarm), even in a decoder, when its parent closes the pipe."""
     if lifeline < 0:
         return
     import fcntl

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError
 from clrecon.reading.dicom.headers.slice_header import SliceHeader
 from clrecon.reading.dicom.headers.surplus import INFLATED_LIMIT
+from clrecon.reading.dicom.parse.elements import inflate
 from clrecon.reading.dicom.parse.transfer_syntaxes import (
     JPEG_2000,
     JPEG_LOSSLESS,
@@ -58,9 +59,7 @@ _NO_FRAMES = (0xC4, 0xC8, 0xCC)  # tables, though within the range of starts of 
 
 @dataclass(frozen=True)
 class Codestream:
-    """A compressed frame, without a container around it, and the facts in its head; its sign is None where that is
-    silent.
-    """
+    """A compressed frame without its container, and the facts in its head, which may say nothing about the sign."""
 
     data: bytes
     rows: int
@@ -200,7 +199,6 @@ class StoredPixels(Closing):
         self._inflated: dict[Path, bytes] = {}
 
     def close(self) -> None:
-        """Close the processes that decode."""
         self._pool.close()
 
     def stop(self) -> None:
@@ -208,11 +206,9 @@ class StoredPixels(Closing):
         self._pool.kill()
 
     def load(self, header: SliceHeader, out: NDArray[Any]) -> NDArray[Any]:
-        """Read one slice.
+        """Read one slice, in the type that the header declares, unused bits included, in native byte order.
 
         out: C-contiguous (rows, columns); memory that may be used for the result where its type has the same width.
-
-        Returns: Stored values in the type that the header declares, unused bits included, in native byte order.
         """
         dtype = stored_dtype(header.float_pixels, header.signed, header.bits_allocated)
         fits = out.dtype.itemsize == dtype.itemsize and (out.dtype.kind == "f") == (dtype.kind == "f")
@@ -301,24 +297,15 @@ def _check_compressed_bytes(found: int, pixel_bytes: int) -> None:
 
 
 def _inflate_data_set(header: SliceHeader, needed: int) -> bytes:
-    """Return the first `needed` bytes of a deflated data set, or those that exist; zlib takes no more memory than
-    these.
-    """
+    """Return the first `needed` bytes of a deflated data set, or those that exist; zlib takes no more memory."""
     if needed > INFLATED_LIMIT:
         raise RefusedInputError(f"deflated image of {needed} bytes, no more than {INFLATED_LIMIT} are inflated")
-    inflater = zlib.decompressobj(-zlib.MAX_WBITS)
-    inflated = bytearray()
     try:
         with open_regular(header.file, 0) as file:
             file.seek(header.inflate_from)
-            while len(inflated) < needed and not inflater.eof:
-                deflated = inflater.unconsumed_tail or file.read(INFLATE_STEP)
-                if not deflated:
-                    break
-                inflated += inflater.decompress(deflated, needed - len(inflated))
+            return inflate(file.read, needed, INFLATE_STEP)[0]
     except zlib.error as error:
         raise RefusedInputError("the deflated data set is damaged") from error
-    return bytes(inflated)
 
 
 def _settle_sign(header: SliceHeader, frame: Codestream, decoded: NDArray[Any]) -> None:

@@ -69,9 +69,8 @@ def judge_series(
     likeness: Likeness | None = None,
     value_gates: Sequence[Gate] | None = None,
 ) -> list[Gate]:
-    """Judge a series by the gates; those on what is None are not measured.
+    """Judge a series, its slices stacked as they are read, by the gates; those on what is None are not measured.
 
-    stack: Its slices as they are or would be read.
     value_gates: Gates of the values of the voxels, see `clrecon.reading.common.plausibility.examine_voxels`.
     """
     refused = len(series.problems)
@@ -81,13 +80,18 @@ def judge_series(
     ]
     if stack is None:
         return gates
-    gates.append(_judge_spacing(stack))
+    first = stack.slices[0]
+    gates.append(judge_steps((first.di_mm, first.dj_mm), stack.line.gap_median_mm))
     gates += _gates_of_places(stack)
     what = "slices at the place of another that differ from it and are no phases"
     gates.append(judge_numbers(series.census, stack, _count_copies(series)))
     gates.append(none_of("duplicate_slices", _count_doubled(series), what))
     gates.append(_judge_one_volume(series, likeness))
-    gates += _gates_of_values(stack.slices)
+    gates += [
+        none_of("hu_known", count_unknown(stack.slices), "slices whose values are not known to be HU"),
+        none_of("lossless", sum(h.lossy for h in stack.slices), "slices with lossy compression"),
+        none_of("measured_images", sum(bool(h.derived) for h in stack.slices), "slices that were computed from others"),
+    ]
     gates.append(_judge_hu(stack.slices, facts))
     gates += leave_unexamined() if value_gates is None else value_gates
     share = "share of voxels without a measurement (padding)"
@@ -120,11 +124,6 @@ def _gates_of_places(stack: Stack) -> Iterator[Gate]:
     yield _judge_stated_gap(stack)
 
 
-def _judge_spacing(stack: Stack) -> Gate:
-    first = stack.slices[0]
-    return judge_steps((first.di_mm, first.dj_mm), stack.line.gap_median_mm)
-
-
 def _judge_thickness(stack: Stack) -> Gate:
     """Compare gaps with SliceThickness: how much of the tissue was measured."""
     what = "largest gap between slices as a multiple of SliceThickness; above 1 the tissue between was not measured"
@@ -153,9 +152,7 @@ def _judge_hu(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> Gate:
 
 
 def _judge_one_volume(series: Series, likeness: Likeness | None) -> Gate:
-    """Judge whether neighbours differ more than slices farther apart, and whether an element alternates along the
-    slices.
-    """
+    """Judge whether slices differ more from neighbours than from others, and whether an element alternates."""
     doubts = 0 if series.stack is None or series.find_doubt() == "" else 1
     what = "signs of several volumes between each other: a header that alternates, neighbours less alike than others"
     if likeness is None and not doubts:
@@ -192,12 +189,6 @@ def count_unknown(headers: Sequence[SliceHeader]) -> int:
     return sum(
         not (h.has_slope and h.has_intercept) or h.rescale_type not in ("", "HU") or h.modality_lut for h in headers
     )
-
-
-def _gates_of_values(headers: Sequence[SliceHeader]) -> Iterator[Gate]:
-    yield none_of("hu_known", count_unknown(headers), "slices whose values are not known to be HU")
-    yield none_of("lossless", sum(h.lossy for h in headers), "slices with lossy compression")
-    yield none_of("measured_images", sum(bool(h.derived) for h in headers), "slices that were computed from others")
 
 
 SAID_BY_GATES = (
@@ -293,11 +284,6 @@ def _describe_what_was_left(series: Series) -> list[str]:
     return warnings
 
 
-def _facts_of_identity(series: Series) -> dict[str, Any]:
-    identity = series.identity
-    return {"number": series.number, "uid_hash": hash_uid(identity.uid), "modality": identity.modality}
-
-
 def _facts_of_phase(series: Series) -> dict[str, Any] | None:
     if series.phase is None or not series.places.phases:
         return None
@@ -337,18 +323,17 @@ def certify(
 ) -> Certificate:
     """Build the certificate of a series: the report of its volume, and what ``clrecon info`` shows.
 
-    facts, findings: None: the pixels were not read, and entries that depend on them are None.
+    facts, likeness, findings: None: the pixels were not read, and entries that depend on them are None.
     affine: None: the series is refused.
-    likeness: None: the pixels were not read, or there are too few slices.
     """
-    headers, first, line = stack.slices, stack.slices[0], stack.line
+    headers, first, line, identity = stack.slices, stack.slices[0], stack.line, series.identity
     stated = next((h.stated_gap_mm for h in headers if h.stated_gap_mm is not None), None)
     lay = {h.patient_position for h in headers}
     gates = judge_series(series, stack, facts, likeness, None if findings is None else findings.gates)
     unsaid = [gate.text for gate in gates if gate.name in SAID_BY_GATES and gate.ok is False]
     return Certificate(
         format="DICOM",
-        series=_facts_of_identity(series),
+        series={"number": series.number, "uid_hash": hash_uid(identity.uid), "modality": identity.modality},
         phase=_facts_of_phase(series),
         slices=len(headers),
         slices_missing=stack.missing,

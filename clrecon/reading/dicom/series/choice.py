@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -79,7 +79,9 @@ def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> C
     if wanted is None:
         ct = [series for series in found if series.kind != "other"]
         if not ct:
-            raise NoDicomError(_describe_modalities(found))
+            counts = Counter(series.identity.modality for series in found)
+            what = ", ".join(f"{count} series of modality {modality}" for modality, count in sorted(counts.items()))
+            raise NoDicomError(f"found {what}, no CT series")
         _check_one_patient(ct)
         return _take_best(ct)
     matches = _match_series(found, wanted)
@@ -238,14 +240,6 @@ def _describe_other_planes(left: Sequence[Series], chosen: Series) -> list[str]:
     count = sum(len(part.headers) for part in parts)
     angles = f"{low:.1f}" if len(parts) == 1 else f"{low:.1f} to {high:.1f}"
     return [f"{count} slice{'s' * (count > 1)} of the series that is read left: in another plane, {angles} degrees off"]
-
-
-def _describe_modalities(found: Sequence[Series]) -> str:
-    counts: dict[str, int] = defaultdict(int)
-    for series in found:
-        counts[series.identity.modality] += 1
-    what = ", ".join(f"{count} series of modality {modality}" for modality, count in sorted(counts.items()))
-    return f"found {what}, no CT series"
 
 
 def _list_lines(found: Sequence[Series]) -> str:

@@ -173,8 +173,6 @@ def find_remains(strangers: Sequence[Stranger], slices: Iterable[tuple[str, int 
 
     slices: Path and bytes of the files that hold CT slices; None where they are no measure for others.
     """
-    if not strangers:
-        return []
     folders: dict[str, _Slices] = defaultdict(_Slices)
     paths: set[str] = set()  # of the slices: patterns of names and folders
     for file, size in slices:
@@ -186,12 +184,8 @@ def find_remains(strangers: Sequence[Stranger], slices: Iterable[tuple[str, int 
     for folder, known in folders.items():
         known.finish()
         paths.update(f"{_pattern(os.path.basename(folder))}/{pattern}" for pattern in known.patterns)
-    found = []
-    for stranger in strangers:
-        reason = _judge(stranger, folders, paths)
-        if reason:
-            found.append((Path(stranger.file), reason))
-    return found
+    judged = ((Path(stranger.file), _judge(stranger, folders, paths)) for stranger in strangers)
+    return [(path, reason) for path, reason in judged if reason]
 
 
 def _judge(stranger: Stranger, folders: dict[str, _Slices], paths: set[str]) -> str:

@@ -19,7 +19,7 @@ from clrecon.reading.dicom.headers.slice_header import PHASE_KEYWORDS, SliceHead
 from clrecon.reading.dicom.pixels.stored import StoredPixels
 from clrecon.reading.dicom.pixels.voxels import read_voxels
 from clrecon.reading.dicom.stack.fit import measure_gap
-from clrecon.reading.dicom.stack.mixtures import Alternation, find_mixture, values_of
+from clrecon.reading.dicom.stack.mixtures import Alternation, find_mixture, read_number, values_of
 from clrecon.reading.dicom.stack.spacing import measure_unit
 from clrecon.system.arguments import name_parameter
 from clrecon.system.text import join_names
@@ -47,11 +47,7 @@ RANK_KEYWORDS = (
 
 @dataclass(frozen=True)
 class Phase:
-    """One of several volumes in a series.
-
-    number: From 1; the value that ``phase=`` takes.
-    keyword, value: The element that distinguishes the phases, and its value for this one; times count from the first.
-    """
+    """One of the volumes in a series, from 1, and the element that distinguishes it; times count from the first."""
 
     number: int
     keyword: str
@@ -65,10 +61,8 @@ class Phase:
 
 @dataclass(frozen=True)
 class Places:
-    """Slices grouped by their places.
+    """Slices grouped by their places, without copies.
 
-    headers: The slices without copies.
-    copies: Number of slices that were left out as copies.
     phases: Empty where each place has one slice; none is chosen yet.
     problem: Why the slices are no volume and no phase of them is one; empty if there is no problem.
     interleaved: The phases share no place, and the slices of one lie between those of another.
@@ -248,9 +242,7 @@ def _keyword_choices(places: Sequence[Sequence[SliceHeader]]) -> Iterator[tuple[
 
 
 def _rank_by_time(places: Sequence[Sequence[SliceHeader]]) -> tuple[Phase, ...]:
-    """Rank slices by time, first visits, second visits and so on, where all places were equally often visited at known
-    times.
-    """
+    """Rank slices by time, first visits, second visits..., where all places have equally many, each with a time."""
     most = max(map(len, places))
     if any(len(slices) != most for slices in places):
         return ()
@@ -290,27 +282,18 @@ def _are_passes(values: Sequence[Sequence[tuple[str, ...]]], keywords: tuple[str
 
 def _order(value: tuple[str, ...]) -> list[tuple[int, float, str]]:
     """Return a sort key: numbers by size, before text."""
-    return [(0, number, "") if (number := _number(part)) is not None else (1, 0.0, part) for part in value]
-
-
-def _number(text: str) -> float | None:
-    try:
-        number = float(text)
-    except ValueError:
-        return None
-    return number if np.isfinite(number) else None
+    return [(0, number, "") if (number := read_number(part)) is not None else (1, 0.0, part) for part in value]
 
 
 def _show(keywords: Sequence[str], values: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return values for a listing; of dates and times, which may identify the patient, only the time since the first
-    one.
-    """
+    """Return values for a listing; dates and times, which may identify the patient, only since the first one."""
     columns = []
     for place, keyword in enumerate(keywords):
         column = [value[place] for value in values]
         if keyword in TIME_KEYWORDS:
             seconds = [_seconds(text) for text in column]
-            column = _since_first(seconds, "s")
+            first = min((value for value in seconds if value is not None), default=0.0)
+            column = ["(none)" if value is None else f"+{value - first:g} s" for value in seconds]
         elif keyword in DATE_KEYWORDS:
             column = [f"date {1 + sorted(set(column)).index(text)}" for text in column]
         columns.append([text or "(none)" for text in column])
@@ -318,18 +301,12 @@ def _show(keywords: Sequence[str], values: Sequence[tuple[str, ...]]) -> list[st
 
 
 def _seconds(text: str) -> float | None:
-    number = _number(text)
+    number = read_number(text)
     if number is None:
         return None
     hours, rest = divmod(number, 10000)
     minutes, seconds = divmod(rest, 100)
     return hours * 3600 + minutes * 60 + seconds
-
-
-def _since_first(seconds: Sequence[float | None], unit: str) -> list[str]:
-    known = [value for value in seconds if value is not None]
-    first = min(known, default=0.0)
-    return ["(none)" if value is None else f"+{value - first:g} {unit}" for value in seconds]
 
 
 def describe_phases(places: Places) -> str:

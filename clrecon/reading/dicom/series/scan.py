@@ -21,6 +21,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from time import perf_counter
@@ -83,24 +84,21 @@ class DiskReader:
             chunk = files[first : first + CHUNK]
             count = len(self._threads)
             start = perf_counter()
-            parts = self._run_all([self._make_job(chunk[part::count]) for part in range(count)])
+            parts = self._run_all([partial(self._read_files, chunk[part::count]) for part in range(count)])
             if count == 1 and perf_counter() - start > SLOW_FILE_S * len(chunk):
                 self._start_threads(MOST_THREADS)
             for place in range(len(chunk)):
                 yield parts[place % count][place // count]
 
-    def _make_job(self, files: Sequence[str]) -> Callable[[], list[FileStart | OSError]]:
-        def read_all() -> list[FileStart | OSError]:
-            found: list[FileStart | OSError] = []
-            for file in files:
-                self.touched = file
-                try:
-                    found.append(read_start(file))
-                except OSError as error:
-                    found.append(error)
-            return found
-
-        return read_all
+    def _read_files(self, files: Sequence[str]) -> list[FileStart | OSError]:
+        found: list[FileStart | OSError] = []
+        for file in files:
+            self.touched = file
+            try:
+                found.append(read_start(file))
+            except OSError as error:
+                found.append(error)
+        return found
 
     def _start_threads(self, count: int) -> None:
         while len(self._threads) < count:
@@ -173,14 +171,12 @@ class CorruptFile:
 
 @dataclass
 class Scan:
-    """The contents of a folder, slices in the order of their paths.
+    """The contents of a folder, or file, slices in the order of their paths.
 
     skipped: Maps a reason to the number of files (or folders) passed over.
     corrupt: Files that claim to be DICOM but cannot be parsed; files and folders that cannot be read at all.
     suspects: Files that are not DICOM, but look like remains of a slice; links that are not followed or lead nowhere.
     strangers: All other files that are not DICOM.
-    rescale: Slope and intercept that the user gave for all slices.
-    is_file: The path names one file and no folder.
     """
 
     slices: list[SliceHeader] = field(default_factory=list)
@@ -195,8 +191,7 @@ class Scan:
 
 
 def scan_path(path: Path, progress: Progress | None = None, force: bool = False, follow_links: bool = False) -> Scan:
-    """Read the headers of all DICOM files at `path`, a file or a folder with its subfolders; progress in
-    `PROGRESS_STEPS`.
+    """Read the headers of all DICOM files at `path`, a file or a folder with its subfolders.
 
     force: Also accept data sets without preamble or meta header.
     follow_links: Also read the files and folders that links out of the folder lead to.
@@ -211,15 +206,10 @@ def scan_path(path: Path, progress: Progress | None = None, force: bool = False,
             if progress is not None and (done % step == 0 or done == total):
                 progress("scan", done, total)
     if scan.strangers:
-        _suspect_strangers(scan)
+        slices: dict[str, int | None] = {str(header.file): header.file_bytes for header in scan.slices}
+        slices |= {str(image.file): None for image in scan.others if image.kind == "broken"}
+        scan.suspects += [CorruptFile(*remains) for remains in find_remains(scan.strangers, slices.items())]
     return scan
-
-
-def _suspect_strangers(scan: Scan) -> None:
-    slices: dict[str, int | None] = {str(header.file): header.file_bytes for header in scan.slices}
-    slices |= {str(image.file): None for image in scan.others if image.kind == "broken"}
-    for path, reason in find_remains(scan.strangers, slices.items()):
-        scan.suspects.append(CorruptFile(path, reason))
 
 
 def _take_file(file: str, start: FileStart | OSError, scan: Scan, force: bool) -> None:
@@ -344,5 +334,4 @@ def _sort_link(entry: os.DirEntry[str], found: _Found, scan: Scan) -> None:
 
 
 def advise_on_links() -> str:
-    """Say how links are followed."""
     return f"{name_parameter('follow_links', True)} follows links"

@@ -35,10 +35,7 @@ With smaller differences they are one stack, and the gate reports the difference
 
 
 class Planes:
-    """Pairs of directions, numbered as they arrive; pairs within `SPLIT_ANGLE_RAD` of an earlier one get its number.
-
-    A series may have as many planes as files: beyond the first few they are looked up in a grid of cells of that size.
-    """
+    """Pairs of directions, numbered as they come; a grid of cells finds pairs within `SPLIT_ANGLE_RAD` of a new one."""
 
     FEW = 4
 
@@ -113,9 +110,7 @@ class Series:
     corrupt: Files and folders that cannot be read and may be or contain slices of it.
     lost: Descriptions of missing files that leave no hole: parts of concatenations.
     census: Of all parts of the series.
-    number: Place in the listing, from 1.
     patient, study: Numbers among those scanned, from 1; 0 where the files do not tell.
-    phase: Number of the wanted phase.
     allow_gaps: Missing slices give a warning and are not a problem.
     is_file: One file was named, and not the folder of the series.
     """
@@ -268,11 +263,8 @@ class Series:
 
     def describe(self) -> str:
         """Describe the series in one line for a message, without its description, since people type names into it."""
-        return f"{self.number}: {self.identity.modality}, {self._describe_count()}"
-
-    def _describe_count(self) -> str:
         kind = "" if self.kind in ("stack", "other") else f", {self.kind}"
-        return f"{self.count} slice{'s' * (self.count != 1)}{kind}"
+        return f"{self.number}: {self.identity.modality}, {self.count} slice{'s' * (self.count != 1)}{kind}"
 
 
 def group_series(scan: Scan) -> list[Series]:
@@ -308,7 +300,7 @@ def group_series(scan: Scan) -> list[Series]:
             part.census = census
         parts.sort(key=lambda part: (part.kind != "stack", -part.count))
         found += parts
-    found.sort(key=_listing_key)
+    found.sort(key=lambda one: (one.identity.number is None, one.identity.number or 0, one.identity.uid))
     _number_patients_and_studies(found)
     found.sort(key=_owner_key(found))
     for number, series in enumerate(found, start=1):
@@ -349,9 +341,8 @@ def _owner_key(found: Sequence[Series]) -> Callable[[Series], tuple[float, float
 def _blame_corrupt_files(found: Sequence[Series], scan: Scan) -> None:
     """Give every stack the unreadable files that may belong to it: a lost slice at its end would leave no hole.
 
-    A corrupt file may belong to any stack, unless its folder holds slices of other series only.  A suspect may belong
-    to a stack with slices in its folder, or to one with slices in several folders where its own folder holds none at
-    all.
+    A corrupt file may belong to any stack, unless its folder holds slices of other series only; a suspect to a stack
+    with slices in its folder, or in several folders where its own holds none.
     """
     holders: dict[Path, set[str]] = defaultdict(set)  # from folder to the series, by UID, with slices in it
     for series in found:
@@ -393,20 +384,14 @@ def _group_key(image: SliceHeader | OtherImage) -> str:
     return image.series.uid or f"{image.series.number} {image.file.parent}"
 
 
-def _listing_key(series: Series) -> tuple[bool, int, str]:
-    number = series.identity.number
-    return number is None, number or 0, series.identity.uid
-
-
 def _split_slices(headers: Sequence[SliceHeader]) -> list[Series]:
     """Divide the slices of one SeriesInstanceUID by plane, localizers first."""
     planes = Planes()
     parts: list[Series] = []
     known: dict[tuple[float, ...], Series] = {}
-    localizers = Series(headers[0].series, "localizer") if headers else None
+    localizers = [header for header in headers if header.localizer]
     for header in headers:
-        if header.localizer and localizers is not None:
-            localizers.headers.append(header)
+        if header.localizer:
             continue
         key = (*header.row_cosines, *header.column_cosines)
         if key not in known:
@@ -415,7 +400,6 @@ def _split_slices(headers: Sequence[SliceHeader]) -> list[Series]:
                 parts.append(Series(header.series, "stack"))
             known[key] = parts[number]
         known[key].headers.append(header)
-    found = parts
-    if localizers is not None and localizers.headers:
-        found.append(localizers)
-    return found
+    if localizers:
+        parts.append(Series(headers[0].series, "localizer", localizers))
+    return parts

@@ -17,17 +17,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clrecon.geometry import compose_affine, signed_tilt
-from clrecon.geometry.affine import TILT_REPORT_DEG
+from clrecon.geometry.affine import TILT_REPORT_DEG, Float64Array
 from clrecon.geometry.grid import fit_line, position_tolerance
 from clrecon.reading.dicom.headers.slice_header import SliceHeader
 from clrecon.reading.dicom.stack.spacing import Holes, Rounding, find_holes, find_rounding, median
 from clrecon.system.arguments import name_parameter
 from clrecon.system.text import join_names
-
-Float64Array = NDArray[np.float64]
 
 ORIENTATION_EXACT = 1e-4
 """Deviation from unit length and right angle that is accepted without a warning (rounding of stored numbers)."""
@@ -39,8 +36,7 @@ ORIENTATION_SPREAD_RAD = 1e-4
 
 @dataclass(frozen=True)
 class Directions:
-    """Mean directions of a stack, orthonormal (3,), LPS; x and y, for sorting, where a slice exceeds
-    `ORIENTATION_LIMIT`.
+    """Mean directions of a stack, orthonormal (3,), LPS; x and y, for sorting, if one exceeds `ORIENTATION_LIMIT`.
 
     deviations: Of each slice's stored directions (n,) from unit length and right angle.
     angles_rad: Between the directions of each slice (n,) and the mean; NaN where there is no mean.
@@ -125,8 +121,7 @@ class Stack:
 
     slices: Sorted by ascending position along the normal.
     positions_mm, distances_mm: (n, 3) LPS, and along the normal (n,).
-    affine: Index (i, j, k) to LPS mm; None for a stack with problems.
-    tilt_deg: See `signed_tilt`; None where there is no affine.
+    affine, tilt_deg: Index (i, j, k) to LPS mm, and its `signed_tilt`; None for a stack with problems.
     missing: Number of missing slices, computed from the usual gap; they are either allowed or one of the problems.
     """
 
@@ -147,10 +142,7 @@ class Stack:
 
 
 def measure_stack(headers: Sequence[SliceHeader], allow_gaps: bool = False) -> Stack:
-    """Sort slices, at most one at each place, find their problems, which raise no error, and fit the affine.
-
-    allow_gaps: Missing slices give a warning and are not a problem.
-    """
+    """Sort slices, one at a place, find problems, which raise no error (gaps may be allowed), and fit the affine."""
     problems = find_mixed_values(headers)
     warnings: list[str] = []
     row, column = _mean_directions(headers, problems, warnings)
@@ -177,7 +169,12 @@ def measure_stack(headers: Sequence[SliceHeader], allow_gaps: bool = False) -> S
         if not problems:
             assert line.step is not None and line.origin is not None
             affine = compose_affine(row * slices[0].di_mm, column * slices[0].dj_mm, line.step, line.origin)
-        warnings += _describe_stated_gap(measure_stated_gap(slices, positions, line.gap_median_mm))
+        stated = measure_stated_gap(slices, positions, line.gap_median_mm)
+        if stated is not None and stated[2] > STATED_GAP_TOLERANCE:
+            says, measured, _ = stated
+            warnings.append(
+                f"SpacingBetweenSlices says {says:g} mm, the positions say {measured:.4g} mm: the positions are used"
+            )
     tilt = None if affine is None else signed_tilt(affine)
     aside = _measure_sideways(positions, distances) if line.uneven else 0.0
     if affine is not None and aside > (line.tolerance_mm or 0.0):
@@ -294,10 +291,7 @@ def _mean_directions(
 
 
 def group_places(headers: Sequence[SliceHeader]) -> list[list[SliceHeader]]:
-    """Group the slices by place, in the order of the places; slices closer than `DUPLICATE_MM` share one place.
-
-    Where the directions are wrong, places cannot be compared: each slice gets its own.
-    """
+    """Group slices by place (`DUPLICATE_MM`), in order; where directions are wrong, each slice has its own."""
     problems: list[str] = []
     row, column = _mean_directions(headers, problems, [])
     if problems:
@@ -341,13 +335,6 @@ def measure_stated_gap(
     return stated, measured, abs(stated - measured) / measured
 
 
-def _describe_stated_gap(found: tuple[float, float, float] | None) -> list[str]:
-    if found is None or found[2] <= STATED_GAP_TOLERANCE:
-        return []
-    stated, measured, _ = found
-    return [f"SpacingBetweenSlices says {stated:g} mm, the positions say {measured:.4g} mm: the positions are used"]
-
-
 def measure_extent(stack: Stack) -> list[float] | None:
     """Return the size in mm of the box of whole voxels along rows, columns and normal; None for an unknown gap."""
     first, usual = stack.slices[0], stack.line.gap_median_mm
@@ -358,11 +345,7 @@ def measure_extent(stack: Stack) -> list[float] | None:
 
 
 def summarise_gaps(distances: Float64Array) -> list[dict[str, Any]]:
-    """Return the runs of equal gaps between sorted positions (mm along the normal), in order: ``count``, mean
-    ``gap_mm``.
-
-    A gap belongs to a run as long as it equals the first of it within the tolerance of an even stack.
-    """
+    """Return runs of equal gaps of sorted positions (mm along the normal): ``count``, mean ``gap_mm``."""
     runs: list[list[float]] = []
     for gap in np.diff(distances).tolist():
         if runs and abs(gap - runs[-1][0]) <= position_tolerance(runs[-1][0]):

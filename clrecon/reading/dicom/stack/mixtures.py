@@ -22,6 +22,7 @@ import numpy as np
 
 from clrecon.reading.dicom.headers.slice_header import SliceHeader
 from clrecon.reading.dicom.parse.elements import CorruptFileError, NotDicomError, read_elements
+from clrecon.reading.dicom.parse.values import name_element
 from clrecon.reading.dicom.stack.spacing import median
 
 CERTAIN = (
@@ -62,9 +63,9 @@ def values_of(header: SliceHeader, keywords: Sequence[str]) -> tuple[str, ...]:
 def find_mixture(
     headers: Sequence[SliceHeader],
 ) -> tuple[tuple[str, ...], Mapping[tuple[str, ...], Sequence[SliceHeader]]] | None:
-    """Find the element that divides a stack, with one slice at each place, into volumes that lie between each other.
+    """Find the keyword that divides a stack into volumes that lie between each other, and the slices of each value.
 
-    Returns: The keyword, and the slices by their value of it: each group has at least three, and all have a value.
+    Each group has at least three slices, and all have a value.
     """
     for keyword, values in _values_along(headers, (*CERTAIN, *POSSIBLE)):
         groups = _find_interleaved(values, headers)
@@ -207,10 +208,9 @@ _VERDICTS = {tag: kind.verdict for kind in ELEMENT_KINDS for tag in kind.tags}
 
 
 def find_verdict(tag: int, even: bool) -> Verdict:
-    """Return what follows where an element alternates; `even`: the stack has equal gaps.
+    """Return what follows where an element alternates in a stack, `even` or not, of which two volumes overlap in part.
 
-    In an uneven stack two volumes overlap in part, and any standard element that alternates there makes phases.
-    Private elements, whose meaning is unknown, never do so alone: the number of the detector row is one of them.
+    There any standard element makes phases.  Private ones never do so alone: the number of the detector row is one.
     """
     known = _VERDICTS.get(tag)
     if even:
@@ -248,10 +248,10 @@ WINDOW_TAGS = frozenset({0x00281050, 0x00281051, 0x00281055})
 
 @dataclass(frozen=True)
 class Alternation:
-    """An element whose values alternate along a stack.
+    """An element whose values alternate along a stack, with the places, from 0, of each volume in the order of the
+    values.
 
     tag: 0 where the groups do not come from an element.
-    groups: The places, from 0, of each volume, in the order of the values.
     certain: The element is constant within one volume.
     heaps: The groups are heaps of close numbers, and each slice has its own number.
     absent: The group that lacks the element.
@@ -265,20 +265,14 @@ class Alternation:
 
     @property
     def name(self) -> str:
-        """Keyword of the element, or its tag."""
-        from pydicom.datadict import keyword_for_tag
-
-        private = (self.tag >> 16) % 2
-        known = "" if private else keyword_for_tag(self.tag)
-        return known or f"({self.tag >> 16:04X},{self.tag & 0xFFFF:04X})"
+        return name_element(self.tag)
 
 
 def find_alternation(headers: Sequence[SliceHeader], even: bool) -> Alternation | None:
-    """Find an element that alternates along a stack of one slice at each place; reads the headers of its files again.
+    """Find an element that alternates along a stack, a certain one first; the headers of its files are read again.
 
-    even: All gaps are equal.  Fewer elements are certain then, and in a long stack some windows are examined first.
-
-    Returns: A certain one before a doubtful one.  None for multi-frame images too, whose frames share one header.
+    In an even stack fewer are certain, and some windows of a long one come first.  None for frames, which share a
+    header.
     """
     count = len(headers)
     if count < FEWEST_SLICES or any(header.frames > 1 for header in headers):
@@ -358,7 +352,7 @@ def _is_compared(tag: int) -> bool:
 
 def _code(tag: int, column: Sequence[bytes]) -> Iterator[tuple[list[int], bool]]:
     """Return the ways to group the slices by the values of one element: group numbers, and whether these are heaps."""
-    numbers = [_number(raw) for raw in column]
+    numbers = [read_number(raw) for raw in column]
     if tag == INSTANCE_NUMBER:
         known = [number for number in numbers if number is not None]
         if len(known) == len(column) >= FEWEST_NUMBERED:
@@ -367,7 +361,7 @@ def _code(tag: int, column: Sequence[bytes]) -> Iterator[tuple[list[int], bool]]
         return
     values = set(column)
     if len(values) <= MOST_VALUES:
-        ranks = {raw: rank for rank, raw in enumerate(sorted(values, key=lambda raw: (_number(raw) or 0.0, raw)))}
+        ranks = {raw: rank for rank, raw in enumerate(sorted(values, key=lambda raw: (read_number(raw) or 0.0, raw)))}
         yield [ranks[raw] for raw in column], False
     if len(values) == 2:
         return
@@ -382,7 +376,8 @@ def _code(tag: int, column: Sequence[bytes]) -> Iterator[tuple[list[int], bool]]
             yield np.searchsorted(np.sort(ordered[steps[: heaps - 1]]), known).tolist(), True
 
 
-def _number(raw: bytes) -> float | None:
+def read_number(raw: bytes | str) -> float | None:
+    """Return a finite number in decimal digits, None for any other value."""
     try:
         number = float(raw)
     except ValueError:
@@ -391,10 +386,7 @@ def _number(raw: bytes) -> float | None:
 
 
 def alternates(codes: Sequence[int], gaps: Sequence[float]) -> bool:
-    """True where values repeat in a fixed order, along the whole stack or where its slices are closer together.
-
-    codes, gaps: A number for the value of each slice, and the distances in mm to the next one.
-    """
+    """Tell whether `codes` repeat in a fixed order, in the whole stack or where the `gaps` to the next are shorter."""
     counts = Counter(codes)
     if len(counts) < 2 or min(counts.values()) < SMALLEST_VOLUME:
         return False

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.geometry.affine import Float64Array
 from clrecon.reading.dicom.headers.slice_header import SliceHeader
 
 
@@ -23,8 +24,6 @@ def median(values: Sequence[float] | NDArray[Any]) -> float:
     middle = len(ordered) // 2
     return float(ordered[middle] if len(ordered) % 2 else (ordered[middle - 1] + ordered[middle]) / 2)
 
-
-Float64Array = NDArray[np.float64]
 
 MISSING_RATIO = 1.5
 RUN_LENGTH = 3
@@ -38,11 +37,7 @@ PLACES_SHOWN = 4
 
 @dataclass(frozen=True)
 class Holes:
-    """Gaps in a stack that are too wide, by the rule at `MISSING_RATIO`; gap k lies between the slices k and k + 1.
-
-    ends_mm: Positions along the normal of the slices before and after each gap.
-    usual_mm: The gap that would be there without a hole.
-    """
+    """Gaps k, from slice k to k + 1, that are too wide (`MISSING_RATIO`), positions of their ends, usual gap, mm."""
 
     places: tuple[int, ...] = ()
     gaps_mm: tuple[float, ...] = ()
@@ -117,10 +112,7 @@ WHOLE = 1e-3
 
 @dataclass(frozen=True)
 class Rounding:
-    """Even steps of `stated_mm` by an element (`keyword`) that explain the written positions.
-
-    unit_mm: Of the last of `digits` decimals of the positions, along the normal.
-    """
+    """Even steps of `stated_mm` by `keyword` that explain positions rounded to `unit_mm`, the last of their digits."""
 
     unit_mm: float
     digits: int
@@ -147,12 +139,10 @@ def measure_unit(headers: Sequence[SliceHeader], normal: Float64Array) -> tuple[
 def find_rounding(
     headers: Sequence[SliceHeader], distances: Float64Array, normal: Float64Array, tolerance: float
 ) -> Rounding | None:
-    """Explain uneven positions along the normal (3,) by their digits.
+    """Explain uneven positions along the normal (3,), at sorted distances (n,), mm, n >= 2, by their digits.
 
-    distances: Of the slices in the order of their places (n,), mm, n >= 2.
-    tolerance: Largest distance in mm that counts as rounding anyway.
-
-    Returns: None where positions have digits enough, no distance is stated, or a stated one does not explain them.
+    Returns None where positions have digits enough, no distance is stated, or a stated one does not explain them, if
+    they are further off than `tolerance`, mm.
     """
     unit, digits = measure_unit(headers, normal)
     if len(headers) < 3 or unit / 2.0 <= SLACK or np.ptp(np.diff(distances)) < min(unit / 2.0, tolerance):
