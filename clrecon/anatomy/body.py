@@ -29,11 +29,12 @@ from clrecon.anatomy.dense_pieces import (
 )
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.certificate import amend
-from clrecon.geometry.grid import AIR_HU
+from clrecon.geometry.resample import air_of
 from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.pieces import in_threads
 from clrecon.system.progress import Progress, Steps
+from clrecon.system.records import Gate
 from clrecon.system.text import format_ml
 
 TISSUE_HU = -300.0
@@ -49,12 +50,10 @@ SMALL_MM2 = 2500.0
 LUNG_WALL, AIR_WALL = 0.2, 0.7
 """Least share of a cavity's wall that must be thick tissue: for lung, and for larger regions of air."""
 LUNG_HU, MOST_AIR = -950.0, 0.2
-"""A region is lung when less than the share `MOST_AIR` of its cells is below `LUNG_HU`; air, foam and blankets have
-more."""
+"""A region is lung when less than `MOST_AIR` of its cells is below `LUNG_HU`; air, foam and blankets have more."""
 FOAM_HU, FOAM_WALL, FOAM_MM = -900.0, 0.3, 10.0
 """Foam that fits a body closely is not lung.  A region is foam when most of it is below `FOAM_HU`, at most the share
-`FOAM_WALL` of its wall is thick, and it is nowhere thicker than 2 `FOAM_MM`.  The lungs of three scans are thicker, and
-have thicker walls or more HU."""
+`FOAM_WALL` of its wall is thick, and it is nowhere thicker than 2 `FOAM_MM`, unlike the lungs of three scans."""
 FEWEST_UNMEASURED = 16
 """Least number of connected cells of one value that count as unmeasured; smaller groups occur by chance."""
 MARGIN_MM = 3.0
@@ -118,9 +117,7 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Pro
     said = {"body_share": round(float(body.mean()), 4), **bone, "bone_removed": removed}
     boneless = [] if pieces.specimen else find_boneless(cells, body, cells.mean > TISSUE_HU)
     said["kept_without_bone"] = _place_pieces(volume, cells, boneless)
-    masked = _turn_into_air(volume, outside, "remove_table", said, steps)
-    masked.report = amend(masked.report, gates=[*masked.report.get("gates", []), gate])
-    return masked
+    return _turn_into_air(volume, outside, "remove_table", said, steps, gate)
 
 
 def _place_pieces(volume: Volume, cells: Cells, pieces: list[Piece]) -> list[dict[str, Any]]:
@@ -184,14 +181,12 @@ def mask_field_of_view(volume: Volume, radius_mm: float | None = None, *, progre
     middle = np.ix_(np.minimum(np.arange(cj) * sj + sj // 2, nj - 1), np.minimum(np.arange(ci) * si + si // 2, ni - 1))
     bone, gate = judge_circle(cells, ~mask[middle])
     said = {"radius_mm": round(radius, 3), **bone}
-    masked = _turn_into_air(volume, lambda k: mask, "field_of_view", said, steps)
-    if radius_mm is None:
-        masked.report = amend(masked.report, gates=[*masked.report.get("gates", []), gate])
-    return masked
+    judged = gate if radius_mm is None else None
+    return _turn_into_air(volume, lambda k: mask, "field_of_view", said, steps, judged)
 
 
 def _turn_into_air(
-    volume: Volume, outside: Callable[[int], Mask], name: str, said: dict[str, Any], steps: Steps
+    volume: Volume, outside: Callable[[int], Mask], name: str, said: dict[str, Any], steps: Steps, gate: Gate | None
 ) -> Volume:
     """Give the voxels outside the value of the air there; `outside` returns the mask of a slice."""
     voxels = np.array(volume.voxels)
@@ -209,13 +204,13 @@ def _turn_into_air(
     facts["air_hu"] = float(air)
     masked = volume.with_voxels(voxels)
     masked.report = amend(masked.report, **{name: facts})
+    if gate is not None:
+        masked.report = amend(masked.report, gates=[*masked.report.get("gates", []), gate])
     return masked
 
 
 def _air_level(volume: Volume, outside: Callable[[int], Mask]) -> Any:
-    """Return the median of the air outside, so that no surface appears where the mask ends; `AIR_HU` without air
-    outside.
-    """
+    """Return the median of the air outside, so that no surface appears where the mask ends; `AIR_HU` without any."""
     low, high = AIR_RANGE_HU
     found = []
     for k in range(0, volume.voxels.shape[0], -(-volume.voxels.shape[0] // 16)):
@@ -224,19 +219,11 @@ def _air_level(volume: Volume, outside: Callable[[int], Mask]) -> Any:
     air = np.sort(np.concatenate(found))
     if len(air):
         return air[(len(air) - 1) // 2]
-    dtype = volume.voxels.dtype
-    return dtype.type(AIR_HU if dtype.kind == "f" else max(AIR_HU, np.iinfo(dtype).min))
+    return volume.dtype.type(air_of(volume.dtype))
 
 
 def find_body(volume: Volume, *, steps: Steps | None = None) -> tuple[Mask, tuple[int, int, int]]:
-    """Find the cells of the patient's body, with its margin.
-
-    steps: Counts the slices of `count_cells` and `BODY_STEPS`.
-
-    Returns:
-    body: ndarray, shape (ck, cj, ci), bool. One entry a cell of ``step`` voxels.
-    step: (int, int, int). Number of voxels of a cell along i, j, k.
-    """
+    """Find the patient's body with its margin: cells (ck, cj, ci), and the voxels of a cell along i, j, k."""
     steps = steps or Steps(None, "mask", count_cells(volume)[0] + BODY_STEPS)
     cells = measure_cells(volume, steps.take_slice)
     return _find_body(cells, steps)[0], cells.step
@@ -344,9 +331,7 @@ def _find_cavities(cells: NDArray[np.float32], tissue: Mask, thick: Mask, across
 
 
 def find_unmeasured(cells: NDArray[Any]) -> Mask:
-    """Mark unmeasured cells or voxels: regions of one value that begin at the corners of a slice (padding, air without
-    noise).
-    """
+    """Mark regions of one value that begin at the corners of a slice: padding, air without noise."""
     from scipy import ndimage
 
     found = np.zeros(cells.shape, dtype=bool)

@@ -1,6 +1,4 @@
-"""The coarse grid on which the body is found: cells of about 2 mm, each with its mean HU and its number of dense
-voxels.
-"""
+"""The coarse grid on which the body is found: cells of about 2 mm, each with its mean HU and count of dense voxels."""
 
 from __future__ import annotations
 
@@ -10,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from clrecon.geometry.volume import Volume
 from clrecon.system.pieces import in_threads
@@ -32,13 +30,8 @@ PIECE = 4
 
 @dataclass(frozen=True)
 class Cells:
-    """Figures of the voxels in each cell.
-
-    mean: ndarray, shape (ck, cj, ci), float32. Mean HU; cells at the far ends may hold fewer voxels.
-    dense, hard, metal: ndarray, shape (ck, cj, ci), uint16 or wider. Number of voxels above `DENSE_HU`, `HARD_HU` and
-        `SURE_METAL_HU`; the type holds the number of voxels of a full cell.
-    step: Number of voxels of a cell along i, j, k.
-    size_mm: Lengths of a cell along i, j, k.
+    """Figures of the voxels in each cell (ck, cj, ci), of which those at the far ends hold fewer: mean HU, counts above
+    `DENSE_HU`, `HARD_HU` and `SURE_METAL_HU` (the type holds a full cell); voxels and mm of a cell along i, j, k.
     """
 
     mean: NDArray[np.float32]
@@ -73,9 +66,8 @@ def count_cells(volume: Volume) -> tuple[int, int, int]:
 
 
 def measure_cells(volume: Volume, done: Callable[[slice], None] | None = None) -> Cells:
-    """Compute the cells, reading the voxels once, slab by slab.
+    """Compute the cells of a scan, reading the voxels once, slab by slab.
 
-    volume: A scan in HU.
     done: Called in the thread of the caller with the slices of cells that are finished.
     """
     nk, nj, ni = volume.voxels.shape
@@ -90,7 +82,7 @@ def measure_cells(volume: Volume, done: Callable[[slice], None] | None = None) -
         for place in range(where.start, where.stop):
             first, end = place * sk, min((place + 1) * sk, nk)
             slab = volume.voxels[first:end]
-            mean[place] = _sum_blocks(slab, sj, si) / (end - first)
+            mean[place] = sum_blocks(slab, sj, si) / (end - first)
             _count_dense(slab, {DENSE_HU: dense[place], HARD_HU: hard[place], SURE_METAL_HU: metal[place]}, sj, si)
             volume.release_slices(first, end)
 
@@ -102,9 +94,9 @@ def measure_cells(volume: Volume, done: Callable[[slice], None] | None = None) -
     return Cells(mean, dense, hard, metal, (si, sj, sk), (si * di, sj * dj, sk * dk))
 
 
-def _sum_blocks(slab: NDArray[Any], sj: int, si: int) -> NDArray[np.float32]:
+def sum_blocks(slab: NDArray[Any], sj: int, si: int, dtype: DTypeLike = np.float32) -> NDArray[Any]:
     """Sum a slab over all its slices and over blocks of sj x si voxels; those at the far ends may hold fewer."""
-    total = slab[0].astype(np.float32)
+    total = slab[0].astype(dtype)
     for layer in slab[1:]:
         total += layer
     # Sums of long rows: numpy is slow where it adds a few values at a time.
@@ -134,10 +126,7 @@ def _count_dense(slab: NDArray[Any], counts: dict[float, NDArray[Any]], sj: int,
 
 
 def grow(mask: Mask, cells: float) -> Mask:
-    """Dilate slice by slice by `cells` cells, or erode where `cells` is below 0.
-
-    Cross and square alternate, so a point grows to an octagon.
-    """
+    """Dilate by `cells` cells slice by slice, erode below 0; cross and square alternate: a point becomes an octagon."""
     turns = max(1, round(abs(cells)))
     # The border erodes nothing: an eroded mask is what is left of the grown rest.
     changed = mask.copy() if cells > 0 else ~mask

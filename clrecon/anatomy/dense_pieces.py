@@ -8,12 +8,12 @@ A piece is a connected component of cells that hold voxels above `DENSE_HU`.  Th
 
 - Plastic and carbon fibre have next to no voxels above `HARD_HU`; bone has, teeth and metal too.
 - A table moves through the scanner along the step of the slices, so its cross section is the same in all of them:
-  columns of its cells are filled from the first slice to the last.  Bones taper and bend.
+columns of its cells are filled from the first slice to the last.  Bones taper and bend.
 - Plates and rails are thin.
 
-A patient has more soft tissue than bone; a dry specimen has no soft tissue.  In the scan of a patient a piece is kept
-if most of it lies within the body, or if it is large enough to be a second body.  In the scan of a specimen every piece
-is kept that is not a table."""
+A patient has more soft tissue than bone; a dry specimen has none.  In the scan of a patient a piece is kept if most of
+it lies within the body, or if it is large enough to be a second body; in that of a specimen, if it is not a table.
+"""
 
 from __future__ import annotations
 
@@ -25,9 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.anatomy.body_cells import DENSE_HU, Cells, Mask
+from clrecon.geometry.affine import Float64Array
 from clrecon.system.records import Gate, at_least, unmeasured
-
-Float64Array = NDArray[np.float64]
 
 METAL_SHARE = 0.25
 """Least share of voxels above `SURE_METAL_HU` among the dense voxels of a piece of metal; their blurred edges are the
@@ -49,12 +48,7 @@ RING_CELLS, SOFT_RING = 2, 0.8
 
 
 def find_equipment(cells: Cells, labels: NDArray[np.int32], chosen: Mask, tissue: Mask) -> Mask:
-    """Return which of the chosen pieces are bars or metal and do not lie in soft tissue.
-
-    labels: ndarray, shape (ck, cj, ci). Number of the piece of each cell.
-    chosen: ndarray, shape (n,), bool. By number.
-    tissue: ndarray, shape (ck, cj, ci), bool. Cells that are not air.
-    """
+    """Return which of the chosen pieces (n,), numbered in `labels`, are bars or metal and do not lie in soft tissue."""
     from scipy import ndimage
 
     found = np.zeros_like(chosen)
@@ -119,28 +113,23 @@ Piece = tuple[int, tuple[float, ...]]
 BONE_KEPT = 0.98
 """Least share of the bone that must stay; if less stays, the body was not found."""
 HARD_SHARE = 0.005
-"""Least share of hard voxels in a piece of bone.  Tables have no hard voxels; a thin cortex in coarse voxels has a
-share of 0.02."""
+"""Least share of hard voxels in a piece of bone.  Tables have none; a thin cortex in coarse voxels has 0.02."""
 SOLID_HU = 200.0
 """Cells with a higher mean are bone.  The mean is used because noise lifts single voxels over any bound."""
 SOFT_PER_SOLID = 0.5
-"""Cells of soft tissue for each cell of bone; dry specimens have fewer.  Patients have 2 or more (a head), dry
-specimens less than 0.1."""
+"""Cells of soft tissue for each cell of bone; patients have 2 or more (a head), dry specimens less than 0.1."""
 STRAIGHT_SHARE = 0.95
 """A column of cells belongs to a table when at least this share of it is dense enough."""
 STRAIGHT_MM = 60.0
 """Least height of a scan in which tables are looked for; in shorter scans bones are as straight as a table."""
 UNIFORM_HU = 100.0
-"""Largest standard deviation of the HU along a table, from noise and shadows.  The cortex of a bone varies more in
-thickness."""
+"""Largest standard deviation of the HU along a table, from noise and shadows; the cortex of a bone varies more."""
 RAIL_MM = 10.0
-"""Largest thickness of a rail or a plate, among pieces that are straight, uniform and hard; shafts of long bones are
-thicker."""
+"""Largest thickness of a rail or a plate, among straight, uniform and hard pieces; shafts of long bones are thicker."""
 CABLE_MM, CABLE_ML = 5.0, 3.0
 """A hard piece beside a patient is a cable when its thickness and its volume are both at most these."""
 BODY_ML = 10.0
-"""A hard piece beside a patient is a second body when its volume, with the regions that it encloses in each slice, is
-at least this."""
+"""A hard piece beside a patient is a second body from this volume on, with what it encloses in each slice."""
 LONG_MM = 150.0
 """Thin pieces without hard voxels beside a specimen, and wide thin plates, are equipment from this length on."""
 GROWTH_MM = 6.0
@@ -150,18 +139,14 @@ MOST_SAID = 3
 BONELESS_ML = 3.0
 """Smaller pieces of the body without bone are not named."""
 INSIDE, HARD_INSIDE = 0.5, 0.25
-"""Least share of a piece that lies within the body if the piece belongs to the patient; for hard pieces the second,
-lower value."""
+"""Least share of a piece within the body if it belongs to the patient; for hard pieces the second, lower value."""
 
 
 @dataclass(frozen=True)
 class DensePieces:
-    """Decision on all dense pieces.
+    """Decision on all dense pieces: cells (ck, cj, ci) of the body beside those found by thickness, and those of bone.
 
     specimen: The scan shows dry bone without soft tissue.
-    added: ndarray, shape (ck, cj, ci), bool. Cells that belong to the body in addition to those found by their
-        thickness.
-    counted: ndarray, shape (ck, cj, ci), bool. Dense cells that count as bone.
     """
 
     specimen: bool
@@ -211,25 +196,23 @@ def _sum_by(labels: NDArray[np.int32], of: NDArray[Any], count: int) -> Float64A
 def find_dense_pieces(cells: Cells, tissue: Mask, thick: Mask, body: Mask) -> DensePieces:
     """Decide for every dense piece whether it belongs to the body and whether it counts as bone.
 
-    tissue: ndarray, shape (ck, cj, ci), bool. Cells that are not air.
-    thick: ndarray, shape (ck, cj, ci), bool. The thick cells among these.
-    body: ndarray, shape (ck, cj, ci), bool. Cells found by their thickness, without margin; all False if there are
-        none.
+    tissue, thick: Cells (ck, cj, ci) that are not air, and the thick ones among these.
+    body: Cells found by their thickness, without margin; perhaps none.
     """
     from scipy import ndimage
 
     solid = cells.mean > SOLID_HU
     soft = thick & ~ndimage.binary_dilation(solid, iterations=2)
     specimen = np.count_nonzero(soft) < SOFT_PER_SOLID * np.count_nonzero(solid)
-    return (_of_specimen if specimen else _of_patient)(cells, tissue, body)
+    return _of_specimen(cells, tissue) if specimen else _of_patient(cells, tissue, body)
 
 
 def _of_patient(cells: Cells, tissue: Mask, body: Mask) -> DensePieces:
     """Decide for the scan of a patient.
 
     Pieces that lie mostly within the body are added.  Hard pieces that partly reach into it count as bone.  A hard
-    piece apart from the body counts too, unless it is a cable or as straight as a table.  A large piece of this kind is
-    also added, as a second body.  Bars and metal beside the body are neither, see `clrecon.anatomy.dense_pieces`.
+    piece apart from the body counts too, unless it is a cable or as straight as a table; a large one is also added, as
+    a second body.  Bars and metal beside the body are neither.
     """
     pieces = _label(cells, cells.dense > 0)
     hard = pieces.is_hard
@@ -248,10 +231,8 @@ def _of_patient(cells: Cells, tissue: Mask, body: Mask) -> DensePieces:
     return DensePieces(False, mask, pieces.cells_of(added | apart | (loose & (inside > 0.0))))
 
 
-def _of_specimen(cells: Cells, tissue: Mask, body: Mask) -> DensePieces:
-    """Decide for a specimen: all pieces are added and count, except straight plates, rails and long thin pieces that
-    are not hard.
-    """
+def _of_specimen(cells: Cells, tissue: Mask) -> DensePieces:
+    """Decide for a specimen: pieces are added and count, but for straight plates, rails and long thin ones not hard."""
     table = tissue & _straight_plates(cells, tissue)
     pieces = _label(cells, (cells.dense > 0) & ~table)
     kept = pieces.is_hard
@@ -342,14 +323,9 @@ def _room(cells: Cells, pieces: _Pieces, chosen: Mask) -> Float64Array:
 
 
 def judge_bone(cells: Cells, pieces: DensePieces, kept: Mask) -> tuple[dict[str, Any], Gate]:
-    """Count the dense voxels that stay, and judge the share of bone among them.
+    """Count the dense voxels that stay in the body with its margin (`kept`), and judge ``bone_kept`` by `BONE_KEPT`.
 
-    kept: ndarray, shape (ck, cj, ci), bool. The body with its margin.
-
-    Returns:
-    facts: ``specimen``, ``bone_voxels`` (above 300 HU, in pieces that count), ``bone_voxels_removed``, ``bone_kept``
-        (share, None without any), ``other_voxels_removed`` (above 300 HU, in tables and cables).
-    gate: ``bone_kept``, at least `BONE_KEPT`.
+    ``bone_voxels`` are above 300 HU in pieces that count, ``other_voxels_removed`` in tables and cables.
     """
     bone = int(cells.dense[pieces.counted].sum(dtype=np.int64))
     lost = int(cells.dense[pieces.counted & ~kept].sum(dtype=np.int64))
@@ -363,26 +339,23 @@ def judge_bone(cells: Cells, pieces: DensePieces, kept: Mask) -> tuple[dict[str,
         "other_voxels_removed": removed - lost,
     }
     what = f"share of the {bone:,} voxels of bone above {DENSE_HU:g} HU that stay without the table"
+    return facts, _judge_share("bone_kept", share, what)
+
+
+def _judge_share(name: str, share: float | None, what: str) -> Gate:
     if share is None:
-        return facts, unmeasured("bone_kept", BONE_KEPT, None, f"no bone above {DENSE_HU:g} HU")
-    return facts, at_least("bone_kept", share, BONE_KEPT, None, what)
+        return unmeasured(name, BONE_KEPT, None, f"no bone above {DENSE_HU:g} HU")
+    return at_least(name, share, BONE_KEPT, None, what)
 
 
 def find_removed(cells: Cells, pieces: DensePieces, kept: Mask) -> list[Piece]:
-    """Return the largest pieces of bone that are removed.
-
-    cells, pieces, kept: As for `judge_bone`.
-    """
+    """Return the largest pieces of bone that are removed; parameters as of `judge_bone`."""
     lost = _label(cells, pieces.counted & ~kept)
     return _list_largest(cells, lost.labels, lost.dense, cells.dense)
 
 
 def find_boneless(cells: Cells, kept: Mask, tissue: Mask) -> list[Piece]:
-    """Return the largest pieces of the body that hold no bone, beside others that do.
-
-    kept: ndarray, shape (ck, cj, ci), bool. The body with its margin.
-    tissue: ndarray, shape (ck, cj, ci), bool. Cells that are not air.
-    """
+    """Return the largest pieces of the body (`kept`) that hold no bone, beside others that do."""
     parts = _label(cells, kept)
     has_bone = parts.is_hard & (parts.hard > 0.0)
     if not has_bone.any():
@@ -406,14 +379,9 @@ def _list_largest(cells: Cells, labels: NDArray[np.int32], voxels: Float64Array,
 
 
 def judge_circle(cells: Cells, inside: Mask) -> tuple[dict[str, Any], Gate]:
-    """Count the voxels of bone that a circle cuts off, with the precision of a cell.
+    """Count the voxels of bone that a circle cuts off, to a cell (cj, ci), and judge ``bone_in_circle`` by `BONE_KEPT`.
 
-    inside: ndarray, shape (cj, ci), bool. Cells of a slice with their centre in the circle.
-
-    Returns:
-    facts: ``bone_voxels`` (above 300 HU, of pieces of bone), ``bone_voxels_removed``, of these ``bone_voxels_apart`` in
-        pieces that lie wholly outside, and ``bone_kept``: the share that stays (None without bone).
-    gate: ``bone_in_circle``, at least `BONE_KEPT`.
+    ``bone_voxels`` are above 300 HU in pieces of bone, ``bone_voxels_apart`` in pieces that lie wholly outside.
     """
     pieces = _label(cells, cells.dense > 0)
     hard = (pieces.hard >= HARD_SHARE * pieces.dense) & (pieces.dense > 0)
@@ -428,6 +396,4 @@ def judge_circle(cells: Cells, inside: Mask) -> tuple[dict[str, Any], Gate]:
         "bone_kept": None if share is None else round(share, 6),
     }
     what = f"share of the {bone:,} voxels of bone above {DENSE_HU:g} HU that lie in the circle"
-    if share is None:
-        return facts, unmeasured("bone_in_circle", BONE_KEPT, None, f"no bone above {DENSE_HU:g} HU")
-    return facts, at_least("bone_in_circle", share, BONE_KEPT, None, what)
+    return facts, _judge_share("bone_in_circle", share, what)

@@ -134,12 +134,9 @@ def find_head(volume: Volume) -> bool | None:
     False: every slice with a body shows a trunk, or fills the slice, so that no skin shows.  None: neither, such as a
         leg.
     """
-    try:
-        return _judged[volume]
-    except KeyError:
-        found = _judge(volume)
-        _judged[volume] = found
-        return found
+    if volume not in _judged:
+        _judged[volume] = _judge(volume)
+    return _judged[volume]
 
 
 def _judge(volume: Volume) -> bool | None:

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import METAL_HU
+from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import AIR_HU
 from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import explains_arguments, name_parameter
@@ -98,11 +99,10 @@ def measure_edges(voxels: NDArray[Any], sampled: range, background: Background) 
 
 
 def _measure_slice(padded: NDArray[Any], axis: int, background: Background) -> tuple[NDArray[Any], ...]:
-    """Measure bone, tissue, steepest step and flatness of the edges of one slice along the columns (axis 0) or rows
-    (1).
+    """Measure bone, tissue, steepest step and flatness of the edges of a slice along its columns (axis 0) or rows (1).
 
-    padded: (nj + 2 p, ni + 2 p). The slice with its border values continued by p = `REACH` + `FLAT` voxels, where every
-        walk ends because values are constant.
+    It is continued by its border values, p = `REACH` + `FLAT` voxels each way: every walk ends where values are
+    constant.
     """
     border = REACH + FLAT
     inside = padded >= background.seed
@@ -159,9 +159,9 @@ def _walk(
 
 
 def leave_contrast_medium(edges: BoneEdges) -> tuple[BoneEdges, float, float]:
-    """Leave out edges that end in flat, faint plateaus (contrast medium), unless most edges do.
+    """Leave out edges that end in flat, faint plateaus (contrast medium), unless most do.
 
-    Returns: Also the shares of the contrast that were left out, and that are flat and faint, left out or not.
+    Returns also the shares of the contrast that were left out, and that are flat and faint.
     """
     total = edges.contrast.sum()
     share = float(edges.contrast[edges.flat].sum() / total) if total else 0.0
@@ -169,8 +169,6 @@ def leave_contrast_medium(edges: BoneEdges) -> tuple[BoneEdges, float, float]:
         return edges, 0.0, share
     return edges.where(~edges.flat), share, share
 
-
-Float64Array = NDArray[np.float64]
 
 SAMPLED_VOXELS = 8_400_000
 """Approximate number of voxels that are examined: 32 slices of 512 x 512."""
@@ -279,10 +277,6 @@ def choose_iso_value(volume: Volume, *, progress: Progress | None = None) -> Iso
         Voxels in HU.
     progress : callable, optional
         Called as ``progress("choose", steps done, 3)``.
-
-    Returns
-    -------
-    IsoChoice
 
     Raises
     ------

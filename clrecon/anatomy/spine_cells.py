@@ -1,8 +1,7 @@
 """The coarse grid on which the spinal canal is looked for, and what its middle looks like in each cell.
 
-A cell has the mean HU along the patient's axes.
-
-The traits are figures of 0 to 1 for every cell, worked out slice by slice."""
+A cell has the mean HU along the patient's axes; traits are figures of 0 to 1, worked out slice by slice.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.anatomy.body_cells import sum_blocks
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.volume import Volume
 from clrecon.system.pieces import in_threads
@@ -27,11 +27,7 @@ HU_RANGE = (-1024, 1500)
 
 @dataclass(frozen=True)
 class SpineCells:
-    """Mean HU of cells.
-
-    values: ndarray, shape (nz, ny, nx), float32. HU; uppermost slice last; -1024 outside of the scan.
-    origin: ndarray, shape (3,), float64. Centre of the first cell, LPS mm.
-    """
+    """Mean HU of cells (nz, ny, nx), the lowest slice first, from `origin` on, LPS mm; -1024 outside of the scan."""
 
     values: Field
     origin: Float64Array
@@ -48,11 +44,9 @@ def heights(mm: float) -> int:
 
 @dataclass(frozen=True)
 class Lattice:
-    """Where the cells of a volume lie.
+    """Where the cells of a volume lie, along x, y, z from the centre of the first one, LPS mm.
 
-    block: ndarray, shape (3,), int64. Voxels that are averaged, along i, j, k.
-    count: ndarray, shape (3,), int64. Cells along x, y, z.
-    origin: ndarray, shape (3,), float64. Centre of the first cell, LPS mm.
+    block: Voxels that are averaged, along i, j, k.
     """
 
     block: NDArray[np.int64]
@@ -77,11 +71,7 @@ def plan_cells(volume: Volume) -> Lattice:
 
 
 def average_cells(volume: Volume, lattice: Lattice, done: Callable[[slice], None]) -> SpineCells:
-    """Average the voxels in blocks of about a cell, then interpolate at the cells.
-
-    lattice: From `plan_cells`.
-    done: Called in the thread of the caller with the slices that are finished: of blocks, then of cells.
-    """
+    """Average the voxels in blocks of about a cell, then interpolate at the cells; `done` gets the slices of both."""
     means = _average_blocks(volume, lattice, done)
     x, y, z = (lattice.origin[axis] + CELL_MM[axis] * np.arange(lattice.count[axis]) for axis in range(3))
     values = np.empty(lattice.count[::-1], np.float32)
@@ -110,17 +100,7 @@ def _average_blocks(volume: Volume, lattice: Lattice, done: Callable[[slice], No
     def average(where: slice) -> None:
         for k in range(where.start, where.stop):
             part = np.clip(volume.voxels[fk * k : fk * (k + 1), : whole[1], : whole[0]], *HU_RANGE)
-            # Sums of few long arrays: numpy is slow where it adds a few values at a time.
-            plane = part[0].astype(add)
-            for layer in part[1:]:
-                plane += layer
-            rows = plane[::fj].copy()
-            for n in range(1, fj):
-                rows += plane[n::fj]
-            total = rows[:, ::fi].copy()
-            for n in range(1, fi):
-                total += rows[:, n::fi]
-            np.divide(total, fi * fj * fk, out=means[k], casting="same_kind")
+            np.divide(sum_blocks(part, fj, fi, add), fi * fj * fk, out=means[k], casting="same_kind")
             volume.release_slices(fk * k, fk * (k + 1))
 
     in_threads(average, len(means), 4, done)
@@ -248,12 +228,10 @@ PIECE = 4
 
 @dataclass(frozen=True)
 class Likeness:
-    """How much each cell of a box is like the middle of the spinal canal.
+    """How much each cell (nz, ny, nx) of a box, from row and column `first`, is like the middle of the spinal canal.
 
-    worth: ndarray, shape (nz, ny, nx), float32. Sum of the traits for it, less those against it.
-    sure: ndarray, shape (nz, ny, nx), bool. Each trait for it is at least as in `SURE`.
-    goes_on: ndarray, shape (nz, ny, nx), bool. The traits of `STILL` are at least as there.
-    first: Row and column of the box among the cells; outside of it are only air and what is not measured.
+    worth: Sum of the traits for it, less those against it.
+    sure, goes_on: Each trait for it is at least as in `SURE`, or those of `STILL` as there.
     """
 
     worth: Field
@@ -268,10 +246,7 @@ class Likeness:
 
 
 def measure_likeness(cells: SpineCells, done: Callable[[slice], None]) -> Likeness:
-    """Measure how much each cell is like the middle of the spinal canal.
-
-    done: Called in the thread of the caller with the slices that are finished.
-    """
+    """Measure how much each cell is like the canal's middle; `done` is called in this thread with finished slices."""
     rows, columns = (_extent(cells.values, axis) for axis in (1, 2))
     box = SpineCells(np.ascontiguousarray(cells.values[:, rows, columns]), cells.origin)
     worth = np.empty(box.values.shape, np.float32)
@@ -330,9 +305,7 @@ def _steps(right: float, back: float) -> tuple[int, int]:
 
 
 def _moved(field: Field, ways: list[tuple[float, float]]) -> list[Field]:
-    """Return the field with the values that each cell has `right` and `back` mm further in its slice, for each way; 0
-    beyond the ends.
-    """
+    """Return, for each way, the values `right` and `back` mm further in the slices; 0 beyond the ends."""
     steps = [_steps(*way) for way in ways]
     reach = max(abs(n) for step in steps for n in step)
     padded = with_border(field, reach)
