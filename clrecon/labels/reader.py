@@ -87,8 +87,9 @@ def read_labels(
         The file is not a label map (CT images, probabilities, negative numbers, four axes), is cut off or corrupt, does
         not say where it lies in space, or has segments that overlap.
     """
-    labels = _read(Path(path), Wanted(check_wanted(only), others=False), volume, progress)
-    return labels if only is None else _keep(labels, [labels.find(label) for label in check_wanted(only) or ()])
+    wanted = check_wanted(only)
+    labels = _read(Path(path), Wanted(wanted, others=False), volume, progress)
+    return labels if wanted is None else _keep(labels, [labels.find(label) for label in wanted])
 
 
 def read_all_labels(

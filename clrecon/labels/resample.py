@@ -142,19 +142,15 @@ def check_together(labels: LabelMap, volume: Volume) -> dict[int, float]:
     """Refuse a map of another scan; return for each number its share of labelled voxels inside the volume, 0 to 1."""
     if not labels.numbers:
         raise RefusedInputError("the label map is empty: no voxel has a label")
-    _check_frame_of_reference(labels, volume)
-    shares = _shares_inside(labels, volume)
-    _check_overlap(labels, volume, shares)
-    return shares
-
-
-def _check_frame_of_reference(labels: LabelMap, volume: Volume) -> None:
     ours, theirs = volume.report.get("frame_of_reference_hash"), labels.frame_of_reference_hash
     if ours is not None and theirs is not None and ours != theirs:
         raise RefusedInputError(
             f"the label map belongs to frame of reference {theirs}, the CT to {ours} (hashes): the scanner does not"
             " vouch that they lie together; choose the labels of this series"
         )
+    shares = _shares_inside(labels, volume)
+    _check_overlap(labels, volume, shares)
+    return shares
 
 
 def _take_aligned(labels: LabelMap, volume: Volume) -> NDArray[Any] | None:

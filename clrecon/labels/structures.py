@@ -122,12 +122,11 @@ class _Structure:
 def read_structures(
     path: Path, volume: Volume | None, wanted: Wanted, progress: Progress = ignore_progress
 ) -> LabelMap:
-    """Read the ROIs of an RTSTRUCT as labels on the slices of its scan, thinner ones of an uneven scan.
+    """Read the ROIs of an RTSTRUCT as labels, by their numbers, on the slices of its scan, thinner ones of an uneven
+    scan.
 
     A voxel has the label of an ROI where its centre is inside of the closed contours of its slice, see
-    `clrecon.labels.contours`.  The label's number is the ROI's.
-
-    wanted: Only the other ROIs may overlap, and only the wanted ones have to fit the scan.
+    `clrecon.labels.contours`.  Only ROIs that are not wanted may overlap, or not fit the scan.
     """
     name = escape_text(path.name)
     if volume is None:
@@ -191,7 +190,8 @@ class _Raster:
         slices: dict[int, tuple[list[Corners], list[Corners]]] = {}
         normal = slice_normal(volume.affine)
         heights = volume.slice_origins() @ normal
-        allowed = _allowed_mm(volume.slice_origins(border=1) @ normal)
+        gaps = np.abs(np.diff(volume.slice_origins(border=1) @ normal))
+        allowed = np.maximum(ON_SLICE_MM, ON_SLICE_STEPS * np.minimum(gaps[1:], gaps[:-1]))
         for contour in self._structure.contours:
             points = _points_of(contour, self._file, self._shown)
             if len(points) < LEAST_POINTS:
@@ -281,12 +281,6 @@ class _Raster:
                 " the outline belong to the label"
             )
         return said
-
-
-def _allowed_mm(heights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how far off each slice contours may lie, from the heights of the slices and of one beyond each end."""
-    gaps = np.abs(np.diff(heights))
-    return np.maximum(ON_SLICE_MM, ON_SLICE_STEPS * np.minimum(gaps[1:], gaps[:-1]))
 
 
 def _points_of(contour: _Contour, file: str, shown: str) -> NDArray[np.float64]:

@@ -32,8 +32,7 @@ _DATE, _TIME = "19700101", "000000"
 def encode_segmentation(labels: LabelMap, slices: Sequence[SourceSlice], *, label: str = "VERTEBRAE") -> bytes:
     """Return the bytes of the file; the same labels, on the grid of the scan, and slices give the same bytes.
 
-    slices: Of the scan, slice k of the label map at place k.
-    label: Content label: upper case letters, digits and underscores, at most 16.
+    `label` is the content label: upper case letters, digits and underscores, at most 16.
     """
     from pydicom.sequence import Sequence as Items
 
@@ -140,8 +139,8 @@ def _item(**values: Any) -> Any:
     return item
 
 
-def _code(value: str, meaning: str) -> list[Any]:
-    return [_item(CodeValue=value, CodingSchemeDesignator="SCT", CodeMeaning=meaning)]
+def _code(value: str, meaning: str, scheme: str = "SCT") -> list[Any]:
+    return [_item(CodeValue=value, CodingSchemeDesignator=scheme, CodeMeaning=meaning)]
 
 
 def _segment(number: int, name: str) -> Any:
@@ -174,9 +173,8 @@ def _decimals(values: Any) -> list[Any]:
 def _shared(labels: LabelMap) -> Any:
     di, dj, _ = labels.spacing
     row, column, step = labels.affine[:3, 0] / di, labels.affine[:3, 1] / dj, labels.affine[:3, 2]
-    gap = abs(float(np.cross(row, column) @ step))
-    measures = _item(PixelSpacing=_decimals((dj, di)), SliceThickness=_decimals([gap])[0])
-    measures.SpacingBetweenSlices = _decimals([gap])[0]
+    gap = _decimals([abs(float(np.cross(row, column) @ step))])[0]
+    measures = _item(PixelSpacing=_decimals((dj, di)), SliceThickness=gap, SpacingBetweenSlices=gap)
     return _item(
         PixelMeasuresSequence=[measures],
         PlaneOrientationSequence=[_item(ImageOrientationPatient=_decimals([*row, *column]))],
@@ -191,15 +189,8 @@ def _frame(
     source.SpatialLocationsPreserved = "YES"
     if frames > 1:
         source.ReferencedFrameNumber = frame + 1
-    source.PurposeOfReferenceCodeSequence = [
-        _item(
-            CodeValue="121322", CodingSchemeDesignator="DCM", CodeMeaning="Source image for image processing operation"
-        )
-    ]
-    derivation = _item(
-        SourceImageSequence=[source],
-        DerivationCodeSequence=[_item(CodeValue="113076", CodingSchemeDesignator="DCM", CodeMeaning="Segmentation")],
-    )
+    source.PurposeOfReferenceCodeSequence = _code("121322", "Source image for image processing operation", "DCM")
+    derivation = _item(SourceImageSequence=[source], DerivationCodeSequence=_code("113076", "Segmentation", "DCM"))
     return _item(
         FrameContentSequence=[_item(DimensionIndexValues=[list(numbers).index(number) + 1, k + 1])],
         PlanePositionSequence=[_item(ImagePositionPatient=_decimals(labels.ijk_to_lps([(0, 0, k)])[0]))],
