@@ -29,10 +29,8 @@ def crop_box(
 
     They are (x0, x1, y0, y1, z0, z1), heights (z0, z1), and a point with half the side of the cube around (x, y, z, r).
     """
-    boxes = []
-    for name, values in (("clip_box", clip_box), ("between", between), ("around", around)):
-        if values is not None:
-            boxes.append(_box_of(name, values))
+    given = (("clip_box", clip_box), ("between", between), ("around", around))
+    boxes = [_box_of(name, values) for name, values in given if values is not None]
     if not boxes:
         return None
     low = tuple(max(corner[axis] for corner, _ in boxes) for axis in range(3))

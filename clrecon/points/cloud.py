@@ -117,26 +117,21 @@ class PointCloud(Message, ShownAsHtml):
 
     def _checked(self, name: str, values: ArrayLike | None) -> NDArray[Any] | None:
         """Return what is known of the points as it is kept, for example their `labels`."""
+        if values is None:
+            return None
         if name == "hu":
             return self._values(values, name, np.float32, "fiu")
         if name == "labels":
             return self._values(values, name, np.int32, "iu")
-        vectors = self._vectors(values, name, np.float32 if name == "normals" else np.int32)
-        if name == "normals" and vectors is not None:
+        dtype: DTypeLike = np.float32 if name == "normals" else np.int32
+        vectors = np.ascontiguousarray(_rows(values, name), dtype=dtype)
+        if len(vectors) != len(self._points):
+            raise UsageError(f"{len(vectors):,} {name} for {len(self._points):,} points: one a point is needed")
+        if name == "normals":
             _check_finite(vectors, name)
         return vectors
 
-    def _vectors(self, values: ArrayLike | None, name: str, dtype: DTypeLike) -> NDArray[Any] | None:
-        if values is None:
-            return None
-        array = np.ascontiguousarray(_rows(values, name), dtype=dtype)
-        if len(array) != len(self._points):
-            raise UsageError(f"{len(array):,} {name} for {len(self._points):,} points: one a point is needed")
-        return array
-
-    def _values(self, values: ArrayLike | None, name: str, dtype: DTypeLike, kinds: str) -> NDArray[Any] | None:
-        if values is None:
-            return None
+    def _values(self, values: ArrayLike, name: str, dtype: DTypeLike, kinds: str) -> NDArray[Any]:
         array = np.asarray(values)
         if array.shape != (len(self._points),):
             raise UsageError(f"{name} have shape ({len(self._points)},), one value a point; these have {array.shape}")

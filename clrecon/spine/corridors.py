@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
+from clrecon.geometry.affine import Float64Array
 from clrecon.labels import LabelMap
 from clrecon.labels.resample import resample_labels
 from clrecon.spine.frame import VertebraFrame, find_frame
@@ -24,7 +25,6 @@ from clrecon.spine.measures import Bias, canal_wall, find_exit, line_angles, mar
 from clrecon.spine.solid_bone import SolidBone, fill_vertebra
 from clrecon.system.arguments import explains_arguments
 
-Float64Array = NDArray[np.float64]
 Depth = Callable[[Float64Array], Float64Array]
 """Distance from the surface at points (n, 3) in the vertebra's frame, mm, positive inside."""
 
@@ -85,8 +85,7 @@ class Span:
 class Line:
     """A line on one side, in the vertebra's frame, by the point where it passes ``y = span.pass_y``, mm.
 
-    medial_deg, sagittal_deg: Angles of its projections: on the axial plane towards the midline, on the sagittal plane
-        towards cranial.
+    medial_deg, sagittal_deg: As of `clrecon.spine.measures.line_angles`.
     radius: Its least distance from the surface, mm.
     medial_range, sagittal_range: Angles of lines whose radius is at most `SAME_MM` less.
     tried: Lines whose distance was taken.
@@ -288,21 +287,19 @@ BESIDE_MM = 1.5
 
 @dataclass(frozen=True)
 class Corridor:
-    """The widest line through one pedicle.  Points are LPS mm.
+    """The widest line through one pedicle, left or right of the patient.  Points (3,) are LPS mm.
 
-    side: {"left", "right"}. Of the patient.
     refused: Why there is no corridor; everything below is None then.
     radius: Least distance of the line from the surface of the bone, from `back` to `tip`, mm.
-    entry: ndarray, shape (3,). Where the line, followed backwards, leaves the bone.
-    back: ndarray, shape (3,). Where its distance begins to count: in the coronal plane through the canal's axis.
-    pass_point: ndarray, shape (3,). In the narrowest coronal section of the pedicle.
-    tip: ndarray, shape (3,). At 80 % of the body's depth.
+    entry: Where the line, followed backwards, leaves the bone.
+    back: Where its distance begins to count: in the coronal plane through the canal's axis.
+    pass_point: In the narrowest coronal section of the pedicle.
+    tip: At 80 % of the body's depth.
     length: From entry to tip, mm.
     medial_deg, sagittal_deg: Angles in the vertebra's frame, see `clrecon.spine.measures.line_angles`.
     medial_lps_deg, sagittal_lps_deg: The same in the patient's frame.
     medial_range_deg, sagittal_range_deg: Angles, in the vertebra's frame, of lines whose radius is at most 0.1 mm less.
-    margins: Least distance from the surface by quarter, mm.
-    canal: Least distance from the wall of the vertebral canal, mm.
+    margins, canal: Least distances from the surface by quarter, and from the wall of the vertebral canal, mm.
     bias: How far the level lies from the half maximum of this pedicle's wall.
     by_hu_share: Share of the walls' points that HU place and not the label.
     width_voxels: Width of the corridor in voxels, across its nearest wall.
@@ -333,11 +330,7 @@ class Corridor:
 
 @dataclass(frozen=True)
 class VertebraCorridors:
-    """Both corridors of a vertebra.
-
-    name: Of the label.
-    corridors: Left and right.
-    """
+    """Both corridors of a vertebra, left and right, and the name of its label."""
 
     name: str
     bone: SolidBone

@@ -11,12 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
+from clrecon.geometry.affine import Float64Array
 from clrecon.spine.solid_bone import SolidBone
-
-Float64Array = NDArray[np.float64]
 
 STRIDE = 2
 """Points of the lattice in one step of the frame's points: 1 mm."""

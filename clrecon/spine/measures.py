@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
+from clrecon.geometry.affine import Float64Array
 from clrecon.spine.frame import VertebraFrame
 from clrecon.spine.solid_bone import SolidBone
-
-Float64Array = NDArray[np.float64]
 
 DIRECTIONS = ("medial", "lateral", "cranial", "caudal")
 
@@ -32,7 +31,7 @@ CANAL_SAMPLES = 16
 class Bias:
     """How far the surface at the level lies outside of the half maximum of the pedicle's own wall.
 
-    median_mm, low_mm, high_mm: Median and quartiles over the rays; positive: the level lies outside, distances are too
+    median_mm, low_mm, high_mm: Median and quartiles over the rays; positive: the level lies outside, distances too
         large.
     half_hu: Median of the levels half way between the wall's peak and the tissue beside it.
     rays: Rays with a wall that is dense enough.
@@ -111,8 +110,7 @@ def find_exit(bone: SolidBone, start: Float64Array, direction: Float64Array, rea
 
 
 def measure_bias(bone: SolidBone, frame: VertebraFrame, first: Float64Array, last: Float64Array) -> Bias | None:
-    """Measure how far the surface lies from the half maximum of the pedicle's wall, on rays square to a line in the
-    frame.
+    """Measure how far the surface lies from the half maximum of the pedicle's wall, on rays square to a line.
 
     Returns None where less than a quarter of the rays meets a wall that HU show.
     """
@@ -187,9 +185,8 @@ class Screw:
 
 @dataclass(frozen=True)
 class ScrewGrade:
-    """The grade of a screw.
+    """The grade, A to E, of a screw.
 
-    grade: {"A", "B", "C", "D", "E"}
     breach_mm: How far its surface lies outside of the bone at most, 0 for none.
     direction: The quarter of the largest breach: medial, lateral, cranial or caudal.
     breaches_mm: Largest breach by quarter.
@@ -216,9 +213,8 @@ def grade_breach(breach_mm: float) -> str:
 def grade_screw(bone: SolidBone, frame: VertebraFrame, screw: Screw, what: str) -> ScrewGrade:
     """Grade a screw in a vertebra, named `what` in messages.
 
-    Graded is the part between the coronal plane through the canal's axis and the middle of the body, and behind that
-    plane what lies in the canal.  Farther back the screw has to leave the bone, and farther in front the original scale
-    does not look.
+    Graded is the part from the coronal plane through the canal's axis to the body's middle, and behind it what lies in
+    the canal.  Farther back it has to leave the bone, and farther in front the original scale does not look.
     """
     first, last = frame.to_frame(np.stack((screw.entry, screw.tip)))
     if first[1] < last[1]:

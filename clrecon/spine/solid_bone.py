@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import AIR_HU, Volume
+from clrecon.geometry.affine import Float64Array
 from clrecon.labels.label_bodies import Growth, fill_solid
 
-Float64Array = NDArray[np.float64]
 Box = tuple[slice, slice, slice]
 
 LATTICE_STEP_MM = 0.5
@@ -94,8 +94,7 @@ def _own(labels: NDArray[Any], number: int, volume: Volume) -> NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class SolidBone:
-    """The solid bone of one vertebra: arrays of the lattice, and points (n, 3) of the surface, LPS mm, about a step
-    apart.
+    """The solid bone of one vertebra: arrays of the lattice, and points (n, 3) of the surface, a step apart, LPS mm.
 
     hu: At the points of the lattice within `MARGIN_MM` of the label; elsewhere `AIR_HU`.
     mask: True in the label itself, whatever the HU.
@@ -174,9 +173,8 @@ class SolidBone:
 def fill_vertebra(volume: Volume, labels: NDArray[Any], number: int, level: float, what: str) -> SolidBone:
     """Make the solid bone of one label on the volume's own grid; `what` names it in messages.
 
-    Inside is what has the level, HU, or more and is the label's own (within it, or one voxel beyond), and what it
-    encloses: see `clrecon.labels.label_bodies.fill_solid`.  The vertebral canal is open above and below, and so stays
-    outside.
+    Inside is what has the level, HU, and is the label's own (or one voxel beyond), and what that encloses, see
+    `clrecon.labels.label_bodies.fill_solid`.  The canal is open above and below, and so stays outside.
     """
     spacing = np.array(volume.spacing)
     margin = tuple(int(np.ceil(MARGIN_MM / step)) + 1 for step in spacing[::-1])

@@ -29,7 +29,7 @@ def available_memory_bytes(proc: Path = Path("/proc"), groups: Path = Path("/sys
 
     Linux shows a container all memory of the computer, and kills a process that exceeds the container's own limit.
     """
-    container = free_bytes_of_container(proc, groups)
+    container = min(_group_bytes(proc, groups), default=math.inf)
     try:
         with open(proc / "meminfo", encoding="ascii") as file:
             for line in file:
@@ -66,11 +66,6 @@ _FILES = {  # Of a version of control groups: the files of limit and use, and th
     2: ("memory.max", "memory.current", "inactive_file"),
     1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
 }
-
-
-def free_bytes_of_container(proc: Path, groups: Path) -> float:
-    """Return the bytes that this process may take before it is killed, by ``/proc`` or ``/sys/fs/cgroup``; or inf."""
-    return min(_group_bytes(proc, groups), default=math.inf)
 
 
 def _group_bytes(proc: Path, groups: Path) -> Iterator[int]:
