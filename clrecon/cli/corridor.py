@@ -52,7 +52,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    from clrecon.jobs.corridor import CorridorFiles, make_corridors, parse_screw, read_screws
+    from clrecon.jobs.corridor import make_corridors, parse_screw, read_screws
+    from clrecon.jobs.outputs import MeshFiles
 
     space = options.space or "lps"
     screws = tuple(parse_screw(text, space, number) for number, text in enumerate(options.screw, start=1))
@@ -61,7 +62,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     report = make_corridors(
         options.input,
         common.make_settings(CorridorSettings, options, screws=screws),
-        CorridorFiles(options.output, options.picture, options.report),
+        MeshFiles(options.output, options.picture, options.report),
         no_clobber=options.no_clobber,
         progress=console.progress,
     )

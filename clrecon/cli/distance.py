@@ -39,12 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
-    from clrecon.jobs.distance import DistanceFiles, measure_meshes
+    from clrecon.jobs.distance import measure_meshes
+    from clrecon.jobs.outputs import MeshFiles
 
     report = measure_meshes(
         options.mesh,
         options.reference,
-        DistanceFiles(options.output, options.picture, options.report),
+        MeshFiles(options.output, options.picture, options.report),
         common.make_settings(DistanceSettings, options),
         no_clobber=options.no_clobber,
         progress=console.progress,

@@ -6,7 +6,6 @@ import csv
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +21,7 @@ from clrecon.jobs.corridor_results import (
     describe_vertebra,
     draw_corridors,
 )
-from clrecon.jobs.outputs import check_files, name_outputs
+from clrecon.jobs.outputs import MeshFiles, check_files, name_outputs
 from clrecon.jobs.run import Run
 from clrecon.jobs.settings import CorridorSettings
 from clrecon.labels.label_map import file_suffixes
@@ -38,15 +37,6 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
-
-
-@dataclass(frozen=True)
-class CorridorFiles:
-    """Outputs: meshes of the vertebra and a cylinder a side, named by label and side; a picture a vertebra."""
-
-    output: str | Path | None = None
-    picture: str | Path | None = None
-    report: str | Path | None = None
 
 
 CSV_COLUMNS = ("entry_x", "entry_y", "entry_z", "tip_x", "tip_y", "tip_z", "diameter")
@@ -136,14 +126,13 @@ _PLACED_BY_LABEL = 0.5
 
 
 def make_corridors(
-    source: str | Path, settings: CorridorSettings, files: CorridorFiles | None = None, **how: Any
+    source: str | Path, settings: CorridorSettings, files: MeshFiles | None = None, **how: Any
 ) -> CorridorReport:
     """Find the corridors through the pedicles of labelled vertebrae, and grade given screws."""
-    files = files or CorridorFiles()
+    files = files or MeshFiles()
     with Run(settings, **how) as run:
         _check_formats(files)
-        named = [("the mesh", files.output), ("the picture", files.picture), ("the report", files.report)]
-        run.check(named, source, settings.labels)
+        run.check(files.named("the mesh"), source, settings.labels)
         volume, labels = run.read_labelled(source)
         run.lap("read")
         numbers = list(dict.fromkeys(labels.find(label) for label in settings.only))
@@ -189,7 +178,7 @@ def make_corridors(
         return run.finish(report, files.report)
 
 
-def _check_formats(files: CorridorFiles) -> None:
+def _check_formats(files: MeshFiles) -> None:
     from clrecon.exchange.formats import check_format
     from clrecon.rendering.pictures.picture import check_image_path
 
@@ -199,13 +188,13 @@ def _check_formats(files: CorridorFiles) -> None:
         check_image_path(files.picture)
 
 
-def _picture_paths(files: CorridorFiles, names: Sequence[str]) -> list[str | Path]:
+def _picture_paths(files: MeshFiles, names: Sequence[str]) -> list[str | Path]:
     if files.picture is None:
         return []
     return name_outputs(files.picture, list(names) if len(names) > 1 else [""])
 
 
-def _name_files(files: CorridorFiles, names: Sequence[str]) -> None:
+def _name_files(files: MeshFiles, names: Sequence[str]) -> None:
     """Refuse files that exist and stay, and those that two outputs would share, now that the labels are known."""
     pictures = [("the picture", path) for path in _picture_paths(files, names)]
     meshes: list[tuple[str, str | Path]] = []
@@ -260,7 +249,7 @@ def _draw_sheets(
     found: Sequence[VertebraCorridors],
     graded: Sequence[list[tuple[Screw, ScrewGrade]]],
     level: float,
-    files: CorridorFiles,
+    files: MeshFiles,
 ) -> list[dict[str, Any]]:
     """Write the picture of each vertebra, and return their entries."""
     outputs = []

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.jobs.outputs import MeshFiles
 from clrecon.jobs.run import JobReport, Run
 from clrecon.jobs.settings import DistanceSettings
 from clrecon.mesh import Mesh
@@ -51,30 +52,20 @@ class DistanceReport(JobReport):
     device: str | None
 
 
-@dataclass(frozen=True)
-class DistanceFiles:
-    """Files that a job writes; `output` is A coloured by its distance from B, ``.ply``."""
-
-    output: str | Path | None = None
-    picture: str | Path | None = None
-    report: str | Path | None = None
-
-
 def measure_meshes(
     mesh: str | Path,
     reference: str | Path,
-    files: DistanceFiles | None = None,
+    files: MeshFiles | None = None,
     settings: DistanceSettings | None = None,
     **how: Any,
 ) -> DistanceReport:
     """Measure how far two meshes lie apart, files A and B."""
     from clrecon.operators import take_device
 
-    files, settings = files or DistanceFiles(), settings or DistanceSettings()
+    files, settings = files or MeshFiles(), settings or DistanceSettings()
     with Run(settings, **how) as run:
         _check_formats(files)
-        named = [("the coloured mesh", files.output), ("the picture", files.picture), ("the report", files.report)]
-        run.check(named, mesh, reference)
+        run.check(files.named("the coloured mesh"), mesh, reference)
         device = None if files.picture is None else take_device(settings.device)
         run.progress("read", 0, 0)
         meshes = [read_side(path, settings.mesh_space) for path in (mesh, reference)]
@@ -117,7 +108,7 @@ def measure_meshes(
         return run.finish(report, files.report)
 
 
-def _check_formats(files: DistanceFiles) -> None:
+def _check_formats(files: MeshFiles) -> None:
     from clrecon.rendering.pictures.picture import check_image_path
     from clrecon.rendering.pictures.pillow import load_pillow
 
@@ -177,7 +168,7 @@ def _write_files(
     mesh: Mesh,
     colored: _Colored | None,
     drawn: Rendering | None,
-    files: DistanceFiles,
+    files: MeshFiles,
     settings: DistanceSettings,
 ) -> list[dict[str, Any]]:
     from clrecon.exchange.formats import FORMATS, stage_content

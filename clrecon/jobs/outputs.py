@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +25,18 @@ MESH_FILES, OBJECT_FILES = list_extensions(tuple(FORMATS)), list_extensions(ASSE
 
 MOST_FILES = 1000
 """Most meshes of a job.  More are useless crumbs, and each keeps a file open until all are written."""
+
+
+@dataclass(frozen=True)
+class MeshFiles:
+    """Files that a job writes: meshes, with several labels named by each; pictures in the same way; the report."""
+
+    output: str | Path | None = None
+    picture: str | Path | None = None
+    report: str | Path | None = None
+
+    def named(self, mesh: str) -> list[tuple[str, str | Path | None]]:
+        return [(mesh, self.output), ("the picture", self.picture), ("the report", self.report)]
 
 
 def name_outputs(output: str | Path, names: Sequence[str], report_path: str | Path | None = None) -> list[str | Path]:

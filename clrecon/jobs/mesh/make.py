@@ -15,6 +15,7 @@ from clrecon.jobs.inputs import read_with_labels
 from clrecon.jobs.mesh.bone import find_bone
 from clrecon.jobs.mesh.choices import LabelChoice, find_seeds
 from clrecon.jobs.mesh.labels import extract_label_surfaces, open_labels
+from clrecon.jobs.mesh.purposes import measure_pieces
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface, check_known_values, choose_level, plan_surfaces
 from clrecon.jobs.outputs import MOST_FILES
@@ -309,8 +310,6 @@ def select_parts(
     """Keep the components that are asked for, and measure what the purpose needs; `steps` counts `SELECT_STEPS`."""
     if not settings.is_for_print:
         return _select_parts(surface, mesh, settings, device, volume, steps)
-    from clrecon.jobs.mesh.purposes import measure_pieces
-
     found = measure_pieces(mesh.vertices, mesh.triangles)
     steps.take()
     parts = _select_parts(surface, mesh, settings, device, volume, steps)
@@ -346,8 +345,6 @@ def _select_parts(
             mesh, volume, surface, labelled, without_table=settings.remove_table, advice=_advise_without_bone(settings)
         )
         if settings.is_for_print:
-            from clrecon.jobs.mesh.purposes import measure_pieces
-
             other = mesh.triangles[~among[labelled[1][mesh.triangles[:, 0]]]]
             no_bone = measure_pieces(mesh.vertices, other)
             mesh.report.update(not_bone=no_bone["pieces"], not_bone_ml=no_bone["pieces_ml"])
