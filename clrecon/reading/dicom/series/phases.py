@@ -177,7 +177,8 @@ def have_same_pixels(one: SliceHeader, other: SliceHeader, source: StoredPixels 
     """True when two slices hold the same HU; reads both, from `source` where many are compared."""
     if (one.rows, one.columns) != (other.rows, other.columns):
         return False
-    return bool(np.array_equal(read_voxels([one], source=source)[0], read_voxels([other], source=source)[0]))
+    voxels, _ = read_voxels([one, other], source=source)
+    return np.array_equal(voxels[0], voxels[1])
 
 
 def _sort_copies(
