@@ -10,6 +10,7 @@ ran.  See CONTRIBUTING.md for the variables that choose devices.
 """
 
 import os
+import re
 import sys
 
 if sys.version_info < (3, 10):
@@ -19,40 +20,68 @@ import shutil
 import subprocess
 import tempfile
 from contextlib import ExitStack
+from typing import IO
 
 from _environment import ROOT, SetupError, ensure_environment, program_path
 
 MOST_PROCESSES = 4
+CLOSING_LINE = re.compile(r"(=+ )?(\d+ (passed|failed|skipped|errors?)|no tests ran)\b.* in [\d.]+s")
+Steps = dict[str, list[str]]
 
 
-def run_steps(steps: dict[str, list[str]], environment: dict[str, str], beside: str) -> list[str]:
-    """Run the steps in their order and return the names of those that failed.
-
-    The step `beside` uses one core: it runs in parallel from the beginning, and its output is printed in its turn.
-    """
+def run_in_turn(steps: Steps, environment: dict[str, str]) -> list[str]:
+    """Run the steps one after the other and return the names of those that failed."""
     failed = []
-    with ExitStack() as early:
-        if beside in steps:
-            said = early.enter_context(tempfile.TemporaryFile())
-            process = early.enter_context(
-                subprocess.Popen(steps[beside], cwd=ROOT, env=environment, stdout=said, stderr=subprocess.STDOUT)
-            )
-            early.callback(process.kill)  # for an interrupted program; does nothing if the step has ended
-        for name, command in steps.items():
-            print(f"== {name}", flush=True)
-            if name == beside:
-                code = process.wait()
-                said.seek(0)
-                print(said.read().decode(errors="replace"), end="", flush=True)
-            else:
-                code = subprocess.run(command, cwd=ROOT, env=environment).returncode
-            if code:
-                failed.append(name)
-                print(f"{name} failed", file=sys.stderr, flush=True)
+    for name, command in steps.items():
+        print(f"== {name}", flush=True)
+        if subprocess.run(command, cwd=ROOT, env=environment).returncode:
+            failed.append(name)
     return failed
 
 
-def quick_checks(folder: str) -> dict[str, list[str]]:
+def run_beside(steps: Steps, command: list[str], environment: dict[str, str]) -> list[str]:
+    """Run `command`, pytest, with the steps beside it, and return the names of those that failed.
+
+    What pytest prints comes as it is printed, that of the steps after it, and pytest's closing line last.
+    """
+    failed = []
+    with ExitStack() as early:
+        beside = {}
+        for name, step in steps.items():
+            said = early.enter_context(tempfile.TemporaryFile())
+            process = subprocess.Popen(step, cwd=ROOT, env=environment, stdout=said, stderr=subprocess.STDOUT)
+            early.enter_context(process)
+            early.callback(process.kill)  # for an interrupted program; does nothing if the step has ended
+            beside[name] = process, said
+        print("== pytest", flush=True)
+        tests = early.enter_context(subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE))
+        early.callback(tests.kill)
+        assert tests.stdout is not None
+        closing = show_but_closing(tests.stdout)
+        if tests.wait():
+            failed.append("pytest")
+        for name, (process, said) in beside.items():
+            print(f"== {name}", flush=True)
+            if process.wait():
+                failed.append(name)
+            said.seek(0)
+            print(said.read().decode(errors="replace"), end="", flush=True)
+    print(closing, end="", flush=True)
+    return failed
+
+
+def show_but_closing(lines: IO[bytes]) -> str:
+    """Print what pytest prints, line by line, but for its closing line: return that, or nothing if none came."""
+    closing = ""
+    for line in lines:
+        text = line.decode(errors="replace")
+        if CLOSING_LINE.match(text):
+            text, closing = closing, text
+        print(text, end="", flush=True)
+    return closing
+
+
+def quick_checks(folder: str) -> Steps:
     """Return the checks that take a second, by name: the same as in .pre-commit-config.yaml."""
     ruff = program_path(folder, "ruff")
     return {
@@ -69,13 +98,16 @@ def main() -> int:
         return 0
     fast = "--fast" in arguments
     arguments = [argument for argument in arguments if argument != "--fast"]
+    is_release = os.environ.get("CLRECON_RELEASE_TESTS", "") not in ("", "0")
     try:
-        folder = ensure_environment(".venv-test", extras="test,dev,docs", program="pytest", compiled=False)
+        extras = "test,dev,docs,release" if is_release else "test,dev"
+        folder = ensure_environment(".venv-test", extras=extras, program="pytest", compiled=False)
     except SetupError as error:
         print(error, file=sys.stderr)
         return 1
     python = program_path(folder, "python")
-    steps = {**quick_checks(folder), "mypy": [program_path(folder, "mypy")]}
+    # Bodies of tests are half of mypy's time: running them asks the same, and those that do not run wait for a release.
+    steps = {"mypy": [program_path(folder, "mypy"), *([] if is_release else ["clrecon", "scripts", "tests/support"])]}
     if not fast and (shutil.which("oclgrind") or os.environ.get("CLRECON_REQUIRE_OCLGRIND")):
         steps["oclgrind"] = [python, os.path.join("scripts", "proof", "check_oclgrind.py")]
     # Much of the suite's time is the building of kernels, on one core.  Each process gets a part of the tests in order.
@@ -83,14 +115,16 @@ def main() -> int:
     # crashes ends the run: pytest-xdist 3.8 would wait for ever for a process in its place.
     cores = min(os.cpu_count() or 1, MOST_PROCESSES)
     options = ["-n", str(cores), "--dist", "worksteal", "--max-worker-restart", "0"]
-    spread = options if cores > 1 and not arguments else []
-    # pytest comes last: its closing line is the closing line of this program
-    steps["pytest"] = [python, "-m", "pytest", "-q", *spread, *arguments]
+    tests = [python, "-m", "pytest", "-q", *(options if cores > 1 and not arguments else []), *arguments]
     environment = {**os.environ, "CLRECON_REQUIRE_TESTS": "1", "CLRECON_FAST_TESTS": "1" if fast else ""}
     # Hundreds of tests start a process that imports clrecon: it is compiled once, whatever the machine's habit.
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
-    failed = run_steps(steps, environment, beside=("mypy" if fast else "oclgrind") if cores > 1 else "")
-    if failed and failed != ["pytest"]:
+    failed = run_in_turn(quick_checks(folder), environment)
+    if cores > 1 and not arguments:
+        failed += run_beside(steps, tests, environment)
+    else:
+        failed += run_in_turn({**steps, "pytest": tests}, environment)
+    if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr, flush=True)
     return 1 if failed else 0
 

@@ -184,6 +184,7 @@ def test_hashes_of_identifiers_stay_out_of_files(tmp_path):
         assert found == [False, True]
 
 
+@pytest.mark.release
 def test_open3d_reads_the_same(tmp_path):
     open3d = pytest.importorskip("open3d", exc_type=ImportError)
     cloud = make_cloud()
@@ -204,6 +205,7 @@ def test_open3d_reads_the_same(tmp_path):
     np.testing.assert_array_equal(np.float32(own.to_legacy().normals), cloud.normals)
 
 
+@pytest.mark.release
 def test_open3d_writes_what_we_read(tmp_path):
     open3d = pytest.importorskip("open3d", exc_type=ImportError)
     cloud = make_cloud()

@@ -34,6 +34,7 @@ def test_points_in_ras_are_turned():
     assert cloud.points.tolist() == [[-1.0, -2.0, 3.0]] and cloud.normals is None and cloud.hu is None
 
 
+@pytest.mark.release
 def test_a_cloud_goes_to_open3d_and_comes_back():
     pytest.importorskip("open3d")
     cloud = make_cloud()
