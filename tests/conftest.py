@@ -130,19 +130,12 @@ def is_for_every_device(node: Any) -> bool:
     return any(node.get_closest_marker(name) for name in ("every_device", "oclgrind"))
 
 
-def is_another_version(device: Any) -> bool:
-    """True for a further device of a driver that an earlier device has in another version.
-
-    Every day the self-test, the commands and the tests of drivers ask it; those of operators ask it for a release.
+def is_for_release(item: pytest.Item) -> bool:
+    """True where a test of an operator, or one of seconds, is to run on a further device: every day the self-test asks
+    that one.
     """
-    devices = Devices.get()[0]
-    return any(earlier.platform == device.platform for earlier in devices[: devices.index(device)])
-
-
-def is_for_release(item: pytest.Item, device: Any) -> bool:
-    """True where a test of an operator is to run on another version of a driver."""
-    is_of_operator = item.path.is_relative_to(ROOT / "tests" / "operators")
-    return is_of_operator and is_another_version(device) and not is_set("CLRECON_RELEASE_TESTS")
+    is_one = item.path.is_relative_to(ROOT / "tests" / "operators") or item.get_closest_marker("seconds") is not None
+    return is_one and not is_set("CLRECON_RELEASE_TESTS")
 
 
 def is_left_out(item: pytest.Item, seen: set[str]) -> bool:
@@ -186,7 +179,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         device = item.callspec.params.get("device") if hasattr(item, "callspec") else None
         if device in devices[1:]:
             item.add_marker("further_device")
-            if device not in first and (item.get_closest_marker("first_device") or is_for_release(item, device)):
+            if device not in first and (item.get_closest_marker("first_device") or is_for_release(item)):
                 continue
         chosen.append(item)
     config.hook.pytest_deselected(items=left)

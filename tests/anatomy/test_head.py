@@ -63,6 +63,7 @@ def test_row_70_every_level_below_bone_is_warned_of() -> None:
     assert warn_of_face(head, [None, 400.0], "surface") == [] and warn_of_face(head, [None, 40.0], "surface") == [SAID]
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_row_70_meshes_of_python_say_so(device: Any) -> None:
     head = phantom("head")
@@ -76,6 +77,7 @@ def test_row_70_meshes_of_python_say_so(device: Any) -> None:
     assert warnings(300) == warnings((200, 400)) == warnings(50, phantom("pelvis", spacing=(4.0, 4.0, 4.0))) == []
 
 
+@pytest.mark.release
 @pytest.mark.slow
 def test_row_70_commands_say_so_once(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_phantom(tmp_path / "ct", PhantomSettings(kind="head", **COARSE))

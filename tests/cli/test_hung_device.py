@@ -38,6 +38,7 @@ def test_row_56_a_signal_ends_a_command_whose_kernel_hangs(device, tmp_path, com
     assert [path.name for path in tmp_path.iterdir()] == ["ct"]
 
 
+@pytest.mark.release
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "kernel"), daily_rows(1, [("mesh", "emit_triangles"), ("render", "composite_rays")])

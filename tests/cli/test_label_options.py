@@ -12,6 +12,7 @@ import tolerances
 from contract_tables import names_in
 from ct_files import ORIGIN, PATIENT, RADIUS_MM, SPACING, sphere_voxels, write_series
 from label_files import write_nifti
+from variants import daily_rows
 
 from clrecon.cli.main import main
 
@@ -192,15 +193,18 @@ CORNER = ",".join(str(value) for value in np.array(ORIGIN) + SPACING * np.array(
 
 @pytest.mark.parametrize(
     ("options", "names", "failed"),
-    [
-        (["--split"], ["label_1_001", "label_2_001", "label_2_002", "label_3_001"], []),
-        (["--keep-largest", "1"], ["label_1", "label_2", "label_3"], ["label_2"]),
-        (["--min-volume", "0.5", "--label", "1", "--label", "2"], ["label_1", "label_2"], ["label_2"]),
-        (["--seed", CORNER, "--label", "2"], [None], [None]),
-        (["--smooth"], ["label_1", "label_2", "label_3"], []),
-        (["--smooth", "--decimate", "0.5"], ["label_1", "label_2", "label_3"], []),
-        (["--for", "print", "--label", "1"], [None], []),
-    ],
+    daily_rows(
+        4,
+        [
+            (["--split"], ["label_1_001", "label_2_001", "label_2_002", "label_3_001"], []),
+            (["--keep-largest", "1"], ["label_1", "label_2", "label_3"], ["label_2"]),
+            (["--min-volume", "0.5", "--label", "1", "--label", "2"], ["label_1", "label_2"], ["label_2"]),
+            (["--seed", CORNER, "--label", "2"], [None], [None]),
+            (["--smooth"], ["label_1", "label_2", "label_3"], []),
+            (["--smooth", "--decimate", "0.5"], ["label_1", "label_2", "label_3"], []),
+            (["--for", "print", "--label", "1"], [None], []),
+        ],
+    ),
 )
 def test_components_and_refinement_of_masks(
     options: list[str], names: list[str], failed: list[str], device: Any, ct: Path, pieces: Path, tmp_path: Path,

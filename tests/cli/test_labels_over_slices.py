@@ -27,6 +27,7 @@ def colours_of(path: Path) -> np.ndarray:
     return image[np.ptp(image, axis=-1) > 40]
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_a_sheet_shows_its_labels_in_their_colours_and_names_them(
     spine: Path, tmp_path: Path, device: Any, capsys: pytest.CaptureFixture[str]

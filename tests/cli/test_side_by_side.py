@@ -88,6 +88,7 @@ def test_rows_60_and_72_every_run_writes_the_same_bytes(device, ct: Path, tmp_pa
     assert made(plain) == made(odd)
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_row_58_processes_share_a_device(device, ct: Path, tmp_path: Path) -> None:
     """Both begin with an empty cache of kernels."""

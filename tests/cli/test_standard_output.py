@@ -115,9 +115,9 @@ def spine(tmp_path_factory):
         [
             (("stats", "{ct}", "--labels", "{ct}/levels.nrrd"), "labels"),
             (("inside", "{ct}", "-o", "{out}.stl", "--labels", "{ct}/levels.nrrd", "--label", "L3"), "vertebrae"),
-            (("corridor", "{ct}", "--labels", "{ct}/levels.nrrd", "--label", "L3"), "vertebrae"),
             (("vertebrae", "{ct}", "-o", "{out}.nii.gz"), "vertebrae"),
             (("cloud", "{ct}", "-o", "{out}.ply", "--hu", "200"), "points"),
+            (("corridor", "{ct}", "--labels", "{ct}/levels.nrrd", "--label", "L3"), "vertebrae"),
             (("export", "{ct}", "-o", "{out}.nii.gz"), "volume"),
             (("render", "{ct}", "-o", "{out}.png", "--size", "40"), "pictures"),
             (("distance", "{out}_a.stl", "{out}_a.stl"), "hausdorff_mm"),

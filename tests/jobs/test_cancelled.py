@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import is_set
 from variants import daily
 
 import clrecon
@@ -91,6 +92,10 @@ class Buffers:
         return sum(buffer() is not None for buffer in self._made)
 
 
+def last_of_each_stage(found: Calls) -> Calls:
+    return list({moment[0]: moment for moment in found}.values())
+
+
 def old_files(folder: Path, *names: str) -> dict[str, bytes]:
     for name in names:
         (folder / name).write_bytes(b"old " + name.encode())
@@ -128,7 +133,7 @@ def test_a_mesh(scan: Path, device: Any, tmp_path: Path) -> None:
     }  # fmt: skip
     assert ("write", 1, 2) in found  # between the files
     before = old_files(tmp_path, "a.stl", "a_100hu_001.stl", "a.json")
-    for moment in found:
+    for moment in found if is_set("CLRECON_RELEASE_TESTS") else last_of_each_stage(found):
         cancel(work, moment)
         assert there(tmp_path) == before
 

@@ -124,6 +124,7 @@ def test_wrong_files_are_one_line_and_leave_nothing(
         InsideSettings(labels="x.nrrd", only=["L1"], memory=0)
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_pictures_show_each_part(inside: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image = pytest.importorskip("PIL.Image")

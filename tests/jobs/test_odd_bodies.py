@@ -45,7 +45,7 @@ def share_near(body: OddBody, vertices: np.ndarray, *materials: str) -> float:
 
 
 @pytest.mark.seconds
-@pytest.mark.parametrize("name", but_seldom(BONY, SELDOM))
+@pytest.mark.parametrize("name", daily(2, but_seldom(BONY, SELDOM)))
 def test_the_mesh_without_the_table_is_that_of_the_bone(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     body = odd[name]
     report, vertices = mesh_of(odd, device, tmp_path, name, iso_value=300.0, remove_table=True, strict=True)
@@ -183,7 +183,7 @@ def test_what_holds_no_bone_says_so_once(odd: OddBodies, device: Any, tmp_path: 
 
 @pytest.mark.parametrize(
     ("name", "least"),  # walls of cavities are pieces of their own, and loose pieces of dry bone go
-    daily_rows(3, [("skull", 0.9), ("skull-prone", 0.9), ("head", 0.95), ("bones", 0.7), ("limb", 0.95), ("pair", 0.95),
+    daily_rows(2, [("skull", 0.9), ("skull-prone", 0.9), ("head", 0.95), ("bones", 0.7), ("limb", 0.95), ("pair", 0.95),
      ("pelvis", 0.95)]),
 )  # fmt: skip
 def test_bone_is_kept_and_no_alarm_is_false(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from label_files import write_nrrd
+from variants import daily_rows
 
 from clrecon import read_points
 from clrecon.cli.main import main
@@ -167,14 +168,17 @@ def test_steps_run_in_their_order_and_a_region_has_its_place(report_of: Any) -> 
 
 @pytest.mark.parametrize(
     ("step", "given"),
-    [
-        ("bilateral-2d:0.8:30", {"dimensions": 2, "sigma_mm": 0.8, "sigma_hu": 30.0}),
-        ("bilateral-near:0.8:30", {"near_hu": 200.0, "rings": 2}),
-        ("median:1", {"radius_mm": 1.0}),
-        ("gaussian:0.5", {"sigma_mm": 0.5}),
-        ("curvature-flow:3", {"iterations": 3}),
-        ("non-local-means:20", {"sigma_hu": 20.0}),
-    ],
+    daily_rows(
+        3,
+        [
+            ("bilateral-2d:0.8:30", {"dimensions": 2, "sigma_mm": 0.8, "sigma_hu": 30.0}),
+            ("bilateral-near:0.8:30", {"near_hu": 200.0, "rings": 2}),
+            ("median:1", {"radius_mm": 1.0}),
+            ("gaussian:0.5", {"sigma_mm": 0.5}),
+            ("curvature-flow:3", {"iterations": 3}),
+            ("non-local-means:20", {"sigma_hu": 20.0}),
+        ],
+    ),
 )
 def test_every_filter_takes_its_numbers(report_of: Any, step: str, given: dict[str, Any]) -> None:
     if step.startswith(("median", "curvature-flow")):

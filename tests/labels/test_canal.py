@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from variants import daily
 
 from clrecon.geometry import Volume
 from clrecon.labels.canal import find_canal
@@ -67,7 +68,7 @@ def test_slices_close_an_arch_together():
 
 
 @pytest.mark.parametrize(
-    "change", [{"gap": 3.0}, {"pedicles": (8, 8)}, {"lamina": (25, 29), "pedicles": (2, 8)}], ids=str
+    "change", daily(1, [{"gap": 3.0}, {"pedicles": (8, 8)}, {"lamina": (25, 29), "pedicles": (2, 8)}]), ids=str
 )
 def test_an_open_arch_has_no_canal(change):
     solid, volume, _ = block(**change)

@@ -315,6 +315,7 @@ def test_corrupt_files_are_one_line(volume, tmp_path, harm):
     assert "rt.dcm" in str(found.value) and "\n" not in str(found.value)
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.first_device
 def test_commands_take_them(tmp_path, capsys):

@@ -39,6 +39,7 @@ def environment_of(tmp_path, **variables):
     return {**environment, "TMPDIR": str(tmp_path), **variables}
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.parametrize(
     ("variables", "fault"),

@@ -98,6 +98,7 @@ def test_row_59_what_a_dead_process_built_is_built_anew(device, built):
     assert run_child(device, built) == []
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_row_59_a_process_that_dies_leaves_no_record(device, tmp_path):
     if not is_pocl(device.platform):

@@ -86,6 +86,7 @@ def labels(volume):
     return label_boxes(volume, np.s_[3:7, 4:12, 3:10], np.s_[7:10, 4:12, 3:10])
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.parametrize(("size", "works"), daily_rows(1, [(1, ("surface",)), (7, ("labels", "slice"))]))
 def test_row_51_small_groups_give_the_same_bytes(device, volume, labels, monkeypatch, size, works):

@@ -51,6 +51,7 @@ def test_line_marks_point_to_the_true_line():
     assert seen > 100
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("name", kernel_files())
 def test_every_file_builds_alone(name, device):
     kernels = load_program(device, name).kernel_names
@@ -58,6 +59,7 @@ def test_every_file_builds_alone(name, device):
     assert kernels == sorted(declared)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("voxel", ["char", "uchar", "short", "ushort", "int", "float"])
 def test_every_voxel_type_builds(voxel, device):
     program = load_program(device, "surface/marching_cubes.cl", {"VOXEL": voxel})

@@ -180,6 +180,7 @@ def test_spare_buffers_make_way_where_the_driver_has_no_room(apart, monkeypatch)
     assert refused == [2 << 20]
 
 
+@pytest.mark.seconds
 @pytest.mark.every_device
 def test_what_a_surface_and_a_picture_ask_of_the_driver(apart):
     """A discrete card spends most of a surface in waits and allocations: their numbers may only fall."""
@@ -199,6 +200,7 @@ def test_what_a_surface_and_a_picture_ask_of_the_driver(apart):
     assert counts["launches"] == 3 and counts["blocking reads"] == 1 and counts["allocations"] == 0
 
 
+@pytest.mark.seconds
 @pytest.mark.every_device
 def test_memory_of_its_own_changes_no_bit(device, monkeypatch):
     if device.is_simulator:

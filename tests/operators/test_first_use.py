@@ -177,6 +177,7 @@ choose_device(int(sys.argv[1]))
 """
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_row_57_a_crash_in_the_check_becomes_words_in_the_next_process(device: Device, tmp_path: Path) -> None:
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import is_another_version, is_set
+from conftest import is_set
 from house import ROOT
 
 from clrecon.errors import DeviceError
@@ -47,16 +47,15 @@ ASKED_BY_OPERATORS = frozenset({
     "gradients in uneven stacks", "filter of points", "outliers of points", "thinned points", "sparse cells of points",
     "clusters of free points", "points of voxels",
 })  # fmt: skip
-"""Checks whose kernels, with the same variants, tests of operators compare with their twins on every device, but for
-further versions of one driver.  They are for a release: a driver takes minutes to build what they need, and their twins
-are slow."""
+"""Checks whose kernels, with the same variants, tests of operators compare with their twins: every day on the first
+device, for a release on all.  They too are for a release: a driver takes minutes to build what they need, and their
+twins are slow."""
 
 EVERY_DAY = frozenset({
     "exclusive_scan", "bricks", "extract_isosurface", "types of voxels", "extract_labels", "distances to a surface",
     "volume rendering", "projections", "slices", "bilateral filter", "balls", "nearest points", "clusters of voxels",
 })  # fmt: skip
-"""Those of them that run every day on the first device and on further versions of its driver: of each room one, and
-that of the types, see `VOXEL_TYPES`."""
+"""Those of them that run every day on all devices: of each room one, and that of the types, see `VOXEL_TYPES`."""
 
 OF_TYPES = {"VOXEL", "VALUE", "LABEL", "VOXEL_IS_SHORT"}
 OF_DEVICES = {"LANES", "WORDS_PER_ITEM", "HAS_BUILTIN_PREFETCH", "SCAN_GROUP", "CPU_NAME", "ATOMIC_LOADS"}
@@ -97,14 +96,10 @@ def remember(monkeypatch: pytest.MonkeyPatch, module: ModuleType, name: str) -> 
 @pytest.mark.long
 @pytest.mark.every_device
 def test_row_57_every_check_passes_and_launches_what_it_declares(
-    device: Device, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+    device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """So each kernel and each of its variants is compared with its twin on every device."""
-    is_further = request.node.get_closest_marker("further_device") is not None
-    is_asked = is_further and not is_another_version(device)
-    left_out = ASKED_BY_OPERATORS if is_asked else ASKED_BY_OPERATORS - EVERY_DAY
-    if is_set("CLRECON_RELEASE_TESTS"):
-        left_out = frozenset()
+    left_out = frozenset() if is_set("CLRECON_RELEASE_TESTS") else ASKED_BY_OPERATORS - EVERY_DAY
     checks = [check for check in CHECKS if check.name not in left_out]
     launched: dict[str, int] = {}
 

@@ -26,7 +26,7 @@ from variants import daily_rows
 from clrecon.errors import RefusedInputError
 
 CASES = {
-    "values": 8, "bytes": 6, "ends": 2, "volumes": 3, "labels": 2, "clouds": 3, "options": 4, "environment": 1,
+    "values": 4, "bytes": 3, "ends": 1, "volumes": 2, "labels": 1, "clouds": 1, "options": 2, "environment": 1,
 }  # fmt: skip
 """The first cases of each family, about as the time of a campaign is shared."""
 UNHARMED = Answer({"voxels": "a"}, ("known",))

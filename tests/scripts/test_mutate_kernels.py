@@ -20,7 +20,7 @@ sys.path.insert(0, str(ROOT / "scripts" / "proof"))
 from kernel_mutations import EQUIVALENT, all_mutations  # noqa: E402
 from mutate_kernels import judge, key_of, report, run_mutations  # noqa: E402
 
-DRAWN = 4
+DRAWN = 2
 
 
 def commit() -> str:

@@ -23,12 +23,16 @@ them are built every day by the check "types of voxels" of the self-test: kernel
 
 def daily(number: int, values: Iterable[Any]) -> list[Any]:
     """Values of one parameter of which the first `number` run every day, and the others for a release."""
-    return [value if place < number else pytest.param(value, marks=FOR_RELEASE) for place, value in enumerate(values)]
+    return daily_rows(number, (value if hasattr(value, "marks") else pytest.param(value) for value in values))
 
 
 def daily_rows(number: int, rows: Iterable[Any]) -> list[Any]:
-    """Rows of several parameters of which the first `number` run every day, and the others for a release."""
-    return [row if place < number else pytest.param(*row, marks=FOR_RELEASE) for place, row in enumerate(rows)]
+    """Rows of several parameters of which the first `number` run every day, and the others for a release.
+
+    A row may have marks and a name, as `pytest.param` gives them.
+    """
+    made = [row if hasattr(row, "marks") else pytest.param(*row) for row in rows]
+    return [*made[:number], *(row._replace(marks=(*row.marks, FOR_RELEASE)) for row in made[number:])]
 
 
 def but_seldom(values: Iterable[Any], seldom: Container[Any]) -> list[Any]:

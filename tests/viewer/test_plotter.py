@@ -142,6 +142,7 @@ def test_without_a_display_the_other_ways_are_said(tmp_path, monkeypatch):
         clrecon.show(make_mesh())
 
 
+@pytest.mark.release
 def test_a_display_that_does_not_answer_is_said(tmp_path, monkeypatch):
     monkeypatch.setenv("DISPLAY", ":4711")
     check_refusal(refusal([tmp_path], tmp_path, dict(os.environ)), "the display :4711 does not answer")

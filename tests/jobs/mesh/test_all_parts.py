@@ -67,6 +67,7 @@ def test_all_bones_are_named_objects_of_a_3mf(device, bones, tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.3mf", "a.json"]
 
 
+@pytest.mark.release
 def test_all_bones_are_one_mesh_of_other_formats(device, bones, tmp_path, capsys):
     code, report = run(bones, tmp_path / "a.stl", device, "--for", "print", "--all-parts")
     assert code == 0, capsys.readouterr().err

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from variants import daily
 
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
@@ -174,7 +175,7 @@ def test_a_vtp_tells_the_mesh_of_each_triangle(scan: Path, device: Any, tmp_path
         assert ((own.cell_data["COLOR"] == [255, 0, 0]).all()) == (name == "vertebrae_L3")
 
 
-@pytest.mark.parametrize("kind", ["glb", "3mf", "obj", "vtp"])
+@pytest.mark.parametrize("kind", daily(2, ["glb", "3mf", "obj", "vtp"]))
 def test_components_and_iso_values_without_labels_are_objects(
     kind: str, scan: Path, device: Any, tmp_path: Path
 ) -> None:

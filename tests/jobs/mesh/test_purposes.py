@@ -93,6 +93,7 @@ def test_warnings_say_what_can_go_wrong() -> None:
     assert "bone that was left out encloses 1.1 ml" in warn_of_print({**good, "left_out": told})[0]
 
 
+@pytest.mark.release
 def test_a_print_of_a_phantom(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     settings = PhantomSettings(kind="torus", size=(72, 56), slices=31, spacing=(0.5, 0.7, 1.0), noise=30.0)
     truth = write_phantom(tmp_path / "ct", settings)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from contract_tables import names_in
 from PIL import Image
+from variants import daily_rows
 
 from clrecon.errors import DeviceError, OutputError, RefusedInputError, UsageError
 from clrecon.jobs.render.job import PictureFiles, make_pictures, name_view, path_of
@@ -238,15 +239,18 @@ FAR = (5000, 0, 0, 1, 0, 0)
 
 @pytest.mark.parametrize(
     ("settings", "words"),
-    [
-        ({"preset": "x-ray", "clip_planes": [FAR]}, "black.*mm of water"),
-        ({"iso_value": 30000.0}, "mode surface"),
-        ({"clip_planes": [FAR]}, "mode dvr"),
-        ({"clip_planes": [FAR], "mode": "mip"}, "mode mip"),
-        ({"preset": "minip", "keep_air": True}, "picture is black.*do not keep it"),
-        ({"mode": "slice", "window": (20000, 30000)}, "picture is black"),
-        ({"mode": "slice", "window": (-30000, -20000)}, "picture is white"),
-    ],
+    daily_rows(
+        4,
+        [
+            ({"preset": "x-ray", "clip_planes": [FAR]}, "black.*mm of water"),
+            ({"iso_value": 30000.0}, "mode surface"),
+            ({"clip_planes": [FAR]}, "mode dvr"),
+            ({"clip_planes": [FAR], "mode": "mip"}, "mode mip"),
+            ({"preset": "minip", "keep_air": True}, "picture is black.*do not keep it"),
+            ({"mode": "slice", "window": (20000, 30000)}, "picture is black"),
+            ({"mode": "slice", "window": (-30000, -20000)}, "picture is white"),
+        ],
+    ),
 )
 def test_a_picture_of_nothing_says_so(
     device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, settings: dict[str, Any], words: str

@@ -253,6 +253,7 @@ def test_ways_within_a_room_equal_the_twin(device):
         one.dilate_within(other, 0)
 
 
+@pytest.mark.release
 def test_a_vertebra_of_the_phantom_is_as_large_as_its_truth_and_what_the_level_adds(device):
     settings = PhantomSettings(levels="L2", size=(128, 128), spacing=(0.7, 0.7, 0.8))
     voxels, affine, _ = make_phantom(settings)

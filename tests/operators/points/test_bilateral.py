@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from point_shapes import cube, plane, sphere
 from tolerances import FILTER_TRUTH_SHARE, FILTERED_PLANE_MM, TWIN_FILTER_MM
+from variants import daily_rows
 
 from clrecon.errors import UsageError
 from clrecon.operators.points import neighbours
@@ -37,9 +38,9 @@ def run_twin(points, k=16, factor=2.0, features=None):
     return points.astype(np.float64) - factors[:, None] * axes
 
 
-@pytest.mark.parametrize(("shape", "k", "factor"), [
+@pytest.mark.parametrize(("shape", "k", "factor"), daily_rows(1, [
     (plane, 16, 2.0), (sphere, 5, 1.5), (cube, 16, 1.0), pytest.param(cube, 32, 1.0, marks=pytest.mark.release),
-])  # fmt: skip
+]))  # fmt: skip
 def test_filtered_points_equal_their_twin(device, shape, k, factor):
     points = shape().points
     step = denoise_points(PointCloud(points), k, factor, device=device)

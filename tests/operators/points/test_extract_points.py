@@ -157,6 +157,7 @@ def test_the_bytes_of_a_volume_with_and_without_points(device, high, points):
     assert emission.largest == {"volume": 2 * 495, "output": 20 * points, "scratch": 15 * (4 * 2 + 4 + 9)}
 
 
+@pytest.mark.release
 def test_surface_points_are_the_vertices_of_the_mesh(device):
     volume = make_volume((9, 10, 40), uneven=True)
     mesh = extract_isosurface(volume, 50, device=device)

@@ -119,6 +119,7 @@ def test_fewer_points_than_neighbours_are_said(device):
     assert find_neighbours(scattered_points(5), 5, device=device).warnings == ()
 
 
+@pytest.mark.release
 def test_a_million_equal_points_do_not_take_the_square(device):
     """Each of them would be compared with all: a minute."""
     found = find_neighbours(np.zeros((100_000, 3), np.float32), 16, device=device)

@@ -120,6 +120,7 @@ def test_more_samples_than_a_stencil_has_is_all_noise(device):
     assert check_equal(device, volume, 2.6, 255) == 1
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.parametrize("group", daily(1, [16, 1]))
 def test_devices_with_small_work_groups_get_the_same(device, group, monkeypatch):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from variants import each_value
+from variants import daily_rows, each_value
 
 import clrecon
 from clrecon.errors import UsageError
@@ -44,7 +44,9 @@ def test_the_whole_volume_fits_where_nothing_is_taken_away(two_blocks, device):
 
 @pytest.mark.parametrize(
     ("kind", "mode"),
-    [*each_value(["clip", "mask"], ["dvr", "slices", "surface", "mip"]), ("label", "surface"), ("label", "dvr")],
+    daily_rows(
+        3, [*each_value(["clip", "mask"], ["dvr", "slices", "surface", "mip"]), ("label", "surface"), ("label", "dvr")]
+    ),
 )
 def test_what_is_left_fills_the_picture(two_blocks, device, kind, mode):
     volume, labels = two_blocks

@@ -21,6 +21,7 @@ from raycast_scenes import (
     uneven_volume,
 )
 from soft_function import SOFT
+from variants import daily
 
 from clrecon.geometry import Volume
 from clrecon.opencl.sources import read_kernel_source
@@ -111,7 +112,7 @@ def assert_alike(found: Any, expected: Any, mode: str) -> None:
             assert (away <= tolerances.RAY_TWIN_DEPTH_MM).mean() >= 1.0 - tolerances.RAY_TWIN_DEPTH_SHARE, name
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", daily(14, SCENES))
 def test_the_kernel_is_its_twin(device, name):
     volume, settings = SCENES[name]()
     assert_alike(DeviceCaster(device)(volume, **settings), TwinCaster()(volume, **settings), settings["mode"])

@@ -52,7 +52,7 @@ def test_a_homogeneous_slab_is_as_opaque_as_its_way_is_long(cast, ray_step, pers
         assert np.abs(image[visible][:, :3] / 255.0 - (0.2, 0.6, 1.0)).max() <= tolerances.RAY_OPACITY
 
 
-@pytest.mark.parametrize("soft_gradient", [0.0, 25.0, 120.0])
+@pytest.mark.parametrize("soft_gradient", daily(1, [0.0, 25.0, 120.0]))
 def test_light_fades_with_the_gradient(cast, soft_gradient):
     """A field that rises by 60 HU per mm, 50 degrees off the view, opaque and of one colour."""
     along = np.array([np.sin(np.radians(50.0)), np.cos(np.radians(50.0)), 0.0])
@@ -88,6 +88,7 @@ def test_a_fixed_light_lights_only_the_side_that_faces_it(cast, mode, rise):
             assert np.abs(image[..., :3] - truth).max() <= tolerances.RAY_SAME_255 + 0.5
 
 
+@pytest.mark.release
 def test_a_smaller_step_brings_a_picture_nearer(cast):
     volume = even_volume(blobs, "anisotropic", 18.0)
     soft = TransferFunction([(200, 1, 1, 1, 0.0), (300, 1, 1, 1, 0.5), (400, 1, 1, 1, 0.0)])
@@ -100,6 +101,7 @@ def test_a_smaller_step_brings_a_picture_nearer(cast):
     assert errors[2] <= 0.5 * errors[1] + tolerances.RAY_ROUNDING
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.parametrize("ramp", daily(1, [0.7, 1.2]))
 def test_skin_has_no_rings_at_the_default_step(cast, ramp):

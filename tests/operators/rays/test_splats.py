@@ -60,8 +60,15 @@ def test_every_pixel_shows_the_point_of_the_twin(device: Any, name: str, radius:
     assert np.allclose(found.depth, expected, rtol=0.0, atol=tolerances.SPLAT_DEPTH_MM, equal_nan=True)
 
 
-@pytest.mark.oclgrind
-@pytest.mark.parametrize("lighting", [Lighting(), Lighting(0.1, 0.7, 0.5, 20.5, direction=(0.4, -1.0, 0.8)), UNSHADED])
+@pytest.mark.every_device
+@pytest.mark.parametrize(
+    "lighting",
+    [
+        pytest.param(Lighting(), marks=pytest.mark.oclgrind),
+        Lighting(0.1, 0.7, 0.5, 20.5, direction=(0.4, -1.0, 0.8)),
+        UNSHADED,
+    ],
+)
 @pytest.mark.parametrize("has_normals", [True, False])
 def test_the_light_is_that_of_the_twin(device: Any, has_normals: bool, lighting: Lighting) -> None:
     points, normals = ball(700)

@@ -52,8 +52,8 @@ def quad(low: float, high: float, y: float) -> Mesh:
     return Mesh(corners, [(0, 1, 2), (0, 2, 3)])
 
 
-@pytest.mark.oclgrind
-@pytest.mark.parametrize("lighting", [Lighting(), FIXED, UNSHADED])
+@pytest.mark.every_device
+@pytest.mark.parametrize("lighting", [pytest.param(Lighting(), marks=pytest.mark.oclgrind), FIXED, UNSHADED])
 @pytest.mark.parametrize("name", CAMERAS)
 def test_every_layer_is_that_of_the_twin(device: Any, name: str, lighting: Lighting) -> None:
     mesh, camera = soup(), CAMERAS[name]
@@ -205,6 +205,7 @@ def test_what_is_beside_behind_or_as_small_as_a_pixel(device: Any) -> None:
     assert one.image.tolist() == [[[255, 255, 255, 255]]] and one.depth[0, 0] == 53.0
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_clipped_meshes_are_open(device: Any) -> None:
     mesh = Mesh(*ball(8.0, 30))

@@ -10,7 +10,7 @@ import pytest
 from device_work import SIZE, WORK, label_boxes, mesh_arrays
 from failing_devices import Failing, lost_error, pretended_gpu
 from surface_volumes import smooth_volume
-from variants import each_value
+from variants import daily_rows, each_value
 
 import clrecon
 from clrecon.errors import DeviceError, DeviceFailedError, DeviceMemoryError
@@ -35,7 +35,7 @@ def gpu(device):
     return pretended_gpu(device)
 
 
-@pytest.mark.parametrize(("work", "kind"), each_value(WORK, ["launch", "buffer"]))
+@pytest.mark.parametrize(("work", "kind"), daily_rows(6, each_value(WORK, ["launch", "buffer"])))
 def test_row_54_the_cpu_device_takes_over_from_any_buffer_or_launch_on(
     device, gpu, volume, labels, monkeypatch, work, kind
 ):

@@ -199,6 +199,7 @@ def test_where_there_is_no_bone_it_is_said(shell, tmp_path, capsys):
     assert "no walls of bone" in capsys.readouterr().err and not (tmp_path / "a.stl").exists()
 
 
+@pytest.mark.release
 def test_a_label_lies_on_the_bone(shell, tmp_path):
     ct, labels = tmp_path / "ct.nii.gz", tmp_path / "labels.nii.gz"
     shell.save(ct)

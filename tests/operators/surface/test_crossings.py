@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import sample_meshes as samples
+from variants import daily
 
 from clrecon.errors import Cancelled
 from clrecon.mesh.intersections import find_self_intersections
@@ -48,7 +49,7 @@ def test_a_few_triangles(device):
 
 @pytest.mark.parametrize("sizes", [(0.01, 1.0, 40.0), (1.0,), (0.02, 0.021)])
 @pytest.mark.parametrize("extent", [(60.0, 50.0, 40.0), (0.0, 90.0, 5.0), (500.0, 1.0, 1.0)])
-@pytest.mark.parametrize("place", [0.0, 3000.0])
+@pytest.mark.parametrize("place", daily(1, [3000.0, 0.0]))
 def test_pairs_are_those_of_the_host(device, sizes, extent, place, monkeypatch):
     monkeypatch.setattr(decimation, "FEWEST", 1)
     vertices, triangles = scattered(1200, sizes, extent=extent)
@@ -69,7 +70,7 @@ def test_pairs_with_a_changed_triangle(device, fewest, monkeypatch):
     )
 
 
-@pytest.mark.parametrize("scale", [2.0**-60, 2.0**-9, 1.0, 2.0**30])
+@pytest.mark.parametrize("scale", daily(2, [2.0**-60, 2.0**-9, 1.0, 2.0**30]))
 def test_bodies_that_cut_each_other(device, scale, monkeypatch):
     """Whatever the unit of length; two spheres whose triangles lie in each other's planes too."""
     monkeypatch.setattr(decimation, "FEWEST", 1)

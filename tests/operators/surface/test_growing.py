@@ -69,7 +69,7 @@ def assert_twin(volume: Volume, device: Any, level: Any, **options: Any) -> None
 
 
 @pytest.mark.every_device
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", daily(14, SHAPES))
 def test_the_part_of_noise_equals_the_twin_at_sizes_of_words(shape: tuple[int, int, int], device: Any) -> None:
     if np.prod(shape) > 10_000:
         shape = (2, 2, shape[2])

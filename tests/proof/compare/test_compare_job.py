@@ -102,6 +102,7 @@ def _first_device() -> str | None:
     return wanted or None
 
 
+@pytest.mark.release
 @pytest.mark.long
 def test_every_method_has_its_row_and_its_picture(device: Any, whole: Path) -> None:
     report = read_report(whole)
@@ -123,6 +124,7 @@ def test_every_method_has_its_row_and_its_picture(device: Any, whole: Path) -> N
     assert {path.name for path in whole.iterdir()} >= {"slice-k.png", "slice-k-detail.png", "slice-i.png"}
 
 
+@pytest.mark.release
 @pytest.mark.long
 def test_parts_of_time_add_up(device: Any, whole: Path) -> None:
     for method in read_report(whole)["methods"]:
@@ -132,6 +134,7 @@ def test_parts_of_time_add_up(device: Any, whole: Path) -> None:
         assert (method["kernels_ms"] is not None) == COMPARED[method["name"]].on_device
 
 
+@pytest.mark.release
 @pytest.mark.long
 def test_the_page_stands_alone(device: Any, whole: Path) -> None:
     page = (whole / "index.html").read_text(encoding="utf-8")
@@ -144,6 +147,7 @@ def test_the_page_stands_alone(device: Any, whole: Path) -> None:
     assert "prefers-color-scheme: dark" in page and "@media print" in page
 
 
+@pytest.mark.release
 @pytest.mark.long
 def test_numbers_of_the_page_are_those_of_the_report(device: Any, whole: Path) -> None:
     report = read_report(whole)
@@ -160,6 +164,7 @@ def test_numbers_of_the_page_are_those_of_the_report(device: Any, whole: Path) -
     assert paper["all black"][3] == f"{report['paper']['controls']['black']['ssim']:.3f}"
 
 
+@pytest.mark.release
 @pytest.mark.long
 def test_the_paper_is_compared_with_controls(device: Any, whole: Path) -> None:
     paper = read_report(whole)["paper"]
@@ -168,6 +173,7 @@ def test_the_paper_is_compared_with_controls(device: Any, whole: Path) -> None:
     assert paper["controls"]["next"]["ssim"] > paper["controls"]["shifted"]["ssim"] > paper["controls"]["noise"]["ssim"]
 
 
+@pytest.mark.release
 @pytest.mark.long
 def test_the_report_is_read_again_as_records(device: Any, whole: Path) -> None:
     told = read_report(whole)

@@ -125,6 +125,7 @@ def test_slices_follow_the_levels_and_hold_whole_bones() -> None:
     assert 25 < counts["L4-L5"] < 35 < counts["C3-C7,T1-T2"] < 45
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_a_written_label_map_has_the_levels_by_name(tmp_path: Path) -> None:
     settings = PhantomSettings(**COARSE, levels="C6-T1,L5", noise=0.0, oblique=(4.0, -3.0, 9.0))

@@ -63,6 +63,7 @@ def test_a_dry_skull_has_no_soft_tissue_and_a_head_has_it() -> None:
     assert dry["bone"]["voxels"] == whole["bone"]["voxels"]
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_contrast_is_larger_and_brighter_than_the_marrow_of_the_spine() -> None:
     settings = settings_of("contrast", **CLEAN)

@@ -114,6 +114,7 @@ def test_analytic_voxels_hold_the_stated_volume_and_level(kind: str) -> None:
     assert max(voxels.take(end, axis).max() for axis in range(3) for end in (0, -1)) == -900
 
 
+@pytest.mark.release
 def test_same_seed_same_bytes_other_seed_other_bytes(tmp_path: Path) -> None:
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
         write_phantom(tmp_path / name, PhantomSettings(kind="spine", **AWKWARD, seed=seed))

@@ -25,6 +25,7 @@ def values_at(made: tuple, points_mm: np.ndarray) -> np.ndarray:
     return voxels[k, j, i]
 
 
+@pytest.mark.release
 def test_histogram_has_air_soft_tissue_and_bone(spine: tuple) -> None:
     voxels = spine[0]
     count, edges = np.histogram(voxels, bins=np.arange(-1105, 1500, 10))

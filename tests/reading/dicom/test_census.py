@@ -6,6 +6,7 @@ import shutil
 
 import pytest
 from dicom_series import ROOT, Plan, set_values, write_series
+from variants import daily
 
 from clrecon.reading import list_series, read_volume
 from clrecon.reading.dicom.series.census import CLOSEST, LOCALIZERS, WIDER
@@ -140,7 +141,7 @@ def test_localizers_of_the_series_have_numbers_and_are_counted(tmp_path):
     assert (gate["ok"], gate["measured"]) == (False, 6)
 
 
-@pytest.mark.parametrize("together", [True, False], ids=["numbered by place", "one after the other"])
+@pytest.mark.parametrize("together", daily(1, [True, False]), ids=["numbered by place", "one after the other"])
 def test_all_phases_have_their_numbers_and_are_counted(tmp_path, together):
     for phase in (0, 1):
         number = (lambda k, p=phase: 2 * k + p + 1) if together else (lambda k, p=phase: SLICES * p + k + 1)

@@ -59,6 +59,7 @@ def test_no_more_of_a_deflated_file_is_read_than_its_header_takes(tmp_path, monk
     assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_long_sequences_are_stepped_over_without_objects(tmp_path, monkeypatch):
     """What contours and segments are: pydicom takes 50 times their size for them."""

@@ -43,6 +43,7 @@ def copy_series(folder: Path, series: int, slices: int) -> int:
     return series * slices
 
 
+@pytest.mark.release
 @pytest.mark.slow
 @pytest.mark.parametrize(("series", "slices"), [(300, 10), pytest.param(3, 1000, marks=FOR_RELEASE)])
 def test_row_47_many_files_are_walked_once_and_stay_small(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import tolerances
 from dicom_series import Plan, write_series
+from variants import daily_rows
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.reading import list_series, read_volume
@@ -52,24 +53,31 @@ def refusal(folder):
 
 @pytest.mark.parametrize(
     ("first", "second", "keyword"),
-    [
-        ({"AcquisitionTime": "101500"}, {"AcquisitionTime": "103000"}, "AcquisitionTime"),
-        ({"AcquisitionDate": "20200101"}, {"AcquisitionDate": "20200102"}, "AcquisitionDate"),
-        ({"ContentTime": "101500"}, {"ContentTime": "101501"}, "ContentTime"),
-        ({}, {"ContrastBolusAgent": "IODINE"}, "ContrastBolusAgent"),
-        ({}, {"AcquisitionNumber": 2}, "AcquisitionNumber"),
-        ({"AcquisitionNumber": 1}, {"AcquisitionNumber": 2}, "AcquisitionNumber"),
-        ({"FilterType": "A"}, {"FilterType": "B"}, "FilterType"),
-        ({"ProtocolName": "plain"}, {"ProtocolName": "portal"}, "ProtocolName"),
-        ({"ImageComments": "DOE"}, {"ImageComments": "DOE late"}, "ImageComments"),
-        ({}, {"ContrastBolusVolume": lambda k: 10 + k}, "ContrastBolusVolume"),
-        (
-            {"AcquisitionTime": lambda k: f"1015{k:02d}"},
-            {"AcquisitionTime": lambda k: f"1015{20 + k:02d}"},
-            "order of AcquisitionTime",
-        ),
-        ({"AcquisitionTime": lambda k: f"1015{k // 4:02d}"}, {"AcquisitionTime": "102500"}, "order of AcquisitionTime"),
-    ],
+    daily_rows(
+        4,
+        [
+            ({"AcquisitionTime": "101500"}, {"AcquisitionTime": "103000"}, "AcquisitionTime"),
+            ({"AcquisitionDate": "20200101"}, {"AcquisitionDate": "20200102"}, "AcquisitionDate"),
+            ({"ContentTime": "101500"}, {"ContentTime": "101501"}, "ContentTime"),
+            ({}, {"ContrastBolusAgent": "IODINE"}, "ContrastBolusAgent"),
+            ({}, {"AcquisitionNumber": 2}, "AcquisitionNumber"),
+            ({"AcquisitionNumber": 1}, {"AcquisitionNumber": 2}, "AcquisitionNumber"),
+            ({"FilterType": "A"}, {"FilterType": "B"}, "FilterType"),
+            ({"ProtocolName": "plain"}, {"ProtocolName": "portal"}, "ProtocolName"),
+            ({"ImageComments": "DOE"}, {"ImageComments": "DOE late"}, "ImageComments"),
+            ({}, {"ContrastBolusVolume": lambda k: 10 + k}, "ContrastBolusVolume"),
+            (
+                {"AcquisitionTime": lambda k: f"1015{k:02d}"},
+                {"AcquisitionTime": lambda k: f"1015{20 + k:02d}"},
+                "order of AcquisitionTime",
+            ),
+            (
+                {"AcquisitionTime": lambda k: f"1015{k // 4:02d}"},
+                {"AcquisitionTime": "102500"},
+                "order of AcquisitionTime",
+            ),
+        ],
+    ),
 )
 def test_whatever_alternates_parts_two_volumes(tmp_path, first, second, keyword):
     plans = write_volumes(tmp_path, first, second)

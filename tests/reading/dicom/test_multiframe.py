@@ -437,6 +437,7 @@ def test_real_legacy_converted_image(real_data):
     assert volume.report["warnings"] == ["RescaleType is 'US': the values are not HU (all slices)"]
 
 
+@pytest.mark.release
 @pytest.mark.untraced
 def test_a_thousand_frames_are_split_at_once(tmp_path):
     plan = write_enhanced(tmp_path / "mf", Plan(shape=(1000, 2, 2)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from dicom_series import Plan, make_dataset, save_dataset, set_values, write_series
+from variants import daily_rows
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.reading import list_series, read_volume
@@ -45,20 +46,23 @@ def test_one_identical_slice_is_dropped(tmp_path):
 
 @pytest.mark.parametrize(
     ("first", "second", "keyword", "values"),
-    [
-        ({"AcquisitionNumber": 3}, {"AcquisitionNumber": 12}, "AcquisitionNumber", ["3", "12"]),
-        (
-            {"TemporalPositionIdentifier": 1},
-            {"TemporalPositionIdentifier": 2},
-            "TemporalPositionIdentifier",
-            ["1", "2"],
-        ),
-        ({"TriggerTime": "9.5"}, {"TriggerTime": "78.5"}, "TriggerTime", ["9.5", "78.5"]),
-        ({"AcquisitionTime": "101500.5"}, {"AcquisitionTime": "101601"}, "AcquisitionTime", ["+0 s", "+60.5 s"]),
-        ({"AcquisitionDate": "20200101"}, {"AcquisitionDate": "20210704"}, "AcquisitionDate", ["date 1", "date 2"]),
-        ({"ConvolutionKernel": "B31f"}, {"ConvolutionKernel": "B70f"}, "ConvolutionKernel", ["B31f", "B70f"]),
-        ({}, {"AcquisitionNumber": 1}, "AcquisitionNumber", ["1", "(none)"]),
-    ],
+    daily_rows(
+        4,
+        [
+            ({"AcquisitionNumber": 3}, {"AcquisitionNumber": 12}, "AcquisitionNumber", ["3", "12"]),
+            (
+                {"TemporalPositionIdentifier": 1},
+                {"TemporalPositionIdentifier": 2},
+                "TemporalPositionIdentifier",
+                ["1", "2"],
+            ),
+            ({"TriggerTime": "9.5"}, {"TriggerTime": "78.5"}, "TriggerTime", ["9.5", "78.5"]),
+            ({"AcquisitionTime": "101500.5"}, {"AcquisitionTime": "101601"}, "AcquisitionTime", ["+0 s", "+60.5 s"]),
+            ({"AcquisitionDate": "20200101"}, {"AcquisitionDate": "20210704"}, "AcquisitionDate", ["date 1", "date 2"]),
+            ({"ConvolutionKernel": "B31f"}, {"ConvolutionKernel": "B70f"}, "ConvolutionKernel", ["B31f", "B70f"]),
+            ({}, {"AcquisitionNumber": 1}, "AcquisitionNumber", ["1", "(none)"]),
+        ],
+    ),
 )
 def test_phases_are_listed_and_chosen(tmp_path, first, second, keyword, values):
     plan = write_phase(tmp_path, 1, **first)

@@ -16,6 +16,7 @@ from pydicom.uid import (
 )
 from stored_pixels import set_pixels
 from tolerances import AFFINE_MM
+from variants import daily
 
 from clrecon.errors import NoDicomError, RefusedInputError
 from clrecon.reading import list_series, read_volume
@@ -278,7 +279,7 @@ def copy_as_stack(source: Path, folder: Path) -> None:
         ds.save_as(folder / f"{k}", enforce_file_format=True)
 
 
-@pytest.mark.parametrize("ending", [*LOSSLESS, "4.91", "4.81"])
+@pytest.mark.parametrize("ending", daily(5, [*LOSSLESS, "4.91", "4.81"]))
 def test_transfer_syntaxes_decode_as_the_plain_file(tmp_path, real_data, ending):
     reference = pydicom.dcmread(real_data / SYNTAXES / "CTImage.dcm")
     expected = np.frombuffer(reference.PixelData, "<i2").reshape(512, 512).astype(int) - 1024
@@ -320,6 +321,7 @@ def test_a_compressed_frame_of_another_size_is_refused_before_decoding(tmp_path,
     assert len(list(tmp_path.iterdir())) == 3
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_damaged_compressed_frames_are_refused(tmp_path, real_data):
     sources = sorted((real_data / SYNTAXES).glob("*Lossless*.dcm"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from dicom_series import Plan, set_raw, write_series
+from variants import daily, daily_rows
 
 from clrecon.errors import RefusedInputError
 from clrecon.reading import list_series, read_volume
@@ -27,12 +28,15 @@ def write_rounded(folder, step, digits, stated=None, keyword="SliceThickness", *
 
 @pytest.mark.parametrize(
     ("step", "digits", "keyword"),
-    [
-        (0.0105, 2, "SliceThickness"),
-        (0.0105, 2, "SpacingBetweenSlices"),
-        (0.333, 1, "SliceThickness"),
-        (1.5, 0, "SliceThickness"),
-    ],
+    daily_rows(
+        2,
+        [
+            (0.0105, 2, "SliceThickness"),
+            (0.0105, 2, "SpacingBetweenSlices"),
+            (0.333, 1, "SliceThickness"),
+            (1.5, 0, "SliceThickness"),
+        ],
+    ),
 )
 def test_rounded_even_steps_are_one_even_stack(tmp_path, step, digits, keyword):
     write_rounded(tmp_path, step, digits, keyword=keyword)
@@ -52,7 +56,7 @@ def test_rounded_even_steps_are_one_even_stack(tmp_path, step, digits, keyword):
     assert failed == []
 
 
-@pytest.mark.parametrize("lost", [1, 2, 20, 30, 57, 58])
+@pytest.mark.parametrize("lost", daily(3, [1, 2, 20, 30, 57, 58]))
 def test_a_missing_slice_is_no_rounding(tmp_path, lost):
     write_rounded(tmp_path, 0.0105, 2, leave_out=(lost,))
     with pytest.raises(RefusedInputError, match="slice missing between"):
@@ -67,7 +71,7 @@ def test_whole_millimetres_hide_no_missing_slice(tmp_path, lost):
         read_volume(tmp_path)
 
 
-@pytest.mark.parametrize(("stated", "digits"), [(5, 2), (0.02, 2), (0.0105, 3)])
+@pytest.mark.parametrize(("stated", "digits"), daily_rows(1, [(5, 2), (0.02, 2), (0.0105, 3)]))
 def test_another_thickness_or_more_digits_explain_nothing(tmp_path, stated, digits):
     write_rounded(tmp_path, 0.0105, digits, stated=stated, leave_out=() if digits == 2 else (30,))
     with pytest.raises(RefusedInputError, match="slice missing between"):

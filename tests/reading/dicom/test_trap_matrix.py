@@ -10,6 +10,7 @@ import pytest
 from tolerances import AFFINE_MM, FAR_AFFINE_MM, JITTER_AFFINE_MM, ROUNDED_AFFINE_MM
 from trap_cases import BACKGROUND_HU, CASES, EXACT, REFUSED, WARNED, Case, Marks, Size
 from trap_plan import BODY_HU
+from variants import daily
 
 from clrecon.errors import ClreconError, RefusedInputError
 from clrecon.geometry import Volume
@@ -53,7 +54,7 @@ def test_a_row_of_the_matrix(tmp_path: Path, case: Case) -> None:
 
 
 @pytest.mark.parametrize(
-    "case", [c for c in CASES.values() if c.again], ids=[c.name for c in CASES.values() if c.again]
+    "case", daily(8, [c for c in CASES.values() if c.again]), ids=[c.name for c in CASES.values() if c.again]
 )
 def test_a_refused_row_read_on_request(tmp_path: Path, case: Case) -> None:
     truth = case.write(tmp_path, Size())

@@ -184,6 +184,7 @@ def test_keys_look_from_the_sides_with_their_letters(page) -> None:
     page.find_element("id", "scene").send_keys(Keys.ESCAPE)
 
 
+@pytest.mark.release
 def test_a_distance_by_two_clicks_is_that_of_the_places(page) -> None:
     page.find_element("id", "distance").click()
     for number in (0, 1):
@@ -254,6 +255,7 @@ def test_the_cross_is_seen_in_the_picture_and_slices_have_names_and_colours(page
     assert 4 < len(marks) < 20 and "0" in [mark.text for mark in marks]
 
 
+@pytest.mark.release
 def test_left_right_and_the_wheel_step_the_iso_value(page) -> None:
     from selenium.webdriver import ActionChains
     from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
@@ -404,6 +406,7 @@ def test_the_wheel_scrolls_a_slice_and_a_right_drag_is_its_window(page) -> None:
     assert after["cross"][:2] == pytest.approx(before["cross"][:2])
 
 
+@pytest.mark.release
 def test_clip_planes_and_a_box_cut(page) -> None:
     before = picture(page)
     page.find_element("id", "cut").click()
@@ -460,6 +463,7 @@ def test_files_that_were_named_are_written_here_and_q_ends_it(browser, device, t
     assert read_mesh(tmp_path / "shown-2.ply", space="lps").triangle_count == scenes.make_mesh().triangle_count
 
 
+@pytest.mark.release
 def test_another_browser_has_a_view_of_its_own(page, served) -> None:
     page.execute_script("clrecon.run('set_iso', { hu: 350 })")
     wait_for(page, "return clrecon.facts.iso.hu === 350")

@@ -85,6 +85,7 @@ def test_a_signal_ends_it_while_pictures_are_drawn(device, scan: Path, number: i
         assert process.stderr.read() == ""
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.opencl
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
