@@ -87,8 +87,6 @@ class Signs:
 
 @dataclass(frozen=True)
 class _Runs:
-    """Runs of far nodes on the device."""
-
     offsets_d: Any
     firsts_d: Any
     lasts_d: Any

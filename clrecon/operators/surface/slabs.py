@@ -17,10 +17,7 @@ BRICKS = "brick ranges"
 
 @dataclass(frozen=True)
 class SampleGrid:
-    """The samples of a volume with its border, and their packing in the inside mask.
-
-    If only a part of the surface is made (`grows`), bits of the whole grid stay on the device.
-    """
+    """Samples of a volume with its border, and their packing in bits, all on the device where it `grows`."""
 
     volume: Volume
     rule: IsoRule

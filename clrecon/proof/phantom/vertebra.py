@@ -202,9 +202,7 @@ def _mix(thoracic: tuple[float, ...], lumbar: tuple[float, ...], share: float) -
 
 
 def _arch_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
-    """Return the distance to pedicles, articular processes, laminae, transverse and spinous processes; |x| serves both
-    sides.
-    """
+    """Return the distance to pedicles, laminae, articular, transverse and spinous processes, on both sides."""
     side = np.abs(x)
     wide, deep, high = vertebra.canal_half_width, vertebra.canal_half_depth, vertebra.height
     middle = vertebra.depth / 2.0 + deep
@@ -275,9 +273,7 @@ def upper_facet_seats(vertebra: Vertebra) -> list[tuple[float, float, float]]:
 
 
 def vertebra_shape(vertebra: Vertebra, x: Field, y: Field, z: Field) -> tuple[Field, list[Field]]:
-    """Return the distance to the bone before cutting, and those to what is cut out of it, mm, positive inside; x, y, z
-    are local mm.
-    """
+    """Return the distance to the bone before cutting, and those to what is cut out, mm, at local x, y, z."""
     if vertebra.is_cervical:
         bone, cuts = cervical_shape(vertebra, x, y, z)
     else:
@@ -290,10 +286,7 @@ def vertebra_shape(vertebra: Vertebra, x: Field, y: Field, z: Field) -> tuple[Fi
 
 
 def vertebra_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
-    """Return the distance to the outer surface of the bone, mm, positive inside; x, y, z are local mm.
-
-    It is exact on the surface and of first order near it; `clrecon.proof.phantom.truth` has true distances.
-    """
+    """Return the distance to the bone's surface, mm, positive inside, exact on it and of first order near it."""
     bone, cuts = vertebra_shape(vertebra, x, y, z)
     for cut in cuts:
         bone = np.minimum(bone, -cut)
@@ -387,9 +380,7 @@ def _distance_to(vertebra: Vertebra, points: Float64Array) -> Float64Array:
 
 
 def close_facets(vertebrae: Sequence[Vertebra], gap_mm: float) -> list[Vertebra]:
-    """Widen the upper articular processes of vertebrae, from top to bottom, by balls `gap_mm` from the vertebra above,
-    where that is the neighbour in the spine.
-    """
+    """Widen upper articular processes by balls `gap_mm` from the vertebra above, if that is the neighbour."""
     closed = list(vertebrae[:1])
     for lower in vertebrae[1:]:
         upper = closed[-1]
