@@ -95,7 +95,7 @@ def _compare_components(
     level = volume.voxels.dtype.type(rule.lowest_inside)
     slab = Slab(grid, 0, grid.shape[2])
     with watch.running(job.device):
-        classified = classify(job.device, slab, resident.whole(watch), (level,), watch)
+        classified = classify(job.device, slab, resident.whole(watch), (level,))
     mask = volume.voxels >= job.hu
     own = find_components(resident, grid, classified, watch)
     peers: dict[str, Callable[[], Any]] = {
