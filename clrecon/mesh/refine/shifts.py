@@ -152,9 +152,9 @@ def move_vertices(
     share = np.ones(len(vertices))
     moved = as_stored(vertices + step)
     spoilt: IntArray = _find_spoilt(moved, triangles, np.ones(len(triangles), dtype=bool), find_crossings)
-    near = _Near(vertices, moved, triangles)
+    near: _Near | None = None
     for turn in range(_ROUNDS):
-        if turn >= _ROUNDS_OF_ITS_OWN:
+        if turn >= _ROUNDS_OF_ITS_OWN and near is not None:
             spoilt = np.unique(triangles[near.touching(spoilt)])
         spoilt = spoilt[share[spoilt] > 0.0]
         if len(spoilt):
@@ -166,6 +166,7 @@ def move_vertices(
             share[spoilt] = 0.0
         if len(spoilt) == 0:
             break
+        near = near or _Near(vertices, moved, triangles)
         moved[spoilt] = vertices[spoilt] + share[spoilt, None] * step[spoilt]
         spoilt = near.find_spoilt(spoilt)
     return moved, int(np.count_nonzero(share < 1.0))
