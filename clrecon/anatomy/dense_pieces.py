@@ -8,7 +8,7 @@ A piece is a connected component of cells that hold voxels above `DENSE_HU`.  Th
 
 - Plastic and carbon fibre have next to no voxels above `HARD_HU`; bone has, teeth and metal too.
 - A table moves through the scanner along the step of the slices, so its cross section is the same in all of them:
-columns of its cells are filled from the first slice to the last.  Bones taper and bend.
+  columns of its cells are filled from the first slice to the last.  Bones taper and bend.
 - Plates and rails are thin.
 
 A patient has more soft tissue than bone; a dry specimen has none.  In the scan of a patient a piece is kept if most of

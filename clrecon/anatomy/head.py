@@ -131,8 +131,8 @@ def shows_face(volume: Volume, hu: float) -> bool:
 def find_head(volume: Volume) -> bool | None:
     """Tell, once for each volume, whether a scan shows a head: True where slices show the vault of a skull.
 
-    False: every slice with a body shows a trunk, or fills the slice, so that no skin shows.  None: neither, such as a
-        leg.
+    It is False where every slice with a body shows a trunk or is filled by it, so that no skin shows; None for all
+    else, such as a leg.
     """
     if volume not in _judged:
         _judged[volume] = _judge(volume)
