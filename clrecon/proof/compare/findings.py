@@ -28,7 +28,6 @@ def megabytes(value: float) -> str:
 
 
 def count(value: float) -> str:
-    """Write a whole number."""
     return f"{value:,.0f}"
 
 

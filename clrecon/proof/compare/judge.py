@@ -39,7 +39,6 @@ class Judge:
 
     @cached_property
     def truth(self) -> Any:
-        """The true surface of the phantom."""
         from clrecon.proof.phantom import phantom_truth
 
         return phantom_truth(self._truth)
@@ -51,7 +50,6 @@ class Judge:
 
     @cached_property
     def cells(self) -> GridCells:
-        """The cells of that mesh."""
         assert self.reference is not None
         return find_mesh_cells(self.reference, self._volume, name=self._reference or "")
 

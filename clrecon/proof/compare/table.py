@@ -122,7 +122,6 @@ def shown_columns(report: CompareReport) -> list[Column]:
 
 
 def main_table(report: CompareReport, colors: Mapping[str, str]) -> str:
-    """Return the table with a row for each method."""
     columns = shown_columns(report)
     head = "".join(_head(column) for column in columns)
     reference = next((r for r in report.methods if r.name == report.reference and r.is_done), None)
