@@ -72,7 +72,6 @@ class VoxelMask:
 
 
 def mask_bytes(shape_ijk: tuple[int, int, int], pad: int = 0) -> dict[str, int]:
-    """Return the bytes of a mask on the device, by description."""
     ni, nj, nk = shape_ijk
     return {"mask of the voxels": 4 * (-(-ni // 32) + pad) * nj * nk, "row extents": 4 * nj * nk}
 

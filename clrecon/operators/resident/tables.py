@@ -161,7 +161,6 @@ class BrickStates:
 
 
 def brick_bytes(shape_ijk: tuple[int, int, int], dtype: np.dtype[Any]) -> int:
-    """Return the bytes of the ranges of a volume's bricks on the device."""
     return 2 * math.prod(-(-n // BRICK) for n in shape_ijk) * int(dtype.itemsize)
 
 
