@@ -220,7 +220,11 @@ class _Child:
 
 
 def run_check(device: Device, check: Check) -> dict[str, Any]:
-    """Run one check; ``detail`` says what was compared or is wrong; ``seconds`` include builds of kernels."""
+    """Run one check.
+
+    Return ``operator`` (name of the check), ``passed``, ``detail`` (what was compared, or what is wrong) and
+    ``seconds``, kernel builds included.
+    """
     start = time.perf_counter()
     try:
         passed, detail = True, check.run(device)

@@ -322,7 +322,9 @@ def _default_seal(volume: Volume, bone: Mask) -> float:
 
 
 def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, steps: Steps) -> Volume:
-    """Fill what a mask encloses; `how` is the radius of the seal, that of wide spaces, and whether air stays."""
+    """Fill what a mask encloses, see `fill_enclosed`; `how` is the radius of the seal, that of wide spaces, and whether
+    air stays.
+    """
     volume = bone.scan
     seal_mm, largest_mm, keep_air = how
     # Near the ends of the volume no ball fits; there discs close what lies in the end slices themselves.

@@ -29,6 +29,8 @@ def prepare_runs(device: Device) -> Program:
 
 @dataclass(frozen=True)
 class StencilTable:
+    """A stencil on a device."""
+
     rows_d: Any
     tables_d: Any
 
@@ -141,7 +143,9 @@ def write_runs(
 
 @dataclass(frozen=True)
 class Components:
-    """Components of voxels by their faces, on a device: that of each run, (count,) int32, by their first runs."""
+    """Components of the set voxels of a mask by the faces of voxels, on a device: the number of each run, (runs.count,)
+    int32, in the order of their first runs.
+    """
 
     runs: RowRuns
     count: int

@@ -255,6 +255,8 @@ class _Settings:
 
 
 class _Run:
+    """All iterations on one device."""
+
     def __init__(self, settings: _Settings, device: Device, memory: int | None, progress: Progress):
         self.settings, self.device, self.memory, self.progress = settings, device, memory, progress
         self.stopwatch = Stopwatch()

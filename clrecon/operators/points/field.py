@@ -87,6 +87,8 @@ class Signs:
 
 @dataclass(frozen=True)
 class _Runs:
+    """Runs of far nodes on the device."""
+
     offsets_d: Any
     firsts_d: Any
     lasts_d: Any

@@ -68,7 +68,9 @@ CELLS_AN_ITEM = 32
 
 @dataclass(frozen=True, eq=False)
 class FreeClusters:
-    """Clusters of free points, numbered by their first core point, -1 for noise, and facts for a report."""
+    """The result of `cluster_free_points`: clusters, numbered by their first core point, -1 for noise, and facts for a
+    report.
+    """
 
     labels: NDArray[np.int32]
     cores: NDArray[np.bool_]
@@ -161,7 +163,10 @@ def find_clusters(
     memory: int | None = None,
     progress: Progress = ignore_progress,
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_], int, int]:
-    """Return labels, cores, numbers of clusters and cells, whatever `per_chunk`, a multiple of `CELLS_AN_ITEM`."""
+    """Return labels, cores, and the number of clusters and of cells of a plan that `plan_cells` made for `eps`.
+
+    The result does not depend on `per_chunk`, the cells of a chunk, a multiple of `CELLS_AN_ITEM`.
+    """
     n = len(plan.points)
     needs = {**plan.needs(device), "clusters": 23 * n}
     require_room(memory_limits(device, memory), needs, "the clusters of the points cannot be found")

@@ -361,6 +361,8 @@ def _choose_lengths(
 
 
 class _Reconstruction:
+    """One surface of a cloud on a device."""
+
     def __init__(
         self,
         cloud: PointCloud,

@@ -195,6 +195,8 @@ class _Rounds:
 
 
 class _Search(_Rounds):
+    """The rounds on a mesh."""
+
     def __init__(self, device: Device, triangles: NDArray[np.uint32], vertex_count: int, memory: int | None):
         self._limits = memory_limits(device, memory)
         self._faces, self._vertices = len(triangles), vertex_count

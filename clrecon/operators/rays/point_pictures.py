@@ -64,7 +64,10 @@ _SHADINGS = {
 
 
 class SplatPicture(NamedTuple):
-    """A picture of points, and mm along the ray, NaN where none is; the cloud went through in `parts`."""
+    """A picture of points: (h, w, 4) uint8, and their depth, (h, w) float32, mm along the ray, NaN where none is.
+
+    `shading` is "none", "normals" or "depths"; the cloud went through the device in `parts`.
+    """
 
     image: NDArray[np.uint8]
     depth: NDArray[np.float32]
@@ -280,7 +283,10 @@ class _Colors(NamedTuple):
 
 
 class PointPictures(Closing):
-    """Pictures of a cloud, a context manager: its arrays must not change meanwhile; a large one goes in parts."""
+    """A cloud of points of which pictures are made one after the other: a context manager.
+
+    Its arrays must not change as long as this object is open; a cloud over `memory` goes through in parts.
+    """
 
     def __init__(self, cloud: PointCloud, *, device: Device | str | int | None = None, memory: int | None = None):
         check_memory(memory)

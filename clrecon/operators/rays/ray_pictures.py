@@ -198,7 +198,9 @@ def composite_slab(
     stopwatch: Stopwatch,
     between: Between | None = None,
 ) -> None:
-    """Blend one slab into a picture, or its part `between` into the states of `output` alone, and wait."""
+    """Blend one slab into a picture, and wait; of a part of the rays, `between`, only the states of `output` are
+    written.
+    """
     device = resident.device
     variants = {"GRADIENT_OPACITY": "1"} if tables.weighed else {}
     if tables.steepness.is_steep and takes_parts(resident.volume, view.ray_step):
@@ -303,7 +305,10 @@ def take_with_layers(
     beside: Mapping[str, int],
     draw: Callable[[DrawnVolume], Rendering],
 ) -> Rendering:
-    """Take a picture with what lies in the volume, bytes `beside` it; `draw` is called again after a failure."""
+    """Take a picture of a volume with what lies in it, whose buffers take bytes `beside` it.
+
+    `draw` is called again where the device has no room, or another one takes over.
+    """
 
     for attempt in resident.with_fallback():
         with attempt as (device, warnings):

@@ -134,7 +134,9 @@ def pad_slices(voxels: NDArray[Any]) -> NDArray[Any]:
 def plan_ray_slabs(
     resident: DeviceVolume, others: Mapping[str, int], extra: Mapping[str, int], labels: ResampledLabels | None = None
 ) -> int:
-    """Return the slices of a slab that fits with bytes of `others`, and of `extra` if it is not the whole."""
+    """Return the number of slices in a slab, all if everything fits beside labels and `others`, bytes of other buffers;
+    `extra` are needed only with more than one slab.
+    """
     ni, nj, nk = resident.volume.shape_ijk
     cells, size = choose_brick_cells(resident.volume), resident.dtype.itemsize
 

@@ -73,7 +73,10 @@ class Still(NamedTuple):
 
 
 class LayeredPicture(NamedTuple):
-    """A picture of layers, with mm along the ray, NaN: nothing; of `open_pixels` further ones are left out."""
+    """A picture of layers, (h, w, 4) uint8, with depths, (h, w) float32, mm along the ray, NaN where nothing is.
+
+    `open_pixels` may have further layers than those that were drawn, which are left out.
+    """
 
     image: NDArray[np.uint8]
     depth: NDArray[np.float32]
@@ -112,6 +115,8 @@ def draw_layers(
 
 
 class _Layers:
+    """One picture: its buffers, and its passes."""
+
     def __init__(
         self,
         device: Device,

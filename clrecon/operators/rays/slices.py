@@ -82,7 +82,10 @@ def overlay_with_layers(
     beside: Mapping[str, int],
     draw: Callable[[DrawnVolume], Rendering],
 ) -> Rendering:
-    """Show slices with what lies between them, bytes `beside` them; `draw` is called again after a failure."""
+    """Show slices of a volume in space with what lies between them, whose buffers take bytes `beside` it.
+
+    `draw` is called again where the device has no room, or another one takes over.
+    """
     for attempt in resident.with_fallback():
         with attempt as (device, warnings):
             overlay = _Overlay(resident, style, shot, warnings)
@@ -113,7 +116,9 @@ class _Colors(NamedTuple):
 
 
 def _sort_slices(volume: Volume, camera: Camera, chosen: Sequence[int]) -> list[int]:
-    """Sort slices as all rays cross them: parallel ones up or down, others away from the camera."""
+    """Sort slices in the order in which rays cross them, all alike: parallel ones up or down, others away from the
+    camera.
+    """
     heights = _heights(volume, volume.slice_origins()[list(chosen)])
     if camera.is_parallel:
         along = heights * np.sign(_heights(volume, camera.basis().forward[None])[0] or 1.0)

@@ -48,6 +48,8 @@ def cast_surface(resident: DeviceVolume, style: SurfaceLook, shot: Shot, ray_ste
 
 
 class _Job(SlabPicture):
+    """One picture, slab after slab."""
+
     def __init__(
         self, resident: DeviceVolume, rule: IsoRule, look: SurfaceLook, shot: Shot, ray_step: float, warnings: list[str]
     ):

@@ -63,7 +63,10 @@ def framing_key(volume: Volume, style: Style) -> tuple[object, ...]:
 
 
 def shown_box(shown: Volume | DeviceVolume, style: Style) -> Grid:
-    """Return what cameras fit: the volume where all or nothing of it is shown, else `find_seen_box`."""
+    """Return the grid that cameras fit: the volume itself where all of it is shown, or nothing, else `find_seen_box`.
+
+    A `DeviceVolume` brings labels to the grid of the volume once for all pictures.
+    """
     volume = shown.volume if isinstance(shown, DeviceVolume) else shown
     clip = getattr(style, "clip", None)
     labels = _shown_labels(shown, style)

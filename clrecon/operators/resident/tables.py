@@ -44,7 +44,9 @@ BOX_BORDER = 0.5
 
 @dataclass(frozen=True)
 class FieldFrame:
-    """The map from LPS mm to indices, ``matrix @ p + offset``; in uneven stacks the third is height in mm."""
+    """The map from LPS mm to field coordinates, ``matrix @ p + offset``: indices; for uneven slices indices in the
+    plane of slice 0, and height in mm.
+    """
 
     matrix: Float64Array
     offset: Float64Array
@@ -154,7 +156,9 @@ class BrickRanges:
 
 @dataclass(frozen=True)
 class BrickStates:
-    """States of words of 32 samples, (bk, bj, words) uint8, at an iso value, and extents, (bk, bj, 2) uint16."""
+    """The result of comparing words of 32 samples with an iso value, one row of words for each row of bricks: states_d
+    (bk, bj, words) uint8, extents_d (bk, bj, 2) uint16.
+    """
 
     states_d: Any
     extents_d: Any

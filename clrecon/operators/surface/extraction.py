@@ -93,7 +93,10 @@ def _join(parts: list[Part]) -> Part:
 
 
 class Extraction:
-    """One extraction in slabs, thinner ones if need be; with `vertices_only` their parts have no triangles."""
+    """One extraction, slab by slab, with fewer slices in a slab if the device has no room for more.
+
+    With `vertices_only` it stops after the vertices: the part of a slab then has no triangles.
+    """
 
     def __init__(
         self,
@@ -233,7 +236,9 @@ class Extraction:
             self.largest[what] = max(self.largest[what], size)
 
     def _describe_cells(self) -> tuple[dict[str, int], dict[str, Any] | None]:
-        """Cells that are visited, of all; of a grown surface the active and grown ones too, and what was grown."""
+        """Cells that are visited, of all; of a surface that is grown also the active and the grown ones, and what was
+        grown.
+        """
         if self._grown is not None:
             return self._grown.report(self.device, self.grid)
         every = math.prod(n - 1 for n in self.grid.shape)

@@ -140,6 +140,8 @@ class Sums:
 
 @dataclass(frozen=True)
 class Runs:
+    """Runs of active cells on the device."""
+
     active_d: Any
     starts_d: Any
     words_d: Any
@@ -267,6 +269,8 @@ class Grown:
 
 
 class _Search:
+    """Components of the active cells of one grid."""
+
     def __init__(self, resident: DeviceVolume, grid: SampleGrid, classified: Classified):
         self.resident, self.grid, self.classified = resident, grid, classified
         self.device = resident.device

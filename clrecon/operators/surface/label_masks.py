@@ -311,7 +311,9 @@ class StartedMesh:
             self.emission.vertices(level, map=held.map_d, label=self.number, occupied=held.occupied_d, biases=biases_d)
 
     def enclosed_mm3(self, level: int) -> float:
-        """Return the volume enclosed at a level: a device sums hundreds of triangles at a time, the host the rest."""
+        """Return the volume that the mesh encloses at a level: the device sums some hundred triangles at a time, the
+        host the rest.
+        """
         self.place(level)
         device, stopwatch, placement = self.run.device, self.run.stopwatch, self.run.placement
         middle = [[(part.start + part.stop - 1) / 2 for part in self.box[::-1]]]

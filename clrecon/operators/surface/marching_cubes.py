@@ -67,7 +67,9 @@ class Classified:
 
 @dataclass(frozen=True)
 class Counted:
-    """What `count` found for one slab, and the totals of its own rows; `cells` are for the trilinear field."""
+    """The results of `count` for one slab, on the device, and the totals of the slab's own rows; `cells` with the
+    topology of the trilinear field.
+    """
 
     row_offsets_d: Any
     word_vertices_d: Any

@@ -17,7 +17,10 @@ BRICKS = "brick ranges"
 
 @dataclass(frozen=True)
 class SampleGrid:
-    """Samples of a volume with its border, and their packing in bits, all on the device where it `grows`."""
+    """The samples of a volume with its border, and their packing in the inside mask.
+
+    If only a part of the surface is made (`grows`), bits of the whole grid stay on the device.
+    """
 
     volume: Volume
     rule: IsoRule

@@ -51,7 +51,10 @@ def _field_arguments(slab: Slab) -> dict[str, Any]:
 def count_cells(
     device: Device, slab: Slab, voxels_d: Any, mask_d: Any, flags_d: Any, row_counts_d: Any, word_triangles_d: Any
 ) -> CellVertices:
-    """Count triangles of count_rows again, in place, and vertices inside cells, which follow those of each slice."""
+    """Count the slab's triangles again, in place, and the vertices inside cells, which follow those of each slice.
+
+    Of count_rows are: words with work, counts of each row, triangles of the row before each word.
+    """
     grid, rows = slab.grid, slab.counted_rows
     row_vertices_d = allocate(device, 4 * rows)
     word_places_d = allocate(device, 2 * slab.rows * grid.words)
@@ -81,7 +84,10 @@ def emit_cells(
     output: dict[str, Any],
     first_vertex: int,
 ) -> None:
-    """Write triangles and vertices inside cells, behind `first_vertex` of earlier slabs, to buffers of `output`."""
+    """Write triangles and vertices inside cells, after `first_vertex` vertices of earlier slabs.
+
+    `tables` are as emit_vertices takes them; `output` has the buffers ``positions``, ``normals`` and ``triangles``.
+    """
     program = prepare_trilinear(device, slab.grid.volume.voxels.dtype)
     cells: CellVertices = counted.cells
     active = counted.active_words

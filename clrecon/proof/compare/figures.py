@@ -42,7 +42,10 @@ Segments = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane across an `axis` at an index; `across` and `down` run right and down, with `flip` the latter up."""
+    """A plane across an `axis` (of i, j, k) of the volume at an index coordinate.
+
+    The axes `across` and `down` run to the right and down in the picture, with `flip` the latter upward.
+    """
 
     name: str
     axis: int

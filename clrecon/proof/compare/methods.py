@@ -17,7 +17,9 @@ MESH, CLOUD, PICTURE = "mesh", "cloud", "picture"
 
 @dataclass(frozen=True)
 class Compared:
-    """A method that makes a "mesh", "cloud" or "picture", on the device or not, by a `peer` or by clrecon."""
+    """A method that is compared; it makes a "mesh", "cloud" or "picture", on the device or not, by a `peer` or by
+    clrecon.
+    """
 
     name: str
     title: str

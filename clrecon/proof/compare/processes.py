@@ -29,7 +29,10 @@ _VOXELS, _PLACE = "voxels.npy", "place.npz"
 
 @dataclass(frozen=True)
 class Request:
-    """What one process does with a method; `along` is a view along the slices, for the table of the paper."""
+    """What one process does with a method: the volume is in `folder`, which gets the results.
+
+    Of `repeat` warm runs; `along` is a view along the slices, for the table of the paper.
+    """
 
     method: str
     folder: str
@@ -153,7 +156,11 @@ def _describe_end(code: int) -> str:
 
 
 def measure_in_processes(told: Mapping[str, Any], methods: Mapping[str, int]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Measure methods, by how much there is, in a process a core: figures of `Judge`, or only ``reasons``."""
+    """Measure what methods made in a process a core, and yield names with figures, see `Judge`, or only with
+    ``reasons``.
+
+    `methods` tells by name how much there is to measure.
+    """
     parts = _share(methods, min(usable_cores(), MOST_JUDGES))
     lines: queue.Queue[tuple[int, bytes]] = queue.Queue()
     processes: list[subprocess.Popen[bytes]] = []

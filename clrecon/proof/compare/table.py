@@ -30,7 +30,11 @@ GROUPS = {"mesh": "surfaces", "cloud": "clouds", "picture": "pictures of the vox
 
 @dataclass(frozen=True)
 class Column:
-    """A column: `take` gives the number of a row or None; the `best`, low or high, is bold; some need a truth."""
+    """A column of the main table: `take` gives the number of a row, or None, `write` its text; one may need the
+    `truth`.
+
+    The "low" or "high" end of the numbers of meshes is set in bold, or none.
+    """
 
     head: str
     unit: str

@@ -142,7 +142,9 @@ METAL_HU = 8000.0
 
 
 def _leg(x: float, y: float, size: float) -> list[Part]:
-    """Plan a lower leg without ends, `size` times a large person's: skin, fat, muscle, two bones as tubes."""
+    """Plan a lower leg without ends, `size` times that of a large person: skin and fat, muscle, tibia and fibula as
+    tubes.
+    """
 
     def bone(dx: float, dy: float, radius: float, wall: float) -> list[Part]:
         lean = 12.0 * size

@@ -124,7 +124,9 @@ class Part:
 
 @dataclass(frozen=True)
 class Plan:
-    """The parts of a body in order, y of its front and back, where a table may lie, and (x, z) of a head to rest."""
+    """The parts of a body in order, with the y of its front and back surfaces, against which a table may lie, and the
+    middle (x, z) of the head, for a head rest.
+    """
 
     parts: Sequence[Part]
     front: float

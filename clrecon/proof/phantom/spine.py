@@ -77,7 +77,10 @@ def _draw_organs(
     seed: int,
     blood_hu: float,
 ) -> Field:
-    """Draw organs in fat, and lungs; return the distance into these; x, y count from the trunk's middle."""
+    """Draw abdominal organs in fat and, above the diaphragm, lungs; return the distance into the lungs.
+
+    `x` and `y` count from the middle of the trunk.
+    """
     wide, deep = anatomy.half_width - 28.0, anatomy.half_depth - 28.0
     low = np.float32(anatomy.level_z("L1"))
     _blend(canvas, coverage(cavity, ramp), FAT_HU + 8.0)
@@ -138,7 +141,10 @@ def draw_tissue(
     *,
     blood_hu: float = BLOOD_HU,
 ) -> Field:
-    """Draw one slice without bone in HU; lengths in mm of the plan; no table: a couch under back or front."""
+    """Draw one slice without bone, in bands of rows, HU, (nj, ni), at x, y, z in mm of the plan.
+
+    Interfaces are `ramp` mm wide.  Without a table the body lies on a couch of its own, if prone under the front.
+    """
     canvas = np.full(x.shape, AIR_HU, dtype=np.float32)
     rows = max(1, _BAND // x.shape[1])
     for start in range(0, x.shape[0], rows):

@@ -237,7 +237,9 @@ class Outline:
 
 
 def plan_outline(chain: Chain, half_width: float, half_depth: float) -> Outline | None:
-    """Plan the outline round a chain; None round a straight trunk, an ellipse about x = y = 0 at all heights."""
+    """Plan the outline round a chain; None round a straight trunk: its ellipse, of these half axes in mm, has its
+    middle at x = y = 0 at all heights.
+    """
     with_neck = chain.names[0] == "C1"
     if not with_neck and not chain.moved.any():
         return None

@@ -224,7 +224,9 @@ def spine_choice(
     directions: tuple[float, tuple[float, float, float], bool],
     length_mm: float | None,
 ) -> SpineChoice:
-    """Return a choice of levels and bend, (kyphosis, scoliosis), for slices of directions (tilt, oblique, prone)."""
+    """Return a choice, bent by (kyphosis, scoliosis), for slices of directions (tilt, oblique, prone), see
+    `slice_directions`, and a volume of a length along their normal.
+    """
     row, column, _ = slice_directions(*directions)
     x, y, z = (float(value) for value in np.cross(row, column))
     return SpineChoice(levels, *bend, facet_gap_mm, centred, (x, y, z), length_mm)

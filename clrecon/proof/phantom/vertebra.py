@@ -202,7 +202,9 @@ def _mix(thoracic: tuple[float, ...], lumbar: tuple[float, ...], share: float) -
 
 
 def _arch_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
-    """Return the distance to pedicles, laminae, articular, transverse and spinous processes, on both sides."""
+    """Return the distance to pedicles, articular processes, laminae, transverse and spinous processes; |x| serves both
+    sides.
+    """
     side = np.abs(x)
     wide, deep, high = vertebra.canal_half_width, vertebra.canal_half_depth, vertebra.height
     middle = vertebra.depth / 2.0 + deep
@@ -273,7 +275,9 @@ def upper_facet_seats(vertebra: Vertebra) -> list[tuple[float, float, float]]:
 
 
 def vertebra_shape(vertebra: Vertebra, x: Field, y: Field, z: Field) -> tuple[Field, list[Field]]:
-    """Return the distance to the bone before cutting, and those to what is cut out, mm, at local x, y, z."""
+    """Return the distance to the bone before cutting, and those to what is cut out of it, mm, positive inside; x, y, z
+    are local mm.
+    """
     if vertebra.is_cervical:
         bone, cuts = cervical_shape(vertebra, x, y, z)
     else:
@@ -286,7 +290,10 @@ def vertebra_shape(vertebra: Vertebra, x: Field, y: Field, z: Field) -> tuple[Fi
 
 
 def vertebra_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
-    """Return the distance to the bone's surface, mm, positive inside, exact on it and of first order near it."""
+    """Return the distance to the outer surface of the bone, mm, positive inside; x, y, z are local mm.
+
+    It is exact on the surface and of first order near it; `clrecon.proof.phantom.truth` has true distances.
+    """
     bone, cuts = vertebra_shape(vertebra, x, y, z)
     for cut in cuts:
         bone = np.minimum(bone, -cut)
@@ -380,7 +387,9 @@ def _distance_to(vertebra: Vertebra, points: Float64Array) -> Float64Array:
 
 
 def close_facets(vertebrae: Sequence[Vertebra], gap_mm: float) -> list[Vertebra]:
-    """Widen upper articular processes by balls `gap_mm` from the vertebra above, if that is the neighbour."""
+    """Widen the upper articular processes of vertebrae, from top to bottom, by balls `gap_mm` from the vertebra above,
+    where that is the neighbour in the spine.
+    """
     closed = list(vertebrae[:1])
     for lower in vertebrae[1:]:
         upper = closed[-1]

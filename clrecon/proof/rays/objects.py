@@ -117,7 +117,10 @@ FAR_ENOUGH_MM = 0.1
 
 
 class Meetings(NamedTuple):
-    """Where rays meet triangles, by pixel, depth (mm across the view) and number; shares of corners sum to 1."""
+    """Where rays meet triangles, sorted by pixel, and in a pixel by depth and then by the number of the triangle.
+
+    Depths are mm across the view; shares, (n, 3), of the corners, in sum 1.
+    """
 
     pixels: NDArray[np.int64]
     triangles: NDArray[np.int64]
