@@ -121,6 +121,7 @@ def test_pillow_is_hidden_from_all_but_what_makes_pictures(tmp_path: Path) -> No
             text=True,
             timeout=120,
         )
+        assert done.stdout, (done.returncode, done.stderr)
         found.append((done.returncode, done.stdout.splitlines()[-1]))
     if found[1][0] == 5:
         pytest.skip("no OpenCL device")

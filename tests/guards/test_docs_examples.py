@@ -7,6 +7,7 @@ import inspect
 import os
 import re
 import textwrap
+from importlib.util import find_spec
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,9 @@ SMALLER = {
     "TransferFunction.from_vtk(actor.prop, voxel_mm=0.8)    # any vtkVolumeProperty\n": "",
 }
 """What the machine of a test has not, or what takes long, and what stands for it."""
+if find_spec("open3d") is None:  # installed for a release
+    SMALLER["dense.to_open3d().to_legacy()"] = "dense"
+    SMALLER["clrecon.PointCloud.from_open3d(legacy)"] = "legacy"
 
 
 def find_python(text: str) -> list[str]:

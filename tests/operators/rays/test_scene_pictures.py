@@ -82,7 +82,7 @@ def test_fog_before_and_behind_a_screen_is_a_closed_form(
             slabs.append(slab)
             yield slab
 
-    monkeypatch.setattr("clrecon.operators.rays.ray_pictures.ray_slabs", count)
+    monkeypatch.setattr("clrecon.operators.rays.ray_slabs.ray_slabs", count)
     memory = PIXEL_BYTES * SIZE[0] * SIZE[1] + 14_000 if in_slabs else None
     picture = clrecon.render(
         [(block(), VolumeLook(FOG, lighting=UNSHADED)), (screen(y), look)], camera=camera, size=SIZE, device=device,

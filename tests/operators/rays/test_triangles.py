@@ -271,7 +271,7 @@ def test_what_cannot_be_shown_is_refused(device: Any, monkeypatch: pytest.Monkey
     for colors in (np.zeros(3), np.full((4, 3), 2.0), np.zeros((4, 3), np.int64), np.full((4, 3), np.nan)):
         with pytest.raises(UsageError, match="colours of vertices"):
             MeshLook(vertex_colors=colors)
-    with pytest.raises(UsageError, match="not both"):
+    with pytest.raises(UsageError, match="one colour"):
         MeshLook("red", vertex_colors=np.zeros((4, 3)))
     with pytest.raises(UsageError, match="opacity of a mesh"):
         MeshLook(opacity=0.0)
