@@ -109,7 +109,7 @@ def test_an_interrupt_leaves_nothing(number: signal.Signals, tmp_path: Path) -> 
 @pytest.mark.seconds
 def test_pillow_is_hidden_from_all_but_what_makes_pictures(tmp_path: Path) -> None:
     write_series(tmp_path / "ct")
-    told = "import sys; print(sys.modules.get('PIL') is not None)"
+    told = "import sys; print(sys.modules.get('PIL') is not None, flush=True)"
     code = f"import atexit; from clrecon.cli import main; atexit.register(lambda: exec({told!r})); main.run()"
     root = Path(__file__).resolve().parents[2]
     found = []

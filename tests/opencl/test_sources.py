@@ -59,7 +59,6 @@ def test_every_file_builds_alone(name, device):
     assert kernels == sorted(declared)
 
 
-@pytest.mark.release
 @pytest.mark.parametrize("voxel", ["char", "uchar", "short", "ushort", "int", "float"])
 def test_every_voxel_type_builds(voxel, device):
     program = load_program(device, "surface/marching_cubes.cl", {"VOXEL": voxel})

@@ -18,7 +18,7 @@ VOXEL_TYPES = [
     *(pytest.param(kind, marks=[pytest.mark.first_device, FOR_RELEASE]) for kind in ("int8", "uint16", "int32")),
 ]
 """In a test for every device, those of scans and of computed volumes are built on each: a build takes seconds.  All of
-them are built every day by the check "types of voxels" of the self-test: kernels read voxels by one macro."""
+them are built every day on the first by tests/opencl/test_sources.py: kernels read voxels by one macro."""
 
 
 def daily(number: int, values: Iterable[Any]) -> list[Any]:
