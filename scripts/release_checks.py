@@ -33,7 +33,7 @@ class ReleaseCheck:
 CHECKS = {
     "tests": ReleaseCheck(
         "all that .ci/run checks, with the tests marked release: every check of the self-test and every test of an"
-        " operator on every device, where .ci/run asks further devices a check of each room; the tools of"
+        " operator on every device, where .ci/run asks further devices checks of most rooms; the tools of"
         " a release (changed code, benches, the site of the Guide), and the truths of twins that devices reach"
         " every day; all types of voxels, products of parameters, odd bodies, real scans and pages of the Guide,"
         " of which .ci/run tries a few that differ; the methods of the comparison in processes of their own; a"

@@ -55,7 +55,7 @@ EVERY_DAY = frozenset({
     "exclusive_scan", "bricks", "extract_isosurface", "extract_labels", "distances to a surface", "projections",
     "slices", "balls", "nearest points", "clusters of voxels",
 })  # fmt: skip
-"""Those of them that run every day on further devices: of each room one that is built in seconds."""
+"""Those of them that run every day on further devices: of most rooms one that is built in seconds."""
 
 OF_TYPES = {"VOXEL", "VALUE", "LABEL", "VOXEL_IS_SHORT"}
 OF_DEVICES = {"LANES", "WORDS_PER_ITEM", "HAS_BUILTIN_PREFETCH", "SCAN_GROUP", "CPU_NAME", "ATOMIC_LOADS"}
