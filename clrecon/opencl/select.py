@@ -152,7 +152,7 @@ def _key(device: Device) -> str:
 
 
 LEAST_ADDRESS_SPACE = 1_000_000_000
-"""Bytes of address space below which no driver is loaded: PoCL shows no device, waits for ever or ends the process."""
+"""Bytes of address space below which no driver is loaded: PoCL shows no device, hangs or ends the process."""
 
 
 def _address_space() -> int | None:

@@ -1,4 +1,4 @@
-"""Measures of a line in a vertebra, and grades of given screws: how far they lie outside of the bone, and where."""
+"""Measures of a line in a vertebra, and grades of given screws: how far they breach the bone, and where."""
 
 from __future__ import annotations
 
