@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from clrecon.geometry.volume import Volume
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import in_threads
 
 Mask = NDArray[np.bool_]

@@ -18,7 +18,6 @@ it lies within the body, or if it is large enough to be a second body; in that o
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 
 from clrecon.anatomy.body_cells import DENSE_HU, Cells, Mask
 from clrecon.geometry.affine import Float64Array
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.records import Gate, at_least, unmeasured
 
 METAL_SHARE = 0.25

@@ -22,7 +22,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,6 +33,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import AIR_HU
 from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import explains_arguments, name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import count_of, format_share
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass
 
 SOFT_TISSUE_HU = (-150.0, 250.0)
 """All voxels of a block lie here: fat, muscle and organs with noise of up to some 60 HU, no air and no dense bone."""

@@ -6,7 +6,6 @@ A cell has the mean HU along the patient's axes; traits are figures of 0 to 1, w
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from clrecon.anatomy.body_cells import sum_blocks
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.volume import Volume
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import in_threads
 
 Field = NDArray[np.float32]

@@ -15,7 +15,6 @@ The search is meant for the spine of an adult, in a scan whose axes are those of
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -43,6 +42,7 @@ from clrecon.errors import RefusedInputError
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, Steps
 
 GAP_MM = 12.0

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import re
-from dataclasses import dataclass, field
 from importlib import import_module
 
 from clrecon.cli import common
 from clrecon.cli.console import Console
 from clrecon.errors import UsageError
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.text import guess_word
 
 SHELLS = ("bash", "zsh", "fish")

@@ -12,12 +12,12 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from clrecon.cli import common
 from clrecon.cli.console import Console, is_terminal, printable
 from clrecon.jobs.settings import InfoSettings
+from clrecon.system.light_dataclass import dataclass
 
 if TYPE_CHECKING:
     from rich.table import Table

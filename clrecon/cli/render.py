@@ -6,7 +6,6 @@ import argparse
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from clrecon.cli import common
@@ -30,6 +29,7 @@ from clrecon.jobs.render.settings import (
     describe_presets,
     parse_direction,
 )
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.options import numbers_reader, option
 from clrecon.system.text import count_of
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import islice
 from typing import IO, Any, Protocol
 
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import OutputError
 from clrecon.geometry import frame_from_lps
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.pieces import chunks
 
 LINE_LENGTH = 256

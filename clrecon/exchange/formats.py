@@ -13,13 +13,13 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from clrecon.errors import NoSurfaceError, OutputError, RefusedInputError, UsageError
 from clrecon.system.files import StagedFile, stage_file
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.paths import find_extension, open_regular
 from clrecon.system.text import escape_text
 

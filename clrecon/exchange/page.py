@@ -22,7 +22,6 @@ import os
 import re
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -33,6 +32,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.exchange.content import BONE_COLOR, Assembly, Content, check_same, parts_of, refuse_file
+from clrecon.system.light_dataclass import dataclass
 from clrecon.version import package_version
 
 STEPS = 65_535

@@ -18,7 +18,6 @@ import io
 import re
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -28,6 +27,7 @@ from numpy.typing import NDArray
 from clrecon.errors import OutputError, RefusedInputError
 from clrecon.exchange.content import Content, PointContent, check_same
 from clrecon.exchange.raw_content import Part, RawCloud, RawMesh, read_remarks, say_cut
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.paths import open_regular
 from clrecon.system.pieces import chunks
 from clrecon.system.text import escape_text

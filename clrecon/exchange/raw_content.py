@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.text import escape_text, join_names
 
 HU_NAMES = ("hu", "scalar_hu", "ct", "scalar", "intensity", "scalar_intensity")

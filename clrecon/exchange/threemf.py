@@ -15,7 +15,6 @@ import zipfile
 import zlib
 from array import array
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from html import escape  # that of xml.sax loads all of urllib
 from pathlib import Path
 from typing import IO, Any, BinaryIO
@@ -27,6 +26,7 @@ from numpy.typing import NDArray
 from clrecon.errors import OutputError, RefusedInputError
 from clrecon.exchange.content import BONE_COLOR, Assembly, Content, check_same, parts_of, write_lines
 from clrecon.exchange.raw_content import MOST_LEVELS, Part, PlacedShapes, RawMesh, Shape, read_remarks, say_cut
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 

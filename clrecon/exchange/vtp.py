@@ -15,7 +15,6 @@ import binascii
 import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, BinaryIO, TypeVar
@@ -24,9 +23,10 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.errors import OutputError, RefusedInputError
+from clrecon.errors import OutputError, RefusedInputError, UsageError
 from clrecon.exchange.content import BONE_COLOR, Assembly, Content, PointContent, refuse_file
 from clrecon.exchange.raw_content import Part, PlacedShapes, RawCloud, RawMesh, Shape, columns_of, say_cut
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 
@@ -86,6 +86,35 @@ def make_polydata(
 
 
 _END = b"</VTKFile>"
+
+
+def wrap_cloud(
+    points: NDArray[np.floating],
+    normals: NDArray[np.float32] | None,
+    hu: NDArray[np.float32] | None,
+    labels: NDArray[np.int32] | None,
+) -> Any:
+    """``pyvista.PolyData`` in LPS mm that shares the memory of the arrays; see `PointCloud.to_pyvista`."""
+    import pyvista
+
+    polydata = pyvista.wrap(make_polydata(points, None, normals, hu, labels))
+    polydata.field_data["SPACE"] = ["LPS"]
+    polydata.field_data["UNIT"] = ["mm"]
+    return polydata
+
+
+def unwrap_cloud(polydata: Any) -> tuple[dict[str, NDArray[Any] | None], str | None]:
+    """Arrays of a ``pyvista.PolyData`` by their names in a cloud, and the frame that it names."""
+    import pyvista
+
+    found = pyvista.wrap(polydata) if hasattr(polydata, "GetPolys") else polydata
+    if not isinstance(found, pyvista.PolyData):
+        raise UsageError(f"a {type(polydata).__name__} is no pyvista.PolyData")
+    arrays: dict[str, NDArray[Any] | None] = {"points": np.array(found.points)}
+    for name, theirs in {"normals": "Normals", "hu": "HU", "labels": "label"}.items():
+        arrays[name] = np.array(found.point_data[theirs]) if theirs in found.point_data else None
+    named = found.field_data["SPACE"][0] if "SPACE" in found.field_data else None
+    return arrays, None if named is None else str(named)
 
 
 def _join(content: PointContent | Assembly) -> PointContent:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
 from typing import Any
 
+from clrecon.system.light_dataclass import dataclass, field, fields
 from clrecon.system.records import Gate, Record
 
 _ELSEWHERE = {"slices_missing": ("dropped",), "rescale": ("padding_share", "padding_hu")}

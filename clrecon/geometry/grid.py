@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import sys
 from copy import deepcopy
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,6 +26,7 @@ from clrecon.geometry.affine import (
 )
 from clrecon.geometry.certificate import Certificate, amend
 from clrecon.system.base_classes import MappedArray, Message
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.memory import find_mapping
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -22,6 +21,7 @@ from clrecon.geometry.vertices import (
     power_of_two_over,
 )
 from clrecon.geometry.volume import Volume
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.text import format_digits
 
 LARGEST_INTEGER = 2**23

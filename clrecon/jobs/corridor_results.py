@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from clrecon.rendering.pictures.sheets import Panel, Stroke, draw_sheet
 from clrecon.spine.corridors import SIDES, Corridor, VertebraCorridors, screw_diameter
 from clrecon.spine.measures import SCALE, Bias, Screw, ScrewGrade
 from clrecon.spine.solid_bone import sample_volume
+from clrecon.system.light_dataclass import dataclass
 
 NOT_FOR_PLANNING = "not for planning an operation: a measurement on one surface at one level, checked on phantoms alone"
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +18,7 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SAMPLES, DistanceSummary
 from clrecon.mesh.compare.signed import MeshDeviation, SideDistance, measure_distance, measure_vertex_distances
 from clrecon.mesh.mesh_reader import read_mesh
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text, format_digits
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,7 @@ from clrecon.reading.grids.write_volume import (
     stage_volume,
     stored_values,
 )
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:

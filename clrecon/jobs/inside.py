@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.outputs import check_files, check_kept, check_outputs, name_outputs, refuse_files
 from clrecon.jobs.run import DeviceOpening, Run, RunReport, trial_cube
 from clrecon.jobs.settings import InsideSettings
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.log import get_logger
 from clrecon.system.paths import extension_of
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.jobs.presets import DEFAULT_PRESET, PRESETS
 from clrecon.reading import Selection
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass, fields
 from clrecon.system.options import numbers_reader, option, parse_numbers
 
 if TYPE_CHECKING:

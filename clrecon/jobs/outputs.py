@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +13,7 @@ from clrecon.errors import ClreconError, OutputError, UsageError
 from clrecon.exchange.formats import ASSEMBLIES, FORMATS, check_format, list_extensions
 from clrecon.system.arguments import name_parameter
 from clrecon.system.files import check_writable
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.text import count_of
 
 if TYPE_CHECKING:

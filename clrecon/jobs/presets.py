@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 from clrecon.errors import UsageError
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.text import guess_word, unknown_name
 
 

@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from clrecon.errors import Cancelled, ClreconError, DeviceError
 from clrecon.jobs.outputs import check_files, check_kept, commit_all
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.paths import extension_of, keep_existing
 from clrecon.system.progress import Progress, ignore_progress

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from clrecon.jobs.options import (
 )
 from clrecon.reading import Selection
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.options import numbers_reader, option
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,7 @@ from clrecon.jobs.run import Run, ScanReport
 from clrecon.jobs.settings import StatsSettings
 from clrecon.labels import resample_labels
 from clrecon.labels.statistics import PERCENTILES, check_percentiles, measure_resampled, name_percentile
+from clrecon.system.light_dataclass import dataclass
 
 if TYPE_CHECKING:
     from clrecon.labels.statistics import LabelFigures

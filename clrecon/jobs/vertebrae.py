@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +16,7 @@ from clrecon.jobs.run import Run, ScanReport
 from clrecon.jobs.settings import VertebraeSettings
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.pictures.pillow import load_font, load_pillow
+from clrecon.system.light_dataclass import dataclass
 
 if TYPE_CHECKING:
     from clrecon.labels import LabelMap

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
+from clrecon.system.light_dataclass import dataclass
 
 Bits = NDArray[np.bool_]
 

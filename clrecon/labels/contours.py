@@ -9,10 +9,11 @@ neighbours, never to both: the lower end of an interval is inside, the upper end
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from clrecon.system.light_dataclass import dataclass
 
 MOST_OVER_EACH_OTHER = 20_000
 """Most pairs of contours of one ROI that lie over each other on one slice."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.blocks import MM3_PER_ML
 from clrecon.labels.label_map import LabelMap
+from clrecon.system.light_dataclass import dataclass
 
 MOST_OFFSETS = 5000
 SAME_DISTANCE = 1e-6

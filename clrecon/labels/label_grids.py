@@ -12,7 +12,6 @@ import gzip
 import html
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap, find_number
 from clrecon.labels.segments import Painter, Wanted, empty_labels, iterate_labels
 from clrecon.reading.grids.grid_file import LABEL_MAP, GridFile, import_extra
 from clrecon.reading.grids.reader import name_of_grid, open_grid, tell_kind
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import count_of, escape_text
 

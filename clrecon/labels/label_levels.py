@@ -10,11 +10,12 @@ neighbours, and changes their volumes.  So the levels of all of them are found t
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from clrecon.system.light_dataclass import dataclass
 
 REACH = 2
 """Samples each way that count; the kernels have the same number, in cl/surface/label_masks.h."""

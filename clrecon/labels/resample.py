@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -13,6 +12,7 @@ from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume, apply_affine
 from clrecon.labels.label_map import LabelMap
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_ml

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ from clrecon.reading.dicom.parse.plain import EXPLICIT_LITTLE, IMPLICIT_LITTLE
 from clrecon.reading.dicom.parse.transfer_syntaxes import RLE
 from clrecon.reading.dicom.parse.values import Schema, ValueProblem, read_sequences
 from clrecon.reading.grids.grid_file import check_size
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.paths import open_regular
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text, hash_uid

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from clrecon.labels.label_bodies import label_ml
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.resample import ResampledLabels, resample_labels
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
 from clrecon.system.text import format_digits

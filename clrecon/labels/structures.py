@@ -9,7 +9,6 @@ Source: DICOM PS3.3 C.8.8.5 (Structure Set) and C.8.8.6 (ROI Contour).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +24,7 @@ from clrecon.labels.segments import Painter, Wanted, empty_labels
 from clrecon.reading.dicom.headers.multiframe import find_data_set
 from clrecon.reading.dicom.parse.plain import EXPLICIT_LITTLE, IMPLICIT_LITTLE
 from clrecon.reading.dicom.parse.values import Item, Schema, ValueProblem, read_sequences
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.paths import open_regular
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import count_of, escape_text, hash_uid

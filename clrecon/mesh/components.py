@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -17,6 +16,7 @@ from clrecon.mesh.connectivity import label_components
 from clrecon.mesh.quality import measure_components
 from clrecon.mesh.triangles import find_nearest_triangle
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.text import count_of, format_digits
 
 Own = TypeVar("Own", bound=BaseMesh)

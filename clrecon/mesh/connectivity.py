@@ -6,11 +6,12 @@ number.  Two half-edges are opposite when they run along one edge in opposite di
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from clrecon.system.light_dataclass import dataclass
 
 _MOST_STEPS = 64
 """Most faces around a vertex that are counted one after the other; vertices with more take the general way."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.mesh.triangles import corner_edges, cross_product
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import in_threads, local_origin
 from clrecon.system.progress import Steps
 

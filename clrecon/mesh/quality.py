@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +17,7 @@ from clrecon.mesh.connectivity import (
     opposite_half_edges,
 )
 from clrecon.mesh.triangles import corner_edges, cross_product, cross_products
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import CHUNK, find_bounds, local_origin
 from clrecon.system.records import Record
 

@@ -13,7 +13,6 @@ import mmap
 import threading
 import weakref
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +26,7 @@ from clrecon.opencl.launching import wait
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.opencl.transfers import LEAST_BYTES, read_buffers, write_buffer
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass, replace
 
 
 def _mib(size: int, up: bool = False) -> str:

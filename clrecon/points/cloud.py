@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
@@ -18,6 +17,7 @@ from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import choose_space
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.base_classes import Message
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.packages import ShownAsHtml, install_command
 from clrecon.system.paths import keep_existing
 
@@ -326,7 +326,7 @@ class PointCloud(Message, ShownAsHtml):
         Each point is a cell.  The point arrays are ``HU`` (the active scalars), ``label`` and ``Normals`` (the active
         normals), those that are known; the field arrays ``SPACE`` and ``UNIT`` name frame and unit.
         """
-        from clrecon.points.vtk import wrap_cloud
+        from clrecon.exchange.vtp import wrap_cloud
 
         return wrap_cloud(self._points, self._normals, self._hu, self._labels)
 
@@ -347,7 +347,7 @@ class PointCloud(Message, ShownAsHtml):
         UsageError
             It is no PolyData, or an array has a number that a cloud cannot have; or ``space`` is not that of the array.
         """
-        from clrecon.points.vtk import unwrap_cloud
+        from clrecon.exchange.vtp import unwrap_cloud
 
         arrays, named = unwrap_cloud(polydata)
         return cls._of_others(arrays, choose_space(space, named, "the PolyData"))

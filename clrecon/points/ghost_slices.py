@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.points.cloud import PointCloud, PointStep
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass
 
 GHOST_SHARE = 0.75
 """A slice is a ghost where its likeness to both neighbours is below this share of their likeness to each other."""

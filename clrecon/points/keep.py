@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.points.cloud import PointCloud, PointStep
 from clrecon.system.arguments import explains_arguments, name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import chunks
 
 SHEET_POINTS = 500

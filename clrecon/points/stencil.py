@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume, column_spacing, slice_normal
 from clrecon.geometry.affine import Float64Array
+from clrecon.system.light_dataclass import dataclass
 
 SLACK = 1e-6
 """Distances up to ``eps * (1 + SLACK)`` are within eps, so that an eps of one slice gap reaches the next slice."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from clrecon.spine.frame import VertebraFrame, find_frame
 from clrecon.spine.measures import Bias, canal_wall, find_exit, line_angles, margins, measure_bias
 from clrecon.spine.solid_bone import SolidBone, fill_vertebra
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass
 
 Depth = Callable[[Float64Array], Float64Array]
 """Distance from the surface at points (n, 3) in the vertebra's frame, mm, positive inside."""

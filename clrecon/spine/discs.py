@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.grid import Grid
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import in_threads
 
 Field = NDArray[np.float32]

@@ -7,7 +7,6 @@ body, give the cranial direction.  The median plane is that by which the label i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from clrecon.errors import RefusedInputError
 from clrecon.geometry.affine import Float64Array
 from clrecon.spine.solid_bone import SolidBone
+from clrecon.system.light_dataclass import dataclass
 
 STRIDE = 2
 """Points of the lattice in one step of the frame's points: 1 mm."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +9,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.spine.frame import VertebraFrame
 from clrecon.spine.solid_bone import SolidBone
+from clrecon.system.light_dataclass import dataclass
 
 DIRECTIONS = ("medial", "lateral", "cranial", "caudal")
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.volume import Volume
 from clrecon.spine.discs import AHEAD_MM, ASIDE_MM, BODY_BACK_MM, TILTS_DEG, Bound, Course, Field, Looks
+from clrecon.system.light_dataclass import dataclass
 
 Mask = NDArray[np.bool_]
 Planes = tuple[Float64Array, Float64Array]

@@ -6,7 +6,6 @@ Where HU cross the level between two points of the lattice, the surface lies at 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -17,6 +16,7 @@ from clrecon.errors import RefusedInputError
 from clrecon.geometry import AIR_HU, Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels.label_bodies import Growth, fill_solid
+from clrecon.system.light_dataclass import dataclass
 
 Box = tuple[slice, slice, slice]
 

@@ -8,7 +8,6 @@ import itertools
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -39,6 +38,7 @@ from clrecon.spine.discs import (
 from clrecon.spine.regions import CONFIDENT, Piece, beside_share, cut_part, divide, fill_bone, judge, planes_of, weigh
 from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.base_classes import Message
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
 from clrecon.system.text import count_of

@@ -10,9 +10,9 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
 
 from clrecon.errors import UsageError
+from clrecon.system.light_dataclass import dataclass
 
 SECONDS = 30.0
 """Until the child is given up; it takes half a second where nothing else runs."""

@@ -11,7 +11,6 @@ import mmap
 import os
 import stat
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import RefusedInputError
+from clrecon.system.light_dataclass import dataclass
 
 MEMORY_SHARE = 0.9
 """Share of the free memory that voxels may take; the rest is for what is computed beside the volume."""

@@ -8,8 +8,9 @@ and of volumes they have the same form.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, NoReturn, TypeVar
+
+from clrecon.system.light_dataclass import dataclass, fields, replace
 
 Own = TypeVar("Own", bound="Record")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +15,7 @@ from clrecon.jobs.inputs import describe_cloud, is_cloud_file, refuse_other_clou
 from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restrict_volume
 from clrecon.jobs.run import Run, RunReport
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
 from clrecon.system.paths import extension_of
 from clrecon.system.progress import Progress

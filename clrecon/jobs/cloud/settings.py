@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from clrecon.errors import UsageError
 from clrecon.jobs.options import InputSettings, label_map_option, parse_point, space_option
 from clrecon.points import POINT_KINDS
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.options import option, parse_numbers
 
 DENOISERS = ("grid", "bilateral")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.jobs.options import label_map_option, parse_label_color
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import MISSING, dataclass
 from clrecon.system.options import option
 
 if TYPE_CHECKING:

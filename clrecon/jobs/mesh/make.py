@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +22,7 @@ from clrecon.jobs.preprocess import Band, mask_volume, preprocess_volume, restri
 from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
 from clrecon.jobs.run import Run, trial_cube
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, Steps, ignore_progress
 from clrecon.system.text import format_hu, format_ml
 

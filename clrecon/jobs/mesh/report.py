@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.mesh.labels import describe_label
@@ -12,6 +11,7 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, describe_level
 from clrecon.jobs.presets import find_iso_preset
 from clrecon.jobs.run import RunReport
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.paths import extension_of
 from clrecon.system.pieces import find_bounds
 

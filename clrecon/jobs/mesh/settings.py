@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.choices import LABEL_SEED, LabelChoice, check_growing, check_point, is_label_seed
@@ -21,6 +20,7 @@ from clrecon.jobs.options import (
 from clrecon.jobs.outputs import OBJECT_FILES
 from clrecon.jobs.presets import DEFAULT_PRESET, PURPOSES, Purpose, find_iso_preset, find_purpose
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.options import option
 
 _ITERATIONS = 20

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from clrecon.errors import RefusedInputError
 from clrecon.jobs.mesh.settings import MeshSettings, name_level
 from clrecon.jobs.presets import find_iso_preset, find_purpose
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_hu
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +23,7 @@ from clrecon.rendering.pictures.modes import check_known
 from clrecon.rendering.pictures.styles import Projection, SurfaceLook
 from clrecon.system.arguments import name_parameter
 from clrecon.system.files import allow_open_files
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
 from clrecon.system.paths import extension_of
 from clrecon.system.progress import Progress, ignore_progress

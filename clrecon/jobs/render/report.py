@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from clrecon.anatomy.head import SKIN_SEEN_HU, warn_of_face
@@ -15,6 +14,7 @@ from clrecon.rendering.pictures.label_style import NO_LABEL, find_shown
 from clrecon.rendering.pictures.object_looks import MeshLook, PointLook
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, Style, SurfaceLook, VolumeLook
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import asdict, dataclass
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

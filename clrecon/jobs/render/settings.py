@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -38,6 +37,7 @@ from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import ANTERIOR, DEFAULT_SIZE, DIRECTIONS, SLICES_VIEWS, checked_size
 from clrecon.rendering.views.reformation import PLANES, find_plane
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import MISSING, dataclass, fields, replace
 from clrecon.system.options import numbers_reader, option
 from clrecon.system.text import unknown_name
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.options import mesh_space_option
 from clrecon.jobs.settings import check_space
+from clrecon.system.light_dataclass import dataclass, field, replace
 from clrecon.system.options import option
 
 MOST_NAME = 80

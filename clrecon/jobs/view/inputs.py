@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +18,7 @@ from clrecon.jobs.view import ViewSettings
 from clrecon.mesh import Mesh
 from clrecon.reading import read_selected, tell_format
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass, field, fields
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +19,7 @@ from clrecon.jobs.view import ViewSettings
 from clrecon.mesh import Mesh
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.text import escape_text
 

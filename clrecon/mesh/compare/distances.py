@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +10,7 @@ from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.triangles import cross_products, enclosed_ml
 from clrecon.mesh.vtk import CellLocator
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record

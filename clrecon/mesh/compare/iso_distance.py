@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -14,6 +13,7 @@ from clrecon.geometry import METAL_HU, Volume
 from clrecon.geometry.iso_rule import IsoRule, layer_normal_matrices
 from clrecon.mesh.compare.distances import DistanceSummary, summarise_distances
 from clrecon.mesh.mesh import Mesh
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import chunks
 from clrecon.system.records import Record
 

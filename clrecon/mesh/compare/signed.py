@@ -7,8 +7,6 @@ the normals of both faces, at a vertex the sum of those around it weighted by th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,6 +25,7 @@ from clrecon.mesh.quality import MeshQuality, measure_quality
 from clrecon.mesh.triangles import cross_products, vertex_normals
 from clrecon.mesh.vtk import CellLocator
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import chunks, local_origin
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record

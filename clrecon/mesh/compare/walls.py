@@ -9,7 +9,6 @@ voxels larger than 1 mm depths are counted in voxels.  Figures are in docs/iso_v
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from clrecon.geometry import METAL_HU, Volume
 from clrecon.geometry.iso_rule import IsoRule
 from clrecon.mesh.compare.iso_distance import trilinear_values
 from clrecon.mesh.mesh import Mesh
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.records import Record
 
 COMPACT_HU = 600.0

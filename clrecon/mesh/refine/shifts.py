@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from clrecon.mesh.intersections import (
 )
 from clrecon.mesh.refine.topology import TriangleFinder
 from clrecon.mesh.triangles import cross_products
+from clrecon.system.light_dataclass import dataclass
 
 _VOLUME_STEPS = 4
 """Newton steps along the normals; the first leaves about a hundredth of the missing volume."""

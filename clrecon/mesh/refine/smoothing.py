@@ -9,7 +9,6 @@ longer than the bound, by construction.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.refine.decimation import carry_on, check_refinement
 from clrecon.mesh.refine.shifts import move_vertices
 from clrecon.mesh.triangles import cross_product, vertex_normals
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import in_threads, local_origin
 from clrecon.system.progress import Progress, ignore_progress
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +13,7 @@ from clrecon.mesh.connectivity import (
     find_split_vertices,
     opposite_half_edges,
 )
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.records import Record
 
 LISTED = 20

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -30,6 +29,7 @@ from clrecon.operators.primitives.scan import Compacted, compact, prepare_compac
 from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
 from clrecon.operators.resident.tables import voxel_variants
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 
 NEAR_GROUP = kernel_constant("filters/near_level.cl", "GROUP")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from importlib import import_module, metadata
 from typing import Any, TypeVar
 
@@ -18,6 +17,7 @@ from clrecon.geometry.resample import shear_degrees
 from clrecon.operators.filters.settings import checked_length, report_filter
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.packages import install_command
 from clrecon.system.progress import Progress, ignore_progress
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.iso_rule import LARGEST_INTEGER, checked_iso_value
 from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.system.light_dataclass import dataclass, replace
 
 LARGEST_REACH = 14
 """Most voxels from the middle of a window to its end, along each axis: with two rings, a group of 16."""

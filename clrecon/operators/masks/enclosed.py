@@ -5,7 +5,6 @@ Spaces that a mask encloses are measured first: which they are, how large and ho
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from clrecon.operators.masks.voxel_mask import mask_bytes, zero_words
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points.stencil import Lattice
 from clrecon.system.arguments import explains_arguments, name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, Steps
 from clrecon.system.records import at_most
 from clrecon.system.text import count_of, format_hu, format_ml

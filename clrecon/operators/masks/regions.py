@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +11,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array, checked_points
 from clrecon.points.stencil import SLACK
+from clrecon.system.light_dataclass import dataclass
 
 Ends = tuple[Float64Array, Float64Array]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from clrecon.operators.masks.voxel_mask import VoxelMask, zero_words
 from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
 from clrecon.operators.primitives.union_find import join_parts, prepare_components
 from clrecon.points.stencil import Stencil
+from clrecon.system.light_dataclass import dataclass
 
 PARTS_PER_CORE = 4
 """Parts of the rows for each core of a CPU device, so that all cores are busy to the end."""

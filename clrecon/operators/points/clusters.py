@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from clrecon.points.cloud import VoxelNumbers
 from clrecon.points.keep import REPORTED, ClusterFigures, measure_clusters
 from clrecon.points.stencil import Lattice, Stencil, checked_eps, make_stencil
 from clrecon.system.arguments import explains_arguments, name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 
 DEFAULT_MIN_SAMPLES = 6

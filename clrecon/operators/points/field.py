@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -32,6 +31,7 @@ from clrecon.opencl import (
 from clrecon.operators.points.grid import CELL_ROUNDING, GridPlan, fill_grid, plan_grid
 from clrecon.operators.primitives.scan import compact, exclusive_scan
 from clrecon.operators.primitives.union_find import label_components
+from clrecon.system.light_dataclass import dataclass
 
 
 class Masks:

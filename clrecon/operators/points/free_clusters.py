@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -39,6 +38,7 @@ from clrecon.operators.points.grid import (
 from clrecon.operators.primitives.scan import exclusive_scan
 from clrecon.operators.primitives.union_find import hook_in_rounds
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 
 EPS_TOLERANCE = 1e-6

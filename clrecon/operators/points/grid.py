@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from clrecon.opencl import (
 )
 from clrecon.operators.primitives.scan import exclusive_scan, prepare_sort, radix_sort, sort_bytes
 from clrecon.points.spacing import MARGIN
+from clrecon.system.light_dataclass import dataclass
 
 STEPS_A_POINT = 16
 """Steps with each point of a cloud that a work-item may make where all others are candidates: four passes at least."""

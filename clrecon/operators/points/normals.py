@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -29,6 +27,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.resident.tables import voxel_variants
 from clrecon.points import PointCloud, PointStep
 from clrecon.system.arguments import as_numbers, explains_arguments, name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_share
 

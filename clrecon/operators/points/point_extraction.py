@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,6 +35,7 @@ from clrecon.operators.surface.slabs import OUTPUT_SHARE
 from clrecon.points import POINT_KINDS, PointCloud
 from clrecon.points.cloud import MOST_POINTS, VoxelNumbers
 from clrecon.system.arguments import explains_arguments, name_parameter
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_hu
 

@@ -6,7 +6,6 @@ Where it is a wall that no points support, `find_walls` says what holes in the c
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.points import PointCloud
 from clrecon.points.spacing import mean_spacing
 from clrecon.system.arguments import explains_arguments, name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_share
 

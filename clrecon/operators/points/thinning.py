@@ -5,7 +5,6 @@ the others.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -33,6 +32,7 @@ from clrecon.operators.points.neighbours import find_neighbours
 from clrecon.operators.primitives.union_find import hook_in_rounds
 from clrecon.points import PointCloud, PointStep
 from clrecon.system.arguments import explains_arguments, name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_share
 

@@ -4,13 +4,13 @@ number of their element.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from clrecon.errors import UsageError
 from clrecon.opencl import Device, Program, allocate, download, kernel_constant, launch, load_program
+from clrecon.system.light_dataclass import dataclass
 
 SCAN_PER_ITEM = kernel_constant("primitives/scan.cl", "SCAN_PER_ITEM")
 """Elements a work-item."""

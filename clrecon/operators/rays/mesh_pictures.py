@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from clrecon.operators.rays.point_pictures import eye_table
 from clrecon.rendering import Lighting
 from clrecon.rendering.pictures.object_looks import MeshLook
 from clrecon.rendering.views.camera import Camera
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import find_bounds
 from clrecon.system.text import format_digits
 

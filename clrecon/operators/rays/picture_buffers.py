@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +17,7 @@ from clrecon.rendering import Lighting
 from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.looks.lighting import LEAST_SOFT_GRADIENT
 from clrecon.rendering.views.camera import Camera, box_corners
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 
 TILE = kernel_constant("rays/view.h", "TILE")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -51,6 +50,7 @@ from clrecon.rendering.looks.window import (
 from clrecon.rendering.pictures.label_style import LabelStyle
 from clrecon.rendering.pictures.styles import Projection, VolumeLook
 from clrecon.rendering.views.camera import Camera
+from clrecon.system.light_dataclass import dataclass
 
 NODES = kernel_constant("rays/steep_segments.h", "NODES")
 """Entries of a transfer function's table."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from clrecon.operators.resident.tables import BOX_BORDER, enclose
 from clrecon.rendering import Rendering
 from clrecon.rendering.pictures.label_style import LabelStyle
 from clrecon.rendering.views.camera import Camera
+from clrecon.system.light_dataclass import dataclass, field
 
 BRICK_CELLS = kernel_constant("rays/leap.h", "BRICK_CELLS")
 """Cells of a brick along i and j."""

@@ -5,7 +5,6 @@ common.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -37,6 +36,7 @@ from clrecon.rendering.pictures.label_style import draw_labels, facts_of_overlay
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.reformation import Sheet, SlabSamples, slab_samples
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 
 COMBINATIONS = {name: kernel_constant("reformat/sample.cl", f"COMBINE_{name.upper()}") for name in styles.COMBINATIONS}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import numpy as np
@@ -32,6 +31,7 @@ from clrecon.opencl import (
 )
 from clrecon.operators.resident.tables import StackTable, ray_variants
 from clrecon.system.base_classes import Closing
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
 from clrecon.system.text import count_of
 

@@ -5,7 +5,6 @@ slices (cl/rays/stack.h), and the ranges of its bricks, which are measured once 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.iso_rule import slice_normal_matrices
 from clrecon.opencl import Device, Program, allocate, kernel_constant, launch, load_program, upload
+from clrecon.system.light_dataclass import dataclass
 
 _NAMES = {
     "int8": "char", "uint8": "uchar", "int16": "short", "uint16": "ushort", "int32": "int", "float32": "float",

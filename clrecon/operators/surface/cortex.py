@@ -12,7 +12,6 @@ Treece et al. 2010, "High resolution cortical bone thickness measurement from cl
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,6 +35,7 @@ from clrecon.opencl import (
 )
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.tables import voxel_variants
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.records import Record
 
 Float32Array = NDArray[np.float32]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -28,6 +27,7 @@ from clrecon.operators.surface.cortex import (
 )
 from clrecon.operators.surface.decimation import find_crossings
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import in_threads
 from clrecon.system.progress import Progress, Steps, ignore_progress
 from clrecon.system.records import Record

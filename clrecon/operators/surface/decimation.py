@@ -7,7 +7,6 @@ alone, in float64.  The pairs are those that it finds among all triangles.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
@@ -38,6 +37,7 @@ from clrecon.opencl import (
 )
 from clrecon.operators.masks.voxel_mask import zero_words
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.pieces import chunks, find_bounds
 from clrecon.system.progress import Progress, Steps
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,6 +31,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.marching_cubes import Classified, load_cells
 from clrecon.operators.surface.seeds import AUTO_SHARE, SEED_REACH_MM, Seeds
 from clrecon.operators.surface.slabs import SampleGrid, Slab
+from clrecon.system.light_dataclass import dataclass
 
 FARTHEST_TOLD_MM = 50.0
 """Of a seed in air the nearest cell is looked for up to here, for the message."""

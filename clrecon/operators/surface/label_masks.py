@@ -8,7 +8,6 @@ cl/surface/marching_cubes.cl.  If the device has no room for the survey of a who
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +58,7 @@ from clrecon.operators.surface.labels import ExtractionByLabel
 from clrecon.operators.surface.marching_cubes import Counted, Placement, count
 from clrecon.operators.surface.slabs import SampleGrid
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.progress import Progress, ignore_progress
 
 

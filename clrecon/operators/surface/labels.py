@@ -6,7 +6,6 @@ The host side of cl/surface/labels.cl; counting and writing are those of cl/surf
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic, TypeVar
 
@@ -41,6 +40,7 @@ from clrecon.operators.surface.extraction import Part, voxel_level
 from clrecon.operators.surface.marching_cubes import Classified, Counted, Placement, count
 from clrecon.operators.surface.slabs import SampleGrid, Slab
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 
 Held = TypeVar("Held")

@@ -5,7 +5,6 @@ slab.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,6 +30,7 @@ from clrecon.operators.primitives.scan import enqueue_scan, prepare_scan
 from clrecon.operators.resident.tables import BrickStates, label_variants, voxel_variants
 from clrecon.operators.surface.slabs import Slab
 from clrecon.operators.surface.trilinear import CellVertices, count_cells, emit_cells
+from clrecon.system.light_dataclass import dataclass
 
 
 def load_cells(device: Device, grown: bool = False) -> Program:

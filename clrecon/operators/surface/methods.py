@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import re
 import time
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -31,6 +30,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.extract import SurfaceExtractor
 from clrecon.operators.surface.seeds import AUTO
 from clrecon.system.arguments import explains_arguments, name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress
 
 CORNERS = np.array([(c & 1, c >> 1 & 1, c >> 2) for c in range(8)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass
 
 AUTO = "auto"
 """Word for: the components with at least `AUTO_SHARE` of the cells of the largest."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 
 from clrecon.errors import DeviceError, DeviceFailedError
 from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.iso_rule import IsoRule
 from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.system.light_dataclass import dataclass
 
 BRICKS = "brick ranges"
 """Name of the object that surfaces keep for a whole volume."""

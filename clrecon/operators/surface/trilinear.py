@@ -4,7 +4,6 @@ field.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 from numpy.typing import DTypeLike
@@ -15,6 +14,7 @@ from clrecon.opencl import Device, Program, allocate, launch, load_program
 from clrecon.operators.primitives.scan import exclusive_scan
 from clrecon.operators.resident.tables import voxel_variants
 from clrecon.operators.surface.slabs import Slab
+from clrecon.system.light_dataclass import dataclass
 
 LONGEST_ROW = 2_970
 """Most samples in a row: indices in a row have 16 bits, and a cell has up to 22 triangles."""

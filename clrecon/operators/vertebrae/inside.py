@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NoReturn
 
@@ -23,6 +22,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.label_masks import extract_label_masks
 from clrecon.operators.vertebrae.solid import CLOSE_MM, LabelCrop, crop_label, label_margin, make_solid
 from clrecon.system.arguments import explains_arguments, name_parameter
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.records import Record
 from clrecon.system.text import format_volume
 

@@ -5,8 +5,6 @@ It is made in the part of the volume around the label, with slices across the pa
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +21,7 @@ from clrecon.operators.masks.regions import checked_mm
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.labels import LabelExtraction
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.text import format_hu
 
 SPARE_VOXELS = 3

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry.affine import TILT_REPORT_DEG
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.pieces import count_readers
 
 LEAST_LIKENESS = 1.25

@@ -11,7 +11,6 @@ stored bits apart.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from clrecon.errors import RefusedInputError
 from clrecon.geometry import METAL_HU
 from clrecon.reading.common.hu_scale import LOWEST_AIR_HU, SCALE_SAID, ValueSample, judge_scale, sample_slices
 from clrecon.reading.common.source_facts import PixelFacts, StoredValues
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.records import Gate, none_of, unmeasured
 
 PADDING_SHARE = 0.75

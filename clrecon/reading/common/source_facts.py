@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 from clrecon.errors import ClreconError
 from clrecon.geometry.certificate import Certificate
+from clrecon.system.light_dataclass import asdict, dataclass, field
 from clrecon.system.packages import ShownAsHtml
 
 

@@ -11,7 +11,6 @@ import io
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, BinaryIO, cast
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError
 from clrecon.geometry.affine import Float64Array
 from clrecon.reading.common.selection import Rescale
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.packages import import_package
 from clrecon.system.paths import open_regular
 from clrecon.system.progress import Progress

@@ -10,7 +10,6 @@ from __future__ import annotations
 import gzip
 import math
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -29,6 +28,7 @@ from clrecon.reading.grids.grid_file import (
     import_extra,
     read_bytes,
 )
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text
 

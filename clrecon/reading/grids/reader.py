@@ -12,7 +12,6 @@ from __future__ import annotations
 import re
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +39,7 @@ from clrecon.reading.grids.metaimage import is_metaimage, open_metaimage
 from clrecon.reading.grids.nifti import is_nifti, open_nifti
 from clrecon.reading.grids.nrrd import is_nrrd, open_nrrd
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.memory import allocate_voxels
 from clrecon.system.paths import open_regular

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -28,6 +27,7 @@ from clrecon.reading.grids.nrrd import write_nrrd
 from clrecon.reading.grids.reader import open_grid
 from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.files import StagedFile, stage_file
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 
 SAME_PLACE_MM = 1e-3

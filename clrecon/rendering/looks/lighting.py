@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from clrecon.errors import UsageError
+from clrecon.system.light_dataclass import dataclass
 
 LEAST_SOFT_GRADIENT = 0.01
 """Least gradient in HU per mm that is shaded; rounding errors of float32 in a flat field are a hundredth of it."""

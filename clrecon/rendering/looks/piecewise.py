@@ -7,13 +7,12 @@ volume rendering divides its segments into parts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
+from clrecon.system.light_dataclass import dataclass
 
 STRAIGHT_PARTS = 32
 """Number of straight parts that replace a bent one; the error is at most 0.003 of its rise."""

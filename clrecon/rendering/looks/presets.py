@@ -6,11 +6,10 @@ show the same tissue: there as a surface, here through opacities.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 from clrecon.errors import UsageError
 from clrecon.rendering.looks.lighting import UNSHADED, Lighting
 from clrecon.rendering.looks.transfer_function import TransferFunction
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.text import unknown_name
 
 DEFAULT_PRESET = "bone"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -15,6 +14,7 @@ from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import DIRECTIONS
 from clrecon.rendering.views.reformation import Sheet
 from clrecon.system.base_classes import Message
+from clrecon.system.light_dataclass import dataclass, field
 
 if TYPE_CHECKING:
     from PIL import Image

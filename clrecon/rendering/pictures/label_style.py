@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from clrecon.labels import LabelMap, file_suffixes
 from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.views.reformation import Sheet
 from clrecon.system.base_classes import Message
+from clrecon.system.light_dataclass import dataclass
 
 NO_COLOR = (-1.0, -1.0, -1.0)
 """Colour in the table that means: keep the colour of the picture without labels."""

@@ -7,7 +7,6 @@ Transactions on Image Processing 13(4), as scikit-image's ``structural_similarit
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.records import Record
 
 WINDOW = 7

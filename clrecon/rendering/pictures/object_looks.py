@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, field
 from functools import partial
 from typing import Any, ClassVar
 
@@ -20,6 +20,7 @@ from clrecon.rendering.pictures.styles import DEFAULT_COLOR, Style, style_field
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.reformation import positive_mm
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass
 
 
 def _vertex_colors(value: Any) -> NDArray[np.uint8]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from io import BytesIO
 from typing import Any
 
@@ -19,6 +18,7 @@ from clrecon.rendering.pictures.annotations import PictureData
 from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.system.arguments import explains_arguments, name_parameter
 from clrecon.system.files import replace_file
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.paths import find_extension, keep_existing
 from clrecon.version import package_version
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from clrecon.rendering.looks.window import BONE_WINDOW, grey_image
 from clrecon.rendering.pictures.annotations import PictureData
 from clrecon.rendering.pictures.picture import Rendering
 from clrecon.rendering.pictures.pillow import load_font, load_pillow
+from clrecon.system.light_dataclass import dataclass, field, replace
 
 SHEET_SIZE = (1600, 1200)
 """Default width and height of a contact sheet: twenty slices of about 300 pixels."""

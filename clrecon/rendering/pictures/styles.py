@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, fields
+from dataclasses import KW_ONLY, field, fields
 from functools import cached_property, partial
 from typing import Any, ClassVar, TypeVar, cast
 
@@ -31,6 +31,7 @@ from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.reformation import checked_offset, checked_thickness, positive_mm
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass
 
 _T = TypeVar("_T")
 _ByLabel = Mapping[int, _T] | Mapping[str, _T] | Mapping[int | str, _T]

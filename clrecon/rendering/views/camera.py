@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +21,7 @@ from clrecon.rendering.views.directions import (
     number_or_nan,
 )
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.light_dataclass import dataclass, replace
 
 DEFAULT_VIEW_ANGLE = 30.0
 """Degrees from the bottom to the top of a perspective picture, as in VTK."""

@@ -16,7 +16,6 @@ line that bends with radius r, lengths along the line towards the centre of the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,6 +27,7 @@ from clrecon.geometry.volume import Volume
 from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.rendering.views.centre_line import Curve, rotation_minimising_normals
 from clrecon.rendering.views.directions import DIRECTIONS, as_point, checked_size, number_or_nan
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.text import unknown_name
 
 MOST_SAMPLES = 65536

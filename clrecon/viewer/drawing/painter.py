@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
@@ -24,6 +23,7 @@ from clrecon.rendering.pictures.styles import CurveCut, Projection, SlicesInSpac
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import as_point, checked_size
 from clrecon.rendering.views.reformation import PLANES, find_plane
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress
 from clrecon.system.text import unknown_name
 from clrecon.viewer.drawing.looks import LEAST_OPACITY, LabelledLook, Looks, to_voxels

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -20,6 +19,7 @@ from clrecon.rendering.looks.presets import PRESETS
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.views.camera import box_corners
 from clrecon.rendering.views.directions import as_point
+from clrecon.system.light_dataclass import dataclass
 from clrecon.viewer.model.state import ShownPart
 
 if TYPE_CHECKING:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from clrecon.opencl import download
 from clrecon.operators.masks.mask import Mask
 from clrecon.operators.masks.runs import find_components
 from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_hu
 from clrecon.viewer.model.state import Box, Point, ShownPart

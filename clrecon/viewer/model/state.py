@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from clrecon.rendering.pictures.annotations import orientation_letters
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import DIRECTIONS, checked_vector
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.text import unknown_name
 
 Color = tuple[float, float, float]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from clrecon.errors import UsageError
 from clrecon.rendering.looks.window import WINDOWS
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.text import unknown_name
 
 MOST_TEXT = 200

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any
 
 from clrecon.errors import Cancelled, ClreconError
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.log import get_logger
 
 log = get_logger(__name__)

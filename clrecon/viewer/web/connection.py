@@ -14,11 +14,11 @@ import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import ClreconError, UsageError
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.log import get_logger
 from clrecon.viewer.drawing.saving import KINDS, free_name
 from clrecon.viewer.session.commands import page_words

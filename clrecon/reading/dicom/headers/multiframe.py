@@ -20,7 +20,6 @@ import re
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +44,7 @@ from clrecon.reading.dicom.parse.values import (
     name_tag,
     read_sequences,
 )
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.paths import open_regular
 from clrecon.system.text import escape_text, join_names
 

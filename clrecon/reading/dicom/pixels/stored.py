@@ -13,7 +13,6 @@ import sys
 import threading
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -38,6 +37,7 @@ from clrecon.reading.dicom.parse.transfer_syntaxes import (
 )
 from clrecon.reading.dicom.pixels.decoder_pool import DecoderError, DecoderPool
 from clrecon.system.base_classes import Closing
+from clrecon.system.light_dataclass import dataclass
 from clrecon.system.paths import open_regular
 
 RLE_HEAD_BYTES = 64

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from clrecon.reading.dicom.headers.slice_header import OtherImage, SliceHeader
 from clrecon.reading.dicom.stack.fit import Stack, median_thickness
 from clrecon.reading.dicom.stack.spacing import median
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.records import Gate, none_of, unmeasured
 
 LOCALIZERS = 3

@@ -12,11 +12,11 @@ import re
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
 from clrecon.reading.dicom.parse.elements import META_START
+from clrecon.system.light_dataclass import dataclass, field
 
 # First bytes of each type, the longest and surest first.
 _STARTS = (

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
@@ -22,6 +21,7 @@ from clrecon.reading.dicom.stack.fit import measure_gap
 from clrecon.reading.dicom.stack.mixtures import Alternation, find_mixture, read_number, values_of
 from clrecon.reading.dicom.stack.spacing import measure_unit
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass, field, replace
 from clrecon.system.text import join_names
 
 PLACES_SHOWN = 4

@@ -20,7 +20,6 @@ import stat
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -42,6 +41,7 @@ from clrecon.reading.dicom.parse.elements import (
 )
 from clrecon.reading.dicom.series.foreign_files import Stranger, describe_container, describe_start, find_remains
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text
 

@@ -6,7 +6,6 @@ import itertools
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -27,6 +26,7 @@ from clrecon.reading.dicom.series.phases import (
 from clrecon.reading.dicom.series.scan import LINK_OUT, CorruptFile, Scan, advise_on_links
 from clrecon.reading.dicom.stack.fit import Stack, group_places, measure_stack
 from clrecon.reading.dicom.stack.mixtures import alternate_places, find_alternation
+from clrecon.system.light_dataclass import dataclass, field, replace
 from clrecon.system.text import join_names
 
 SPLIT_ANGLE_RAD = math.radians(1.0)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from clrecon.geometry.grid import fit_line, position_tolerance
 from clrecon.reading.dicom.headers.slice_header import SliceHeader
 from clrecon.reading.dicom.stack.spacing import Holes, Rounding, find_holes, find_rounding, median
 from clrecon.system.arguments import name_parameter
+from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.text import join_names
 
 ORIENTATION_EXACT = 1e-4

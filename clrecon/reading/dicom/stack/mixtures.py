@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
@@ -24,6 +23,7 @@ from clrecon.reading.dicom.headers.slice_header import SliceHeader
 from clrecon.reading.dicom.parse.elements import CorruptFileError, NotDicomError, read_elements
 from clrecon.reading.dicom.parse.values import name_element
 from clrecon.reading.dicom.stack.spacing import median
+from clrecon.system.light_dataclass import dataclass
 
 CERTAIN = (
     "TemporalPositionIndex",

@@ -8,7 +8,6 @@ positions are even steps of that distance, each rounded to its last digit, none 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry.affine import Float64Array
 from clrecon.reading.dicom.headers.slice_header import SliceHeader
+from clrecon.system.light_dataclass import dataclass
 
 
 def median(values: Sequence[float] | NDArray[Any]) -> float:
