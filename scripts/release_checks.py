@@ -47,7 +47,7 @@ CHECKS = {
     ),
     "python": ReleaseCheck(
         "at most 5 % of the changes of a room survive its tests; needs the extra mutation",
-        ("scripts/proof/mutate_python.py", "--json", str(KEPT / "changes.json"), "--resume"),
+        ("scripts/proof/mutate_python.py", "--changes", "70", "--json", str(KEPT / "changes.json"), "--resume"),
         {"CLRECON_TEST_DEVICE": "0"},
     ),
     "fuzz": ReleaseCheck(

@@ -40,7 +40,11 @@ from room_traces import Digests, Imports, KeptTrace, Trace, digest  # noqa: E402
 from warm_tests import PYTEST_OPTIONS, Run, WarmTests  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
-ROOMS = ("mesh", "geometry", "labels", "reading", "operators")
+ROOMS = (
+    *("mesh", "geometry", "labels", "reading", "operators", "points", "anatomy", "spine", "exchange", "rendering"),
+    *("viewer", "jobs", "opencl", "system", "cli"),
+)
+"""All but proof, whose checks `mutate_kernels.py` tries."""
 EQUIVALENTS = Path(__file__).with_name("equivalent_changes.json")
 ROOM_TESTS = {
     "labels": ("tests/operators/surface/test_label_masks.py", "tests/operators/surface/test_label_surfaces.py")

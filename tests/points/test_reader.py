@@ -270,7 +270,14 @@ def test_a_line_of_words_and_numbers_before_the_points_is_said(tmp_path):
 
 @pytest.mark.parametrize(
     ("side", "unit"),
-    [(2.5, "metres: then multiply them by 1000"), (3, ""), (5000, ""), (5001, "micrometres: then divide them by 1000")],
+    [
+        (0, ""),
+        (0.25, "metres: then multiply them by 1000"),
+        (2.5, "metres: then multiply them by 1000"),
+        (3, ""),
+        (5000, ""),
+        (5001, "micrometres: then divide them by 1000"),
+    ],
 )
 def test_a_unit_is_doubted_by_the_longest_side(side, unit, tmp_path):
     rows = [f"{side * n / 99} 0 0" for n in range(100)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tolerances
 
-from clrecon.points.spacing import mean_spacing
+from clrecon.points.spacing import count_cells, find_cell_numbers, mean_spacing
 
 
 def lattice(*counts: int, step: float = 0.7) -> np.ndarray:
@@ -34,3 +34,9 @@ def test_clouds_without_extent() -> None:
     assert 0.1 < mean_spacing(np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)])) <= 1.0
     assert 0.0 < mean_spacing(np.array([(0.0, 0.0, 0.0), (1e6, 1e6, 1e6)])) <= 1e6
     assert 0.5 < mean_spacing(lattice(1000, 1, 1, step=1.0)) < 4.0
+
+
+def test_cells_of_three_points_by_hand() -> None:
+    points = np.array([(11.0, 22.0, 33.0), (10.0, 20.0, 30.0), (10.5, 21.2, 31.0)])
+    assert count_cells(points, 1.0) == (2, 3, 4) and count_cells(points, 2.0) == (1, 2, 2)
+    assert find_cell_numbers(points, 1.0).tolist() == [1 + 2 * (2 + 3 * 3), 0, 2 * (1 + 3)]
