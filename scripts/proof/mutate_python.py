@@ -47,9 +47,13 @@ ROOMS = (
 """All but proof, whose checks `mutate_kernels.py` tries."""
 EQUIVALENTS = Path(__file__).with_name("equivalent_changes.json")
 ROOM_TESTS = {
-    "labels": ("tests/operators/surface/test_label_masks.py", "tests/operators/surface/test_label_surfaces.py")
+    "labels": ("tests/operators/surface/test_label_masks.py", "tests/operators/surface/test_label_surfaces.py"),
+    "geometry": ("tests/jobs/test_cropping.py",),
+    "jobs": ("tests/cli/test_info.py",),
+    "system": ("tests/cli/test_foreign_words.py", "tests/guards/test_wrong_arguments.py"),
+    "cli": ("tests/jobs/test_inside_job.py", "tests/jobs/test_stats_job.py", "tests/proof/compare/test_compare_job.py"),
 }
-"""Further tests of a room: those of the only code that uses a part of it."""
+"""Further tests of a room: those of the only code that uses a part of it, which ask this part too."""
 MOST_SURVIVORS = 0.05
 TIMES_WALL, AND_WALL_SECONDS = 20.0, 60.0
 """Seconds after which a change is given up: so many times what its tests may take of the processor, and this more."""
