@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -205,6 +206,14 @@ def test_what_is_beside_behind_or_as_small_as_a_pixel(device: Any) -> None:
     assert one.image.tolist() == [[[255, 255, 255, 255]]] and one.depth[0, 0] == 53.0
 
 
+def test_a_clipped_square_is_seen_where_it_is_kept(device: Any) -> None:
+    clip = Clip.plane((2.25, 3.0, 0.0), (0.6, 0.8, 0.0)) & Clip.plane((0.0, 3.0, -1.25), (0.0, 0.6, 0.8))
+    look = MeshLook(clip=clip)
+    picture = clrecon.render(quad(-9.1, 9.1, 3.0), look, camera=FRONT, size=SIZE, device=device)
+    seen = np.argwhere(~np.isnan(picture.depth))  # centres of pixels at half mm from the middle, 23 and 30
+    assert [seen.min(axis=0).tolist(), seen.max(axis=0).tolist()] == [[5, 35], [25, 48]] and len(seen) == 21 * 14
+
+
 @pytest.mark.release
 @pytest.mark.seconds
 def test_clipped_meshes_are_open(device: Any) -> None:
@@ -262,6 +271,8 @@ def test_what_cannot_be_shown_is_refused(device: Any, monkeypatch: pytest.Monkey
     ):
         with pytest.raises(UsageError, match=text):
             clrecon.render(bad, camera=FRONT, device=device)
+    with pytest.raises(UsageError, match="at most 4,294,967,294 triangles, the mesh has 4,294,967,295$"):
+        make_part(SimpleNamespace(triangle_count=2**32 - 1), MeshLook())
     with pytest.raises(UsageError, match="mode mesh"):
         clrecon.render(mesh, "dvr", device=device)
     with pytest.raises(UsageError, match="extract a surface"):

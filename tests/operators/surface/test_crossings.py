@@ -40,6 +40,14 @@ def test_marks_equal_the_twin(device, count):
     assert count < 700 or 0.05 < found.mean() < 0.95
 
 
+def test_levels_double_their_edge_and_the_finest_has_few_rows(monkeypatch):
+    monkeypatch.setattr(decimation, "MOST_ROWS", 100)
+    plan = plan_crossings(*scattered(700, sizes=(*[0.1] * 60, 6.0)))
+    np.testing.assert_allclose(plan.edges, plan.edges[0] * 2.0 ** np.arange(len(plan.edges)), rtol=1e-6)
+    rows = plan.levels[:, 1].astype(int) * plan.levels[:, 2]
+    assert 50 < rows[0] <= 100 and len(rows) == len(plan.edges) > 1
+
+
 @pytest.mark.oclgrind
 def test_a_few_triangles(device):
     vertices, triangles = scattered(150, extent=(8.0, 8.0, 8.0))

@@ -19,6 +19,7 @@ from clrecon.labels import LabelMap
 from clrecon.operators.masks.mask import Mask
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
+from clrecon.operators.surface.growing import growing_needs
 from clrecon.operators.surface.seeds import AUTO_SHARE
 from clrecon.operators.surface.slabs import SampleGrid
 from clrecon.proof.phantom import PhantomSettings, make_phantom
@@ -239,6 +240,9 @@ def test_a_volume_without_surface_is_no_part_of_one(device: Any) -> None:
 
 
 def test_memory_for_the_bits_of_the_volume_is_asked_for_first(device: Any) -> None:
+    volume = smooth_volume((7, 4, 70))
+    parts = growing_needs(SampleGrid(volume, choose_iso_rule(volume, 300)))
+    assert list(parts.values()) == [4 * 54 * 3, 4 * 54 * 3, 6 * 54 * 3, 4 * 54 * 3, 20 * 54]
     with pytest.raises(DeviceError, match="a surface cannot be grown|needs"):
         extract_isosurface(smooth_volume((40, 64, 64)), 300, device=device, grow_from="auto", memory=150_000)
 
