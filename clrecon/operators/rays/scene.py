@@ -61,7 +61,7 @@ LAYERS = 16
 
 COUNTED = kernel_constant("rays/layers.cl", "COUNTED")
 
-PIXEL_BYTES = 16 + 20 + 48 + 12 + 5 + 4
+PIXEL_BYTES = 16 + 20 + 48 + 12 + 8 + 4
 """Bytes a pixel: keys, a layer, states and marks, the picture, the still, the depth of the layer before."""
 
 

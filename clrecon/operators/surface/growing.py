@@ -96,7 +96,7 @@ def _rows_near(
 
 def _describe_lone(grid: SampleGrid, point: NDArray[np.float64], away: float | None) -> str:
     volume = grid.volume
-    i, j, k = np.clip(np.rint(volume.lps_to_ijk(point[None])[0]).astype(int), 0, np.array(volume.shape_ijk) - 1)
+    i, j, k = np.minimum(np.rint(volume.lps_to_ijk(point[None])[0]).astype(int), np.array(volume.shape_ijk) - 1)
     far = f"more than {FARTHEST_TOLD_MM:g}" if away is None or away > FARTHEST_TOLD_MM else f"{away:.1f}"
     return (
         f"seed {','.join(f'{n:g}' for n in point)} has {float(volume.voxels[k, j, i]):g} HU and is {far} mm away"

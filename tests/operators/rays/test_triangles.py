@@ -13,8 +13,9 @@ from sample_meshes import ball
 import clrecon
 from clrecon import Mesh, MeshLook
 from clrecon.errors import DeviceError, UsageError
+from clrecon.operators.rays import mesh_pictures, scene
 from clrecon.operators.rays.mesh_pictures import make_part
-from clrecon.operators.rays.scene import LAYERS, draw_layers
+from clrecon.operators.rays.scene import LAYERS, PIXEL_BYTES, Still, draw_layers
 from clrecon.proof.rays.objects import find_meetings, nth_layer, shade_layer
 from clrecon.rendering import UNSHADED, Lighting
 from clrecon.rendering.views.camera import Camera
@@ -234,6 +235,31 @@ def test_clipped_meshes_are_open(device: Any) -> None:
         expected = np.zeros(SIZE[::-1], bool)
         expected[tuple(axis[kept] for axis in pixels)] = True
         assert seen[expected].all()
+
+
+def test_bytes_a_pixel_are_those_of_the_buffers(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[int] = []
+
+    def counted(function: Any, name: str) -> Any:
+        def call(device: Any, what: Any, *more: Any) -> Any:
+            sizes = {"allocate": lambda: what, "upload": lambda: what.nbytes}
+            size = sizes.get(name, lambda: np.empty(what, *more).nbytes)
+            taken.append(size())
+            return function(device, what, *more)
+
+        return call
+
+    for module, names in ((scene, ("allocate", "upload", "empty_output")), (mesh_pictures, ("allocate",))):
+        for name in names:
+            monkeypatch.setattr(module, name, counted(getattr(module, name), name))
+
+    def bytes_of(width: int, height: int) -> int:
+        taken.clear()
+        still = Still(np.zeros((height, width, 4), np.uint8), np.zeros((height, width), np.float32))
+        draw_layers(device, [make_part(quad(-9.0, 9.0, 3.0), MeshLook())], FRONT, (width, height), still=still)
+        return sum(taken)
+
+    assert bytes_of(61, 47) - bytes_of(11, 47) == PIXEL_BYTES * 50 * 47
 
 
 def test_a_mesh_far_away_looks_the_same(device: Any) -> None:
