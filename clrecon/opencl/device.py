@@ -250,7 +250,8 @@ class Device:
         self.first_header: str = quirks.first_header(self.platform, _version_numbers(self.driver))
         self.shortcoming: str = _find_shortcoming(cl_device)
         language = quirks.language_option(self.platform, self.type, _version_numbers(self.driver))
-        self.build_options: tuple[str, ...] = (language, *quirks.rounding_options(cl_device))
+        self.own_options: str = os.environ.get("CLRECON_BUILD_OPTIONS", "")
+        self.build_options: tuple[str, ...] = (language, *quirks.rounding_options(cl_device), *self.own_options.split())
         self._cpu: NameOfCpu | None = None
         if has_unknown_cpu(self.platform, self.version) and not self.shortcoming:
             self._name_cpu()

@@ -163,7 +163,8 @@ def _build(device: Device, name: str, options: tuple[str, ...]) -> Program:
             built = _build_from_source(device, source, options) if kept is None else kept
             program = Program(name, built, find_signatures(source, definitions_of(options)))
     except (import_pyopencl().Error, RuntimeError, OSError) as error:  # OSError: from a cache
-        raise DeviceError(f"cl/{name} does not build on {device.label}: {_first_complaint(str(error))}") from error
+        on = device.label + (f" with CLRECON_BUILD_OPTIONS={device.own_options}" if device.own_options else "")
+        raise DeviceError(f"cl/{name} does not build on {on}: {_first_complaint(str(error))}") from error
     if not program.kernel_names:
         if device.known_good is not None:
             device.known_good.forget(_key(device, source, options))

@@ -136,6 +136,7 @@ def beside(odd: OddBodies, *names: str) -> tuple[Volume, np.ndarray]:
     return Volume(voxels, bodies[0].volume.affine), np.concatenate([body.dense for body in bodies], axis=2)
 
 
+@pytest.mark.release
 def test_a_dry_skull_beside_a_patient_is_a_second_body(odd: OddBodies) -> None:
     volume, dense = beside(odd, "skull", "limb")
     cleaned = remove_table(volume)

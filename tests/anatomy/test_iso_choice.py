@@ -81,6 +81,7 @@ def test_a_specimen_in_air_is_cut_half_way_to_air() -> None:
     assert chosen.background == "air" and "between air" in chosen.reason
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_the_spine_is_cut_where_its_surface_is_nearest(comparison) -> None:
     volume, distance = comparison.make_spine(SPINE, {})
@@ -113,6 +114,7 @@ def test_faint_bone_is_counted() -> None:
 
 
 # --- what must not move it ---
+@pytest.mark.release
 @settings(max_examples=15, deadline=None)
 @given(shift=st.integers(-40, 60), scale=st.floats(0.8, 1.25))
 def test_shift_and_scale_carry_over(shift: int, scale: float) -> None:

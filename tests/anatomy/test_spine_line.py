@@ -48,6 +48,7 @@ def check_canal(line, canal) -> None:
     assert away.mean() <= tolerances.CANAL_MEAN_MM and away.max() <= tolerances.CANAL_MAX_MM
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_the_canal_of_the_phantom_is_found_over_its_whole_height(phantom):
     volume, canal = phantom
@@ -69,6 +70,7 @@ def test_a_bend_costs_its_length(cell, more, bends):
     assert _best_path(gain).tolist() == [[0, 1, 1], [1, *(cell if bends else (1, 1))]]
 
 
+@pytest.mark.release
 def test_how_the_voxels_are_ordered_and_how_the_patient_lies_does_not_matter(phantom):
     volume, canal = phantom
     flip = np.eye(4)

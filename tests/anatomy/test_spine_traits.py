@@ -100,6 +100,7 @@ def plain_likeness(values):
     return worth + mirror, {"wall": wall, "mirror": mirror, "body": body, "soft": soft}
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.parametrize("border", daily(1, [0, 14]))
 def test_the_worth_of_every_cell(border):

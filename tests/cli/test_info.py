@@ -229,6 +229,7 @@ def test_patients_and_studies_stand_apart() -> None:
     assert rows == [["1", "1", "1"], ["2", "1", "3"], ["3", "28", "2"], ["4", "28", "2"], ["5", "-", "-"]]
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.untraced
 def test_thousands_of_series_take_one_line_each() -> None:

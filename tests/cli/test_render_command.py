@@ -11,6 +11,7 @@ import pytest
 from ct_files import ORIGIN, SPACING, find_words, write_series
 from label_files import write_nifti
 from PIL import Image
+from variants import daily
 
 from clrecon.cli.main import main
 
@@ -90,7 +91,7 @@ SEEN = {
 }
 
 
-@pytest.mark.parametrize("mode", [["--mode", "dvr"], ["--preset", "mip"], ["--iso", ISO]])
+@pytest.mark.parametrize("mode", daily(1, [["--mode", "dvr"], ["--preset", "mip"], ["--iso", ISO]]))
 def test_sides_of_the_patient_are_where_they_should_be(mode: list[Any], render: Renders) -> None:
     for view, expected in SEEN.items():
         image, report = render(*mode, "--view", view)

@@ -49,6 +49,7 @@ def test_solid_fills_and_says_how_much(device, bone, tmp_path, capsys):
     assert [gate for gate in reports["--solid"]["gates"] if gate["ok"] is False] == []
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_for_print_is_solid_unless_it_shall_not_be(device, bone, tmp_path, capsys):
     ml = {}

@@ -92,6 +92,7 @@ def test_the_image_shares_the_voxels(dtype):
     assert np.array_equal(image["HU"], np.arange(24))
 
 
+@pytest.mark.release
 def test_the_image_keeps_the_voxels_alive():
     image = Volume(np.arange(60_000, dtype=np.int32).reshape(20, 30, 100), AFFINES["oblique"]).to_pyvista()
     gc.collect()

@@ -116,6 +116,7 @@ def test_reading(scan: Path) -> None:
     assert clrecon.read_volume(scan).voxels.shape[0] == 16
 
 
+@pytest.mark.release
 @pytest.mark.slow
 def test_a_mesh(scan: Path, device: Any, tmp_path: Path) -> None:
     settings = MeshSettings(

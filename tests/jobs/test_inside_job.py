@@ -40,6 +40,7 @@ def inside(device: Any, spine: Path, tmp_path: Path) -> Any:
     return run
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_files_report_and_words_agree(inside: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert inside("--label", "L1", "--report", str(tmp_path / "r.json")) == 0
@@ -61,6 +62,7 @@ def test_files_report_and_words_agree(inside: Any, tmp_path: Path, capsys: pytes
     assert "wrote    " in said.out and "_canal.stl, " in said.out
 
 
+@pytest.mark.release
 def test_several_vertebrae_have_names_of_their_own(
     inside: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

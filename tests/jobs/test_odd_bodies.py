@@ -44,6 +44,7 @@ def share_near(body: OddBody, vertices: np.ndarray, *materials: str) -> float:
     return float(near[k, j, i].mean())
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.parametrize("name", daily(2, but_seldom(BONY, SELDOM)))
 def test_the_mesh_without_the_table_is_that_of_the_bone(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:

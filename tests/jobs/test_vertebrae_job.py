@@ -57,6 +57,7 @@ def test_a_run_writes_map_picture_and_report(written: Path) -> None:
     assert len(np.split(rows, np.flatnonzero(np.diff(rows) > 20) + 1)) >= 2  # one line a disc at least
 
 
+@pytest.mark.release
 def test_front_and_back_come_from_the_affine_where_no_patient_position_is_stated(
     scan: Path, written: Path, tmp_path: Path
 ) -> None:

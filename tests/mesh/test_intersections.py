@@ -115,6 +115,7 @@ def test_two_triangles():
     assert count((np.array(flat + flat, float), [[0, 1, 2], [3, 4, 5]])) == 0  # the same: counted as such elsewhere
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.parametrize("shift", daily(1, [(3.1, 0.2, 0.3), (11.0, 4.0, -3.0), (19.5, 0.1, 0.2), (21.0, 0.0, 0.0)]))
 def test_spheres_that_cut_each_other(shift):

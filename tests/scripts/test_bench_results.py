@@ -121,6 +121,7 @@ def test_seconds_are_short() -> None:
     assert [tables.seconds(value) for value in (2.345, 0.0345, 0.00034)] == ["2.35 s", "34.5 ms", "0.34 ms"]
 
 
+@pytest.mark.release
 def test_plots_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     matplotlib_image = pytest.importorskip("matplotlib.image")
     folder = keep(tmp_path / "a", make_result(), make_result(given="b", ratio=0.5), make_scaling_result())

@@ -73,6 +73,7 @@ def test_the_cylinder_is_the_corridor(name: str) -> None:
         assert low <= corridor.medial_deg <= high
 
 
+@pytest.mark.release
 def test_angles_of_the_patient_follow_the_pose() -> None:
     vertebra = BoxVertebra(rotation=turned(0.0, 0.0, 15.0))
     affine, shape = grid_around(vertebra)
@@ -84,6 +85,7 @@ def test_angles_of_the_patient_follow_the_pose() -> None:
     assert right.medial_lps_deg - right.medial_deg == pytest.approx(turn, abs=2.0)
 
 
+@pytest.mark.release
 def test_a_level_farther_out_is_told() -> None:
     """Partial volume reaches half a voxel to both sides: a tenth of the contrast lies 0.4 voxel outside of the half."""
     vertebra = BoxVertebra()
@@ -172,6 +174,7 @@ def test_the_largest_screw_keeps_the_margin(radius: float, margin: float, diamet
     assert screw_diameter(radius, margin) == pytest.approx(diameter)
 
 
+@pytest.mark.release
 def test_a_label_map_by_name_gives_the_same() -> None:
     vertebra = BoxVertebra()
     volume, labels = vertebra.scan(*grid_around(vertebra))

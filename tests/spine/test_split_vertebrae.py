@@ -52,6 +52,7 @@ def shares(labels: np.ndarray, truth: np.ndarray, names: dict[int, str]) -> dict
 CASES = [("T12-L3", {}), ("L1-L4", {"tilt": 12.0, "oblique": (5.0, -8.0, 4.0)}), ("T9-T12", {"scoliosis_deg": 20.0})]
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.parametrize(("levels", "choice"), daily_rows(1, CASES), ids=["straight", "tilted", "scoliosis"])
 def test_all_levels_with_touching_facets_are_told_apart(levels: str, choice: dict[str, Any]) -> None:
@@ -79,6 +80,7 @@ def test_discs_lie_between_the_true_centres_and_normals_point_down() -> None:
     assert np.abs(np.array(heights) - centres[:, 2]).max() < 6.0
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_a_named_point_names_all_and_numbers_them_as_verse_does() -> None:
     volume, truth, _ = phantom("T12-L3")
@@ -154,6 +156,7 @@ def test_a_disc_that_bone_fills_lowers_the_confidence_of_the_vertebrae_beside_it
     assert min(share for _, share in shares(result.labels.voxels, truth, names).values()) >= LEAST_RIGHT
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_vertebrae_of_low_confidence_are_kept_only_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
     """A disc that is not seen makes one vertebra of two, of twice the height, with a disc within it."""
@@ -181,13 +184,16 @@ def test_vertebrae_of_low_confidence_are_kept_only_on_request(monkeypatch: pytes
 @pytest.mark.parametrize(
     ("levels", "choice", "least"),
     daily_rows(
-        3,
-        [
-            ("C1-T1", {"size": (140, 140), "spacing": (1.6, 1.6, 2.0)}, 0.7),
-            ("C3-T2", {"size": (140, 140), "spacing": (1.6, 1.6, 2.5), "tilt": 15.0}, 0.7),
-            ("T1-T12", {"size": (150, 150), "spacing": (2.4, 2.4, 2.4)}, 0.7),
-            ("C1-L5", {"size": (150, 150), "spacing": (2.4, 2.4, 2.5)}, 0.65),
-        ],
+        1,
+        daily_rows(
+            3,
+            [
+                ("C1-T1", {"size": (140, 140), "spacing": (1.6, 1.6, 2.0)}, 0.7),
+                ("C3-T2", {"size": (140, 140), "spacing": (1.6, 1.6, 2.5), "tilt": 15.0}, 0.7),
+                ("T1-T12", {"size": (150, 150), "spacing": (2.4, 2.4, 2.4)}, 0.7),
+                ("C1-L5", {"size": (150, 150), "spacing": (2.4, 2.4, 2.5)}, 0.65),
+            ],
+        ),
     ),
     ids=["neck", "tilted neck", "chest with ribs", "whole spine"],
 )
@@ -211,6 +217,7 @@ def test_all_levels_are_found_and_confidence_is_near_the_overlap_with_the_truth(
     assert min(dice) >= least and off.mean() <= 0.08 and off.max() <= 0.2, (dice, off)
 
 
+@pytest.mark.release
 def test_a_kyphotic_upper_chest_is_never_wrong_without_a_word() -> None:
     _, truth, names = phantom("C7-T6", kyphosis_deg=60.0)
     result = split("C7-T6", kyphosis_deg=60.0)
@@ -295,6 +302,7 @@ def test_a_side_wall_is_looked_for_from_the_core_to_behind_it(sign: int) -> None
     assert found[:, 0].tolist() == inner
 
 
+@pytest.mark.release
 def test_the_order_of_the_axes_does_not_matter() -> None:
     """A volume whose slices are sagittal, as in NIfTI files."""
     volume, _, _ = phantom("T12-L3")

@@ -136,10 +136,10 @@ def compare_meshes(
     reference.check()
     sides = []
     progress = progress or ignore_progress
-    for side, (one, other) in enumerate(((mesh, reference), (reference, mesh))):
+    points = [sample_surface(each.vertices, each.triangles, samples) for each in (mesh, reference)]
+    for side, other in enumerate((reference, mesh)):
         progress("compare", side, 2)
-        points = sample_surface(one.vertices, one.triangles, samples)
-        sides.append(summarise_distances(SurfaceDistance(other.vertices, other.triangles)(points)))
+        sides.append(summarise_distances(SurfaceDistance(other.vertices, other.triangles)(points[side])))
     progress("compare", 2, 2)
     origin = local_origin(reference.vertices)
     volume, wanted = (enclosed_ml(each.vertices, each.triangles, origin) for each in (mesh, reference))

@@ -76,6 +76,7 @@ def test_all_bones_are_one_mesh_of_other_formats(device, bones, tmp_path, capsys
     assert report["print"]["left_out"]["cavities"] == 1
 
 
+@pytest.mark.release
 def test_a_print_that_leaves_bone_out_names_the_option(device, bones, tmp_path):
     code, report = run(bones, tmp_path / "a.stl", device, "--for", "print")
     assert code == 0 and report["components"] == 1
@@ -120,6 +121,7 @@ def test_least_volumes_go_with_all_parts():
     assert (settings.keep, settings.keep_largest, settings.min_volume_ml) == ("bone", None, 0.1)
 
 
+@pytest.mark.release
 def test_the_seal_of_a_print_can_be_given(device, bones, tmp_path):
     code, report = run(bones, tmp_path / "a.stl", device, "--for", "print", "--seal", 0.3)
     assert code == 0 and report["volume"]["solid"]["seal_mm"] == 0.3

@@ -156,6 +156,7 @@ def make_hip() -> Volume:
     return Volume(np.rint(np.minimum(hu, 3071)).astype(np.int16), np.diag([1.0, 1.0, 1.5, 1.0]))
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_metal_is_named_and_distances_are_judged_without_it(device: Any, tmp_path: Path) -> None:
     make_hip().save(tmp_path / "hip.nii.gz")

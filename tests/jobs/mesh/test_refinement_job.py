@@ -94,6 +94,7 @@ def test_what_is_smoothed_and_decimated_is_written(device: Any, noisy_torus: Any
     assert seconds.pop("total") == pytest.approx(sum(seconds.values()), abs=0.01)
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_each_of_several_meshes_has_its_own_gates(device: Any, noisy_torus: Any, tmp_path: Path) -> None:
     level = noisy_torus[1]["iso_value_hu"]
@@ -105,6 +106,7 @@ def test_each_of_several_meshes_has_its_own_gates(device: Any, noisy_torus: Any,
     assert [mesh["refinement"]["decimate"]["fraction"] for mesh in report["meshes"]] == [0.5, 0.5]
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_strict_is_an_exit_code_and_nothing_else(
     device: Any, noisy_torus: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -94,6 +94,7 @@ def find_in(voxels: np.ndarray):
     return judge_slices(twin.count_overlaps(voxels >= 200), 120 * 120, (200.0, np.inf))
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("slices", daily(1, [24, 30, 40]))
 def test_discs_between_vertebrae_are_no_ghosts(slices):
     """They are unlike both neighbours, which are alike, but lie within one of them."""

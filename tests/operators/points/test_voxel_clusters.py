@@ -158,6 +158,7 @@ def voxel_cloud(volume: Volume) -> PointCloud:
     return PointCloud(volume.ijk_to_lps(ijk), ijk=ijk, report=report)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(("eps", "samples"), daily_rows(1, [(1.2, 6), (0.85, 1), (1.6, 20)]))
 def test_scikit_learn_says_the_same(device, eps, samples):
     sklearn = pytest.importorskip("sklearn.cluster")

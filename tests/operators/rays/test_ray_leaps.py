@@ -148,6 +148,7 @@ def scene(seed: int):
 LOST_ONCE = (4406, 7282, 8362, 9701, 13084)
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 def test_what_is_free_ahead_hides_nothing(device, monkeypatch):
     shown = 0

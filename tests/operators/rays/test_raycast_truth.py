@@ -52,6 +52,7 @@ def test_a_homogeneous_slab_is_as_opaque_as_its_way_is_long(cast, ray_step, pers
         assert np.abs(image[visible][:, :3] / 255.0 - (0.2, 0.6, 1.0)).max() <= tolerances.RAY_OPACITY
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("soft_gradient", daily(1, [0.0, 25.0, 120.0]))
 def test_light_fades_with_the_gradient(cast, soft_gradient):
     """A field that rises by 60 HU per mm, 50 degrees off the view, opaque and of one colour."""
@@ -274,6 +275,7 @@ def test_a_ball_in_an_uneven_stack_is_round(cast):
     assert (np.isfinite(shot.depth) != (passing < radius))[~edge].sum() > 20
 
 
+@pytest.mark.release
 def test_uneven_and_even_samplings_of_one_field_look_alike(cast):
     field = lambda p: 900.0 * np.exp(-(p[:, 0] ** 2 + 2 * p[:, 1] ** 2 + p[:, 2] ** 2) / 120.0)  # noqa: E731
     uneven, even = uneven_volume(field), even_volume(field, "even", 60.0)

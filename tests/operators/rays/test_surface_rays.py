@@ -134,6 +134,7 @@ def test_long_steps_are_shortened_for_slabs(device):
     assert "in slabs: the ray step is 0.9 mm in place of 5" in parts.report["warnings"][0]
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.parametrize("grid", daily(1, ["sheared", "uneven"]))
 def test_depths_are_those_of_the_extracted_mesh_caps_included(device, grid):

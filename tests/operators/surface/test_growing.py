@@ -101,6 +101,7 @@ def test_the_identity_holds_on_a_spine(device: Any) -> None:
     assert extract_isosurface(volume, 226, device=device, grow_from="auto").report["growing"]["components"] > 10
 
 
+@pytest.mark.every_device
 def test_a_mask_grows_what_it_touches(device: Any) -> None:
     volume = blocks()
     chosen = np.zeros(volume.voxels.shape, bool)

@@ -7,6 +7,7 @@ import pickle
 
 import numpy as np
 import pytest
+from variants import daily
 
 import clrecon
 from clrecon.errors import NoSurfaceError, UsageError
@@ -212,7 +213,7 @@ def test_a_real_label_with_gaps_is_warned_of(real_data, device):
     assert "in the next voxel outside of the label" in told
 
 
-@pytest.mark.parametrize("turned", [{"tilt": 15.0}, {"oblique": (10.0, -5.0, 30.0)}], ids=str)
+@pytest.mark.parametrize("turned", daily(1, [{"tilt": 15.0}, {"oblique": (10.0, -5.0, 30.0)}]), ids=str)
 def test_tilted_and_oblique_scans_have_the_same_parts(turned, device):
     settings = PhantomSettings(levels="L1", size=(130, 130), spacing=(1.0, 1.0, 1.2), **turned)
     voxels, affine, _ = make_phantom(settings)

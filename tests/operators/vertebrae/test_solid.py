@@ -51,6 +51,7 @@ def test_the_label_alone_is_closed_and_filled_and_its_canal_stays_open(device):
     assert solid.name == "solid bone of label ring, closed by 1.5 mm"
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.parametrize(
     ("level", "more_ml", "dice"),

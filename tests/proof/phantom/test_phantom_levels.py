@@ -113,6 +113,7 @@ def test_defaults_stay_as_they_were() -> None:
     assert PhantomSettings(levels="l5").as_dict()["levels"] == "L5"
 
 
+@pytest.mark.release
 def test_slices_follow_the_levels_and_hold_whole_bones() -> None:
     counts = {}
     for levels in ("L4-L5", "C3-C7,T1-T2"):
@@ -183,12 +184,14 @@ def test_levels_lie_apart(levels: str) -> None:
     assert min(gaps(planned(levels))) > 2.0
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(("levels", "gap"), daily_rows(1, [("C1-C3", 0.3), ("T6-T7", 0.0), ("L4-L5", 0.8)]))
 def test_facets_come_as_near_as_asked(levels: str, gap: float) -> None:
     found = gaps(planned(levels, facet_gap_mm=gap, scoliosis_deg=10.0))
     assert found == pytest.approx([gap] * len(found), abs=tolerances.PHANTOM_FACET_MM)
 
 
+@pytest.mark.release
 def test_a_bent_spine_has_the_angles_asked_and_rigid_vertebrae() -> None:
     described = []
     for bend in ({}, {"kyphosis_deg": 20.0, "scoliosis_deg": -35.0}):

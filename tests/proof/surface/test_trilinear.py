@@ -103,6 +103,7 @@ def compare_cells(seed: int, count: int) -> Counter:
     return found
 
 
+@pytest.mark.release
 @pytest.mark.seconds
 @pytest.mark.untraced
 def test_random_cells_have_the_topology_of_their_trilinear_field():
