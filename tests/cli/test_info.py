@@ -141,7 +141,9 @@ def test_strict_holds_a_series_against_its_gates(tmp_path: Path, capsys: pytest.
     write_plan(tmp_path / "good")
     assert main(["info", str(tmp_path / "good"), "--strict"]) == 0
     shown = capsys.readouterr().out
-    unmeasured = "stated_gap, one_volume, hu_scale, stored_sign, padding_share, stored_bits"
+    unmeasured = (
+        "stated_gap, stated_places, one_volume, hu_scale, stored_sign, shown_places, padding_share, stored_bits"
+    )
     assert re.search(rf"gates +\d+ kept, 0 failed, not measured: {unmeasured}", shown)
     write_plan(tmp_path / "lossy", change=set_values(LossyImageCompression="01", RescaleType="US"))
     assert main(["info", str(tmp_path / "lossy")]) == 0
@@ -256,7 +258,10 @@ def test_the_certificate_in_words(tmp_path: Path) -> None:
     assert words["padding"] == "0.0 % of the voxels hold no measurement"
     assert words["values"] == "-124 to 145 HU; slope 1, intercept -1024"
     assert words["stored"] == "Explicit VR Little Endian"
-    assert words["gates"] == "17 kept, 0 failed, not measured: stated_gap, one_volume, hu_scale"
+    assert (
+        words["gates"]
+        == "17 kept, 0 failed, not measured: stated_gap, stated_places, one_volume, hu_scale, shown_places"
+    )
     write_plan(tmp_path / "uneven", Plan(offsets={3: 0.4}), set_values(SliceThickness=1))
     words = dict(describe_certificate(list_series(tmp_path / "uneven").certificate))
     assert words["gaps"] == "2 of 1.25, then 1 of 1.65, then 1 of 0.85, then 2 of 1.25 mm"
@@ -288,7 +293,7 @@ def test_mesh_strict_counts_the_gates_of_the_volume(
     folder = write_series(tmp_path / "ct")
     arguments = ["mesh", str(folder), "-o", str(tmp_path / "a.ply"), "--hu", "100", "--device", str(device.index)]
     assert main([*arguments, "--strict"]) == 0
-    assert b"comment CERTIFICATE gates 18 passed 0 failed" in (tmp_path / "a.ply").read_bytes()
+    assert b"comment CERTIFICATE gates 19 passed 0 failed" in (tmp_path / "a.ply").read_bytes()
     import pydicom
 
     for path in folder.iterdir():

@@ -21,12 +21,14 @@ class Place:
     """A damage, and what becomes of it.
 
     `result` is one of `RESULTS`; each of `values` is a value, None for a missing element, or a function of the slice.
+    The pictures of a `body` show a patient, of others numbers that tell voxels apart.
     """
 
     result: str
     gates: set[str]
     words: str
     values: dict[str, Any]
+    body: bool = False
 
 
 RESULTS = {
@@ -45,12 +47,35 @@ def as_stated(gates: str, words: str, /, **values: Any) -> Place:
     return Place("as stated", set(gates.split()), words, values)
 
 
-def silent(**values: Any) -> Place:
-    return Place("silent", set(), "", values)
+def silent(why: str, /, **values: Any) -> Place:
+    return Place("silent", set(), why, values)
 
 
 def refused(words: str, /, **values: Any) -> Place:
     return Place("refused", set(), words, values)
+
+
+def seen(words: str, /, **values: Any) -> Place:
+    return Place("as stated", {"shown_places"}, words, values, body=True)
+
+
+def swap(a: int, b: int) -> Any:
+    return lambda k: position({a: b, b: a}.get(k, k))
+
+
+DOUBLED = {"ImagePositionPatient": lambda k: [2 * value for value in position(k)]}
+IN_CM = {"ImagePositionPatient": lambda k: [value / 10 for value in position(k)]}
+LOCATION = {"SliceLocation": lambda k: -position(k)[2]}
+LETTERS = {"PatientOrientation": ["L", "P"]}
+
+
+def make_patient() -> np.ndarray:
+    """A round body that turns and grows along 12 slices of 72 x 96 pixels, a bone in it, HU without noise."""
+    k, j, i = np.mgrid[:12, :72, :96].astype(float)
+    turn = k / 4.0
+    body = np.hypot((j - 36.0) / (24.0 + k), (i - 46.0) / (34.0 + k))
+    bone = np.hypot(j - 36.0 - 12.0 * np.sin(turn), i - 46.0 - 16.0 * np.cos(turn))
+    return np.rint(np.clip(400.0 * (1.0 - body), -1000.0, 50.0) + np.clip(1000.0 - 100.0 * bone, 0.0, 800.0))
 
 
 def at_one(k: int, odd: Any, usual: Any) -> Any:
@@ -86,12 +111,21 @@ PLACES = {
         "spacings that no scanner has",
         ImagePositionPatient=lambda k: [1000 * value for value in position(k)],
     ),
-    "positions doubled": silent(ImagePositionPatient=lambda k: [2 * value for value in position(k)]),
-    "positions in cm": silent(ImagePositionPatient=lambda k: [value / 10 for value in position(k)]),
+    "positions doubled": as_stated("stated_places", "ImagePositionPatient by 2.5 mm", **DOUBLED, **LOCATION),
+    "positions doubled, no other element says where": silent("no SliceLocation, no SpacingBetweenSlices", **DOUBLED),
+    "positions in cm": as_stated("stated_places", "ImagePositionPatient by 0.125 mm", **IN_CM, **LOCATION),
+    "positions in cm, no other element says where": silent("slices may overlap as much as they like", **IN_CM),
     "position with the wrong sign along the slices": silent(
-        ImagePositionPatient=lambda k: [*position(k)[:2], -position(k)[2]]
+        "a mirror of the patient that fits all headers: SliceLocation has no direction",
+        ImagePositionPatient=lambda k: [*position(k)[:2], -position(k)[2]],
+        **LOCATION,
     ),
-    "positions of two slices swapped": silent(ImagePositionPatient=lambda k: position(11 - k if k in (5, 6) else k)),
+    "positions of two slices swapped": seen(
+        "slices 6 and 7 of 12 seem to lie in each other's place", ImagePositionPatient=swap(5, 6)
+    ),
+    "positions of two distant slices swapped": seen(
+        "slices 4 and 9 of 12 seem to lie in each other's place", ImagePositionPatient=swap(3, 8)
+    ),
     "orientation missing": refused("ImageOrientationPatient (0020,0037) is missing", ImageOrientationPatient=None),
     "orientation of three numbers": refused("expected 6 finite numbers", ImageOrientationPatient=[1, 0, 0]),
     "orientation doubled": refused("off unit length or right angle", ImageOrientationPatient=[2, 0, 0, 0, 2, 0]),
@@ -105,8 +139,18 @@ PLACES = {
     "orientation of another plane": refused(
         "all 12 images lie in one plane", ImageOrientationPatient=[0, 1, 0, 0, 0, -1]
     ),
-    "orientation with the wrong sign of rows": silent(ImageOrientationPatient=[-1, 0, 0, 0, 1, 0]),
-    "orientation with rows and columns swapped": silent(ImageOrientationPatient=[0, 1, 0, 1, 0, 0]),
+    "orientation with the wrong sign of rows": as_stated(
+        "stated_places", "PatientOrientation says L\\P", ImageOrientationPatient=[-1, 0, 0, 0, 1, 0], **LETTERS
+    ),
+    "orientation with the wrong sign of rows, no PatientOrientation": silent(
+        "pictures seen from the head are as good", ImageOrientationPatient=[-1, 0, 0, 0, 1, 0]
+    ),
+    "orientation with rows and columns swapped": as_stated(
+        "stated_places", "by ImageOrientationPatient it is P\\L", ImageOrientationPatient=[0, 1, 0, 1, 0, 0], **LETTERS
+    ),
+    "orientation with rows and columns swapped, no PatientOrientation": silent(
+        "a patient may lie on the side", ImageOrientationPatient=[0, 1, 0, 1, 0, 0]
+    ),
     "pixel spacing missing": refused("PixelSpacing (0028,0030) is missing", PixelSpacing=None),
     "pixel spacing of one number": refused("expected 2 finite numbers", PixelSpacing=[0.7]),
     "pixel spacing below 0": refused("expected two numbers from 0.001 to 50 mm", PixelSpacing=[-0.7, 0.5]),
@@ -115,9 +159,22 @@ PLACES = {
     "pixel spacing of one slice doubled": refused(
         "PixelSpacing differs within the series", PixelSpacing=at_one(5, [1.4, 1.0], [0.7, 0.5])
     ),
-    "pixel spacing doubled": silent(PixelSpacing=[1.4, 1.0]),
-    "pixel spacing in cm": silent(PixelSpacing=[0.07, 0.05]),
-    "pixel spacing of rows and columns swapped": silent(PixelSpacing=[0.5, 0.7]),
+    "pixel spacing doubled": as_stated(
+        "stated_places", "ReconstructionDiameter says 11.2 mm", PixelSpacing=[1.4, 1.0], ReconstructionDiameter=11.2
+    ),
+    "pixel spacing doubled, no ReconstructionDiameter": silent("no other element says how wide", PixelSpacing=[1.4, 1]),
+    "pixel spacing doubled, cut out of a larger picture": silent(
+        "it still fits into the ReconstructionDiameter", PixelSpacing=[1.4, 1.0], ReconstructionDiameter=358.4
+    ),
+    "pixel spacing in cm": as_stated(
+        "stated_places", "5,120 pixels of 0.07 mm", PixelSpacing=[0.07, 0.05], ReconstructionDiameter=358.4
+    ),
+    "pixel spacing in cm, no ReconstructionDiameter": silent(
+        "fine scanners have such pixels", PixelSpacing=[0.07, 0.05]
+    ),
+    "pixel spacing of rows and columns swapped": silent(
+        "all other elements are of both sides alike", PixelSpacing=[0.5, 0.7], ReconstructionDiameter=358.4
+    ),
     "thickness missing": exact(SliceThickness=None),
     "thickness 0": exact(SliceThickness=0),
     "thickness below 0": exact(SliceThickness=-1.25),
@@ -147,7 +204,7 @@ PLACES = {
     "rows doubled": refused("truncated: 1152 bytes of pixels expected", Rows=32),
     "rows halved": refused("more pixels than the header says", Rows=8),
     "rows of one slice halved": refused("slice005.dcm: Pixel Data has 576 bytes", Rows=at_one(5, 8, 16)),
-    "rows and columns swapped": silent(Rows=18, Columns=16),
+    "rows and columns swapped": seen("Rows and Columns seem to be swapped", Rows=96, Columns=72),
     "series missing": exact("", "no SeriesInstanceUID", SeriesInstanceUID=None),
     "a series for each slice": refused(
         "a single slice cannot make a surface: 12 series of one slice each",

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from clrecon.geometry.affine import TILT_REPORT_DEG
 from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.pieces import count_readers
+from clrecon.system.records import Gate, none_of, unmeasured
 
 LEAST_LIKENESS = 1.25
 """Ratio of the differences from neighbours to those one period on, from which on slices belong to several volumes.
@@ -176,3 +177,85 @@ def _average(pictures: NDArray[np.float32], side: int) -> NDArray[np.float32]:
     rows, columns = pictures.shape[1] // side, pictures.shape[2] // side
     cut = pictures[:, : rows * side, : columns * side].reshape(len(pictures), rows, side, columns, side)
     return cut.mean(axis=(2, 4))
+
+
+SHOWN_SAID = "pictures that are not where their headers put them: slices in each other's place, rows of a wrong length"
+
+LEAST_EXCHANGE, MOST_EXCHANGES = 1.25, 2
+"""How much less alike two slices in each other's place are to their neighbours there, and most pairs of them: more are
+two volumes.  Five scans, whole and with every 2nd, 3rd and 5th slice: at most 1.01; exchanged 1.5 to 3 where slices lie
+up to 4 mm apart."""
+FEWEST_SLICES, FEWEST_SAMPLES, SAMPLES, FEWEST_MOVED = 6, 512, 64, 25
+"""Fewest slices and samples of a slice that are compared, most samples along a side, and fewest that must differ:
+square of the sum of their differences by the sum of the squares."""
+WRONG_ROW, NARROWEST, PICTURES = 4.0, 16, 4
+"""How much less alike pixels of neighbouring rows are than those of a row, and than those of rows as long as columns
+are; least pixels along a side, and pictures looked at."""
+
+
+def judge_shown_places(voxels: NDArray[Any]) -> Gate:
+    """Judge the gate ``shown_places`` of slices (nk, nj, ni) of HU: order of the slices, and length of the rows."""
+    nk, nj, ni = voxels.shape
+    samples = _sample_rows(voxels)
+    comparable = nk >= FEWEST_SLICES and samples.shape[1] >= FEWEST_SAMPLES
+    found = [f"slices {a + 1} and {b + 1} of {nk}" for a, b in _find_exchanged(samples)] if comparable else []
+    texts = [f"{' and '.join(found)} seem to lie in each other's place, by what they show"] if found else []
+    if _has_swapped_sides(voxels):
+        texts.append(f"rows of {nj} pixels fit better than those of {ni}: Rows and Columns seem to be swapped")
+    if not texts and not comparable:
+        return unmeasured("shown_places", 0, None, f"{SHOWN_SAID}: too few slices or pixels")
+    return none_of("shown_places", len(texts), f"{SHOWN_SAID} ({'; '.join(texts)})" if texts else SHOWN_SAID)
+
+
+def _sample_rows(voxels: NDArray[Any]) -> NDArray[np.int16]:
+    """Return means along pieces of some rows of each slice, (nk, n)."""
+    nk, nj, ni = voxels.shape
+    side = -(-min(nj, ni) // SAMPLES)
+    rows = range(side // 2, nj, side)
+    samples = np.empty((nk, len(rows) * (ni // side)), np.int16)
+
+    def sample(k: int) -> None:
+        pieces = voxels[k, side // 2 :: side, : ni // side * side].reshape(len(rows), -1, side)
+        np.rint(np.clip(pieces, *HU_RANGE).mean(axis=2).ravel(), out=samples[k], casting="unsafe")
+
+    with ThreadPoolExecutor(count_readers(nk, READERS)) as pool:
+        for _ in pool.map(sample, range(nk)):
+            pass
+    return samples
+
+
+def _find_exchanged(samples: NDArray[np.int16]) -> list[tuple[int, int]]:
+    """Return pairs of slices (n, samples) that each are more like the other's neighbours; none if there are many."""
+
+    def differ(a: int, b: int) -> float:
+        apart = np.square(np.subtract(samples[a], samples[b], dtype=np.float32))
+        total, squares = float(apart.sum()), float(apart @ apart)
+        few = total**2 < FEWEST_MOVED * squares
+        return np.nan if few else max(total / apart.size, NOISE_HU2)
+
+    count, found = len(samples), []
+    first, second, third = (np.array([differ(k, k + step) for k in range(count - step)]) for step in (1, 2, 3))
+    odd = (np.flatnonzero(np.minimum(first[:-1], first[1:]) > LEAST_EXCHANGE * second) + 1).tolist()
+    for place, a in enumerate(odd if len(odd) <= 2 * MOST_EXCHANGES else ()):
+        for b in odd[place + 1 :]:
+            there = [differ(a - 1, b) + differ(a + 1, b), differ(b - 1, a) + differ(b + 1, a)]
+            here = [first[a - 1] + first[a], first[b - 1] + first[b]]
+            if b - a > 2 and all(one > LEAST_EXCHANGE * other for one, other in zip(here, there, strict=True)):
+                found.append((a, b))
+    for apart, further in () if found else ((1, second), (2, third)):  # a stretch of the stack is turned round
+        ratios = np.minimum(first[: -apart - 1] / further[:-1], first[apart + 1 :] / further[1:])
+        found += [(k + 1, k + 1 + apart) for k in np.flatnonzero(ratios > LEAST_EXCHANGE).tolist()]
+    return found if len(found) <= MOST_EXCHANGES else []
+
+
+def _has_swapped_sides(voxels: NDArray[Any]) -> bool:
+    """True where pixels one after the other make a picture only with rows as long as the columns are said to be."""
+    nk, nj, ni = voxels.shape
+    if min(nj, ni) < NARROWEST or nj % ni == 0 or ni % nj == 0:
+        return False
+    beside, other, below = 0.0, 0.0, 0.0
+    for picture in voxels[:: -(-nk // PICTURES)]:
+        flat = np.clip(picture, *HU_RANGE).astype(np.float32).ravel()
+        apart = [float(np.square(flat[lag:] - flat[:-lag]).mean()) for lag in (1, nj, ni)]
+        beside, other, below = beside + apart[0], other + apart[1], below + apart[2]
+    return below > WRONG_ROW * max(beside, other) and other * WRONG_ROW > beside

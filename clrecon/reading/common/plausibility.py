@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import METAL_HU
 from clrecon.reading.common.hu_scale import LOWEST_AIR_HU, SCALE_SAID, ValueSample, judge_scale, sample_slices
+from clrecon.reading.common.likeness import SHOWN_SAID, judge_shown_places
 from clrecon.reading.common.source_facts import PixelFacts, StoredValues
 from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.records import Gate, none_of, unmeasured
@@ -127,7 +128,7 @@ LEAST_PADDING_SHARE = 0.01
 
 @dataclass(frozen=True)
 class VoxelFindings:
-    """Warnings, the gates ``hu_scale`` and ``stored_sign``, and the values of both materials where the first fails."""
+    """Warnings, the gates ``hu_scale``, ``stored_sign`` and ``shown_places``, both materials where the first fails."""
 
     warnings: list[str]
     gates: list[Gate]
@@ -150,24 +151,24 @@ def examine_voxels(
     if facts.hu_min == facts.hu_max:
         what = "padding" if facts.padding_share == 1.0 else f"{facts.hu_min:g} HU"
         raise RefusedInputError(f"all {voxels.size:,} voxels are {what}: the volume is constant and holds no image")
-    sign = judge_sign(voxels, facts, slices or stored)
+    sign, shown = judge_sign(voxels, facts, slices or stored), judge_shown_places(voxels)
     if sign.ok is False:
         unknown = unmeasured("hu_scale", 0, None, f"{SCALE_SAID}: the sign of the values is lost")
-        return VoxelFindings([], [unknown, sign])
+        return VoxelFindings([], [unknown, sign, shown])
     sample = ValueSample.of(voxels, facts)
     scale, materials = judge_scale(sample, facts, [one.slope for one in slices] or [1.0], known)
     warnings = [facts.padding_text] if facts.padding_text else []
     warnings += _warn_of_saturation(voxels, facts, slices)
     if sample is not None and scale.ok is not False:
         warnings += _warn_of_padding(sample, voxels)
-    return VoxelFindings(warnings, [scale, sign], materials)
+    return VoxelFindings(warnings, [scale, sign, shown], materials)
 
 
 def leave_unexamined() -> list[Gate]:
     """Return the gates of `examine_voxels` as not measured, for voxels that were not read."""
     return [
         unmeasured(name, 0, None, f"{text}: the pixels were not read")
-        for name, text in (("hu_scale", SCALE_SAID), ("stored_sign", SIGN_SAID))
+        for name, text in (("hu_scale", SCALE_SAID), ("stored_sign", SIGN_SAID), ("shown_places", SHOWN_SAID))
     ]
 
 

@@ -60,6 +60,8 @@ def test_headers_alone_say_nothing_of_pixels(tmp_path, monkeypatch):
     assert (certificate["padding_share"], certificate["hu_range"]) == (None, None)
     assert unmeasured(certificate) == {
         "stated_gap",
+        "stated_places",
+        "shown_places",
         "padding_share",
         "stored_bits",
         "one_volume",

@@ -49,6 +49,13 @@ FLOAT_PIXEL_BITS = {0x7FE00008: 32, 0x7FE00009: 64}
 
 PIXEL_SPACING_MM = (1e-3, 50.0)
 POSITION_LIMIT_MM = 1e6
+_STATED_LENGTHS = (
+    ("slice_thickness_mm", "SliceThickness", "(0018,0050)"),
+    ("stated_gap_mm", "SpacingBetweenSlices", "(0018,0088)"),
+    ("stated_field_mm", "ReconstructionDiameter", "(0018,1100)"),
+    ("stated_location_mm", "SliceLocation", "(0020,1041)"),
+)
+_LETTERS = re.compile(r"[LRAPHF]{1,3}\\[LRAPHF]{1,3}")
 RESCALE_SLOPE = (1e-6, 1e6)
 RESCALE_INTERCEPT_LIMIT = 1e9
 
@@ -179,6 +186,7 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
         warnings.append(f"derived images (ImageType has DERIVED and {' '.join(derived)}): maybe not measured HU")
 
     row_cosines, column_cosines = _share_halves(orientation)
+    letters = values.text("PatientOrientation").upper().replace(" ", "")
     header = SliceHeader(
         series=series,
         file=path,
@@ -205,8 +213,8 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
         position_digits=values.decimal_places("ImagePositionPatient"),  # type: ignore[arg-type]
         di_mm=di,
         dj_mm=dj,
-        slice_thickness_mm=stated["SliceThickness"],
-        stated_gap_mm=stated["SpacingBetweenSlices"],
+        **stated,
+        stated_letters=letters if _LETTERS.fullmatch(letters) else "",
         slope=slope,
         intercept=intercept,
         has_slope="RescaleSlope" in values,
@@ -233,12 +241,13 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
 
 
 def _read_stated_lengths(values: Values, warnings: list[str]) -> dict[str, float | None]:
-    """Return SliceThickness and SpacingBetweenSlices where they are numbers; they place no slice."""
-    lengths: dict[str, float | None] = {"SliceThickness": None, "SpacingBetweenSlices": None}
-    for keyword, tag in (("SliceThickness", "(0018,0050)"), ("SpacingBetweenSlices", "(0018,0088)")):
+    """Return the lengths that place no slice, where they are numbers."""
+    lengths: dict[str, float | None] = {}
+    for field, keyword, tag in _STATED_LENGTHS:
         try:
-            lengths[keyword] = values.decimals(keyword, 1)[0] if keyword in values else None
+            lengths[field] = values.decimals(keyword, 1)[0] if keyword in values else None
         except ValueProblem:
+            lengths[field] = None
             warnings.append(f"{keyword} {tag} is no finite number; ignored, it plays no part in the geometry")
     return lengths
 

@@ -106,6 +106,8 @@ class SliceHeader:
     position_digits: Number of decimals of each number of ImagePositionPatient, as it was written.
     di_mm, dj_mm: Column spacing (PixelSpacing[1]) and row spacing (PixelSpacing[0]).
     slice_thickness_mm, stated_gap_mm: SliceThickness and SpacingBetweenSlices; never used for geometry.
+    stated_location_mm, stated_field_mm, stated_letters: SliceLocation, ReconstructionDiameter and PatientOrientation
+        ("L\\P"); only compared.
     padding: Lowest and highest stored value that mean "no measurement".
     float_pixels: Float or Double Float Pixel Data, which are HU without rescale.
     slope, intercept: 1 and 0 where the file has none, see `has_slope` and `has_intercept`.
@@ -166,6 +168,9 @@ class SliceHeader:
     stated_files: int | None = None
     modality_lut: bool = False
     quadruped: bool = False
+    stated_location_mm: float | None = None
+    stated_field_mm: float | None = None
+    stated_letters: str = ""
 
     @property
     def pixel_bytes(self) -> int:

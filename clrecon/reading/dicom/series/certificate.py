@@ -59,6 +59,15 @@ GAP_THICKNESSES = 2.0
 SLOPES, INTERCEPTS = (1e-3, 100.0), (-40_000.0, 40_000.0)
 """Ranges of slope and intercept.  Scanners write the slope 1, a fraction of 1 or a few; below 0 bone would be dark.
 Stored 16-bit values in the middle of their range need an intercept of 32768."""
+FEWEST_LOCATIONS, FOLLOWS = 3, 0.25
+"""Fewest slices whose SliceLocation counts, and how far, in steps, a slice may be from a line through them."""
+LOCATION_PART, LOCATION_MM = 0.05, 1.0
+"""Largest difference of the length of the stack by SliceLocation: some writers round it to whole mm."""
+FIELD_WIDER = 1.5
+"""Largest width of a picture in ReconstructionDiameters: the circle is in the square, or hardly beyond it."""
+MOST_PIXELS, FINEST_MM = 4096, 0.03
+"""More pixels along the diameter no scanner has, of those that are not of a micro-CT."""
+CLEAR_DIRECTION = 0.8
 STRAY = "values beyond the stored bits"
 
 
@@ -122,6 +131,7 @@ def _gates_of_places(stack: Stack) -> Iterator[Gate]:
     yield none_of("missing_slices", stack.missing, "slices missing in between")
     yield _judge_thickness(stack)
     yield _judge_stated_gap(stack)
+    yield _judge_stated_places(stack)
 
 
 def _judge_thickness(stack: Stack) -> Gate:
@@ -184,6 +194,72 @@ def _judge_stated_gap(stack: Stack) -> Gate:
     return at_most("stated_gap", 100.0 * found[2], bound, "%", what)
 
 
+def _judge_stated_places(stack: Stack) -> Gate:
+    """Compare position, orientation and pixel spacing with other elements that say the same."""
+    what = "elements that contradict the places of the voxels"
+    said = [text for text in (_compare_locations(stack), _compare_field(stack), _compare_letters(stack)) if text != ""]
+    wrong = [text for text in said if text is not None]
+    if not any(text is None for text in said) and not wrong:
+        return unmeasured("stated_places", 0, None, f"{what}: there are none")
+    return none_of("stated_places", len(wrong), f"{what} ({'; '.join(wrong)})" if wrong else what)
+
+
+def _compare_locations(stack: Stack) -> str | None:
+    """Compare SliceLocation with the positions: None where both move alike, "" where it cannot be compared.
+
+    It is counted from anywhere in any direction, along the normal, the table or an axis of the patient.
+    """
+    places = [header.stated_location_mm for header in stack.slices]
+    if len(places) < FEWEST_LOCATIONS or any(place is None for place in places):
+        return ""
+    along = np.abs(np.array(places, np.float64) - (places[0] or 0.0))
+    moved = np.abs(stack.positions_mm - stack.positions_mm[0])
+    distances = np.linalg.norm(moved, axis=1)
+    last = len(places) - 1
+    if along[-1] <= 0.0 or (np.diff(along) == 1.0).all():  # all at one place, or numbers of the slices
+        return ""
+    if np.abs(along / along[-1] - distances / distances[-1]).max() * last > FOLLOWS:
+        return ""  # it does not follow the slices
+    ways = [float(distances[-1]), float(stack.distances_mm[-1] - stack.distances_mm[0]), *moved[-1].tolist()]
+    nearest = min(ways, key=lambda length: abs(length - along[-1]))
+    if abs(nearest - along[-1]) <= max(LOCATION_PART * nearest, LOCATION_MM):
+        return None
+    return (
+        f"SliceLocation moves by {along[-1] / last:.4g} mm from slice to slice, ImagePositionPatient by"
+        f" {distances[-1] / last:.4g} mm"
+    )
+
+
+def _compare_field(stack: Stack) -> str | None:
+    """Compare ReconstructionDiameter with the picture, as `_compare_locations` does; pictures may be cut out of it."""
+    first = stack.slices[0]
+    diameter, pixel = first.stated_field_mm or 0.0, max(first.di_mm, first.dj_mm)
+    widest = max(first.columns * first.di_mm, first.rows * first.dj_mm)
+    if diameter <= 0.0:
+        return ""
+    if widest > FIELD_WIDER * diameter:
+        return f"ReconstructionDiameter says {diameter:g} mm, by PixelSpacing the picture is {widest:.4g} mm wide"
+    if pixel < FINEST_MM or diameter <= MOST_PIXELS * pixel:
+        return None
+    return f"ReconstructionDiameter says {diameter:g} mm, {diameter / pixel:,.0f} pixels of {pixel:g} mm"
+
+
+def _compare_letters(stack: Stack) -> str | None:
+    """Compare PatientOrientation with the directions, as `_compare_locations` does."""
+    first, directions = stack.slices[0], measure_directions(stack.slices)
+    if not first.stated_letters or first.quadruped or directions.deviation > ORIENTATION_LIMIT:
+        return ""
+    found = []
+    for direction, letters in zip((directions.row, directions.column), first.stated_letters.split("\\"), strict=True):
+        axis = int(np.argmax(np.abs(direction)))
+        letter = ("LR", "PA", "HF")[axis][int(direction[axis] < 0.0)]
+        found.append(letters if letter in letters or abs(direction[axis]) < CLEAR_DIRECTION else letter)
+    shown = "\\".join(found)
+    if shown == first.stated_letters:
+        return None
+    return f"PatientOrientation says {first.stated_letters}, by ImageOrientationPatient it is {shown}"
+
+
 def count_unknown(headers: Sequence[SliceHeader]) -> int:
     """Count slices whose values are not known to be HU."""
     return sum(
@@ -193,6 +269,8 @@ def count_unknown(headers: Sequence[SliceHeader]) -> int:
 
 SAID_BY_GATES = (
     "complete_series",
+    "stated_places",
+    "shown_places",
     "padding_share",
     "stored_bits",
     "plausible_spacing",
