@@ -139,7 +139,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--write", action="store_true", help="put the table into docs/calibration.md")
     options = parser.parse_args()
-    peers = {name: peer for name, peer in PEERS.items() if _version(peer[0])}
+    peers = {name: peer for name, peer in PEERS.items() if find_version(peer[0])}
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for number, case in enumerate(CASES):
@@ -149,12 +149,13 @@ def main() -> None:
             rows.append([case.name, read_with_clrecon(path, case), *cells])
     table = markdown_table(["case", "clrecon", *peers], rows)
     print(table)
-    print(", ".join(f"{name} {_version(peer[0])}" for name, peer in peers.items()))
+    print(", ".join(f"{name} {find_version(peer[0])}" for name, peer in peers.items()))
     if options.write:
         PAGE.write_text(put_table(PAGE.read_text(encoding="utf-8"), "meshes", table), encoding="utf-8")
 
 
-def _version(package: str) -> str:
+def find_version(package: str) -> str:
+    """Return the version of a package that is installed, else ""."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:

@@ -70,23 +70,26 @@ class Row:
     verdict : {"exact", "exact+warning", "refused"}
     words : str
         What the warning or the refusal must hold.
+    file : callable, optional
+        Writes the file alone: its path, and voxels and affine that it would have if it were not odd.
     """
 
     name: str
     write: Callable[[Path], tuple[LabelMap, np.ndarray]]
     verdict: str = EXACT
     words: str = ""
+    file: Callable[[Path], tuple[Path, np.ndarray, np.ndarray]] | None = None
 
 
 ROWS: list[Row] = []
 
 
-def row(name: str, verdict: str = EXACT, words: str = "") -> Callable[[Any], Any]:
-    def add(write: Any) -> Any:
-        ROWS.append(Row(name, write, verdict, words))
-        return write
+def add_grid(name: str, verdict: str, words: str, file: Callable[[Path], tuple[Path, np.ndarray, np.ndarray]]) -> None:
+    def write(folder: Path) -> tuple[LabelMap, np.ndarray]:
+        path, voxels, _ = file(folder)
+        return read_labels(path), voxels
 
-    return add
+    ROWS.append(Row(name, write, verdict, words, file))
 
 
 def judge(case: Row, folder: Path) -> tuple[str, str]:
@@ -124,17 +127,17 @@ def add_nifti(
 ) -> None:
     voxels = make_labels() if voxels is None else voxels
 
-    def write(folder: Path) -> tuple[LabelMap, np.ndarray]:
-        path = write_nifti(folder / "a.nii", voxels, options.pop("affine", STRAIGHT), **options)
+    def file(folder: Path) -> tuple[Path, np.ndarray, np.ndarray]:
+        path = write_nifti(folder / "a.nii", voxels, STRAIGHT, **options)
         content = bytearray(path.read_bytes())
         for field, value in (fields or {}).items():
             offset, dtype = FIELDS[field]
             stored = np.array([value], dtype).tobytes()
             content[offset : offset + len(stored)] = stored
         path.write_bytes(content)
-        return read_labels(path), voxels if wanted is None else wanted
+        return path, voxels if wanted is None else wanted, STRAIGHT
 
-    ROWS.append(Row(f"NIfTI, {name}", write, verdict, words))
+    add_grid(f"NIfTI, {name}", verdict, words, file)
 
 
 add_nifti("pixdim[0] = 0 with a qform alone", sform=False, qform=True, fields={"qfac": 0})
@@ -165,14 +168,14 @@ def edit(path: Path, old: bytes, new: bytes) -> Path:
     return path
 
 
-def add_text(name: str, file: str, old: bytes, new: bytes, verdict: str, words: str) -> None:
-    write_file = write_metaimage if ".mh" in file else (lambda *args: write_nrrd(*args, encoding="raw"))
+def add_text(name: str, file_name: str, old: bytes, new: bytes, verdict: str, words: str) -> None:
+    write_file = write_metaimage if ".mh" in file_name else (lambda *args: write_nrrd(*args, encoding="raw"))
 
-    def write(folder: Path) -> tuple[LabelMap, np.ndarray]:
-        path = write_file(folder / file, make_labels(), STRAIGHT)
-        return read_labels(edit(path, old, new)), make_labels()
+    def file(folder: Path) -> tuple[Path, np.ndarray, np.ndarray]:
+        path = write_file(folder / file_name, make_labels(), STRAIGHT)
+        return edit(path, old, new), make_labels(), STRAIGHT
 
-    ROWS.append(Row(name, write, verdict, words))
+    add_grid(name, verdict, words, file)
 
 
 add_text(

@@ -162,6 +162,14 @@ def check_holds(volume: Volume, extension: str) -> None:
     elif shear > LARGEST_SHEAR_DEGREES and not FORMATS[extension].holds_shear:
         fault = f"{extension} has axes at right angles, and this volume is sheared by {shear:.2f} degrees"
         fault += " (.nii.gz and .nrrd hold that)"
+    elif FORMATS[extension].kind == "NIfTI":
+        off = _measure_apart(volume.affine.astype(np.float32), volume.affine, volume.voxels.shape)
+        if off > SAME_PLACE_MM:
+            raise UsageError(
+                f"{extension} has places in numbers of single precision, which are up to {off:.2g} mm off so far from"
+                " the origin; .nrrd and .mha hold them"
+            )
+        return
     else:
         return
     raise UsageError(f"{fault}; resample it to a regular grid ({name_parameter('resample', 'MM')})")
@@ -170,8 +178,12 @@ def check_holds(volume: Volume, extension: str) -> None:
 def _verify(path: Path, kind: str, content: VolumeContent) -> None:
     """Read the header back."""
     grid = open_grid(path, kind, VOLUME)
-    last = np.array([*content.voxels.shape[::-1], 1.0]) - (1.0, 1.0, 1.0, 0.0)
-    ends = (np.array([0.0, 0.0, 0.0, 1.0]), last)
-    off = max(float(np.abs((grid.affine - content.affine) @ end).max()) for end in ends)
+    off = _measure_apart(grid.affine, content.affine, content.voxels.shape)
     if grid.shape_ijk != content.voxels.shape[::-1] or off > SAME_PLACE_MM or grid.scaled:
         raise OutputError("the volume file was not written rightly: its header reads back otherwise")
+
+
+def _measure_apart(affine: NDArray[Any], other: NDArray[np.float64], shape: tuple[int, ...]) -> float:
+    """Return how far, along an axis, the first or last voxel of a shape (nk, nj, ni) lies from its place in another."""
+    last = np.array([*shape[::-1], 1.0]) - (1.0, 1.0, 1.0, 0.0)
+    return max(float(np.abs((affine - other) @ end).max()) for end in (np.array([0.0, 0.0, 0.0, 1.0]), last))
