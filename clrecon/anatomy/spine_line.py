@@ -161,7 +161,7 @@ CANAL_WIDTH_MM = 11.0
 class SpineLine:
     """The middle of the spinal canal.
 
-    points: (n, 3). LPS mm, from the head downwards, about 10 mm apart.
+    points: (n, 3). LPS mm, from the head downwards, about 15 mm apart.
     sure_share: Share of the slices of the line whose traits are all sure, see `clrecon.anatomy.spine_cells.SURE`.
     searched_mm: Height of the volume; the line may be shorter.
     sure_mm: Heights between which its slices are sure, but for gaps, z of the upper and the lower end.

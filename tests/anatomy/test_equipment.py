@@ -8,6 +8,7 @@ from beside_bodies import METAL_HU, PLASTIC_HU, RAIL_HU, X, Y, Z, as_scan, box, 
 from variants import daily
 
 from clrecon.anatomy.body import remove_table
+from clrecon.anatomy.dense_pieces import _is_bar
 from clrecon.errors import RefusedInputError
 
 CLIP = box((0, 70, 20), (8, 8, 12))
@@ -86,3 +87,11 @@ def test_a_dry_shaft_beside_a_patient_is_no_bar():
     cleaned = remove_table(as_scan(hu))
     assert cleaned.report["remove_table"]["bone_voxels"] >= np.count_nonzero(bone) + 0.95 * np.count_nonzero(shaft)
     assert (cleaned.voxels > 600)[shaft].all()
+
+
+@pytest.mark.parametrize(
+    ("cells", "found"), [((34, 2, 2), False), ((35, 2, 2), True), ((36, 12, 12), False), ((38, 12, 12), True)]
+)
+def test_a_bar_is_50_mm_long_and_three_times_its_thickness(cells, found):
+    """Between the first and the last middle of cells of 1.5 mm."""
+    assert _is_bar(np.ones(cells, bool), np.full(cells, 500, np.float32), (1.5, 1.5, 1.5)) == found

@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 
 import clrecon
 from clrecon.anatomy import iso_choice
-from clrecon.anatomy.iso_choice import choose_iso_value, half_iso_value
+from clrecon.anatomy.iso_choice import choose_iso_value, half_iso_value, lies_in_air
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.proof.phantom import PhantomSettings, make_phantom
@@ -76,8 +76,9 @@ def test_faint_homogeneous_bone_is_not_taken_for_contrast_medium() -> None:
 
 
 def test_a_specimen_in_air_is_cut_half_way_to_air() -> None:
-    chosen = choose_iso_value(as_volume(make_ball(1000.0, -1000.0, 0.8, 30.0)))
-    assert abs(chosen.iso_value) <= tolerances.HALF_WAY_STEP_SHARE * 2000.0
+    volume = as_volume(make_ball(1000.0, -1000.0, 0.8, 30.0))
+    chosen = choose_iso_value(volume)
+    assert lies_in_air(volume) and abs(chosen.iso_value) <= tolerances.HALF_WAY_STEP_SHARE * 2000.0
     assert chosen.background == "air" and "between air" in chosen.reason
 
 
@@ -262,6 +263,7 @@ def test_what_has_no_two_materials_is_refused(name) -> None:
     with pytest.raises(NoSurfaceError, match=words) as caught:
         choose_iso_value(as_volume(field))
     assert "iso_value=N" in str(caught.value) and "\n" not in str(caught.value)
+    assert not lies_in_air(as_volume(field))
 
 
 def test_nan_is_refused() -> None:
