@@ -492,4 +492,4 @@ def _median(values: NDArray[Any], weights: NDArray[Any], share: float = 0.5) -> 
         return 0.0
     order = np.argsort(values, kind="stable")
     summed = np.cumsum(weights[order], dtype=np.float64)
-    return float(values[order][min(np.searchsorted(summed, share * summed[-1]), len(values) - 1)])
+    return float(values[order[np.searchsorted(summed, share * summed[-1])]])

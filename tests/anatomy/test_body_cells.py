@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from clrecon.anatomy.body import _fill_holes, find_unmeasured
+from clrecon.anatomy.body import _fill_holes, _find_cavities, find_unmeasured
 from clrecon.anatomy.body_cells import count_cells, grow, measure_cells
 from clrecon.geometry import Volume
 
@@ -85,3 +85,14 @@ def test_what_is_not_measured_begins_at_the_corners_and_is_large():
     expected = np.zeros((20, 20), bool)
     expected[:4, :4] = True
     assert all(np.array_equal(out, own) for out, own in zip(found, [expected, expected[:, ::-1]] * 3, strict=True))
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_air_within_a_cell_of_the_border_of_the_scan_is_no_cavity(turns):
+    for place, found in ((0, False), (1, False), (2, True)):
+        tissue = np.ones((1, 12, 12), bool)
+        tissue[:, 5:8, place : place + 3] = False
+        tissue = np.rot90(tissue, turns, (1, 2))
+        cells = np.where(tissue, np.arange(144).reshape(tissue.shape), -1000).astype(np.float32)
+        cavities = _find_cavities(cells, tissue, np.zeros_like(tissue), 2.0)
+        assert np.array_equal(cavities, ~tissue if found else np.zeros_like(tissue))

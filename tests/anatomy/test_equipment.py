@@ -8,7 +8,7 @@ from beside_bodies import METAL_HU, PLASTIC_HU, RAIL_HU, X, Y, Z, as_scan, box, 
 from variants import daily
 
 from clrecon.anatomy.body import remove_table
-from clrecon.anatomy.dense_pieces import _is_bar
+from clrecon.anatomy.dense_pieces import _is_bar, _measure_sections
 from clrecon.errors import RefusedInputError
 
 CLIP = box((0, 70, 20), (8, 8, 12))
@@ -90,8 +90,18 @@ def test_a_dry_shaft_beside_a_patient_is_no_bar():
 
 
 @pytest.mark.parametrize(
-    ("cells", "found"), [((34, 2, 2), False), ((35, 2, 2), True), ((36, 12, 12), False), ((38, 12, 12), True)]
+    ("cells", "found"),
+    [((34, 2, 2), False), ((35, 2, 2), True), ((36, 12, 12), False), ((38, 12, 12), True), ((7, 41, 4), True)],
 )
 def test_a_bar_is_50_mm_long_and_three_times_its_thickness(cells, found):
-    """Between the first and the last middle of cells of 1.5 mm."""
-    assert _is_bar(np.ones(cells, bool), np.full(cells, 500, np.float32), (1.5, 1.5, 1.5)) == found
+    """Between the first and the last middle of cells of 1.5 mm; a bar across has slices of 3 mm."""
+    size_mm = (3.0 if cells[0] == 7 else 1.5, 1.5, 1.5)
+    assert _is_bar(np.ones(cells, bool), np.full(cells, 500, np.float32), size_mm) == found
+
+
+def test_sections_of_an_even_bar_have_the_same_weight():
+    """40 cells of 1.5 mm, less half a cell at both ends: four sections of 57 / 4 mm, of 9.5 cells."""
+    along, across = 1.5 * np.arange(40.0), np.tile([0.5, -2.0], (40, 1))
+    middles, sums = _measure_sections(along, across, np.full(40, 3.0), 1.5)
+    np.testing.assert_allclose(sums, 3.0 * 9.5, rtol=1e-12)
+    np.testing.assert_allclose(middles, across[:4], rtol=1e-12)

@@ -82,6 +82,24 @@ def test_a_specimen_in_air_is_cut_half_way_to_air() -> None:
     assert chosen.background == "air" and "between air" in chosen.reason
 
 
+@pytest.mark.parametrize(
+    ("mode", "noise", "around"),
+    [
+        (40, 20.0, ("soft tissue", 140, -210.0, 80.0)),
+        (40, 60.0, ("soft tissue", 280, -210.0, 160.0)),
+        (-1000, 20.0, ("air", 150, -np.inf, -950.0)),
+        (-1000, 60.0, ("air", 150, -np.inf, -880.0)),
+    ],
+)
+def test_the_range_of_what_bone_lies_in(mode, noise, around) -> None:
+    hu = np.arange(iso_choice.LOWEST_HU, iso_choice.HIGHEST_HU + 1)
+    found = iso_choice._find_background(1e5 * np.exp(-0.5 * ((hu - mode) / noise) ** 2))
+    assert found.mode == pytest.approx(mode, abs=1.0) and found.noise == pytest.approx(noise, abs=1.0)
+    name, *figures = around
+    assert found.name == name
+    assert [found.seed, found.lowest, found.highest] == pytest.approx(figures, abs=4.0)
+
+
 @pytest.mark.release
 @pytest.mark.seconds
 def test_the_spine_is_cut_where_its_surface_is_nearest(comparison) -> None:
@@ -230,6 +248,10 @@ def test_padding_filled_with_air_does_not_hide_the_noise_of_air() -> None:
     assert choose_iso_value(filled) == expected
     filled.report["padding_hu"] = None
     assert choose_iso_value(filled).noise_hu < 20
+    for share, left in ((0.04, 6.0), (0.1, 0.0), (0.2, 0.0)):
+        counts = np.full(3000, 10.0)
+        iso_choice._leave_padding(counts, 100, {"padding_hu": iso_choice.LOWEST_HU + 7, "padding_share": share})
+        assert counts[7] == left and counts.sum() == 29_990 + left
 
 
 # --- what is refused ---
