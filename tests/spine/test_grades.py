@@ -8,7 +8,7 @@ from box_vertebra import HALF_HU, BoxVertebra, grid_around, turned
 from variants import daily
 
 from clrecon.errors import UsageError
-from clrecon.spine.frame import VertebraFrame, find_frame
+from clrecon.spine.frame import VertebraFrame, _basis, _look_through, find_frame
 from clrecon.spine.measures import Screw, grade_breach, grade_screw
 from clrecon.spine.solid_bone import SolidBone, fill_vertebra
 
@@ -99,3 +99,14 @@ def test_screws_that_cannot_be_graded_are_refused(placed: tuple[SolidBone, Verte
     ):
         with pytest.raises(UsageError, match=said):
             Screw(np.array(entry), there.tip, diameter)
+
+
+def test_a_tube_is_looked_through_along_its_axis() -> None:
+    """A wall of 1.5 mm round a hole of 12 mm that leans between the directions that are tried first."""
+    basis = _basis(3.3, -11.0)
+    around = np.linspace(0.0, 2.0 * np.pi, 110, endpoint=False)
+    radius, angle, height = np.meshgrid(np.arange(12.0, 13.6, 0.5), around, np.arange(-20.0, 20.5))
+    tube = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1).reshape(-1, 3)
+    found, axes, centre = _look_through(tube @ basis)
+    assert np.degrees(np.arccos(axes[2] @ basis[2])) < 0.3
+    assert found == pytest.approx(11.0, abs=0.5) and np.abs(centre).max() < 0.5
