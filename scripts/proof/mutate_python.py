@@ -49,6 +49,7 @@ EQUIVALENTS = Path(__file__).with_name("equivalent_changes.json")
 ROOM_TESTS = {
     "labels": ("tests/operators/surface/test_label_masks.py", "tests/operators/surface/test_label_surfaces.py"),
     "geometry": ("tests/jobs/test_cropping.py",),
+    "exchange": ("tests/points/test_reader.py", "tests/mesh/test_mesh_reader.py"),
     "jobs": ("tests/cli/test_info.py",),
     "system": ("tests/cli/test_foreign_words.py", "tests/guards/test_wrong_arguments.py"),
     "cli": ("tests/jobs/test_inside_job.py", "tests/jobs/test_stats_job.py", "tests/proof/compare/test_compare_job.py"),

@@ -13,6 +13,7 @@ from clrecon import Mesh
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.exchange.formats import MESH_INPUTS
 from clrecon.exchange.stl import join_corners
+from clrecon.exchange.vtp import has_polygons
 
 BALL = Mesh(*ball(8.0, 12))
 
@@ -51,6 +52,18 @@ def test_files_of_others_are_lps_unless_said(tmp_path: Path) -> None:
         head + "element face 1\nproperty list uchar int vertex_index\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
     )
     assert clrecon.read_mesh(ply).triangles.tolist() == [[0, 1, 2]]
+    columns = "".join(f"property float {name}\n" for name in ("confidence", "scalar_HU", "scalar_2nd", "scalar_"))
+    rows = "".join(f"{point} 1 {n} 3 4\n" for n, point in enumerate(("0 0 0", "1 0 0", "0 1 0")))
+    faces = "element face 1\nproperty list uchar int vertex_index\nend_header\n"
+    ply.write_text(f"{head}{columns}{faces}{rows}3 0 1 2\n")
+    assert {name: values.tolist() for name, values in clrecon.read_mesh(ply).values.items()} == {"HU": [0, 1, 2]}
+
+
+def test_polygons_are_looked_for_in_the_first_mebibyte(tmp_path: Path) -> None:
+    mark = b'NumberOfPolys="1"'
+    for before, found in ((2**20 - len(mark), True), (2**20 - len(mark) + 1, False)):
+        (tmp_path / "a.vtp").write_bytes(bytes(before) + mark + bytes(9))
+        assert has_polygons(tmp_path / "a.vtp") == found
 
 
 def test_corners_are_joined_where_they_are_equal() -> None:

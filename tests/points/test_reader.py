@@ -93,6 +93,13 @@ def test_pickled_arrays_are_refused(tmp_path):
         read_points(tmp_path / "a.npz")
 
 
+@pytest.mark.parametrize("points", [np.zeros((2, 4)), np.zeros(3), np.zeros((2, 3), complex), np.zeros((2, 3), bool)])
+def test_arrays_that_are_no_points_are_refused(points, tmp_path):
+    np.savez(tmp_path / "a.npz", points=points)
+    with pytest.raises(RefusedInputError, match=r"^a.npz has points of shape \(.*\) and type .*: \(n, 3\) is needed$"):
+        read_points(tmp_path / "a.npz")
+
+
 @pytest.mark.parametrize("mode", ["Ascii", "Binary", "Appended"])
 @pytest.mark.parametrize("packing", ["None", "ZLib"])
 @pytest.mark.parametrize("base64", [True, False])
@@ -174,10 +181,16 @@ def test_the_frame_of_a_file(tmp_path):
         ("a.xyz", "", "is no cloud that is read"),
         ("a.npz", b"PK\3\4" + bytes(100), "is cut or corrupt"),
         ("a.las", b"LASF" + bytes(100), "is cut: it has 104 bytes"),
+        ("a.las", b"LASF" + bytes(20) + b"\1\4" + bytes(348), "is cut: it has 374 bytes"),
         (
             "a.las",
             b"LASF" + bytes(20) + b"\1\2" + bytes(74) + b"\xff" * 4 + b"\0\x14" + bytes(200),
-            "variable records have no room",
+            "4,294,967,295 and 0 variable records have no room",
+        ),
+        (
+            "a.las",
+            b"LASF" + bytes(20) + b"\1\4" + bytes(78) + b"\0\x14" + bytes(137) + b"\xff" * 4 + bytes(200),
+            "0 and 4,294,967,295 variable records have no room",
         ),
         ("a.vtp", '<VTKFile type="ImageData"></VTKFile>', "holds 'ImageData' of VTK"),
         ("a.vtp", '<VTKFile type="PolyData"><PolyData/></VTKFile>', "has no points"),
