@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -104,3 +106,26 @@ def test_the_document_says_what_they_are() -> None:
         if begins:
             points = preset.transfer_function.points
             assert float(begins.split()[0]) == points[np.flatnonzero(points[:, 4] > 0)[0] - 1, 0]
+
+
+POINTS = {
+    "bone": 0xAA76027B,
+    "spine": 0x07A3E427,
+    "skin": 0x73ACC3B2,
+    "lung": 0x8FB2EF29,
+    "vessels": 0x81DDA3D3,
+    "muscle": 0x1C6EF3A8,
+    "metal": 0xC2DECF6E,
+    "x-ray": 0xCBDD13C3,
+    "mip": 0x64184FCC,
+    "minip": 0x2D0CE1AD,
+}
+"""Checksums of the points of each preset."""
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("name", NAMES)
+def test_a_preset_shows_what_it_showed_in_earlier_versions(name: str) -> None:
+    """Who changes one on purpose says so in CHANGELOG.md, and writes the new figure here."""
+    points = PRESETS[name].transfer_function.points.tolist()
+    assert f"{zlib.crc32(json.dumps(points).encode()):08X}" == f"{POINTS[name]:08X}"

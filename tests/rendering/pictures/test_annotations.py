@@ -123,7 +123,8 @@ def test_the_bar_is_as_long_as_it_says(size, background, ink):
 def test_on_white_the_bar_is_black():
     picture = make_picture((300, 200), WHITE)
     marked = picture.annotated(scale_bar=True)
-    assert bar_pixels(marked, 0).max() == 100.0  # 100 mm at 1 mm a pixel
+    bar = bar_pixels(marked, 0)
+    assert bar.max() == 100.0 and np.count_nonzero(bar == 100.0) == 2  # 100 mm at 1 mm a pixel, 2 pixels thick
     assert marked.image[~drawn(picture, marked)].tolist() == picture.image[~drawn(picture, marked)].tolist()
 
 

@@ -11,6 +11,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.rendering.views.directions import DIRECTIONS
+from clrecon.rendering.views.reformation import plane_sheet
 
 CENTRE = np.array([12.0, -30.0, 850.0])
 MARKS = {name: CENTRE + 20.0 * np.array(direction) for name, direction in DIRECTIONS.items()}
@@ -285,3 +286,12 @@ def test_a_parallel_camera_with_a_centre_stays_outside_of_the_volume(view):
         assert depths.min() >= radius - 1e-6
         pixel, _ = camera.project([center], SIZE)
         np.testing.assert_allclose(pixel[0], (200.0, 150.0), atol=1e-6)
+
+
+@pytest.mark.unit
+def test_the_pixels_of_a_plane_lie_about_the_focal_point() -> None:
+    camera = Camera((7.0, -50.0, 9.0), (7.0, 0.0, 9.0), (0.0, 0.0, 1.0), parallel_scale=6.0)
+    sheet, own = plane_sheet(camera, (5, 3), 2.0)
+    assert sheet.origins.tolist() == [[-1, 2, 13], [-1, 2, 9], [-1, 2, 5]] and sheet.width == 5
+    assert sheet.steps.tolist() == [[4, 0, 0]] * 3 and sheet.normals.tolist() == [[0, 1, 0]] * 3
+    assert own == Camera((7.0, -48.0, 9.0), (7.0, 2.0, 9.0), (0.0, 0.0, 1.0), parallel_scale=6.0)
