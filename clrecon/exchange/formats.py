@@ -73,7 +73,7 @@ FORMATS = {extension: own for extension, own in REGISTRY.items() if own.meshes}
 CLOUD_FORMATS = {extension: own for extension, own in REGISTRY.items() if own.clouds}
 ASSEMBLIES = tuple(extension for extension, own in FORMATS.items() if own.holds_many)
 MESH_INPUTS = tuple(extension for extension, own in FORMATS.items() if own.is_read)
-CLOUD_INPUTS = (*CLOUD_FORMATS, ".csv", ".txt")
+CLOUD_INPUTS = (*CLOUD_FORMATS, ".csv", ".txt", ".asc")
 
 
 def list_extensions(extensions: Sequence[str]) -> str:

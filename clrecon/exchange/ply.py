@@ -138,12 +138,16 @@ _PIECE = 1 << 16
 
 @dataclass
 class Element:
-    """An element of a file: its rows, their numbers by name, and their lists by name (types of count and entries)."""
+    """An element of a file: its rows, their numbers by name, and their lists by name (types of count and entries).
+
+    leading: Number of numbers before the first list.
+    """
 
     name: str
     count: int
     types: dict[str, str] = field(default_factory=dict)
     lists: dict[str, tuple[str, str]] = field(default_factory=dict)
+    leading: int = 0
 
 
 @dataclass
@@ -206,6 +210,7 @@ def read_header(stream: BinaryIO, name: str) -> Header:
 
 def _add_property(element: Element, words: list[str], number: int, name: str) -> None:
     if len(words) == 4 and words[0] == "list" and words[1] in _TYPES and words[2] in _TYPES:
+        element.leading = element.leading if element.lists else len(element.types)
         element.lists[words[3]] = _TYPES[words[1]], _TYPES[words[2]]
         return
     if len(words) != 2 or words[0] not in _TYPES or words[1] in element.types:
@@ -301,10 +306,12 @@ def read_mesh(path: Path) -> RawMesh:
     said = read_remarks(header.comments)
     color = _one_color(found)
     parts = [] if color is None else [Part("", len(triangles), color)]
+    warnings = [f"numbers at faces left out: {escape_text(', '.join(face.types))}"] if face.types else []
     named = {own[7:]: column for own, column in found.items() if own.startswith("scalar_") and own.isascii()}
     with np.errstate(all="ignore"):  # harmed bits
         values = {own: column.astype(np.float32) for own, column in named.items() if own.isidentifier()}
-    return RawMesh("PLY", points, triangles, normals, warnings=cloud.warnings, parts=parts, values=values, **said)
+    warnings += cloud.warnings
+    return RawMesh("PLY", points, triangles, normals, warnings=warnings, parts=parts, values=values, **said)
 
 
 def _one_color(columns: Mapping[str, NDArray[Any]]) -> tuple[float, float, float] | None:
@@ -322,15 +329,17 @@ def _find_faces(header: Header, vertex: Element, name: str) -> Element:
     face = header.elements[place] if place < len(header.elements) else None
     if face is None or face.name != "face":
         raise RefusedInputError(f"{name} has no faces after its vertices: it is no mesh, perhaps a cloud of points")
-    if len(face.lists) != 1 or not set(face.lists) <= set(_CORNERS) or face.types:
-        known = escape_text(", ".join((*face.lists, *face.types)))
-        raise RefusedInputError(f"the faces of {name} have {known}: one list of vertices alone is read")
+    if len(face.lists) != 1 or not set(face.lists) <= set(_CORNERS):
+        known = escape_text(", ".join(face.lists)) or "no list"
+        raise RefusedInputError(f"the faces of {name} have {known}: one list, of vertices, is read")
     return face
 
 
 def _read_faces(stream: BinaryIO, header: Header, face: Element, name: str, size: int) -> NDArray[Any]:
     ((count, corner),) = face.lists.values()
-    row = np.dtype([("count", header.order + count), ("corners", header.order + corner, (3,))])
+    numbers = [(f"own {name_of}", header.order + kind) for name_of, kind in face.types.items()]
+    corners = [("count", header.order + count), ("corners", header.order + corner, (3,))]
+    row = np.dtype([*numbers[: face.leading], *corners, *numbers[face.leading :]])
     left = size - stream.tell()
     if face.count * row.itemsize > left:
         raise RefusedInputError(
@@ -349,7 +358,7 @@ def _read_lines(text: BinaryIO, vertex: Element, face: Element, name: str) -> ND
         warnings.simplefilter("ignore")  # about empty lines
         table = np.loadtxt(
             io.TextIOWrapper(text, encoding="latin-1"), comments=None, ndmin=2, dtype=np.int64, skiprows=vertex.count,
-            max_rows=face.count,
+            max_rows=face.count, usecols=range(face.leading, face.leading + 4) if face.types else None,
         )  # fmt: skip
     if len(table) != face.count or table.shape[1] != 4:
         raise RefusedInputError(f"{name} is cut or corrupt, or has faces that are not triangles")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -124,8 +125,19 @@ def read_remarks(lines: Iterable[str]) -> dict[str, Any]:
 
 
 def say_cut(name: str, error: object) -> RefusedInputError:
-    """Return the error for a file that ends early or holds what its format forbids."""
-    return RefusedInputError(f"{name} is cut or corrupt: {escape_text(str(error) or type(error).__name__, 120)}")
+    """Return the error for a file that ends early or holds what its format forbids; numpy's of tables in our words."""
+    said = str(error) or type(error).__name__
+    if found := _COLUMNS.match(said):
+        before, now, row = found.groups()
+        said = f"row {row} of its table has {now} numbers, those before have {before}"
+    elif found := _NO_NUMBER.match(said):
+        word, row, column = found.groups()
+        said = f"{word} stands in place of a number in row {int(row) + 1} of its table, column {column}"
+    return RefusedInputError(f"{name} is cut or corrupt: {escape_text(said, 120)}")
+
+
+_COLUMNS = re.compile(r"the number of columns changed from (\d+) to (\d+) at row (\d+)")
+_NO_NUMBER = re.compile(r"could not convert string (.*) to \w+ at row (\d+), column (\d+)")
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from clrecon.points import PointCloud
 
 
-OTHER_CLOUDS = (".pcd", ".e57", ".laz", ".pts", ".ptx", ".asc")
+OTHER_CLOUDS = (".pcd", ".e57", ".laz", ".pts", ".ptx")
 """Extensions of clouds that are not read."""
 
 _OF_BOTH = ("keep_ids", "device", "memory")

@@ -25,8 +25,24 @@ MOST_POINTS = 2**31 - 1
 """Most points of a cloud, so that their numbers fit a signed 32-bit integer."""
 
 
+def _as_array(values: ArrayLike, name: str) -> NDArray[Any]:
+    try:
+        return np.asarray(values)
+    except ValueError as error:
+        raise UsageError(f"{name} are rows of unequal length") from error
+
+
+def _as_numbers(array: NDArray[Any], name: str, dtype: DTypeLike) -> NDArray[Any]:
+    """Return an array in the type in which a cloud keeps it, which must hold its values."""
+    if dtype is np.int32 and not (array.dtype.kind in "iu" and np.can_cast(array.dtype, np.int32)):
+        with np.errstate(invalid="ignore"):
+            if not np.array_equal(array.astype(np.int32), array):
+                raise UsageError(f"{name} are whole numbers of 32 bits, some of these are not")
+    return np.ascontiguousarray(array, dtype=dtype)
+
+
 def _rows(values: ArrayLike, name: str) -> NDArray[Any]:
-    array = np.asarray(values)
+    array = _as_array(values, name)
     if array.size == 0 and array.ndim < 2:
         array = array.reshape(0, 3)
     if array.ndim != 2 or array.shape[1] != 3:
@@ -124,7 +140,7 @@ class PointCloud(Message, ShownAsHtml):
         if name == "labels":
             return self._values(values, name, np.int32, "iu")
         dtype: DTypeLike = np.float32 if name == "normals" else np.int32
-        vectors = np.ascontiguousarray(_rows(values, name), dtype=dtype)
+        vectors = _as_numbers(_rows(values, name), name, dtype)
         if len(vectors) != len(self._points):
             raise UsageError(f"{len(vectors):,} {name} for {len(self._points):,} points: one a point is needed")
         if name == "normals":
@@ -132,12 +148,12 @@ class PointCloud(Message, ShownAsHtml):
         return vectors
 
     def _values(self, values: ArrayLike, name: str, dtype: DTypeLike, kinds: str) -> NDArray[Any]:
-        array = np.asarray(values)
+        array = _as_array(values, name)
         if array.shape != (len(self._points),):
             raise UsageError(f"{name} have shape ({len(self._points)},), one value a point; these have {array.shape}")
         if array.size and array.dtype.kind not in kinds:
             raise UsageError(f"{name} are {'numbers' if 'f' in kinds else 'whole numbers'}, these are {array.dtype}")
-        return np.ascontiguousarray(array, dtype=dtype)
+        return _as_numbers(array, name, dtype)
 
     @property
     def points(self) -> NDArray[np.floating]:

@@ -338,3 +338,40 @@ def check_refused(path: Path, words: str) -> None:
     with pytest.raises(RefusedInputError, match=words) as error:
         clrecon.read_mesh(path)
     assert "\n" not in str(error.value) and path.name in str(error.value)
+
+
+FACE_ROW = [("shade", "f4"), ("count", "u1"), ("corners", "i4", (3,)), ("red", "u1"), ("flag", "i2")]
+FACE_HEAD = """property float shade
+property list uchar int vertex_indices
+property uchar red
+property short flag
+end_header
+"""
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_numbers_at_the_faces_of_a_ply_file_are_left_out_with_a_warning(tmp_path: Path, form: str) -> None:
+    """MeshLab writes colours, flags and qualities at faces, before or after the list of corners."""
+    points, faces = (np.array(each) for each in TETRA)
+    order = ">" if "big" in form else "<"
+    head = f"ply\nformat {form} 1.0\nelement vertex 4\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    head += f"element face 4\n{FACE_HEAD}"
+    rows = np.zeros(4, np.dtype(FACE_ROW).newbyteorder(order))
+    rows["shade"], rows["count"], rows["corners"], rows["red"], rows["flag"] = 0.5, 3, faces, 200, -7
+    body = points.astype(f"{order}f4").tobytes() + rows.tobytes()
+    if form == "ascii":
+        lines = [" ".join(map(str, point)) for point in points]
+        lines += [f"0.5 3 {' '.join(map(str, face))} 200 -7" for face in faces]
+        body = ("\n".join(lines) + "\n").encode()
+    (tmp_path / "a.ply").write_bytes(head.encode() + body)
+    mesh = clrecon.read_mesh(tmp_path / "a.ply")
+    assert np.array_equal(mesh.vertices, points) and np.array_equal(mesh.triangles, faces)
+    assert "numbers at faces left out: shade, red, flag" in mesh.report["file"]["warnings"]
+
+
+def test_faces_of_four_corners_beside_numbers_are_refused(tmp_path: Path) -> None:
+    head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    text = f"{head}element face 1\n{FACE_HEAD}0 0 0\n1 0 0\n1 1 0\n0 1 0\n0.5 4 0 1 2 3 200 -7\n"
+    (tmp_path / "a.ply").write_text(text)
+    with pytest.raises(RefusedInputError, match="face 0 of a.ply has 4 corners: only triangles are read"):
+        clrecon.read_mesh(tmp_path / "a.ply")

@@ -127,3 +127,23 @@ def test_a_step_counts_by_reason() -> None:
     step = PointStep(a_cloud(2), np.array([0, 2, 1, 2, 0], np.uint8), ("noise", "sheet", "ghost"), {"eps_mm": 1.2})
     assert step.counts == {"noise": 1, "sheet": 2, "ghost": 0}
     assert step.as_dict() == {"points_before": 5, "points_after": 2, "removed": step.counts, "eps_mm": 1.2}
+
+
+RAGGED = [[1.0, 2.0, 3.0], [4.0, 5.0]]
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"points": RAGGED}, "points are rows of unequal length"),
+        ({"normals": RAGGED}, "normals are rows of unequal length"),
+        ({"hu": [1.0, [2.0]]}, "hu are rows of unequal length"),
+        ({"labels": [1, 2**40]}, "labels are whole numbers of 32 bits"),
+        ({"ijk": [[0, 0, 0], [0, 0, 2.0**40]]}, "ijk are whole numbers of 32 bits"),
+        ({"ijk": [[0, 0, 0], [0, 0, np.nan]]}, "ijk are whole numbers of 32 bits"),
+        ({"ijk": [[0, 0, 0], [0, 0, 1.5]]}, "ijk are whole numbers of 32 bits"),
+    ],
+)
+def test_values_that_no_cloud_can_have_are_refused_by_name(values: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        PointCloud(**{"points": [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], **values})

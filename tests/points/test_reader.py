@@ -302,3 +302,25 @@ def test_a_unit_is_doubted_by_the_longest_side(side, unit, tmp_path):
 def test_more_points_than_a_number_of_32_bits_can_tell_are_refused():
     with pytest.raises(RefusedInputError, match="^a.npz has 2,147,483,648 points: 1 to 2,147,483,647 are read$"):
         _check_points(LongTable(2**31), "a.npz")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("1 2 3\n4 5 6\n7 8\n", "row 3 of its table has 2 numbers, those before have 3"),
+        ("1 2 3\n4 x 6\n", "'x' stands in place of a number in row 2 of its table, column 2"),
+        ("1,5 2,5 3,5\n2,5 3,5 4,5\n", "in place of a number in row 1 of its table"),
+    ],
+)
+def test_tables_with_faults_are_named_by_row_without_words_of_numpy(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "a.xyz").write_text(text)
+    with pytest.raises(RefusedInputError) as caught:
+        read_points(tmp_path / "a.xyz")
+    assert words in str(caught.value)
+    assert not any(word in str(caught.value) for word in ("usecols", "float64", "convert"))
+
+
+@pytest.mark.parametrize("name", ["a.asc", "A.ASC", "a.pts"])
+def test_tables_of_numbers_are_read_by_content_whatever_they_are_called(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("X;Y;Z\n1;2;3\n4;5;6\n")
+    assert read_points(tmp_path / name).points.tolist() == [[1, 2, 3], [4, 5, 6]]

@@ -70,6 +70,12 @@ def test_clouds_that_are_not_read_are_no_scans(
     assert f"clouds in files {name[1:].lower()} are not read: convert it to one of .ply," in capsys.readouterr().err
 
 
+def test_a_cloud_of_numbers_may_be_called_asc(tmp_path: Path, cloud_command: Any) -> None:
+    source = write_ball(tmp_path / "free.xyz", 10.0).rename(tmp_path / "free.asc")
+    assert cloud_command(source, output="a.ply") == 0
+    assert len(clrecon.read_points(tmp_path / "a.ply")) == len(clrecon.read_points(source))
+
+
 def test_a_single_point_has_no_cells(tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "one.xyz").write_text("1 2 3\n")
     assert cloud_command(tmp_path / "one.xyz", "--denoise", "grid") == 3
