@@ -17,6 +17,7 @@ from clrecon.operators.surface.label_masks import extract_label_masks
 from clrecon.rendering.pictures.label_style import distinct_colors
 from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.rendering.pictures.styles import DEFAULT_ISO_VALUE
+from clrecon.rendering.views.directions import DIRECTIONS
 from clrecon.system.display import Display, DisplayProbe, NoDisplayError
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.viewer.model.objects import (
@@ -42,7 +43,7 @@ BONE = (0.90, 0.86, 0.78)
 
 KEYS = "c: clip plane, again: without   m: measure, again: without   1 to 6: sides of the patient   q: quit"
 
-_SIDES = {"1": (0, -1, 0), "2": (0, 1, 0), "3": (1, 0, 0), "4": (-1, 0, 0), "5": (0, 0, 1), "6": (0, 0, -1)}
+_SIDES = {str(key): side for key, side in enumerate(DIRECTIONS.values(), start=1)}
 """Where the camera stands, LPS: anterior, posterior, left, right, superior, inferior."""
 
 _LISTEN_MS = 100

@@ -96,8 +96,12 @@ def test_it_ends_by_ctrl_c_and_by_the_window_manager(display, tmp_path, how):
 
 
 @pytest.mark.opencl
-def test_everything_lies_in_one_scene_and_the_slider_sets_the_surface(device):
+def test_everything_lies_in_one_scene_and_the_slider_sets_the_surface(device, monkeypatch):
     need_screen()
+    plotters, asked, keys = pytest.importorskip("pyvista").Plotter, [], {}
+    monkeypatch.setattr(plotters, "add_key_event", lambda self, key, callback: keys.update({key: callback}))
+    for name in ("add_measurement_widget", "clear_measure_widgets", "add_plane_widget", "clear_plane_widgets"):
+        monkeypatch.setattr(plotters, name, lambda *given, name=name, **named: asked.append(name))
     objects = show_objects([make_scan(), make_mesh(), make_cloud(), make_labels()], ["", "front"])
     with open_plotter(objects, iso_value=ISO, device=device, off_screen=True) as plotter:
         actors = plotter.renderer.actors
@@ -105,7 +109,15 @@ def test_everything_lies_in_one_scene_and_the_slider_sets_the_surface(device):
         surface = actors["scan 1"].mapper.dataset
         mesh = clrecon.extract_isosurface(make_scan(), ISO, device=device)
         np.testing.assert_array_equal(np.sort(surface.points, axis=0), np.sort(mesh.vertices, axis=0))
+        assert actors["cloud 3"].prop.point_size == 3
         assert plotter.camera.position[1] < plotter.camera.focal_point[1]  # it looks from anterior
+        for key in "mmcc":
+            keys[key]()
+        assert asked == ["add_measurement_widget", "clear_measure_widgets", "add_plane_widget", "clear_plane_widgets"]
+        for key, axis, sign in (("3", 0, 1), ("4", 0, -1), ("5", 2, 1), ("6", 2, -1)):  # left, right, above, below
+            keys[key]()
+            away = np.subtract(plotter.camera.position, plotter.camera.focal_point)
+            assert np.argmax(np.abs(away)) == axis and sign * away[axis] > 0.999 * np.linalg.norm(away)
 
 
 def test_methods_and_the_function_show_the_same(monkeypatch):

@@ -12,6 +12,7 @@ import numpy as np
 from clrecon.errors import UsageError
 from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import Float64Array
+from clrecon.rendering.looks.window import BONE_WINDOW
 from clrecon.rendering.pictures.annotations import edge_letters
 from clrecon.rendering.pictures.styles import DEFAULT_ISO_VALUE
 from clrecon.rendering.views.clip import Clip
@@ -20,7 +21,6 @@ from clrecon.rendering.views.reformation import PLANES
 from clrecon.system.text import format_hu, unknown_name
 from clrecon.viewer.model.changes import ChangingView, checked_numbers, fit_camera, plane_step
 from clrecon.viewer.model.objects import (
-    SLICE_WINDOW,
     ShownLabels,
     ShownObject,
     ShownScan,
@@ -77,7 +77,7 @@ class ViewModel(ChangingView):
             camera=fit_camera(corners, "anterior", 1.0),
             mode="labels" if only_labels else "surface",
             iso_value=min(high, max(low, DEFAULT_ISO_VALUE)) if iso_value is None else iso_value,
-            window=SLICE_WINDOW,
+            window=BONE_WINDOW,
             cross=as_point(middle),
             parts=tuple(first_parts(objects)),
         )

@@ -26,10 +26,6 @@ if TYPE_CHECKING:
     from clrecon.jobs.view.inputs import OpenedInput
 
 
-SLICE_WINDOW = (-450.0, 1050.0)
-"""HU shown as black and white in slices at the start: a window for bone."""
-
-
 @dataclass(frozen=True)
 class ViewMode:
     """A mode; `words` say what is seen.

@@ -221,7 +221,9 @@ def test_clip_planes_keep_the_other_side_and_turn_round():
 
 def test_a_view_fits_what_is_shown():
     model = make_model()
+    version = model.version
     model.take_parts([found()])
+    assert model.version == version + 1 and model.state.window == (-450.0, 1050.0)
     whole = model.camera.parallel_scale
     box = ((-50.0, -30.0, 205.0), (-45.0, -25.0, 210.0))
     parts = tuple(
