@@ -96,7 +96,7 @@ def make_vertebrae(
 
 def _check_formats(source: str | Path, output: str | Path, picture: str | Path | None) -> None:
     """Refuse names of files that say another format."""
-    from clrecon.labels.label_grids import load_nibabel
+    from clrecon.labels.label_map import load_nibabel
     from clrecon.reading import tell_format
 
     kind = map_format(output)
@@ -117,7 +117,7 @@ def _encode_map(labels: LabelMap, output: str | Path, source: str | Path, settin
         from clrecon.reading.dicom.reader import list_slices
 
         return encode_segmentation(labels, list_slices(source, settings))
-    from clrecon.labels.label_grids import encode_nifti
+    from clrecon.labels.label_map import encode_nifti
 
     return encode_nifti(labels, packed=kind.endswith(".gz"))
 

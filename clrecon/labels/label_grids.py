@@ -1,14 +1,12 @@
 """Label maps in grid files: NIfTI with a label table, NRRD with 3D Slicer's segments and layers, MetaImage.
 
-A folder of masks, one file a structure, as TotalSegmentator writes it, is one map with the names of the files. NIfTI-1
-(.nii, .nii.gz) is written, by nibabel, with the names in a label table as other programs have it.
+A folder of masks, one file a structure, as TotalSegmentator writes it, is one map with the names of the files.
 
 Source: 3D Slicer's segmentation file format; the label table of Caret and Connectome Workbench.
 """
 
 from __future__ import annotations
 
-import gzip
 import html
 import re
 from collections.abc import Iterable, Sequence
@@ -19,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
-from clrecon.geometry.images import place_in_header
 from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap, find_number
 from clrecon.labels.segments import Painter, Wanted, empty_labels, iterate_labels
-from clrecon.reading.grids.grid_file import LABEL_MAP, GridFile, import_extra
+from clrecon.reading.grids.grid_file import LABEL_MAP, GridFile
 from clrecon.reading.grids.reader import name_of_grid, open_grid, tell_kind
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
@@ -227,27 +224,3 @@ def _add(voxels: NDArray[Any], number: int, grid: GridFile) -> int:
         shared += np.count_nonzero(mask & taken)
         voxels[k][mask & ~taken] = number
     return shared
-
-
-CARET_CODE = 30
-"""Code of the extension that holds Caret's XML."""
-
-
-def load_nibabel() -> Any:
-    return import_extra("nibabel", LABEL_MAP)
-
-
-def encode_nifti(labels: LabelMap, *, packed: bool) -> bytes:
-    """Return the bytes of the file, for .nii.gz packed; the same labels give the same bytes."""
-    nibabel = load_nibabel()
-    image = nibabel.Nifti1Image(np.asarray(labels.voxels).transpose(2, 1, 0), None)
-    place_in_header(image.header, labels.affine)
-    table = "".join(
-        f'<Label Key="{number}" Red="1" Green="1" Blue="1" Alpha="1">{html.escape(name, quote=False)}</Label>'
-        for number, name in labels.names.items()
-    )
-    text = f'<?xml version="1.0" encoding="UTF-8"?><CaretExtension><VolumeInformation Index="0"><LabelTable>{table}'
-    text += "</LabelTable></VolumeInformation></CaretExtension>"
-    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(CARET_CODE, text.encode("utf-8")))
-    content = bytes(image.to_bytes())
-    return gzip.compress(content, compresslevel=6, mtime=0) if packed else content

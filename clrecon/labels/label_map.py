@@ -1,10 +1,14 @@
 """`LabelMap`: one whole number for each voxel, the affine that places the voxels, and the names of the numbers.
 
 Names come from files that strangers wrote: in messages they are escaped, in file names they are letters and digits.
+A map is written as NIfTI-1, by nibabel, with its names in the label table of Caret and Connectome Workbench.
 """
 
 from __future__ import annotations
 
+import gzip
+import html
+import os
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -17,8 +21,12 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import Grid
 from clrecon.geometry.affine import checked_affine
+from clrecon.geometry.images import make_nibabel, make_sitk, place_in_header, take_nibabel, take_sitk
+from clrecon.geometry.resample import LARGEST_SHEAR_DEGREES, shear_degrees
 from clrecon.system.arguments import explains_arguments
+from clrecon.system.files import replace_file
 from clrecon.system.packages import ShownAsHtml
+from clrecon.system.paths import keep_existing
 from clrecon.system.text import escape_text
 
 SUFFIX_LENGTH = 40
@@ -215,10 +223,156 @@ class LabelMap(Grid, ShownAsHtml):
         wanted = check_wanted(labels)
         return self.numbers if wanted is None else tuple(dict.fromkeys(self.find(label) for label in wanted))
 
+    @explains_arguments
+    def voxels_of(self, labels: Iterable[int | str] | int | str) -> NDArray[np.bool_]:
+        """Return which voxels have one of some labels, chosen as by `choose`; shape (nk, nj, ni)."""
+        return np.isin(self._voxels, self.choose(labels))
+
+    @explains_arguments
+    def only(self, labels: Iterable[int | str] | int | str) -> LabelMap:
+        """Return a map with some of the labels, chosen as by `choose`, their numbers and names, and 0 elsewhere."""
+        numbers = self.choose(labels)
+        voxels = np.where(np.isin(self._voxels, numbers), self._voxels, 0).astype(self._voxels.dtype, copy=False)
+        names = {number: name for number, name in self._names.items() if number in numbers}
+        return LabelMap(
+            voxels, self._affine, names, frame_of_reference_hash=self.frame_of_reference_hash, warnings=self.warnings
+        )
+
+    @explains_arguments
+    def save(self, path: str | os.PathLike[str], *, no_clobber: bool = False) -> int:
+        """Write the map to .nii.gz or .nii, with its names in a label table, as a whole or not at all.
+
+        Parameters
+        ----------
+        path : str or path
+        no_clobber : bool
+            True: a file of that name stays and is an `OutputError`.
+
+        Returns
+        -------
+        int
+            Size of the file in bytes.
+
+        Raises
+        ------
+        UsageError
+            The path has another extension, or nibabel is not installed.
+        OutputError
+            The file cannot be written; an older one is intact.
+        """
+        name = os.fspath(path).lower()
+        if not name.endswith((".nii", ".nii.gz")):
+            raise UsageError(f"a label map is written as .nii.gz or .nii, not {escape_text(name[-40:])!r}")
+        content = encode_nifti(self, packed=name.endswith(".gz"))
+        with keep_existing(no_clobber):
+            replace_file(path, lambda stream: stream.write(content), expected_bytes=len(content))
+        return len(content)
+
+    def to_sitk(self) -> Any:
+        """Return the map as ``SimpleITK.Image`` of whole numbers, a copy in LPS mm; names do not go with it.
+
+        Raises
+        ------
+        UsageError
+            The axes are sheared, which such an image cannot hold, or SimpleITK is not installed.
+        """
+        shear = shear_degrees(self._affine)
+        if shear > LARGEST_SHEAR_DEGREES:
+            raise UsageError(
+                f"this image has axes at right angles, but those of the label map are sheared by {shear:.2f} degrees:"
+                " to_nibabel() and save() hold them"
+            )
+        return make_sitk(self._voxels, self._affine)
+
+    @classmethod
+    @explains_arguments
+    def from_sitk(cls, image: Any, names: Mapping[int, str] | None = None) -> LabelMap:
+        """Make a map of a ``SimpleITK.Image`` of three axes, LPS mm; its voxels are a copy.
+
+        Parameters
+        ----------
+        image : SimpleITK.Image
+            Of whole numbers from 0 to 65,535, which may be stored as real ones.
+        names : mapping of int to str, optional
+            As of a `LabelMap`.
+
+        Raises
+        ------
+        UsageError
+            It is no such image, or SimpleITK is not installed.
+        """
+        voxels, affine = take_sitk(image)
+        return cls(_as_whole(voxels), affine, names)
+
+    def to_nibabel(self) -> Any:
+        """Return the map as ``nibabel.Nifti1Image``: array (i, j, k) on the memory of the voxels, affine to RAS mm.
+
+        Names do not go with it: `save` writes them.
+
+        Raises
+        ------
+        UsageError
+            nibabel is not installed.
+        """
+        return make_nibabel(self._voxels, self._affine)
+
+    @classmethod
+    @explains_arguments
+    def from_nibabel(cls, image: Any, names: Mapping[int, str] | None = None) -> LabelMap:
+        """Make a map of an image of nibabel, whose affine leads to RAS mm.
+
+        Parameters
+        ----------
+        image : nibabel.spatialimages.SpatialImage
+            Of whole numbers from 0 to 65,535, which may be stored as real ones.
+        names : mapping of int to str, optional
+            As of a `LabelMap`; `clrecon.read_labels` of a file takes those of its label table.
+
+        Raises
+        ------
+        UsageError
+            It is no such image, does not say where it lies, or nibabel is not installed.
+        """
+        voxels, affine = take_nibabel(image)
+        return cls(_as_whole(voxels), affine, names)
+
     def __repr__(self) -> str:
         ni, nj, nk = self.shape_ijk
         di, dj, dk = self.spacing
         return f"LabelMap({ni} x {nj} x {nk}, spacing {di:.4g} x {dj:.4g} x {dk:.4g} mm, {len(self.numbers)} labels)"
+
+
+CARET_CODE = 30
+"""Code of the extension that holds Caret's XML, which has a table of labels."""
+
+
+def load_nibabel() -> Any:
+    from clrecon.reading.grids.grid_file import LABEL_MAP, import_extra
+
+    return import_extra("nibabel", LABEL_MAP)
+
+
+def encode_nifti(labels: LabelMap, *, packed: bool) -> bytes:
+    """Return the bytes of the file, for .nii.gz packed; the same labels give the same bytes."""
+    nibabel = load_nibabel()
+    image = nibabel.Nifti1Image(np.asarray(labels.voxels).transpose(2, 1, 0), None)
+    place_in_header(image.header, labels.affine)
+    table = "".join(
+        f'<Label Key="{number}" Red="1" Green="1" Blue="1" Alpha="1">{html.escape(name, quote=False)}</Label>'
+        for number, name in labels.names.items()
+    )
+    text = f'<?xml version="1.0" encoding="UTF-8"?><CaretExtension><VolumeInformation Index="0"><LabelTable>{table}'
+    text += "</LabelTable></VolumeInformation></CaretExtension>"
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(CARET_CODE, text.encode("utf-8")))
+    content = bytes(image.to_bytes())
+    return gzip.compress(content, compresslevel=6, mtime=0) if packed else content
+
+
+def _as_whole(voxels: NDArray[Any]) -> NDArray[Any]:
+    """Return real numbers that are whole, within the range of labels, as such; others as they are."""
+    if voxels.dtype.kind != "f" or not (voxels == np.rint(voxels)).all() or abs(voxels).max() > LARGEST_NUMBER:
+        return voxels
+    return voxels.astype(np.int32)
 
 
 def _checked_voxels(voxels: ArrayLike) -> NDArray[Any]:

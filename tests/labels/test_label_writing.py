@@ -9,7 +9,7 @@ import pytest
 
 from clrecon.errors import RefusedInputError
 from clrecon.labels import LabelMap, read_labels, resample_labels
-from clrecon.labels.label_grids import encode_nifti
+from clrecon.labels.label_map import encode_nifti
 from clrecon.labels.write_segmentation import encode_segmentation
 from clrecon.reading import Selection, read_volume
 from clrecon.reading.dicom.reader import list_slices

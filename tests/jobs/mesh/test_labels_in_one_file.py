@@ -14,7 +14,7 @@ from clrecon.cli.main import main
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.choices import LabelChoice
 from clrecon.labels import LabelMap
-from clrecon.labels.label_grids import encode_nifti
+from clrecon.labels.label_map import encode_nifti
 
 pytest.importorskip("nibabel")
 trimesh = pytest.importorskip("trimesh")

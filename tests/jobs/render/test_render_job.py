@@ -344,7 +344,7 @@ def test_a_sheet_is_reported_with_its_slices_and_labels(
     device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
     from clrecon.labels import LabelMap
-    from clrecon.labels.label_grids import encode_nifti
+    from clrecon.labels.label_map import encode_nifti
     from clrecon.reading import read_volume
 
     volume = read_volume(sphere[0])

@@ -1,0 +1,96 @@
+"""Label maps handed to files and other libraries and taken back: numbers, places and names."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import clrecon
+from clrecon import LabelMap
+from clrecon.errors import OutputError, UsageError
+
+NAMES = {1: "vertebrae_L4", 700: "vertebrae_L3", 9: "absent & <odd>"}
+OBLIQUE = np.array([[0.8, 0.0, 0.6, -20.0], [0.0, -0.7, 0.0, 30.0], [-0.6, 0.0, 0.8, 5.0], [0.0, 0.0, 0.0, 1.0]])
+SHEARED = OBLIQUE + np.array([[0, 0, 0, 0], [0, 0, 0.3, 0], [0, 0, 0, 0], [0, 0, 0, 0]])
+
+
+def label_map(affine: np.ndarray = OBLIQUE) -> LabelMap:
+    voxels = np.zeros((3, 4, 5), np.uint16)
+    voxels[0, 1, 2], voxels[2, 3, 4] = 1, 700
+    return LabelMap(voxels, affine, NAMES)
+
+
+def test_voxels_of_labels_are_those_of_their_numbers() -> None:
+    labels = label_map()
+    assert np.argwhere(labels.voxels_of("L3")).tolist() == [[2, 3, 4]]
+    assert np.argwhere(labels.voxels_of(["L4", 700])).tolist() == [[0, 1, 2], [2, 3, 4]]
+    with pytest.raises(UsageError, match="label 'L1' is not in the label map"):
+        labels.voxels_of("L1")
+
+
+def test_a_map_of_some_labels_keeps_their_numbers_names_and_places() -> None:
+    labels = LabelMap(label_map().voxels, OBLIQUE, NAMES, frame_of_reference_hash="f", warnings=["doubtful"])
+    some = labels.only("L3")
+    assert some.counts == {700: 1} and some.names == {700: "vertebrae_L3"} and some.voxels.dtype == np.uint16
+    assert np.array_equal(some.affine, labels.affine)
+    assert (some.frame_of_reference_hash, some.warnings) == ("f", ("doubtful",))
+    assert labels.counts == {1: 1, 700: 1}
+
+
+@pytest.mark.parametrize("name", ["map.nii.gz", "MAP.NII"])
+@pytest.mark.parametrize("affine", [OBLIQUE, SHEARED], ids=["oblique", "sheared"])
+def test_a_saved_map_is_read_as_it_was(affine: np.ndarray, name: str, tmp_path: Path) -> None:
+    labels = label_map(affine)
+    path = tmp_path / name
+    assert labels.save(path) == path.stat().st_size
+    read = clrecon.read_labels(path)
+    assert np.array_equal(read.voxels, labels.voxels) and read.names == labels.names
+    np.testing.assert_allclose(read.affine, affine, atol=1e-5)  # NIfTI has places as float32
+    with pytest.raises(OutputError, match="exists"):
+        labels.save(path, no_clobber=True)
+    before = path.read_bytes()
+    label_map(OBLIQUE).only(1).save(path)
+    assert path.read_bytes() != before
+
+
+@pytest.mark.parametrize("name", ["map.nrrd", "map", "map.nii.zip"])
+def test_other_extensions_are_refused_and_nothing_is_written(name: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=re.escape("a label map is written as .nii.gz or .nii, not '") + ".*" + name):
+        label_map().save(tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("library", ["sitk", "nibabel"])
+def test_another_library_gives_back_what_it_got(library: str) -> None:
+    labels = label_map()
+    image = getattr(labels, f"to_{library}")()
+    back = getattr(LabelMap, f"from_{library}")(image, names=NAMES)
+    assert np.array_equal(back.voxels, labels.voxels) and back.names == labels.names
+    np.testing.assert_allclose(back.affine, labels.affine, atol=1e-5)
+
+
+def test_places_in_simpleitk_are_those_of_the_map() -> None:
+    image = label_map().to_sitk()
+    assert image[2, 1, 0] == 1
+    np.testing.assert_allclose(
+        image.TransformIndexToPhysicalPoint((4, 3, 2)), (OBLIQUE @ [4.0, 3.0, 2.0, 1.0])[:3], atol=1e-12
+    )
+    with pytest.raises(UsageError, match=r"sheared by \d+\.\d\d degrees: to_nibabel\(\) and save\(\) hold them"):
+        label_map(SHEARED).to_sitk()
+
+
+def image_of(values: Any) -> Any:
+    import nibabel
+
+    return nibabel.Nifti1Image(np.asarray(values).reshape(1, 1, 3), np.eye(4))
+
+
+def test_whole_numbers_stored_as_real_ones_are_labels_and_others_are_not() -> None:
+    assert LabelMap.from_nibabel(image_of(np.array([0.0, 2.0, 65_535.0]))).numbers == (2, 65_535)
+    for wrong in ([0.0, 0.5, 1.0], [0.0, np.nan, 1.0], [0.0, 1.0, 1e20]):
+        with pytest.raises(UsageError, match="labels are whole numbers, these are float64"):
+            LabelMap.from_nibabel(image_of(np.array(wrong)))
+    with pytest.raises(UsageError, match="labels run from 0 to 65,535, these from -1 to 1"):
+        LabelMap.from_nibabel(image_of(np.array([0.0, -1.0, 1.0])))
