@@ -118,7 +118,7 @@ def apply_region(
     rules = parse_region_rules(settings.region or ())
     progress("region", 0, 0)
     volume = resident.volume
-    mask, facts, warnings = _find_region(resident, rules, settings.space_of_points)
+    mask, facts, warnings = _find_region(resident, rules, settings.space_of_points, settings.follow_links)
     kept, cells = mask.count, _count_cells(mask.to_numpy())
     every, all_cells = math.prod(volume.shape_ijk), math.prod(n - 1 for n in volume.shape_ijk)
     outside = value_outside(bands, volume.voxels.dtype)
@@ -164,7 +164,7 @@ def value_outside(bands: Sequence[Band], dtype: np.dtype[Any]) -> float:
 
 
 def _find_region(
-    resident: DeviceVolume, rules: Sequence[RegionRule], space: str
+    resident: DeviceVolume, rules: Sequence[RegionRule], space: str, follow_links: bool
 ) -> tuple[Mask, dict[str, Any], list[str]]:
     """Return the region's voxels, facts and warnings: rules of one kind are united, different kinds intersected."""
     facts: dict[str, Any] = {}
@@ -173,7 +173,7 @@ def _find_region(
     for rule in rules:
         if rule.kind == "seed":
             continue
-        own = _mask_of(resident, rule, space, facts, warnings)
+        own = _mask_of(resident, rule, space, facts, warnings, follow_links)
         if not own.count:
             raise UsageError(f"the region {rule} holds no voxel: {describe_extent(resident.volume, space)}")
         by_kind[rule.kind] = by_kind[rule.kind] | own if rule.kind in by_kind else own
@@ -192,7 +192,9 @@ def _count_cells(marked: NDArray[np.bool_]) -> int:
     return sum(int(np.count_nonzero(low & high)) for low, high in zip(rows, rows[1:], strict=False))
 
 
-def _mask_of(resident: DeviceVolume, rule: RegionRule, space: str, facts: dict[str, Any], warnings: list[str]) -> Mask:
+def _mask_of(
+    resident: DeviceVolume, rule: RegionRule, space: str, facts: dict[str, Any], warnings: list[str], follow_links: bool
+) -> Mask:
     from clrecon.operators.masks.mask import Mask
 
     if rule.kind == "box":
@@ -207,7 +209,7 @@ def _mask_of(resident: DeviceVolume, rule: RegionRule, space: str, facts: dict[s
 
     assert rule.path is not None
     names = None if rule.name is None else [rule.name]
-    labels = read_labels(rule.path, names, volume=resident.volume)
+    labels = read_labels(rule.path, names, volume=resident.volume, follow_links=follow_links)
     warnings += labels.warnings
     return Mask.from_labels(resident, labels, names)
 

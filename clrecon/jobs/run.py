@@ -278,9 +278,9 @@ class Run(Laps):
         from clrecon.jobs.inputs import read_with_labels
         from clrecon.labels import read_labels
 
-        path = self.settings.labels
+        path, linked = self.settings.labels, self.settings.follow_links
         volume, labels = read_with_labels(
-            partial(self.read, source), path, lambda volume: read_labels(path, only, volume=volume)
+            partial(self.read, source), path, lambda volume: read_labels(path, only, volume=volume, follow_links=linked)
         )
         assert labels is not None
         return volume, labels

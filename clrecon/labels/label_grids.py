@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,10 @@ from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap, find_number
 from clrecon.labels.segments import Painter, Wanted, empty_labels, iterate_labels
 from clrecon.reading.grids.grid_file import LABEL_MAP, GridFile
 from clrecon.reading.grids.reader import name_of_grid, open_grid, tell_kind
+from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
-from clrecon.system.text import count_of, escape_text
+from clrecon.system.text import count_of, escape_text, join_names
 
 _LABEL = re.compile(
     rb"""<Label\b[^>]{0,500}?\bKey=["']([0-9]{1,9})["'][^>]{0,500}>\s*(?:<!\[CDATA\[(.*?)\]\]>|([^<]*))""", re.DOTALL
@@ -140,12 +141,42 @@ SAME_GRID_MM = 1e-3
 """Largest distance of a voxel from its place in the first mask; a sform is float32."""
 
 
-def open_masks(folder: Path) -> dict[str, GridFile]:
+GRID_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".hdr")
+"""Ends of the names of links that are not opened, by which they may be masks."""
+
+
+def _list_files(folder: Path, follow_links: bool) -> Iterator[Path]:
+    """List files as scans are looked for: links inside of the folder lead to what is there anyway, others wait."""
+    root, kept, lost = folder.resolve(), [], []
+    for path in sorted(folder.iterdir(), key=lambda path: path.name):
+        if path.name.startswith("."):
+            continue
+        if not path.is_symlink():
+            yield path
+        elif not path.exists():
+            lost.append(path)
+        elif root not in path.resolve().parents:
+            kept.append(path)
+    left = [
+        (lost, "to a file that is not there", "restore it"),
+        (kept, "out of it", f"{name_parameter('follow_links', True)} follows links"),
+    ]
+    for links, whither, advice in left:
+        masks = [escape_text(path.name) for path in links if path.name.lower().endswith(GRID_SUFFIXES)]
+        if masks and not (follow_links and links is kept):
+            what = "mask of {} is a link" if len(masks) == 1 else "masks of {} are links"
+            raise RefusedInputError(
+                f"{len(masks)} {what.format(escape_text(folder.name))} {whither} ({join_names(masks)}); {advice}"
+            )
+    yield from kept if follow_links else ()
+
+
+def open_masks(folder: Path, follow_links: bool = False) -> dict[str, GridFile]:
     """Read the headers of a folder's masks, by structure in alphabetical order; hidden and other files are left out."""
     shown = escape_text(folder.name)
     masks: dict[str, GridFile] = {}
-    for path in sorted(folder.iterdir(), key=lambda path: path.name):
-        kind = tell_kind(path) if path.is_file() and not path.name.startswith(".") else None
+    for path in sorted(_list_files(folder, follow_links), key=lambda path: path.name):
+        kind = tell_kind(path) if path.is_file() else None
         if kind == "DICOM":
             raise RefusedInputError(
                 f"{shown} is a folder with DICOM files: of a DICOM SEG or RTSTRUCT give the file, of masks a folder"
@@ -177,13 +208,18 @@ def read_masks(folder: Path, masks: dict[str, GridFile], wanted: Wanted, progres
     first = masks[names[order[0]]]
     ni, nj, nk = first.shape_ijk
     voxels = empty_labels(escape_text(folder.name), (nk, nj, ni))
-    shared = 0
+    shared, empty = 0, []
     for done, number in enumerate(order, start=1):
         grid = masks[names[number]]
         _check_same(first, grid)
-        shared += _add(voxels, number, grid)
+        own, others = _add(voxels, number, grid)
+        shared += others
+        empty += [] if own else [escape_text(names[number])]
         progress("read", done, len(order))
     warnings = [f"{warning} ({grid.name})" for grid in (masks[names[n]] for n in order) for warning in grid.warnings]
+    if empty:
+        hold = "holds" if len(empty) == 1 else "hold"
+        warnings.append(f"{len(empty)} of {count_of(len(order), 'mask')} {hold} no voxel: {join_names(empty)}")
     if shared:
         warnings.append(
             f"the masks overlap in {count_of(shared, 'voxel')}: each belongs to the first of its masks in alphabetical"
@@ -205,9 +241,9 @@ def _check_same(first: GridFile, other: GridFile) -> None:
         )
 
 
-def _add(voxels: NDArray[Any], number: int, grid: GridFile) -> int:
-    """Write a mask into voxels that are free, and return how many of its voxels were not."""
-    value, shared = 0, 0
+def _add(voxels: NDArray[Any], number: int, grid: GridFile) -> tuple[int, int]:
+    """Write a mask into voxels that are free, and return how many it has, and how many of them were not."""
+    value, own, shared = 0, 0, 0
     for k, plane in enumerate(iterate_labels(grid)):
         mask = plane != 0
         if not mask.any():
@@ -221,6 +257,7 @@ def _add(voxels: NDArray[Any], number: int, grid: GridFile) -> int:
                 " give a label map as a file"
             )
         taken = voxels[k] != 0
+        own += np.count_nonzero(mask)
         shared += np.count_nonzero(mask & taken)
         voxels[k][mask & ~taken] = number
-    return shared
+    return own, shared

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from math import prod
 from pathlib import Path
@@ -52,6 +52,7 @@ def read_labels(
     only: Sequence[str | int] | str | int | None = None,
     *,
     volume: Grid | None = None,
+    follow_links: bool = False,
     progress: Progress | None = None,
 ) -> LabelMap:
     """Read a label map: NIfTI (.nii, .nii.gz), NRRD and 3D Slicer's .seg.nrrd, MetaImage, DICOM SEG, RTSTRUCT, or a
@@ -71,6 +72,8 @@ def read_labels(
     volume : Volume, optional
         The scan of the labels.  An RTSTRUCT needs it: its contours become labels on the slices of the scan.  A map that
         takes long to unpack is refused if it has many times as many voxels.
+    follow_links : bool
+        In a folder of masks, read those that are links out of it too (git-annex, DataLad); else they are refused.
     progress : callable, optional
         Called as ``progress("read", done, total)``: slices, in DICOM SEG frames.
 
@@ -88,7 +91,7 @@ def read_labels(
         not say where it lies in space, or has segments that overlap.
     """
     wanted = check_wanted(only)
-    labels = _read(Path(path), Wanted(wanted, others=False), volume, progress)
+    labels = _read(Path(path), Wanted(wanted, others=False), volume, follow_links, progress)
     return labels if wanted is None else _keep(labels, [labels.find(label) for label in wanted])
 
 
@@ -97,10 +100,11 @@ def read_all_labels(
     first: Sequence[str | int] | None = None,
     *,
     volume: Grid | None = None,
+    follow_links: bool = False,
     progress: Progress | None = None,
 ) -> LabelMap:
     """Read a label map with all labels, which tell a surface where its own ends; `first` get voxels of several."""
-    return _read(Path(path), Wanted(check_wanted(first)), volume, progress)
+    return _read(Path(path), Wanted(check_wanted(first)), volume, follow_links, progress)
 
 
 def _keep(labels: LabelMap, numbers: Sequence[int]) -> LabelMap:
@@ -117,7 +121,7 @@ def _keep(labels: LabelMap, numbers: Sequence[int]) -> LabelMap:
     )
 
 
-def _read(path: Path, wanted: Wanted, volume: Grid | None, progress: Progress | None) -> LabelMap:
+def _read(path: Path, wanted: Wanted, volume: Grid | None, follow_links: bool, progress: Progress | None) -> LabelMap:
     try:
         if not path.exists():
             raise UsageError(f"there is no label map {escape_text(str(path), 200)}")
@@ -128,7 +132,9 @@ def _read(path: Path, wanted: Wanted, volume: Grid | None, progress: Progress | 
             raise RefusedInputError(
                 f"{name} is no label map that can be read: NIfTI, NRRD, MetaImage, DICOM SEG and RTSTRUCT are"
             )
-        reader = {"DICOM": _read_dicom, "folder": _read_folder}.get(kind, partial(_read_grid, kind))
+        reader: Callable[..., LabelMap] = partial(_read_grid, kind)
+        if kind in ("folder", "DICOM"):
+            reader = _read_dicom if kind == "DICOM" else partial(_read_folder, follow_links)
         labels = reader(path, wanted, volume, progress or ignore_progress)
     except OSError as error:
         raise RefusedInputError(f"{escape_text(path.name)} cannot be read: {error.strerror or error}") from error
@@ -157,8 +163,8 @@ def _read_grid(kind: str, path: Path, wanted: Wanted, volume: Grid | None, progr
     return _name_mask(read_grid_labels(grid, wanted, progress), path)
 
 
-def _read_folder(path: Path, wanted: Wanted, volume: Grid | None, progress: Progress) -> LabelMap:
-    masks = open_masks(path)
+def _read_folder(follow_links: bool, path: Path, wanted: Wanted, volume: Grid | None, progress: Progress) -> LabelMap:
+    masks = open_masks(path, follow_links)
     for grid in masks.values():
         _check_proportion(grid.name, volume, grid.shape_ijk, _stored_bytes(grid))
     return read_masks(path, masks, wanted, progress)

@@ -46,9 +46,56 @@ def test_each_file_is_a_label_with_its_name(tmp_path):
     assert labels.counts == {1: 84, 2: 42, 4: 42} and labels.find("L3") == 4
     assert np.allclose(labels.affine, OBLIQUE, atol=1e-5)
     assert labels.warnings == (
+        "1 of 4 masks holds no voxel: spleen",
         "the masks overlap in 84 voxels: each belongs to the first of its masks in alphabetical order, labels that were"
         " chosen before others",
     )
+
+
+def link_out(folder, name):
+    """Move a mask out of its folder and leave a link, as git-annex does."""
+    store = folder.parent / "store"
+    store.mkdir(exist_ok=True)
+    (folder / name).rename(store / name)
+    (folder / name).symlink_to(store / name)
+
+
+def test_masks_that_are_links_out_of_the_folder_are_followed_on_request_alone(tmp_path):
+    whole = read_labels(write_folder(tmp_path / "whole"))
+    folder = write_folder(tmp_path / "masks")
+    link_out(folder, "aorta.seg.nrrd")
+    link_out(folder, "liver.mha")
+    with pytest.raises(RefusedInputError, match=r"2 masks of masks are links out of it \(aorta.seg.nrrd, liver.mha\)"):
+        read_labels(folder)
+    assert not is_large_map(folder)
+    labels = read_labels(folder, follow_links=True)
+    assert np.array_equal(labels.voxels, whole.voxels) and labels.names == whole.names
+
+
+def test_links_inside_of_the_folder_are_left_out_and_lost_ones_are_told(tmp_path):
+    folder = write_folder(tmp_path / "masks")
+    (folder / "copy.nii.gz").symlink_to("vertebrae_L3.nii.gz")
+    assert "copy" not in read_labels(folder).names.values()
+    (folder / "rib.nii.gz").symlink_to("../gone.nii.gz")
+    with pytest.raises(
+        RefusedInputError, match=r"1 mask of masks is a link to a file that is not there \(rib.nii.gz\)"
+    ):
+        read_labels(folder, follow_links=True)
+    (folder / "rib.nii.gz").unlink()
+    (tmp_path / "readme.txt").write_text("text")
+    (folder / "readme.txt").symlink_to("../readme.txt")
+    assert read_labels(folder).counts == {1: 84, 2: 42, 4: 42}
+
+
+def test_commands_follow_links_to_masks_on_request(tmp_path, capsys):
+    dicom_series.write_series(tmp_path / "ct", dicom_series.Plan(shape=SHAPE))
+    folder = write_folder(tmp_path / "masks", read_volume(tmp_path / "ct").affine)
+    link_out(folder, "aorta.seg.nrrd")
+    command = ["stats", str(tmp_path / "ct"), "--labels", str(folder)]
+    assert main(command) == 4
+    assert "--follow-links follows links" in capsys.readouterr().err
+    assert main([*command, "--follow-links"]) == 0
+    assert "aorta" in capsys.readouterr().out
 
 
 def test_chosen_masks_come_before_others(tmp_path):

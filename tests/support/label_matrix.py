@@ -446,3 +446,13 @@ add_folder(
     last=lambda path: dicom_series.write_series(path / "", dicom_series.Plan(shape=(2, 4, 5))),
 )
 add_folder("other files among them", last=lambda path: (path / "statistics.json").write_text("{}"))
+
+
+def link_out(masks: Path) -> None:
+    path = write_nifti(masks.parent / "c.nii", make_labels() > 0, STRAIGHT, dtype="u1")
+    (masks / "c.nii").symlink_to(path)
+
+
+add_folder("a link out of it", REFUSED, "is a link out of it (c.nii)", last=link_out)
+add_folder("a mask without voxels", WARNED, "1 of 3 masks holds no voxel: c",
+           last=lambda path: write_nifti(path / "c.nii", np.zeros((4, 6, 7), np.uint8), STRAIGHT))  # fmt: skip

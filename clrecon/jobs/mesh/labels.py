@@ -28,13 +28,15 @@ _FACTS = (
 )  # fmt: skip
 
 
-def open_labels(choice: LabelChoice | None, volume: Volume | None = None) -> LabelMap | None:
+def open_labels(
+    choice: LabelChoice | None, volume: Volume | None = None, *, follow_links: bool = False
+) -> LabelMap | None:
     """Read the label map, None if the job has none; with the scan, a large one is held against its grid first."""
     if choice is None:
         return None
     from clrecon.labels.reader import read_all_labels
 
-    return read_all_labels(choice.path, choice.only or None, volume=volume)
+    return read_all_labels(choice.path, choice.only or None, volume=volume, follow_links=follow_links)
 
 
 def name_label_files(labels: LabelMap, choice: LabelChoice, surfaces: Sequence[Surface]) -> list[str]:

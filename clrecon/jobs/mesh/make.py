@@ -98,7 +98,7 @@ def _read_inputs(
     settings: MeshSettings = run.settings
 
     def read_map(volume: Volume | None) -> LabelMap | None:
-        labels = open_labels(settings.labels, volume)
+        labels = open_labels(settings.labels, volume, follow_links=settings.follow_links)
         if labels is not None and settings.labels_pick and check_map is not None:
             check_map(labels)
         return labels

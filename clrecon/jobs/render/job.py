@@ -110,7 +110,8 @@ def _read_input(source: str | Path, run: Run) -> tuple[Volume | PointCloud | Mes
 
         return read_points(source), None
     path = None if settings.labels is None else settings.labels.path
-    return read_with_labels(partial(run.read, source), path, partial(read_look, settings.labels))
+    read_map = partial(read_look, settings.labels, follow_links=settings.follow_links)
+    return read_with_labels(partial(run.read, source), path, read_map)
 
 
 def _mask_scan(volume: Volume, settings: RenderSettings, device: Device, progress: Progress) -> Volume:

@@ -51,7 +51,7 @@ def read_curve(named: str | None) -> Float64Array | None:
     return read_curve_points(named)
 
 
-def read_look(look: LabelLook | None, volume: Volume | None = None) -> LabelMap | None:
+def read_look(look: LabelLook | None, volume: Volume | None = None, *, follow_links: bool = False) -> LabelMap | None:
     """Read the label map; None if no file is given.  With the scan, a large one is held against its grid first."""
     if look is None:
         return None
@@ -59,7 +59,7 @@ def read_look(look: LabelLook | None, volume: Volume | None = None) -> LabelMap 
 
     opacities = [label for label in look.opacities if label.strip() != str(NO_LABEL)]
     named = [*look.colors, *opacities]  # they get the voxels that they share with others
-    labels = read_all_labels(look.path, named or None, volume=volume)
+    labels = read_all_labels(look.path, named or None, volume=volume, follow_links=follow_links)
     for label in named:
         labels.find(label)
     return labels

@@ -193,7 +193,7 @@ def _holds_labels(volume: Volume) -> bool:
 
 
 def _open_labels(settings: ViewSettings, scan: Any) -> OpenedInput:
-    labels = open_labels(settings.scan.labels, scan)
+    labels = open_labels(settings.scan.labels, scan, follow_links=settings.scan.follow_links)
     assert labels is not None
     labels = crop_labels(labels, settings.scan.crop, settings.scan.space)
     return OpenedInput(labels, labels.warnings)
