@@ -7,7 +7,7 @@ import pytest
 from variants import daily
 
 from clrecon.geometry import Volume
-from clrecon.labels.canal import find_canal
+from clrecon.labels.canal import _Places, find_canal
 
 BODY, PEDICLES, LAMINA = (0, 30), (8, 22), (8, 14)
 """Heights in mm of the parts of a block; the canal is 20 mm wide and 16 mm deep between them."""
@@ -116,3 +116,20 @@ def test_uneven_and_turned_slices_keep_their_places():
     canal = find_canal(solid[kept], uneven)
     assert np.array_equal(canal.voxels, expected[kept])
     assert canal.height_mm == pytest.approx(14.0, abs=1.01)
+
+
+def test_what_is_shifted_beyond_a_slice_is_left_out():
+    places = _Places(Volume(np.zeros((2, 3, 4), np.int16), np.eye(4)))
+    full = np.ones((3, 4), bool)
+    for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1), (2, -2)):
+        shifted = places.shift(full, 0, 1, np.array([di, dj], float))
+        expected = np.zeros((3, 4), bool)
+        expected[max(0, dj) : 3 + min(0, dj), max(0, di) : 4 + min(0, di)] = True
+        assert np.array_equal(shifted, expected)
+
+
+def test_three_slices_tell_the_direction_of_a_canal():
+    solid, volume, expected = block((1.0, 1.0, 4.0), tilt=20.0)
+    canal = find_canal(solid, volume)
+    assert np.count_nonzero(expected.any(axis=(1, 2))) == 3
+    assert (canal.voxels & expected).sum() >= 0.97 * max(expected.sum(), canal.voxels.sum())

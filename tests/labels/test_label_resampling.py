@@ -11,7 +11,7 @@ from label_files import OBLIQUE, make_labels
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap, resample_labels
-from clrecon.labels.resample import _take_aligned
+from clrecon.labels.resample import _shares_of_bone, _take_aligned
 
 VOXELS = make_labels((5, 7, 8))
 VOLUME = Volume(np.zeros((5, 7, 8), np.int16), OBLIQUE)
@@ -151,3 +151,11 @@ def test_an_aligned_map_is_cut_out_and_the_same_grid_is_not_copied():
         taken((3, 4, 5), (0, 0, 1)), np.concatenate([numbers[1:], np.zeros_like(numbers[:1])])
     )
     assert taken((3, 4, 5), (0.5, 0, 0)) is None
+
+
+def test_slices_leave_memory_one_by_one_where_bone_is_counted(monkeypatch):
+    volume, left = Volume(np.full((3, 2, 2), 500, np.int16), np.eye(4)), []
+    monkeypatch.setattr(Volume, "release_slices", lambda self, first, end: left.append((first, end)))
+    half = np.zeros((3, 2, 2), np.uint8)
+    assert _shares_of_bone(volume, half, half + 1) == [0.0, 1.0]
+    assert left == [(0, 1), (1, 2), (2, 3)]

@@ -112,6 +112,6 @@ def test_one_voxel_and_progress() -> None:
     (one,) = measure_labels(
         volume, LabelMap(np.ones((1, 1, 1), np.uint8), volume.affine), progress=lambda *given: told.append(given)
     )
-    assert isinstance(one, LabelFigures)
+    assert isinstance(one, LabelFigures) and list(one.percentiles_hu) == ["5", "25", "50", "75", "95"]
     assert (one.ml, one.mean_hu, one.sd_hu, one.percentiles_hu["5"]) == (0.024, -3.0, 0.0, -3.0)
     assert told == [("measure labels", 0, 1), ("measure labels", 1, 1)]

@@ -18,6 +18,7 @@ from clrecon.labels.contours import fill_contours, unite_contours
 from clrecon.labels.label_bodies import label_ml
 from clrecon.labels.reader import read_all_labels
 from clrecon.labels.resample import resample_labels
+from clrecon.labels.structures import label_slices
 from clrecon.reading import read_volume
 
 pytestmark = pytest.mark.unit
@@ -263,6 +264,20 @@ def test_scans_that_cannot_have_contours(tmp_path):
         read_labels(path)
     with pytest.raises(UsageError, match="too uneven for contours: .* pixels off a line"):
         read_labels(path, volume=stack)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_map_has_four_or_two_slices_to_the_smallest_gap(sign):
+    def slices(gap):
+        table = np.zeros((6, 3))
+        table[:, 2] = sign * np.array([0.0, gap, 5.0, 10.0, 15.0, 20.0])
+        affine = np.diag((1.0, 1.0, sign, 1.0))
+        return label_slices(Volume(np.zeros((6, 4, 4), np.int16), affine, slice_positions=table)).affine
+
+    for gap, parts in ((0.05, 4), (0.02, 2)):
+        assert slices(gap)[2, 2:] == pytest.approx([sign * gap / parts, sign * (gap / parts - gap) / 2.0])
+    with pytest.raises(UsageError, match=r"too uneven for contours: 0\.005 to 5 mm apart"):
+        slices(0.005)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 18.0])
