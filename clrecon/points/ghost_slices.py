@@ -17,8 +17,8 @@ GHOST_SHARE = 0.75
 """A slice is a ghost where its likeness to both neighbours is below this share of their likeness to each other."""
 
 WITHIN_SHARE = 0.45
-"""And where less than this share of its voxels lies within one of them, beyond chance: a disc between two vertebrae is
-unlike both, but 89 % of it lies within one."""
+"""And where less than this share of its voxels lies within one of them, or of one of them within it, beyond chance: a
+disc between two vertebrae is unlike both, but 89 % of it lies within one, and the base of a skull holds 61 % of one."""
 
 REASON = "ghost slice"
 
@@ -30,8 +30,9 @@ class GhostSlices:
     points: (nk,). Voxels of the band `hu` in each slice.
     nearest: (nk,). The higher one of Dice's coefficients with the slice before and the one behind.
     around: (nk,). Dice's coefficient of these two slices with each other.
-    within: (nk,). Share of a slice's voxels that lie within one of its neighbours, the larger one of both, corrected
-        for chance: 0 where it is the share that the neighbour takes of its whole slice, 1 where all of them lie within.
+    within: (nk,). Share of a slice's voxels that lie within one of its neighbours, or of a neighbour's within it, the
+        largest, corrected for chance: 0 where it is the share that the other takes of its whole slice, 1 where all lie
+        within.
     """
 
     slices: tuple[int, ...]
@@ -88,11 +89,13 @@ def judge_slices(
         with np.errstate(divide="ignore", invalid="ignore"):
             likeness = [2.0 * counts[n, : nk - n] / (points[: nk - n] + points[n:]) for n in (1, 2)]
             chance = points / area
-            before = (counts[1, :-2] / points[1:-1] - chance[:-2]) / (1.0 - chance[:-2])
-            behind = (counts[1, 1:-1] / points[1:-1] - chance[2:]) / (1.0 - chance[2:])
+            common = counts[1, :-1]
+            next_holds = (common / points[:-1] - chance[1:]) / (1.0 - chance[1:])
+            holds_next = (common / points[1:] - chance[:-1]) / (1.0 - chance[:-1])
+            most = np.fmax(next_holds, holds_next)
         nearest[1:-1] = np.fmax(likeness[0][:-1], likeness[0][1:])
         around[1:-1] = likeness[1]
-        within[1:-1] = np.fmax(before, behind)
+        within[1:-1] = np.fmax(most[:-1], most[1:])
     # NaN is no ghost.
     ghosts = (points > 0) & (nearest < GHOST_SHARE * around) & (within < WITHIN_SHARE)
     return GhostSlices(tuple(np.flatnonzero(ghosts).tolist()), points, nearest, around, within, hu, warnings)

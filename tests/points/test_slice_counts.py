@@ -14,8 +14,8 @@ def test_figures_of_five_slices() -> None:
     found = judge_slices(counts, 100, (200.0, np.inf), ("a word",))
     np.testing.assert_allclose(found.nearest, [np.nan, 0.4, 0.4, 0.6, np.nan], rtol=1e-12)
     np.testing.assert_allclose(found.around, [np.nan, 0.2, 0.55, 0.25, np.nan], rtol=1e-12)
-    within = (10 / 30 - 0.2) / 0.8
-    np.testing.assert_allclose(found.within, [np.nan, (6 / 20 - 0.1) / 0.9, within, (9 / 20 - 0.1) / 0.9, np.nan])
+    within = (10 / 20 - 0.3) / 0.7  # of the slice behind in this one: more than the other way round
+    np.testing.assert_allclose(found.within, [np.nan, (6 / 10 - 0.2) / 0.8, within, (9 / 10 - 0.2) / 0.8, np.nan])
     assert (found.slices, found.tested, found.warnings) == ((2,), 3, ("a word",))
     assert found.as_dict() == {
         "hu": [200.0, np.inf],

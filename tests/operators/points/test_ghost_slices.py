@@ -104,6 +104,14 @@ def test_discs_between_vertebrae_are_no_ghosts(slices):
     assert found.slices == () and found.as_dict()["within_share"] == 0.45
 
 
+def test_bone_that_closes_in_one_slice_is_no_ghost():
+    """The base of a skull, 5 mm apart: unlike both neighbours, but most of one lies within it."""
+    voxels = make_phantom(PhantomSettings(kind="skull", size=(192, 192), slices=30, spacing=(0.9, 0.9, 5.0)))[0]
+    found = judge_slices(twin.count_overlaps(voxels >= 200), 192 * 192, (200.0, np.inf))
+    unlike = np.flatnonzero(found.nearest < 0.75 * found.around)
+    assert unlike.tolist() == [8] and found.within[8] > 0.55 and found.slices == ()
+
+
 @pytest.mark.parametrize("at", daily(2, [1, 4, 12, 17, 28]))
 def test_a_slice_of_another_scan_is_found_among_thick_slices(at):
     voxels = thick_slices()
