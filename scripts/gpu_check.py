@@ -190,7 +190,7 @@ def timed(run: Callable[[], Any], runs: int = RUNS) -> dict[str, Any]:
     """Time a case after a run that warms up; with the parts and kernels that reports know, as medians, and the calls of
     the last run.
     """
-    from clrecon.proof.calls import counting_calls
+    from counted_calls import counting_calls
 
     seconds: list[float] = []
     reports: list[dict[str, Any]] = []

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.errors import RefusedInputError
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry.affine import SPACES, frame_from_lps
 from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.text import escape_text, join_names
 
@@ -164,6 +165,30 @@ class RawMesh:
     unit: str = "mm"
     parts: Sequence[Part] = ()
     values: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+
+
+def frame_of_file(raw: RawCloud | RawMesh, asked: str | None, name: str) -> tuple[str, str]:
+    """Return the frame of a file's coordinates, LPS or RAS, and where it is known from: file, argument or assumed."""
+    named = None if raw.space is None else raw.space.upper()
+    if named is not None and named.lower() not in SPACES:
+        raw.warnings.append(f"{name} names the frame '{escape_text(named)}', which is not known")
+        named = None
+    if asked is not None and named is not None and asked.upper() != named:
+        raise UsageError(
+            f"{name} says that its coordinates are {named}, {asked.upper()} was asked for: leave the space out"
+        )
+    return (named, "file") if named else (asked.upper(), "argument") if asked else ("LPS", "assumed")
+
+
+def turn_to_lps(
+    frame: str, points: NDArray[Any], normals: NDArray[np.float32] | None
+) -> tuple[NDArray[Any], NDArray[np.float32] | None]:
+    """Return points (n, 3) and normals (n, 3) of a frame in LPS."""
+    if frame == "LPS":
+        return points, normals
+    signs = np.diag(frame_from_lps(frame))
+    points = points * signs.astype(points.dtype if points.dtype.kind == "f" else np.float64)
+    return points, None if normals is None else normals * signs.astype(np.float32) + np.float32(0)
 
 
 MOST_LEVELS = 32

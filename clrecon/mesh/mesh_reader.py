@@ -10,8 +10,8 @@ import numpy as np
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.exchange.formats import FORMATS, MESH_INPUTS
-from clrecon.exchange.raw_content import RawMesh
-from clrecon.geometry import SPACES, frame_from_lps
+from clrecon.exchange.raw_content import RawMesh, frame_of_file, turn_to_lps
+from clrecon.geometry import frame_from_lps
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.log import get_logger, log_warnings
@@ -50,9 +50,8 @@ def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh
     RefusedInputError
         The file cannot be read, is cut or corrupt, or has numbers that a mesh cannot have.
     """
-    asked = None if space is None else space.upper()
-    if asked is not None:
-        frame_from_lps(asked)
+    if space is not None:
+        frame_from_lps(space)
     file = Path(path)
     name = escape_text(file.name)
     extension = file.suffix.lower()
@@ -61,32 +60,20 @@ def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh
     if not os.path.lexists(file):
         raise UsageError(f"there is no mesh {escape_text(str(path), 200)}")
     raw: RawMesh = FORMATS[extension].code.read_mesh(file)
-    warnings = raw.warnings
-    named = None if raw.space is None else raw.space.upper()
-    if named is not None and named.lower() not in SPACES:
-        warnings.append(f"{name} names the frame '{escape_text(named)}', which is not known")
-        named = None
-    if asked is not None and named is not None and asked != named:
-        raise UsageError(f"{name} says that its coordinates are {named}, {asked} was asked for: leave the space out")
-    used = named or asked or "LPS"
-    vertices, normals = raw.vertices, raw.normals
-    if vertices.dtype.kind not in "fiu":
+    frame, source = frame_of_file(raw, space, name)
+    if raw.vertices.dtype.kind not in "fiu":
         raise RefusedInputError(f"{name} is corrupt: its vertices are no numbers")
-    if used != "LPS":
-        signs = np.diag(frame_from_lps(used))
-        vertices = vertices * signs.astype(vertices.dtype if vertices.dtype.kind == "f" else np.float64)
-        normals = None if normals is None else normals * signs.astype(np.float32) + np.float32(0)
-    if named is None and asked is None:
-        warnings.append(f"{name} names no patient frame: its coordinates are taken as LPS")
-    source = "file" if named else "argument" if asked else "assumed"
-    report = _report_of_file(raw, used, source)
+    vertices, normals = turn_to_lps(frame, raw.vertices, raw.normals)
+    if source == "assumed":
+        raw.warnings.append(f"{name} names no patient frame: its coordinates are taken as LPS")
+    report = _report_of_file(raw, frame, source)
     try:
         mesh = Mesh(vertices, raw.triangles, normals, report)
     except UsageError as error:
         raise RefusedInputError(f"{name} is corrupt: {error}") from error
     mesh.values = dict(raw.values)
     log.info("%s file read: %d triangles", raw.kind, mesh.triangle_count)
-    log_warnings(log, warnings)
+    log_warnings(log, raw.warnings)
     return mesh
 
 

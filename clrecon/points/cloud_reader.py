@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from clrecon.errors import RefusedInputError, UsageError
+from clrecon.errors import RefusedInputError
 from clrecon.exchange.formats import read_raw_cloud
-from clrecon.geometry import SPACES, frame_from_lps
+from clrecon.exchange.raw_content import frame_of_file, turn_to_lps
+from clrecon.geometry import frame_from_lps
 from clrecon.points.cloud import MOST_POINTS, PointCloud
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.log import get_logger, log_warnings
@@ -51,32 +52,21 @@ def read_points(path: str | os.PathLike[str], *, space: str | None = None) -> Po
     RefusedInputError
         The file cannot be read, is cut or corrupt, has no points or points that are not finite.
     """
-    asked = None if space is None else space.upper()
-    if asked is not None:
-        frame_from_lps(asked)
+    if space is not None:
+        frame_from_lps(space)
     raw = read_raw_cloud(path)
     name = escape_text(Path(path).name)
     warnings = raw.warnings
-    named = None if raw.space is None else raw.space.upper()
-    if named is not None and named.lower() not in SPACES:
-        warnings.append(f"the file names the frame '{escape_text(named)}', which is not known")
-        named = None
-    if asked is not None and named is not None and asked != named:
-        raise UsageError(f"{name} says that its coordinates are {named}, {asked} was asked for: leave the space out")
-    used = named or asked or "LPS"
+    frame, source = frame_of_file(raw, space, name)
     _check_points(raw.points, name)
-    points, normals = raw.points, raw.normals()
-    if used != "LPS":
-        signs = np.diag(frame_from_lps(used))
-        points = points * signs.astype(points.dtype if points.dtype.kind == "f" else np.float64)
-        normals = None if normals is None else normals * signs.astype(np.float32) + np.float32(0)
+    points, normals = turn_to_lps(frame, raw.points, raw.normals())
     warnings += _doubt_unit(points)
     arrays = {"normals": normals, "hu": raw.hu(), "labels": raw.labels(), "ijk": raw.ijk()}
     warnings += raw.unused()
     facts: dict[str, Any] = {
         "kind": raw.kind,
-        "space": used,
-        "space_from": "file" if named else "argument" if asked else "assumed",
+        "space": frame,
+        "space_from": source,
         "points": len(points),
         "warnings": warnings,
     }

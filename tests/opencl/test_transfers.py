@@ -9,12 +9,12 @@ import threading
 
 import numpy as np
 import pytest
+from counted_calls import counting_calls
 
 import clrecon
 from clrecon.opencl import allocate, buffers, copy_buffer, download, download_all, transfers, upload
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.opencl.transfers import LEAST_BYTES, PIECE_BYTES, PIECES, PinnedPieces
-from clrecon.proof.calls import counting_calls
 from clrecon.rendering.pictures.styles import VolumeLook
 
 

@@ -147,7 +147,7 @@ def test_the_frame_of_a_file(tmp_path):
     with pytest.raises(UsageError, match="unknown space"):
         read_points(bare, space="scanner")
     odd = read_points(write(tmp_path / "odd.xyz", "# SPACE=MNI\n1 2 3\n"))
-    assert odd.report["file"]["warnings"] == ["the file names the frame 'MNI', which is not known"]
+    assert odd.report["file"]["warnings"] == ["odd.xyz names the frame 'MNI', which is not known"]
     assert odd.report["file"]["space_from"] == "assumed"
 
 
