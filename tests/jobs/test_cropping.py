@@ -144,6 +144,8 @@ def test_boxes() -> None:
     everywhere = float("inf")
     assert crop_box(None, (1, 2), None) == ((-everywhere, -everywhere, 1), (everywhere, everywhere, 2))
     assert crop_box((0, 9, 0, 9, 0, 9), (3, 20), (1, 5, 5, 4)) == ((0, 1, 3), (5, 9, 9))
+    with pytest.raises(UsageError, match=f"^clip_box takes six .*, not {'x' * 60}$"):
+        crop_box("x" * 99, None, None)
     with pytest.raises(UsageError, match="clip_box takes six numbers"):
         MeshSettings(clip_box=(1, 2))
     assert RenderSettings.of(clip_box=(0, 1, 0, 1, 0, 1)).crop_margin == 1
