@@ -11,10 +11,10 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 92_141,
-    "modules": 417,
-    "small_modules_with_one_reader": 11,
-    "docstrings_with_raises": 130,
+    "lines": 92_082,
+    "modules": 416,
+    "small_modules_with_one_reader": 10,
+    "docstrings_with_raises": 135,
     "options_in_several_files": 19,
     "modules_with_own_all": 0,
 }
