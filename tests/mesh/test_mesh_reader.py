@@ -98,7 +98,7 @@ def test_harmed_files_are_refused_in_one_line(tmp_path: Path) -> None:
         ("cut.ply", ply[:-3], "cut or corrupt"),
         ("far.ply", bytes(far), "refers to vertex"),
         ("four.ply", bytes(four), "4 corners"),
-        ("lists.ply", quads, "one list of vertices"),
+        ("lists.ply", quads, "one list, of vertices, is read"),
         (
             "cloud.ply",
             ply[: ply.index(b"element face")] + b"end_header\n" + ply[ply.index(b"end_header") + 11 :],

@@ -60,7 +60,10 @@ def seen(words: str, /, **values: Any) -> Place:
 
 
 def swap(a: int, b: int) -> Any:
-    return lambda k: position({a: b, b: a}.get(k, k))
+    def swapped(k: int) -> Any:
+        return position(b if k == a else a if k == b else k)
+
+    return swapped
 
 
 DOUBLED = {"ImagePositionPatient": lambda k: [2 * value for value in position(k)]}
