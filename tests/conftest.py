@@ -15,9 +15,7 @@ CLRECON_REQUIRE_DEVICE=1
 CLRECON_REQUIRE_PLATFORMS
     Comma list of texts; each must be found in platform, version or driver of a device of its own.
 CLRECON_RELEASE_TESTS=1
-    Tests marked ``release`` too, and kernels built with the optimiser in all tests.
-CLRECON_BUILD_OPTIONS
-    Options of kernels; ``-cl-opt-disable`` if not set, but for releases and simulators.
+    Tests marked ``release`` too.
 CLRECON_FAST_TESTS=1
     All guards, and of other tests the first parameter on the first device, but for those marked seconds, slow, long or
     fuzz.
@@ -49,12 +47,6 @@ ROOT = Path(__file__).resolve().parent.parent
 
 def is_set(variable: str) -> bool:
     return os.environ.get(variable, "") not in ("", "0")
-
-
-# PoCL takes twice as long to build kernels with its optimiser, and they compute the same: the self-test has it on, see
-# tests/proof/test_selftest.py.
-if not (is_set("CLRECON_RELEASE_TESTS") or is_set("CLRECON_TEST_SIMULATORS")):
-    os.environ.setdefault("CLRECON_BUILD_OPTIONS", "-cl-opt-disable")
 
 
 def find_devices() -> tuple[list[Any], str]:
