@@ -98,8 +98,7 @@ def wrap_cloud(
     import pyvista
 
     polydata = pyvista.wrap(make_polydata(points, None, normals, hu, labels))
-    polydata.field_data["SPACE"] = ["LPS"]
-    polydata.field_data["UNIT"] = ["mm"]
+    polydata.field_data["SPACE"], polydata.field_data["UNIT"] = ["LPS"], ["mm"]
     return polydata
 
 

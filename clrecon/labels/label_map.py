@@ -265,8 +265,7 @@ class LabelMap(Grid, ShownAsHtml):
             raise UsageError(f"a label map is written as .nii.gz or .nii, not {escape_text(name[-40:])!r}")
         content = encode_nifti(self, packed=name.endswith(".gz"))
         with keep_existing(no_clobber):
-            replace_file(path, lambda stream: stream.write(content), expected_bytes=len(content))
-        return len(content)
+            return replace_file(path, lambda stream: stream.write(content), expected_bytes=len(content))
 
     def to_sitk(self) -> Any:
         """Return the map as ``SimpleITK.Image`` of whole numbers, a copy in LPS mm; names do not go with it.

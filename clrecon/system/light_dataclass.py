@@ -97,7 +97,9 @@ def _refuse_to_set(self: Any, name: str, value: object) -> None:
 
 
 def _refuse_to_delete(self: Any, name: str) -> None:
-    raise FrozenInstanceError(f"cannot delete field {name!r}")
+    if name in self.__dataclass_fields__ or "__dataclass_fields__" in vars(type(self)):
+        raise FrozenInstanceError(f"cannot delete field {name!r}")
+    object.__delattr__(self, name)
 
 
 class _Signature:

@@ -169,5 +169,7 @@ def test_objects_are_pickled_and_a_plain_class_derived_may_have_attributes() -> 
     extended = Extended(3)
     extended.note = "kept"  # type: ignore[attr-defined]
     assert extended.note == "kept"  # type: ignore[attr-defined]
+    del extended.note  # type: ignore[attr-defined]
+    assert not hasattr(extended, "note")
     with pytest.raises(dataclasses.FrozenInstanceError):
         extended.value = 4  # type: ignore[misc]
