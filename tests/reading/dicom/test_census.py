@@ -51,6 +51,11 @@ LOST = {
     "every second, downwards": (numbered(lambda k: 50 - k), ODD, 11, "leaves out 11 of 28 to 50: step 2"),
     "every second, overlapping": (numbered(up, thickness=1.5), ODD, 11, "slices of 1.5 mm lie 2 mm apart"),
     "two of three": (numbered(up), [k for k in range(SLICES) if k % 3], 14, "leaves out 14 of 1 to 22: step 3"),
+    "every second, the thickness unknown": (
+        numbered(up, thickness=None), ODD, 11,
+        "of 1 to 23: step 2, slices lie 2 mm apart, and no SliceThickness says that none is between them",
+    ),
+    "three of four, the thickness unknown": (numbered(lambda k: 4 * k, thickness=None), (), 69, "step 4", {"gap": 2.8}),
     "every second of one half": (
         numbered(up, thickness=5), range(13, SLICES, 2), 5, "leaves out 5 of 1 to 23: their positions leave room"
     ),
@@ -70,8 +75,8 @@ LOST = {
 
 @pytest.mark.parametrize("case", LOST.values(), ids=LOST)
 def test_slices_that_are_missing_are_counted(tmp_path, case):
-    change, missing, count, words = case
-    write(tmp_path, change, missing)
+    change, missing, count, words, *plan = case
+    write(tmp_path, change, missing, **(plan[0] if plan else {}))
     gate = judge(tmp_path)
     assert (gate["ok"], gate["measured"], gate["bound"]) == (False, count, 0)
     assert words in gate["text"]
@@ -83,7 +88,9 @@ KEPT = {
     "downwards": (numbered(lambda k: 90 - k), ()),
     "in steps, touching": (numbered(lambda k: 2 * k + 1), ()),
     "every second of slices that overlap by half": (numbered(up, thickness=2), ODD),
-    "in steps, the thickness unknown": (numbered(lambda k: 2 * k, set_values(SliceThickness=None)), ()),
+    "in steps, the thickness unknown": (numbered(lambda k: 2 * k, thickness=None), ()),
+    "in large steps, the thickness unknown": (numbered(lambda k: 5 * k, thickness=None), (), {"gap": 9.0}),
+    "in ones, the thickness unknown": (numbered(up, thickness=None), (), {"gap": 5.0}),
     "a hole in the numbers alone": (numbered(lambda k: k + 1 + 50 * (k > 9)), ()),
     "after localizers elsewhere": (numbered(lambda k: k + 1 + LOCALIZERS), ()),
     "cut out of a longer series": (numbered(lambda k: k + 1 + SLICES), ()),

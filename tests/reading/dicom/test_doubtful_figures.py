@@ -44,8 +44,19 @@ def test_headers_alone_tell_spacings_and_rescale(tmp_path):
 
 
 def test_a_thickness_that_is_not_stated(tmp_path):
-    write_series(tmp_path, Plan(gap=30.0), set_values(SliceThickness=None))
-    assert judge(tmp_path)[1] == []
+    write_series(tmp_path, Plan(gap=7.0), set_values(SliceThickness=None, InstanceNumber=None))
+    warnings, failed = judge(tmp_path)
+    assert [text for text in warnings if "times the width" in text] == [
+        "slices lie 7 mm apart, 10 times the width of a pixel, and no SliceThickness says whether the tissue"
+        " between them was measured"
+    ]
+    assert failed == []
+
+
+@pytest.mark.parametrize(("gap", "thickness"), [(6.9, None), (7.0, 5.0)])
+def test_gaps_of_which_nothing_is_said(tmp_path, gap, thickness):
+    write_series(tmp_path, Plan(gap=gap), set_values(SliceThickness=thickness))
+    assert not any("times the width" in text for text in judge(tmp_path)[0])
 
 
 # --- HU ---

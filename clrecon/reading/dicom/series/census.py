@@ -3,7 +3,8 @@
 A stack without its ends, or without every second slice, is as evenly spaced as a whole one.  Its headers may tell:
 InstanceNumber leaves out numbers or begins late, and ImagesInAcquisition or NumberOfSeriesRelatedInstances count more
 than there is.  Numbers alone prove nothing, because writers are free to number in steps, from 0, downwards, or from
-where another series ended.  So a step of numbers counts only where the positions or the thickness agree with it.
+where another series ended.  So a step of numbers counts only where the positions or the thickness agree with it, or
+where no thickness contradicts it and the gaps are wide.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ WIDER = 1.05
 """Where numbers go up in steps, a gap over this many thicknesses means that the slices between are missing: scanners
 make slices that touch or overlap.  With a gap of one thickness, numbers in steps are only odd."""
 CLOSEST = 0.25
-"""Least distance in thicknesses that the slices between would have: numbers in larger steps are only odd."""
+"""Least distance in thicknesses that the slices between would have: numbers in larger steps are only odd.  Where no
+thickness is stated, the slices between would lie at least a pixel apart, and the steps are at most 1 / `CLOSEST`."""
 PROPORTIONAL = 0.05
 """Largest relative difference of the distances for one number where positions follow the numbers."""
 
@@ -133,9 +135,14 @@ def _judge_steps(census: Census, stack: Stack, numbers: NDArray[np.int64]) -> tu
     if (steps == unit).all():
         thickness = median_thickness(stack.slices)
         gap = stack.line.gap_median_mm or median(gaps)  # where positions are rounded, not that of the numbers
-        if unit == 1 or thickness is None or gap <= WIDER * thickness or gap < unit * CLOSEST * thickness:
+        if thickness is None:
+            touches = unit * CLOSEST > 1.0 or gap < unit * max(stack.slices[0].di_mm, stack.slices[0].dj_mm)
+            why = f"step {unit}, slices lie {gap:.4g} mm apart, and no SliceThickness says that none is between them"
+        else:
+            touches = gap <= WIDER * thickness or gap < unit * CLOSEST * thickness
+            why = f"step {unit}, and slices of {thickness:g} mm lie {gap:.4g} mm apart"
+        if unit == 1 or touches:
             return 0, ""
-        why = f"step {unit}, and slices of {thickness:g} mm lie {gap:.4g} mm apart"
         unit = 1
     else:
         each = gaps * unit / steps

@@ -54,6 +54,8 @@ from clrecon.system.arguments import name_parameter
 from clrecon.system.records import Gate, at_most, none_of, unmeasured
 from clrecon.system.text import count_of, hash_uid
 
+LONG_VOXELS = 10.0
+"""Gaps of so many pixels want a SliceThickness that says what lies between."""
 GAP_THICKNESSES = 2.0
 """Largest gap in slice thicknesses.  Beyond it more is left out than measured: 10 in a high-resolution lung scan."""
 SLOPES, INTERCEPTS = (1e-3, 100.0), (-40_000.0, 40_000.0)
@@ -329,10 +331,22 @@ def collect_series_warnings(series: Series) -> list[str]:
             text = text.format(type=odd.rescale_type, intercept=f"{odd.intercept:g}", slope=f"{odd.slope:g}")
             warnings.append(f"{text} ({_place(series.stack, is_so)})")
     warnings += [f"{text} ({_place(series.stack, is_so)})" for text, is_so in describe_differences(headers)]
+    warnings += _describe_long_voxels(series.stack)
     doubt = series.find_doubt()
     if doubt and not any(doubt in text for text in warnings):
         warnings.append(doubt)
     return warnings
+
+
+def _describe_long_voxels(stack: Stack) -> list[str]:
+    """Describe gaps of many pixels where no thickness says whether the tissue between was measured."""
+    gap, pixel = stack.line.gap_median_mm, max(stack.slices[0].di_mm, stack.slices[0].dj_mm)
+    if gap is None or gap < LONG_VOXELS * pixel or median_thickness(stack.slices) is not None:
+        return []
+    return [
+        f"slices lie {gap:.4g} mm apart, {gap / pixel:.3g} times the width of a pixel, and no SliceThickness says"
+        " whether the tissue between them was measured"
+    ]
 
 
 def _describe_what_was_left(series: Series) -> list[str]:
