@@ -64,7 +64,7 @@ def make_mesh(
         run.lap("select")
         is_measured = settings.strict or (report_path is not None if measure is None else measure)
         gates = _refine_and_measure(run, made, is_measured)
-        warnings = [*warn_of_crumbs(parts, settings), *describe_purposes(parts), *warn_of_gates(gates)]
+        warnings = [*warn_of_crumbs(parts, settings), *describe_purposes(parts, settings), *warn_of_gates(gates)]
         run.lap("measure")
         meshes = [part.mesh for part in parts]
         if settings.one_file:

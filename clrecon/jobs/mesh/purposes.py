@@ -79,6 +79,9 @@ THIN_MM = 1.0
 LEFT_SHARE = 0.5
 """What was left out in volumes of what was kept, from which on there is a warning: the other leg of a pair."""
 
+OTHER_SHARE = 0.05
+"""Share of ml without walls like bone, beside all parts, from which on there is a warning: ribs in coarse voxels."""
+
 THIN_SHARE = 0.05
 """Share of the surface with thin walls from which on there is a warning."""
 
@@ -141,7 +144,21 @@ def warn_of_print(facts: dict[str, Any]) -> list[str]:
     return warnings
 
 
-def describe_purposes(parts: Sequence[Part]) -> list[str]:
+def warn_of_other_pieces(facts: Sequence[dict[str, Any]]) -> list[str]:
+    """Return a warning if all parts (of `describe_print`) leave out much that may be thin bone."""
+    left_out = facts[0]["left_out"] if facts else {}
+    other_ml = left_out.get("not_bone_ml") or 0.0
+    if other_ml <= OTHER_SHARE * sum(one["pieces_ml"] for one in facts):
+        return []
+    all_pieces, all_parts = name_parameter("min_volume_ml", 0.1), name_parameter("all_parts", True)
+    return [
+        f"{count_of(left_out['not_bone'], 'piece')} of {format_digits(other_ml)} ml together were left out, crumbs or"
+        " with walls that do not reach 600 HU like those of bone: coarse voxels blur thin ribs below that."
+        f" {all_pieces} in place of {all_parts} keeps pieces of any material"
+    ]
+
+
+def describe_purposes(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
     """Measure what the purpose of the meshes needs, as ``print`` in the `facts` of each; return warnings."""
 
     warnings = []
@@ -150,4 +167,6 @@ def describe_purposes(parts: Sequence[Part]) -> list[str]:
         if part.facts["print"] is not None:
             name = f"{part.name}: " if part.name else ""
             warnings += [name + text for text in warn_of_print(part.facts["print"])]
+    if settings.all_parts:
+        warnings += warn_of_other_pieces([facts for part in parts if (facts := part.facts["print"]) is not None])
     return warnings

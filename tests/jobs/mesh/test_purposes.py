@@ -14,7 +14,7 @@ from clrecon import Volume
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
 from clrecon.jobs.mesh.choices import LabelChoice
-from clrecon.jobs.mesh.purposes import settings_for, warn_of_print
+from clrecon.jobs.mesh.purposes import settings_for, warn_of_other_pieces, warn_of_print
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.proof.phantom import PhantomSettings, write_phantom
 
@@ -91,6 +91,16 @@ def test_warnings_say_what_can_go_wrong() -> None:
     assert warn_of_print({**good, "left_out": told}) == []
     told["not_bone_ml"] = 3.0
     assert "bone that was left out encloses 1.1 ml" in warn_of_print({**good, "left_out": told})[0]
+
+
+def test_all_parts_say_how_much_is_left_out_as_no_bone() -> None:
+    facts = [{"left_out": {"not_bone": 27, "not_bone_ml": 2.1}, "pieces_ml": 30.0}, {"pieces_ml": 11.9}]
+    (text,) = warn_of_other_pieces(facts)
+    assert text.startswith("27 pieces of 2.1 ml together were left out, crumbs or with walls that do not reach 600 HU")
+    assert "min_volume_ml=0.1 in place of all_parts=True keeps" in text
+    assert warn_of_other_pieces([*facts, {"pieces_ml": 0.2}]) == []
+    facts[0]["left_out"]["not_bone_ml"] = None  # bone was not told from other things
+    assert warn_of_other_pieces(facts) == warn_of_other_pieces([]) == []
 
 
 @pytest.mark.release
