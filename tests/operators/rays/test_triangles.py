@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from types import SimpleNamespace
 from typing import Any
 
@@ -55,8 +56,16 @@ def quad(low: float, high: float, y: float) -> Mesh:
 
 
 @pytest.mark.every_device
-@pytest.mark.parametrize("lighting", [pytest.param(Lighting(), marks=pytest.mark.oclgrind), FIXED, UNSHADED])
-@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize(
+    ("name", "lighting"),
+    [
+        pytest.param("inside", Lighting(), marks=pytest.mark.oclgrind),
+        pytest.param("parallel", Lighting(), marks=pytest.mark.oclgrind),
+        ("perspective", Lighting()),
+        ("inside, parallel", Lighting()),
+        *product(CAMERAS, (FIXED, UNSHADED)),
+    ],
+)
 def test_every_layer_is_that_of_the_twin(device: Any, name: str, lighting: Lighting) -> None:
     mesh, camera = soup(), CAMERAS[name]
     rng = np.random.default_rng(4)
