@@ -396,4 +396,4 @@ def _find_several(command: str, options: argparse.Namespace) -> str:
     if isinstance(levels, tuple) and len(levels) > 1:
         return "several iso values"
     picked = options.path is not None and not any(str(seed).startswith("label:") for seed in options.grow_from or ())
-    return "labels (name one with --label)" if picked and len(options.only or ()) != 1 else ""
+    return "labels (name one with --label)" if picked and len(options.label or ()) != 1 else ""

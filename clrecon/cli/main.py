@@ -31,7 +31,6 @@ _DESTINATIONS = {
     "iso_value": "hu",
     "kind": "points",
     "min_samples": "clusters",
-    "only": "label",
     "picture": "output",
 }
 """Other names of parameters, which count where a command has no option of the parameter's own name."""

@@ -25,8 +25,8 @@ _TURNED = "in reverse order: the volume's axes are left-handed"
 """Field array ``SLICES`` of an image whose slices run from the last one of the volume to its first."""
 
 
-def make_image_data(own: Image) -> Any:
-    """Make the image of `Volume.to_pyvista`."""
+def make_image_data(own: Image, name: str = "HU") -> Any:
+    """Make the image of `Volume.to_pyvista`, its numbers as the point data `name`."""
     import pyvista
 
     notes = {} if own.resampled is None else {"RESAMPLED": f"trilinear, to a regular grid: {own.resampled}"}
@@ -37,10 +37,10 @@ def make_image_data(own: Image) -> Any:
     steps = np.linalg.norm(affine[:3, :3], axis=0)
     image = pyvista.ImageData(dimensions=values.shape[::-1], spacing=tuple(steps), origin=tuple(affine[:3, 3]))
     image.SetDirectionMatrix(*(affine[:3, :3] / steps).ravel())  # pyvista has a property for it since 0.45
-    image.point_data["HU"] = values.reshape(-1)
-    image.set_active_scalars("HU")
-    for name, text in {"SPACE": "LPS", "UNIT": "mm", **notes}.items():
-        image.field_data[name] = [text]
+    image.point_data[name] = values.reshape(-1)
+    image.set_active_scalars(name)
+    for note, text in {"SPACE": "LPS", "UNIT": "mm", **notes}.items():
+        image.field_data[note] = [text]
     return image
 
 

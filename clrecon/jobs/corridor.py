@@ -135,7 +135,7 @@ def make_corridors(
         run.check(files.named("the mesh"), source, settings.labels)
         volume, labels = run.read_labelled(source)
         run.lap("read")
-        numbers = list(dict.fromkeys(labels.find(label) for label in settings.only))
+        numbers = list(dict.fromkeys(labels.find(one) for one in settings.label))
         names = file_suffixes({number: labels.name(number) for number in numbers})
         with run.keeping():
             _name_files(files, list(names.values()))
@@ -279,7 +279,7 @@ def _write_meshes(
     from clrecon.operators.surface.labels import extract_labels
 
     vertebrae = extract_labels(
-        volume, labels, level, device=run.settings.device, numbers=list(found), solid=True,
+        volume, labels, level, device=run.settings.device, label=list(found), solid=True,
         memory=run.settings.memory, progress=run.progress,
     )  # fmt: skip
     meshes: dict[str, Mesh] = {}

@@ -100,7 +100,6 @@ def crop_labels(labels: LabelMap, box: Box | None, space: str) -> LabelMap:
 
     from clrecon.geometry import frame_from_lps
     from clrecon.geometry.blocks import find_block, place_block
-    from clrecon.labels import LabelMap
 
     turned = np.sort(np.array(box) * np.diag(frame_from_lps(space)), axis=0)
     origins = labels.affine[:3, 3] + np.arange(labels.shape_ijk[2])[:, None] * labels.affine[:3, 2]
@@ -113,6 +112,4 @@ def crop_labels(labels: LabelMap, box: Box | None, space: str) -> LabelMap:
         raise UsageError("nothing is left: no labelled voxel lies in the box of the crop")
     affine, _ = place_block(labels.affine, origins, False, block)
     names = {number: labels.name(number) for number in labels.numbers}
-    return LabelMap(
-        cut, affine, names, frame_of_reference_hash=labels.frame_of_reference_hash, warnings=labels.warnings
-    )
+    return labels.changed(cut, names, affine=affine)

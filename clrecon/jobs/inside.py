@@ -106,7 +106,7 @@ def make_inside(
         with DeviceOpening(settings.device, _try_masks) as opening:
             volume, labels = run.read_labelled(source)
             device = opening.wait()
-        numbers = list(dict.fromkeys(labels.find(label) for label in settings.only))
+        numbers = list(dict.fromkeys(labels.find(one) for one in settings.label))
         suffixes = list(file_suffixes({number: labels.name(number) for number in numbers}).values())
         several = len(suffixes) > 1
         if run.no_clobber:
@@ -167,7 +167,7 @@ def _check_files(
     from clrecon.operators.vertebrae.inside import PARTS
 
     # names of several vertebrae are those of the label map, which is not read yet: their number stands for them
-    first = [part if len(settings.only) == 1 else f"{len(settings.only)}_{part}" for part in PARTS]
+    first = [part if len(settings.label) == 1 else f"{len(settings.label)}_{part}" for part in PARTS]
     outputs = check_outputs(output, report_path, first)
     if picture is not None:
         check_pictures(picture, settings.view)

@@ -273,14 +273,14 @@ class Run(Laps):
 
         return read_selected(source, self.settings, progress=self.progress)
 
-    def read_labelled(self, source: str | Path, only: Sequence[str | int] | None = None) -> tuple[Volume, LabelMap]:
-        """Read the scan and the label map of the settings; with `only` these labels of it."""
+    def read_labelled(self, source: str | Path, label: Sequence[str | int] | None = None) -> tuple[Volume, LabelMap]:
+        """Read the scan and the label map of the settings; with `label` these labels of it."""
         from clrecon.jobs.inputs import read_with_labels
         from clrecon.labels import read_labels
 
         path, linked = self.settings.labels, self.settings.follow_links
         volume, labels = read_with_labels(
-            partial(self.read, source), path, lambda volume: read_labels(path, only, volume=volume, follow_links=linked)
+            partial(self.read, source), path, lambda scan: read_labels(path, label, volume=scan, follow_links=linked)
         )
         assert labels is not None
         return volume, labels

@@ -79,10 +79,10 @@ class ExportSettings(InputSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class StatsSettings(ScanSettings):
-    """Settings of the job of statistics; without `only` all labels are measured."""
+    """Settings of the job of statistics; without `label` all labels are measured."""
 
     labels: str | Path = label_map_option(required=True)
-    only: Sequence[str | int] = option(
+    label: Sequence[str | int] = option(
         "--label NAME|N", "this label only; may be given again", default=(), action="append", first=True
     )
     percentiles: Sequence[float] | None = option(
@@ -156,7 +156,7 @@ class InsideSettings(ScanSettings, DeviceSettings):
     """
 
     labels: str | Path = label_map_option(required=True)
-    only: Sequence[str | int] = option(
+    label: Sequence[str | int] = option(
         "--label NAME|N", "label of a vertebra; may be given again", action="append", required=True, first=True
     )
     view: str = option(
@@ -185,8 +185,8 @@ class InsideSettings(ScanSettings, DeviceSettings):
 
     def __post_init__(self) -> None:
         check_space(self.space)
-        if not self.only:
-            raise UsageError(f"choose the vertebrae by their labels: {name_parameter('only', 'L3')}")
+        if not self.label:
+            raise UsageError(f"choose the vertebrae by their labels: {name_parameter('label', 'L3')}")
         super().__post_init__()
         if self.grow_mm is not None and self.iso_value is None:
             raise UsageError(
@@ -270,7 +270,7 @@ class CorridorSettings(ScanSettings, DeviceSettings):
     """Settings of the corridor job; without `iso_value` it is half way, measured in the scan."""
 
     labels: str | Path = label_map_option(required=True)
-    only: Sequence[str | int] = option(
+    label: Sequence[str | int] = option(
         "--label NAME|N", "a vertebra of the map; may be given again", default=(), action="append", first=True
     )
     iso_value: float | None = option(
@@ -289,8 +289,8 @@ class CorridorSettings(ScanSettings, DeviceSettings):
     space: str = space_option("patient frame of points and meshes", group="space")
 
     def __post_init__(self) -> None:
-        if not self.only:
-            raise UsageError(f"name the vertebrae: {name_parameter('only', 'L3')}, once for each")
+        if not self.label:
+            raise UsageError(f"name the vertebrae: {name_parameter('label', 'L3')}, once for each")
         if not (math.isfinite(self.margin) and 0.0 <= self.margin <= LARGEST_MARGIN_MM):
             raise UsageError(f"the margin is a length from 0 to {LARGEST_MARGIN_MM:g} mm, not {self.margin:g}")
         if self.iso_value is not None and not math.isfinite(self.iso_value):

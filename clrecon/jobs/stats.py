@@ -41,12 +41,12 @@ def measure_stats(
     """Read a scan and its label map, and measure each label."""
     with Run(settings, **how) as run:
         run.check([("the report", report_path), ("the table", csv_path)], source, settings.labels)
-        only = tuple(settings.only) or None
-        volume, labels = run.read_labelled(source, only)
+        label = tuple(settings.label) or None
+        volume, labels = run.read_labelled(source, label)
         run.lap("read")
         taken = resample_labels(labels, volume)
         percentiles = check_percentiles(PERCENTILES if settings.percentiles is None else settings.percentiles)
-        figures = measure_resampled(volume, labels, taken, only, percentiles=percentiles, progress=run.progress)
+        figures = measure_resampled(volume, labels, taken, label, percentiles=percentiles, progress=run.progress)
         run.lap("measure")
         report = run.report(
             StatsReport,

@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry import Grid
+from clrecon.geometry import Grid, Volume
 from clrecon.geometry.affine import checked_affine
-from clrecon.geometry.images import make_nibabel, make_sitk, place_in_header, take_nibabel, take_sitk
+from clrecon.geometry.images import Image, make_nibabel, make_sitk, place_in_header, take_nibabel, take_sitk
 from clrecon.geometry.resample import LARGEST_SHEAR_DEGREES, shear_degrees
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.files import replace_file
-from clrecon.system.packages import ShownAsHtml
+from clrecon.system.packages import ShownAsHtml, public_function
 from clrecon.system.paths import keep_existing
 from clrecon.system.text import escape_text
 
@@ -110,11 +110,11 @@ def file_suffixes(names: Mapping[int, str]) -> dict[int, str]:
     return unique
 
 
-def check_wanted(only: str | int | Iterable[str | int] | None) -> tuple[str | int, ...] | None:
-    if only is None:
+def check_wanted(label: str | int | Iterable[str | int] | None) -> tuple[str | int, ...] | None:
+    if label is None:
         return None
-    wanted = (only,) if isinstance(only, str | int) else tuple(only)
-    if not all(isinstance(label, str | int) for label in wanted):
+    wanted = (label,) if isinstance(label, str | int) else tuple(label)
+    if not all(isinstance(one, str | int) for one in wanted):
         raise UsageError("labels are chosen by number or name")
     if not wanted:
         raise UsageError("no label is chosen: name one, or leave the choice out for all")
@@ -212,7 +212,7 @@ class LabelMap(Grid, ShownAsHtml):
         return find_number(label, self.names, self.counts)
 
     @explains_arguments
-    def choose(self, labels: Iterable[int | str] | int | str | None) -> tuple[int, ...]:
+    def choose(self, label: Iterable[int | str] | int | str | None) -> tuple[int, ...]:
         """Return the numbers of one or several labels, each once; of all that occur for None.
 
         Raises
@@ -220,23 +220,69 @@ class LabelMap(Grid, ShownAsHtml):
         UsageError
             The sequence is empty, or as for `find`.
         """
-        wanted = check_wanted(labels)
-        return self.numbers if wanted is None else tuple(dict.fromkeys(self.find(label) for label in wanted))
+        wanted = check_wanted(label)
+        return self.numbers if wanted is None else tuple(dict.fromkeys(self.find(one) for one in wanted))
 
     @explains_arguments
-    def voxels_of(self, labels: Iterable[int | str] | int | str) -> NDArray[np.bool_]:
+    def voxels_of(self, label: Iterable[int | str] | int | str) -> NDArray[np.bool_]:
         """Return which voxels have one of some labels, chosen as by `choose`; shape (nk, nj, ni)."""
-        return np.isin(self._voxels, self.choose(labels))
+        return np.isin(self._voxels, self.choose(label))
 
     @explains_arguments
-    def only(self, labels: Iterable[int | str] | int | str) -> LabelMap:
+    def only(self, label: Iterable[int | str] | int | str) -> LabelMap:
         """Return a map with some of the labels, chosen as by `choose`, their numbers and names, and 0 elsewhere."""
-        numbers = self.choose(labels)
+        numbers = self.choose(label)
         voxels = np.where(np.isin(self._voxels, numbers), self._voxels, 0).astype(self._voxels.dtype, copy=False)
         names = {number: name for number, name in self._names.items() if number in numbers}
-        return LabelMap(
-            voxels, self._affine, names, frame_of_reference_hash=self.frame_of_reference_hash, warnings=self.warnings
-        )
+        return self.changed(voxels, names)
+
+    @explains_arguments
+    def label(self, label: Iterable[int | str] | int | str, volume: Volume | None = None, *, device: Any = None) -> Any:
+        """Return the voxels of a label, or of several, as a `clrecon.Mask`.
+
+        ``labels & mask`` and ``labels - mask`` are maps of what lies inside and outside of a mask; ``labels | mask``
+        has the mask's voxels without a label as a new label, named as the mask.
+
+        Parameters
+        ----------
+        label : int, str or iterable of them
+            As `choose` takes them.
+        volume : Volume or DeviceVolume, optional
+            Whose voxels are chosen, on any grid, as `clrecon.Mask.from_labels`; by default those of the map itself.
+        device : Device, str or int, optional
+            See `clrecon.device`; errors are those of `clrecon.Mask.from_labels`.
+        """
+        scan = Volume(self._voxels, self._affine) if volume is None else volume
+        return public_function("Mask").from_labels(scan, self, label, device=device)
+
+    @explains_arguments
+    def resample(self, to: Volume) -> LabelMap:
+        """Return the map on the grid of a volume, as `clrecon.resample_labels` brings it there.
+
+        Parameters
+        ----------
+        to : Volume
+
+        Raises
+        ------
+        UsageError, RefusedInputError
+            The slices of the volume are uneven, or as `clrecon.resample_labels`.
+        """
+        if to.uneven:
+            raise UsageError(
+                "the slices of the volume are uneven, which a label map cannot be: clrecon.resample_labels"
+            )
+        taken = public_function("resample_labels")(self, to)
+        return self.changed(taken.voxels, affine=to.affine, warnings=taken.warnings)
+
+    def changed(self, voxels: NDArray[Any], names: Mapping[int, str] | None = None, **place: Any) -> LabelMap:
+        """Return a map with other voxels and names, and whatever else of `LabelMap` is given."""
+        own = {
+            "affine": self._affine,
+            "frame_of_reference_hash": self.frame_of_reference_hash,
+            "warnings": self.warnings,
+        }
+        return LabelMap(voxels, names=self._names if names is None else names, **{**own, **place})
 
     @explains_arguments
     def save(self, path: str | os.PathLike[str], *, no_clobber: bool = False) -> int:
@@ -275,13 +321,7 @@ class LabelMap(Grid, ShownAsHtml):
         UsageError
             The axes are sheared, which such an image cannot hold, or SimpleITK is not installed.
         """
-        shear = shear_degrees(self._affine)
-        if shear > LARGEST_SHEAR_DEGREES:
-            raise UsageError(
-                f"this image has axes at right angles, but those of the label map are sheared by {shear:.2f} degrees:"
-                " to_nibabel() and save() hold them"
-            )
-        return make_sitk(self._voxels, self._affine)
+        return make_sitk(*self._at_right_angles()[:2])
 
     @classmethod
     @explains_arguments
@@ -302,6 +342,52 @@ class LabelMap(Grid, ShownAsHtml):
         """
         voxels, affine = take_sitk(image)
         return cls(_as_whole(voxels), affine, names)
+
+    def to_pyvista(self) -> Any:
+        """Return the map as ``pyvista.ImageData`` in LPS mm: point data ``label``, names in a field array ``LABELS``.
+
+        Memory and axes are as of `Volume.to_pyvista`: sheared ones are refused.
+        """
+        from clrecon.geometry.vtk import make_image_data
+
+        image = make_image_data(self._at_right_angles(), "label")
+        image.field_data["LABELS"] = [f"{number} {name}" for number, name in self.names.items()] or [""]
+        return image
+
+    @classmethod
+    @explains_arguments
+    def from_pyvista(
+        cls, image: Any, names: Mapping[int, str] | None = None, *, name: str | None = None, space: str | None = None
+    ) -> LabelMap:
+        """Make a map of a ``pyvista.ImageData``; its voxels are a copy.
+
+        Parameters
+        ----------
+        image : pyvista.ImageData
+            In mm, with a whole number from 0 to 65,535 at each point, which may be stored as a real one.
+        names : mapping of int to str, optional
+            As of a `LabelMap`; None: those of the field array ``LABELS``, which `to_pyvista` writes.
+        name : str, optional
+            Name of the point data; None: the active scalars.
+        space : {"lps", "ras"}, optional
+            As of `Volume.from_pyvista`, whose errors are those of a map.
+        """
+        from clrecon.geometry.vtk import take_image_data
+
+        voxels, affine = take_image_data(image, name, space)
+        if names is None and "LABELS" in image.field_data:
+            rows = [str(text).partition(" ")[::2] for text in image.field_data["LABELS"]]
+            names = {int(number): text for number, text in rows if re.fullmatch("[0-9]{1,5}", number)}
+        return cls(_as_whole(voxels), affine, names)
+
+    def _at_right_angles(self) -> Image:
+        shear = shear_degrees(self._affine)
+        if shear > LARGEST_SHEAR_DEGREES:
+            raise UsageError(
+                f"this image has axes at right angles, but those of the label map are sheared by {shear:.2f} degrees:"
+                " to_nibabel() and save() hold them"
+            )
+        return Image(self._voxels, self._affine, None)
 
     def to_nibabel(self) -> Any:
         """Return the map as ``nibabel.Nifti1Image``: array (i, j, k) on the memory of the voxels, affine to RAS mm.

@@ -49,7 +49,7 @@ WARNINGS_SHOWN = 3
 @explains_arguments
 def read_labels(
     path: str | Path,
-    only: Sequence[str | int] | str | int | None = None,
+    label: Sequence[str | int] | str | int | None = None,
     *,
     volume: Grid | None = None,
     follow_links: bool = False,
@@ -66,7 +66,7 @@ def read_labels(
     Parameters
     ----------
     path : path
-    only : sequence of str or int, optional
+    label : int, str or sequence of them, optional
         The labels to read, as `LabelMap.find` takes them; the map has no others.  They may overlap other labels, but
         not each other.
     volume : Volume, optional
@@ -90,7 +90,7 @@ def read_labels(
         The file is not a label map (CT images, probabilities, negative numbers, four axes), is cut off or corrupt, does
         not say where it lies in space, or has segments that overlap.
     """
-    wanted = check_wanted(only)
+    wanted = check_wanted(label)
     labels = _read(Path(path), Wanted(wanted, others=False), volume, follow_links, progress)
     return labels if wanted is None else _keep(labels, [labels.find(label) for label in wanted])
 
@@ -112,13 +112,8 @@ def _keep(labels: LabelMap, numbers: Sequence[int]) -> LabelMap:
         return labels
     table = np.zeros(LARGEST_NUMBER + 1, labels.voxels.dtype)
     table[list(numbers)] = numbers
-    return LabelMap(
-        np.stack([table[plane] for plane in labels.voxels]),
-        labels.affine,
-        {number: labels.name(number) for number in numbers},
-        frame_of_reference_hash=labels.frame_of_reference_hash,
-        warnings=labels.warnings,
-    )
+    names = {number: labels.name(number) for number in numbers}
+    return labels.changed(np.stack([table[plane] for plane in labels.voxels]), names)
 
 
 def _read(path: Path, wanted: Wanted, volume: Grid | None, follow_links: bool, progress: Progress | None) -> LabelMap:

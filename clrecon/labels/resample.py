@@ -47,6 +47,9 @@ class ResampledLabels:
     inside: dict[int, float]
     warnings: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        return f"ResampledLabels({self.voxels.shape}, exact={self.exact}, {len(self.inside)} labels)"
+
 
 @explains_arguments
 def resample_labels(labels: LabelMap, volume: Volume, *, progress: Progress | None = None) -> ResampledLabels:

@@ -102,6 +102,6 @@ class Painter:
             raise RefusedInputError(
                 f"segments of {self._file} overlap: {a} {self._names[a]} and {b} {self._names[b]} share {count:,}"
                 f" voxels{f', and {len(self._shared) - 1} more pairs' if len(self._shared) > 1 else ''};"
-                f" choose labels that do not overlap ({name_parameter('only')}), one run each"
+                f" choose labels that do not overlap ({name_parameter('label')}), one run each"
             )
         return LabelMap(self._voxels, affine, self._names, **options)

@@ -99,7 +99,7 @@ def check_percentiles(percentiles: Sequence[float]) -> tuple[float, ...]:
 def measure_labels(
     volume: Volume,
     labels: LabelMap,
-    only: Sequence[str | int] | str | int | None = None,
+    label: Sequence[str | int] | str | int | None = None,
     *,
     percentiles: Sequence[float] = PERCENTILES,
     progress: Progress | None = None,
@@ -113,7 +113,7 @@ def measure_labels(
     ----------
     volume : Volume
     labels : LabelMap
-    only : sequence of str or int, optional
+    label : int, str or sequence of them, optional
         The labels that are wanted, as `LabelMap.find` takes them; default: all that occur.
     percentiles : sequence of float
         From 0 to 100.
@@ -134,7 +134,7 @@ def measure_labels(
     """
     check_percentiles(percentiles)
     return measure_resampled(
-        volume, labels, resample_labels(labels, volume), only, percentiles=percentiles, progress=progress
+        volume, labels, resample_labels(labels, volume), label, percentiles=percentiles, progress=progress
     )
 
 
@@ -142,7 +142,7 @@ def measure_resampled(
     volume: Volume,
     labels: LabelMap,
     taken: ResampledLabels,
-    only: Sequence[str | int] | str | int | None = None,
+    label: Sequence[str | int] | str | int | None = None,
     *,
     percentiles: Sequence[float] = PERCENTILES,
     progress: Progress | None = None,
@@ -152,7 +152,7 @@ def measure_resampled(
 
     wanted = check_percentiles(percentiles)
     progress = progress or ignore_progress
-    numbers = sorted(labels.choose(only))
+    numbers = sorted(labels.choose(label))
     boxes = find_objects(taken.voxels)
     voxel_ml = slice_voxel_ml(volume)
     figures = []

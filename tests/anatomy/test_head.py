@@ -119,7 +119,7 @@ def test_row_70_surfaces_of_labels_say_so(
     tissue, bone = MATERIALS.index("tissue"), MATERIALS.index("bone")
 
     def told(iso_value: float) -> dict[int, int]:
-        meshes = clrecon.extract_labels(head, map_, iso_value, numbers=[tissue, bone], device=device)
+        meshes = clrecon.extract_labels(head, map_, iso_value, label=[tissue, bone], device=device)
         return {number: mesh.report["warnings"].count(SAID) for number, mesh in meshes.items()}
 
     looked: list[Volume] = []

@@ -86,6 +86,7 @@ def test_a_right_import_is_accepted(module: str, source: str) -> None:
 
 CALLS_PUBLIC = {
     "clrecon/geometry/volume.py": {"write_volume", "show"},
+    "clrecon/labels/label_map.py": {"Mask", "resample_labels"},
     "clrecon/mesh/mesh.py": {"show"},
     "clrecon/operators/masks/mask.py": {"extract_label_masks"},
     "clrecon/system/packages.py": {"to_html"},

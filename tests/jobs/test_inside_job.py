@@ -118,12 +118,12 @@ def test_wrong_files_are_one_line_and_leave_nothing(
     assert inside("--label", "L1", output="none/a.stl") == 6
     assert capsys.readouterr().err.count("\n") == 3
     assert list(tmp_path.iterdir()) == []
-    settings = InsideSettings(labels=spine / "levels.nrrd", only=["L1"])
+    settings = InsideSettings(labels=spine / "levels.nrrd", label=["L1"])
     assert settings.space == "lps"
     with pytest.raises(UsageError, match="choose the vertebrae by their labels"):
-        InsideSettings(labels="x.nrrd", only=())
+        InsideSettings(labels="x.nrrd", label=())
     with pytest.raises(UsageError, match="must be above 0 bytes"):
-        InsideSettings(labels="x.nrrd", only=["L1"], memory=0)
+        InsideSettings(labels="x.nrrd", label=["L1"], memory=0)
 
 
 @pytest.mark.release

@@ -62,7 +62,7 @@ def test_other_extensions_are_refused_and_nothing_is_written(name: str, tmp_path
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("library", ["sitk", "nibabel"])
+@pytest.mark.parametrize("library", ["sitk", "nibabel", "pyvista"])
 def test_another_library_gives_back_what_it_got(library: str) -> None:
     labels = label_map()
     image = getattr(labels, f"to_{library}")()
@@ -77,8 +77,21 @@ def test_places_in_simpleitk_are_those_of_the_map() -> None:
     np.testing.assert_allclose(
         image.TransformIndexToPhysicalPoint((4, 3, 2)), (OBLIQUE @ [4.0, 3.0, 2.0, 1.0])[:3], atol=1e-12
     )
-    with pytest.raises(UsageError, match=r"sheared by \d+\.\d\d degrees: to_nibabel\(\) and save\(\) hold them"):
-        label_map(SHEARED).to_sitk()
+    for library in ("to_sitk", "to_pyvista"):
+        with pytest.raises(UsageError, match=r"sheared by \d+\.\d\d degrees: to_nibabel\(\) and save\(\) hold them"):
+            getattr(label_map(SHEARED), library)()
+
+
+def test_pyvista_has_numbers_places_and_names_of_the_map() -> None:
+    labels = label_map()
+    image = labels.to_pyvista()
+    assert image.active_scalars_name == "label"
+    row = int(np.flatnonzero(image["label"] == 700)[0])
+    np.testing.assert_allclose(image.points[row], (OBLIQUE @ [4.0, 3.0, 2.0, 1.0])[:3], atol=1e-5)
+    assert LabelMap.from_pyvista(image).names == labels.names
+    assert LabelMap.from_pyvista(image, {1: "one"}).names == {1: "one", 700: "label_700"}
+    empty = LabelMap(np.zeros((2, 2, 2), np.uint8), np.eye(4)).to_pyvista()
+    assert LabelMap.from_pyvista(empty).names == {}
 
 
 def image_of(values: Any) -> Any:
@@ -94,3 +107,16 @@ def test_whole_numbers_stored_as_real_ones_are_labels_and_others_are_not() -> No
             LabelMap.from_nibabel(image_of(np.array(wrong)))
     with pytest.raises(UsageError, match="labels run from 0 to 65,535, these from -1 to 1"):
         LabelMap.from_nibabel(image_of(np.array([0.0, -1.0, 1.0])))
+
+
+def test_a_map_on_the_grid_of_a_volume_is_what_resampling_says() -> None:
+    labels = label_map()
+    volume = clrecon.Volume(np.zeros((6, 4, 5), np.int16), OBLIQUE @ np.diag([1.0, 1.0, 0.5, 1.0]))
+    taken = labels.resample(volume)
+    assert np.array_equal(taken.voxels, clrecon.resample_labels(labels, volume).voxels)
+    assert np.array_equal(taken.affine, volume.affine) and taken.names == labels.names
+    assert repr(clrecon.resample_labels(labels, volume)) == "ResampledLabels((6, 4, 5), exact=False, 2 labels)"
+    places = [(OBLIQUE @ [0.0, 0.0, k, 1.0])[:3] for k in (0.0, 1.0, 2.5)]
+    uneven = clrecon.Volume(np.zeros((3, 4, 5), np.int16), OBLIQUE, slice_positions=places)
+    with pytest.raises(UsageError, match="the slices of the volume are uneven"):
+        labels.resample(uneven)

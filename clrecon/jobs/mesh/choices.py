@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LabelChoice:
-    """The labels of a map, by numbers or names, that become meshes; without `only` all that have a surface."""
+    """The labels of a map, by numbers or names, that become meshes; without `label` all that have a surface."""
 
     path: str | Path = label_map_option(default=MISSING)
-    only: tuple[str | int, ...] = option(
+    label: tuple[str | int, ...] = option(
         "--label NAME|N", "this label only; may be given again (default: all)", default=(), action="append"
     )
     hidden: tuple[str | int, ...] = option(
@@ -57,7 +57,7 @@ class LabelChoice:
     def numbers_of(self, labels: LabelMap) -> list[int]:
         """Return the numbers of the labels that become meshes."""
         hidden = {labels.find(label) for label in self.hidden}
-        wanted = [labels.find(label) for label in self.only] or list(labels.numbers)
+        wanted = [labels.find(label) for label in self.label] or list(labels.numbers)
         left = [number for number in wanted if number not in hidden]
         if not left:
             raise UsageError("all labels are hidden: there is no mesh to make")

@@ -36,7 +36,7 @@ def open_labels(
         return None
     from clrecon.labels.reader import read_all_labels
 
-    return read_all_labels(choice.path, choice.only or None, volume=volume, follow_links=follow_links)
+    return read_all_labels(choice.path, choice.label or None, volume=volume, follow_links=follow_links)
 
 
 def name_label_files(labels: LabelMap, choice: LabelChoice, surfaces: Sequence[Surface]) -> list[str]:
@@ -65,7 +65,7 @@ def extract_label_surfaces(
     found: list[tuple[Surface, int, Mesh]] = []
     numbers = choice.numbers_of(labels)
     colors = choice.colors_of(labels, numbers, settings.one_file)
-    asked = numbers if choice.only or choice.hidden else None
+    asked = numbers if choice.label or choice.hidden else None
     suffixes = file_suffixes({number: labels.name(number) for number in numbers})  # reports contain no other names
     for surface in surfaces:
         if surface.iso_value is None:
@@ -75,7 +75,7 @@ def extract_label_surfaces(
         if isinstance(surface.iso_value, tuple):  # refused with the settings
             raise UsageError(f"labels take one iso value, not {surface.describe()}")
         meshes = extract_labels(
-            volume, labels, surface.iso_value, device=device, numbers=asked, grow_mm=choice.grow_mm,
+            volume, labels, surface.iso_value, device=device, label=asked, grow_mm=choice.grow_mm,
             closed=settings.closed, solid=choice.solid, memory=settings.memory, progress=progress,
         )  # fmt: skip
         found += [(surface, number, mesh) for number, mesh in meshes.items()]
@@ -113,7 +113,7 @@ def _extract_masks(
         labels = crop_labels(labels, settings.crop, settings.space)
         numbers = None if numbers is None else [number for number in numbers if number in labels.counts]
     meshes = extract_label_masks(
-        labels, device=device, numbers=numbers, closed=settings.closed, memory=settings.memory, progress=progress
+        labels, device=device, label=numbers, closed=settings.closed, memory=settings.memory, progress=progress
     )
     for number, mesh in meshes.items():
         mesh.report |= {

@@ -246,7 +246,7 @@ class MeshSettings(InputSettings):
         if self.grow_from or self.method_used != "t-mc" or self.vertex_rule != "linear":
             check_growing(
                 self.method_used, self.grow_from, self.vertex_rule, topology=self.topology, inside=self.inside,
-                has_labels=self.labels is not None, makes_labels=self.labels is not None and bool(self.labels.only),
+                has_labels=self.labels is not None, makes_labels=self.labels is not None and bool(self.labels.label),
             )  # fmt: skip
         if self.labels_pick and self.below is not None:
             raise UsageError("labels take what lies from one iso value on, not below it")

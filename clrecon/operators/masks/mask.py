@@ -97,7 +97,7 @@ class Mask(MaskComponents):
         cls,
         volume: Volume | DeviceVolume,
         labels: LabelMap,
-        numbers: Sequence[int | str] | int | str | None = None,
+        label: Sequence[int | str] | int | str | None = None,
         *,
         device: Device | str | int | None = None,
         memory: int | None = None,
@@ -109,7 +109,7 @@ class Mask(MaskComponents):
         volume : Volume or DeviceVolume
         labels : LabelMap
             On any grid.
-        numbers : sequence of int or str, optional
+        label : int, str or sequence of them, optional
             Numbers or names of labels; all of the map by default.
 
         Raises
@@ -121,7 +121,7 @@ class Mask(MaskComponents):
         DeviceError
             As for `from_band`.
         """
-        chosen = labels.choose(numbers)
+        chosen = labels.choose(label)
         with open_volume(volume, device, memory, "a mask") as resident:
             voxels = resident.bring(labels).voxels
             wanted = np.zeros(int(np.iinfo(voxels.dtype).max) + 1, np.bool_)
@@ -265,6 +265,29 @@ class Mask(MaskComponents):
             raise NoSurfaceError(f"no voxel is chosen ({self.name}): there is no surface")
         extract: Callable[..., dict[int, Mesh]] = public_function("extract_label_masks")
         return extract(self.to_label_map(), device=self.device, memory=self.memory)[1]
+
+    def __rand__(self, other: LabelMap) -> LabelMap:
+        return self._relabelled(other, lambda voxels, chosen: np.where(chosen, voxels, 0))
+
+    def __rsub__(self, other: LabelMap) -> LabelMap:
+        return self._relabelled(other, lambda voxels, chosen: np.where(chosen, 0, voxels))
+
+    def __ror__(self, other: LabelMap) -> LabelMap:
+        number = max({0, *getattr(other, "names", ())}) + 1
+        return self._relabelled(
+            other,
+            lambda voxels, chosen: np.where(chosen & (voxels == 0), np.int32(number), voxels),
+            {number: self.name},
+        )
+
+    def _relabelled(self, labels: LabelMap, change: Callable[..., NDArray[Any]], more: Any = None) -> LabelMap:
+        """Return a label map on the grid of the mask with changed voxels and `more` names."""
+        from clrecon.labels import LabelMap
+
+        if not isinstance(labels, LabelMap):
+            return NotImplemented
+        self._check_frame(Volume(labels.voxels, labels.affine))
+        return labels.changed(change(labels.voxels, self.to_numpy()), {**labels.names, **(more or {})})
 
     @explains_arguments
     def apply(self, volume: Volume | DeviceVolume, outside: float = AIR_HU) -> Any:

@@ -471,7 +471,7 @@ def _surface(
     if np.ndim(level) != 0:
         raise UsageError("the surface of a label has one iso value, no band: ask for voxels, or leave the labels out")
     numbers = None if label is None else [label]
-    meshes = extract_labels(resident, labels, level, numbers=numbers, progress=progress)
+    meshes = extract_labels(resident, labels, level, label=numbers, progress=progress)
     report: Mapping[str, Any] = next(iter(meshes.values())).report
     points = np.concatenate([mesh.vertices for mesh in meshes.values()])
     normals = np.concatenate([mesh.normals for mesh in meshes.values() if mesh.normals is not None])

@@ -355,7 +355,7 @@ def extract_label_masks(
     labels: LabelMap,
     *,
     device: Device | str | int | None = None,
-    numbers: Sequence[int | str] | int | str | None = None,
+    label: Sequence[int | str] | int | str | None = None,
     closed: bool = True,
     memory: int | None = None,
     progress: Progress | None = None,
@@ -375,7 +375,7 @@ def extract_label_masks(
         The surfaces lie on its own grid: nothing is resampled.
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.
-    numbers : sequence of int or str, optional
+    label : int, str or sequence of them, optional
         Labels to extract, as `LabelMap.find` takes them.  None: all that occur.
     closed : bool
         Close the surface where it meets the border of the map.
@@ -412,7 +412,7 @@ def extract_label_masks(
     if not labels.numbers:
         raise RefusedInputError("the label map is empty: no voxel has a label")
     marching_cubes.check_row(labels.shape_ijk[0])
-    chosen = labels.choose(numbers)
+    chosen = labels.choose(label)
 
     for attempt in with_fallback(take_device(device)):
         with attempt as (current, warnings):

@@ -356,7 +356,7 @@ def extract_labels(
     iso_value: float,
     *,
     device: Device | str | int | None = None,
-    numbers: Sequence[int | str] | int | str | None = None,
+    label: Sequence[int | str] | int | str | None = None,
     grow_mm: float | None = None,
     closed: bool = True,
     solid: bool = False,
@@ -381,7 +381,7 @@ def extract_labels(
         HU.
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.
-    numbers : sequence of int or str, optional
+    label : int, str or sequence of them, optional
         Labels to extract, as `LabelMap.find` takes them; each must have a surface.  None: all that have one.
     grow_mm : float, optional
         Distance of growth; None is one voxel each way, the 26 neighbours.
@@ -423,7 +423,7 @@ def extract_labels(
         for attempt in resident.with_fallback():
             with attempt as (_, warnings):
                 run = LabelExtraction(resident, taken, rule, growth, solid, warnings)
-                meshes = _make_meshes(run, labels, taken, numbers, progress or ignore_progress)
+                meshes = _make_meshes(run, labels, taken, label, progress or ignore_progress)
     if not meshes:
         raise _refuse_all(resident.volume, taken, labels, rule)
     return meshes
@@ -442,13 +442,13 @@ def _make_meshes(
     run: LabelExtraction,
     labels: LabelMap,
     taken: ResampledLabels,
-    numbers: Sequence[int | str] | int | str | None,
+    label: Sequence[int | str] | int | str | None,
     progress: Progress,
 ) -> dict[int, Mesh]:
     """Make the meshes of labels that have one; a label that was named must have one."""
-    chosen = labels.choose(numbers)
+    chosen = labels.choose(label)
     boxes = find_boxes(taken.voxels, chosen, run.growth.reach)
-    refuse = None if numbers is None else partial(_refuse_label, run.volume, taken, labels, run.rule)
+    refuse = None if label is None else partial(_refuse_label, run.volume, taken, labels, run.rule)
     missing = [number for number in chosen if number not in boxes]
     if missing and refuse is not None:
         raise refuse(missing[0])

@@ -296,7 +296,7 @@ def _check_masks(device: Device) -> str:
     for dtype in ("uint8", "uint16"):
         wave = waves(WIDE, "float32") > 40.0
         numbers = np.where(wave, 3, np.where(noise(WIDE, "uint8", 9) == 0, 5, 0)).astype(dtype)
-        mesh = extract_label_masks(LabelMap(numbers, OBLIQUE), device=device, numbers=[3], closed=False)[3]
+        mesh = extract_label_masks(LabelMap(numbers, OBLIQUE), device=device, label=[3], closed=False)[3]
         level = round(mesh.report["mask_level"] * FULL)
         expected = twin.extract_label_mask(numbers, OBLIQUE, 3, level, closed=False)
         worst = max(worst, compare_mesh(stack(numbers, OBLIQUE), mesh, expected, f"a mask of type {dtype}"))

@@ -161,7 +161,7 @@ def _mesh_labels(stage: Stage, shown: ShownLabels, state: ViewState, progress: P
     if not parts:
         return []
     found = extract_label_masks(
-        shown.labels, numbers=sorted(parts), device=stage.device, memory=stage.memory, progress=progress
+        shown.labels, label=sorted(parts), device=stage.device, memory=stage.memory, progress=progress
     )
     made = []
     for number, mesh in found.items():

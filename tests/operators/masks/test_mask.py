@@ -6,6 +6,7 @@ import copy
 import math
 import pickle
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from surface_volumes import MIRRORED, OBLIQUE, random_volume
 from uneven_volume import uneven
 
 import clrecon
+from clrecon import LabelMap, Mask
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume, slice_voxel_ml
 from clrecon.proof.volumes import volume_twins as twin
@@ -260,3 +262,31 @@ def test_the_surface_of_a_mask_is_that_of_its_label(device):
     assert mesh.volume / 1000.0 == pytest.approx(mask.ml, rel=1e-3)
     expected = clrecon.extract_label_masks(mask.to_label_map(), device=device)[1]
     np.testing.assert_array_equal(mesh.vertices, expected.vertices)
+
+
+def test_labels_and_masks_of_one_grid_make_label_maps(device: Any) -> None:
+    voxels = np.zeros((3, 4, 37), np.uint8)
+    voxels[0], voxels[1, :, 30:] = 2, 9
+    labels = LabelMap(voxels, np.diag([1.0, 1.0, 2.0, 1.0]), {2: "two", 9: "nine"}, warnings=["doubtful"])
+    assert np.array_equal(labels.label(["two", 9], device=device).to_numpy(), voxels > 0)
+    volume = Volume(np.where(np.arange(37) < 33, -5, 50) * np.ones((3, 4, 1), np.int16), labels.affine)
+    bone = Mask.from_band(volume, (0, None), device=device)
+    chosen = bone.to_numpy()
+    within, outside, more = labels & bone, labels - bone, labels | bone
+    assert np.array_equal(within.voxels, np.where(chosen, voxels, 0)) and within.warnings == ("doubtful",)
+    assert np.array_equal(outside.voxels, np.where(chosen, 0, voxels)) and outside.names == labels.names
+    assert np.array_equal(more.voxels, np.where(chosen & (voxels == 0), 10, voxels))
+    assert more.names == {**labels.names, 10: bone.name}
+    assert np.array_equal(labels.label("nine", volume, device=device).to_numpy(), voxels == 9)
+
+
+def test_labels_and_masks_of_other_grids_are_refused(device: Any) -> None:
+    labels = LabelMap(np.ones((3, 4, 5), np.uint8), np.eye(4))
+    away = Volume(np.ones((3, 4, 5), np.int16), np.diag([1.0, 1.0, 2.0, 1.0]))
+    with pytest.raises(UsageError, match="up to 2 mm apart"):
+        labels & Mask.from_band(away, (0, None), device=device)
+    with pytest.raises(UsageError, match=r"the mask has \(5, 4, 2\) voxels, the other volume \(5, 4, 3\)"):
+        labels - Mask.from_band(away[:2], (0, None), device=device)
+    for other in (3, labels):
+        with pytest.raises(TypeError, match="unsupported operand"):
+            labels & other  # type: ignore[operator]

@@ -179,7 +179,7 @@ def test_surface_points_of_labels(device):
     volume = make_volume((8, 12, 40))
     labels = LabelMap((np.indices(volume.voxels.shape)[2] // 14).astype(np.uint8), volume.affine, {1: "bone"})
     cloud = extract_points(volume, 50, labels=labels, label="bone", device=device)
-    mesh = extract_labels(volume, labels, 50, numbers=["bone"], device=device)[1]
+    mesh = extract_labels(volume, labels, 50, label=["bone"], device=device)[1]
     np.testing.assert_array_equal(cloud.points, mesh.vertices)
     assert set(cloud.labels.tolist()) == {1} and cloud.report["label_name"] == "bone"
     both = extract_points(volume, 50, labels=labels, device=device)

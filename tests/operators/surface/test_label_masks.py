@@ -198,7 +198,7 @@ def test_a_tilted_plane_has_no_steps(device):
 def test_volumes_are_kept_on_any_grid(device, affine):
     labels = mask_of((17, 24, 26), 7.3).astype(np.uint8)
     labels[mask_of((17, 24, 26), 3.0)] = 2
-    for mesh in extract_label_masks(LabelMap(labels, affine), device=device, numbers=[1]).values():
+    for mesh in extract_label_masks(LabelMap(labels, affine), device=device, label=[1]).values():
         assert abs(volume_share(mesh)) <= tolerances.MASK_VOLUME
         assert_sound(mesh)
 
@@ -286,7 +286,7 @@ def test_a_label_that_another_encloses_keeps_its_volume(device, radius):
         assert abs(volume_share(mesh)) <= tolerances.MASK_VOLUME
         assert_sound(mesh)
     assert meshes[2].report["mask_level"] < meshes[1].report["mask_level"] - 0.05
-    alone = extract_label_masks(LabelMap(labels, OBLIQUE), device=device, numbers=[2])[2]
+    alone = extract_label_masks(LabelMap(labels, OBLIQUE), device=device, label=[2])[2]
     assert np.array_equal(alone.vertices, meshes[2].vertices)
 
 
@@ -353,7 +353,7 @@ def test_one_label_alone_is_the_same_as_among_others(device):
     labels = random_labels((20, 9, 40), numbers=(0, 0, 3, 7, 9))
     together = extract_label_masks(LabelMap(labels, OBLIQUE), device=device)
     for number in (7, 9):
-        alone = extract_label_masks(LabelMap(labels, OBLIQUE), device=device, numbers=[number])[number]
+        alone = extract_label_masks(LabelMap(labels, OBLIQUE), device=device, label=[number])[number]
         assert np.array_equal(alone.vertices, together[number].vertices)
         assert np.array_equal(alone.normals, together[number].normals)
         assert np.array_equal(alone.triangles, together[number].triangles)
@@ -388,7 +388,7 @@ def test_every_variant_of_the_kernels_gives_the_same_meshes(device, lanes, words
 def test_the_report_says_what_was_done(device):
     labels = mask_of((9, 9, 9), 3.0).astype(np.uint8)
     label_map = LabelMap(labels, np.diag([1.0, 1.0, 2.0, 1.0]), {1: "lung"}, warnings=["doubtful"])
-    mesh = extract_label_masks(label_map, device=device, numbers=["lung"])[1]
+    mesh = extract_label_masks(label_map, device=device, label=["lung"])[1]
     assert mesh.report["label"] == 1 and mesh.report["label_name"] == "lung" and mesh.report["surface"] == "mask"
     assert mesh.report["label_ml"] == pytest.approx(np.count_nonzero(labels) * 0.002)
     assert 0.3 < mesh.report["mask_level"] < 0.5
@@ -403,7 +403,7 @@ def test_what_cannot_be_is_refused(device):
     with pytest.raises(RefusedInputError, match="the label map is empty"):
         extract_label_masks(LabelMap(np.zeros((2, 3, 4), np.uint8), np.eye(4)), device=device)
     with pytest.raises(UsageError, match="label '9' is not in the label map"):
-        extract_label_masks(labels, device=device, numbers=[9])
+        extract_label_masks(labels, device=device, label=[9])
 
 
 @pytest.mark.oclgrind

@@ -141,7 +141,7 @@ def test_one_label_alone_is_the_same_as_among_others(device):
     labels[2:6], labels[6:13, 2:], labels[15:] = 3, 7, 9
     together = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device)
     for number in (7, 9):
-        alone = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, numbers=[number])[number]
+        alone = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, label=[number])[number]
         assert np.array_equal(alone.vertices, together[number].vertices)
         assert np.array_equal(alone.normals, together[number].normals)
         assert np.array_equal(alone.triangles, together[number].triangles)
@@ -192,7 +192,7 @@ def test_labels_on_another_grid_are_the_same_where_it_covers_the_volume(device):
 def test_the_report_says_what_was_done(device):
     volume, labels = random_volume((5, 7, 9)), random_labels((5, 7, 9))
     label_map = LabelMap(labels, OBLIQUE, {3: "vertebrae_T12"}, warnings=["doubtful"])
-    mesh = extract_labels(volume, label_map, 3, device=device, numbers=["T12"])[3]
+    mesh = extract_labels(volume, label_map, 3, device=device, label=["T12"])[3]
     assert mesh.report["label"] == 3 and mesh.report["label_name"] == "vertebrae_T12"
     assert mesh.report["label_inside_share"] == 1.0 and mesh.report["solid"] is False
     assert mesh.report["grow_mm"] is None
@@ -217,13 +217,13 @@ def test_labels_without_a_surface_are_refused_or_left_out(device):
     label_map = LabelMap(labels, OBLIQUE, {2: "liver"})
     assert tuple(extract_labels(volume, label_map, 3, device=device)) == (5,)
     with pytest.raises(NoSurfaceError, match="no surface of label 2 liver at 3 HU: its voxels run from 1 to 1 HU"):
-        extract_labels(volume, label_map, 3, device=device, numbers=[5, 2])
+        extract_labels(volume, label_map, 3, device=device, label=[5, 2])
     with pytest.raises(NoSurfaceError, match="no label has a voxel of 6 HU or more"):
         extract_labels(volume, label_map, 6, device=device)
     with pytest.raises(UsageError, match="label '9' is not in the label map; there are: 2 liver, 5 label_5"):
-        extract_labels(volume, label_map, 3, device=device, numbers=[9])
+        extract_labels(volume, label_map, 3, device=device, label=[9])
     with pytest.raises(UsageError, match="no label is chosen"):
-        extract_labels(volume, label_map, 3, device=device, numbers=[])
+        extract_labels(volume, label_map, 3, device=device, label=[])
     far = OBLIQUE.copy()
     far[0, 3] += 1000
     with pytest.raises(RefusedInputError, match="0 % of the labels"):
@@ -236,15 +236,15 @@ def test_a_label_that_is_the_whole_of_an_open_volume_has_no_surface(device, numb
     hu[2:4, 2:5, 2:6] = 300
     volume, label_map = Volume(hu, OBLIQUE), LabelMap(np.ones((5, 7, 9), np.uint8), OBLIQUE, {1: "all"})
     for closed, solid in ((True, False), (True, True), (False, False)):
-        assert 1 in extract_labels(volume, label_map, 30, device=device, numbers=numbers, closed=closed, solid=solid)
+        assert 1 in extract_labels(volume, label_map, 30, device=device, label=numbers, closed=closed, solid=solid)
     # Nothing leads to its dense voxels from outside: solid, all of it is inside.
     with pytest.raises(NoSurfaceError, match="no surface of label 1 all at 30 HU: the whole CT is inside of it"):
-        extract_labels(volume, label_map, 30, device=device, numbers=numbers, closed=False, solid=True)
+        extract_labels(volume, label_map, 30, device=device, label=numbers, closed=False, solid=True)
     full = Volume(np.full((5, 7, 9), 50, np.int16), OBLIQUE)
     with pytest.raises(NoSurfaceError, match="no surface of label 1 all at 30 HU: the whole CT is inside of it"):
-        extract_labels(full, label_map, 30, device=device, numbers=numbers, closed=False)
+        extract_labels(full, label_map, 30, device=device, label=numbers, closed=False)
     with pytest.raises(NoSurfaceError, match="no label has a voxel of 500|its voxels run from 0 to 300 HU"):
-        extract_labels(volume, label_map, 500, device=device, numbers=numbers, closed=False, solid=True)
+        extract_labels(volume, label_map, 500, device=device, label=numbers, closed=False, solid=True)
 
 
 def test_a_label_outside_the_volume_is_refused_when_asked_for(device):
@@ -253,7 +253,7 @@ def test_a_label_outside_the_volume_is_refused_when_asked_for(device):
     label_map = LabelMap(labels, OBLIQUE)
     assert tuple(extract_labels(volume, label_map, 3, device=device)) == (2,)
     with pytest.raises(NoSurfaceError, match="label 4 label_4 has no voxel in the CT: it lies outside"):
-        extract_labels(volume, label_map, 3, device=device, numbers=[4])
+        extract_labels(volume, label_map, 3, device=device, label=[4])
 
 
 @pytest.mark.oclgrind
@@ -282,8 +282,7 @@ def test_a_real_vertebra_is_sound(device, real_data):
     folder = real_data / "thoracolumbar_labels"
     volume, labels = read_volume(folder / "ct_2mm_jpeg2000"), read_labels(folder / "ct_2mm_labels.nii.gz")
     hollow, full = (
-        extract_labels(volume, labels, 200, device=device, numbers=["T12", "T11"], solid=solid)
-        for solid in (False, True)
+        extract_labels(volume, labels, 200, device=device, label=["T12", "T11"], solid=solid) for solid in (False, True)
     )
     for mesh in (*hollow.values(), *full.values()):
         assert mesh.quality()["closed"] and mesh.quality()["manifold"]
