@@ -143,6 +143,11 @@ def test_the_unit_of_length_changes_no_pair(scale):
     assert count((scale * beside, [[0, 1, 2], [3, 4, 5]])) == 0
 
 
+def test_the_bound_of_rounding_is_not_below_the_proven_one():
+    half_step = 2.0**-53
+    assert (7.0 + 56.0 * half_step) * half_step <= intersections._ROUNDING <= 2.0**-50  # of a volume; of an area 3 + 16
+
+
 def test_triangles_with_a_common_corner_cut_each_other_by_the_edges_opposite_to_it():
     """The edge from vertex 3 to 4 passes through the inside of the first triangle, and then beside it."""
     vertices = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [1, 1, -1], [1, 1.5, 3], [0.5, 0.5, 3.0]])

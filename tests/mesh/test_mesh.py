@@ -93,6 +93,13 @@ def test_what_a_mesh_says_of_itself():
     assert repr(Mesh(*samples.box())) == "Mesh(8 vertices, 12 triangles, LPS mm)"
 
 
+def test_contents_of_a_file_have_name_and_colour_of_a_part():
+    content = Mesh(*samples.box(), None, {"part_name": "001", "color": [1, 0.5, 0]}).describe("LPS")
+    assert (content.name, content.color) == ("001", (1.0, 0.5, 0.0))
+    plain = Mesh(*samples.box()).describe("LPS")
+    assert (plain.name, plain.color) == (None, None)
+
+
 def test_what_is_empty_still_has_three_columns():
     assert Mesh([], []).vertices.shape == Mesh(np.zeros((0, 3)), []).vertices.shape == (0, 3)
     with pytest.raises(UsageError, match=r"shape \(n, 3\), these have \(0, 2\)"):

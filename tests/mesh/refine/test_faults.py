@@ -120,3 +120,18 @@ def test_two_faces_back_to_back_beside_what_is_new_are_found():
     new = np.zeros(count + 3, dtype=bool)
     new[count + 1] = True
     assert find_faults_beside(faces, new).tolist() == [count, count + 1, count + 2]
+
+
+def test_all_of_a_surface_is_examined_before_what_is_new(monkeypatch):
+    def beside(*given):
+        raise AssertionError("the surroundings alone were examined")
+
+    monkeypatch.setattr("clrecon.mesh.refine.clusters.find_faults_beside", beside)
+    vertices, triangles = samples.box()
+    clusters = Clusters(np.asarray(vertices, np.float64), np.asarray(triangles, np.uint32), np.zeros(3))
+    clusters._new_to_faults[0] = True
+    assert clusters.find_faults().tolist() == [] and not clusters._new_to_faults.any()
+    assert clusters.find_faults().tolist() == []  # nothing is new
+    clusters._new_to_faults[0] = True
+    with pytest.raises(AssertionError, match="surroundings"):
+        clusters.find_faults()

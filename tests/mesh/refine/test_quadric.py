@@ -11,7 +11,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.connectivity import label_components
-from clrecon.mesh.refine.quadric import _farthest_point, collapse_quadric
+from clrecon.mesh.refine.quadric import _compare_topology, _farthest_point, collapse_quadric
 from clrecon.mesh.refine.topology import compare_topology, measure_topology
 
 pytestmark = pytest.mark.unit
@@ -84,6 +84,17 @@ def test_the_farthest_of_points_is_exact():
     there = SurfaceDistance(vertices, triangles.astype(np.uint32))(points).max()
     found = _farthest_point(points - FAR, vertices - FAR, triangles.astype(np.uint32))
     assert found == pytest.approx(there, abs=tolerances.FLOAT32_POINT_MM)
+
+
+def test_vertices_without_faces_are_in_no_component_that_is_lost():
+    vertices, triangles = samples.join(samples.box(), samples.box())
+    mesh = Mesh(np.vstack((vertices, FAR)), triangles)
+    names = np.arange(len(mesh.vertices))
+    found, lost = _compare_topology(mesh, mesh.triangles, names)
+    assert (found.components_lost, lost.tolist()) == (0, [])
+    names[8:16] = 8  # the second box shrinks to a point
+    found, lost = _compare_topology(mesh, mesh.triangles[:12], names)
+    assert (found.components_lost, lost.tolist()) == (1, list(range(8, 16)))
 
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0, -0.1, 90.0, float("nan")])
