@@ -15,9 +15,24 @@ from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.geometry import column_spacing, signed_tilt
-from clrecon.proof.phantom.sampling import add_noise, apply_point_spread, sample_occupancy
+from clrecon.proof.phantom.sampling import (
+    add_cupping,
+    add_noise,
+    add_streaks,
+    apply_point_spread,
+    outside_disc,
+    sample_occupancy,
+)
 from clrecon.proof.phantom.scene_plans import plan_scene
-from clrecon.proof.phantom.scenes import CEILING_HU, DENSE_HU, LabelArray, draw_scene, facts_of_parts
+from clrecon.proof.phantom.scenes import (
+    CEILING_HU,
+    DENSE_HU,
+    MATERIALS,
+    METAL_HU,
+    LabelArray,
+    draw_scene,
+    facts_of_parts,
+)
 from clrecon.proof.phantom.series import RESCALE_INTERCEPT, Placement, place_slices, write_label_map, write_series
 from clrecon.proof.phantom.settings import CENTRE_LPS_MM, KINDS, PhantomSettings, draw_ghosts
 from clrecon.proof.phantom.shapes import choose_body
@@ -112,8 +127,10 @@ def _make(
     spine: dict[str, Any] | None = None
     half_maximum: float | None = None
     labels: LabelArray | None = None
+    scanner = KINDS[settings.kind].scanner
     if KINDS[settings.kind].is_scene:
         field, labels = draw_scene(plan_scene(settings), settings, affine, progress)
+        half_maximum = _half_maximum(settings)
     elif settings.kind == "spine":
         blood = BLOOD_HU + _PHASE_HU * phase
         field, anatomy = draw_spine(settings, affine, progress, places=places, blood_hu=blood)
@@ -126,11 +143,17 @@ def _make(
         surface = body.describe()
         half_maximum = (settings.inside_hu + settings.outside_hu) / 2.0
     apply_point_spread(field, affine, settings.point_spread_mm, progress, places)
+    if labels is not None and scanner.streaks:
+        add_streaks(field, labels == MATERIALS.index("metal"), METAL_HU, affine, scanner.streaks, settings.seed)
+    if scanner.cupping_hu:
+        add_cupping(field, affine, scanner.cupping_hu)
     add_noise(field, settings.noise, settings.seed if phase == 0 else settings.seed + 1000003 * phase)
     voxels = np.empty(field.shape, dtype=np.int16)
     floor, ceiling = (-32768, 32767 + RESCALE_INTERCEPT) if labels is None else (RESCALE_INTERCEPT, CEILING_HU)
     for k in range(len(field)):
-        voxels[k] = np.rint(np.clip(field[k], floor, ceiling))
+        voxels[k] = np.rint(scanner.slope * np.clip(field[k], floor, ceiling) + scanner.offset)
+    if scanner.padding is not None:
+        voxels[:, outside_disc(field.shape[1:], affine)] = scanner.padding
     ghosts = draw_ghosts(voxels, settings.seed) if settings.ghosts else None
     truth = {
         "generator": _GENERATOR,
@@ -146,6 +169,7 @@ def _make(
         "surface": surface,
         "spine": spine,
         "ghosts": ghosts,
+        "unit": scanner.unit,
         "parts": None if labels is None else facts_of_parts(voxels, labels, affine),
         "noise_hu": settings.noise,
         "point_spread_mm": settings.point_spread_mm,
@@ -156,6 +180,13 @@ def _make(
         truth["series"] = series
         truth["shape_ijk"][2] = len(series["slice_positions_lps_mm"])
     return voxels, truth, labels
+
+
+def _half_maximum(settings: PhantomSettings) -> float | None:
+    """Return the value half way between bone and tissue of a scene, None where it has several."""
+    kind = KINDS[settings.kind]
+    pair = kind.bone_and_tissue_hu
+    return None if pair is None else round(kind.scanner.to_values(sum(pair) / 2.0), 1)
 
 
 def _iso_value(settings: PhantomSettings, half_maximum: float | None) -> float:

@@ -1,15 +1,19 @@
-"""Plans of scenes: heads, limbs, specimens, trunks, and the table from the kind of a scene to its plan."""
+"""Plans of scenes: heads, limbs, specimens, trunks, and the table from the kind of a scene to its plan.
+
+Bone of jaw, long bone, hand, hip and mouse is compact all over, with marrow of tissue's values in it: its volume at
+half of the way from tissue to bone is that of its parts.  Walls are three voxels thick and more."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from clrecon.proof.phantom.fields import Field, coverage, ellipsoid
-from clrecon.proof.phantom.scenes import AIR_HU, Part, Plan, ball, column, cut, lay_under, rod
+from clrecon.proof.phantom.scenes import AIR_HU, METAL_HU, Part, Plan, Point, ball, box, column, cut, lay_under, rod
 from clrecon.proof.phantom.settings import PhantomSettings
 from clrecon.proof.phantom.spine_parts import Vertebra
 from clrecon.proof.phantom.spine_plan import plan_anatomy
@@ -137,8 +141,6 @@ SPONGY_HU = 260.0
 MARROW_HU = -60.0
 MUSCLE_HU = 55.0
 FAT_HU = -100.0
-METAL_HU = 8000.0
-"""Far above the highest 12-bit value, so that it is cut off when stored."""
 
 
 def _leg(x: float, y: float, size: float) -> list[Part]:
@@ -302,6 +304,130 @@ def plan_nothing() -> Plan:
     return Plan([], front=-40.0, back=40.0)
 
 
+def _tubes(
+    chains: Sequence[tuple[Sequence[Point], float]], wall: float, bone_hu: float, marrow_hu: float
+) -> list[Part]:
+    """Plan closed bones along chains of points with their outer radius: all of bone first, then the marrow in it."""
+
+    def along(material: str, hu: float, inset: float) -> list[Part]:
+        return [
+            rod(material, hu, a, b, radius - inset)
+            for points, radius in chains
+            if radius > inset
+            for a, b in itertools.pairwise(points)
+        ]
+
+    return [*along("bone", bone_hu, 0.0), *along("tissue", marrow_hu, wall)]
+
+
+def _arch(angle_deg: float, z: float) -> Point:
+    """Return a place on the arch of the jaw: 0 is the chin, 90 the patient's left end."""
+    angle = math.radians(angle_deg)
+    return 26.0 * math.sin(angle), 22.0 - 48.0 * math.cos(angle), z
+
+
+def plan_jaw() -> Plan:
+    """Plan a mandible with nine teeth and an implant in soft tissue, air in the mouth and before the lips."""
+    angles = np.linspace(-90.0, 90.0, 15)
+    body = [([_arch(float(angle), z) for angle in angles], 6.4) for z in (-7.6, -1.0)]
+    parts = [
+        column("tissue", 50.0, (0.0, 6.0), (40.0, 42.0)),
+        ball("air", AIR_HU, (0.0, 2.0, 10.0), (13.0, 15.0, 7.0)),
+        *_tubes(body, 2.2, 1400.0, 60.0),
+    ]
+    *teeth, lost = (-66.0, -50.0, -36.0, -22.0, -8.0, 8.0, 22.0, 52.0, 68.0, 37.0)
+    parts += [rod("bone", 1900.0, _arch(angle, 0.0), _arch(angle, 13.0), 3.0) for angle in teeth]
+    parts += [rod("metal", METAL_HU, _arch(lost, -4.0), _arch(lost, 12.0), 2.0)]
+    return Plan(parts, front=-36.0, back=48.0)
+
+
+def plan_long_bone() -> Plan:
+    """Plan a shaft of 3.1 mm with a lattice of trabeculae 0.16 mm thick, in saline in a plastic tube."""
+    parts = [
+        column("table", 120.0, (0.0, 0.0), (1.96, 1.96)),
+        column("tissue", 0.0, (0.0, 0.0), (1.84, 1.84)),
+        rod("bone", 2600.0, (-0.08, 0.0, -5.0), (0.08, 0.0, 5.0), 1.55),
+        rod("tissue", 0.0, (-0.08, 0.0, -5.0), (0.08, 0.0, 5.0), 1.2),
+    ]
+
+    def within(x: Field, y: Field, z: Field) -> Field:
+        return np.asarray(np.float32(1.35) - np.sqrt(x * x + y * y), dtype=np.float32)
+
+    jitter = np.random.default_rng(20)
+    for axis, one, other in itertools.product(range(3), np.arange(-0.9, 1.0, 0.6), np.arange(-0.9, 1.0, 0.6)):
+        ends = np.insert(np.add((one, other), jitter.uniform(-0.05, 0.05, (2, 2))), axis, (-1.5, 1.5), axis=1)
+        a, b = ((float(end[0]), float(end[1]), float(end[2])) for end in ends)
+        parts.append(cut(rod("bone", 2600.0, a, b, 0.08), within))
+    return Plan(parts, front=-1.96, back=1.96)
+
+
+def plan_hand() -> Plan:
+    """Plan a flat hand: 14 phalanges, 5 metacarpals and 8 wrist bones, 2.5 mm apart and more, in fingers and a palm."""
+    bones: list[tuple[Sequence[Point], float]] = []
+    flesh: list[Part] = []
+    lengths, radii = (42.0, 27.0, 16.0, 11.0), (4.6, 4.4, 4.0, 3.6)
+    for base, lean, scale, first in (
+        ((27.0, 0.0, -44.0), 0.6, 0.9, 1),
+        ((17.0, 0.0, -42.0), 0.12, 0.98, 0),
+        ((2.0, -1.0, -42.0), 0.0, 1.02, 0),
+        ((-13.0, 0.0, -42.0), -0.1, 0.96, 0),
+        ((-28.0, 1.0, -43.0), -0.2, 0.82, 0),
+    ):
+        way = np.array((math.sin(lean), 0.0, math.cos(lean)))
+        at = np.array(base)
+        for length, radius in list(zip(lengths, radii, strict=True))[first:]:
+            start, at = at + radius * way, at + scale * length * way
+            bones.append(([_point(start), _point(at - radius * way)], radius))
+            at = at + 2.8 * way
+        flesh.append(rod("tissue", 60.0, base, _point(at), 10.0, 8.0))
+    places = [(x, y, z) for z, y in ((-51.0, 0.0), (-63.5, 1.0)) for x in (-22.0, -8.0, 6.0, 20.0)]
+    wrist = [([(x - 0.7, y, z), (x + 0.7, y, z)], 5.0) for x, y, z in places]
+    palm = ball("tissue", 60.0, (-4.0, 0.0, -30.0), (40.0, 13.0, 34.0))
+    arm = column("tissue", 60.0, (-2.0, 0.0), (30.0, 13.0), (-1e4, -40.0))
+    return Plan([palm, arm, *flesh, *_tubes([*bones, *wrist], 2.2, 1250.0, 60.0)], front=-13.0, back=13.0)
+
+
+def plan_hip() -> Plan:
+    """Plan the left hip of a slim person: a stem in the femur and a head of metal in a socket of bone."""
+    head, neck, tip = (-16.0, 0.0, 22.0), (16.0, 4.0, -4.0), (14.0, 6.0, -38.0)
+    ilium = [(-18.0, 8.0, 44.0), (-26.0, 16.0, 140.0)]
+    parts = [
+        column("tissue", FAT_HU, (0.0, 2.0), (74.0, 64.0)),
+        column("tissue", 60.0, (0.0, 2.0), (66.0, 56.0)),
+        *_tubes([(ilium, 15.0), ([head, (-70.0, -24.0, 16.0)], 11.0)], 5.5, 1350.0, 60.0),
+        *_tubes([([(17.0, 4.0, -8.0), (13.0, 7.0, -180.0)], 15.5)], 6.0, 1350.0, 60.0),
+        ball("bone", 1350.0, head, (26.0, 26.0, 26.0)),
+        column("tissue", 60.0, (head[0] + 8.0, 0.0), (22.0, 30.0), (-12.0, 14.0)),
+        ball("tissue", 60.0, head, (18.0, 18.0, 18.0)),
+        ball("metal", METAL_HU, head, (14.0, 14.0, 14.0)),
+        rod("metal", METAL_HU, head, neck, 6.0),
+        rod("metal", METAL_HU, neck, tip, 6.5, 5.0),
+    ]  # fmt: skip
+    return Plan(parts, front=-62.0, back=66.0)
+
+
+def plan_mouse() -> Plan:
+    """Plan the hind part of a mouse: lumbar spine, pelvis and legs, in a half pipe of plastic."""
+    parts = [
+        column("table", 110.0, (0.0, 0.0), (12.4, 12.4)),
+        column("air", AIR_HU, (0.0, 0.0), (11.6, 11.6)),
+        box("air", AIR_HU, (-14.0, -14.0, -1e4), (14.0, -2.0, 1e4)),
+        column("tissue", FAT_HU, (0.0, 1.4), (10.2, 10.2)),
+        column("tissue", 40.0, (0.0, 1.4), (9.5, 9.5)),
+        ball("air", AIR_HU, (1.5, -3.5, 2.0), (1.6, 1.2, 2.2)),
+    ]
+    legs: list[tuple[Sequence[Point], float]] = []
+    for side in (1.0, -1.0):
+        hip, knee = (side * 3.6, 3.0, -0.6), (side * 6.6, -2.6, 2.6)
+        legs += [([hip, knee], 0.85), ([(side * 6.4, -3.6, 0.6), (side * 4.6, 2.0, -4.0)], 0.7)]
+        legs += [([(side * 1.8, 6.2, 3.4), (side * 2.3, 3.6, -0.8), (side * 1.6, 0.0, -4.0)], 0.65)]
+        for z in (-2.6, 0.4, 3.4):
+            parts.append(rod("bone", 1300.0, (side * 0.6, 8.0, z), (side * 2.4, 8.3, z + 0.5), 0.36))
+    parts += [rod("bone", 1300.0, (0.0, 8.0, z - 0.5), (0.0, 8.0, z + 0.5), 0.85) for z in (-5.6, -2.6, 0.4, 3.4)]
+    parts += [rod("bone", 1300.0, (0.0, 8.0, z), (0.0, 10.1, z), 0.36) for z in (-2.6, 0.4, 3.4)]
+    return Plan([*parts, *_tubes(legs, 0.37, 1300.0, 40.0)], front=-8.8, back=12.4)
+
+
 PLANS: dict[str, Callable[[], Plan]] = {
     "skull": plan_dry_skull,
     "head": plan_head,
@@ -312,6 +438,11 @@ PLANS: dict[str, Callable[[], Plan]] = {
     "contrast": plan_contrast,
     "water": plan_water,
     "empty": plan_nothing,
+    "jaw": plan_jaw,
+    "longbone": plan_long_bone,
+    "hand": plan_hand,
+    "hip": plan_hip,
+    "mouse": plan_mouse,
 }
 """The planning function of each kind of `clrecon.proof.phantom.settings.KINDS` that is a scene."""
 

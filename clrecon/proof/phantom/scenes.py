@@ -90,6 +90,8 @@ MATERIALS = ("air", "tissue", "bone", "contrast", "metal", "water", "table")
 """Materials of the parts; the label of a voxel is the index in this tuple."""
 
 AIR_HU = -1000.0
+METAL_HU = 8000.0
+"""Far above the highest 12-bit value, so that it is cut off when stored."""
 CEILING_HU = 3071
 """Highest value of 12 stored bits with the intercept -1024; metal is cut off there."""
 DENSE_HU = 300.0
@@ -186,9 +188,23 @@ def facts_of_parts(voxels: NDArray[np.int16], labels: LabelArray, affine: Float6
                 "label": label,
                 "voxels": count,
                 "volume_ml": round(count * voxel_ml, 3),
+                "volume_mm3": round(1000.0 * count * voxel_ml, 4),
                 "voxels_above_300_hu": int(np.count_nonzero(voxels[mask] > DENSE_HU)),
             }
     return found
+
+
+def bone_depth(parts: Sequence[Part], points_mm: Float64Array, *materials: str) -> Float32Array:
+    """Return how deep points, (n, 3) LPS mm, lie in the parts of these materials, mm, negative outside.
+
+    Exact for rods and balls, and to the first order for the other shapes.
+    """
+    x, y, z = np.ascontiguousarray((points_mm - CENTRE_LPS_MM).T, dtype=np.float32)
+    depth = np.full(len(points_mm), -np.inf, dtype=np.float32)
+    for part in parts:
+        own = part.distance_at(x, y, z)
+        depth = np.maximum(depth, own) if part.material in materials else np.minimum(depth, -own)
+    return depth
 
 
 Distance = Callable[[Field, Field, Field], Field]

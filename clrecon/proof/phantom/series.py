@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.geometry import compose_affine
-from clrecon.proof.phantom.settings import CENTRE_LPS_MM, PhantomSettings, make_localizer
+from clrecon.proof.phantom.settings import CENTRE_LPS_MM, KINDS, PhantomSettings, make_localizer
 from clrecon.proof.phantom.spine_plan import slice_directions
 from clrecon.system.progress import Progress
 
@@ -148,6 +148,7 @@ def _make_headers(settings: PhantomSettings, placement: Placement, phase: int) -
 
     study, series, frame = (_make_uid(settings, name) for name in ("study", "series", "frame of reference"))
     columns, rows = settings.size
+    scanner = KINDS[settings.kind].scanner
     for k, position in enumerate(placement.positions):
         number = phase * settings.slices + k
         instance = _make_uid(settings, "instance", str(number))
@@ -167,7 +168,7 @@ def _make_headers(settings: PhantomSettings, placement: Placement, phase: int) -
         header.PatientName, header.PatientID = "PHANTOM^CLRECON", "PHANTOM"
         header.PatientBirthDate = header.PatientSex = ""
         header.PatientPosition = "HFP" if settings.prone else "HFS"
-        header.KVP, header.SliceThickness = "120", placement.slice_thickness
+        header.KVP, header.SliceThickness = str(scanner.kvp), placement.slice_thickness
         if float(placement.tilt) != 0.0:
             header.GantryDetectorTilt = placement.tilt
         header.StudyInstanceUID, header.SeriesInstanceUID = UID(study), UID(series)
@@ -184,7 +185,7 @@ def _make_headers(settings: PhantomSettings, placement: Placement, phase: int) -
         header.PixelSpacing = placement.pixel_spacing
         header.BitsAllocated, header.BitsStored, header.HighBit, header.PixelRepresentation = 16, 16, 15, 1
         header.WindowCenter, header.WindowWidth = "300", "1500"
-        header.RescaleIntercept, header.RescaleSlope, header.RescaleType = str(RESCALE_INTERCEPT), "1", "HU"
+        header.RescaleIntercept, header.RescaleSlope, header.RescaleType = str(RESCALE_INTERCEPT), "1", scanner.unit
         yield header
 
 

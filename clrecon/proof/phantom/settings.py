@@ -110,6 +110,29 @@ def make_localizer(
 
 
 @dataclass(frozen=True)
+class Scanner:
+    """What a scanner makes of HU: the values in its files are ``slope * HU + offset``, in `unit`.
+
+    unit: RescaleType of the files.
+    cupping_hu: What beam hardening takes away at the centre of the field of view, falling with the square of the
+        radius.
+    streaks: Strength of the streaks of metal, see `clrecon.proof.phantom.sampling.add_streaks`.
+    padding: Value outside of the round field of view; None where it is a square.
+    """
+
+    kvp: int = 120
+    slope: float = 1.0
+    offset: float = 0.0
+    unit: str = "HU"
+    cupping_hu: float = 0.0
+    streaks: float = 0.0
+    padding: int | None = None
+
+    def to_values(self, hu: float) -> float:
+        return self.slope * hu + self.offset
+
+
+@dataclass(frozen=True)
 class Kind:
     """A kind of phantom: its description, and its default settings."""
 
@@ -120,10 +143,15 @@ class Kind:
     table: str | None = None
     """Table under bodies of this kind; None for an analytic shape, which lies on nothing."""
     is_scene: bool = False
+    size: tuple[int, int] = (256, 256)
+    slices: int = 120
+    scanner: Scanner = Scanner()
+    bone_and_tissue_hu: tuple[float, float] | None = None
+    """HU of both sides of most of the surface of bone; None where there are several bones or tissues."""
 
 
-def _scene(said: str, spacing: tuple[float, float, float], table: str = "none") -> Kind:
-    return Kind(said, spacing, noise=12.0, point_spread_mm=0.5, table=table, is_scene=True)
+def _scene(said: str, spacing: tuple[float, float, float], table: str = "none", **more: Any) -> Kind:
+    return Kind(said, spacing, **{"noise": 12.0, "point_spread_mm": 0.5, "table": table, "is_scene": True, **more})
 
 
 KINDS = {
@@ -141,6 +169,55 @@ KINDS = {
     "contrast": _scene("trunk with heart and vessels brighter and larger than the spine", (1.4, 1.4, 2.0)),
     "water": _scene("cylinder of water in an acrylic shell", (1.0, 1.0, 1.5)),
     "empty": _scene("a table with nothing on it", (1.7, 1.7, 2.0), "curved"),
+    "jaw": _scene(
+        "mandible with an implant in a cone beam: grey values of its own, cupping, streaks, a round field of view",
+        (0.4, 0.4, 0.4),
+        noise=40.0,
+        point_spread_mm=0.24,
+        size=(220, 220),
+        slices=90,
+        scanner=Scanner(kvp=90, slope=0.8, offset=350.0, cupping_hu=160.0, streaks=1.0, padding=0),
+        bone_and_tissue_hu=(1400.0, 50.0),
+    ),
+    "longbone": _scene(
+        "shaft with trabeculae in micro-CT, in mg HA/cm3",
+        (0.02, 0.02, 0.02),
+        noise=60.0,
+        point_spread_mm=0.011,
+        size=(200, 200),
+        slices=100,
+        scanner=Scanner(kvp=55, slope=0.4, unit="MGML"),
+        bone_and_tissue_hu=(2600.0, 0.0),
+    ),
+    "hand": _scene(
+        "hand on a table, fingers along the slices' step",
+        (0.7, 0.7, 0.7),
+        "flat",
+        noise=15.0,
+        point_spread_mm=0.4,
+        size=(168, 80),
+        slices=208,
+        bone_and_tissue_hu=(1250.0, 60.0),
+    ),
+    "hip": _scene(
+        "one hip with a prosthesis and its streaks",
+        (0.8, 0.8, 1.6),
+        noise=15.0,
+        size=(200, 176),
+        slices=64,
+        scanner=Scanner(streaks=1.0),
+        bone_and_tissue_hu=(1350.0, 60.0),
+    ),
+    "mouse": _scene(
+        "hind part of a mouse in a holder",
+        (0.12, 0.12, 0.12),
+        noise=40.0,
+        point_spread_mm=0.07,
+        size=(220, 220),
+        slices=88,
+        scanner=Scanner(kvp=70),
+        bone_and_tissue_hu=(1300.0, 40.0),
+    ),
 }
 """Every kind with its description and defaults."""
 
@@ -228,15 +305,11 @@ class PhantomSettings:
         first=True,
         words=KINDS,
     )
-    size: tuple[int, int] = option(
-        "--size N",
-        "columns and rows, like 256 or 256x192 (default: 256)",
-        default=(256, 256),
-        parse=parse_size,
-        first=True,
+    size: tuple[int, int] = option(  # two numbers once constructed
+        "--size N", "columns and rows, like 256 or 256x192 (default: by kind, mostly 256)", parse=parse_size, first=True
     )
     slices: int = option(  # a number once constructed
-        "--slices N", "default: as many as the levels need, 120 without levels", first=True
+        "--slices N", "default: as many as the levels need, else by kind, mostly 120", first=True
     )
     spacing: tuple[float, float, float] = option(  # three numbers once constructed
         "--spacing DJ DI DK",
@@ -306,7 +379,7 @@ class PhantomSettings:
             raise UsageError(unknown_name("phantom kind", self.kind, KINDS))
         if self.transfer_syntax not in ("explicit", "implicit"):
             raise UsageError(f"unknown transfer syntax {self.transfer_syntax!r}: use explicit or implicit")
-        for name in ("spacing", "noise", "point_spread_mm"):
+        for name in ("spacing", "noise", "point_spread_mm", "size"):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, getattr(KINDS[self.kind], name))
         # Lists (from a command line) become tuples, so that equal settings compare and describe equal.
@@ -321,7 +394,7 @@ class PhantomSettings:
             _check_integer("slices", self.slices, 1, 9999)
         _check_integer("seed", self.seed, 0, 2**31 - 1)
         for name, step in zip(("row spacing dj", "column spacing di", "slice gap dk"), self.spacing, strict=True):
-            _check_number(name, step, 0.05, 50.0, "mm")
+            _check_number(name, step, 0.005, 50.0, "mm")
         _check_number("tilt", self.tilt, -45.0, 45.0, "degrees")
         for name, angle in zip(("oblique about x", "oblique about y", "oblique about z"), self.oblique, strict=True):
             _check_number(name, angle, -360.0, 360.0, "degrees")
@@ -358,7 +431,7 @@ class PhantomSettings:
             choice, slices = self.spine_choice, self.slices
             if choice is not None and self.levels is not None:
                 slices = fit_slices(choice, self.size, self.spacing, self.seed, self._directions, self.slices)
-            object.__setattr__(self, "slices", slices or 120)
+            object.__setattr__(self, "slices", slices or KINDS[self.kind].slices)
 
     def _check_series(self) -> None:
         missing = tuple(self.missing)
