@@ -14,7 +14,7 @@ from clrecon.exchange.content import Content, facts_for_file
 from clrecon.exchange.coordinates import as_stored
 from clrecon.exchange.formats import write_mesh
 from clrecon.geometry import frame_from_lps
-from clrecon.geometry.affine import apply_affine, checked_affine, normal_matrix
+from clrecon.geometry.affine import apply_affine, checked_affine, column_spacing, normal_matrix
 from clrecon.mesh.quality import find_pieces
 from clrecon.mesh.triangles import vertex_normals
 from clrecon.system.arguments import explains_arguments
@@ -107,6 +107,12 @@ class BaseMesh(Message):
         """Number of triangles, m."""
         return len(self._triangles)
 
+    @property
+    def voxel_mm(self) -> float | None:
+        """Shortest voxel step of the scan that the mesh comes from, mm, the measure of bounds; None where unknown."""
+        affine = self.report.get("affine_ijk_to_lps_mm")
+        return self.report.get("voxel_mm") if affine is None else min(column_spacing(np.asarray(affine)))
+
     def check(self) -> None:
         """Check every number, as when a mesh is made; this is for arrays that were changed since."""
         if self.triangle_count and int(self._triangles.max()) >= self.vertex_count:
@@ -171,6 +177,8 @@ class BaseMesh(Message):
         scan = ("affine_ijk_to_lps_mm", "certificate", "certificate_lines")
         report = {name: value for name, value in self.report.items() if name not in scan}
         before = self.report.get("moved_by")
+        if self.voxel_mm is not None:
+            report["voxel_mm"] = self.voxel_mm * float(np.linalg.svd(checked[:3, :3], compute_uv=False).min())
         report["moved_by"] = (checked if before is None else checked @ np.array(before)).tolist()
         triangles = self._triangles[:, ::-1] if mirrored else self._triangles
         made = type(self)(apply_affine(checked, self._vertices), triangles, normals, report)

@@ -7,16 +7,26 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from clrecon.errors import UsageError
+from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry.affine import choose_space, frame_from_lps
 from clrecon.mesh.base import BaseMesh
 from clrecon.mesh.components import select_components, split_components
+from clrecon.mesh.connectivity import find_edges
+from clrecon.mesh.intersections import find_self_intersections
 from clrecon.mesh.quality import MeshQuality, measure_quality, measure_triangles
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import as_numbers, explains_arguments
 from clrecon.system.packages import ShownAsHtml, import_package, public_function
-from clrecon.system.pieces import find_bounds
+from clrecon.system.pieces import find_bounds, local_origin
+
+
+def _finite_points(points: ArrayLike, name: str, *, one: bool = False) -> NDArray[np.float64]:
+    """Return points (n, 3) or (3,), only the latter where `one` is wanted, as (n, 3)."""
+    rows = as_numbers(name, points)
+    if rows.shape[-1:] != (3,) or rows.ndim > (1 if one else 2) or not np.isfinite(rows).all():
+        raise UsageError(f"{name} must be three finite numbers{'' if one else ' each'}, these have shape {rows.shape}")
+    return rows.reshape(-1, 3)
 
 
 class Mesh(BaseMesh, ShownAsHtml):
@@ -116,6 +126,110 @@ class Mesh(BaseMesh, ShownAsHtml):
         own.report = dict(self.report)
         return select_components(own, count)
 
+    @explains_arguments
+    def clip(self, point: ArrayLike, normal: ArrayLike, *, capped: bool = True) -> Mesh:
+        """Return the part on the side of a plane that its normal points to, cut by VTK: with report and `values`.
+
+        Parameters
+        ----------
+        point, normal : array_like, shape (3,)
+            A point of the plane, LPS mm, and a vector of any length but 0.
+        capped : bool
+            True: the cut is filled, so that a closed mesh stays closed; an open one is refused.  False: it ends open.
+
+        Raises
+        ------
+        NoSurfaceError
+            Nothing lies on that side.
+        """
+        from clrecon.mesh.vtk import clip_surface, unwrap_polydata
+
+        surface, at, along, origin = self._cut_by(point, normal)
+        if capped and find_edges(self.triangles, self.vertex_count).boundary:
+            raise UsageError("the mesh is open, so that its cut cannot be filled: capped=False leaves it open")
+        part = clip_surface(surface, at, along, capped)
+        if not part.GetNumberOfCells():
+            off = float(((at + origin - self.vertices) @ along).min())
+            raise NoSurfaceError(f"nothing of the mesh lies on that side of the plane: it ends {abs(off):.4g} mm off")
+        vertices, triangles, _, values, *_ = unwrap_polydata(part)
+        made = Mesh(vertices + origin, triangles, report=dict(self.report))
+        made.values = {name: values[name].astype(np.float32) for name in self.values}
+        return made
+
+    @explains_arguments
+    def section(self, point: ArrayLike, normal: ArrayLike) -> list[NDArray[np.float64]]:
+        """Return the outlines in which a plane cuts the mesh, found by VTK; the plane is given as to `clip`.
+
+        Returns
+        -------
+        list of ndarray, shape (n, 3)
+            Polylines in LPS mm, in the order of their points; a closed one ends with its first point.
+        """
+        from clrecon.mesh.vtk import cut_surface
+
+        surface, at, along, origin = self._cut_by(point, normal)
+        return [line + origin for line in cut_surface(surface, at, along)]
+
+    def _cut_by(self, point: ArrayLike, normal: ArrayLike) -> tuple[Any, Any, Any, NDArray[np.float64]]:
+        """Return the surface near zero for VTK, a plane there, its normal of length 1, and the place of zero."""
+        from clrecon.mesh.vtk import make_polydata
+
+        at, along = (
+            _finite_points(vector, name, one=True)[0] for vector, name in ((point, "point"), (normal, "normal"))
+        )
+        if not along.any():
+            raise UsageError("the normal of a plane has length 0: it has no side")
+        origin = self._origin()
+        surface = make_polydata(self.vertices - origin, self.triangles, None, values=self.checked_values())
+        return surface, at - origin, along / np.linalg.norm(along), origin
+
+    def _origin(self) -> NDArray[np.float64]:
+        if not self.triangle_count:
+            raise UsageError("the mesh has no triangle")
+        return local_origin(self.vertices)
+
+    @explains_arguments
+    def closest_points(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+        """Find the points of the surface that are nearest to points (n, 3) or (3,), LPS mm.
+
+        Returns
+        -------
+        nearest, distances, triangles : ndarray, shape (n, 3), (n,) and (n,)
+            LPS mm; mm without a sign, which `measure_vertex_distances` has; rows of the triangles.
+        """
+        from clrecon.mesh.vtk import CellLocator
+
+        asked, origin = _finite_points(points, "points"), self._origin()
+        nearest, rows = CellLocator(self.vertices - origin, self.triangles).nearest(asked - origin)
+        return nearest + origin, np.linalg.norm(nearest + origin - asked, axis=1), rows
+
+    @explains_arguments
+    def ray(self, start: ArrayLike, direction: ArrayLike) -> NDArray[np.float64]:
+        """Find where rays first meet the surface, (n, 3), LPS mm; NaN where one meets nothing.
+
+        Parameters
+        ----------
+        start : array_like, shape (n, 3) or (3,)
+            LPS mm.
+        direction : array_like, shape (n, 3) or (3,)
+            Vectors of any length but 0; one alone is that of all rays.
+        """
+        from clrecon.mesh.vtk import CellLocator
+
+        starts, ways = _finite_points(start, "start"), _finite_points(direction, "direction")
+        if len(ways) not in (1, len(starts)) or not ways.any(axis=1).all():
+            raise UsageError(
+                f"{len(starts)} starts and {len(ways)} directions: one for each or for all, none of length 0"
+            )
+        origin = self._origin()
+        begin, unit = starts - origin, ways / np.linalg.norm(ways, axis=1, keepdims=True)
+        far = np.linalg.norm(begin, axis=1, keepdims=True) + 2.0 * np.abs(self.vertices - origin).max()
+        return CellLocator(self.vertices - origin, self.triangles).first_hits(begin, begin + far * unit) + origin
+
+    def self_intersections(self) -> NDArray[np.int64]:
+        """Find the pairs of triangles that cut each other, as rows of `triangles`, shape (k, 2), exactly."""
+        return find_self_intersections(self.vertices, self.triangles)
+
     def to_pyvista(self) -> Any:
         """Return the mesh as ``pyvista.PolyData`` in LPS mm, sharing the memory of vertices and normals.
 
@@ -130,7 +244,7 @@ class Mesh(BaseMesh, ShownAsHtml):
         from clrecon.mesh.vtk import wrap_polydata
 
         self.check()
-        return wrap_polydata(self._vertices, self._triangles, self._normals, self.checked_values())
+        return wrap_polydata(self._vertices, self._triangles, self._normals, self.checked_values(), self.voxel_mm)
 
     @classmethod
     @explains_arguments
@@ -153,8 +267,8 @@ class Mesh(BaseMesh, ShownAsHtml):
         """
         from clrecon.mesh.vtk import unwrap_polydata
 
-        vertices, triangles, normals, values, named = unwrap_polydata(polydata)
-        made = cls._of_others(vertices, triangles, normals, choose_space(space, named, "the PolyData"))
+        vertices, triangles, normals, values, named, voxel = unwrap_polydata(polydata)
+        made = cls._of_others(vertices, triangles, normals, choose_space(space, named, "the PolyData"), voxel)
         made.values = values
         return made
 
@@ -174,7 +288,7 @@ class Mesh(BaseMesh, ShownAsHtml):
             np.array(self.vertices, dtype=np.float64),
             self.triangles.astype(np.int64),
             vertex_normals=None if self.normals is None else self.normals.astype(np.float64),
-            metadata={"SPACE": "LPS", "UNIT": "mm"},
+            metadata={"SPACE": "LPS", "UNIT": "mm", "VOXEL_MM": self.voxel_mm},
             process=False,
         )
         made.units = "mm"
@@ -206,19 +320,20 @@ class Mesh(BaseMesh, ShownAsHtml):
         units = getattr(mesh, "units", None)
         if units not in (None, "mm", "millimeter", "millimeters"):
             raise UsageError(f"the mesh is in {units}, clrecon's are in mm: call its convert_units('mm') first")
-        named = (getattr(mesh, "metadata", None) or {}).get("SPACE")
-        return cls._of_others(np.asarray(vertices), np.asarray(faces), None, choose_space(space, named, "the Trimesh"))
+        facts = getattr(mesh, "metadata", None) or {}
+        frame = choose_space(space, facts.get("SPACE"), "the Trimesh")
+        return cls._of_others(np.asarray(vertices), np.asarray(faces), None, frame, facts.get("VOXEL_MM"))
 
     @classmethod
     def _of_others(
-        cls, vertices: NDArray[Any], triangles: NDArray[Any], normals: NDArray[Any] | None, space: str
+        cls, vertices: NDArray[Any], triangles: NDArray[Any], normals: NDArray[Any] | None, space: str, voxel: Any
     ) -> Mesh:
-        """Make a mesh of arrays in ``space``."""
+        """Make a mesh of arrays in ``space``, of a scan whose shortest voxel step is known or None."""
         if space != "LPS":
             signs = np.diag(frame_from_lps(space))
             vertices = vertices * signs.astype(vertices.dtype)
             normals = None if normals is None else normals * signs.astype(normals.dtype)
-        return cls(vertices, triangles, normals)
+        return cls(vertices, triangles, normals, None if voxel is None else {"voxel_mm": float(voxel)})
 
     def show(self) -> None:
         """Show the mesh in a window of pyvista, until it is closed; see `clrecon.show`.

@@ -72,11 +72,58 @@ class CellLocator:
         return found
 
 
+def clip_surface(surface: Any, point: Points, normal: Points, capped: bool) -> Any:
+    """Return the part of a ``vtkPolyData`` on the side of a plane that the normal points to."""
+    from vtkmodules.vtkCommonDataModel import vtkPlane, vtkPlaneCollection
+    from vtkmodules.vtkFiltersCore import vtkClipPolyData
+    from vtkmodules.vtkFiltersGeneral import vtkClipClosedSurface
+
+    plane = vtkPlane(origin=point, normal=normal)
+    if capped:
+        planes = vtkPlaneCollection()
+        planes.AddItem(plane)
+        clipper: Any = vtkClipClosedSurface(clipping_planes=planes, pass_point_data=True)
+    else:
+        clipper = vtkClipPolyData(clip_function=plane)
+    clipper.SetInputData(surface)
+    clipper.Update()
+    return clipper.GetOutput()
+
+
+def cut_surface(surface: Any, point: Points, normal: Points) -> list[Points]:
+    """Return the lines in which a plane cuts a ``vtkPolyData``, (n, 3) each, the first point again at a closed end."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkCommonDataModel import vtkPlane
+    from vtkmodules.vtkFiltersCore import vtkCutter
+
+    cutter: Any = vtkCutter(cut_function=vtkPlane(origin=point, normal=normal))
+    cutter.SetInputData(surface)
+    cutter.Update()
+    lines = cutter.GetOutput().GetLines()
+    if not lines.GetNumberOfCells():
+        return []
+    points = vtk_to_numpy(cutter.GetOutput().GetPoints().GetData()).astype(np.float64)
+    next_to: list[list[int]] = [[] for _ in points]
+    for one, other in vtk_to_numpy(lines.GetConnectivityArray()).reshape(-1, 2).tolist():
+        next_to[one].append(other)
+        next_to[other].append(one)
+    found = []
+    for start in sorted(range(len(points)), key=lambda row: len(next_to[row]) % 2 == 0):  # open ends first
+        line = [start]
+        while next_to[line[-1]]:  # VTK's own joining of lines breaks them where it begins
+            line.append(next_to[line[-1]].pop())
+            next_to[line[-1]].remove(line[-2])
+        if len(line) > 1:
+            found.append(points[line])
+    return found
+
+
 def wrap_polydata(
     vertices: NDArray[np.floating],
     triangles: NDArray[np.uint32],
     normals: NDArray[np.float32] | None,
     values: Mapping[str, NDArray[np.float32]],
+    voxel_mm: float | None = None,
 ) -> Any:
     """``pyvista.PolyData`` in LPS mm that shares the memory of vertices and normals; see `Mesh.to_pyvista`."""
     import pyvista
@@ -84,13 +131,15 @@ def wrap_polydata(
     polydata = pyvista.wrap(make_polydata(vertices, triangles, normals, values=values))
     polydata.field_data["SPACE"] = ["LPS"]
     polydata.field_data["UNIT"] = ["mm"]
+    if voxel_mm is not None:
+        polydata.field_data["VOXEL_MM"] = [voxel_mm]
     return polydata
 
 
 def unwrap_polydata(
     polydata: Any,
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None, dict[str, NDArray[Any]], str | None]:
-    """Points, triangles, normals, numbers and the frame that a ``pyvista.PolyData`` names; see `Mesh.from_pyvista`."""
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None, dict[str, NDArray[Any]], str | None, float | None]:
+    """Points, triangles, normals, numbers, frame and voxel step of a ``pyvista.PolyData``; see `Mesh.from_pyvista`."""
     import pyvista
 
     found = pyvista.wrap(polydata) if hasattr(polydata, "GetPolys") else polydata
@@ -108,4 +157,5 @@ def unwrap_polydata(
     arrays = {name: np.asarray(found.point_data[name]) for name in found.point_data if name.isidentifier()}
     values = {name: np.array(array) for name, array in arrays.items() if array.ndim == 1 and array.dtype.kind in "biuf"}
     triangles = faces.reshape(-1, 4)[:, 1:]
-    return np.array(found.points), triangles, normals, values, None if named is None else str(named)
+    voxel = float(found.field_data["VOXEL_MM"][0]) if "VOXEL_MM" in found.field_data else None
+    return np.array(found.points), triangles, normals, values, None if named is None else str(named), voxel

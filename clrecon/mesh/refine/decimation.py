@@ -65,11 +65,9 @@ _SHARE_FOR_VOLUME = 0.1
 
 def default_deviation(mesh: Mesh) -> float:
     """Return the default bound in mm: a quarter of the shortest voxel step that the mesh was made from."""
-    affine = mesh.report.get("affine_ijk_to_lps_mm")
-    if affine is None:
+    if mesh.voxel_mm is None:
         raise UsageError("this mesh does not say how large its voxels were: give max_deviation_mm")
-    steps = np.linalg.norm(np.array(affine, dtype=np.float64)[:3, :3], axis=0)
-    return BOUND_VOXEL * float(steps.min())
+    return BOUND_VOXEL * mesh.voxel_mm
 
 
 def check_refinement(mesh: Mesh, max_deviation_mm: float | None) -> float:
