@@ -18,6 +18,7 @@ import pytest
 from clrecon.errors import OutputError, RefusedInputError, UsageError
 from clrecon.system import arguments, files, foreign_words, memory, progress
 from clrecon.system.light_dataclass import dataclass
+from clrecon.system.packages import import_package
 from clrecon.system.paths import find_extension, read_regular
 from clrecon.system.records import at_most
 
@@ -49,10 +50,14 @@ def test_a_volume_that_does_not_fit_is_named_with_its_gib(monkeypatch: pytest.Mo
     assert memory.allocate_voxels((2, 3, 4), np.int16).nbytes == 48
 
 
-def test_interrupts_are_held_and_given_back() -> None:
+def test_interrupts_are_held_and_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
     before = signal.getsignal(signal.SIGINT)
-    with files.hold_interrupts():
-        assert signal.getsignal(signal.SIGINT) is not before
+    with monkeypatch.context() as patch:
+        patch.setattr(signal, "SIGTERM", signal.SIGUSR1)  # one that this process does not handle
+        default = signal.getsignal(signal.SIGUSR1)
+        with files.hold_interrupts():
+            assert signal.getsignal(signal.SIGINT) is not before
+            assert not callable(default) and signal.getsignal(signal.SIGUSR1) is default
     assert signal.getsignal(signal.SIGINT) is before
     seen: list[Any] = []
 
@@ -125,6 +130,12 @@ def test_warnings_of_libraries_are_left_out_by_default() -> None:
         assert warnings.showwarning is not shown
     with foreign_words.own_streams(show=True):
         assert warnings.showwarning is shown
+
+
+def test_a_missing_package_is_named_as_it_is_installed() -> None:
+    for package, name in ((None, "no_such_module"), ("other-name", "other-name")):
+        with pytest.raises(UsageError, match=f"a table needs the package {name}: .*install.* {name}$"):
+            import_package("no_such_module", "a table", package)
 
 
 def test_a_device_may_be_without_progress_for_ten_minutes() -> None:

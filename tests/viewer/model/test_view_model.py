@@ -13,7 +13,7 @@ from clrecon.labels.resample import ResampledLabels
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import ShownLabels, ShownMesh, ShownScan, show_objects
 from clrecon.viewer.model.parts import FoundParts
-from clrecon.viewer.model.state import Pick, ShownPart
+from clrecon.viewer.model.state import ClipPlane, Pick, ShownPart
 
 pytestmark = pytest.mark.unit
 
@@ -282,3 +282,27 @@ def test_slices_scroll_by_voxels_and_stay_within():
     assert model.state.cross[2] - before == pytest.approx(1.4, abs=0.01)
     model.scroll("axial", 10_000)
     assert model.state.cross[2] == pytest.approx(model.objects[0].corners[:, 2].max())
+
+
+def test_a_clip_plane_says_its_side():
+    def say(name, direction, share=0.25, flipped=False):
+        plane = ClipPlane(direction=direction, name=name, low=-10.0, high=30.0, share=share, flipped=flipped)
+        return plane.describe() | {"row": plane.row}
+
+    assert say("left", (1.0, 0.0, 0.0)) == {
+        "name": "left", "words": "left side", "direction": [1.0, 0.0, 0.0], "share": 0.25, "at_mm": 0.0,
+        "flipped": False, "row": (-1.0, 0.0, 0.0, 0.0),
+    }  # fmt: skip
+    oblique = say("0,0,1", (0.0, 0.0, 1.0), 0.5, True)
+    assert (oblique["words"], oblique["row"]) == ("S side", (0.0, 0.0, 1.0, 10.0))
+
+
+def test_a_perspective_camera_sees_the_focal_plane_as_the_parallel_one_did():
+    model = make_model()
+    before = model.state.camera
+    model.set_perspective(True)
+    after = model.state.camera
+    assert after.view_angle == 30.0 and after.focal_point == before.focal_point
+    assert after.half_height() * after.distance == pytest.approx(before.parallel_scale)
+    model.set_perspective(False)
+    assert model.state.camera.parallel_scale == pytest.approx(before.parallel_scale)
