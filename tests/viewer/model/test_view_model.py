@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import view_scenes as scenes
 
 from clrecon.errors import UsageError
 from clrecon.labels.resample import ResampledLabels
+from clrecon.viewer.drawing.painter import Painter
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import ShownLabels, ShownMesh, ShownScan, show_objects
 from clrecon.viewer.model.parts import FoundParts
@@ -306,3 +309,20 @@ def test_a_perspective_camera_sees_the_focal_plane_as_the_parallel_one_did():
     assert after.half_height() * after.distance == pytest.approx(before.parallel_scale)
     model.set_perspective(False)
     assert model.state.camera.parallel_scale == pytest.approx(before.parallel_scale)
+
+
+@pytest.mark.parametrize(("number", "key", "of"), [(2, "1/2", 7), (3, None, None)])
+def test_a_place_in_a_slice_is_of_the_part_that_lies_there(number, key, of):
+    look = SimpleNamespace(parts=[SimpleNamespace(number=2, key="1/2")])
+    camera = make_model().state.camera
+    painter = SimpleNamespace(
+        lock=nullcontext(), hu_at=lambda point: 55.0, slice_camera=lambda *given: camera,
+        _sliced=lambda state: ("scan", look), _number_at=lambda scan, labelled, point: number,
+    )  # fmt: skip
+    state = SimpleNamespace(part=lambda key: SimpleNamespace(object=7))
+    middle = Painter.pick_slice(painter, state, "axial", (40, 30), 20.0, 15.0)
+    assert (middle.part, middle.object, middle.hu) == (key, of, 55.0)
+    assert middle.point == pytest.approx(camera.focal_point)
+    for found in (None, ("scan", None)):  # no scan, or no parts
+        painter._sliced = lambda state, found=found: found
+        assert Painter.pick_slice(painter, state, "axial", (40, 30), 20.0, 15.0).part is None

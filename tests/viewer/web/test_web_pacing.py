@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from clrecon.viewer.session.picture_facts import SCENE
+from clrecon.viewer.web.connection import Connection
 from clrecon.viewer.web.pictures import Asked, Pace, _lay_over
 
 pytestmark = pytest.mark.unit
@@ -84,3 +89,22 @@ def test_pictures_lie_over_their_ground_rounded_to_whole_numbers(ground: tuple[i
     share = image[..., 3:] / 255.0
     exact = image[..., :3] * share + np.array(ground) * (1.0 - share)
     assert np.abs(_lay_over(image, ground) - exact).max() <= 0.5 + 1e-9
+
+
+def test_what_waits_in_a_connection_that_closes_is_cancelled() -> None:
+    told: list[object] = []
+
+    async def close() -> None:
+        connection: Any = SimpleNamespace(
+            _closed=False,
+            downloads=SimpleNamespace(close=lambda: told.append("downloads")),
+            _thread=SimpleNamespace(shutdown=lambda **how: told.append(how)),
+            _resting=None,
+            _session=SimpleNamespace(close=lambda: told.append("session")),
+            _loop=asyncio.get_running_loop(),
+        )
+        await Connection.close(connection)
+        await Connection.close(connection)
+
+    asyncio.run(close())
+    assert told == ["downloads", {"wait": False, "cancel_futures": True}, "session"]
