@@ -12,7 +12,10 @@ import view_scenes as scenes
 
 from clrecon.errors import UsageError
 from clrecon.labels.resample import ResampledLabels
+from clrecon.points import PointCloud
 from clrecon.viewer.drawing.painter import Painter
+from clrecon.viewer.drawing.saving import shown_cloud
+from clrecon.viewer.model import parts
 from clrecon.viewer.model.model import ViewModel
 from clrecon.viewer.model.objects import ShownLabels, ShownMesh, ShownScan, show_objects
 from clrecon.viewer.model.parts import FoundParts
@@ -326,3 +329,25 @@ def test_a_place_in_a_slice_is_of_the_part_that_lies_there(number, key, of):
     for found in (None, ("scan", None)):  # no scan, or no parts
         painter._sliced = lambda state, found=found: found
         assert Painter.pick_slice(painter, state, "axial", (40, 30), 20.0, 15.0).part is None
+
+
+def test_clouds_that_are_shown_are_one_with_what_all_of_them_have():
+    one = PointCloud(np.zeros((2, 3)), hu=np.array([1.0, 2.0]), labels=np.array([1, 2]))
+    other = PointCloud(np.ones((3, 3)), hu=np.array([3.0, 4.0, 5.0]))
+    model = make_model(one, other)
+    painter = SimpleNamespace(objects=show_objects([one, other]))
+    both = shown_cloud(painter, model.state)
+    assert both.points[:, 0].tolist() == [0, 0, 1, 1, 1] and both.hu.tolist() == [1, 2, 3, 4, 5] and both.labels is None
+    model.show("1", False)
+    assert shown_cloud(painter, model.state).hu.tolist() == [3, 4, 5]
+    painter.objects = show_objects([one])
+    assert shown_cloud(painter, make_model(one).state).labels.tolist() == [1, 2]
+
+
+def test_the_search_for_parts_tells_every_step(monkeypatch):
+    nothing = np.empty(0, np.int64)
+    runs = parts._Runs(nothing.astype(np.int32), nothing, nothing, nothing)
+    monkeypatch.setattr(parts, "_find_runs", lambda resident, iso_value: runs)
+    told = []
+    parts.find_clusters(SimpleNamespace(volume=scenes.make_scan()), 1, 300.0, True, lambda *step: told.append(step))
+    assert told == [("parts", done, parts.STEPS) for done in range(parts.STEPS + 1)]

@@ -44,6 +44,12 @@ def test_a_line_on_the_surface_and_one_beside_the_picture_are_seen():
     assert len(seen_pieces(wall(0, 100, 100.0), [on, beside], expected=True)) == 2
 
 
+@pytest.mark.parametrize(("behind", "count"), [(2.4, 1), (2.6, 0)])
+def test_a_line_may_lie_half_a_mm_and_two_pixels_behind_what_is_seen(behind, count):
+    line = np.array([[-40.0, 0, 0], [40.0, 0, 0]])
+    assert len(seen_pieces(wall(0, 100, 100.0 - behind), [line], expected=False)) == count
+
+
 def changed_views(**changes: object) -> set[str]:
     state = ViewModel(show_objects([scenes.make_scan(), scenes.make_mesh()])).state
     made = replace(state, **changes)
