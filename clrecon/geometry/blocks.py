@@ -158,7 +158,7 @@ def cut_block(volume: Own, block: Block) -> Own:
     """Return a block of a volume with the report of the whole."""
     (i0, j0, k0), (i1, j1, k1) = block
     affine, positions = place_block(volume.affine, volume.slice_origins(), volume.uneven, block)
-    return type(volume)(volume.voxels[k0:k1, j0:j1, i0:i1], affine, volume.report, positions)
+    return volume.alike(volume.voxels[k0:k1, j0:j1, i0:i1], affine, volume.report, positions)
 
 
 def _certify(volume: Own, cropped: Own, block: Block, box: np.ndarray, space: str) -> Own:
@@ -254,7 +254,7 @@ def slice_volume(volume: Own, key: Any) -> Own:
     origins = volume.slice_origins()[np.array(along_ijk[2])] + aside
     shape = tuple(len(kept) for kept in along_ijk)
     placed, positions = place_block(affine, origins, volume.uneven, Block((0, 0, 0), shape))  # type: ignore[arg-type]
-    made = type(volume)(volume.voxels[slices], placed, None, positions)
+    made = volume.alike(volume.voxels[slices], placed, None, positions)
     said = f"sliced to {', '.join(map(_slice_text, slices))} of k, j, i: {made.voxels.size:,} of {volume.voxels.size:,}"
     facts = {
         "first_ijk": [kept.start for kept in along_ijk],

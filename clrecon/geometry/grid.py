@@ -299,6 +299,10 @@ class BaseVolume(Grid):
             return self._stack.origins_at(k)
         return self._affine[:3, 3] + k[:, None] * self._affine[:3, 2]
 
+    def alike(self: Own, voxels: ArrayLike, affine: ArrayLike, *more: Any, **known: Any) -> Own:
+        """Return another volume of the same kind, of the arguments of a `Volume`; one on a device gives one there."""
+        return type(self)(voxels, affine, *more, **known)
+
     def with_voxels(self: Own, voxels: ArrayLike, report: dict[str, Any] | None = None) -> Own:
         """Return a volume with other values (nk, nj, ni) at the same places.
 
@@ -310,12 +314,12 @@ class BaseVolume(Grid):
             raise UsageError(f"the voxels have shape {array.shape}, those of this volume {self._voxels.shape}")
         positions = None if self._stack is None else self.slice_origins()
         if report is not None:
-            return type(self)(array, self._affine, report, positions)
+            return self.alike(array, self._affine, report, positions)
         report, found = deepcopy(self.report), None
         if report.get("hu_range") is not None:
             found = _value_range(array)
             report = amend(report, hu_range=None if found is None else list(found))
-        return type(self)(array, self._affine, report, positions, hu_range=found)
+        return self.alike(array, self._affine, report, positions, hu_range=found)
 
     def release_slices(self, first: int, end: int) -> None:
         """Let slices ``first`` to ``end - 1`` of a memory-mapped volume leave memory until they are used again."""

@@ -152,7 +152,7 @@ def resample_volume(volume: Own, to: float | Sequence[float] | BaseVolume, *, pr
     if isinstance(to, BaseVolume):
         _check_overlap(volume, to)
         positions = to.slice_origins() if to.uneven else None
-        made = type(volume)(sample_onto(volume, to, air, report), to.affine, None, positions)
+        made = volume.alike(sample_onto(volume, to, air, report), to.affine, None, positions)
         what = "the voxels of another volume"
         figures["step_mm"] = list(to.spacing)
     else:
@@ -165,7 +165,7 @@ def resample_volume(volume: Own, to: float | Sequence[float] | BaseVolume, *, pr
         what = " x ".join(f"{step:g}" for step in steps) + " mm"
         regular = regular_grid(volume, volume.slice_origins(), to)
         check_count(regular, f"in steps of {what}")
-        made = type(volume)(resample_grid(volume, regular, air, report), regular.affine)
+        made = volume.alike(resample_grid(volume, regular, air, report), regular.affine)
     before = " x ".join(f"{step:.4g}" for step in volume.spacing)
     said = f"resampled (trilinear) from {'uneven slices' if volume.uneven else f'{before} mm'} to {what}"
     take_report(made, volume, said, resampled=figures)

@@ -24,7 +24,7 @@ RESULTS = {
 }  # fmt: skip
 """Classes that functions return and nobody makes."""
 INNER = {
-    "attempts", "bring", "changed", "clear", "describe", "describe_parts", "follow", "keep", "kept_bytes",
+    "alike", "attempts", "bring", "changed", "clear", "describe", "describe_parts", "follow", "keep", "kept_bytes",
     "make_way", "of_known", "part", "pays_whole", "place", "plan", "program", "release_slices", "render_with_layers",
     "shortage", "slice_origins", "upload", "whole",
 }  # fmt: skip

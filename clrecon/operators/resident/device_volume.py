@@ -7,8 +7,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
@@ -50,8 +49,8 @@ class _Kept:
     nbytes: int
 
 
-class DeviceVolume(Closing):
-    """A volume on a device: uploaded once, and used by every operator that it is given to.
+class DeviceVolume(Closing, Volume):
+    """A volume on a device: uploaded once, and used by every operator that it is given to; a `Volume` for all else.
 
     The voxels are uploaded when they are first needed.  If they do not fit as a whole beside an operator's other
     buffers, that operator processes them in slabs.  The results are the same.  Use it as a context manager, or `close`
@@ -99,7 +98,8 @@ class DeviceVolume(Closing):
         if not isinstance(volume, Volume):
             raise UsageError(f"a DeviceVolume is made of a Volume, not {type(volume).__name__}")
         check_memory(memory)
-        self.volume = volume
+        vars(self).update(vars(volume))  # the same voxels, places and report
+        self.volume: Volume = volume.volume if isinstance(volume, DeviceVolume) else volume
         self._taken_device = take_device(device)
         self.device = self._taken_device.current
         self.memory = memory
@@ -111,12 +111,32 @@ class DeviceVolume(Closing):
         self._kept: dict[str, _Kept] = {}
         self._taken: tuple[LabelMap, ResampledLabels] | None = None
         self._part_bytes = 0
+        self.surfaces = 0  # made of it so far
         self.most_slices: dict[str, int] = {}
 
     def close(self) -> None:
         """Free everything on the device.  Objects that are asked for later are uploaded again."""
         self.release()
         self._taken = None
+
+    def alike(self, voxels: ArrayLike, affine: ArrayLike, *more: Any, **known: Any) -> DeviceVolume:
+        return self.follow(Volume(voxels, affine, *more, **known))
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """That of `volume`."""
+        return self.volume.report
+
+    @report.setter
+    def report(self, report: dict[str, Any]) -> None:
+        self.volume.report = report
+
+    def __dir__(self) -> list[str]:
+        """Leave out what clrecon's own operators call."""
+        return sorted({*dir(Volume), "close", "device", "memory", "uploaded_bytes", "values", "volume"})
+
+    def __repr__(self) -> str:
+        return f"DeviceVolume({self.volume!r} on {self.device!r})"
 
     # Data on the device
 
@@ -140,11 +160,6 @@ class DeviceVolume(Closing):
         if voxels_d is not None:
             made._context, made._whole_d = self.device.context, voxels_d
         return made
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the voxels."""
-        return self.volume.voxels.dtype
 
     @property
     def is_held(self) -> bool:

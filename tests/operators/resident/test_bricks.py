@@ -11,6 +11,7 @@ from clrecon.geometry import Volume
 from clrecon.opencl import download, upload
 from clrecon.operators.resident.tables import compare_bricks, measure_bricks
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
+from clrecon.operators.surface.extraction import MEASURED_FROM
 from clrecon.proof.volumes import volume_twins as twin
 
 SHAPES = [(1, 1, 1), (3, 9, 7), (8, 8, 8), (9, 7, 8), (17, 16, 33), (8, 9, 100)]
@@ -45,6 +46,9 @@ def test_the_surface_is_the_same_with_and_without(device, shape, dtype, closed):
     voxels[random.integers(0, 50, shape) == 0] = 2
     volume = Volume(voxels, OBLIQUE)
     with SurfaceExtractor(volume, device=device) as extractor:
+        first = MEASURED_FROM[device.kernel_variants["LANES"]]
+        for number in range(1, first + 1):
+            assert ("measure_bricks" in extractor.extract(1).report["kernel_seconds"]) == (number == first)
         for iso_value in (1, 2, 3, 1.5):
             mesh = extractor.extract(iso_value, closed=closed)
             expected = extract_isosurface(volume, iso_value, device=device, closed=closed)
