@@ -12,7 +12,6 @@ from clrecon.opencl import Device
 from clrecon.operators.rays.point_pictures import PointPictures
 from clrecon.operators.rays.scene import ScenePictures, Subject, check_objects
 from clrecon.operators.rays.volume_renderer import Place, VolumeRenderer
-from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
@@ -94,7 +93,7 @@ def render(
     """
     placing: dict[str, Any] = {"camera": camera, "view": view, "up": up, "zoom": zoom}
     placing |= {"view_angle": view_angle, "center": center}
-    if isinstance(shown, Volume | DeviceVolume) or not isinstance(shown, PointCloud | Mesh | Sequence):
+    if isinstance(shown, Volume) or not isinstance(shown, PointCloud | Mesh | Sequence):
         with VolumeRenderer(shown, device=device, memory=memory) as renderer:
             return renderer.render(style, size=size, background=background, progress=progress, **{**placing, **look})
     objects = _name_objects(shown, style, look)
@@ -131,8 +130,7 @@ def _with_view(placing: dict[str, Any], objects: Sequence[tuple[Any, Style]]) ->
     if placing["camera"] is None and placing["view"] is None:
         for subject, style in objects:
             if isinstance(style, SlicesInSpace):
-                volume = subject.volume if isinstance(subject, DeviceVolume) else subject
-                return {**placing, "view": default_view(style.mode, volume)}
+                return {**placing, "view": default_view(style.mode, subject)}
     return placing
 
 
