@@ -30,7 +30,7 @@ TAKE_PROGRESS = {
     "measure_truth", "measure_vertex_distances",
     "split_vertebrae", "read_labels", "read_volume", "reconstruct_surface", "reformat_curve",
     "remove_outliers", "remove_sparse_cells", "remove_table", "render", "resample_labels", "smooth_mesh", "thin_points",
-    "Volume.resample", "Volume.save",
+    "DeviceVolume.resample", "DeviceVolume.save", "Volume.resample", "Volume.save",
     "write_animation",
 }  # fmt: skip
 """What can take longer than a second."""
