@@ -1,0 +1,60 @@
+"""A volume that is kept on a device is a volume for everything that takes one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from device_work import label_boxes
+from surface_volumes import smooth_volume
+
+import clrecon
+from clrecon.operators.resident.device_volume import DeviceVolume
+
+
+@pytest.fixture(scope="module")
+def volume():
+    return smooth_volume((22, 26, 45))
+
+
+@pytest.fixture(scope="module")
+def labels(volume):
+    return label_boxes(volume, np.s_[3:12, 4:20, 5:30], np.s_[12:20, 4:20, 5:30])
+
+
+AS_A_VOLUME = {
+    "places": lambda v: (v.shape, v.spacing, v.bounds.tolist(), v.ijk_to_lps((1, 2, 3)).tolist()),
+    "voxels": lambda v: (np.asarray(v).tobytes(), v[3:9, ::2].affine.tolist(), v[3:9].report),
+    "crop": lambda v: (v.crop(between=v.bounds[:, 2] + (1, -2)).report, v.resample(3.0).voxels.tobytes()),
+    "sampled": lambda v: v.sample(v.bounds.mean(axis=0)),
+    "field of view": lambda v: clrecon.mask_field_of_view(v, 5.0).voxels.tobytes(),
+    "table": lambda v: clrecon.remove_table(v).voxels.tobytes(),
+    "filtered": lambda v: clrecon.filter_bilateral(v, sigma_hu=20.0).voxels.tobytes(),
+    "image": lambda v: v.to_nibabel().to_bytes(),
+}
+
+
+@pytest.mark.first_device
+@pytest.mark.parametrize("name", AS_A_VOLUME)
+def test_a_kept_volume_is_a_volume_for_what_takes_one(name: str, volume, device) -> None:
+    ask = AS_A_VOLUME[name]
+    assert isinstance(DeviceVolume(volume, device=device), clrecon.Volume)
+    assert ask(DeviceVolume(volume, device=device)) == ask(volume)  # type: ignore[no-untyped-call]
+
+
+@pytest.mark.first_device
+def test_parts_of_a_kept_volume_are_kept_on_its_device(volume, labels, device, tmp_path) -> None:
+    kept = DeviceVolume(volume, device=device, memory=2**28)
+    part = kept[4:16]
+    assert isinstance(part, DeviceVolume) and (part.device, part.memory) == (device, 2**28)
+    part.report = {"warnings": ["told"]}
+    assert part.volume.report["warnings"] == ["told"] and "warnings" in kept.report and kept.report is volume.report
+    assert np.array_equal(
+        clrecon.extract_isosurface(part, 100).vertices, clrecon.extract_isosurface(volume[4:16], 100).vertices
+    )
+    assert [one.ml for one in clrecon.measure_labels(kept, labels)] == [
+        one.ml for one in clrecon.measure_labels(volume, labels)
+    ]
+    assert kept.save(tmp_path / "a.nii") == volume.save(tmp_path / "b.nii")
+    assert DeviceVolume(kept, device=device).volume is volume
+    assert repr(kept).startswith("DeviceVolume(Volume(45 x 26 x 22 ")
+    assert not {"keep", "plan", "attempts", "upload"} & set(dir(kept)) and {"crop", "close", "volume"} <= set(dir(kept))
