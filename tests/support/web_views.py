@@ -21,7 +21,7 @@ from clrecon.viewer.model.state import Pick
 from clrecon.viewer.session.session import ViewSession
 from clrecon.viewer.web.server import WebServer
 
-PATIENCE = 30.0
+PATIENCE = 120.0
 """Seconds until something has to have happened that takes a moment."""
 
 

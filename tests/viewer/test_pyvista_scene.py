@@ -63,7 +63,7 @@ def test_from_the_side_points_still_lie_on_the_ball(plotter):
     assert np.linalg.norm(points - CENTRE, axis=1) == pytest.approx(RADIUS, abs=tolerances.FLOAT32_POINT_MM)
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("camera", daily(1, CAMERAS))
 def test_a_mesh_and_a_picture_cover_each_other_as_in_space(plotter, camera):
     right, _, forward = camera.basis()
     places = {  # of a green ball of a mesh beside the red one of the picture

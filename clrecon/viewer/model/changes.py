@@ -136,7 +136,7 @@ class ChangingView:
         self.aspect = 1.0
         self._first_camera = state.camera
         self._clock, self._undo = clock, list[tuple[ViewState, str]]()
-        self._last = ("", -math.inf)
+        self._last, self._held = ("", -math.inf), False
 
     @property
     def camera(self) -> Camera:
@@ -278,6 +278,12 @@ class ChangingView:
         self.version += 1
         return words
 
+    def hold(self, on: bool) -> None:
+        """Say that the pointer is pressed, or released: what is dragged meanwhile is one step, however long it takes."""
+        self._held = on
+        if on:
+            self._last = ("", -math.inf)
+
     # How changes are made
 
     def _change(self, kind: str, words: str, **changes: Any) -> None:
@@ -287,7 +293,11 @@ class ChangingView:
             return
         now = self._clock()
         last_kind, last_time = self._last
-        goes_on = kind == last_kind and kind.split(" ")[0] in _GESTURES and now - last_time <= SAME_GESTURE_S
+        goes_on = kind.split(" ")[0] in _GESTURES and (
+            last_kind.split(" ")[0] in _GESTURES
+            if self._held
+            else kind == last_kind and now - last_time <= SAME_GESTURE_S
+        )
         if not goes_on:
             self._undo.append((self.state, words))
             del self._undo[:-MOST_UNDO]

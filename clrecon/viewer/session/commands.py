@@ -141,6 +141,7 @@ _model("set_clip_box", "show a box, LPS mm; null: all", "set_clip_box",
        low=_or_none(_numbers(3)), high=_or_none(_numbers(3)))  # fmt: skip
 _model("toggle_clip_box", "show a box about the cross, or all", "toggle_clip_box")
 _session("undo", "take the last change back", "undo")
+_model("hold", "the pointer is pressed: until it is released one step of undo", "hold", on=_flag)
 _session("save", "write what is shown; the extension says as what", "save_to", path=_text, takes={"size": _size})
 _session("cancel", "stop the work in the background", "cancel")
 _session("dismiss", "drop the words of the last error", "dismiss")

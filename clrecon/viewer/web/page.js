@@ -241,6 +241,7 @@
       fingers.set(event.pointerId, at(event));
       moved = fingers.size > 1 ? Infinity : 0;
       steps = 0;
+      last("hold", { on: true });
       delete view.angle;
     });
     view.box.addEventListener("pointermove", (event) => {
@@ -272,6 +273,7 @@
     for (const name of ["pointerup", "pointercancel"]) {
       view.box.addEventListener(name, (event) => {
         fingers.delete(event.pointerId);
+        if (!fingers.size) last("hold", { on: false }, "release");
         if (name === "pointerup" && moved < 4 && event.button === 0) click(view, at(event), event.shiftKey);
       });
     }

@@ -137,6 +137,23 @@ def test_moves_of_one_gesture_are_one_step_of_undo():
     assert model.state == first
 
 
+def test_a_slow_drag_is_one_step_of_undo_and_the_next_another():
+    clock = iter(range(0, 100, 10))
+    model = ViewModel(show_objects([scenes.make_scan()]), clock=lambda: next(clock))
+    states = [model.state]
+    for _ in range(2):
+        model.hold(True)
+        model.pan(0.1, 0.0)
+        model.zoom(1.1)
+        model.pan(0.1, 0.1)
+        model.hold(False)
+        states.append(model.state)
+    model.pan(0.1, 0.0)
+    assert model.undo() == "the shift" and model.state == states[2]
+    assert model.undo() == "the shift" and model.state == states[1]
+    assert model.undo() == "the shift" and model.state == states[0]
+
+
 def test_facts_are_json_and_say_what_is_there():
     model = make_model(scenes.make_scan(), scenes.make_mesh(), scenes.make_cloud(), scenes.make_labels(), space="ras")
     model.add_clip("superior")

@@ -78,6 +78,7 @@ RIGHT: dict[str, dict[str, Any]] = {
     "remove_clip": {"n": 0},
     "set_clip_box": {"low": [-60, -40, 200], "high": [-20, -10, 220]},
     "toggle_clip_box": {},
+    "hold": {"on": True},
     "clear_measures": {},
     "end_tool": {},
     "undo": {},
