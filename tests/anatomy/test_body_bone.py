@@ -25,7 +25,7 @@ def share_kept(before: Volume, after: Volume, mask: np.ndarray) -> float:
     return float((before.voxels == after.voxels)[mask].mean())
 
 
-@pytest.mark.parametrize("name", daily(4, [name for name in BODIES if name not in ("empty", "water")]))
+@pytest.mark.parametrize("name", daily(2, [name for name in BODIES if name not in ("empty", "water")]))
 def test_bone_stays_and_the_table_goes(odd: OddBodies, name: str) -> None:
     body = odd[name]
     cleaned = remove_table(body.volume)

@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import pytest
-from variants import daily
+from variants import daily, daily_rows
 
 import clrecon
 from clrecon.anatomy import head as head_module
@@ -39,7 +39,7 @@ def test_row_70_heads_are_told_from_other_bodies(kind: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "settings", [{"tilt": 20.0}, {"prone": True}, {"table": "headrest"}], ids=lambda given: next(iter(given))
+    "settings", daily(1, [{"tilt": 20.0}, {"prone": True}, {"table": "headrest"}]), ids=lambda given: next(iter(given))
 )
 def test_row_70_heads_in_any_position(settings: dict[str, Any]) -> None:
     assert find_head(phantom("head", **settings)) is True
@@ -139,7 +139,7 @@ def test_row_70_surfaces_of_labels_say_so(
 
 
 @pytest.mark.parametrize(
-    ("name", "found"), [("head_tilt_gaps", True), ("lumbar_4p25mm", False), ("thoracic_0p8mm", False)]
+    ("name", "found"), daily_rows(2, [("head_tilt_gaps", True), ("lumbar_4p25mm", False), ("thoracic_0p8mm", False)])
 )
 def test_row_70_real_scans(name: str, found: bool, real_data: Path) -> None:
     volume = clrecon.read_volume(real_data / name, allow_gaps=True)

@@ -120,6 +120,7 @@ def test_skin_warns_that_a_face_shows(
     assert captured.err.startswith("clrecon: warning: a surface of the skin can show a face")
 
 
+@pytest.mark.release
 def test_mesh_keeps_components_by_size(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     voxels = np.full((9, 20, 24), -1000, np.int16)
     voxels[2:7, 2:12, 2:14] = 800
@@ -199,6 +200,7 @@ def test_open_leaves_the_border_open(device: Any, tmp_path: Path, capsys: pytest
     assert closed == [(True, False), (False, True)]
 
 
+@pytest.mark.release
 def test_topology_joins_what_the_trilinear_field_joins(
     device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

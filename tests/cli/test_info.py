@@ -287,6 +287,7 @@ def test_the_example_of_the_document(
     assert len(comments) == 7 and [line for line in comments if line not in written] == []
 
 
+@pytest.mark.release
 def test_mesh_strict_counts_the_gates_of_the_volume(
     tmp_path: Path, device: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:

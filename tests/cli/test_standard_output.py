@@ -27,7 +27,7 @@ def run(*arguments: object) -> int:
 
 
 @pytest.mark.parametrize(
-    ("name", "start"), daily_rows(2, [("-", None), ("-.ply", b"ply\n"), ("-.glb", b"glTF"), ("-.3mf", b"PK")])
+    ("name", "start"), daily_rows(1, [("-", None), ("-.ply", b"ply\n"), ("-.glb", b"glTF"), ("-.3mf", b"PK")])
 )
 def test_a_mesh_goes_to_standard_output_as_the_file_has_it(device, ct, tmp_path, capfdbinary, name, start):
     common = ("mesh", ct, "--hu", 200, "--device", device.index)
@@ -42,6 +42,7 @@ def test_a_mesh_goes_to_standard_output_as_the_file_has_it(device, ct, tmp_path,
     assert (b"metres, Y up" in err) == (name == "-.glb")
 
 
+@pytest.mark.release
 def test_a_report_goes_to_standard_output_and_the_remarks_to_standard_error(device, ct, tmp_path, capsys):
     common = ("mesh", ct, "--hu", 200, "-o", tmp_path / "a.stl", "--device", device.index)
     assert run(*common, "--report", tmp_path / "r.json") == 0

@@ -239,7 +239,6 @@ def test_hostile_3mf_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
 
 GLB: dict[str, tuple[dict[str, Any], str]] = {
     "node in itself": ({"nodes": [{"children": [0]}]}, "nodes within themselves"),
-    "doubled 31 times": ({"nodes": [*({"children": [n + 1, n + 1]} for n in range(30)), {"mesh": 0}]}, "more than"),
     "missing node": ({"scenes": [{"nodes": [3]}]}, "nodes has no number 3"),
     "beyond the end": (
         {"accessors": [{"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 13}]},
@@ -255,10 +254,11 @@ GLB: dict[str, tuple[dict[str, Any], str]] = {
     "strips": ({"meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 5}]}]}, "triangle strips"),
     "kinds": ({"nodes": [{"mesh": "0"}]}, "meshes has no number '0'"),
     "not finite": ({"nodes": [{"mesh": 0, "matrix": [float("nan")] * 16}]}, "no affine of finite numbers"),
+    "doubled 31 times": ({"nodes": [*({"children": [n + 1, n + 1]} for n in range(30)), {"mesh": 0}]}, "more than"),
 }
 
 
-@pytest.mark.parametrize("case", daily(6, GLB))
+@pytest.mark.parametrize("case", daily(5, GLB))
 def test_hostile_glb_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
     changes, words = GLB[case]
     check_refused(glb_of(tmp_path / "a.glb", **changes), words)

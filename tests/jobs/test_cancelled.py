@@ -183,7 +183,7 @@ def test_slabs_of_a_slice(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         assert buffers.held == 0
 
 
-@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("own", daily(1, [False, True]))
 def test_labels(own: bool, device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     voxels = np.zeros((24, 24, 24), np.int16)
     marks = np.zeros(voxels.shape, np.uint8)
@@ -207,7 +207,7 @@ def test_labels(own: bool, device: Any, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", daily(2, ["a.apng", "a.gif", "a.mp4", "frames"]))
+@pytest.mark.parametrize("name", daily(1, ["a.apng", "a.gif", "a.mp4", "frames"]))
 def test_a_turntable(name: str, scan: Path, device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = RenderSettings.of(
         "mip", size=(32, 32), turntable=Turntable(frames=4), background="black", device=str(device.index)

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 import tolerances
 from dicom_series import Plan, write_series
+from variants import daily_rows
 
 from clrecon.cli.main import main
 
 FAR = np.array([1e5, -1e5, 5e4])
 
 
-@pytest.mark.parametrize(("extension", "warned"), [("ply", False), ("stl", True)])
+@pytest.mark.parametrize(("extension", "warned"), daily_rows(1, [("ply", False), ("stl", True)]))
 def test_coordinates_of_a_hundred_metres(device: Any, tmp_path: Path, extension: str, warned: bool) -> None:
     meshes = []
     for name, origin in (("near", np.zeros(3)), ("far", FAR)):

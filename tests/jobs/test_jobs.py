@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import tolerances
 from PIL import Image
+from variants import daily
 
 from clrecon.errors import DeviceError, NoSurfaceError, OutputError, UsageError
 from clrecon.jobs.devices import survey_devices
@@ -74,7 +75,7 @@ def test_outputs_then_device_then_input(sphere: tuple[Path, dict[str, Any]], tmp
         make_mesh(nowhere, tmp_path / "a.stl", bad_device)
 
 
-@pytest.mark.parametrize("fails", ["clrecon.exchange.formats.stage_mesh", "clrecon.jobs.run.stage_report"])
+@pytest.mark.parametrize("fails", daily(1, ["clrecon.exchange.formats.stage_mesh", "clrecon.jobs.run.stage_report"]))
 def test_a_failed_write_leaves_both_old_files(
     fails: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

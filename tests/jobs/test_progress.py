@@ -48,7 +48,7 @@ NAMES = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", daily(4, NAMES))
+@pytest.mark.parametrize("name", daily(2, NAMES))
 def test_progress_is_told_and_changes_nothing(works: dict[str, tuple[str, Work]], name: str) -> None:
     stage, work = works[name]
     calls: list[tuple[str, int, int]] = []

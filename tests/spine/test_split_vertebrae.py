@@ -94,6 +94,7 @@ def test_a_named_point_names_all_and_numbers_them_as_verse_does() -> None:
     assert np.array_equal(named.labels.voxels, same)
 
 
+@pytest.mark.release
 def test_the_level_of_the_uppermost_vertebra_names_all() -> None:
     named = clrecon.split_vertebrae(phantom("T12-L3")[0], first="t12")
     assert named.labels.names == {19: "T12", 20: "L1", 21: "L2", 22: "L3"}
@@ -141,6 +142,7 @@ def test_seeds_are_the_vertebrae_and_need_no_canal(monkeypatch: pytest.MonkeyPat
         assert min(share for _, share in found.values()) >= (LEAST_RIGHT if canal_is_found else 0.9), found
 
 
+@pytest.mark.release
 def test_a_disc_that_bone_fills_lowers_the_confidence_of_the_vertebrae_beside_it() -> None:
     """Its place follows from its neighbours: the vertebrae stay right, but less is to be expected of them."""
     volume, truth, names = phantom("T12-L3")
@@ -185,15 +187,12 @@ def test_vertebrae_of_low_confidence_are_kept_only_on_request(monkeypatch: pytes
     ("levels", "choice", "least"),
     daily_rows(
         1,
-        daily_rows(
-            3,
-            [
-                ("C1-T1", {"size": (140, 140), "spacing": (1.6, 1.6, 2.0)}, 0.7),
-                ("C3-T2", {"size": (140, 140), "spacing": (1.6, 1.6, 2.5), "tilt": 15.0}, 0.7),
-                ("T1-T12", {"size": (150, 150), "spacing": (2.4, 2.4, 2.4)}, 0.7),
-                ("C1-L5", {"size": (150, 150), "spacing": (2.4, 2.4, 2.5)}, 0.65),
-            ],
-        ),
+        [
+            ("C1-T1", {"size": (140, 140), "spacing": (1.6, 1.6, 2.0)}, 0.7),
+            ("C3-T2", {"size": (140, 140), "spacing": (1.6, 1.6, 2.5), "tilt": 15.0}, 0.7),
+            ("T1-T12", {"size": (150, 150), "spacing": (2.4, 2.4, 2.4)}, 0.7),
+            ("C1-L5", {"size": (150, 150), "spacing": (2.4, 2.4, 2.5)}, 0.65),
+        ],
     ),
     ids=["neck", "tilted neck", "chest with ribs", "whole spine"],
 )
@@ -326,6 +325,7 @@ def test_the_middle_plane_shows_scan_labels_and_discs() -> None:
         assert abs(plane.sagittal[int(row), plane.canal_column]) < 130
 
 
+@pytest.mark.release
 def test_progress_and_level() -> None:
     volume, _, _ = phantom("T12-L3")
     told: list[tuple[str, int, int]] = []

@@ -135,6 +135,7 @@ def test_strict_is_an_exit_code_and_nothing_else(
     assert len([gate for gate in report["gates"] if gate["ok"] is False]) == len(lines)
 
 
+@pytest.mark.release
 def test_strict_passes_what_is_good(
     device: Any, noisy_torus: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from contract_tables import names_in
 from PIL import Image
-from variants import daily_rows
+from variants import daily, daily_rows
 
 from clrecon.errors import DeviceError, OutputError, RefusedInputError, UsageError
 from clrecon.jobs.render.job import PictureFiles, make_pictures, name_view, path_of
@@ -55,7 +55,7 @@ def test_a_sphere_is_a_disc_of_its_size_from_every_side(
         assert float(np.nanmin(depth)) == pytest.approx(nearest, abs=0.7)
 
 
-@pytest.mark.parametrize("mode", ["dvr", "slice"])
+@pytest.mark.parametrize("mode", daily(1, ["dvr", "slice"]))
 def test_views_have_scales_of_their_own_until_zoom_makes_them_one(
     mode: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:

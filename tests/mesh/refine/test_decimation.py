@@ -67,9 +67,9 @@ def test_a_sphere_loses_nine_of_ten_triangles_within_the_bound():
 
 @pytest.mark.slow
 def test_the_bound_stops_the_decimation():
-    sphere = Mesh(*samples.sphere(FAR, 20.0, 6))
+    sphere = Mesh(*samples.sphere(FAR, 20.0, 5))
     reached = []
-    for bound in (0.0005, 0.01, 0.05):
+    for bound in (0.002, 0.04, 0.2):
         small = decimate_mesh(sphere, 0.97, bound)
         check_within(small, sphere, bound)
         reached.append(small.report["refinement"]["decimate"]["reached"])
@@ -113,7 +113,7 @@ def test_what_is_not_looked_at_again_is_still_within_the_bound(seed):
         assert not deviation.are_far(clusters.places, faces, of).any()
 
 
-@pytest.mark.parametrize("seed", daily(2, range(4)))
+@pytest.mark.parametrize("seed", daily(1, range(4)))
 @pytest.mark.parametrize("bound", [None, 0.6])
 def test_torn_topology_is_mended(seed, bound):
     from fast_simplification import simplify

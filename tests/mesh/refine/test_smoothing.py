@@ -66,6 +66,7 @@ def test_more_iterations_smooth_more():
     assert many < few < 0.1
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("bound", daily(1, [0.02, 0.1]))
 def test_no_point_of_either_surface_is_further_than_the_bound(bound):
     rough = noisy_sphere(0.2)

@@ -72,6 +72,7 @@ def test_types_of_voxels(device, dtype):
     check_voxels(extract_points(volume, hu=BAND, device=device), volume)
 
 
+@pytest.mark.release
 def test_floats_and_uneven_tilted_slices(device):
     volume = make_volume((9, 12, 40), "float32", uneven=True)
     cloud = extract_points(volume, hu=(20.0, 60.0), device=device)

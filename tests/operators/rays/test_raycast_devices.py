@@ -112,7 +112,7 @@ def assert_alike(found: Any, expected: Any, mode: str) -> None:
             assert (away <= tolerances.RAY_TWIN_DEPTH_MM).mean() >= 1.0 - tolerances.RAY_TWIN_DEPTH_SHARE, name
 
 
-@pytest.mark.parametrize("name", daily(14, SCENES))
+@pytest.mark.parametrize("name", daily(10, SCENES))
 def test_the_kernel_is_its_twin(device, name):
     volume, settings = SCENES[name]()
     assert_alike(DeviceCaster(device)(volume, **settings), TwinCaster()(volume, **settings), settings["mode"])

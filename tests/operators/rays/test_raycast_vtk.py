@@ -84,7 +84,7 @@ def draw(volume: Volume, camera: Camera, shaded: bool, device: Any) -> tuple[np.
 
 
 @pytest.mark.parametrize("view_angle", daily(1, [None, 30.0]))
-@pytest.mark.parametrize("shaded", [True, False])
+@pytest.mark.parametrize("shaded", daily(1, [True, False]))
 @pytest.mark.parametrize("axes", AXES)
 def test_smooth_bodies_look_as_vtk_draws_them(device, axes, shaded, view_angle):
     volume = blobs(axes)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tolerances
 from sample_meshes import ball
-from variants import each_value
+from variants import daily_rows, each_value
 
 import clrecon
 from clrecon import (
@@ -66,7 +66,7 @@ def ways(camera: Camera, y: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.mark.seconds
 @pytest.mark.every_device
-@pytest.mark.parametrize(("name", "opacity", "in_slabs"), each_value(CAMERAS, [0.4, 1.0], [False, True]))
+@pytest.mark.parametrize(("name", "opacity", "in_slabs"), daily_rows(3, each_value(CAMERAS, [0.4, 1.0], [False, True])))
 def test_fog_before_and_behind_a_screen_is_a_closed_form(
     device: Any, name: str, opacity: float, in_slabs: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

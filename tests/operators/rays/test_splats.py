@@ -43,7 +43,7 @@ CAMERAS = {
 
 @pytest.mark.parametrize(("name", "radius"), each_value(CAMERAS, [0.01, 0.4, 2.0]))
 def test_every_pixel_shows_the_point_of_the_twin(device: Any, name: str, radius: float) -> None:
-    points, _ = ball(1000)
+    points, _ = ball(300)
     camera = CAMERAS[name]
     depth, numbers = find_splats(points, camera, SIZE, radius)
     colors = np.zeros((len(points), 4), np.uint8)

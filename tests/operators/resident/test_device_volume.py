@@ -10,7 +10,7 @@ import tolerances
 from device_work import SIZE, WORK, centre_line, label_boxes
 from failing_devices import Failing
 from surface_volumes import OBLIQUE, smooth_volume
-from variants import each_value
+from variants import daily_rows, each_value
 
 import clrecon
 from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
@@ -44,7 +44,7 @@ def assert_equal(found, expected, work: str) -> None:
             assert np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
 
 
-@pytest.mark.parametrize(("work", "kind"), each_value(WORK, ["buffer", "launch"]))
+@pytest.mark.parametrize(("work", "kind"), daily_rows(6, each_value(WORK, ["buffer", "launch"])))
 def test_whatever_buffer_or_launch_fails_the_result_is_the_same(device, volume, labels, monkeypatch, work, kind):
     with monkeypatch.context() as patch, DeviceVolume(volume, device=device) as resident:
         counted = Failing(patch, kind, 0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import tolerances
 from raycast_scenes import DeviceCaster, look, premultiplied
-from variants import each_value
+from variants import daily_rows, each_value
 
 from clrecon.geometry import Volume
 from clrecon.opencl.arrays import download, empty_output, upload
@@ -96,7 +96,8 @@ def test_a_window_shows_every_pair_of_its_row(windows):
 
 @pytest.mark.seconds
 @pytest.mark.parametrize(
-    ("columns", "towards", "perspective"), each_value([14, 16, 17, 40], [ALONG_J, ALONG_K, NEARLY_J], [False, True])
+    ("columns", "towards", "perspective"),
+    daily_rows(3, each_value([14, 16, 17, 40], [ALONG_J, ALONG_K, NEARLY_J], [False, True])),
 )
 def test_pictures_with_and_without_windows_are_one(windows, monkeypatch, columns, towards, perspective):
     volume = noise_volume((24, 20, columns))

@@ -35,7 +35,7 @@ def gpu(device):
     return pretended_gpu(device)
 
 
-@pytest.mark.parametrize(("work", "kind"), daily_rows(6, each_value(WORK, ["launch", "buffer"])))
+@pytest.mark.parametrize(("work", "kind"), daily_rows(3, each_value(WORK, ["launch", "buffer"])))
 def test_row_54_the_cpu_device_takes_over_from_any_buffer_or_launch_on(
     device, gpu, volume, labels, monkeypatch, work, kind
 ):

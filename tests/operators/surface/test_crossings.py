@@ -32,7 +32,7 @@ def pairs(found) -> set[tuple[int, int]]:
 
 
 @pytest.mark.every_device
-@pytest.mark.parametrize("count", [1, 2, 31, 32, 33, 700])
+@pytest.mark.parametrize("count", [1, 2, 31, 32, 33, 200])
 def test_marks_equal_the_twin(device, count):
     vertices, triangles = scattered(count, sizes=(0.3, 1.0, 5.0))
     found = mark_crossings(device, plan_crossings(vertices, triangles))
@@ -78,7 +78,7 @@ def test_pairs_with_a_changed_triangle(device, fewest, monkeypatch):
     )
 
 
-@pytest.mark.parametrize("scale", daily(2, [2.0**-60, 2.0**-9, 1.0, 2.0**30]))
+@pytest.mark.parametrize("scale", daily(1, [2.0**-60, 2.0**-9, 1.0, 2.0**30]))
 def test_bodies_that_cut_each_other(device, scale, monkeypatch):
     """Whatever the unit of length; two spheres whose triangles lie in each other's planes too."""
     monkeypatch.setattr(decimation, "FEWEST", 1)

@@ -59,7 +59,7 @@ def assert_sound(mesh) -> dict:
 
 @pytest.mark.every_device
 @pytest.mark.parametrize("closed", daily(1, [True, False]))
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", daily(4, SHAPES))
 def test_device_equals_twin(device, shape, closed):
     if not closed and min(shape) < 2:
         pytest.skip("an open map of one layer has no cells")

@@ -7,7 +7,7 @@ import pytest
 import tolerances
 from slab_surfaces import assert_same, extract_in_slabs
 from surface_volumes import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
-from variants import FOR_RELEASE, daily
+from variants import daily, daily_rows
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
@@ -42,13 +42,9 @@ def ball(radius: float, size: int = 33) -> Volume:
 
 @pytest.mark.parametrize(
     ("dtype", "affine"),
-    [
-        ("int16", OBLIQUE),
-        ("float32", MIRRORED),
-        pytest.param("int16", MIRRORED, marks=FOR_RELEASE),
-        pytest.param("uint8", OBLIQUE, marks=FOR_RELEASE),
-        pytest.param("int32", MIRRORED, marks=FOR_RELEASE),
-    ],
+    daily_rows(
+        1, [("int16", OBLIQUE), ("float32", MIRRORED), ("int16", MIRRORED), ("uint8", OBLIQUE), ("int32", MIRRORED)]
+    ),
 )
 def test_device_equals_twin_for_voxel_types(device, dtype, affine):
     """Of whole numbers one of each kind: with a sign, without one, and beyond what float32 holds."""
@@ -66,7 +62,7 @@ def test_device_equals_twin_at_word_borders(device, shape, closed):
     assert_equals_twin(volume, 3, device, closed=closed, below=True)
 
 
-@pytest.mark.parametrize("high", [2, 3, 6, 12])
+@pytest.mark.parametrize("high", daily(2, [3, 12, 2, 6]))
 def test_random_integers_in_every_range_are_sound(device, high):
     for seed, shape in enumerate([(7, 9, 11), (5, 4, 35)]):
         volume = random_volume(shape, high=high, seed=seed)

@@ -30,7 +30,7 @@ def assert_equals_twin(volume, iso_value, device, closed=True) -> None:
 
 
 @pytest.mark.parametrize("closed", daily(1, [True, False]))
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", daily(8, SHAPES))
 def test_device_equals_twin_at_word_borders(device, shape, closed):
     assert_equals_twin(random_volume(shape, high=50), 25, device, closed)
 

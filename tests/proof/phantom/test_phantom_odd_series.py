@@ -37,6 +37,7 @@ def test_uneven_slices_lie_where_the_truth_says(tmp_path: Path, extra: dict) -> 
     assert np.array_equal(volume.voxels, make_phantom(settings)[0])
 
 
+@pytest.mark.release
 def test_uneven_slices_show_what_is_at_their_place() -> None:
     settings = PhantomSettings(size=(40, 36), slices=5, spacing=(6.0, 6.0, 2.5), **CLEAN)
     affine = place_slices(settings).affine

@@ -70,7 +70,7 @@ def is_inside(body, points: np.ndarray) -> np.ndarray:
     return (np.abs(u) < 6.0) & (np.abs(v) < 8.0) & (np.abs(w) < 2.5)
 
 
-@pytest.mark.parametrize("body", daily(2, BODIES), ids=IDS)
+@pytest.mark.parametrize("body", daily(1, BODIES), ids=IDS)
 def test_distance_equals_nearest_surface_point(body) -> None:
     points = CENTRE + np.random.default_rng(3).uniform(-14.0, 14.0, (500, 3))
     surface = surface_points(body)

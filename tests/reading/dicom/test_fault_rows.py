@@ -144,7 +144,7 @@ def both(first, second):
     return change
 
 
-@pytest.mark.parametrize("text", daily(4, HOSTILE_TEXTS.values()), ids=HOSTILE_TEXTS)
+@pytest.mark.parametrize("text", daily(2, HOSTILE_TEXTS.values()), ids=HOSTILE_TEXTS)
 def test_row_45_hostile_texts_are_escaped_and_name_no_file(tmp_path, monkeypatch, capsys, text):
     folder, utf8 = tmp_path / "ct", set_values(SpecificCharacterSet="ISO_IR 192")
     monkeypatch.chdir(tmp_path)

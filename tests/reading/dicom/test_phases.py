@@ -47,7 +47,7 @@ def test_one_identical_slice_is_dropped(tmp_path):
 @pytest.mark.parametrize(
     ("first", "second", "keyword", "values"),
     daily_rows(
-        4,
+        2,
         [
             ({"AcquisitionNumber": 3}, {"AcquisitionNumber": 12}, "AcquisitionNumber", ["3", "12"]),
             (

@@ -63,7 +63,7 @@ def test_a_missing_slice_is_no_rounding(tmp_path, lost):
         read_volume(tmp_path)
 
 
-@pytest.mark.parametrize("lost", [1, 30, 58])
+@pytest.mark.parametrize("lost", daily(1, [1, 30, 58]))
 def test_whole_millimetres_hide_no_missing_slice(tmp_path, lost):
     """Steps that are a multiple of the unit are not changed by rounding."""
     write_rounded(tmp_path, 1.0, 0, leave_out=(lost,))

@@ -7,6 +7,7 @@ import pytest
 import tolerances
 from dicom_series import Plan, write_series
 from lost_slices import MISSING
+from variants import daily_rows
 
 from clrecon.errors import RefusedInputError
 from clrecon.reading import list_series, read_volume
@@ -115,14 +116,17 @@ def test_noise_within_the_tolerance_stays_one_affine(tmp_path):
 
 @pytest.mark.parametrize(
     ("plan", "missing"),
-    [
-        (Plan(shape=(13, 3, 3), leave_out=(2, 5, 8, 11)), 4),
-        (Plan(shape=(4, 3, 3), leave_out=(2,)), 1),
-        (Plan(shape=(40, 3, 3), offsets={k: 1.25 * (k - 10) for k in range(11, 40)}, leave_out=(5,)), 1),
-        (Plan(shape=(40, 3, 3), offsets={k: 1.25 * (k - 10) for k in range(11, 40)}, leave_out=(1,)), 1),
-        (Plan(shape=(40, 3, 3), offsets={k: 1.25 * (k - 10) for k in range(11, 40)}, leave_out=(4, 6)), 2),
-        (Plan(shape=(40, 3, 3), offsets={k: 3.75 * (k - 30) for k in range(31, 40)}, leave_out=(35,)), 1),
-    ],
+    daily_rows(
+        3,
+        [
+            (Plan(shape=(13, 3, 3), leave_out=(2, 5, 8, 11)), 4),
+            (Plan(shape=(4, 3, 3), leave_out=(2,)), 1),
+            (Plan(shape=(40, 3, 3), offsets={k: 1.25 * (k - 10) for k in range(11, 40)}, leave_out=(5,)), 1),
+            (Plan(shape=(40, 3, 3), offsets={k: 1.25 * (k - 10) for k in range(11, 40)}, leave_out=(1,)), 1),
+            (Plan(shape=(40, 3, 3), offsets={k: 1.25 * (k - 10) for k in range(11, 40)}, leave_out=(4, 6)), 2),
+            (Plan(shape=(40, 3, 3), offsets={k: 3.75 * (k - 30) for k in range(31, 40)}, leave_out=(35,)), 1),
+        ],
+    ),
     ids=["as many holes as gaps", "three slices", "fine part", "first gap", "two in a row", "coarse part"],
 )
 def test_holes_are_measured_by_the_gaps_beside_them(tmp_path, plan, missing):

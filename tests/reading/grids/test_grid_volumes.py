@@ -220,7 +220,7 @@ def test_labels_of_the_same_kind_of_file_lie_on_their_volume_exactly(tmp_path, n
     assert taken.exact and np.array_equal(taken.voxels, voxels > 200)
 
 
-@pytest.mark.parametrize("name", ["a.nii.gz", "gzip.nrrd", "packed.mha", "a.mha"])
+@pytest.mark.parametrize("name", daily(2, ["a.nii.gz", "gzip.nrrd", "packed.mha", "a.mha"]))
 @pytest.mark.parametrize("kind", daily(1, ["whole", "fractions", "a fraction at the end"]))
 def test_no_more_than_two_volumes_of_memory(tmp_path, name, kind):
     voxels = np.repeat(make_ct((50, 150, 100)), 3, axis=2).astype(np.float32)

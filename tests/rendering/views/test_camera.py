@@ -97,7 +97,7 @@ def in_picture(camera: Camera, volume: Volume, size) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", daily(1, [(400, 300), (300, 400), (512, 512)]))
-@pytest.mark.parametrize("perspective", [None, 50.0])
+@pytest.mark.parametrize("perspective", daily(1, [50.0, None]))
 @pytest.mark.parametrize("make", [box, sheared, uneven])
 def test_the_whole_volume_is_in_the_picture_of_any_view(make, perspective, size):
     volume = make()
