@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from house import ROOT
 
 from clrecon.errors import DeviceError, UsageError
-from clrecon.opencl import arrays, cache, launching, pocl, program, quirks, select
+from clrecon.opencl import arrays, cache, launching, pocl, program, quirks, select, sources
 from clrecon.opencl.device import HEADROOM_BYTES, Device, _find_shortcoming
 from clrecon.opencl.sources import find_signatures
+from clrecon.opencl.transfers import LEAST_BYTES
 
 
 def test_a_cache_may_fill_the_disk_to_the_room_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,3 +160,46 @@ def test_a_variable_set_to_nothing_is_none(value: str, kept: bool, monkeypatch: 
     monkeypatch.setattr(quirks, "prepare_caches", lambda: None)
     quirks.import_pyopencl.__wrapped__()
     assert ("PYOPENCL_NO_CACHE" in os.environ) is kept
+
+
+def test_kernels_lie_beside_the_sources_where_they_are_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def is_missing(name: str) -> Any:
+        raise ModuleNotFoundError(name)
+
+    monkeypatch.setattr(sources.resources, "files", is_missing)
+    assert sources.kernel_root.__wrapped__() == ROOT / "cl"
+
+
+@pytest.mark.parametrize(
+    ("size", "simulator", "way"),
+    [(LEAST_BYTES - 1, False, "copy"), (LEAST_BYTES, False, "pieces"), (LEAST_BYTES, True, "copy")],
+)
+def test_large_arrays_come_back_in_pieces(
+    size: int, simulator: bool, way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ways: list[str] = []
+    opencl = SimpleNamespace(
+        mem_flags=SimpleNamespace(USE_HOST_PTR=8), enqueue_copy=lambda *given, **more: ways.append("copy")
+    )
+    monkeypatch.setattr(arrays, "import_pyopencl", lambda: opencl)
+    monkeypatch.setattr(arrays, "raw", lambda array_d: array_d)
+    monkeypatch.setattr(arrays, "wait", lambda device: None)
+    monkeypatch.setattr(arrays, "read_buffers", lambda device, large: ways.append("pieces"))
+    device: Any = SimpleNamespace(is_simulator=simulator, queue=None, commands=SimpleNamespace(add=lambda *given: None))
+    arrays._fill_all(device, [(np.zeros(size, np.uint8), SimpleNamespace(flags=0), 0)])
+    assert ways == [way]
+
+
+def test_the_log_says_how_long_a_build_took(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[tuple[Any, ...]] = []
+    seconds = iter((5.0, 7.5))
+    monkeypatch.setattr(program, "log", SimpleNamespace(debug=lambda *words: told.append(words)))
+    monkeypatch.setattr(program.time, "perf_counter", lambda: next(seconds))
+    monkeypatch.setattr(program, "_build_from_source", lambda *given: None)
+    monkeypatch.setattr(program, "_key", lambda *given: "key")
+    monkeypatch.setattr(program, "Program", lambda *given: SimpleNamespace(kernel_names=["a"]))
+    device: Any = SimpleNamespace(
+        first_header="", trace=None, known_good=None, keeps_binaries=False, checked_cache=lambda key: nullcontext()
+    )
+    program._build(device, "primitives/scan.cl", ())
+    assert told == [("cl/%s %s built from %s in %.3f s", "primitives/scan.cl", (), "source", 2.5)]
