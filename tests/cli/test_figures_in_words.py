@@ -282,3 +282,9 @@ def test_a_volume_on_the_device_has_its_row(resident: dict[str, float] | None) -
     }  # fmt: skip
     lines = bench._describe_device(entry)
     assert any("new iso value" in line for line in lines) is (resident is not None)
+
+
+def test_meshes_are_made_of_a_part_of_a_scan(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main.main(["help", "mesh"]) == 0
+    told = capsys.readouterr().out
+    assert all(option in told for option in ("--clip-box", "--between", "--around", "--fov", "--remove-table"))
