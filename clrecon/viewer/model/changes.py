@@ -279,7 +279,7 @@ class ChangingView:
         return words
 
     def hold(self, on: bool) -> None:
-        """Say that the pointer is pressed, or released: what is dragged meanwhile is one step, however long it takes."""
+        """Say that the pointer is pressed, or released: what is dragged meanwhile is one step, however long."""
         self._held = on
         if on:
             self._last = ("", -math.inf)
