@@ -288,3 +288,39 @@ def test_meshes_are_made_of_a_part_of_a_scan(capsys: pytest.CaptureFixture[str])
     assert main.main(["help", "mesh"]) == 0
     told = capsys.readouterr().out
     assert all(option in told for option in ("--clip-box", "--between", "--around", "--fov", "--remove-table"))
+
+
+def test_the_picture_of_distances_is_among_the_first_options(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main.main(["distance", "--help"]) == 0
+    assert "--picture FILE" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("given", [{}, {"report": "a.json"}, {"json": True}, {"verbose": True}])
+def test_a_mesh_is_measured_for_whoever_sees_the_figures(
+    given: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[bool] = []
+
+    def make_mesh(*names: object, measure: bool, **how: object) -> None:
+        told.append(measure)
+        raise UsageError("enough")
+
+    monkeypatch.setattr("clrecon.jobs.mesh.job.make_mesh", make_mesh)
+    monkeypatch.setattr(mesh_command, "mesh_fields", lambda options: {})
+    options = {"input": "a", "output": "b.stl", "report": None, "json": False, "verbose": False, "no_clobber": False}
+    with pytest.raises(UsageError, match="enough"):
+        mesh_command.run(argparse.Namespace(**options | given), Console())
+    assert told == [bool(given)]
+
+
+def test_a_moving_line_has_20_characters_at_least(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(console, "_columns", lambda: 5)
+    Console()._draw("x" * 50, 0, 0)
+    assert capsys.readouterr().err == "\rclrecon: " + "x" * 11
+
+
+def test_a_turntable_needs_no_picture(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main.main(["help", "render"]) == 0
+    assert "[-o OUT]" in capsys.readouterr().out

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from dicom_series import Plan, set_values, write_series
 
+from clrecon.errors import RefusedInputError
 from clrecon.reading import list_series, read_volume
 
 
@@ -57,6 +58,22 @@ def test_a_thickness_that_is_not_stated(tmp_path):
 def test_gaps_of_which_nothing_is_said(tmp_path, gap, thickness):
     write_series(tmp_path, Plan(gap=gap), set_values(SliceThickness=thickness))
     assert not any("times the width" in text for text in judge(tmp_path)[0])
+
+
+def test_a_gap_is_compared_with_the_slices_beside_it(tmp_path):
+    write_series(tmp_path, Plan(gap=5.0), lambda ds, k: setattr(ds, "SliceThickness", 4 if k < 5 else 1))
+    (gate,) = (gate for gate in read_volume(tmp_path).report["gates"] if gate["name"] == "gap_thickness")
+    assert (gate["measured"], gate["ok"]) == (5.0, False)
+
+
+@pytest.mark.parametrize(("slope", "is_read"), [(1e6, True), (1.000001e6, False), (1e-6, True), (0.999999e-6, False)])
+def test_slopes_beyond_any_scale_are_refused(tmp_path, slope, is_read):
+    write_series(tmp_path, Plan(), set_values(RescaleSlope=slope))
+    if is_read:
+        assert read_volume(tmp_path).report["rescale"]["slope"] == [slope, slope]
+    else:
+        with pytest.raises(RefusedInputError, match="RescaleSlope"):
+            read_volume(tmp_path)
 
 
 # --- HU ---

@@ -319,6 +319,7 @@ def test_a_doubt_about_the_order_is_said_once(monkeypatch):
         header.lossy = header.modality_lut = header.quadruped = False
         header.warnings = ()
     monkeypatch.setattr(certificate, "_describe_what_was_left", lambda series: [])
+    monkeypatch.setattr(certificate, "_describe_long_voxels", lambda stack: [])
     for said, doubt, expected in (([], "A doubt", ["A doubt"]), (["A doubt."], "A doubt", ["A doubt."]), ([], "", [])):
         stack = SimpleNamespace(slices=own, warnings=said)
         series: Any = SimpleNamespace(kind="stack", stack=stack, find_doubt=lambda doubt=doubt: doubt)
