@@ -2,6 +2,7 @@
 
 from clrecon.anatomy.body import mask_field_of_view as mask_field_of_view
 from clrecon.anatomy.body import remove_table as remove_table
+from clrecon.anatomy.iso_choice import IsoChoice as IsoChoice
 from clrecon.anatomy.iso_choice import choose_iso_value as choose_iso_value
 from clrecon.anatomy.noise import Noise as Noise
 from clrecon.anatomy.noise import measure_noise as measure_noise
@@ -18,13 +19,16 @@ from clrecon.geometry import Volume as Volume
 from clrecon.labels import LabelMap as LabelMap
 from clrecon.labels import read_labels as read_labels
 from clrecon.labels import resample_labels as resample_labels
+from clrecon.labels.statistics import LabelFigures as LabelFigures
 from clrecon.labels.statistics import measure_labels as measure_labels
 from clrecon.mesh import Mesh as Mesh
 from clrecon.mesh.compare.distances import compare_meshes as compare_meshes
 from clrecon.mesh.compare.signed import measure_distance as measure_distance
 from clrecon.mesh.compare.signed import measure_vertex_distances as measure_vertex_distances
 from clrecon.mesh.mesh_reader import read_mesh as read_mesh
+from clrecon.mesh.quality import MeshQuality as MeshQuality
 from clrecon.mesh.refine.quadric import collapse_quadric as collapse_quadric
+from clrecon.opencl import Device as Device
 from clrecon.opencl import list_devices
 from clrecon.operators import choose_device
 from clrecon.operators.filters.bilateral import filter_bilateral as filter_bilateral
@@ -43,8 +47,8 @@ from clrecon.operators.points.reconstruct import reconstruct_surface as reconstr
 from clrecon.operators.points.slice_overlap import find_ghost_slices as find_ghost_slices
 from clrecon.operators.points.thinning import remove_sparse_cells as remove_sparse_cells
 from clrecon.operators.points.thinning import thin_points as thin_points
-from clrecon.operators.rays.render import VolumeRenderer as VolumeRenderer
 from clrecon.operators.rays.render import render as render
+from clrecon.operators.rays.volume_renderer import VolumeRenderer as VolumeRenderer
 from clrecon.operators.reformat.cut import cut_slice as cut_slice
 from clrecon.operators.reformat.cut import reformat_curve as reformat_curve
 from clrecon.operators.resident.device_volume import DeviceVolume as DeviceVolume

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -21,6 +21,7 @@ from clrecon.geometry.vertices import (
     power_of_two_over,
 )
 from clrecon.geometry.volume import Volume
+from clrecon.system.arguments import Topology
 from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.text import format_digits
 
@@ -33,7 +34,7 @@ LOWEST_OUTSIDE = -(2**30)
 LARGEST_FLOAT = 1e30
 """Largest float voxel: differences, and their squares after scaling, stay within float32."""
 
-TOPOLOGIES = ("separated", "trilinear")
+TOPOLOGIES: tuple[str, ...] = get_args(Topology)
 """How inside samples are joined where the corners of a cell leave it open; see `IsoRule.topology`."""
 
 Level = float | Sequence[float]

@@ -12,20 +12,20 @@ Cubes Algorithm", J. Harbin Inst. Technol. (New Series) 26(6), eq. 6-11 (golden 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
-from clrecon.system.arguments import name_parameter
+from clrecon.system.arguments import VertexRule, name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry.volume import Volume
 
 
-VERTEX_RULES = ("linear", "golden", "golden-search")
+VERTEX_RULES: tuple[str, ...] = get_args(VertexRule)
 
 GOLDEN = 0.6180340
 """(sqrt(5) - 1) / 2 in the digits of the paper, which float32 holds to its last place."""

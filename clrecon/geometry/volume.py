@@ -17,7 +17,7 @@ from clrecon.geometry.grid import BaseVolume
 from clrecon.geometry.images import image_of, make_nibabel, make_sitk, take_nibabel, take_sitk
 from clrecon.geometry.resample import resample_volume
 from clrecon.geometry.sampling import sample_volume
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import Space, explains_arguments
 from clrecon.system.packages import ShownAsHtml, public_function
 from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress
@@ -83,7 +83,7 @@ class Volume(BaseVolume, ShownAsHtml):
         between: Sequence[float | None] | None = None,
         around: Sequence[float] | None = None,
         margin: int = 0,
-        space: str = "lps",
+        space: Space = "lps",
     ) -> Own:
         """Return the smallest block of whole voxels that holds every voxel centre in a box of mm; see docs/export.md.
 
@@ -231,7 +231,7 @@ class Volume(BaseVolume, ShownAsHtml):
 
     @classmethod
     @explains_arguments
-    def from_pyvista(cls: type[Own], image: Any, name: str | None = None, space: str | None = None) -> Own:
+    def from_pyvista(cls: type[Own], image: Any, name: str | None = None, space: Space | None = None) -> Own:
         """Make a volume of a ``pyvista.ImageData``, or ``vtkImageData``; its voxels are a copy.
 
         It has no certificate: nothing vouches for its HU.  What `to_pyvista` turned round comes back as it was.

@@ -18,6 +18,7 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SAMPLES, DistanceSummary
 from clrecon.mesh.compare.signed import MeshDeviation, SideDistance, measure_distance, measure_vertex_distances
 from clrecon.mesh.mesh_reader import read_mesh
+from clrecon.system.arguments import Space
 from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text, format_digits
@@ -194,7 +195,7 @@ _OTHER_UNIT = 100.0
 """Ratio of the sizes of two meshes from which on their units are doubted; metres and millimetres differ by 1000."""
 
 
-def read_side(path: str | Path, space: str | None) -> Mesh:
+def read_side(path: str | Path, space: Space | None) -> Mesh:
     """Read a mesh; `space` is the frame of its coordinates if the file does not name one."""
     mesh = read_mesh(path)
     if space is not None and mesh.report["file"]["space_from"] == "assumed":

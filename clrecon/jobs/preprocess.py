@@ -326,7 +326,7 @@ class _StepRun:
                 progress=self._progress, **given,
             )  # fmt: skip
         else:
-            done = filter_volume(resident, step.name, progress=self._progress, **given)
+            done = filter_volume(resident, step.name, progress=self._progress, **given)  # type: ignore[arg-type]
         return done, dict(done.volume.report["filtered"]["steps"][-1])
 
     def _change_shape(self, resident: DeviceVolume, step: PreprocessStep) -> tuple[DeviceVolume, dict[str, Any]]:

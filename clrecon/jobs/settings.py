@@ -19,7 +19,7 @@ from clrecon.jobs.options import (
     space_option,
 )
 from clrecon.reading import Selection
-from clrecon.system.arguments import name_parameter
+from clrecon.system.arguments import Space, name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.options import numbers_reader, option
 
@@ -56,7 +56,7 @@ class ExportSettings(InputSettings):
         "resample (trilinear) to a regular grid with this step along all axes; without it voxels stay as they are",
         first=True,
     )
-    space: str = option(
+    space: Space = option(
         "--space lps|ras",
         "patient frame of the numbers of crop and region (default: lps); that of the file is its format's",
         default="lps",
@@ -106,7 +106,7 @@ MOST_SAMPLES = 10_000_000
 class DistanceSettings(DeviceSettings):
     """Settings of the job of distances."""
 
-    mesh_space: str | None = mesh_space_option("files that do not name theirs")
+    mesh_space: Space | None = mesh_space_option("files that do not name theirs")
     samples: int | None = option("--samples N", "points on each mesh, evenly by area (default: 50000)")
     range_mm: float | None = option(
         "--range MM",
@@ -117,7 +117,7 @@ class DistanceSettings(DeviceSettings):
     view: str = option(
         "--view V", "view of the picture: anterior (default), left, AZ,EL ...", group="picture", default="anterior"
     )
-    space: str = space_option("patient frame of the coloured mesh", group="picture")
+    space: Space = space_option("patient frame of the coloured mesh", group="picture")
 
     def __post_init__(self) -> None:
         from clrecon.rendering.views.directions import find_view
@@ -181,7 +181,7 @@ class InsideSettings(ScanSettings, DeviceSettings):
         "with --hu: dense voxels this near to the label are its own (default: one voxel each way)",
         group="parts",
     )
-    space: str = space_option("patient frame of the meshes", group="parts")
+    space: Space = space_option("patient frame of the meshes", group="parts")
 
     def __post_init__(self) -> None:
         check_space(self.space)
@@ -286,7 +286,7 @@ class CorridorSettings(ScanSettings, DeviceSettings):
         first=True,
     )
     screws: tuple[Any, ...] = ()
-    space: str = space_option("patient frame of points and meshes", group="space")
+    space: Space = space_option("patient frame of points and meshes", group="space")
 
     def __post_init__(self) -> None:
         if not self.label:

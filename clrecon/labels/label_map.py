@@ -23,7 +23,7 @@ from clrecon.geometry import Grid, Volume
 from clrecon.geometry.affine import checked_affine
 from clrecon.geometry.images import Image, make_nibabel, make_sitk, place_in_header, take_nibabel, take_sitk
 from clrecon.geometry.resample import LARGEST_SHEAR_DEGREES, shear_degrees
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import Space, explains_arguments
 from clrecon.system.files import replace_file
 from clrecon.system.packages import ShownAsHtml, public_function
 from clrecon.system.paths import keep_existing
@@ -259,19 +259,10 @@ class LabelMap(Grid, ShownAsHtml):
     def resample(self, to: Volume) -> LabelMap:
         """Return the map on the grid of a volume, as `clrecon.resample_labels` brings it there.
 
-        Parameters
-        ----------
-        to : Volume
-
-        Raises
-        ------
-        UsageError, RefusedInputError
-            The slices of the volume are uneven, or as `clrecon.resample_labels`.
+        Uneven slices are refused, and else what that refuses.
         """
         if to.uneven:
-            raise UsageError(
-                "the slices of the volume are uneven, which a label map cannot be: clrecon.resample_labels"
-            )
+            raise UsageError("the slices of the volume are uneven, no label map has such: clrecon.resample_labels")
         taken = public_function("resample_labels")(self, to)
         return self.changed(taken.voxels, affine=to.affine, warnings=taken.warnings)
 
@@ -357,20 +348,16 @@ class LabelMap(Grid, ShownAsHtml):
     @classmethod
     @explains_arguments
     def from_pyvista(
-        cls, image: Any, names: Mapping[int, str] | None = None, *, name: str | None = None, space: str | None = None
+        cls, image: Any, names: Mapping[int, str] | None = None, *, name: str | None = None, space: Space | None = None
     ) -> LabelMap:
-        """Make a map of a ``pyvista.ImageData``; its voxels are a copy.
+        """Make a map of a ``pyvista.ImageData`` with a whole number at each point, which may be stored as a real one.
 
         Parameters
         ----------
-        image : pyvista.ImageData
-            In mm, with a whole number from 0 to 65,535 at each point, which may be stored as a real one.
+        image, name, space
+            As of `Volume.from_pyvista`.
         names : mapping of int to str, optional
             As of a `LabelMap`; None: those of the field array ``LABELS``, which `to_pyvista` writes.
-        name : str, optional
-            Name of the point data; None: the active scalars.
-        space : {"lps", "ras"}, optional
-            As of `Volume.from_pyvista`, whose errors are those of a map.
         """
         from clrecon.geometry.vtk import take_image_data
 

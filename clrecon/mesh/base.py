@@ -17,7 +17,7 @@ from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import apply_affine, checked_affine, column_spacing, normal_matrix
 from clrecon.mesh.quality import find_pieces
 from clrecon.mesh.triangles import vertex_normals
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import Space, explains_arguments
 from clrecon.system.base_classes import Message
 from clrecon.system.paths import keep_existing
 
@@ -213,7 +213,7 @@ class BaseMesh(Message):
 
     @explains_arguments
     def save(
-        self, path: str | os.PathLike[str], space: str = "lps", *, no_clobber: bool = False, keep_ids: bool = False
+        self, path: str | os.PathLike[str], space: Space = "lps", *, no_clobber: bool = False, keep_ids: bool = False
     ) -> int:
         """Write the mesh to a file; its extension gives the format.
 

@@ -16,7 +16,7 @@ from clrecon.mesh.components import select_components, split_components
 from clrecon.mesh.connectivity import find_edges
 from clrecon.mesh.intersections import find_self_intersections
 from clrecon.mesh.quality import MeshQuality, measure_quality, measure_triangles
-from clrecon.system.arguments import as_numbers, explains_arguments
+from clrecon.system.arguments import Space, as_numbers, explains_arguments
 from clrecon.system.packages import ShownAsHtml, import_package, public_function
 from clrecon.system.pieces import find_bounds, local_origin
 
@@ -172,7 +172,7 @@ class Mesh(BaseMesh, ShownAsHtml):
 
     def _cut_by(self, point: ArrayLike, normal: ArrayLike) -> tuple[Any, Any, Any, NDArray[np.float64]]:
         """Return the surface near zero for VTK, a plane there, its normal of length 1, and the place of zero."""
-        from clrecon.mesh.vtk import make_polydata
+        from clrecon.mesh.vtk import wrap_polydata
 
         at, along = (
             _finite_points(vector, name, one=True)[0] for vector, name in ((point, "point"), (normal, "normal"))
@@ -180,7 +180,7 @@ class Mesh(BaseMesh, ShownAsHtml):
         if not along.any():
             raise UsageError("the normal of a plane has length 0: it has no side")
         origin = self._origin()
-        surface = make_polydata(self.vertices - origin, self.triangles, None, values=self.checked_values())
+        surface = wrap_polydata(self.vertices - origin, self.triangles, None, self.checked_values())
         return surface, at - origin, along / np.linalg.norm(along), origin
 
     def _origin(self) -> NDArray[np.float64]:
@@ -200,8 +200,8 @@ class Mesh(BaseMesh, ShownAsHtml):
         from clrecon.mesh.vtk import CellLocator
 
         asked, origin = _finite_points(points, "points"), self._origin()
-        nearest, rows = CellLocator(self.vertices - origin, self.triangles).nearest(asked - origin)
-        return nearest + origin, np.linalg.norm(nearest + origin - asked, axis=1), rows
+        nearest, rows, distances = CellLocator(self.vertices - origin, self.triangles).nearest(asked - origin)
+        return nearest + origin, distances, rows
 
     @explains_arguments
     def ray(self, start: ArrayLike, direction: ArrayLike) -> NDArray[np.float64]:
@@ -209,10 +209,8 @@ class Mesh(BaseMesh, ShownAsHtml):
 
         Parameters
         ----------
-        start : array_like, shape (n, 3) or (3,)
-            LPS mm.
-        direction : array_like, shape (n, 3) or (3,)
-            Vectors of any length but 0; one alone is that of all rays.
+        start, direction : array_like, shape (n, 3) or (3,)
+            LPS mm, and vectors of any length but 0; one alone is that of all rays.
         """
         from clrecon.mesh.vtk import CellLocator
 
@@ -248,7 +246,7 @@ class Mesh(BaseMesh, ShownAsHtml):
 
     @classmethod
     @explains_arguments
-    def from_pyvista(cls, polydata: Any, space: str | None = None) -> Mesh:
+    def from_pyvista(cls, polydata: Any, space: Space | None = None) -> Mesh:
         """Make a mesh of a ``pyvista.PolyData``; polygons and strips become triangles.
 
         Parameters
@@ -296,7 +294,7 @@ class Mesh(BaseMesh, ShownAsHtml):
 
     @classmethod
     @explains_arguments
-    def from_trimesh(cls, mesh: Any, space: str | None = None) -> Mesh:
+    def from_trimesh(cls, mesh: Any, space: Space | None = None) -> Mesh:
         """Make a mesh of a ``trimesh.Trimesh``.
 
         Parameters

@@ -13,7 +13,7 @@ from clrecon.exchange.formats import FORMATS, MESH_INPUTS
 from clrecon.exchange.raw_content import RawMesh, frame_of_file, turn_to_lps
 from clrecon.geometry import frame_from_lps
 from clrecon.mesh.mesh import Mesh
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import Space, explains_arguments
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.text import escape_text
 
@@ -21,7 +21,7 @@ log = get_logger(__name__)
 
 
 @explains_arguments
-def read_mesh(path: str | os.PathLike[str], *, space: str | None = None) -> Mesh:
+def read_mesh(path: str | os.PathLike[str], *, space: Space | None = None) -> Mesh:
     """Read a mesh from a file.
 
     Parameters

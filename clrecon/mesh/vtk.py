@@ -28,35 +28,21 @@ class CellLocator:
         self._locator.SetDataSet(self._polydata)
         self._locator.BuildLocator()
 
-    def distances(self, points: Points) -> NDArray[np.float64]:
-        """Return distances in mm, shape (k,), from `points`, shape (k, 3), to the nearest triangle."""
-        from vtkmodules.vtkCommonCore import reference
-        from vtkmodules.vtkCommonDataModel import vtkGenericCell
-
-        closest = [0.0, 0.0, 0.0]
-        square: Any = reference(0.0)
-        others: tuple[Any, ...] = (vtkGenericCell(), reference(0), reference(0), square)
-        squares = np.empty(len(points))
-        find: Any = self._locator.FindClosestPoint
-        for row, point in enumerate(points.tolist()):
-            find(point, closest, *others)
-            squares[row] = square.get()
-        return np.sqrt(squares)
-
-    def nearest(self, points: Points) -> tuple[Points, NDArray[np.int64]]:
-        """Return the nearest points of the surface, shape (k, 3), and the rows of their triangles, shape (k,)."""
+    def nearest(self, points: Points) -> tuple[Points, NDArray[np.int64], NDArray[np.float64]]:
+        """Return the nearest points of the surface, (k, 3), the rows of their triangles and the distances in mm."""
         from vtkmodules.vtkCommonCore import reference
         from vtkmodules.vtkCommonDataModel import vtkGenericCell
 
         closest = [0.0, 0.0, 0.0]
         triangle: Any = reference(0)
-        others: tuple[Any, ...] = (vtkGenericCell(), triangle, reference(0), reference(0.0))
-        places, rows = np.empty((len(points), 3)), np.empty(len(points), dtype=np.int64)
+        square: Any = reference(0.0)
+        others: tuple[Any, ...] = (vtkGenericCell(), triangle, reference(0), square)
+        places, rows, squares = np.empty((len(points), 3)), np.empty(len(points), dtype=np.int64), np.empty(len(points))
         find: Any = self._locator.FindClosestPoint
         for row, point in enumerate(points.tolist()):
             find(point, closest, *others)
-            places[row], rows[row] = closest, triangle.get()
-        return places, rows
+            places[row], rows[row], squares[row] = closest, triangle.get(), square.get()
+        return places, rows, np.sqrt(squares)
 
     def first_hits(self, starts: Points, ends: Points) -> Points:
         """Return where lines from `starts` to `ends`, shape (k, 3), first meet the surface; NaN where they do not."""
@@ -73,48 +59,35 @@ class CellLocator:
 
 
 def clip_surface(surface: Any, point: Points, normal: Points, capped: bool) -> Any:
-    """Return the part of a ``vtkPolyData`` on the side of a plane that the normal points to."""
+    """Return the part of a ``pyvista.PolyData`` on the side of a plane that the normal points to."""
     from vtkmodules.vtkCommonDataModel import vtkPlane, vtkPlaneCollection
-    from vtkmodules.vtkFiltersCore import vtkClipPolyData
     from vtkmodules.vtkFiltersGeneral import vtkClipClosedSurface
 
-    plane = vtkPlane(origin=point, normal=normal)
-    if capped:
-        planes = vtkPlaneCollection()
-        planes.AddItem(plane)
-        clipper: Any = vtkClipClosedSurface(clipping_planes=planes, pass_point_data=True)
-    else:
-        clipper = vtkClipPolyData(clip_function=plane)
+    if not capped:
+        return surface.clip(normal=normal, origin=point, invert=False)
+    planes = vtkPlaneCollection()
+    planes.AddItem(vtkPlane(origin=point, normal=normal))
+    clipper: Any = vtkClipClosedSurface(clipping_planes=planes, pass_point_data=True)  # that of pyvista loses them
     clipper.SetInputData(surface)
     clipper.Update()
     return clipper.GetOutput()
 
 
 def cut_surface(surface: Any, point: Points, normal: Points) -> list[Points]:
-    """Return the lines in which a plane cuts a ``vtkPolyData``, (n, 3) each, the first point again at a closed end."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkCommonDataModel import vtkPlane
-    from vtkmodules.vtkFiltersCore import vtkCutter
-
-    cutter: Any = vtkCutter(cut_function=vtkPlane(origin=point, normal=normal))
-    cutter.SetInputData(surface)
-    cutter.Update()
-    lines = cutter.GetOutput().GetLines()
-    if not lines.GetNumberOfCells():
-        return []
-    points = vtk_to_numpy(cutter.GetOutput().GetPoints().GetData()).astype(np.float64)
-    next_to: list[list[int]] = [[] for _ in points]
-    for one, other in vtk_to_numpy(lines.GetConnectivityArray()).reshape(-1, 2).tolist():
+    """Return the lines in which a plane cuts a ``pyvista.PolyData``, (n, 3), the first point again at a closed end."""
+    cut = surface.slice(normal=normal, origin=point)
+    next_to: list[list[int]] = [[] for _ in range(cut.n_points)]
+    for _, one, other in cut.lines.reshape(-1, 3).tolist():
         next_to[one].append(other)
         next_to[other].append(one)
     found = []
-    for start in sorted(range(len(points)), key=lambda row: len(next_to[row]) % 2 == 0):  # open ends first
+    for start in sorted(range(cut.n_points), key=lambda row: len(next_to[row]) % 2 == 0):  # open ends first
         line = [start]
         while next_to[line[-1]]:  # VTK's own joining of lines breaks them where it begins
             line.append(next_to[line[-1]].pop())
             next_to[line[-1]].remove(line[-2])
         if len(line) > 1:
-            found.append(points[line])
+            found.append(np.array(cut.points[line], np.float64))
     return found
 
 

@@ -15,7 +15,7 @@ from clrecon.exchange.coordinates import as_stored
 from clrecon.exchange.formats import write_cloud
 from clrecon.geometry import frame_from_lps
 from clrecon.geometry.affine import choose_space
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import Space, explains_arguments
 from clrecon.system.base_classes import Message
 from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.packages import ShownAsHtml, install_command
@@ -301,7 +301,7 @@ class PointCloud(Message, ShownAsHtml):
 
     @explains_arguments
     def save(
-        self, path: str | os.PathLike[str], space: str = "lps", *, no_clobber: bool = False, keep_ids: bool = False
+        self, path: str | os.PathLike[str], space: Space = "lps", *, no_clobber: bool = False, keep_ids: bool = False
     ) -> int:
         """Write the cloud to a file; its extension gives the format.
 
@@ -348,7 +348,7 @@ class PointCloud(Message, ShownAsHtml):
 
     @classmethod
     @explains_arguments
-    def from_pyvista(cls, polydata: Any, space: str | None = None) -> PointCloud:
+    def from_pyvista(cls, polydata: Any, space: Space | None = None) -> PointCloud:
         """Make a cloud of the points of a ``pyvista.PolyData``.
 
         Parameters
@@ -370,7 +370,7 @@ class PointCloud(Message, ShownAsHtml):
 
     @classmethod
     @explains_arguments
-    def from_open3d(cls, cloud: Any, space: str = "lps") -> PointCloud:
+    def from_open3d(cls, cloud: Any, space: Space = "lps") -> PointCloud:
         """Make a cloud of an ``open3d.t.geometry.PointCloud``, or of one of ``open3d.geometry``.
 
         Parameters

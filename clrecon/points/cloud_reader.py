@@ -13,7 +13,7 @@ from clrecon.exchange.formats import read_raw_cloud
 from clrecon.exchange.raw_content import frame_of_file, turn_to_lps
 from clrecon.geometry import frame_from_lps
 from clrecon.points.cloud import MOST_POINTS, PointCloud
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import Space, explains_arguments
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.text import escape_text
 
@@ -27,7 +27,7 @@ SMALLEST_MM, LARGEST_MM = 3.0, 5000.0
 
 
 @explains_arguments
-def read_points(path: str | os.PathLike[str], *, space: str | None = None) -> PointCloud:
+def read_points(path: str | os.PathLike[str], *, space: Space | None = None) -> PointCloud:
     """Read a cloud from a file.
 
     Parameters

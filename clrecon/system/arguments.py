@@ -17,7 +17,7 @@ import inspect
 import operator
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar, cast
 
 from clrecon.errors import ClreconError, UsageError
 
@@ -59,6 +59,19 @@ def spoken_by(speaker: Speaker) -> Iterator[None]:
     finally:
         _speaker = before
 
+
+Space = Literal["lps", "ras", "LPS", "RAS"]
+Topology = Literal["separated", "trilinear"]
+VertexRule = Literal["linear", "golden", "golden-search"]
+MethodName = Literal["t-mc", "i-mc", "g-mc", "s-mc", "t-mc-soup", "skimage"]
+FilterName = Literal["median", "gaussian", "curvature-flow", "non-local-means"]
+PointKind = Literal["surface", "shell", "voxels"]
+ProjectionKind = Literal["mip", "minip", "mean", "drr"]
+Combination = Literal["mean", "max", "min"]
+CurvedKind = Literal["straightened", "stretched"]
+Features = Literal["paper", "variation"]
+"""Words of which only some are possible; the functions refuse others."""
+_CHOICES = "Space Topology VertexRule MethodName FilterName PointKind Combination CurvedKind Features Literal".split()
 
 _CLASSES = (
     "Volume", "DeviceVolume", "Mesh", "LabelMap", "PointCloud", "Mask", "Camera", "Grid", "GridCells", "GhostSlices",
@@ -125,6 +138,7 @@ _KINDS: dict[str, tuple[str, Accepts]] = {
     "Sequence": ("a sequence", _is_sequence),
     "Iterable": ("a sequence", _is_iterable),
     "Mapping": ("a mapping", lambda value: isinstance(value, Mapping)),
+    **dict.fromkeys(_CHOICES, ("a text", lambda value: isinstance(value, str))),
     # of `Mask`, whose parts stand in classes of their own
     **dict.fromkeys(("Shapes", "Bits"), ("a Mask", functools.partial(_is_of_class, "Mask"))),
     **{name: (f"a {name}", functools.partial(_is_of_class, name)) for name in _CLASSES},

@@ -19,8 +19,8 @@ from clrecon.system.arguments import explains_arguments
 pytestmark = pytest.mark.first_device
 
 RESULTS = {
-    "Clustering", "MiddlePlane", "Neighbours", "Noise", "PhantomTruth", "PointStep", "Rendering", "Vertebra",
-    "VertebraSplit",
+    "Clustering", "Device", "IsoChoice", "LabelFigures", "MeshQuality", "MiddlePlane", "Neighbours", "Noise",
+    "PhantomTruth", "PointStep", "Rendering", "Vertebra", "VertebraSplit",
 }  # fmt: skip
 """Classes that functions return and nobody makes."""
 INNER = {

@@ -10,7 +10,7 @@ from typing import Any
 from clrecon.errors import UsageError
 from clrecon.jobs.options import InputSettings, label_map_option, parse_point, space_option
 from clrecon.points import POINT_KINDS
-from clrecon.system.arguments import name_parameter
+from clrecon.system.arguments import PointKind, Space, name_parameter
 from clrecon.system.light_dataclass import dataclass, replace
 from clrecon.system.options import option, parse_numbers
 
@@ -92,13 +92,13 @@ def _parse_denoisers(text: str) -> tuple[str, ...]:
 class CloudSettings(InputSettings):
     """Settings of the cloud job; options say in their help what they do.  `keep` alone has the default clusters."""
 
-    space: str = space_option("patient frame of the written files and of seeds")
-    input_space: str | None = option(
+    space: Space = space_option("patient frame of the written files and of seeds")
+    input_space: Space | None = option(
         "--input-space lps|ras",
         "patient frame of a cloud file that does not say its own (default: lps)",
         parse=str.lower,
     )
-    points: str | None = option(
+    points: PointKind | None = option(
         f"--points {'|'.join(POINT_KINDS)}",
         "surface: where the HU cross the iso value, between the voxels; voxels: the centres of those within; shell: of"
         " these the outer ones (default: surface, with a band voxels)",
@@ -229,7 +229,7 @@ class CloudSettings(InputSettings):
             raise UsageError(f"a viewpoint turns normals: ask for them too ({name_parameter('normals', True)})")
 
     @property
-    def kind(self) -> str:
+    def kind(self) -> PointKind:
         """The kind of points that is taken from a scan."""
         return self.points or ("voxels" if self.is_band else "surface")
 

@@ -19,7 +19,7 @@ from clrecon.jobs.options import (
 )
 from clrecon.jobs.outputs import OBJECT_FILES
 from clrecon.jobs.presets import DEFAULT_PRESET, PURPOSES, Purpose, find_iso_preset, find_purpose
-from clrecon.system.arguments import name_parameter
+from clrecon.system.arguments import MethodName, Space, Topology, VertexRule, name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.options import option
 
@@ -116,8 +116,8 @@ class MeshSettings(InputSettings):
         default="hu",
         parse=str.lower,
     )
-    space: str = space_option("patient frame of the mesh", group="surface")
-    topology: str = option(
+    space: Space = space_option("patient frame of the mesh", group="surface")
+    topology: Topology = option(
         "--topology T",
         "what is done where the voxels leave open which of them are joined: separated keeps them apart (default),"
         " trilinear joins those that the trilinear interpolation joins",
@@ -127,7 +127,7 @@ class MeshSettings(InputSettings):
         words=("separated", "trilinear"),
     )
     closed: bool = closed_option()
-    method: str | None = option(
+    method: MethodName | None = option(
         f"--method {'|'.join(METHOD_NAMES)}",
         "t-mc: every cell (default); i-mc: only what hangs together with seeds; g-mc: t-mc, then quadric collapse"
         " without a bound; s-mc: t-mc, then decimation within a bound; t-mc-soup, skimage: on the CPU, to compare with",
@@ -143,7 +143,7 @@ class MeshSettings(InputSettings):
         parse=_parse_seed,
         action="append",
     )
-    vertex_rule: str = option(
+    vertex_rule: VertexRule = option(
         "--vertex-rule linear|golden|golden-search",
         "where on an edge a vertex lies: linear (default); golden: at 0.618 whatever the HU, up to 0.6 voxels off;"
         " golden-search: where a cubic crosses the iso value, no better than linear",
@@ -435,7 +435,7 @@ class MeshSettings(InputSettings):
         return tuple(str(seed)[len(LABEL_SEED) :] for seed in self.grow_from if is_label_seed(seed))
 
     @property
-    def method_used(self) -> str:
+    def method_used(self) -> MethodName:
         """The method of marching cubes."""
         return self.method or ("i-mc" if self.grow_from else "t-mc")
 

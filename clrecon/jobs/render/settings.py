@@ -36,7 +36,7 @@ from clrecon.rendering.views.camera import DEFAULT_VIEW_ANGLE, Camera
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import ANTERIOR, DEFAULT_SIZE, DIRECTIONS, SLICES_VIEWS, checked_size
 from clrecon.rendering.views.reformation import PLANES, find_plane
-from clrecon.system.arguments import name_parameter
+from clrecon.system.arguments import Space, name_parameter
 from clrecon.system.light_dataclass import MISSING, dataclass, fields, replace
 from clrecon.system.options import numbers_reader, option
 from clrecon.system.text import unknown_name
@@ -183,7 +183,7 @@ class RenderSettings(InputSettings):
     curve: str | None = None
     labels: LabelLook | None = None
     meshes: Sequence[MeshFile] = ()
-    mesh_space: str | None = option(
+    mesh_space: Space | None = option(
         "--mesh-space lps|ras",
         "patient frame of meshes whose files do not name theirs (default: lps, with a warning)",
         group="meshes",

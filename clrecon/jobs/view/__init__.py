@@ -8,6 +8,7 @@ from clrecon.errors import UsageError
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.options import mesh_space_option
 from clrecon.jobs.settings import check_space
+from clrecon.system.arguments import Space
 from clrecon.system.light_dataclass import dataclass, field, replace
 from clrecon.system.options import option
 
@@ -29,7 +30,7 @@ class ViewSettings:
         default=(),
         action="append",
     )
-    mesh_space: str | None = mesh_space_option("mesh files that do not name theirs")
+    mesh_space: Space | None = mesh_space_option("mesh files that do not name theirs")
 
     def __post_init__(self) -> None:
         check_space(self.mesh_space)

@@ -17,7 +17,7 @@ from clrecon.jobs.preprocess import mask_volume
 from clrecon.jobs.view import ViewSettings
 from clrecon.mesh import Mesh
 from clrecon.reading import read_selected, tell_format
-from clrecon.system.arguments import name_parameter
+from clrecon.system.arguments import Space, name_parameter
 from clrecon.system.light_dataclass import dataclass, field, fields
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
@@ -132,7 +132,7 @@ def _describe_frame(name: str, file: dict[str, Any]) -> tuple[str, ...]:
     return (*turned, *file["warnings"])
 
 
-def _open_mesh(path: str | Path, space: str | None) -> OpenedInput:
+def _open_mesh(path: str | Path, space: Space | None) -> OpenedInput:
     mesh = read_side(path, space)
     name = escape_text(Path(path).name)
     if not mesh.triangle_count:
@@ -140,7 +140,7 @@ def _open_mesh(path: str | Path, space: str | None) -> OpenedInput:
     return OpenedInput(mesh, _describe_frame(name, mesh.report["file"]), dict(mesh.report["file"]))
 
 
-def _open_cloud(path: str | Path, space: str | None) -> OpenedInput:
+def _open_cloud(path: str | Path, space: Space | None) -> OpenedInput:
     from clrecon.points.cloud_reader import read_points
 
     cloud = read_points(path)

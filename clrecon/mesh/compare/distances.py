@@ -59,7 +59,7 @@ class SurfaceDistance:
 
     def __call__(self, points: Points) -> NDArray[np.float64]:
         """Distances in mm, shape (k,), from `points`, shape (k, 3), mm."""
-        return self._locator.distances(points - self._origin)
+        return self._locator.nearest(points - self._origin)[2]
 
 
 @dataclass(frozen=True, eq=False)

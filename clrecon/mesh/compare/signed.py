@@ -67,7 +67,7 @@ class SignedDistance:
     def __call__(self, points: Points) -> NDArray[np.float64]:
         """Distances in mm, shape (k,), from `points`, shape (k, 3), mm; positive outside."""
         local = points - self._origin
-        nearest, rows = self._locator.nearest(local)
+        nearest, rows, _ = self._locator.nearest(local)
         away = local - nearest
         distance = np.sqrt(np.einsum("ij,ij->i", away, away))
         side = np.einsum("ij,ij->i", away, self._normals_at(nearest, rows))

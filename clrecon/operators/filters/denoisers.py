@@ -16,7 +16,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.resample import shear_degrees
 from clrecon.operators.filters.settings import checked_length, report_filter
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import FilterName, explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.packages import install_command
 from clrecon.system.progress import Progress, ignore_progress
@@ -51,7 +51,7 @@ class _Denoiser:
 
 @explains_arguments
 def filter_volume(
-    volume: VolumeKind, name: str, *, progress: Progress | None = None, **parameters: float | None
+    volume: VolumeKind, name: FilterName, *, progress: Progress | None = None, **parameters: float | None
 ) -> VolumeKind:
     """Filter a volume by a filter of SimpleITK or scikit-image, on the computer's processor.
 

@@ -52,7 +52,7 @@ class Mask(MaskComponents):
     def from_band(
         cls,
         volume: Volume | DeviceVolume,
-        hu: Sequence[float],
+        hu: Sequence[float | None],
         *,
         device: Device | str | int | None = None,
         memory: int | None = None,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ from clrecon.operators.points.neighbours import NeighbourSearch, Part, check_nei
 from clrecon.operators.points.normals import FEWEST_NEIGHBOURS, PlaneFits
 from clrecon.points import PointCloud, PointStep
 from clrecon.points.spacing import VARIATION_OF_FEATURES, distance_ratios, find_features, ratio_threshold
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import Features, explains_arguments
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress, ignore_progress
 
@@ -144,7 +144,7 @@ def remove_outliers(
     return step
 
 
-FEATURES = ("paper", "variation")
+FEATURES: tuple[str, ...] = get_args(Features)
 """Ways to tell features: paper B's ratio of distances, and the surface variation."""
 
 PLANE_NUMBERS = kernel_constant("points/bilateral.cl", "PLANE_NUMBERS")
@@ -162,7 +162,7 @@ def denoise_points(
     k: int = 16,
     range_factor: float = 2.0,
     iterations: int = 1,
-    features: str | None = None,
+    features: Features | None = None,
     paper: bool = False,
     *,
     device: Device | str | int | None = None,

@@ -34,7 +34,7 @@ from clrecon.operators.surface.marching_cubes import pad4, split_steps
 from clrecon.operators.surface.slabs import OUTPUT_SHARE
 from clrecon.points import POINT_KINDS, PointCloud
 from clrecon.points.cloud import MOST_POINTS, VoxelNumbers
-from clrecon.system.arguments import explains_arguments, name_parameter
+from clrecon.system.arguments import PointKind, explains_arguments, name_parameter
 from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import format_hu
@@ -298,7 +298,7 @@ def extract_points(
     volume: Volume | DeviceVolume,
     iso_value: float | None = None,
     *,
-    kind: str | None = None,
+    kind: PointKind | None = None,
     hu: Sequence[float | None] | None = None,
     labels: LabelMap | None = None,
     label: int | str | None = None,
@@ -375,7 +375,9 @@ def extract_points(
     return cloud
 
 
-def _check(iso_value: object, kind: str | None, hu: object, labels: object, label: object, paper: bool) -> str:
+def _check(
+    iso_value: object, kind: PointKind | None, hu: object, labels: object, label: object, paper: bool
+) -> PointKind:
     if iso_value is not None and hu is not None:
         raise UsageError(f"give an iso value or {name_parameter('hu', '(LOW, HIGH)')}, not both")
     kind = kind or ("surface" if hu is None else "voxels")

@@ -35,7 +35,7 @@ from clrecon.rendering.views.reformation import (
     stretched_length,
     stretched_sheet,
 )
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import Combination, CurvedKind, explains_arguments
 from clrecon.system.progress import Progress, ignore_progress
 
 DEFAULT_WIDTH_MM = 120.0
@@ -62,7 +62,7 @@ def cut_slice(
     pixel_mm: float | None = None,
     offset_mm: float = 0.0,
     thickness: float = 0.0,
-    combine: str = "mean",
+    combine: Combination = "mean",
     window: Sequence[float] | str | None = None,
     background: str | Sequence[float] = "black",
     memory: int | None = None,
@@ -174,7 +174,7 @@ def _describe_miss(volume: Volume, camera: Camera) -> str:
 def reformat_curve(
     volume: Volume | DeviceVolume,
     curve: Curve | ArrayLike | str = "spine",
-    kind: str = "straightened",
+    kind: CurvedKind = "straightened",
     size: Sequence[int] | None = None,
     *,
     device: Device | str | int | None = None,
@@ -184,7 +184,7 @@ def reformat_curve(
     pixel_mm: float | None = None,
     width_mm: float | None = None,
     thickness: float = 0.0,
-    combine: str = "mean",
+    combine: Combination = "mean",
     window: Sequence[float] | str | None = None,
     background: str | Sequence[float] = "black",
     memory: int | None = None,

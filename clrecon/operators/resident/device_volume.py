@@ -147,13 +147,7 @@ class DeviceVolume(Closing, Volume):
     def follow(self, volume: Volume, voxels_d: Any = None) -> DeviceVolume:
         """Return another volume on the same device, under the same limit of memory.
 
-        Parameters
-        ----------
-        volume : Volume
-            Made of this one, as by a filter.
-        voxels_d : buffer, optional
-            Its voxels on the device, (nk, nj, ni): the next operator finds them there.  None: they are uploaded when
-            they are first needed.
+        voxels_d: Its voxels there, (nk, nj, ni); None: they are uploaded when they are first needed.
         """
         made = DeviceVolume(volume, device=self._taken_device, memory=self.memory)
         made.device = self.device
@@ -206,22 +200,13 @@ class DeviceVolume(Closing, Volume):
         return voxels_d
 
     def keep(self, what: str, of: Hashable, nbytes: int, make: Callable[[], Made]) -> Made:
-        """Return an object that an operator has made and will need again, on the device; one object of each kind is
-        kept.
+        """Return what an operator made of the volume and `of`, and will need again; one object of each kind is kept.
 
-        It is dropped when an object of the same kind for other inputs is asked for, when the voxels are dropped, or
-        when another operator needs the room.
+        It is dropped when one of its kind for other inputs is asked for, when the voxels are dropped, or when another
+        operator needs the room.
 
-        Parameters
-        ----------
-        what : str
-            Kind of the object, for messages about memory.
-        of : hashable
-            The inputs other than the volume.
-        nbytes : int
-            Its bytes on the device; 0 for small tables, which stay when the voxels are dropped.
-        make : callable
-            Function that makes the object.
+        what: Kind of the object, for messages about memory.
+        nbytes: Its bytes on the device; 0 for small tables, which stay when the voxels are dropped.
         """
         with self._lock:
             self._check_context()
@@ -287,12 +272,8 @@ class DeviceVolume(Closing, Volume):
     def shortage(self, needs: Mapping[str, int], own: tuple[str, ...] = ()) -> str:
         """Return why the device has no room for ``needs``; empty if it has.
 
-        Parameters
-        ----------
-        needs : mapping of str to int
-            Bytes of all buffers that an operator uses at a time, the voxels among them, by description.
-        own : tuple of str
-            Kinds of kept objects that ``needs`` already counts; others are added, and dropped if they are in the way.
+        needs: Bytes of all buffers that an operator uses at a time, the voxels among them, by description.
+        own: Kinds of kept objects that ``needs`` already counts; others are added, and dropped if they are in the way.
         """
         with self._lock:
             others = {what: kept.nbytes for what, kept in self._kept.items() if what not in own and kept.nbytes}
@@ -313,19 +294,9 @@ class DeviceVolume(Closing, Volume):
     ) -> int:
         """Return the number of slices in a slab: ``total`` if all fit, else as many as fit, or 0.
 
-        Parameters
-        ----------
-        what : str
-            Purpose of the slabs.  If thinner slabs were necessary for this purpose before, see `attempts`, they are
-            planned again.
-        total : int
-            Slices of the volume, or of a grid of samples around it.
-        needs : callable
-            Function from a number of slices to the bytes of every buffer, by description.
-        own : tuple of str
-            As in `shortage`.
-        most : int, optional
-            Most slices that kernels can process together.
+        what: Purpose of the slabs.  Thinner ones that were necessary for it before, see `attempts`, are planned again.
+        needs: Function from a number of slices to the bytes of every buffer, by description; `own` as in `shortage`.
+        most: Most slices that kernels can process together.
         """
         limits = self.limits
         most = min(total if most is None else most, self.most_slices.get(what, total))

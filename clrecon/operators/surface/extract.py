@@ -23,7 +23,7 @@ from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
 from clrecon.operators.surface.trilinear import check_row
 from clrecon.points import PointCloud
-from clrecon.system.arguments import explains_arguments, name_parameter
+from clrecon.system.arguments import Topology, VertexRule, explains_arguments, name_parameter
 from clrecon.system.base_classes import Closing
 from clrecon.system.progress import Progress, ignore_progress
 
@@ -71,7 +71,7 @@ class SurfaceExtractor(Closing):
             self._resident.close()
 
     @explains_arguments
-    def forecast(self, *, closed: bool = True, topology: str = "separated") -> dict[str, int]:
+    def forecast(self, *, closed: bool = True, topology: Topology = "separated") -> dict[str, int]:
         """Estimate the memory of an extraction before anything is computed.
 
         Returns
@@ -103,10 +103,10 @@ class SurfaceExtractor(Closing):
         iso_value: Level,
         *,
         closed: bool = True,
-        topology: str = "separated",
+        topology: Topology = "separated",
         below: bool = False,
         grow_from: Any = None,
-        vertex_rule: str = "linear",
+        vertex_rule: VertexRule = "linear",
         progress: Progress | None = None,
     ) -> Mesh:
         """Extract the surface at one iso value, or of one range, see `extract_isosurface`."""
@@ -178,10 +178,10 @@ def extract_isosurface(
     *,
     device: Device | str | int | None = None,
     closed: bool = True,
-    topology: str = "separated",
+    topology: Topology = "separated",
     below: bool = False,
     grow_from: Any = None,
-    vertex_rule: str = "linear",
+    vertex_rule: VertexRule = "linear",
     solid: bool = False,
     memory: int | None = None,
     progress: Progress | None = None,
@@ -282,7 +282,7 @@ def extract_isosurfaces(
     *,
     device: Device | str | int | None = None,
     closed: bool = True,
-    topology: str = "separated",
+    topology: Topology = "separated",
     below: bool = False,
     memory: int | None = None,
     progress: Progress | None = None,

@@ -29,7 +29,7 @@ from clrecon.opencl.sources import read_kernel_source
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.extract import SurfaceExtractor
 from clrecon.operators.surface.seeds import AUTO
-from clrecon.system.arguments import explains_arguments, name_parameter
+from clrecon.system.arguments import MethodName, VertexRule, explains_arguments, name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.progress import Progress
 
@@ -172,10 +172,10 @@ def check_method(
 def extract_by_method(
     volume: Volume | DeviceVolume,
     iso_value: Level,
-    method: str,
+    method: MethodName,
     *,
     grow_from: Any = None,
-    vertex_rule: str = "linear",
+    vertex_rule: VertexRule = "linear",
     decimate: float | None = None,
     closed: bool = True,
     device: Device | str | int | None = None,

@@ -160,7 +160,7 @@ def _joined(reports: list[Mapping[str, Any]]) -> dict[str, Any]:
 Product = tuple[Any, list[Mapping[str, Any]]]
 
 
-def _surface(scene: Scene, method: str, **more: Any) -> Product:
+def _surface(scene: Scene, method: Any, **more: Any) -> Product:
     from clrecon.operators.surface.methods import extract_by_method
 
     request = scene.request

@@ -4,6 +4,8 @@ points.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -121,7 +123,7 @@ PLACE_TOLERANCE_MM = 1.6e-5
 BAND = (20.0, 70.0)
 
 
-def _compare(device: Device, dtype: str, uneven: bool, kind: str, labels: str | None) -> float:
+def _compare(device: Device, dtype: str, uneven: bool, kind: Any, labels: str | None) -> float:
     volume = stack(noise(WIDE, dtype, 100), OBLIQUE, uneven)
     chosen = None if labels is None else random_integers(WIDE, labels, 3)
     label_map = None if chosen is None else LabelMap(chosen, OBLIQUE)

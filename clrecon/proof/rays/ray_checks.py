@@ -280,7 +280,7 @@ def _check_projections(device: Device, kinds: tuple[str, ...], uneven: bool) -> 
             clip = _cut(volume) if dtype == "float32" else None
             camera = look_at(volume, (0.4, 1.0, -0.3), 7.0, perspective=dtype != "uint8")
             step = 0.5 * min(volume.spacing)
-            style = Projection(kind, clip=clip)
+            style = Projection(kind, clip=clip)  # type: ignore[arg-type]
             found = take_picture(DeviceVolume(volume, device=device), style, Shot(camera, SIZE), step)
             twin = cast_rays(volume, None, camera, SIZE, step, None, clip, kind)
             what = f"{kind} of {dtype} voxels{' of uneven slices' * uneven}"

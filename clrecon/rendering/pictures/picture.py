@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from io import BytesIO
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -189,7 +189,9 @@ class Rendering(PictureData):
             return write_floats(self.values, path, self.pixel_mm)
 
     @explains_arguments
-    def to_pyvista(self, form: str = "points", *, expected: bool = False, distance: float | None = None) -> Any:
+    def to_pyvista(
+        self, form: Literal["points", "plane"] = "points", *, expected: bool = False, distance: float | None = None
+    ) -> Any:
         """Return the picture as a PyVista data set in LPS mm, for a scene with meshes.
 
         Show it with ``plotter.add_mesh(data, scalars="RGBA", rgba=True, lighting=False)``, or let

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, field, fields
 from functools import cached_property, partial
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any, ClassVar, TypeVar, cast, get_args
 
 from numpy.typing import ArrayLike
 
@@ -30,16 +30,14 @@ from clrecon.rendering.pictures.style_checks import SPINE
 from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.reformation import checked_offset, checked_thickness, positive_mm
-from clrecon.system.arguments import name_parameter
+from clrecon.system.arguments import Combination, CurvedKind, ProjectionKind, name_parameter
 from clrecon.system.light_dataclass import dataclass
 
 _T = TypeVar("_T")
 _ByLabel = Mapping[int, _T] | Mapping[str, _T] | Mapping[int | str, _T]
 _Color = str | Sequence[float]
 
-PROJECTIONS = ("mip", "minip", "mean", "drr")
-COMBINATIONS = ("mean", "max", "min")
-CURVED_KINDS = ("straightened", "stretched")
+PROJECTIONS, COMBINATIONS, CURVED_KINDS = (get_args(words) for words in (ProjectionKind, Combination, CurvedKind))
 
 DEFAULT_ISO_VALUE = 200.0
 """Iso value of surfaces in HU: bone, including the thin cortex of vertebrae."""
@@ -183,7 +181,7 @@ class Projection(Style):
         The part of space that is shown.
     """
 
-    kind: str = style_field(
+    kind: ProjectionKind = style_field(
         "mip", checks.one_of(PROJECTIONS, f"a projection is one of {', '.join(PROJECTIONS)}"), "mode"
     )
     _: KW_ONLY
@@ -314,7 +312,7 @@ class _Cut(_Labelled):
     """Base of cuts through the volume; a thick one combines samples across it, and labels are those of its middle."""
 
     thickness: float = style_field(0.0, checked_thickness)
-    combine: str = style_field(
+    combine: Combination = style_field(
         "mean", checks.one_of(COMBINATIONS, f"samples of a thick slice are combined by {', '.join(COMBINATIONS)}")
     )
     window: Sequence[float] | str | None = style_field(None, checked_window)
@@ -390,7 +388,7 @@ class CurveCut(_Cut):
 
     curve: Curve | ArrayLike | str = style_field(SPINE, checks.curve)
     _: KW_ONLY
-    kind: str = style_field(
+    kind: CurvedKind = style_field(
         "straightened", checks.one_of(CURVED_KINDS, f"a curved reformation is {' or '.join(CURVED_KINDS)}"), "cpr"
     )
     angle: float = style_field(

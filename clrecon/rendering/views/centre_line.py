@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.volume import Volume
-from clrecon.system.arguments import explains_arguments
+from clrecon.system.arguments import Space, explains_arguments
 from clrecon.system.base_classes import Message
 from clrecon.system.paths import read_regular
 from clrecon.system.text import escape_text
@@ -185,7 +185,7 @@ MARKUP_SPACES = {"LPS": "lps", "RAS": "ras", "1": "lps", "0": "ras"}
 
 
 @explains_arguments
-def read_curve_points(path: str | Path, space: str | None = None) -> Float64Array:
+def read_curve_points(path: str | Path, space: Space | None = None) -> Float64Array:
     """Read the points of a centre line.
 
     Parameters

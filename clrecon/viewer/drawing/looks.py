@@ -62,7 +62,7 @@ class Looks:
             return known
         if mode.kind == "projection":
             window = state.picture_window or mode.window
-            return self._keep(key, Projection(mode.style, window=window, ray_step=ray_step, clip=clip))
+            return self._keep(key, Projection(mode.style, window=window, ray_step=ray_step, clip=clip))  # type: ignore[arg-type]
         if mode.kind == "slices":
             return self._keep(key, SlicesInSpace(window=state.picture_window, clip=clip))
         look = {"ray_step": ray_step, "clip": clip, **_label_fields(labelled, whole.opacity)}

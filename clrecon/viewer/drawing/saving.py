@@ -17,6 +17,7 @@ from clrecon.operators.masks.mask import Mask
 from clrecon.points import PointCloud
 from clrecon.reading.grids.write_volume import FORMATS as VOLUME_FORMATS
 from clrecon.rendering.pictures.picture import IMAGE_FORMATS
+from clrecon.system.arguments import Space
 from clrecon.system.files import check_writable
 from clrecon.system.paths import keep_existing
 from clrecon.system.progress import Progress
@@ -84,7 +85,7 @@ def save_shown(
     state: ViewState,
     *,
     size: Sequence[int] = (1024, 1024),
-    space: str = "lps",
+    space: Space = "lps",
     keep_ids: bool = False,
     no_clobber: bool = False,
     progress: Progress | None = None,

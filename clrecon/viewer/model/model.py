@@ -18,6 +18,7 @@ from clrecon.rendering.pictures.styles import DEFAULT_ISO_VALUE
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import as_point, checked_vector
 from clrecon.rendering.views.reformation import PLANES
+from clrecon.system.arguments import Space
 from clrecon.system.text import format_hu, unknown_name
 from clrecon.viewer.model.changes import ChangingView, checked_numbers, fit_camera, plane_step
 from clrecon.viewer.model.objects import (
@@ -59,7 +60,7 @@ class ViewModel(ChangingView):
         self,
         objects: Sequence[ShownObject],
         *,
-        space: str = "lps",
+        space: Space = "lps",
         iso_value: float | None = None,
         clock: Callable[[], float] = monotonic,
     ) -> None:

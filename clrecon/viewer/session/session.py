@@ -15,6 +15,7 @@ from clrecon.errors import ClreconError, UsageError
 from clrecon.opencl import Device
 from clrecon.rendering import Rendering
 from clrecon.rendering.views.directions import checked_size
+from clrecon.system.arguments import Space
 from clrecon.system.base_classes import Closing
 from clrecon.system.log import get_logger
 from clrecon.system.text import format_volume
@@ -64,7 +65,7 @@ class ViewSession(Closing):
         *,
         device: Device | str | int | None = None,
         memory: int | None = None,
-        space: str = "lps",
+        space: Space = "lps",
         iso_value: float | None = None,
         keep_ids: bool = False,
         no_clobber: bool = False,

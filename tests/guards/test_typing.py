@@ -1,0 +1,122 @@
+"""What a type checker says of user scripts: nothing of right ones, something of each wrong call."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from house import ROOT
+
+RIGHT = """\
+from pathlib import Path
+
+import numpy as np
+
+import clrecon
+
+
+def surfaces(folder: Path) -> list[clrecon.Mesh]:
+    volume = clrecon.read_volume(folder)
+    with clrecon.DeviceVolume(volume, device="cpu") as kept:
+        meshes = clrecon.extract_isosurfaces(kept, [150, (200, 300)], topology="separated")
+        part: clrecon.DeviceVolume = kept[4:9]
+        meshes.append(clrecon.extract_isosurface(part, 226.0, vertex_rule="golden"))
+    return meshes
+
+
+def cut(mesh: clrecon.Mesh) -> float:
+    half = mesh.clip((0, 0, 4), [0, 0, 1], capped=True)
+    nearest, distances, rows = half.closest_points(np.zeros((2, 3)))
+    lines = [line.shape[0] for line in mesh.section((0, 0, 0), (1, 0, 0))]
+    hits = mesh.ray(nearest, (0, 0, 1))
+    half.save("half.stl", space="ras", no_clobber=True)
+    quality: clrecon.MeshQuality = half.quality()
+    return float(distances.max() + sum(lines) + hits[0, 0] + quality.area_mm2 + rows[0])
+
+
+def labelled(volume: clrecon.Volume, labels: clrecon.LabelMap) -> dict[int, clrecon.Mesh]:
+    bone = clrecon.Mask.from_band(volume, (226, None)) & clrecon.Mask.from_labels(volume, labels, label=["L3", 22])
+    kept: clrecon.LabelMap = (labels & bone) | bone
+    figures: list[clrecon.LabelFigures] = clrecon.measure_labels(volume, kept, label="L3")
+    print(figures[0].ml, bone.ml, kept.resample(volume).names[22])
+    return clrecon.extract_labels(volume, kept.only("L3"), 226, label="L3")
+
+
+def pictures(volume: clrecon.Volume) -> clrecon.Rendering:
+    image = clrecon.render(volume, clrecon.Projection("mip", window=(0, 1000)), view="left", size=(64, 64))
+    image.to_pyvista("plane")
+    clrecon.cut_slice(volume, "axial", thickness=5.0, combine="max").save("a.png")
+    return clrecon.render(volume, view=(30, 15), device=clrecon.device())
+
+
+def filtered(volume: clrecon.Volume) -> clrecon.PointCloud:
+    choice: clrecon.IsoChoice = clrecon.choose_iso_value(volume)
+    median: clrecon.Volume = clrecon.filter_volume(volume, "median", radius_mm=1.0).crop(between=(0, 9), space="lps")
+    cloud = clrecon.extract_points(median, hu=(choice.iso_value, None), kind="shell")
+    values = volume.sample(cloud.points, order=3, outside=-1000.0)
+    first: clrecon.Device = clrecon.devices()[0]
+    print(values, first.label, median.spacing[0] + 1.0)
+    return cloud[cloud.points[:, 2] > 3.0]
+"""
+
+SETUP = """\
+import clrecon
+
+volume = clrecon.read_volume("ct")
+mesh = clrecon.extract_isosurface(volume, 226)
+labels = clrecon.read_labels("map.nii.gz")
+mask = clrecon.Mask.from_band(volume, (226, None))
+cloud = clrecon.extract_points(volume, 226)
+"""
+
+WRONG = [
+    'mesh.save("a.stl", space="lpi")',
+    'mesh.save("a.stl", "lps", True)',
+    'clrecon.extract_isosurface(volume, "bone")',
+    'clrecon.extract_isosurface(volume, 226, topology="trilinaer")',
+    'clrecon.extract_isosurface(volume, 226, vertex_rule="gold")',
+    "clrecon.extract_isosurface(volume.voxels, 226)",
+    'clrecon.extract_isosurface(volume, 226, devices="cpu")',
+    "clrecon.extract_labels(volume, labels, 226, numbers=[1])",
+    'clrecon.filter_volume(volume, "medain")',
+    'clrecon.extract_by_method(volume, 226, "mc")',
+    'clrecon.extract_points(volume, 226, kind="voxel")',
+    'clrecon.Projection("max")',
+    'clrecon.cut_slice(volume, "axial", combine="mip")',
+    "clrecon.Mask.from_band(volume, 226)",
+    "clrecon.smooth_mesh(volume)",
+    "clrecon.measure_labels(labels, volume)",
+    "volume.crop(box=(0, 1, 0, 1, 0, 1))",
+    'volume.resample("1 mm")',
+    "mesh.clip((0, 0, 1))",
+    "mesh.ray()",
+    'mask.dilate("2 mm")',
+    "labels & labels",
+    "mesh.volume()",
+    "mesh.quality().closed_edges",
+    "clrecon.rendr(volume)",
+    "clrecon.render(volume, size=64)",
+    "cloud.denoise()",
+    'clrecon.reformat_curve(volume, kind="bent")',
+]
+"""Words that no choice has, kinds of arguments, parameters that are gone or never were."""
+
+
+@pytest.mark.release
+@pytest.mark.untraced
+def test_right_scripts_are_clean_and_each_wrong_call_is_named(tmp_path: Path) -> None:
+    (tmp_path / "right.py").write_text(RIGHT, encoding="utf-8")
+    (tmp_path / "wrong.py").write_text(SETUP + "\n".join(WRONG) + "\n", encoding="utf-8")
+    settings = f"[mypy]\npython_version = 3.10\nstrict = true\nfollow_imports = silent\nmypy_path = {ROOT}\n"
+    (tmp_path / "mypy.ini").write_text(settings, encoding="utf-8")
+    command = [sys.executable, "-m", "mypy", "--config-file", "mypy.ini", "right.py", "wrong.py"]
+    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True).stdout
+    errors = [line for line in said.splitlines() if ": error: " in line]
+    assert [line for line in errors if not line.startswith("wrong.py:")] == []
+    named = {int(found[1]) for line in errors if (found := re.match(r"wrong\.py:(\d+):", line))}
+    first = SETUP.count("\n") + 1
+    assert [call for number, call in enumerate(WRONG, first) if number not in named] == []
+    assert min(named) == first, said
