@@ -11,10 +11,10 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 92_738,
+    "lines": 92_702,
     "modules": 416,
     "small_modules_with_one_reader": 10,
-    "docstrings_with_raises": 137,
+    "docstrings_with_raises": 136,
     "options_in_several_files": 19,
     "modules_with_own_all": 0,
 }
