@@ -179,6 +179,7 @@ class Mesh(BaseMesh, ShownAsHtml):
         )
         if not along.any():
             raise UsageError("the normal of a plane has length 0: it has no side")
+        along = along / np.abs(along).max()  # whose square is neither infinite nor 0
         origin = self._origin()
         surface = wrap_polydata(self.vertices - origin, self.triangles, None, self.checked_values())
         return surface, at - origin, along / np.linalg.norm(along), origin
@@ -220,6 +221,7 @@ class Mesh(BaseMesh, ShownAsHtml):
                 f"{len(starts)} starts and {len(ways)} directions: one for each or for all, none of length 0"
             )
         origin = self._origin()
+        ways = ways / np.abs(ways).max(axis=1, keepdims=True)
         begin, unit = starts - origin, ways / np.linalg.norm(ways, axis=1, keepdims=True)
         far = np.linalg.norm(begin, axis=1, keepdims=True) + 2.0 * np.abs(self.vertices - origin).max()
         return CellLocator(self.vertices - origin, self.triangles).first_hits(begin, begin + far * unit) + origin

@@ -32,6 +32,12 @@ def test_a_clipped_solid_is_closed_and_has_the_volume_of_its_part(move: np.ndarr
     assert part.report == mesh.report and part.values["height"].min() == 1.0
 
 
+@pytest.mark.parametrize("length", [1e-320, 1e-200, 1e200])
+def test_the_length_of_a_normal_or_direction_is_of_no_matter(length: float) -> None:
+    assert box().clip((0, 0, 1), (0, 0, length)).volume == pytest.approx(6.0)
+    assert box().ray((0.4, 0.7, 1), (0, 0, length))[0, 2] == pytest.approx(4.0)
+
+
 def test_an_open_cut_lacks_its_cap_alone() -> None:
     part = box().clip((0, 0, 1), (0, 0, -1), capped=False)
     assert part.area == pytest.approx(2.0 + 6.0) and part.quality().boundary_edges == 8
