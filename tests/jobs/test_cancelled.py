@@ -129,7 +129,7 @@ def test_a_mesh(scan: Path, device: Any, tmp_path: Path) -> None:
     found = moments(work)
     stages = {stage for stage, _, _ in found}
     assert stages == {
-        "device", "scan", "read", "mask", "build", "select", "smooth", "decimate", "compare", "measure", "distance",
+        "device", "scan", "read", "mask", "build", "select", "smooth", "decimate", "compare", "measure",
         "write",
     }  # fmt: skip
     assert ("write", 1, 2) in found  # between the files

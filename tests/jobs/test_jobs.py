@@ -56,7 +56,7 @@ def test_a_tilted_oblique_sphere_has_its_volume_and_place(
     assert centre == pytest.approx(truth["surface"]["center_lps_mm"], abs=0.1)
     assert report["volume"]["tilt_deg"] == pytest.approx(15.0, abs=1e-3)
     assert report["device"] == device.label
-    assert list(dict.fromkeys(stages)) == ["device", "scan", "read", "build", "measure", "distance", "write"]
+    assert list(dict.fromkeys(stages)) == ["device", "scan", "read", "build", "measure", "write"]
 
 
 def test_parts_of_the_time_sum_to_the_total(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:

@@ -64,7 +64,11 @@ def make_mesh(
         run.lap("select")
         is_measured = settings.strict or (report_path is not None if measure is None else measure)
         gates = _refine_and_measure(run, made, is_measured)
-        warnings = [*warn_of_crumbs(parts, settings), *describe_purposes(parts, settings), *warn_of_gates(gates)]
+        warnings = [
+            *warn_of_crumbs(parts, settings, made.device),
+            *describe_purposes(parts, settings),
+            *warn_of_gates(gates),
+        ]
         run.lap("measure")
         meshes = [part.mesh for part in parts]
         if settings.one_file:
@@ -129,7 +133,7 @@ def _refine_and_measure(run: Run, made: MadeParts, measure: bool) -> list[dict[s
         run.lap("refine")
     if measure:
         measure_parts(made.parts, made.solid, settings, made.device, run.progress)
-    gates = judge_parts(made.parts, made.solid, settings, run.progress)
+    gates = judge_parts(made.parts, settings)
     return gates + (judge_label_volumes(made.parts, settings.closed) if settings.labels_pick else [])
 
 

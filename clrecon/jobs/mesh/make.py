@@ -327,20 +327,13 @@ def _select_parts(
         return [Part(surface, surface.name, mesh)]
     from clrecon.geometry import frame_from_lps
     from clrecon.mesh import select_components, split_components
-    from clrecon.mesh.connectivity import label_components as find_labels
-    from clrecon.operators.primitives.union_find import label_components
 
     limits = (settings.keep_largest, settings.min_volume_ml)
     seeds = [(frame_from_lps(settings.space).T @ seed).tolist() for seed in settings.seeds]
-    labelled = None
-    try:
-        labelled = label_components(device, mesh.triangles, mesh.vertex_count, memory=settings.memory)
-    except DeviceFailedError as error:  # the result is the same, it only takes longer
-        mesh.report.setdefault("warnings", []).append(f"{error}: they were found without it")
+    labelled = _label_components(mesh, device, settings)
     steps.take()
     among = None
     if settings.keep == "bone":
-        labelled = labelled or find_labels(mesh.triangles, mesh.vertex_count)
         among = find_bone(
             mesh, volume, surface, labelled, without_table=settings.remove_table, advice=_advise_without_bone(settings)
         )
@@ -349,7 +342,6 @@ def _select_parts(
             no_bone = measure_pieces(mesh.vertices, other)
             mesh.report.update(not_bone=no_bone["pieces"], not_bone_ml=no_bone["pieces_ml"])
     if settings.all_parts:
-        labelled = labelled or find_labels(mesh.triangles, mesh.vertex_count)
         among = _without_cavities(mesh, labelled, among)
     steps.take()
     try:
@@ -363,25 +355,33 @@ def _select_parts(
     return [Part(surface, _name_piece(surface, place), piece) for place, piece in enumerate(pieces, start=1)]
 
 
+def _label_components(mesh: Mesh, device: Device, settings: MeshSettings) -> Labelled:
+    """Number the components on the device, or, where it fails, by the host, which says so."""
+    from clrecon.mesh.connectivity import label_components as label_on_host
+    from clrecon.operators.primitives.union_find import label_components
+
+    try:
+        return label_components(device, mesh.triangles, mesh.vertex_count, memory=settings.memory)
+    except DeviceFailedError as error:  # the result is the same, it only takes longer
+        mesh.report.setdefault("warnings", []).append(f"{error}: they were found without it")
+        return label_on_host(mesh.triangles, mesh.vertex_count)
+
+
 def _without_cavities(mesh: Mesh, labelled: Labelled, among: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
     """Return the components, of `among` if given, that are no walls of cavities; what is left is filled there."""
-    import numpy as np
 
-    from clrecon.mesh.refine.shifts import measure_volumes
+    from clrecon.mesh.refine.shifts import enclosed_mm3
     from clrecon.system.pieces import local_origin
 
-    found = measure_volumes(mesh.vertices - local_origin(mesh.vertices), mesh.triangles)
-    is_wall = np.zeros(labelled[0], dtype=bool)
-    used = labelled[1] >= 0
-    is_wall[labelled[1][used]] = found.mm3[found.labels[used]] < 0.0
-    return ~is_wall if among is None else among & ~is_wall
+    is_body = enclosed_mm3(mesh.vertices - local_origin(mesh.vertices), mesh.triangles, *labelled) >= 0.0
+    return is_body if among is None else among & is_body
 
 
-def warn_of_crumbs(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
+def warn_of_crumbs(parts: Sequence[Part], settings: MeshSettings, device: Device) -> list[str]:
     """Return a warning for each measured mesh of many small components, which names the option that drops them."""
     import numpy as np
 
-    from clrecon.mesh.refine.shifts import measure_volumes
+    from clrecon.mesh.refine.shifts import enclosed_mm3
     from clrecon.system.pieces import local_origin
 
     warnings = []
@@ -389,7 +389,8 @@ def warn_of_crumbs(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
         if part.quality is None or part.quality.components <= MANY_COMPONENTS or settings.min_volume_ml is not None:
             continue
         mesh = part.mesh
-        ml = np.abs(measure_volumes(mesh.vertices - local_origin(mesh.vertices), mesh.triangles).mm3) / 1000.0
+        labelled = _label_components(mesh, device, settings)
+        ml = np.abs(enclosed_mm3(mesh.vertices - local_origin(mesh.vertices), mesh.triangles, *labelled)) / 1000.0
         small = ml[ml < CRUMB_ML]
         if len(small) > MANY_COMPONENTS:
             warnings.append(

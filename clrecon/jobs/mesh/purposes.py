@@ -88,10 +88,12 @@ THIN_SHARE = 0.05
 
 def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> dict[str, float]:
     """Return number and ml of the components that enclose something (pieces), and of the walls of cavities."""
-    from clrecon.mesh.refine.shifts import measure_volumes
+    from clrecon.mesh.connectivity import label_components
+    from clrecon.mesh.refine.shifts import enclosed_mm3
     from clrecon.system.pieces import local_origin
 
-    found = measure_volumes(vertices - local_origin(vertices), triangles).mm3 / 1000.0
+    labelled = label_components(triangles, len(vertices))
+    found = enclosed_mm3(vertices - local_origin(vertices), triangles, *labelled) / 1000.0
     return {
         "pieces": int((found > 0.0).sum()),
         "pieces_ml": float(found[found > 0.0].sum()),

@@ -101,11 +101,14 @@ def measure_parts(
     device: Device | None = None,
     progress: Progress = ignore_progress,
 ) -> None:
-    """Measure the `quality` of each part, and with `strict`, on the device meanwhile, triangles that cut each other."""
+    """Measure the `quality` of each part and how far it lies from the scan, at once, and with `strict`, on the device
+    meanwhile, triangles that cut each other.
+    """
     if not settings.strict:
         steps = Steps(progress, "measure", len(parts))
         for part in parts:
-            part.quality = part.mesh.quality()
+            part.quality, distance = side_by_side(part.mesh.quality, partial(_measure_distance, part, volume))
+            part.facts["iso_distance"] = distance
             steps.take()
         return
     steps = Steps(progress, "crossings", sum(part.mesh.triangle_count for part in parts))
@@ -130,9 +133,7 @@ def _measure_distance(part: Part, volume: Volume) -> IsoDistance | None:
     return None if rule is None else measure_iso_distance(part.mesh, volume, rule)
 
 
-def judge_parts(
-    parts: Sequence[Part], volume: Volume, settings: MeshSettings, progress: Progress = ignore_progress
-) -> list[dict[str, Any]]:
+def judge_parts(parts: Sequence[Part], settings: MeshSettings) -> list[dict[str, Any]]:
     """Judge the parts of a job by the gates, and store the measures in the `facts` of each.
 
     A part that was not measured has only the gates of refinement.  Gates have ``mesh``, the name of their part or None.
@@ -144,12 +145,9 @@ def judge_parts(
     from clrecon.mesh.compare.mesh_gates import judge_mesh
 
     gates = []
-    steps = Steps(progress, "distance", len(parts))
     for part in parts:
         refinement = part.mesh.report.get("refinement")
         iso_distance = part.facts.get("iso_distance")
-        if part.quality is not None and "iso_distance" not in part.facts:
-            iso_distance = _measure_distance(part, volume)
         found = judge_mesh(
             part.quality,
             closed=settings.closed,
@@ -160,7 +158,6 @@ def judge_parts(
         )
         part.facts |= {"iso_distance": iso_distance, "refinement": refinement}
         gates += [{"mesh": part.name or None, **gate} for gate in found]
-        steps.take()
     return gates
 
 

@@ -76,7 +76,23 @@ def measure_volumes(
         border = edges.border(len(vertices))
     is_open = np.zeros(count, dtype=bool)
     is_open[labels[border]] = True
-    return Volumes(labels, _volumes(vertices, triangles, labels, count)[0], is_open)
+    return Volumes(labels, enclosed_mm3(vertices, triangles, count, labels), is_open)
+
+
+def enclosed_mm3(
+    vertices: Float64Array, triangles: NDArray[np.uint32], count: int, labels: NDArray[np.int64],
+    cross_of: Float64Array | None = None,
+) -> Float64Array:  # fmt: skip
+    """Return the volume of each component, shape (count,), as `Volumes` has it; vertices in mm from a point near them.
+
+    cross_of: ndarray, shape (3, m). Gets the cross product of each triangle's edges, mm2.
+    """
+    six_volumes = np.zeros(count)
+    for where, corner, cross in cross_products(vertices, triangles, np.zeros(3), max(count, 1 << 14)):
+        six_volumes += np.bincount(labels[triangles[where, 0]], np.einsum("ij,ij->j", corner, cross), count)
+        if cross_of is not None:
+            cross_of[:, where] = cross
+    return six_volumes / 6.0
 
 
 def restore_volumes(
@@ -113,16 +129,13 @@ def _volumes(
     vertices: Float64Array, triangles: NDArray[np.uint32], labels: NDArray[np.int64], count: int
 ) -> tuple[Float64Array, Float64Array]:
     """Return the volume of each component in mm3, and its gradient by the places of the vertices, shape (3, n), mm2."""
-    volumes = np.zeros(count)
     cross_of = np.empty((3, len(triangles)))
-    for where, corner, cross in cross_products(vertices, triangles, np.zeros(3), max(count, 1 << 14)):
-        volumes += np.bincount(labels[triangles[where, 0]], np.einsum("ij,ij->j", corner, cross), count)
-        cross_of[:, where] = cross
+    volumes = enclosed_mm3(vertices, triangles, count, labels, cross_of)
     gradient = np.zeros((3, len(vertices)))
     for corners in triangles.T:
         for axis in range(3):
             gradient[axis] += np.bincount(corners, cross_of[axis], len(vertices))
-    return volumes / 6.0, gradient / 6.0
+    return volumes, gradient / 6.0
 
 
 def shorten_steps(step: Float64Array, longest: float) -> int:
