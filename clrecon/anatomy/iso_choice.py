@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,6 +38,8 @@ from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import count_of, format_share
 
 FloatArray = NDArray[Any]
+Slices = Iterable[tuple[int, FloatArray]]
+"""Slices with their places in the volume."""
 
 CONTRAST_MEDIUM_HU = 600
 """Vessels and organs with contrast medium stay below this value."""
@@ -69,28 +71,29 @@ class Background:
 
 @dataclass(frozen=True)
 class BoneEdges:
-    """Plateaus, steepest steps and flatness of many edges; shapes (n,)."""
+    """Plateaus, steepest steps and flatness of many edges, shapes (n,), and their places (k, j, i), shape (n, 3)."""
 
     bone: FloatArray
     tissue: FloatArray
     step: FloatArray
     flat: NDArray[np.bool_]
+    places: NDArray[np.int32]
 
     def where(self, mask: NDArray[np.bool_]) -> BoneEdges:
-        return BoneEdges(self.bone[mask], self.tissue[mask], self.step[mask], self.flat[mask])
+        return BoneEdges(self.bone[mask], self.tissue[mask], self.step[mask], self.flat[mask], self.places[mask])
 
     @property
     def contrast(self) -> FloatArray:
         return self.bone - self.tissue
 
 
-def measure_edges(voxels: NDArray[Any], sampled: range, background: Background) -> BoneEdges:
-    """Measure the plateaus on both sides of the edges of bone in the sampled slices, along rows and along columns."""
+def measure_edges(slices: Slices, background: Background) -> BoneEdges:
+    """Measure the plateaus on both sides of the edges of bone in slices, along rows and along columns."""
     found = []
-    for k in sampled:
-        padded = np.pad(np.asarray(voxels[k]), REACH + FLAT, mode="edge")
+    for k, values in slices:
+        padded = np.pad(values, REACH + FLAT, mode="edge")
         with np.errstate(invalid="ignore"):  # two infinite neighbours
-            found += [_measure_slice(padded, axis, background) for axis in (0, 1)]
+            found += [_measure_slice(padded, axis, background, k) for axis in (0, 1)]
     every = BoneEdges(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
     edges = every.where((every.tissue >= background.lowest) & (every.tissue <= background.highest))
     bone = edges.where(edges.bone <= METAL_HU)
@@ -98,8 +101,9 @@ def measure_edges(voxels: NDArray[Any], sampled: range, background: Background) 
     return bone if len(bone.bone) >= LEAST_BONE_SHARE * len(edges.bone) else bone.where(bone.bone < -math.inf)
 
 
-def _measure_slice(padded: NDArray[Any], axis: int, background: Background) -> tuple[NDArray[Any], ...]:
-    """Measure bone, tissue, steepest step and flatness of the edges of a slice along its columns (axis 0) or rows (1).
+def _measure_slice(padded: NDArray[Any], axis: int, background: Background, k: int) -> tuple[NDArray[Any], ...]:
+    """Measure bone, tissue, steepest step, flatness and place of the edges of a slice along its columns (axis 0) or
+    rows (1).
 
     It is continued by its border values, p = `REACH` + `FLAT` voxels each way: every walk ends where values are
     constant.
@@ -112,8 +116,8 @@ def _measure_slice(padded: NDArray[Any], axis: int, background: Background) -> t
     last = np.roll(inside, -1, axis)[inner]
     crossing = np.flatnonzero(first != last)  # border values are continued: no crossing
     crossing = crossing[:: max(1, -(-len(crossing) // MOST_EDGES))]
-    rows, columns = np.divmod(crossing, first.shape[1])
-    low = (rows + border) * padded.shape[1] + columns + border
+    places = np.column_stack((np.full(len(crossing), k), *np.divmod(crossing, first.shape[1]))).astype(np.int32)
+    low = (places[:, 1].astype(np.intp) + border) * padded.shape[1] + places[:, 2] + border
     flat_values, flat_inside = padded.ravel(), inside.ravel()
 
     def values(at: NDArray[np.intp]) -> NDArray[np.float32]:
@@ -136,7 +140,7 @@ def _measure_slice(padded: NDArray[Any], axis: int, background: Background) -> t
     flat = bone < CONTRAST_MEDIUM_HU
     for beyond in range(1, FLAT + 1):
         flat &= np.abs(values(top + beyond * uphill) - bone) <= FLAT_SIGMAS * background.noise
-    return bone, values(bottom), np.maximum(step, np.maximum(steep_up, steep_down)), flat
+    return bone, values(bottom), np.maximum(step, np.maximum(steep_up, steep_down)), flat, places[kept]
 
 
 def _walk(
@@ -183,6 +187,14 @@ FAT_HU = (-150, -31)
 """Range in which fat has its mode: the background of scans that show no other soft tissue."""
 AIR, SOFT_TISSUE = -1000.0, 40.0
 """HU of the two materials by which a scan with a scale of its own is read."""
+DENSE = 1240.0
+"""HU that the denser of two materials is read as, where nothing is known of the values."""
+MATERIAL_BINS, MATERIAL_TAILS, TAIL_SHARE = 400, (0.0005, 0.9995), 0.35
+"""Bins of a histogram of any values, the shares left out at its ends, and how far above its last peak what is denser
+reaches, as a share of the range."""
+STREAKS_HU, FEWEST_METAL, METAL_SLICES = 3000, 20, 3
+"""A slice with so many voxels above this shows metal, whose streaks, and whose rim so many slices away, have the values
+of bone."""
 AIR_MODE_HU = -700
 """Modes below this are air."""
 
@@ -225,6 +237,7 @@ class IsoChoice:
     contrast_medium_share: Share of the contrast left out because it ends in a flat plateau below `CONTRAST_MEDIUM_HU`.
     flat_share: The same before that decision: where it is above three quarters, flat plateaus are taken for bone.
     slices, slice_step: Number of slices examined, and the distance from one to the next in slices.
+    seen_at_lps_mm: A place where an edge has both materials.
     """
 
     iso_value: float
@@ -243,6 +256,7 @@ class IsoChoice:
     flat_share: float | None = None
     slices: int | None = None
     slice_step: int | None = None
+    seen_at_lps_mm: list[float] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -285,12 +299,18 @@ def choose_iso_value(volume: Volume, *, progress: Progress | None = None) -> Iso
     """
     progress = progress or ignore_progress
     progress("choose", 0, 3)
-    sampled, scale = _sample_slices(volume), _OwnScale.of(volume.report)
-    examined, places = (volume.voxels, sampled) if scale is None else scale.to_hu(volume.voxels, sampled)
-    histogram = _leave_padding(_count_values(examined, places), volume.voxels[0].size * len(sampled), volume.report)
-    background = _find_background(histogram)
-    progress("choose", 1, 3)
-    edges = measure_edges(examined, places, background)
+    every, scale = _sample_slices(volume), _OwnScale.of(volume)
+    for sampled in ((_leave_metal(volume.voxels, every),) if scale is None else ()) + (every,):
+
+        def slices(sampled: Sequence[int] = sampled) -> Slices:
+            return ((k, volume.voxels[k] if scale is None else scale.to_hu(volume.voxels[k])) for k in sampled)
+
+        histogram = _leave_padding(_count_values(slices()), volume.voxels[0].size * len(sampled), volume.report)
+        background = _find_background(histogram)
+        progress("choose", 1, 3)
+        edges = measure_edges(slices(), background)
+        if len(edges.bone) >= FEWEST_EDGES:
+            break
     progress("choose", 2, 3)
     edges, left_out, flat_share = leave_contrast_medium(edges)
     progress("choose", 3, 3)
@@ -300,14 +320,20 @@ def choose_iso_value(volume: Volume, *, progress: Progress | None = None) -> Iso
         raise NoSurfaceError(_no_bone(background, edges, histogram, len(sampled)))
     if scale is not None:
         background, edges = scale.from_hu(background, edges)
-    choice = _describe(background, edges, (left_out, flat_share), sampled)
-    return choice if scale is None else dataclasses.replace(choice, reason=f"{choice.reason}; {scale}")
+    choice = _describe(background, edges, (left_out, flat_share), len(sampled), every.step)
+    reason = choice.reason if scale is None else f"{choice.reason}; {scale}"
+    if len(sampled) < len(every):
+        reason += f"; {count_of(len(every) - len(sampled), 'slice')} with metal left out"
+    kji = edges.places[np.argmin(np.abs(edges.bone - choice.bone_hu) + np.abs(edges.tissue - choice.tissue_hu))]
+    place = [round(float(mm), 3) for mm in volume.ijk_to_lps(kji[None, ::-1].astype(np.float64))[0]]
+    reason += f"; both are seen at ({', '.join(f'{mm:.4g}' for mm in place)}) mm, in slice {kji[0] + 1}"
+    return dataclasses.replace(choice, reason=reason, seen_at_lps_mm=place)
 
 
 def lies_in_air(volume: Volume) -> bool:
     """Tell whether the histogram of a scan has a mode of air and none of soft tissue, as of a dry specimen."""
     sampled = _sample_slices(volume)
-    counted = _count_values(volume.voxels, sampled)
+    counted = _count_values((k, volume.voxels[k]) for k in sampled)
     try:
         background = _find_background(_leave_padding(counted, volume.voxels[0].size * len(sampled), volume.report))
     except NoSurfaceError:
@@ -321,55 +347,127 @@ def _sample_slices(volume: Volume) -> range:
     return range((len(volume.voxels) - 1) % step // 2, len(volume.voxels), step)
 
 
-class _OwnScale(NamedTuple):
-    """The scale of values that are not HU, by the air and soft tissue that the failed gate ``hu_scale`` found."""
+def _leave_metal(voxels: NDArray[Any], sampled: Sequence[int]) -> Sequence[int]:
+    """Leave out the slices that show metal, for its streaks, and those beside, unless too few are left."""
+    metal = np.array([k for k in sampled if np.count_nonzero(voxels[k] >= STREAKS_HU) >= FEWEST_METAL])
+    free = [k for k in sampled if not (np.abs(metal - k) <= METAL_SLICES).any()]
+    return free if len(free) >= FEWEST_SLICES else sampled
 
-    air: float
-    tissue: float
+
+class _OwnScale(NamedTuple):
+    """A scale of values that are not HU, by two values and the HU that they stand for.
+
+    said: Where the two values come from.
+    """
+
+    low: float
+    high: float
+    low_hu: float
+    high_hu: float
+    said: str
 
     @classmethod
-    def of(cls, report: Mapping[str, Any]) -> _OwnScale | None:
-        """Take air and soft tissue from a certificate; None where they have the values of a CT, or were not found."""
-        rescale = report.get("rescale") or {}
+    def of(cls, volume: Volume) -> _OwnScale | None:
+        """Take air and soft tissue from a certificate whose gate ``hu_scale`` failed, else two materials from the
+        histogram of values that nothing says are HU; None where they are, or where no two were found.
+        """
+        rescale = volume.report.get("rescale") or {}
         air, tissue = rescale.get("air"), rescale.get("soft_tissue")
-        return None if air is None or tissue is None else cls(air, tissue)
+        if air is not None and tissue is not None:
+            said = f"on the scan's own scale, with air near {air:.0f} and soft tissue near {tissue:.0f}"
+            return cls(air, tissue, AIR, SOFT_TISSUE, said)
+        known = {gate["name"]: gate["ok"] for gate in volume.report.get("gates", ())}.get("hu_known")
+        if known or (known is None and _shows_hu(volume)):
+            return None
+        found = find_two_materials(volume)
+        if found is None:
+            return None
+        said = f"on the scan's own scale, with two materials near {found[0]:.4g} and {found[1]:.4g}"
+        return cls(*found, SOFT_TISSUE, DENSE, said)
 
     def __str__(self) -> str:
         """What is said of it beside the reason of a choice."""
-        return f"on the scan's own scale, with air near {self.air:.0f} and soft tissue near {self.tissue:.0f}"
+        return self.said
 
     @property
     def slope(self) -> float:
         """HU for one unit of the scan."""
-        return (SOFT_TISSUE - AIR) / (self.tissue - self.air)
+        return (self.high_hu - self.low_hu) / (self.high - self.low)
 
-    def to_hu(self, voxels: NDArray[Any], sampled: range) -> tuple[NDArray[np.float32], range]:
-        """Return the sampled slices in HU, and their places there."""
-        slices = [(np.asarray(voxels[k], np.float32) - self.air) * self.slope + AIR for k in sampled]
-        return np.stack(slices), range(len(slices))
+    def to_hu(self, values: NDArray[Any]) -> NDArray[np.float32]:
+        """Return a slice in HU."""
+        return (np.asarray(values, np.float32) - np.float32(self.low)) * np.float32(self.slope) + np.float32(
+            self.low_hu
+        )
 
     def from_hu(self, background: Background, edges: BoneEdges) -> tuple[Background, BoneEdges]:
         """Return what was measured in HU in the units of the scan."""
-        mode = self.air + (background.mode - AIR) / self.slope
-        bone, tissue = (self.air + (hu - AIR) / self.slope for hu in (edges.bone, edges.tissue))
+        mode = self.low + (background.mode - self.low_hu) / self.slope
+        bone, tissue = (self.low + (hu - self.low_hu) / self.slope for hu in (edges.bone, edges.tissue))
         return (
             dataclasses.replace(background, mode=mode, noise=background.noise / self.slope),
-            BoneEdges(bone, tissue, edges.step / self.slope, edges.flat),
+            BoneEdges(bone, tissue, edges.step / self.slope, edges.flat, edges.places),
         )
 
 
-def _describe(background: Background, edges: BoneEdges, flat: tuple[float, float], sampled: range) -> IsoChoice:
+def _shows_hu(volume: Volume) -> bool:
+    """Tell whether the histogram has soft tissue or air where HU have them."""
+    try:
+        _find_background(_count_values((k, volume.voxels[k]) for k in _sample_slices(volume)))
+    except NoSurfaceError:
+        return False
+    return True
+
+
+def find_two_materials(volume: Volume) -> tuple[float, float] | None:
+    """Return the values of what is densest and of what lies around it, on any scale; None where there is no such pair.
+
+    The histogram of every fourth value is smoothed over `MATERIAL_BINS` and its peaks are found, a valley between each
+    two.  What rises far above the last peak is the dense material, else the last peak itself.
+    """
+    sampled = _sample_slices(volume)
+    values = np.concatenate([np.asarray(volume.voxels[k])[::2, ::2].ravel() for k in sampled]).astype(np.float64)
+    padding = volume.report.get("padding_hu")
+    values = values[np.isfinite(values) & (values != padding)] if padding is not None else values[np.isfinite(values)]
+    if not len(values):
+        return None
+    low, high = np.quantile(values, MATERIAL_TAILS)
+    if high <= low:
+        return None
+    counts, ends = np.histogram(values, MATERIAL_BINS, (float(low), float(high)))
+    weights = np.exp(-0.5 * (np.arange(-12, 13) / 4.0) ** 2)
+    smooth = np.convolve(np.pad(counts, 12), weights / weights.sum(), mode="valid")
+    peaks = [
+        k
+        for k in np.flatnonzero((smooth >= np.pad(smooth, (1, 0))[:-1]) & (smooth > np.pad(smooth, (0, 1))[1:]))
+        if smooth[k] >= 0.02 * smooth.max() and smooth[k] > 2.0 * np.median(smooth[max(k - 40, 0) : k + 40])
+    ]
+    if not peaks:
+        return None
+    places = [float((ends[k] + ends[k + 1]) / 2.0) for k in peaks]
+    if high - places[-1] > TAIL_SHARE * (high - low):
+        dense = float(np.median(values[values > (places[-1] + high) / 2.0]))
+        return places[-1], dense
+    return (places[-2], places[-1]) if len(places) > 1 else None
+
+
+def _describe(
+    background: Background, edges: BoneEdges, flat: tuple[float, float], slices: int, slice_step: int
+) -> IsoChoice:
     """Make the choice that follows from the edges; `flat` are the shares of contrast left out, and flat at all."""
     left_out, flat_share = flat
     bone, tissue = _median(edges.bone, edges.contrast), _median(edges.tissue, edges.contrast)
-    iso_value = float(math.floor((bone + tissue) / 2.0 + 0.5))
+    digits = max(0, 3 - math.floor(math.log10(bone - tissue)))  # of values that are not HU
+    digits = digits if digits > 1 else 0
+    iso_value = math.floor((bone + tissue) / 2.0 * 10**digits + 0.5) / 10**digits
     half = (edges.bone + edges.tissue) / 2.0
     spread = (_median(half, edges.contrast, 0.75) - _median(half, edges.contrast, 0.25)) / 2.0
     steepness = _median(edges.step, edges.contrast)
+    below = "air" if background.name == "air" else "tissue"
     reason = (
-        f"half way between {'air' if background.name == 'air' else 'tissue'} {tissue:.0f} and bone {bone:.0f} HU, "
-        f"medians of {count_of(len(half), 'edge')} in {count_of(len(sampled), 'slice')}; single"
-        f" edges spread by {spread:.0f} HU, "
+        f"half way between {below} {tissue:.{digits}f} and bone {bone:.{digits}f} HU, "
+        f"medians of {count_of(len(half), 'edge')} in {count_of(slices, 'slice')}; single"
+        f" edges spread by {spread:.{digits}f} HU, "
         f"{spread / steepness:.2f} voxel"
     )
     if flat_share >= CONTRAST_SAID:
@@ -377,21 +475,21 @@ def _describe(background: Background, edges: BoneEdges, flat: tuple[float, float
         reason += f"; {format_share(flat_share)} of the contrast ends in flat plateaus, as of contrast medium: {done}"
     return IsoChoice(
         iso_value,
-        round(bone, 1),
-        round(tissue, 1),
+        round(bone, 1 + digits),
+        round(tissue, 1 + digits),
         "auto",
         reason,
         background=background.name,
         background_mode_hu=background.mode,
-        noise_hu=round(background.noise, 1),
+        noise_hu=round(background.noise, 1 + digits),
         edges=len(half),
-        spread_hu=round(spread, 1),
-        steepness_hu_per_voxel=round(steepness, 1),
+        spread_hu=round(spread, 1 + digits),
+        steepness_hu_per_voxel=round(steepness, 1 + digits),
         faint_share=round(float(np.mean(edges.bone < iso_value)), 4),
         contrast_medium_share=round(left_out, 4),
         flat_share=round(flat_share, 4),
-        slices=len(sampled),
-        slice_step=sampled.step,
+        slices=slices,
+        slice_step=slice_step,
     )
 
 
@@ -404,12 +502,12 @@ def _no_bone(background: Background, edges: BoneEdges, histogram: Float64Array, 
     )
 
 
-def _count_values(voxels: NDArray[Any], sampled: range) -> Float64Array:
+def _count_values(slices: Slices) -> Float64Array:
     """Count the voxels of each whole HU from `LOWEST_HU`, below which is padding, to `HIGHEST_HU` and more."""
     low = LOWEST_HU - 1
     counts = np.zeros(HIGHEST_HU - low + 1, dtype=np.int64)
-    for k in sampled:
-        values = np.asarray(voxels[k]).ravel()
+    for k, image in slices:
+        values = np.asarray(image).ravel()
         if values.dtype.kind == "f":
             if np.isnan(values).any():
                 raise NoSurfaceError(f"the volume holds NaN (slice {k}): it has no iso surface")

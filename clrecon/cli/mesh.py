@@ -23,6 +23,8 @@ _SHOWN_PARTS = 12
 
 WHAT_BONE_COSTS = "in soft tissue 0.4 to 1.1 mm outside of the bone; --hu auto lies closer"
 """What the default level costs, measured by scripts/proof/measure_levels.py."""
+FINE_MM = 0.5
+"""In smaller voxels, of phantoms of 0.12 to 0.4 mm, it lies 0.8 voxel outside of the bone."""
 
 
 def _epilog() -> str:
@@ -184,12 +186,24 @@ def _describe_choice(report: dict[str, Any]) -> str:
     choice = report["iso_value_choice"]
     if choice is None:
         if report["preset"] == "bone":
-            return f"preset bone: {WHAT_BONE_COSTS}"
+            return f"preset bone: {_describe_costs(report['volume'])}"
         return f"preset {report['preset']}" if report["preset"] else "as given"
     if choice["method"] != "auto":
         return f"half way between tissue {choice['tissue_hu']:g} and bone {choice['bone_hu']:g} HU, as given"
     below = "air" if choice["background"] == "air" else "tissue"
-    return f"auto: half way between {below} {choice['tissue_hu']:.0f} and bone {choice['bone_hu']:.0f} HU"
+    form = ".0f" if choice["bone_hu"] - choice["tissue_hu"] >= 10.0 else ".4g"
+    tissue, bone = (format(choice[name], form) for name in ("tissue_hu", "bone_hu"))
+    return f"auto: half way between {below} {tissue} and bone {bone} HU"
+
+
+def _describe_costs(volume: dict[str, Any]) -> str:
+    """Say what the default level costs: in mm where it was measured, voxels of half a mm and more, else in voxels."""
+    from clrecon.jobs.mesh.surfaces import VALUE_GATES
+
+    if any(gate["name"] in VALUE_GATES and gate["ok"] is False for gate in volume.get("gates") or ()):
+        return "a level in HU, which these values are not; --hu auto measures the level of bone"
+    fine = min(volume.get("spacing_mm") or (1.0,)) < FINE_MM
+    return "in soft tissue about a voxel outside of the bone; --hu auto lies closer" if fine else WHAT_BONE_COSTS
 
 
 def describe_volume(volume: dict[str, Any]) -> str:

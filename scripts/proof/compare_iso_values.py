@@ -65,7 +65,7 @@ SPINES: dict[str, tuple[dict[str, Any], dict[str, float]]] = {
 # --- ways to choose ---
 def _every_slice(volume: Volume) -> tuple[Array, Array]:
     """Count the voxels of each whole HU above the padding; also return these HU."""
-    counts = choice._count_values(volume.voxels, range(len(volume.voxels)))
+    counts = choice._count_values(enumerate(volume.voxels))
     return counts, np.arange(len(counts)) + float(choice.LOWEST_HU)
 
 
@@ -117,7 +117,7 @@ def by_gradient(volume: Volume) -> float:
 def by_plain_edges(volume: Volume) -> float:
     """The edges of "auto", but all with equal weight and with contrast medium included."""
     sampled = range(len(volume.voxels))
-    edges = measure_edges(volume.voxels, sampled, choice._find_background(_every_slice(volume)[0]))
+    edges = measure_edges(((k, volume.voxels[k]) for k in sampled), choice._find_background(_every_slice(volume)[0]))
     return float((np.median(edges.bone) + np.median(edges.tissue)) / 2.0)
 
 

@@ -275,7 +275,7 @@ REFUSED = {
     "even noise": (np.random.default_rng(8).uniform(-1000, 2000, (40, 64, 64)), "no two materials"),
     "water phantom": (make_water_phantom(), "soft tissue has its mode at -?[01] HU"),
     "metal in water": (np.minimum(make_ball(8000.0, 40.0, 0.8, 20.0), 3071.0), "no bone found"),
-    "raw values": (make_ball(1040.0, 40.0) + 1024.0, "no two materials.*near 106\\d HU"),
+    "raw air": (np.full((8, 32, 32), 24.0) + np.arange(32), "no two materials|0 edges of bone"),
 }
 
 
@@ -286,6 +286,51 @@ def test_what_has_no_two_materials_is_refused(name) -> None:
         choose_iso_value(as_volume(field))
     assert "iso_value=N" in str(caught.value) and "\n" not in str(caught.value)
     assert not lies_in_air(as_volume(field))
+
+
+RAW = {
+    "CT without its intercept": (make_ball(1040.0, 40.0) + 1024.0, 1064.0, 2064.0),
+    "16 bits of micro-CT": (make_ball(30_000.0, 9000.0, 0.8, 400.0), 9000.0, 30_000.0),
+    "8 bits": (make_ball(200.0, 30.0, 0.8, 3.0), 30.0, 200.0),
+    "a share": (make_ball(0.9, 0.2, 0.8, 0.01), 0.2, 0.9),
+    "a casting in air": (make_ball(1.6, 0.0, 0.8, 0.01), 0.0, 1.6),
+}
+
+
+@pytest.mark.parametrize("name", RAW)
+def test_two_materials_are_found_on_any_scale(name) -> None:
+    field, tissue, bone = RAW[name]
+    volume = Volume(field.astype(np.float32), np.diag((0.5, 0.5, 0.5, 1.0)))
+    volume.report["gates"] = [{"name": "hu_known", "ok": False}]
+    chosen = choose_iso_value(volume)
+    step = bone - tissue
+    assert abs(chosen.iso_value - (bone + tissue) / 2.0) <= tolerances.HALF_WAY_STEP_SHARE * step
+    assert chosen.bone_hu == pytest.approx(bone, abs=0.06 * step)
+    assert "on the scan's own scale, with two materials near" in chosen.reason
+    place = np.linalg.norm(np.array(chosen.seen_at_lps_mm) - np.array((22.1, 21.4, 21.7)) / 2.0)
+    assert place == pytest.approx(5.0, abs=1.2)
+    assert f"{chosen.seen_at_lps_mm[0]:.4g}" in chosen.reason
+
+
+def test_values_that_are_known_to_be_hu_keep_their_scale() -> None:
+    volume = as_volume(make_ball(2040.0, 1040.0))
+    volume.report["gates"] = [{"name": "hu_known", "ok": True}]
+    with pytest.raises(NoSurfaceError, match="no two materials"):
+        choose_iso_value(volume)
+
+
+def test_slices_with_metal_are_left_out() -> None:
+    """Streaks of 300 HU in the slices of a rod of metal; without it all slices count."""
+    plain = np.tile(make_ball(1040.0, 40.0)[None, 22], (40, 1, 1))
+    field = plain.copy()
+    field[:20, 2:6, 2:40] = 340.0
+    field[:20, ::6] += 300.0
+    field[:20, 40:43, 30:40] = 3071.0
+    found, expected = choose_iso_value(as_volume(field)), choose_iso_value(as_volume(plain))
+    assert (found.iso_value, found.slices, expected.slices) == (expected.iso_value, 17, 40)
+    assert "23 slices with metal left out" in found.reason and "metal" not in expected.reason
+    field[:38, 40:43, 30:40] = 3071.0  # too few without
+    assert choose_iso_value(as_volume(field)).slices == 40
 
 
 def test_nan_is_refused() -> None:

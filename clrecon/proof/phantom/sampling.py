@@ -241,10 +241,11 @@ def add_streaks(
             return
         noise = np.random.default_rng((seed, 31, k)).standard_normal((ANGLES, bins))
         error = np.zeros(field.shape[1:], dtype=np.float32)
-        for n, angle in enumerate(np.pi * np.arange(ANGLES) / ANGLES):
+        for n, angle in enumerate(np.pi * (np.arange(ANGLES) + 0.5) / ANGLES):
             cos, sin = np.float32(math.cos(angle) / step), np.float32(math.sin(angle) / step)
             hit = np.rint(x[0, columns] * cos + y[rows, 0] * sin).astype(np.intp) + bins // 2
             way = np.bincount(hit, minlength=bins) * (spacing[0] * spacing[1] / step)
+            way = np.convolve(way, (0.25, 0.5, 0.25), mode="same")  # a voxel shades more than the bin of its centre
             wrong = metal_hu * way**2 * (STARVED_PER_MM * noise[n] - HARDENED_PER_MM)
             filtered = np.fft.irfft(np.fft.rfft(wrong, 2 * bins) * ramp)[:bins].astype(np.float32)
             error += filtered[(x * cos + y * sin + np.float32(bins // 2 + 0.5)).astype(np.intp)]

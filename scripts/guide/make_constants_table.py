@@ -1,0 +1,103 @@
+#!/usr/bin/env python3
+"""List the constants in mm and HU of anatomy, labels and operators, for the table of docs/limits.md.
+
+    python scripts/guide/make_constants_table.py
+
+A constant is a name in capitals with _MM, _MM2, _CM2, _ML or _HU in it, at the top of a module; what it was made for is
+the first sentence of the text below it.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from marked_tables import markdown_table, put_table  # noqa: E402
+
+PAGE, NAME = ROOT / "docs" / "limits.md", "constants in mm and HU"
+ROOMS = ("anatomy", "labels", "operators")
+UNITS = re.compile(r"^[A-Z].*_(MM2?|CM2|ML|HU)(_|$)")
+
+ADULTS = "the object: adults; in no other way"
+HU = "values: HU alone"
+WRITERS = "files: how writers round"
+FOLLOWS = {
+    "anatomy/body.py": "the object: adults and their tables; cells are one voxel at least",
+    "anatomy/body_cells.py": "the voxel: cells are one at least; values: HU alone",
+    "anatomy/dense_pieces.py": "the object: adults, their tables and cables; values: HU alone",
+    "anatomy/head.py": "the object: heads of people; values: HU alone",
+    "anatomy/iso_choice.py": "values: where they are not HU, two materials of the scan stand for 40 and 1240 HU, or air"
+    " and soft tissue for -1000 and 40",
+    "anatomy/marrow.py": "the voxel: blocks are whole ones",
+    "anatomy/noise.py": HU,
+    "anatomy/spine_cells.py": ADULTS,
+    "anatomy/spine_line.py": ADULTS,
+    "anatomy/surroundings.py": "the object: skin and airways of people",
+    "labels/canal.py": ADULTS,
+    "labels/contours.py": WRITERS,
+    "labels/label_grids.py": WRITERS,
+    "labels/resample.py": HU,
+    "labels/segmentation.py": WRITERS,
+    "labels/structures.py": WRITERS + ", and the step of the slices",
+    "operators/masks/enclosed.py": "the voxel: the ball of `--solid` is 8 steps at most; the object: a share of the"
+    " largest bone; marrow of adults",
+    "operators/masks/regions.py": WRITERS,
+    "operators/masks/shapes.py": WRITERS,
+    "operators/points/clusters.py": WRITERS,
+    "operators/points/free_clusters.py": "nothing: range of float32",
+    "operators/rays/mesh_pictures.py": "nothing: range of float32",
+    "operators/rays/point_pictures.py": "the object: the spacing of the cloud where it has one",
+    "operators/rays/ray_pictures.py": HU,
+    "operators/rays/volume_renderer.py": HU,
+    "operators/reformat/cut.py": ADULTS,
+    "operators/surface/cortex.py": "the voxel: lengths are at a voxel of 1 mm3 and scale with it; values: HU alone",
+    "operators/surface/cortex_mesh.py": "nothing: float32 in mm",
+    "operators/surface/growing.py": "nothing: how far is searched",
+    "operators/surface/seeds.py": ADULTS,
+    "operators/vertebrae/inside.py": "the object: vertebrae of adults; values: HU alone",
+    "operators/vertebrae/solid.py": "the object: vertebrae of adults",
+}
+"""What the constants of a module follow; a module without a line is an error."""
+
+
+def find_constants(source: str) -> Iterator[tuple[str, str, str]]:
+    """Yield names, value and first sentence of each constant with a unit."""
+    body = ast.parse(source).body
+    for statement, after in zip(body, [*body[1:], None], strict=True):
+        if not isinstance(statement, ast.Assign | ast.AnnAssign) or statement.value is None:
+            continue
+        target = statement.targets[0] if isinstance(statement, ast.Assign) else statement.target
+        names = [part.id for part in ast.walk(target) if isinstance(part, ast.Name)]
+        if not any(UNITS.match(name) for name in names):
+            continue
+        said = ""
+        if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) and isinstance(after.value.value, str):
+            said = re.split(r"(?<=[.])\s+(?=[A-Z`])", " ".join(after.value.value.split()))[0].rstrip(".")
+        yield ", ".join(names), ast.unparse(statement.value), said
+
+
+def make_table(root: Path = ROOT / "clrecon") -> str:
+    """Return the table of all constants, by module."""
+    rows = []
+    for room in ROOMS:
+        for path in sorted((root / room).rglob("*.py")):
+            module = path.relative_to(root).as_posix()
+            for names, value, said in find_constants(path.read_text(encoding="utf-8")):
+                cells = (module.removesuffix(".py"), names, value, said, FOLLOWS[module])
+                rows.append([cell.replace("|", "\\|") for cell in cells])
+    return markdown_table(["module", "constant", "value", "made for", "follows"], rows)
+
+
+def main() -> int:
+    PAGE.write_text(put_table(PAGE.read_text(encoding="utf-8"), NAME, make_table()), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

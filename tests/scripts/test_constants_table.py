@@ -1,0 +1,33 @@
+"""Constants in mm and HU: the table of docs/limits.md has them all, as they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import make_constants_table  # isort: skip
+import marked_tables  # isort: skip
+
+
+def test_the_page_has_the_constants_as_they_are() -> None:
+    text = make_constants_table.PAGE.read_text(encoding="utf-8")
+    found = marked_tables.find_table(text, make_constants_table.NAME)
+    assert found == make_constants_table.make_table(), "python scripts/guide/make_constants_table.py"
+    assert found.count("\n") > 90
+
+
+def test_constants_are_found_with_their_first_sentence() -> None:
+    source = 'A_MM, B = 1.0, 2\n"""How far.  And more."""\nC_HU: float = -3.0\nD = 4\n_E_MM = 5\nBONE_HU_MOST = 6\n'
+    assert list(make_constants_table.find_constants(source)) == [
+        ("A_MM, B", "(1.0, 2)", "How far"),
+        ("C_HU", "-3.0", ""),
+        ("BONE_HU_MOST", "6", ""),
+    ]
+
+
+def test_a_module_that_nothing_is_said_of_is_found(tmp_path: Path) -> None:
+    (tmp_path / "anatomy").mkdir()
+    (tmp_path / "anatomy" / "new.py").write_text("A_MM = 1\n", encoding="utf-8")
+    with pytest.raises(KeyError, match=r"anatomy/new\.py"):
+        make_constants_table.make_table(tmp_path)
