@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 CONTRAST_SHARE = 0.04
 """Share of a bone surface that looks like contrast medium and is reported from here on; spongy bone gives 0.03."""
+OTHER_SHARE = 0.05
+"""Share of a surface in one component that is no bone, and is warned of from here on."""
 NAMES_SHOWN = 5
 SPINE_MM = 20.0
 """Largest distance of the wall of the spinal canal from its middle."""
@@ -144,8 +146,11 @@ def _holds_spine(mesh: Mesh, volume: Volume, count: int, labels: NDArray[np.int6
     return found
 
 
-def judge_surfaces(parts: Sequence[Part], volume: Volume, settings: MeshSettings) -> None:
-    """Store in the `facts` of each part the judgement of its walls: ``walls``, None for other surfaces than bone."""
+def judge_surfaces(parts: Sequence[Part], volume: Volume, settings: MeshSettings, *, each: bool = False) -> None:
+    """Store in the `facts` of each part the judgement of its walls: ``walls``, None for other surfaces than bone.
+
+    each: Components are judged one by one, too, where the surface as a whole looks like bone.
+    """
     import numpy as np
 
     from clrecon.mesh.compare.iso_distance import rule_of_report
@@ -168,18 +173,24 @@ def judge_surfaces(parts: Sequence[Part], volume: Volume, settings: MeshSettings
         for part, first, end in zip(own, ends[:-1], ends[1:], strict=True):
             own_walls = walls.where(slice(first, end))
             judged = part.facts["walls"] = judge_walls(own_walls)
-            doubtful = judged["looks_like"] != "bone" or is_straight(own_walls.points, volume)
+            doubtful = each or judged["looks_like"] != "bone" or is_straight(own_walls.points, volume)
             if doubtful and _means_bone(settings) and not settings.selects:
                 part.bones = _count_bones(part.mesh, volume, rule)
 
 
 def _count_bones(mesh: Mesh, volume: Volume, rule: IsoRule) -> Bones:
-    """Count the bone components of a surface that as a whole does not look like bone."""
+    """Count the components of a surface that look like bone, and judge the largest of the others."""
+    import numpy as np
+
     from clrecon.mesh.connectivity import label_components
 
     labelled = label_components(mesh.triangles, mesh.vertex_count)
-    _, bone, rails = _tell_bone(mesh, volume, rule, labelled)
-    return Bones(labelled[0], int(bone.sum()), int(rails.sum()))
+    judged, bone, rails = _tell_bone(mesh, volume, rule, labelled)
+    sizes = np.bincount(labelled[1][labelled[1] >= 0], minlength=labelled[0])
+    sizes[bone | rails | np.array([one is None for one in judged])] = 0
+    other = int(sizes.argmax())
+    share = float(sizes[other] / mesh.vertex_count)
+    return Bones(labelled[0], int(bone.sum()), int(rails.sum()), judged[other] if share else None, share)
 
 
 def _is_of_bone(surface: Surface, lowest: float) -> bool:
@@ -245,6 +256,13 @@ def _warn_of_whole(part: Part, settings: MeshSettings) -> list[str]:
         if settings.seeds or not (settings.keep_largest is not None or _means_bone(settings)):
             return []
         return [f"{where} {_looks(judged)}; {name_parameter('keep', 'bone')} keeps what looks like bone"]
+    if part.bones is not None and part.bones.other is not None and part.bones.other_share >= OTHER_SHARE:
+        share = 100.0 * part.bones.other_share
+        return [
+            f"{where} is in part no bone: one of {count_of(part.bones.components, 'component')}, {share:.0f} % of the"
+            f" surface, {_looks(part.bones.other)}. {name_parameter('remove_table', True)} takes a table away,"
+            f" {name_parameter('keep', 'bone')} leaves out what touches no bone"
+        ]
     if judged["contrast_share"] < CONTRAST_SHARE:
         return []
     joined = settings.keep == "bone"

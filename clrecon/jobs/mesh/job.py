@@ -11,7 +11,14 @@ from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import judge_label_volumes, name_label_files
 from clrecon.jobs.mesh.make import MadeParts, first_names, make_parts, warn_of_crumbs
 from clrecon.jobs.mesh.purposes import describe_purposes
-from clrecon.jobs.mesh.refinement import judge_parts, measure_parts, place_on_cortex, refine_surface, warn_of_gates
+from clrecon.jobs.mesh.refinement import (
+    judge_parts,
+    measure_parts,
+    place_on_cortex,
+    refine_surface,
+    warn_of_gates,
+    warn_of_shift,
+)
 from clrecon.jobs.mesh.report import MeshReport, describe_part, report_of
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface, plan_surfaces
@@ -60,12 +67,13 @@ def make_mesh(
         paths = [output] * len(parts)
         if not settings.one_file:
             paths = name_outputs(output, [part.name for part in parts], report_path)
-        judge_surfaces(parts, made.volume, settings)
-        run.lap("select")
         is_measured = settings.strict or (report_path is not None if measure is None else measure)
+        judge_surfaces(parts, made.volume, settings, each=is_measured)
+        run.lap("select")
         gates = _refine_and_measure(run, made, is_measured)
         warnings = [
             *warn_of_crumbs(parts, settings, made.device),
+            *warn_of_shift(parts, settings),
             *describe_purposes(parts, settings),
             *warn_of_gates(gates),
         ]

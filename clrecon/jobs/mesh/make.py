@@ -254,8 +254,8 @@ def drop_outside_air(volume: Volume, settings: MeshSettings, progress: Progress)
     return volume
 
 
-CRUMB_ML, MANY_COMPONENTS = 0.1, 100
-"""A mesh of more components than this below this volume gets a warning."""
+CRUMB_ML, CRUMB_SHARE, MANY_COMPONENTS = 0.1, 0.01, 100
+"""A mesh of more components than this below this volume, or this share of all where it is small, gets a warning."""
 
 SELECT_STEPS = 4
 """Steps of the selection from a surface, as progress counts them: pieces, components, bone, and what is kept."""
@@ -391,12 +391,13 @@ def warn_of_crumbs(parts: Sequence[Part], settings: MeshSettings, device: Device
         mesh = part.mesh
         labelled = _label_components(mesh, device, settings)
         ml = np.abs(enclosed_mm3(mesh.vertices - local_origin(mesh.vertices), mesh.triangles, *labelled)) / 1000.0
-        small = ml[ml < CRUMB_ML]
+        crumb_ml = float(f"{min(CRUMB_ML, CRUMB_SHARE * float(ml.sum())):.1g}")
+        small = ml[ml < crumb_ml]
         if len(small) > MANY_COMPONENTS:
             warnings.append(
                 f"{f'{part.name}: ' if part.name else ''}{len(small):,} of {len(ml):,} components enclose less than"
-                f" {CRUMB_ML:g} ml each, {format_ml(float(small.sum()))} together:"
-                f" {name_parameter('min_volume_ml', CRUMB_ML)} drops them"
+                f" {format_ml(crumb_ml)} each, {format_ml(float(small.sum()))} together:"
+                f" {name_parameter('min_volume_ml', f'{crumb_ml:g}')} drops them"
             )
     return warnings
 

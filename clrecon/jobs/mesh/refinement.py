@@ -11,6 +11,7 @@ from clrecon.errors import DeviceMemoryError, NoSurfaceError
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part
 from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
+from clrecon.system.arguments import name_parameter
 from clrecon.system.pieces import side_by_side
 from clrecon.system.progress import Progress, Steps, ignore_progress
 
@@ -21,6 +22,10 @@ if TYPE_CHECKING:
     from clrecon.mesh.compare.iso_distance import IsoDistance
     from clrecon.mesh.quality import MeshQuality
     from clrecon.opencl import Device
+
+
+SHIFT_SHARE, FEWEST_TOLD = 0.1, 0.5
+"""A level that changes the volume by this share is warned of, where so much of the surface has told."""
 
 
 def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress: Progress = ignore_progress) -> Mesh:
@@ -92,6 +97,31 @@ def _may_be_bone(part: Part) -> bool:
     if part.mesh.report.get("inside") != "above" or level is None or part.mesh.triangle_count == 0:
         return False
     return math.isfinite(level) and LOWEST_BONE_HU <= level <= HIGHEST_BONE_HU
+
+
+def warn_of_shift(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
+    """Return a warning for each measured mesh whose level, unless the scan gave it, lies outside of the bone by so much
+    that its volume is too large.
+    """
+    if settings.half_way == "auto":
+        return []
+    warnings = []
+    for part in parts:
+        cortex, quality = part.mesh.report.get("cortex"), part.quality
+        if quality is None or not quality.volume_ml or not cortex or not cortex.get("vertices") or cortex["moved"]:
+            continue
+        told = cortex["fitted"] / cortex["vertices"]
+        shift = cortex["outside_mm"]["mean"]
+        excess_ml = shift * told * quality.area_mm2 / 1000.0
+        share = excess_ml / max(quality.volume_ml - excess_ml, 0.2 * quality.volume_ml)
+        if told >= FEWEST_TOLD and share >= SHIFT_SHARE:
+            name = f"{part.name}: " if part.name else ""
+            warnings.append(
+                f"{name}the surface {part.surface.phrase} lies {shift:.2g} mm outside of the bone on average, which"
+                f" makes the volume about {100.0 * share:.0f} % too large: {name_parameter('half_way', 'auto')}"
+                " measures the level of this scan"
+            )
+    return warnings
 
 
 def measure_parts(

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from clrecon.anatomy.iso_choice import IsoChoice
     from clrecon.geometry import Volume
     from clrecon.mesh import Mesh
+    from clrecon.mesh.compare.walls import WallLook
     from clrecon.mesh.quality import MeshQuality
 
 
@@ -48,11 +49,16 @@ class Surface:
 
 
 class Bones(NamedTuple):
-    """The components of a surface: all, those that look like bone, and rails of a table, which would."""
+    """The components of a surface: all, those that look like bone, and rails of a table, which would.
+
+    other: Judgement of the largest that is neither; `other_share` is its part of the vertices.
+    """
 
     components: int
     bone: int
     rails: int
+    other: WallLook | None = None
+    other_share: float = 0.0
 
 
 @dataclass
@@ -62,7 +68,7 @@ class Part:
     name: Text between the stem of the output and its extension, for example ``"200hu_001"``; empty if it is alone.
     facts: Further entries of its object in the report.
     pieces: Enclosed volumes of the components of its surface, as extracted and as kept, if the purpose needs them.
-    bones: Counted if it does not look like bone as a whole.
+    bones: Counted if it is measured, or does not look like bone as a whole.
     """
 
     surface: Surface

@@ -1,0 +1,111 @@
+"""Kinds of scan against their truth: volumes, places, gates and warnings; the page's table and each of its commands."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_once import make_once
+from variants import daily_rows
+
+import marked_tables  # isort: skip
+import measure_kinds  # isort: skip
+
+from clrecon.cli.main import main
+from clrecon.proof.phantom import PhantomSettings, write_phantom
+
+FIGURES = json.loads(measure_kinds.FIGURES.read_text(encoding="utf-8"))
+PAGE = measure_kinds.PAGE.read_text(encoding="utf-8")
+SLICES = {"jaw": 24, "longbone": 30, "hand": 64, "pair": 30, "hip": 64, "mouse": 40}
+"""Slices in the middle of each kind: a part is as true as the whole; of the hip those without metal are at the ends."""
+
+
+def make_scan(folder: Path, kind: str) -> tuple[Path, PhantomSettings]:
+    settings = PhantomSettings(kind=kind, slices=SLICES[kind])
+    return make_once(folder, f"scan-{kind}", lambda path: write_phantom(path, settings)), settings
+
+
+def measure(shared_folder: Path, tmp_path: Path, device: Any, kind: str, way: str) -> dict[str, Any]:
+    scan, settings = make_scan(shared_folder, kind)
+    options = measure_kinds.WAYS[kind][way]
+    return measure_kinds.measure_way(scan, settings, options, tmp_path, str(device.index))
+
+
+ROWS = [(kind, way) for kind, ways in measure_kinds.WAYS.items() for way in ways]
+EVERY_DAY = [("mouse", "default"), ("jaw", "auto"), ("longbone", "auto"), ("hand", "default")]
+
+
+@pytest.mark.parametrize(("kind", "way"), daily_rows(4, EVERY_DAY + [row for row in ROWS if row not in EVERY_DAY]))
+def test_volumes_are_true_or_the_reason_is_named(
+    shared_folder: Path, tmp_path: Path, device: Any, kind: str, way: str
+) -> None:
+    found = measure(shared_folder, tmp_path, device, kind, way)
+    off = abs(measure_kinds.volume_error(found))
+    assert off < 0.1 or measure_kinds.said_of(found), (off, found)
+    if way != "default":
+        assert found["closed"] and off < {"print": 0.05}.get(way, 0.03 if kind != "hip" else 0.1)
+        assert found["off_voxels"] < 0.3
+        assert found["code"] == (7 if way == "print" and kind in ("jaw", "longbone") else 0)
+
+
+@pytest.mark.parametrize(("kind", "ways"), FIGURES.items())
+def test_the_figures_of_the_page_reach_what_is_promised(kind: str, ways: dict[str, Any]) -> None:
+    assert list(ways) == list(measure_kinds.WAYS[kind])
+    for way, found in ways.items():
+        off = abs(measure_kinds.volume_error(found))
+        assert off < 0.1 or measure_kinds.said_of(found)
+        if way != "default":
+            assert found["closed"] and off < (0.05 if way == "print" else 0.03 if kind != "hip" else 0.1)
+            assert found["off_voxels"] < 0.3
+
+
+def test_the_page_has_the_figures() -> None:
+    assert marked_tables.find_table(PAGE, "kinds of scan") == measure_kinds.make_table(FIGURES)
+
+
+def test_what_hard_walls_enclose_is_open_at_the_sides_alone() -> None:
+    hard = np.zeros((4, 7, 7), bool)
+    hard[:, 1:6, 1:6] = True
+    hard[:, 2:5, 2:5] = False  # a canal from end to end
+    assert measure_kinds.enclosed_by(hard)[:, 1:6, 1:6].all() and measure_kinds.enclosed_by(hard).sum() == 100
+    hard[2, 3, 5] = False
+    assert np.array_equal(measure_kinds.enclosed_by(hard), hard)
+
+
+def commands_of_the_page() -> list[tuple[str, list[str], int]]:
+    """Title of the section, arguments and exit code of each command."""
+    found = []
+    for section in PAGE.split("\n## ")[1:]:
+        for line in re.findall(r"^    clrecon (.*)$", section, re.MULTILINE):
+            command, _, code = line.partition("# exit ")
+            found.append((section.split("\n")[0], shlex.split(command), int(code or 0)))
+    return found
+
+
+SECTIONS = dict.fromkeys(title for title, _, _ in commands_of_the_page())
+
+
+@pytest.mark.parametrize("title", daily_rows(1, [(title,) for title in reversed(SECTIONS)]))
+def test_the_commands_of_a_section_run(
+    title: str, shared_folder: Path, tmp_path: Path, device: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
+    for _, arguments, code in (row for row in commands_of_the_page() if row[0] == title):
+        if arguments[0] == "phantom":
+            arguments += ["--slices", str(SLICES[arguments[arguments.index("--kind") + 1]])]
+        assert main([*arguments, "-q"]) == code, arguments
+        if "-o" in arguments:
+            assert Path(arguments[arguments.index("-o") + 1]).stat().st_size > 1000
+
+
+def test_the_page_has_a_section_for_each_kind() -> None:
+    made = [
+        arguments[arguments.index("--kind") + 1] for _, arguments, _ in commands_of_the_page() if "--kind" in arguments
+    ]
+    assert sorted(made) == sorted(measure_kinds.WAYS) == sorted(FIGURES) and len(SECTIONS) == len(made)
