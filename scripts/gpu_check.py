@@ -91,7 +91,7 @@ def results(device: Any, volume: Any) -> Iterator[tuple[str, Callable[[], dict[s
         made = clrecon.render(shown, style, size=(256, 256), device=device, **view)
         return {"image": made.image, "depth": made.depth, "values": made.values}
 
-    def cloud_of(kind: str) -> dict[str, Any]:
+    def cloud_of(kind: Any) -> dict[str, Any]:
         cloud = clrecon.extract_points(volume, kind=kind, **band)
         return {"points": cloud.points, "hu": cloud.hu}
 

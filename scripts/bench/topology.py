@@ -15,11 +15,12 @@ __all__ = ["measure_topology"]
 def measure_topology(job: Job) -> dict[str, Any]:
     """Time meshes from host to host with kernels built; the "peer" is the default table, so ratios are below 1."""
     from clrecon.operators.surface.extract import extract_isosurface
+    from clrecon.system.arguments import Topology
 
     volume = job.input.volume()
     meshes: dict[str, Any] = {}
 
-    def run(topology: str) -> float:
+    def run(topology: Topology) -> float:
         start = time.perf_counter()
         meshes[topology] = extract_isosurface(volume, job.hu, device=job.device, topology=topology)
         return time.perf_counter() - start

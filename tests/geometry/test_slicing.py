@@ -11,7 +11,7 @@ import tolerances
 from dicom_series import rotation
 from uneven_volume import positions, uneven
 
-from clrecon import DeviceVolume, LabelMap, Volume, resample_labels
+from clrecon import LabelMap, Volume, resample_labels
 from clrecon.errors import UsageError
 from clrecon.geometry import compose_affine, is_left_handed
 from clrecon.geometry.affine import facts_of_orientation
@@ -193,8 +193,8 @@ def test_labels_of_the_whole_body_go_with_a_thin_part():
     oblique = Volume(np.zeros(SHAPE, np.int16), placed(STEPS, (1.0, 1.0, 3.0)))
     resample_labels(labels, oblique, progress=lambda *call: told.append(call))
     assert told == [("resample", k, 6) for k in range(6)]
-    with pytest.raises(UsageError, match="volume must be a Volume, not DeviceVolume"):
-        resample_labels(labels, object.__new__(DeviceVolume))
+    with pytest.raises(UsageError, match="volume must be a Volume, not LabelMap"):
+        resample_labels(labels, labels)
 
 
 def test_crop_by_the_boxes_of_the_command_line():

@@ -45,7 +45,7 @@ def test_the_mesh_has_no_table(
     assert main(arguments) == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["components"], report["closed"]) == (components, True)
-    assert len(report["warnings"]) == (entry is not None)
+    assert len([words for words in report["warnings"] if "is air now" in words]) == (entry is not None)
     if entry is not None:
         facts = report["volume"][entry]
         assert facts["air_hu"] == pytest.approx(-1000, abs=2)

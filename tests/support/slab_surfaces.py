@@ -10,6 +10,7 @@ from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.slabs import SampleGrid
+from clrecon.system.arguments import Topology
 
 
 def extract_in_slabs(
@@ -18,7 +19,7 @@ def extract_in_slabs(
     device: Any,
     slices: int,
     closed: bool = True,
-    topology: str = "separated",
+    topology: Topology = "separated",
     **options: Any,
 ) -> Any:
     resident = DeviceVolume(volume, device=device)

@@ -19,6 +19,7 @@ from clrecon.jobs.mesh.choices import LabelChoice
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.labels import LabelMap
+from clrecon.labels.statistics import measure_labels
 from clrecon.mesh import Mesh
 from clrecon.operators.points.clusters import Clustering
 from clrecon.operators.points.neighbours import Neighbours
@@ -93,9 +94,10 @@ MESSAGES = {
     "truth of a phantom": phantom_truth(PhantomSettings(kind="sphere", size=(16, 16), slices=16)),
     "mesh look": MeshLook(vertex_colors=np.zeros((2, 3), np.uint8), opacity=0.5),
     "point look": PointLook(radius_mm=0.5, color_by="label"),
+    "figures of a label": measure_labels(Volume(VOXELS, AFFINE), LABELS)[0],
     "listing": SeriesListing([ENTRY], 1, {}, [], {"slices": 4}, RefusedInputError("no")),
 }
-HELD_BY_A_DEVICE = {"DeviceVolume", "Mask", "SurfaceExtractor", "VertebraInside", "VolumeRenderer"}
+HELD_BY_A_DEVICE = {"Device", "DeviceVolume", "Mask", "SurfaceExtractor", "VertebraInside", "VolumeRenderer"}
 """Public classes that are no messages: they own memory of a device."""
 
 
