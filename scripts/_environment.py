@@ -167,8 +167,11 @@ def _make(folder: str, stamp: str, extras: str, compiled: bool, megabytes: int) 
     if made.returncode:
         raise SetupError(f"python -m venv failed:\n{(made.stdout + made.stderr).strip()}")
     target = f"{ROOT}[{extras}]" if extras else ROOT
-    command = [program_path(folder, "python"), "-m", "pip", "install", "--disable-pip-version-check", "--no-input"]
-    command += ["--progress-bar", "off", *([] if compiled else ["--no-compile"]), "--editable", target]
+    pip = [program_path(folder, "python"), "-m", "pip", "install", "--disable-pip-version-check", "--no-input"]
+    # The pip that comes with Python 3.11 chooses versions in 39 s of the processor, pip 26 in 15.  Where there is no
+    # newer one to be had, the old one does it.
+    subprocess.run([*pip, "--quiet", "--retries", "0", "--upgrade", "pip"], capture_output=True)
+    command = [*pip, "--progress-bar", "off", *([] if compiled else ["--no-compile"]), "--editable", target]
     log = os.path.join(folder, _LOG)
     code = _run_logged(command, log, folder, megabytes)
     if code:
