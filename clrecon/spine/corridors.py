@@ -8,7 +8,7 @@ zero.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.labels import LabelMap
 from clrecon.labels.resample import resample_labels
 from clrecon.spine.frame import VertebraFrame, find_frame
-from clrecon.spine.measures import Bias, canal_wall, find_exit, line_angles, margins, measure_bias
+from clrecon.spine.measures import Bias, canal_wall, find_exit, line_angles, margins, measure_bias, segment_offsets
 from clrecon.spine.solid_bone import SolidBone, fill_vertebra
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
@@ -60,6 +60,9 @@ EVENNESS = 0.02
 
 QUICK_OFF_MM = 1.0
 """Quick distances are right to this much."""
+
+BESIDE_KNOWN_MM = 2.0
+"""Lines this near to those of the coarse search are judged by the points of the surface beside these."""
 
 THIN_MM = 0.8
 """Side of the cells of which one point of the surface each is taken, until the last step."""
@@ -116,18 +119,30 @@ def line_points(lines: Float64Array, span: Span) -> Float64Array:
     return np.asarray(start[:, None] + way[None, :, None] * direction[:, None])
 
 
+def _least_and_mean(depth: Depth, lines: Float64Array, span: Span) -> tuple[Float64Array, Float64Array]:
+    """Return the least depth of lines (n, 4), and the mean."""
+    points = line_points(lines, span)
+    found = depth(points.reshape(-1, 3)).reshape(points.shape[:2])
+    return found.min(axis=1), found.mean(axis=1)
+
+
 def segment_distances(first: Float64Array, last: Float64Array, points: Float64Array) -> Float64Array:
     """Return the least distance (n,) of segments between ends (n, 3) from points (m, 3); infinite without points."""
-    least = np.full(len(first), np.inf)
     if not len(points):
-        return least
+        return np.full(len(first), np.inf)
+    squares = [part.min(axis=1) for part in _pair_squares(first, last, points)]
+    return np.sqrt(np.maximum(np.concatenate(squares), 0.0), dtype=np.float64)
+
+
+def _pair_squares(first: Float64Array, last: Float64Array, points: Float64Array) -> Iterator[NDArray[np.float32]]:
+    """Yield the squared distances (k, m) of the segments, some at a time, from points (m, 3), of which there is one."""
     middle = points.mean(axis=0)
     rows = points - middle
     ones = np.ones(len(rows))
     # float32 is right to 0.001 mm for coordinates of some centimetres about the middle
     table = np.stack((*rows.T, ones, np.einsum("ij,ij->i", rows, rows))).astype(np.float32)
     step = max(1, AT_ONCE // len(points))
-    for start in range(0, len(first), step):
+    for start in range(0, max(len(first), 1), step):
         one, other = first[start : start + step] - middle, last[start : start + step] - middle
         length = np.linalg.norm(other - one, axis=1)
         unit = (other - one) / np.maximum(length, 1e-9)[:, None]
@@ -143,35 +158,50 @@ def segment_distances(first: Float64Array, last: Float64Array, points: Float64Ar
         along -= held
         along *= held
         square -= along
-        least[start : start + step] = np.sqrt(np.maximum(square.min(axis=1), 0.0))
-    return least
+        yield square
 
 
 @dataclass(frozen=True)
-class _Judge:
-    """Scores of lines on one side, by quick distances and by points (n, 3) of the surface, mm in the frame."""
+class LineJudge:
+    """Scores of lines on one side, by quick distances and by points (n, 3) of the surface, mm in the frame.
+
+    walls: The points within `reach` mm of known lines, whose ends (n, 6) `known` finds.
+    """
 
     depth: Depth
     surface: Float64Array
     span: Span
+    walls: Float64Array
+    reach: float
+    known: Any
 
-    def quick(self, lines: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Return the least depth of lines (n, 4), and the mean."""
-        points = line_points(lines, self.span)
-        found = self.depth(points.reshape(-1, 3)).reshape(points.shape[:2])
-        return found.min(axis=1), found.mean(axis=1)
+    @classmethod
+    def beside(cls, lines: Float64Array, reach: float, depth: Depth, surface: Float64Array, span: Span) -> LineJudge:
+        """Make the judge of lines (n, 4) and of those beside them."""
+        from scipy.spatial import cKDTree
+
+        ways = line_points(lines, span)
+        first, last = ways[:, 0], ways[:, -1]
+        square = np.min([part.min(axis=0) for part in _pair_squares(first, last, surface)], axis=0)
+        return cls(depth, surface, span, surface[square <= reach**2], reach, cKDTree(np.hstack((first, last))))
 
     def radius(self, lines: Float64Array) -> Float64Array:
         """Return the least distance of lines (n, 4) from the points of the surface."""
         points = line_points(lines, self.span)
-        return segment_distances(points[:, 0], points[:, -1], self.surface)
+        first, last = points[:, 0], points[:, -1]
+        least = segment_distances(first, last, self.walls)
+        # no point of a line is farther from one that is known than its ends are, and all else is farther than `reach`
+        aside, _ = self.known.query(np.hstack((first, last)))
+        unsure = least > self.reach - aside - 0.01
+        least[unsure] = segment_distances(first[unsure], last[unsure], self.surface)
+        return least
 
     def score(self, lines: Float64Array, above: Float64Array | None = None) -> Float64Array:
         """Return what is made largest: the radius with a little of the mean; below 0 for lines that leave the bone.
 
         So it is for those that by their quick distance do not score `above` some others (n,).
         """
-        least, mean = self.quick(lines)
+        least, mean = _least_and_mean(self.depth, lines, self.span)
         score = np.minimum(least, 0.0) - 1.0
         hopeful = least > (0.0 if above is None else np.maximum(above - QUICK_OFF_MM, 0.0))
         score[hopeful] = self.radius(lines[hopeful]) + EVENNESS * mean[hopeful]
@@ -213,16 +243,20 @@ def find_line(depth: Depth, surface: Float64Array, frame: VertebraFrame, side: f
     if not len(places):
         return None, span
     near = (surface[:, 1] > tip - REACH_MM) & (surface[:, 1] < back + REACH_MM)
-    judge, last = _Judge(depth, _thin(surface[near]), span), _Judge(depth, surface[near], span)
     medial = np.arange(MEDIAL_DEG[0], MEDIAL_DEG[1] + 0.1, COARSE_DEG)
     sagittal = np.arange(SAGITTAL_DEG[0], SAGITTAL_DEG[1] + 0.1, COARSE_DEG)
     turns = np.stack([part.ravel() for part in np.meshgrid(medial, sagittal, indexing="ij")], axis=1)
     lines = np.hstack((np.repeat(places, len(turns), axis=0), np.tile(turns, (len(places), 1))))
-    score = np.concatenate([judge.quick(part)[0] for part in np.array_split(lines, len(lines) // 5000 + 1)])
+    parts = np.array_split(lines, len(lines) // 5000 + 1)
+    score = np.concatenate([_least_and_mean(depth, part, span)[0] for part in parts])
     order = np.argsort(score)[::-1]
     chosen = order[:KEPT][score[order[:KEPT]] > 0.0]
     if not len(chosen):
         return None, span
+    reach = float(score[order[0]]) + QUICK_OFF_MM + BESIDE_KNOWN_MM
+    judge, last = (
+        LineJudge.beside(lines[chosen], reach, depth, points, span) for points in (_thin(surface[near]), surface[near])
+    )
     free = np.ones(4, dtype=bool)
     best, top, tried = _refine(judge, lines[chosen], free)
     winner = best[int(top.argmax())]
@@ -250,7 +284,7 @@ def find_line(depth: Depth, surface: Float64Array, frame: VertebraFrame, side: f
 
 
 def _refine(
-    judge: _Judge, lines: Float64Array, free: NDArray[np.bool_], steps: tuple[tuple[float, float], ...] = FINE_STEPS
+    judge: LineJudge, lines: Float64Array, free: NDArray[np.bool_], steps: tuple[tuple[float, float], ...] = FINE_STEPS
 ) -> tuple[Float64Array, Float64Array, int]:
     """Move lines (n, 4) to higher scores (n,), together, in ever finer steps of `free` columns; count those judged."""
     lines = lines.copy()
@@ -393,7 +427,7 @@ def measure_corridors(volume: Volume, labels: NDArray[Any], number: int, level: 
     found = []
     for side, sign in SIDES.items():
         line, span = find_line(lambda points: bone.quick_depth(frame.to_lps(points)), surface, frame, sign)
-        found.append(_measure(bone, frame, surface, wall, side, line, span, name))
+        found.append(_measure(bone, frame, surface, wall, side, line, span))
     return VertebraCorridors(name, bone, frame, tuple(found), tuple(warnings))
 
 
@@ -412,15 +446,9 @@ def _judge_cut(bone: SolidBone, frame: VertebraFrame, name: str) -> list[str]:
 
 
 def _measure(
-    bone: SolidBone,
-    frame: VertebraFrame,
-    surface: Float64Array,
-    wall: Float64Array,
-    side: str,
-    line: Line | None,
+    bone: SolidBone, frame: VertebraFrame, surface: Float64Array, wall: Float64Array, side: str, line: Line | None,
     span: Span,
-    name: str,
-) -> Corridor:
+) -> Corridor:  # fmt: skip
     """Measure a line, or say why there is no corridor."""
     if line is None:
         return Corridor(
@@ -451,46 +479,20 @@ def _measure(
     pass_point = first + (span.back - span.pass_y) / (span.back - span.tip) * way
     medial, sagittal = line_angles(way, span.side)
     medial_lps, sagittal_lps = line_angles(lps, span.side)
+    canal = float(np.linalg.norm(segment_offsets(wall, first, last)[0], axis=1).min()) if len(wall) else None
     return Corridor(
-        side,
-        None,
-        line.radius,
-        exit_point,
-        start,
-        frame.to_lps(pass_point[None])[0],
-        tip,
-        float(np.linalg.norm(tip - exit_point)),
-        medial,
-        sagittal,
-        medial_lps,
-        sagittal_lps,
-        line.medial_range,
-        line.sagittal_range,
-        margins(surface, first, last, span.side),
-        _distance(wall, first, last),
-        measure_bias(bone, frame, first, middle),
-        by_hu,
-        voxels,
-        line.tried,
-    )
-
-
-def _distance(points: Float64Array, first: Float64Array, last: Float64Array) -> float | None:
-    """Return the least distance of a segment from points, None without any."""
-    if not len(points):
-        return None
-    way = last - first
-    share = np.clip((points - first) @ way / (way @ way), 0.0, 1.0)
-    return float(np.linalg.norm(points - first - share[:, None] * way, axis=1).min())
+        side, None, line.radius, exit_point, start, frame.to_lps(pass_point[None])[0], tip,
+        float(np.linalg.norm(tip - exit_point)), medial, sagittal, medial_lps, sagittal_lps, line.medial_range,
+        line.sagittal_range, margins(surface, first, last, span.side), canal,
+        measure_bias(bone, frame, first, middle), by_hu, voxels, line.tried,
+    )  # fmt: skip
 
 
 def _walls(
     bone: SolidBone, frame: VertebraFrame, surface: Float64Array, first: Float64Array, last: Float64Array, radius: float
 ) -> tuple[float, float, float]:
     """Return the distance of the nearest wall, its width in voxels, and the share of the walls that HU place."""
-    way = last - first
-    share = np.clip((surface - first) @ way / (way @ way), 0.0, 1.0)
-    offsets = surface - first - share[:, None] * way
+    offsets, _ = segment_offsets(surface, first, last)
     distance = np.linalg.norm(offsets, axis=1)
     nearest = int(distance.argmin())
     across = (offsets[nearest] / distance[nearest]) @ frame.axes

@@ -68,14 +68,18 @@ def sector_names(offsets: Float64Array, direction: Float64Array, side: float) ->
     return np.asarray(shares.argmax(axis=1), dtype=np.intp)
 
 
+def segment_offsets(points: Float64Array, first: Float64Array, last: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Return offsets of points (n, 3) from the nearest ones of a segment, and where on it, 0 to 1, these lie (n,)."""
+    way = last - first
+    share = np.clip((points - first) @ way / (way @ way), 0.0, 1.0)
+    return points - first - share[:, None] * way, share
+
+
 def margins(surface: Float64Array, first: Float64Array, last: Float64Array, side: float) -> dict[str, float | None]:
     """Return a segment's least distance from points (n, 3) in the frame in each quarter, mm; None where none lies."""
-    way = last - first
-    share = np.clip((surface - first) @ way / (way @ way), 0.0, 1.0)
-    offsets = surface - first - share[:, None] * way
-    beside = (share > 0.0) & (share < 1.0)
-    offsets = offsets[beside]
-    distance, sector = np.linalg.norm(offsets, axis=1), sector_names(offsets, way, side)
+    offsets, share = segment_offsets(surface, first, last)
+    offsets = offsets[(share > 0.0) & (share < 1.0)]
+    distance, sector = np.linalg.norm(offsets, axis=1), sector_names(offsets, last - first, side)
     found: dict[str, float | None] = {}
     for number, name in enumerate(DIRECTIONS):
         own = distance[sector == number]

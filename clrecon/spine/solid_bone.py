@@ -213,13 +213,9 @@ def fill_vertebra(volume: Volume, labels: NDArray[Any], number: int, level: floa
 
 
 def _sample(
-    volume: Volume,
-    start: NDArray[Any],
-    voxels: NDArray[np.float32],
-    parts: tuple[NDArray[np.bool_], ...],
-    lattice: Lattice,
-    level: float,
-) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
+    volume: Volume, start: NDArray[Any], voxels: NDArray[np.float32], parts: tuple[NDArray[np.bool_], ...],
+    lattice: Lattice, level: float,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:  # fmt: skip
     """Resample HU and label, plane by plane, and decide which points of the lattice are solid.
 
     `parts` are the voxels of the label, its own, the solid ones, and those that are filled and not dense.

@@ -14,8 +14,11 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.labels import LabelMap
 from clrecon.spine.corridors import (
     BODY_SHARE,
+    LineJudge,
+    Span,
     _walls,
     find_corridors,
+    line_points,
     measure_corridors,
     screw_diameter,
     segment_distances,
@@ -165,6 +168,23 @@ def test_distances_of_segments_are_those_of_their_nearest_points() -> None:
         ((4.0, 0.0, 2.0), (2.0, 2.0, np.hypot(1, 2))),
     ):
         np.testing.assert_allclose(segment_distances(*ends, np.array([point])), wanted, atol=1e-5)
+
+
+def test_the_radius_of_a_line_is_its_distance_from_all_points_of_the_surface() -> None:
+    generator = np.random.default_rng(5)
+    surface = generator.uniform(-25.0, 25.0, (3000, 3))
+    surface = surface[np.hypot(surface[:, 0], surface[:, 2]) > 3.0]
+    span = Span(1.0, 20.0, -20.0, 0.0)
+    known = np.zeros((3, 4))
+    known[:, 0] = (-0.5, 0.0, 0.5)
+    judge = LineJudge.beside(known, 5.0, lambda points: points[:, 0], surface, span)
+    lines = np.concatenate([generator.normal(0.0, spread, (60, 4)) for spread in (0.3, 1.0, 8.0)])
+    ends = line_points(lines, span)[:, [0, -1]].transpose(1, 0, 2)
+    radii = judge.radius(lines)
+    np.testing.assert_allclose(radii, segment_distances(*ends, surface), atol=1e-3)
+    beside = segment_distances(*ends, judge.walls)
+    assert len(judge.walls) < len(surface) / 4
+    assert (beside - radii > 0.1).any() and (np.abs(beside - radii)[:60] < 1e-3).all()
 
 
 @pytest.mark.parametrize(
