@@ -30,6 +30,11 @@ from clrecon.system.light_dataclass import dataclass
 from clrecon.system.memory import find_mapping
 
 
+def may_change(array: NDArray[Any]) -> bool:
+    """True where an array, or one whose memory it shows, can be written."""
+    return array.flags.writeable or (isinstance(array.base, np.ndarray) and may_change(array.base))
+
+
 class Grid(Message):
     """Voxels (nk, nj, ni) and their affine, checked by the subclass, which becomes read-only: index (i, j, k) to LPS
     mm.
@@ -270,7 +275,7 @@ class BaseVolume(Grid):
     @property
     def hu_range(self) -> tuple[float, float] | None:
         """Lowest and highest finite value, None where no value is finite; searched anew where voxels can be written."""
-        if self._hu_range is None or self._voxels.flags.writeable:
+        if self._hu_range is None or may_change(self._voxels):
             self._hu_range = _value_range(self._voxels)
         return self._hu_range
 

@@ -230,6 +230,10 @@ class Volume(BaseVolume, ShownAsHtml):
         return make_image_data(image_of(self, resample, "to_pyvista"))
 
     @classmethod
+    def _of(cls: type[Own], *taken: Any) -> Own:
+        return cls(*taken)
+
+    @classmethod
     @explains_arguments
     def from_pyvista(cls: type[Own], image: Any, name: str | None = None, space: Space | None = None) -> Own:
         """Make a volume of a ``pyvista.ImageData``, or ``vtkImageData``; its voxels are a copy.
@@ -252,7 +256,7 @@ class Volume(BaseVolume, ShownAsHtml):
         """
         from clrecon.geometry.vtk import take_image_data
 
-        return cls(*take_image_data(image, name, space))
+        return cls._of(*take_image_data(image, name, space))
 
     @explains_arguments
     def to_sitk(self, resample: bool = False) -> Any:
@@ -286,7 +290,7 @@ class Volume(BaseVolume, ShownAsHtml):
         UsageError
             It is no image of three axes with one real number a voxel, or SimpleITK is not installed.
         """
-        return cls(*take_sitk(image))
+        return cls._of(*take_sitk(image))
 
     @explains_arguments
     def to_nibabel(self, resample: bool = False) -> Any:
@@ -322,7 +326,7 @@ class Volume(BaseVolume, ShownAsHtml):
             It is no image of three axes with one real number a voxel, does not say where it lies, or nibabel is not
             installed.
         """
-        return cls(*take_nibabel(image))
+        return cls._of(*take_nibabel(image))
 
     @explains_arguments
     def show(self, iso_value: float | None = None, *, device: Any = None) -> None:

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import Grid, Volume
 from clrecon.geometry.affine import checked_affine
+from clrecon.geometry.grid import may_change
 from clrecon.geometry.images import Image, make_nibabel, make_sitk, place_in_header, take_nibabel, take_sitk
 from clrecon.geometry.resample import LARGEST_SHEAR_DEGREES, shear_degrees
 from clrecon.system.arguments import Space, explains_arguments
@@ -464,7 +465,7 @@ def _checked_voxels(voxels: ArrayLike) -> NDArray[Any]:
     if low < 0 or high > LARGEST_NUMBER:
         raise UsageError(f"labels run from 0 to {LARGEST_NUMBER:,}, these from {low:,} to {high:,}")
     made = np.ascontiguousarray(array, dtype=np.uint8 if array.dtype.itemsize == 1 else np.uint16)
-    if made.flags.writeable:
+    if may_change(made):
         made = made.copy() if np.shares_memory(made, voxels if isinstance(voxels, np.ndarray) else array) else made
         made.flags.writeable = False
     return made

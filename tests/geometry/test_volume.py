@@ -147,9 +147,12 @@ def test_the_range_of_values_leaves_out_what_is_no_number():
     assert Volume(voxels, np.eye(4)).hu_range == (7.5, 7.5)
 
 
-def test_the_range_of_values_follows_an_array_that_changes():
+@pytest.mark.parametrize("shown", ["itself", "read-only view"])
+def test_the_range_of_values_follows_an_array_that_changes(shown):
     voxels = np.zeros((2, 3, 4), np.int16)
-    volume = Volume(voxels, OBLIQUE)
+    given = voxels.view()
+    given.flags.writeable = shown == "itself"
+    volume = Volume(given, OBLIQUE)
     assert volume.hu_range == (0.0, 0.0)
     voxels[1, 2, 3] = 700
     assert volume.hu_range == (0.0, 700.0)

@@ -30,7 +30,7 @@ INNER = {
 }  # fmt: skip
 """Methods of public classes for clrecon's own modules."""
 WITH_METHODS = {
-    "Camera", "Clip", "LabelMap", "Mask", "Mesh", "PointCloud", "Rendering", "SurfaceExtractor", "TransferFunction",
+    "Camera", "Clip", "DeviceVolume", "LabelMap", "Mask", "Mesh", "PointCloud", "Rendering", "SurfaceExtractor", "TransferFunction",
     "Volume", "VolumeRenderer",
 }  # fmt: skip
 FREE = {"memory", "progress", "report", "trusted"}
@@ -48,6 +48,7 @@ def things() -> dict[str, Any]:
     volume = clrecon.Volume(ball, np.diag([1.0, 1.0, 1.5, 1.0]))
     return {
         "Volume": volume,
+        "DeviceVolume": clrecon.DeviceVolume(volume),
         "LabelMap": clrecon.LabelMap((ball > 0).astype(np.uint8), volume.affine, {1: "bone"}),
         "Mesh": clrecon.extract_isosurface(volume, 200),
         "PointCloud": clrecon.extract_points(volume, hu=(200, 3000)),

@@ -139,9 +139,12 @@ def test_files_that_are_no_label_maps_are_refused(tmp_path):
         read_labels(tmp_path / "a.nii", wrong)
 
 
-def test_a_map_knows_its_labels_whatever_becomes_of_the_array_it_was_made_from():
+@pytest.mark.parametrize("shown", ["itself", "read-only view"])
+def test_a_map_knows_its_labels_whatever_becomes_of_the_array_it_was_made_from(shown):
     array = make_labels(numbers=(0, 2, 5, 7, 8, 11)).astype(np.uint8)
-    made = LabelMap(array, OBLIQUE)
+    given = array.view()
+    given.flags.writeable = shown == "itself"
+    made = LabelMap(given, OBLIQUE)
     before = dict(made.counts)
     array[:] = 3
     assert made.counts == before and 3 not in np.unique(made.voxels)

@@ -209,7 +209,7 @@ def composite_slab(
     if labels is not None and style is not None:
         variants |= {"LABELS": "1", **label_variants(labels.voxels.dtype)}
         label_tables = {
-            "labels": slab_labels(resident, slab, labels, stopwatch),
+            "labels": slab_labels(resident, slab, labels, stopwatch, grown=True),
             "label_colors": upload(device, style.table),
         }
     shortened: dict[str, Any] = {}

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels import ResampledLabels
-from clrecon.opencl import Stopwatch, allocate, check_budget, download, kernel_constant, launch, upload
+from clrecon.labels.label_bodies import Growth
+from clrecon.opencl import Stopwatch, allocate, check_budget, download, kernel_constant, launch, load_program, upload
 from clrecon.operators.rays.picture_buffers import PictureBuffers, Pixels, Shot
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.operators.resident.tables import BOX_BORDER, enclose
+from clrecon.operators.resident.tables import BOX_BORDER, enclose, label_variants, voxel_variants
 from clrecon.rendering import Rendering
 from clrecon.rendering.pictures.label_style import LabelStyle
 from clrecon.rendering.views.camera import Camera
@@ -35,6 +36,9 @@ def choose_brick_cells(volume: Volume) -> tuple[int, int, int]:
     across = dk / max(di, dj)
     return BRICK_CELLS, BRICK_CELLS, 1 if across >= 3.0 else 2 if across >= 1.5 else BRICK_CELLS
 
+
+GROWN = 2
+"""Voxels by which labels grow in volume rendering: a mask ends up to one before the bone, whose flank is one more."""
 
 OVERLAP = 2
 """Slices that a slab holds beyond its own at either side; cells and gradients at its ends read them."""
@@ -144,7 +148,7 @@ def plan_ray_slabs(
         held = nk if slices >= nk else slices + 2 * OVERLAP + 1
         shape = max(2, ni), max(2, nj), max(2, held)
         bricks, samples = math.prod(-(-n // c) for n, c in zip(shape, cells, strict=True)), math.prod(shape)
-        beside = {} if labels is None else {"labels": samples * labels.voxels.itemsize}
+        beside = {} if labels is None else {"labels": 2 * samples * labels.voxels.itemsize}  # they grow
         rest = {} if slices >= nk else extra
         return {"volume": samples * size, "bricks": bricks * (2 * size + 4), **beside, **others, **rest}
 
@@ -181,17 +185,36 @@ def ray_slabs(resident: DeviceVolume, slices: int, entry_k: float, stopwatch: St
         resident.volume.release_slices(first, end)
 
 
-def slab_labels(resident: DeviceVolume, slab: RaySlab, labels: ResampledLabels, stopwatch: Stopwatch) -> Any:
-    """Return the labels of a slab's voxels on the device; those of a whole volume stay there."""
+def slab_labels(
+    resident: DeviceVolume, slab: RaySlab, labels: ResampledLabels, stopwatch: Stopwatch, grown: bool = False
+) -> Any:
+    """Return the labels of a slab's voxels on the device, grown by `GROWN` voxels if asked; those of a whole volume stay."""
 
     def make() -> Any:
         with stopwatch.timed("upload"):
-            return upload(resident.device, pad_slices(labels.voxels[slab.first_k : slab.end_k]))
+            made_d = upload(resident.device, pad_slices(labels.voxels[slab.first_k : slab.end_k]))
+        for _ in range(GROWN if grown else 0):
+            made_d = _grow(resident, slab, made_d, labels.voxels.dtype)
+        return made_d
 
     if not slab.is_whole:
         return make()
     # The labels are kept too, so that no other array can get their address in the meantime.
-    return resident.keep(_LABELS, id(labels), labels.voxels.nbytes, lambda: (labels, make()))[1]
+    return resident.keep(_LABELS, (id(labels), grown), labels.voxels.nbytes, lambda: (labels, make()))[1]
+
+
+def _grow(resident: DeviceVolume, slab: RaySlab, labels_d: Any, dtype: np.dtype[Any]) -> Any:
+    """Return labels of a slab in which voxels without one have that of the nearest of the voxels around them."""
+    device, (ni, nj, nk) = resident.device, slab.shape_ijk
+    near = Growth.of(resident.volume, None).table
+    made_d = allocate(device, ni * nj * nk * dtype.itemsize)
+    own = load_program(device, "surface/labels.cl", {**voxel_variants(resident.dtype), **label_variants(dtype)})
+    lowest = -np.inf if resident.dtype.kind == "f" else np.iinfo(resident.dtype).min
+    launch(
+        device, own["own_samples"], ni * nj * nk, voxels=slab.voxels_d, labels=labels_d,
+        near=upload(device, near), inside=made_d, level=lowest, ni=ni, nj=nj, nk=nk, offsets=len(near),
+    )  # fmt: skip
+    return made_d
 
 
 def _whole_slab(resident: DeviceVolume, stopwatch: Stopwatch) -> RaySlab:

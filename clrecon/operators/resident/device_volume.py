@@ -227,6 +227,10 @@ class DeviceVolume(Closing, Volume):
         """Table of the places of the slices, on the device."""
         return self.keep("places of the slices", None, 0, lambda: StackTable.of(self.volume, self.device))
 
+    @classmethod
+    def _of(cls, *taken: Any) -> DeviceVolume:
+        return cls(Volume(*taken))
+
     def program(self, name: str, **variants: str) -> Program:
         """Build a kernel file that samples this volume along rays."""
         own = {"UNEVEN": "1"} if self.volume.uneven else {}

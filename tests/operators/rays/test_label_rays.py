@@ -12,11 +12,12 @@ from ray_scenes import STEPS, centre_of, look, make_volume, positions, premultip
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.operators.rays.picture_buffers import Shot
+from clrecon.operators.rays.ray_pictures import take_picture
 from clrecon.operators.rays.surface_pictures import cast_surface
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.proof.surface.labels import find_solid
-from clrecon.rendering import Lighting, Rendering
-from clrecon.rendering.pictures.styles import SurfaceLook
+from clrecon.rendering import Lighting, Rendering, TransferFunction
+from clrecon.rendering.pictures.styles import SurfaceLook, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 
@@ -205,3 +206,24 @@ def test_the_label_of_a_hit_is_that_of_meshes(device, grid):
     assert clear.sum() > 200
     np.testing.assert_allclose(found.image[hit][clear, :3], expected[clear], atol=1)
     assert (inside[k, j, i] > 0).mean() > 0.98  # 2 % of the voxels have no labelled one around them
+
+
+@pytest.mark.parametrize("grid", ["even", "oblique"])
+def test_volume_rendering_leaves_no_fringe_around_a_label(device, grid):
+    """A mask that ends a voxel before the bone, in the whole volume and in slabs."""
+    volume = make_volume(lambda p: 300.0 + 60.0 * (8.0 - np.linalg.norm(p, axis=-1)), grid, 26.0, np.int16)
+    ball = (np.linalg.norm(positions(volume), axis=-1) < 7.0).astype(np.uint8)
+    bone = TransferFunction([(299.0, 1, 1, 1, 0.0), (301.0, 1, 1, 1, 0.6), (2000.0, 1, 1, 1, 0.6)])
+    labels = LabelMap(ball, volume.affine)
+    style = VolumeLook(bone, lighting=UNLIT, labels=labels, label_colors={1: "red"})
+    shot = Shot(look(volume, (0.3, 1.0, 0.2), 10.0), SIZE)
+    memory = 44 * SIZE[0] * SIZE[1] + volume.voxels.nbytes
+    whole, parts = (
+        take_picture(DeviceVolume(volume, device=device, memory=limit), style, shot, 0.3) for limit in (None, memory)
+    )
+    color, opacity = premultiplied(whole.image)[..., :3], whole.image[..., 3:] / 255.0
+    seen = opacity[..., 0] > 0.3
+    assert seen.sum() > 200 and parts.report["slabs"] > 2
+    expected = np.broadcast_to((255.0, 51.0, 51.0), (seen.sum(), 3))  # 0.8 of red, 0.2 of the picture's white
+    np.testing.assert_allclose(color[seen] / opacity[seen], expected, atol=4)
+    assert np.abs(premultiplied(parts.image) - premultiplied(whole.image)).max() <= tolerances.RAY_SAME_255

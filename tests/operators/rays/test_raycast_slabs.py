@@ -54,7 +54,7 @@ def test_a_slab_needs_its_slices_with_two_before_and_three_behind(monkeypatch, l
     for slices, held, rest in ((3, 8, {"rays": 13}), (19, 24, {"rays": 13}), (20, 20, {})):
         assert asked["needs"](slices) == {
             "volume": 2 * ni * nj * held,
-            "labels": 2 * ni * nj * held,
+            "labels": 4 * ni * nj * held,
             "bricks": 8 * bricks * -(-held // BRICK_CELLS),
             "picture": 11,
             **rest,

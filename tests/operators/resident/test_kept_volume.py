@@ -42,6 +42,16 @@ def test_a_kept_volume_is_a_volume_for_what_takes_one(name: str, volume, device)
 
 
 @pytest.mark.first_device
+@pytest.mark.parametrize("library", ["sitk", "nibabel", "pyvista"])
+def test_a_kept_volume_is_made_of_an_image_of_another_library(library: str, volume) -> None:
+    pytest.importorskip({"sitk": "SimpleITK"}.get(library, library))
+    image = getattr(clrecon.Volume(volume.voxels, np.diag([0.5, 1, 2, 1])), f"to_{library}")()
+    made, plain = (getattr(kind, f"from_{library}")(image) for kind in (DeviceVolume, clrecon.Volume))
+    assert isinstance(made, DeviceVolume) and np.array_equal(made.affine, plain.affine)
+    assert np.array_equal(made.voxels, volume.voxels)
+
+
+@pytest.mark.first_device
 def test_parts_of_a_kept_volume_are_kept_on_its_device(volume, labels, device, tmp_path) -> None:
     kept = DeviceVolume(volume, device=device, memory=2**28)
     part = kept[4:16]
