@@ -16,7 +16,7 @@ from clrecon.system.light_dataclass import dataclass
 GHOST_SHARE = 0.75
 """A slice is a ghost where its likeness to both neighbours is below this share of their likeness to each other."""
 
-WITHIN_SHARE = 0.45
+WITHIN_SHARE = 0.42
 """And where less than this share of its voxels lies within one of them, or of one of them within it, beyond chance: a
 disc between two vertebrae is unlike both, but 89 % of it lies within one, and the base of a skull holds 61 % of one."""
 

@@ -44,6 +44,9 @@ class Steps:
 DEFAULT_SECONDS = 600.0
 """Far above any launch: a kernel of clrecon takes seconds at most, on a slow CPU with a large scan a minute."""
 
+NO_LIMIT = 1e9
+"""Thirty years, and more than a system can wait for."""
+
 _seconds = DEFAULT_SECONDS
 
 
@@ -56,7 +59,7 @@ def check_time_limit(seconds: float) -> float:
     """Return the seconds of a time limit, infinite for 0."""
     if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not seconds >= 0.0:
         raise UsageError(f"a time limit is a number of seconds, 0 for none, not {seconds!r}")
-    return float(seconds) or math.inf
+    return float(seconds) if 0.0 < seconds < NO_LIMIT else math.inf
 
 
 @contextmanager

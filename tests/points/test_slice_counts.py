@@ -31,7 +31,7 @@ def test_figures_of_five_slices() -> None:
             }
         ],
         "ghost_share": 0.75,
-        "within_share": 0.45,
+        "within_share": 0.42,
         "least_share_of_others": 2.0,
     }
 
@@ -48,8 +48,8 @@ def test_a_ghost_has_less_than_three_quarters(common: int) -> None:
     assert found.slices == ((1,) if common == 5 else ())
 
 
-@pytest.mark.parametrize("alike", [(72, 0), (0, 72), (73, 0), (0, 73)])
-def test_less_than_045_of_a_ghost_lies_within_a_neighbour(alike: tuple[int, int]) -> None:
-    """0.72 and 0.73 of its voxels, where chance is 0.5: 0.44 and 0.46."""
+@pytest.mark.parametrize("alike", [(70, 0), (0, 70), (72, 0), (0, 72)])
+def test_less_than_042_of_a_ghost_lies_within_a_neighbour(alike: tuple[int, int]) -> None:
+    """0.70 and 0.72 of its voxels, where chance is 0.5: 0.40 and 0.44, as a clean phantom of 5 mm has."""
     found = judge_slices(np.array([[100, 100, 100], [*alike, 0], [100, 0, 0]]), 200, (0.0, 1.0))
-    assert found.slices == ((1,) if max(alike) == 72 else ())
+    assert found.slices == ((1,) if max(alike) == 70 else ())

@@ -135,6 +135,8 @@ def cluster_points(
         if not cloud.has_ijk:
             return _cluster_free(cloud, eps, min_samples, volume, device, memory, tell)
         return _cluster_cloud(cloud, eps, min_samples, volume, device, memory)
+    if not isinstance(cloud, Volume):
+        raise TypeError(type(cloud))
     if hu is None or volume is not None:
         raise UsageError(f"clusters of a volume need {name_parameter('hu', 'LO,HI')} and no other volume")
     band = checked_band(hu)

@@ -188,7 +188,7 @@ def ray_slabs(resident: DeviceVolume, slices: int, entry_k: float, stopwatch: St
 def slab_labels(
     resident: DeviceVolume, slab: RaySlab, labels: ResampledLabels, stopwatch: Stopwatch, grown: bool = False
 ) -> Any:
-    """Return the labels of a slab's voxels on the device, grown by `GROWN` voxels if asked; those of a whole volume stay."""
+    """Return the labels of a slab's voxels on the device, grown by `GROWN` voxels or not; those of a whole one stay."""
 
     def make() -> Any:
         with stopwatch.timed("upload"):

@@ -147,7 +147,7 @@ PRESETS: dict[str, Preset] = {
         ),
         _preset(
             "vessels",
-            "vessels and organs with contrast medium in red, bone paler behind them",
+            "vessels and organs with contrast medium in red, bone paler behind them; a table shows too",
             [
                 (120.0, _BLOOD, 0.0),
                 (170.0, (0.66, 0.10, 0.08), 0.04),
