@@ -291,7 +291,6 @@ def add_device(container: argparse._ActionsContainer, computes: bool = True, mem
 
 
 def _parse_seconds(text: str) -> float:
-    """Read the seconds of a time limit."""
     try:
         check_time_limit(float(text))
     except ValueError as error:

@@ -94,7 +94,6 @@ def describe_report(report: dict[str, Any]) -> list[str]:
 
 
 def _name_files(report: dict[str, Any], output: str | None, picture: str | None) -> list[tuple[str, int]]:
-    """Return the path and the size of each picture and mesh."""
     from clrecon.jobs.outputs import name_outputs
 
     files = []

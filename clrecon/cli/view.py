@@ -107,7 +107,6 @@ def _check_faces(options: argparse.Namespace) -> None:
 
 
 def _show(options: argparse.Namespace, console: Console) -> int:
-    """Show a window until it is closed."""
     from clrecon.system.display import DisplayProbe, NoDisplayError
 
     warnings: list[str] = []

@@ -59,7 +59,6 @@ def _origin(content: Content) -> np.ndarray:
 
 
 def _positions(content: Content) -> np.ndarray:
-    """Return the vertices of the buffer, float32."""
     vertices = content.vertices - _origin(content) if content.is_double else content.vertices
     return np.ascontiguousarray(vertices, dtype="<f4")
 
@@ -240,7 +239,6 @@ def read_mesh(path: Path) -> RawMesh:
 
 
 def _split(data: bytes, name: str) -> _File:
-    """Return the document and the binary chunk."""
     if data[:4] != b"glTF" or len(data) < 20:
         raise RefusedInputError(f"{name} is no GLB file: it does not begin with the mark of one")
     version, length, text_length = (int.from_bytes(data[at : at + 4], "little") for at in (4, 8, 12))

@@ -41,7 +41,6 @@ def import_laspy() -> Any:
 
 
 def _extra(content: PointContent) -> dict[str, tuple[str, Any]]:
-    """Return type and values of each extra dimension."""
     found: dict[str, tuple[str, Any]] = {}
     if content.hu is not None:
         found["HU"] = ("float32", content.hu)

@@ -140,7 +140,6 @@ def _planes(values: NDArray[Any], count: int) -> list[bytes]:
 
 
 def _join(planes: NDArray[np.uint8], columns: int, kind: type[np.unsignedinteger[Any]]) -> NDArray[Any]:
-    """Return the rows of which `_planes` made bytes."""
     stacked = planes.reshape(np.dtype(kind).itemsize, columns, -1)
     return sum((plane.astype(kind) << kind(8 * byte) for byte, plane in enumerate(stacked)), np.zeros((), kind)).T
 

@@ -213,7 +213,6 @@ def read_mesh(path: Path) -> RawMesh:
 
 
 def _find_model(package: zipfile.ZipFile, name: str) -> str:
-    """Return the entry of the model: that which the package names, else the usual one."""
     entries = set(package.namelist())
     targets: list[str] = []
 

@@ -266,7 +266,6 @@ def slice_volume(volume: Own, key: Any) -> Own:
 
 
 def _checked_slices(key: Any) -> tuple[slice, slice, slice]:
-    """Return one slice for each of k, j, i."""
     given = key if isinstance(key, tuple) else (key,)
     places = [place for place, one in enumerate(given) if one is Ellipsis]
     if len(places) == 1:

@@ -55,7 +55,6 @@ def _point_placer(space: str) -> Callable[[NDArray[Any] | None], list[float] | N
 
 
 def _round_numbers(value: Any, digits: int = 3) -> Any:
-    """Round the numbers of a value; None stays."""
     if value is None:
         return None
     if isinstance(value, dict):

@@ -212,7 +212,6 @@ def _write_vertebra(
     *,
     several: bool,
 ) -> dict[str, Any]:
-    """Write meshes and pictures of a vertebra, and return its entries in the report."""
     entry: dict[str, Any] = {**one.inside.as_dict(), "name": one.suffix, "pictures": []}
     paths = name_outputs(output, [name_part(one.suffix, part, several=several) for part in one.meshes], report_path)
     written = run.write_meshes(list(one.meshes.values()), paths)

@@ -256,7 +256,6 @@ LARGEST_MARGIN_MM = 5.0
 
 
 def _parse_level(text: str) -> float | None:
-    """Read a level, or ``auto``."""
     if text == "auto":
         return None
     levels = parse_levels(text)

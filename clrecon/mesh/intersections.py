@@ -87,7 +87,6 @@ def find_self_intersections(
 def _leave_cut(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], pairs: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Leave the pairs of triangles, shape (k, 2), that cut each other."""
     cut = np.zeros(len(pairs), dtype=bool)
 
     def work(where: slice) -> None:

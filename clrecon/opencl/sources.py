@@ -47,7 +47,6 @@ def kernel_root() -> Traversable:
 
 
 def _read_file(name: str) -> str:
-    """Return the text of a kernel file or header."""
     try:
         return kernel_root().joinpath(name).read_text(encoding="utf-8")
     except FileNotFoundError as error:
@@ -239,7 +238,6 @@ _OPERATIONS: dict[type, Callable[[int, int], int]] = {
 
 
 def _number(node: ast.expr) -> int:
-    """Compute an expression of whole numbers."""
     if isinstance(node, ast.Constant) and isinstance(node.value, int):
         return node.value
     if isinstance(node, ast.BoolOp):
@@ -256,7 +254,6 @@ def _number(node: ast.expr) -> int:
 
 
 def _expand(text: str, macros: Mapping[str, str]) -> str:
-    """Replace macros, repeatedly."""
     for _ in range(10):
         expanded = _WORD.sub(lambda match: macros.get(match[0], match[0]), text)
         if expanded == text:

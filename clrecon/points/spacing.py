@@ -52,7 +52,6 @@ def mean_spacing(points: NDArray[np.floating]) -> float:
 def _count_cells(
     points: NDArray[np.floating], low: NDArray[np.floating], extent: NDArray[np.float64], edge: float
 ) -> int:
-    """Count the cubes of a grid that hold points."""
     counts = np.floor(extent / edge).astype(np.int64) + 1
     if float(np.prod(counts.astype(np.float64))) > MOST_CELLS:  # a few points far apart
         return len(points)

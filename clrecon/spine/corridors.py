@@ -120,7 +120,6 @@ def line_points(lines: Float64Array, span: Span) -> Float64Array:
 
 
 def _least_and_mean(depth: Depth, lines: Float64Array, span: Span) -> tuple[Float64Array, Float64Array]:
-    """Return the least depth of lines (n, 4), and the mean."""
     points = line_points(lines, span)
     found = depth(points.reshape(-1, 3)).reshape(points.shape[:2])
     return found.min(axis=1), found.mean(axis=1)

@@ -147,7 +147,7 @@ class CloudSettings(InputSettings):
     )
     outliers: float | None = option(
         "--outliers SD",
-        "points go whose mean distance to the 15 nearest others is SD standard deviations over the mean (without a number: 2)",
+        "points go whose mean distance to the 15 nearest is SD standard deviations over the mean (without a number: 2)",
         group="steps",
         nargs="?",
         const=2.0,

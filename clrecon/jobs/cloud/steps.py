@@ -239,7 +239,6 @@ class CloudSteps:
             self.entries.append({"step": "points", "points_after": len(cloud), **facts, "seconds": self._seconds()})
 
     def _seconds(self) -> float:
-        """Return the seconds since the last step ended."""
         now = time.perf_counter()
         elapsed, self._lap = now - self._lap, now
         return round(elapsed, 4)

@@ -322,7 +322,6 @@ def select_parts(
 def _select_parts(
     surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device, volume: Volume, steps: Steps
 ) -> list[Part]:
-    """Keep the components that the settings ask for, together or one by one."""
     if not settings.selects:
         return [Part(surface, surface.name, mesh)]
     from clrecon.geometry import frame_from_lps

@@ -192,7 +192,6 @@ def judge_parts(parts: Sequence[Part], settings: MeshSettings) -> list[dict[str,
 
 
 def _count_crossings(mesh: Mesh, device: Device | None, steps: Steps) -> int:
-    """Count the pairs of triangles that cut each other."""
     from clrecon.mesh.intersections import find_self_intersections
     from clrecon.opencl import with_fallback
     from clrecon.operators.surface.decimation import find_crossings

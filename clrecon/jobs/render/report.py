@@ -196,7 +196,6 @@ def report_of(
 def _describe_meshes(
     subject: Volume | PointCloud | Mesh, settings: RenderSettings, taker: PictureTaker
 ) -> list[dict[str, Any]]:
-    """Describe the mesh that is the input, and those that are shown with it."""
     from clrecon.mesh import Mesh
 
     shown = [(subject, taker.style)] if isinstance(subject, Mesh) else []

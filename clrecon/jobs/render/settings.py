@@ -87,7 +87,6 @@ def parse_direction(text: str) -> str | tuple[float, ...]:
 
 
 def _parse_label_opacity(text: str) -> tuple[str, float]:
-    """Read ``LABEL=OPACITY``."""
     label, _, number = text.rpartition("=")
     try:
         opacity = float(number)
@@ -403,7 +402,6 @@ _DEFAULTS = {own.name: own.default for own in fields(RenderSettings)}
 
 
 def _turn_light(light: str | Sequence[float], lighting: Lighting) -> Lighting:
-    """Return a lighting with its light at the given place."""
     if light == "none":
         return UNSHADED
     direction: Any = light

@@ -196,7 +196,6 @@ class Clusters:
         return self._touching(np.flatnonzero(flags[self._names]))
 
     def _face_rows(self, flags: NDArray[np.bool_]) -> IntArray:
-        """Return those of them that are faces."""
         rows = self._named_rows(flags)
         return rows[self._is_face[rows]]
 
@@ -357,7 +356,6 @@ def _are_faces(named: IntArray) -> NDArray[np.bool_]:
 
 
 def _find_flat(places: NDArray[np.floating], faces: NDArray[np.uint32]) -> list[NDArray[np.uint32]]:
-    """Find corners of faces without area."""
     pieces = cross_products(places, faces, np.zeros(3))
     return [faces[where][~cross.any(axis=0)].reshape(-1) for where, _, cross in pieces]
 

@@ -143,7 +143,6 @@ def decimate_mesh(
 
 
 def _nearly(wanted: float) -> float:
-    """Return the largest number of triangles that counts as the wanted one."""
     return wanted * (1.0 + _SHARE_SLACK) + 2
 
 

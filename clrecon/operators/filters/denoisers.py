@@ -158,7 +158,6 @@ def _number(name: str, value: Any, most: float) -> float:
 
 
 def _image(sitk: Any, volume: Volume) -> Any:
-    """Return the volume as an image with its steps in mm."""
     image = sitk.GetImageFromArray(volume.voxels)
     image.SetSpacing(volume.spacing)
     return image

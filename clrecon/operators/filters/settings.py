@@ -100,7 +100,6 @@ def _nominal_steps(volume: Volume) -> Float64Array:
 
 
 def _squares(offsets: NDArray[np.int32], steps: Float64Array) -> Float64Array:
-    """Return the squared distances in mm."""
     places = offsets @ steps.T
     squares: Float64Array = np.einsum("ni,ni->n", places, places)
     return squares

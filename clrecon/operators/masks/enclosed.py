@@ -84,7 +84,6 @@ class Spaces:
 
 
 def _sum_hu(runs: RunList, volume: Volume, count: int) -> NDArray[np.float64]:
-    """Return the sum of the HU of each component, shape (count,)."""
     sums = np.zeros(count)
     nj, ni = volume.voxels.shape[1:]
     bounds = np.searchsorted(runs.k, np.arange(len(volume.voxels) + 1))

@@ -375,7 +375,6 @@ class Mask(MaskComponents):
 
 
 def _checked_value(value: float, dtype: np.dtype[Any]) -> Any:
-    """Return a value of HU as one of the voxels' type."""
     try:
         number = float(value)
         with np.errstate(invalid="ignore", over="ignore"):

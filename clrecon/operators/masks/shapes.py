@@ -470,7 +470,6 @@ class MaskComponents(MaskShapes):
         return self._choose(found, np.argsort(-sizes, kind="stable")[:count], what)
 
     def _measure_components(self, wanted: int) -> tuple[Components, Float64Array]:
-        """Find the components and the ml of each."""
         if isinstance(wanted, bool) or not isinstance(wanted, int | np.integer) or wanted < 1:
             raise UsageError(f"a number of components is a whole number from 1 on, not {wanted!r}")
         size = mask_bytes(self.shape_ijk)["mask of the voxels"]
@@ -480,7 +479,6 @@ class MaskComponents(MaskShapes):
         return found, RunList.read(self.device, found, self.shape_ijk).sum_ml(self.scan, found.count)
 
     def _choose(self: ComponentMask, found: Components, numbers: NDArray[np.integer], what: str) -> ComponentMask:
-        """Return the components of these numbers as a mask."""
         chosen_d = zero_words(self.device, mask_bytes(self.shape_ijk)["mask of the voxels"] // 4)
         if len(numbers):
             marks = np.zeros(4 * -(-found.count // 4), np.uint8)

@@ -444,7 +444,6 @@ class NodeField:
         return values
 
     def _listed(self, slab: _Slab) -> Any:
-        """Return the list of the bricks of a slab, on the device."""
         if len(self.slabs) == 1:
             return self._list_d
         return upload(self.device, self._list[slab.first_brick : slab.end_brick])

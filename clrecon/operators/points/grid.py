@@ -141,7 +141,6 @@ class PointGrid:
 
 
 def _bits(numbers: int) -> int:
-    """Return the bits of whole numbers below `numbers`."""
     return max(numbers - 1, 0).bit_length()
 
 

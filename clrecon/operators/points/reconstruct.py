@@ -108,7 +108,6 @@ def count_bits(words: Words) -> int:
 
 
 def _valid_bits(nx: int, words: int) -> Words:
-    """Return the bits of a row that are nodes."""
     bits = np.arange(32 * words).reshape(words, 32) < nx
     return np.packbits(bits, axis=1, bitorder="little").view(np.uint32).ravel()
 
@@ -340,7 +339,6 @@ def _check_cloud(cloud: PointCloud) -> NDArray[np.float32]:
 def _choose_lengths(
     spacing: float, noisy: bool, reach: float | None, smoothing: float | None, bridge: float | None
 ) -> FieldSettings:
-    """Return the lengths, with those that are not given."""
     shares = NOISY if noisy else CLEAN
     b = BRIDGE_SHARE * spacing if bridge is None else float(bridge)
     r = max(shares["reach"] * spacing, b) if reach is None else float(reach)

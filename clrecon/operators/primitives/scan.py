@@ -135,7 +135,6 @@ def prepare_sort(device: Device) -> Program:
 
 
 def _plan_chunks(device: Device, n: int) -> tuple[int, int]:
-    """Return the elements of a chunk and the number of chunks."""
     wanted = MOST_CHUNKS
     if device.has_long_items:  # a chunk is the work of a core: some for each, for equal shares
         wanted = min(max(16, 8 * device.compute_units), MOST_CHUNKS)

@@ -110,7 +110,6 @@ def render(
 def _name_objects(
     shown: PointCloud | Mesh | Sequence[Any], style: Style | str | None, look: dict[str, object]
 ) -> list[tuple[Any, Style]]:
-    """Return the objects of a picture, one at least, each with its style."""
     if isinstance(shown, Sequence):
         if style is not None or look:
             raise UsageError("of several objects each has its own style: give pairs (object, style)")
@@ -135,7 +134,6 @@ def _with_view(placing: dict[str, Any], objects: Sequence[tuple[Any, Style]]) ->
 
 
 def _styled(given: Any) -> tuple[Any, Style]:
-    """Return an object with its style, or with the default of its kind."""
     if isinstance(given, tuple):
         if len(given) != 2 or not isinstance(given[1], Style):
             raise UsageError("an object of a picture stands alone, or in a pair (object, style)")

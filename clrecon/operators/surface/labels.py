@@ -475,7 +475,6 @@ def _as_mesh(run: LabelExtraction, taken: ResampledLabels, report: dict[str, Any
 
 
 def _describe_label(volume: Volume, labels: LabelMap, taken: ResampledLabels, number: int, box: Box) -> dict[str, Any]:
-    """Describe a label before its surface is known."""
     return {
         "label": number,
         "label_name": labels.name(number),

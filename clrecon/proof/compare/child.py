@@ -108,7 +108,6 @@ def _save(folder: Path, name: str, product: Any) -> dict[str, Any]:
 
 
 def _open_device(scene: Scene) -> float:
-    """Open the device of a scene, and return the seconds that this takes."""
     from clrecon.operators import choose_device
 
     start = perf_counter()

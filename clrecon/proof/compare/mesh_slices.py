@@ -341,7 +341,6 @@ def _slices_with_border(volume: Volume, rule: IsoRule, first: int, end: int) -> 
 
 
 def _join_corners(corners: NDArray[np.bool_], join: Callable[..., NDArray[np.bool_]]) -> NDArray[np.bool_]:
-    """Join the eight corners of every cell."""
     corners = join(corners[1:], corners[:-1])
     corners = join(corners[:, 1:], corners[:, :-1])
     return join(corners[:, :, 1:], corners[:, :, :-1])

@@ -157,7 +157,6 @@ def compose_report(
 
 
 def _find_versions() -> dict[str, str]:
-    """Return the versions of Python and of the libraries that are installed."""
     versions = {"Python": platform.python_version(), "clrecon": package_version()}
     for title, name in LIBRARIES.items():
         try:

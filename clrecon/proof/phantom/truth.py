@@ -356,7 +356,6 @@ def phantom_truth(source: str | Path | PhantomSettings) -> PhantomTruth:
 
 
 def _read_truth(folder: Path) -> tuple[PhantomSettings, dict[str, Any]]:
-    """Return the settings in a truth.json, and all of it."""
     name = f"{folder.name}/{TRUTH_NAME}"
     try:
         known = json.loads(read_regular(folder / TRUTH_NAME, LARGEST_TRUTH))

@@ -200,7 +200,6 @@ def _known_discs(case: int) -> dict[Loop, tuple[Triangle, ...]]:
 
 
 def _from_lowest(loop: list[int] | Loop) -> Loop:
-    """Return the loop, starting at its lowest edge."""
     start = loop.index(min(loop))
     return (*loop[start:], *loop[:start])
 

@@ -171,7 +171,6 @@ class _Header:
         return RefusedInputError(f"{self.name} is no usable MetaImage: {used} is '{shown}', expected {expected}")
 
     def _name_of(self, key: str) -> str | None:
-        """Return the name under which a field is present."""
         used = [other for other in SAME_FIELD.get(key, (key,)) if other in self.fields]
         if len(used) > 1:
             raise RefusedInputError(f"{self.name} has a corrupt MetaImage header: it says {used[0]} and {used[1]}")

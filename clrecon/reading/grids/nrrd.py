@@ -204,7 +204,6 @@ def nrrd_affine(header: dict[str, Any], name: str) -> Float64Array:
 
 
 def _unit_scale(header: dict[str, Any], name: str) -> NDArray[np.float64]:
-    """Return the millimetres of one unit of each axis of the frame."""
     units = header.get("space units") or ["mm"] * 3
     scales = [MM_PER_UNIT.get(str(unit).strip(' "').lower()) for unit in units]
     if len(scales) != 3 or None in scales:

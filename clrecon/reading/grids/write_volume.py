@@ -176,7 +176,6 @@ def check_holds(volume: Volume, extension: str) -> None:
 
 
 def _verify(path: Path, kind: str, content: VolumeContent) -> None:
-    """Read the header back."""
     grid = open_grid(path, kind, VOLUME)
     off = _measure_apart(grid.affine, content.affine, content.voxels.shape)
     if grid.shape_ijk != content.voxels.shape[::-1] or off > SAME_PLACE_MM or grid.scaled:

@@ -24,7 +24,6 @@ from clrecon.system.light_dataclass import dataclass
 
 
 def _vertex_colors(value: Any) -> NDArray[np.uint8]:
-    """Return colours of vertices, (n, 3) uint8."""
     given = np.asarray(value)
     is_fine = given.ndim == 2 and given.shape[1] == 3 and given.dtype.kind in "fu"
     if is_fine and given.dtype.kind == "f":

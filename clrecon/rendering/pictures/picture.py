@@ -219,8 +219,6 @@ class Rendering(PictureData):
         return rendering_to_pyvista(self, form, expected=expected, distance=distance)
 
     def _repr_png_(self) -> bytes:
-        """Return the PNG bytes that a notebook shows."""
-
         return encode_image(self, ".png")
 
 

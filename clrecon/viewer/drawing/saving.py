@@ -179,7 +179,6 @@ def shown_cloud(painter: Painter, state: ViewState, progress: Progress | None = 
 
 
 def _join(meshes: Sequence[Mesh]) -> Mesh:
-    """Return several meshes as one, for formats that hold one."""
     if len(meshes) == 1:
         return meshes[0]
     starts = np.cumsum([0, *(mesh.vertex_count for mesh in meshes[:-1])])

@@ -112,7 +112,6 @@ def pixel_camera(camera: Camera, size: tuple[int, int], x: float, y: float) -> C
 
 
 def _height_mm(camera: Camera) -> float:
-    """Return the height of the picture at the focal point."""
     return 2.0 * camera.half_height() * (1.0 if camera.is_parallel else camera.distance)
 
 
@@ -317,7 +316,6 @@ class ChangingView:
         return part
 
     def _shown_corners(self) -> Float64Array:
-        """Return points around what is shown."""
         state, corners = self.state, []
         for each in self.objects:
             whole = state.whole(each.number)

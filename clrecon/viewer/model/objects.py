@@ -130,7 +130,6 @@ class ShownLabels(ShownObject):
 
 
 def _box(points: Any) -> Float64Array:
-    """Return the corners of the box around points."""
     return np.array([points.min(axis=0), points.max(axis=0)], dtype=np.float64)
 
 

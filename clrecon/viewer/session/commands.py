@@ -89,8 +89,6 @@ def _model(command: str, words: str, method: str, /, *, takes: Mapping[str, Any]
 
 
 def _session(command: str, words: str, method: str, /, *, takes: Mapping[str, Any] | None = None, **needs: Any) -> None:
-    """Add a command that is a method of the session."""
-
     def call(session: Any, **given: Any) -> Any:
         return getattr(session, method)(**given)
 

@@ -197,7 +197,6 @@ def _parse(data: bytes, size: int, wanted: tuple[int, ...] | None) -> DicomEleme
 
 @lru_cache(maxsize=8)
 def _keys(tags: tuple[int, ...] | None) -> dict[int, int]:
-    """Map tags as stored in the file to tags."""
     if tags is None:
         return _Everything()
     return {(tag & 0xFFFF) << 16 | tag >> 16: tag for tag in tags}
