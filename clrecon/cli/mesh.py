@@ -106,6 +106,7 @@ def mesh_fields(options: argparse.Namespace) -> dict[str, Any]:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.mesh.job import make_mesh, makes_objects
+    from clrecon.jobs.mesh.surfaces import names_level
 
     given = mesh_fields(options)
     settings = MeshSettings(**settings_for(given.pop("purpose", None), given))
@@ -125,7 +126,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     console.say(f"wrote    {_describe_files(options.output, report, together=together)}")
     if options.report:
         console.say(f"report   {printable(options.report)}")
-    return finish_with_gates(report, console, settings.strict)
+    return finish_with_gates(report, console, settings.strict, settings.is_for_print and names_level(settings))
 
 
 def describe_mesh(report: dict[str, Any]) -> list[str]:
@@ -409,15 +410,18 @@ GATES_OF_AFFINE = ("grid_residual",)
 """Gates for the fit of the affine to the slices.  Meshes do not need it: they use the position of each slice."""
 
 
-def finish_with_gates(report: dict[str, Any], console: Console, strict: bool) -> int:
+def finish_with_gates(report: dict[str, Any], console: Console, strict: bool, own_units: bool = False) -> int:
     """Print the warnings of a report; returns the exit code.
 
     With `strict` a failed gate of the volume or of a mesh is an error, which is printed even with ``--quiet`` and
-    ``--json``; that of a mesh decides the code.  A failed gate of `GATES_OF_AFFINE` (uneven slices) stays a warning.
+    ``--json``; that of a mesh decides the code.  A failed gate of `GATES_OF_AFFINE` (uneven slices) stays a warning,
+    and so does one that the values are HU, where a print has a level in the values' `own_units`.
     """
     from clrecon.jobs.mesh.refinement import warn_of_gates
+    from clrecon.jobs.mesh.surfaces import VALUE_GATES
 
-    gates = [gate for gate in report["volume"].get("gates", ()) if gate["name"] not in GATES_OF_AFFINE]
+    settled = GATES_OF_AFFINE + VALUE_GATES * own_units
+    gates = [gate for gate in report["volume"].get("gates", ()) if gate["name"] not in settled]
     of_volume = [{"mesh": "volume", **gate} for gate in gates]
     failed_scan = warn_of_gates(of_volume) if strict else []
     failed_mesh = warn_of_gates(report["gates"]) if strict else []

@@ -27,14 +27,18 @@ UNITS = re.compile(r"^[A-Z].*_(MM2?|CM2|ML|HU)(_|$)")
 ADULTS = "the object: adults; in no other way"
 HU = "values: HU alone"
 WRITERS = "files: how writers round"
+SCALED = (
+    "values: where they are not HU, two materials of the scan stand for 40 and 1240 HU, or air and soft tissue for"
+    " -1000 and 40"
+)
 FOLLOWS = {
     "anatomy/body.py": "the object: adults and their tables; cells are one voxel at least",
     "anatomy/body_cells.py": "the voxel: cells are one at least; values: HU alone",
     "anatomy/dense_pieces.py": "the object: adults, their tables and cables; values: HU alone",
     "anatomy/head.py": "the object: heads of people; values: HU alone",
-    "anatomy/iso_choice.py": "values: where they are not HU, two materials of the scan stand for 40 and 1240 HU, or air"
-    " and soft tissue for -1000 and 40",
+    "anatomy/iso_choice.py": SCALED,
     "anatomy/marrow.py": "the voxel: blocks are whole ones",
+    "anatomy/materials.py": SCALED,
     "anatomy/noise.py": HU,
     "anatomy/spine_cells.py": ADULTS,
     "anatomy/spine_line.py": ADULTS,

@@ -23,6 +23,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 from clrecon.anatomy import iso_choice as choice  # noqa: E402
+from clrecon.anatomy import materials  # noqa: E402
 from clrecon.anatomy.iso_choice import measure_edges  # noqa: E402
 from clrecon.errors import NoSurfaceError  # noqa: E402
 from clrecon.geometry import Volume, column_spacing  # noqa: E402
@@ -65,8 +66,8 @@ SPINES: dict[str, tuple[dict[str, Any], dict[str, float]]] = {
 # --- ways to choose ---
 def _every_slice(volume: Volume) -> tuple[Array, Array]:
     """Count the voxels of each whole HU above the padding; also return these HU."""
-    counts = choice._count_values(enumerate(volume.voxels))
-    return counts, np.arange(len(counts)) + float(choice.LOWEST_HU)
+    counts = materials.count_values(enumerate(volume.voxels))
+    return counts, np.arange(len(counts)) + float(materials.LOWEST_HU)
 
 
 def by_otsu(volume: Volume) -> float:
@@ -97,9 +98,9 @@ def by_minimum_error(volume: Volume) -> float:
 
 def by_modes(volume: Volume) -> float:
     """Half way between the soft-tissue mode and the highest mode of the histogram above the seed."""
-    smooth = choice._smooth(_every_slice(volume)[0])
-    background = choice._find_background(_every_slice(volume)[0])
-    above = smooth[background.seed - choice.LOWEST_HU :]
+    smooth = materials.smooth_counts(_every_slice(volume)[0])
+    background = materials.find_background(_every_slice(volume)[0])
+    above = smooth[background.seed - materials.LOWEST_HU :]
     peaks = np.flatnonzero((above[1:-1] > above[:-2]) & (above[1:-1] >= above[2:])) + 1
     return float((background.mode + background.seed + peaks[np.argmax(above[peaks])]) / 2.0)
 
@@ -117,7 +118,7 @@ def by_gradient(volume: Volume) -> float:
 def by_plain_edges(volume: Volume) -> float:
     """The edges of "auto", but all with equal weight and with contrast medium included."""
     sampled = range(len(volume.voxels))
-    edges = measure_edges(((k, volume.voxels[k]) for k in sampled), choice._find_background(_every_slice(volume)[0]))
+    edges = measure_edges(((k, volume.voxels[k]) for k in sampled), materials.find_background(_every_slice(volume)[0]))
     return float((np.median(edges.bone) + np.median(edges.tissue)) / 2.0)
 
 

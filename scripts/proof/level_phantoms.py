@@ -7,8 +7,10 @@ distance from the truth.
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -23,6 +25,7 @@ from clrecon.proof.phantom import (
     apply_point_spread,
     label_materials,
     make_phantom,
+    write_phantom,
 )
 from clrecon.proof.phantom import spine as spine_hu
 from clrecon.proof.phantom import spine as tissue_hu
@@ -31,12 +34,15 @@ from clrecon.proof.phantom.series import place_slices
 from clrecon.proof.phantom.settings import CENTRE_LPS_MM, KINDS
 from clrecon.proof.phantom.spine import label_levels, plan_spine
 from clrecon.proof.phantom.vertebra import local_bounds, vertebra_distance
+from clrecon.reading import read_volume
 
 __all__ = [
     "BODIES",
+    "KINDS_OF_SCAN",
     "NOTHING",
     "NOT_IN_TISSUE",
     "PHANTOMS",
+    "REACH_MM",
     "SCANNING",
     "Phantom",
     "Profiles",
@@ -51,6 +57,7 @@ BONE, METAL = MATERIALS.index("bone"), MATERIALS.index("metal")
 
 REACH_MM, STEP_MM = 3.0, 0.05
 """Profiles run this far on both sides; a wall whose level is not crossed there is lost."""
+FINE_MM = 0.6
 POINTS = 6000
 _DIRECTIONS, _PROBE_MM = 96, 0.4
 """The normal at a place is the mean direction to what is no bone, at so many directions and this distance."""
@@ -69,6 +76,12 @@ class Phantom:
     vessels_hu: float | None = None
     enhance: float = 0.0
 
+    @property
+    def scale(self) -> float:
+        """What lengths are multiplied by that fit voxels of 0.6 mm and more: finer ones have smaller bones."""
+        finest = min(PhantomSettings(**self.settings).spacing)
+        return 1.0 if finest >= FINE_MM else finest / 0.8
+
 
 _TRUNK = {"size": (240, 240), "slices": 96, "spacing": (1.0, 1.0, 1.25)}
 """240 x 240 x 120 mm: the same body, however it is scanned."""
@@ -78,9 +91,25 @@ def _trunk(**changes: Any) -> dict[str, Any]:
     return {**_TRUNK, **changes}
 
 
-SCANNING, BODIES, DRY, NOTHING = ("one body, scanned in ten ways", "other bodies", "dry specimens", "no bone")
+SCANNING, BODIES, DRY, NOTHING, KINDS_OF_SCAN = (
+    "one body, scanned in ten ways",
+    "other bodies",
+    "dry specimens",
+    "no bone",
+    "other kinds of scan",
+)
 
-NOT_IN_TISSUE = (DRY, NOTHING)
+NOT_IN_TISSUE = (DRY, NOTHING, KINDS_OF_SCAN)
+
+KINDS_MATERIALS = {
+    "jaw": (1470.0, 390.0),
+    "longbone": (1040.0, 0.0),
+    "hand": (1250.0, 60.0),
+    "pair": (1400.0, 55.0),
+    "hip": (1350.0, 60.0),
+    "mouse": (1300.0, 40.0),
+}
+"""Compact bone and tissue of each kind in the units of its values, as they go in."""
 
 PHANTOMS = (
     Phantom("1 mm, slices 1.25 mm", SCANNING, _trunk()),
@@ -107,12 +136,13 @@ PHANTOMS = (
     Phantom("dry bones", DRY, {"kind": "bones"}, bone_hu=950.0, tissue_hu=-1000.0),
     Phantom("water", NOTHING, {"kind": "water", "slices": 60}),
     Phantom("empty table", NOTHING, {"kind": "empty", "slices": 60}),
+    *(Phantom(kind, KINDS_OF_SCAN, {"kind": kind}, *materials) for kind, materials in KINDS_MATERIALS.items()),
 )
 
 
 @dataclass
 class Profiles:
-    """HU along the true normals, shape (n, steps), outwards, and the way along them in mm.
+    """HU along the true normals, shape (n, steps), outwards, and the way along them in mm, at even steps.
 
     points, normals: shape (n, 3). Places of the true surface, LPS mm, and unit vectors outwards.
     """
@@ -132,7 +162,7 @@ class Profiles:
         falls = inside[:, :-1] & ~inside[:, 1:]
         high, low = self.values[:, :-1], self.values[:, 1:]
         share = np.where(falls, (high - level) / np.where(falls, high - low, 1.0), 0.0)
-        at = np.where(falls, self.way_mm[:-1] + np.float32(STEP_MM) * share, np.inf)
+        at = np.where(falls, self.way_mm[:-1] + (self.way_mm[1] - self.way_mm[0]) * share, np.inf)
         nearest = np.abs(at).argmin(axis=1)
         found = at[np.arange(len(at)), nearest]
         return np.where(np.isfinite(found), found, np.nan).astype(np.float32)
@@ -149,9 +179,10 @@ def find_on_mesh(
 
     a, b, c = (vertices[triangles[:, corner]].astype(np.float64) for corner in range(3))
     middles = (a + b + c) / 3.0
-    radius = float(np.percentile(np.linalg.norm(a - middles, axis=1), 99.9)) + 0.05
+    reach = float(profiles.way_mm[-1])
+    radius = float(np.percentile(np.linalg.norm(a - middles, axis=1), 99.9)) + reach / 60.0
     tree = cKDTree(middles)
-    steps = np.arange(-REACH_MM, REACH_MM + radius, radius)
+    steps = np.arange(-reach, reach + radius, radius)
     found, rows = np.full(len(profiles.points), np.inf), np.full(len(profiles.points), -1)
     for begin in range(0, len(profiles.points), 500):
         where = slice(begin, begin + 500)
@@ -171,7 +202,7 @@ def find_on_mesh(
             v = np.einsum("ij,ij->i", n, turned) / size
             way = np.einsum("ij,ij->i", two, turned) / size
         faces_out = np.einsum("ij,ij->i", np.cross(one, two), n) > 0.0
-        hit = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1.0 + 1e-9) & faces_out & (np.abs(way) <= REACH_MM)
+        hit = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1.0 + 1e-9) & faces_out & (np.abs(way) <= reach)
         for each in np.flatnonzero(hit)[np.argsort(-np.abs(way[hit]))]:  # the nearest comes last
             found[line_of[each]], rows[line_of[each]] = way[each], face[each]
     return np.where(np.isfinite(found), found, np.nan), rows
@@ -180,6 +211,10 @@ def find_on_mesh(
 def draw_phantom(phantom: Phantom) -> Volume:
     """Draw the body with its bones' density, its vessels and the enhancement of edges."""
     settings = PhantomSettings(**phantom.settings)
+    if phantom.group == KINDS_OF_SCAN:  # auto asks what its certificate says of the scale
+        with tempfile.TemporaryDirectory() as folder:
+            write_phantom(Path(folder) / "scan", settings)
+            return read_volume(Path(folder) / "scan")
     bones = ("CORTEX_HU", "BODY_CORTEX_HU", "TRABECULAR_HU", "ARCH_MARROW_HU", "RIB_MARROW_HU")
     denser = {name: phantom.density * getattr(spine_hu, name) for name in bones}
     vessels = {} if phantom.vessels_hu is None else {"BLOOD_HU": phantom.vessels_hu}
@@ -266,15 +301,15 @@ def sample_profiles(phantom: Phantom, volume: Volume, seed: int = 1) -> Profiles
 
     sphere = generator.normal(size=(_DIRECTIONS // 2, 3))
     sphere = np.concatenate((sphere, -sphere)) / np.linalg.norm(np.concatenate((sphere, -sphere)), axis=1)[:, None]
-    around = (points[:, None] + _PROBE_MM * sphere).reshape(-1, 3)
+    around = (points[:, None] + _PROBE_MM * phantom.scale * sphere).reshape(-1, 3)
     outside = ~is_bone(around).reshape(len(points), -1)
     normals = outside.astype(np.float64) @ sphere
     length = np.linalg.norm(normals, axis=1)
     clear = length > 0.15 * _DIRECTIONS  # less at corners and in walls thinner than the probe
     points, normals = points[clear], normals[clear] / length[clear, None]
 
-    way = np.arange(-REACH_MM, REACH_MM + STEP_MM / 2, STEP_MM)
-    far = points[:, None] + np.array((-2.5, -1.25, 1.25, 2.5))[None, :, None] * normals[:, None]
+    way = np.arange(-REACH_MM, REACH_MM + STEP_MM / 2, STEP_MM) * phantom.scale
+    far = points[:, None] + phantom.scale * np.array((-2.5, -1.25, 1.25, 2.5))[None, :, None] * normals[:, None]
     clean = ~is_metal(far.reshape(-1, 3)).reshape(len(points), -1).any(axis=1)
     points, normals = points[clean], normals[clean]
     along = points[:, None] + way[None, :, None] * normals[:, None]
@@ -284,4 +319,6 @@ def sample_profiles(phantom: Phantom, volume: Volume, seed: int = 1) -> Profiles
     whole = ((ijk >= 0) & (ijk <= limits)).all(axis=1).reshape(len(points), -1).all(axis=1)
     kji = ijk.reshape(len(points), -1, 3)[whole].reshape(-1, 3)[:, ::-1].T
     values = map_coordinates(volume.voxels.astype(np.float32), kji, order=1)
-    return Profiles(values.reshape(int(whole.sum()), -1).astype(np.float32), points[whole], normals[whole])
+    return Profiles(
+        values.reshape(int(whole.sum()), -1).astype(np.float32), points[whole], normals[whole], way.astype(np.float32)
+    )

@@ -33,7 +33,12 @@ from clrecon.proof.phantom.scenes import bone_depth  # noqa: E402
 PAGE, FIGURES = ROOT / "docs" / "scans.md", ROOT / "docs" / "benchmarks" / "kinds.json"
 
 WAYS: dict[str, dict[str, str]] = {
-    "jaw": {"default": "", "auto": "--hu auto", "print": "--for print --hu 930 --all-parts"},
+    "jaw": {
+        "default": "",
+        "auto": "--hu auto",
+        "print": "--for print --hu 930 --all-parts",
+        "print in HU": "--for print --hu auto --all-parts --rescale 1.25,-1717.5",
+    },
     "longbone": {"default": "", "auto": "--hu auto", "print": "--for print --hu 520 --all-parts"},
     "hand": {
         "default": "",
@@ -47,7 +52,12 @@ WAYS: dict[str, dict[str, str]] = {
         "without table": "--remove-table --hu auto",
         "print": "--for print --hu auto --all-parts",
     },
-    "hip": {"default": "", "auto": "--hu auto", "print": "--for print --hu auto --all-parts --seal 1"},
+    "hip": {
+        "default": "",
+        "auto": "--hu auto",
+        "print": "--for print --hu auto --all-parts --seal 1",
+        "default print": "--for print --hu auto --all-parts",
+    },
     "mouse": {
         "default": "",
         "auto": "--hu auto",
@@ -55,7 +65,7 @@ WAYS: dict[str, dict[str, str]] = {
         "print": "--for print --hu auto --all-parts",
     },
 }
-"""The options of `clrecon mesh` that are tried on each kind."""
+"""The options of `clrecon mesh` that are tried on each kind; a default may be wrong, and says why."""
 
 HARD = ("bone", "metal")
 
@@ -115,6 +125,7 @@ def said_of(found: dict[str, Any]) -> str:
         "metal": ("metal",),
         "part is no bone": ("in part no bone",),
         "volume too large": ("too large",),
+        "filled beside metal": ("filled lie beside",),
     }
     texts = " ".join([*found["failed"], *found["warnings"]])
     return ", ".join(name for name, parts in words.items() if any(part in texts for part in parts))

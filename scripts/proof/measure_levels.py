@@ -6,7 +6,7 @@
     python scripts/proof/measure_levels.py page
 
 `phantoms` measures every phantom of `level_phantoms.py` (about five minutes on one core) at the preset bone, at
-`--hu auto`, at `--hu half:BONE,TISSUE` with the phantom's own materials, at the best of the levels from 100 to 900 HU,
+`--hu auto`, at `--hu half:BONE,TISSUE` with the phantom's own materials, at the best of the levels from 100 to 1200 HU,
 and the surface of `--surface cortex` itself; `--seed` draws other bodies, whose figures are in phantoms_SEED.  `scans`
 does what can be done without a truth: the level that auto picks in the scan, in its two halves and in every other
 slice, and how the surface differs.  Both keep their figures in docs/benchmarks/levels; `page` writes them into
@@ -33,8 +33,10 @@ sys.path[:0] = [str(ROOT), str(Path(__file__).parent), str(ROOT / "scripts" / "g
 
 from level_phantoms import (  # noqa: E402
     DRY,
+    KINDS_OF_SCAN,
     NOTHING,
     PHANTOMS,
+    REACH_MM,
     SCANNING,
     Phantom,
     Profiles,
@@ -51,7 +53,7 @@ from clrecon.jobs.presets import PRESETS  # noqa: E402
 
 FIGURES = ROOT / "docs" / "benchmarks" / "levels"
 PAGE = ROOT / "docs" / "iso_value.md"
-TRIED = range(100, 901, 25)
+TRIED = range(100, 1201, 25)
 CLOSE_MM = 0.5
 RULES = ("preset", "auto", "half", "best", "fitted")
 FITTED_AT = {DRY: -200.0}
@@ -62,7 +64,7 @@ SHARES = (0.3, 0.35, 0.4, 0.45)
 
 def measure_errors(profiles: Profiles, level: float) -> dict[str, float]:
     """Measure a level: mean signed and absolute distance where it is crossed, share lost, share within `CLOSE_MM`."""
-    return describe_errors(profiles.errors(level), level)
+    return describe_errors(profiles.errors(level), level, float(profiles.way_mm[-1]) / REACH_MM)
 
 
 def measure_fitted(phantom: Phantom, volume: Volume, profiles: Profiles) -> dict[str, float]:
@@ -72,24 +74,26 @@ def measure_fitted(phantom: Phantom, volume: Volume, profiles: Profiles) -> dict
     import clrecon
 
     level = FITTED_AT.get(phantom.group, PRESETS["bone"].iso_value)
-    mesh = clrecon.fit_cortex(clrecon.extract_isosurface(volume, level), volume)
+    surface, start = clrecon.extract_isosurface(volume, level), time.perf_counter()
+    mesh = clrecon.fit_cortex(surface, volume)
+    seconds = time.perf_counter() - start
     errors, rows = find_on_mesh(profiles, mesh.vertices, mesh.triangles)
     said = np.where(rows >= 0, mesh.values["error_mm"][mesh.triangles[rows, 0]], np.nan)
     known = np.isfinite(said) & np.isfinite(errors)
     within = [float(np.mean(np.abs(errors[known]) <= times * said[known])) for times in (1.0, 1.96)]
     constants = mesh.report["cortex"]["constants"]
     return {
-        **describe_errors(errors, level),
+        **describe_errors(errors, level, phantom.scale),
         "within_error": round(within[0], 4),
         "within_196_errors": round(within[1], 4),
         **{name: round(float(constants[name]), 3) for name in ("blur_mm", "blur_across_mm", "cortex_hu")},
-        "seconds": round(mesh.report["cortex"]["seconds"], 2),
+        "seconds": round(seconds, 2),
         "triangles": mesh.triangle_count,
     }
 
 
-def describe_errors(errors: NDArray[np.floating], level: float) -> dict[str, float]:
-    """Describe signed distances from the truth, NaN where there is no surface."""
+def describe_errors(errors: NDArray[np.floating], level: float, scale: float = 1.0) -> dict[str, float]:
+    """Describe signed distances from the truth, NaN where there is no surface; `scale` is that of the phantom."""
     found = errors[np.isfinite(errors)]
     if not len(found):
         return {"level_hu": level, "lost_share": 1.0, "close_share": 0.0}
@@ -99,7 +103,7 @@ def describe_errors(errors: NDArray[np.floating], level: float) -> dict[str, flo
         "mean_mm": round(float(np.abs(found).mean()), 4),
         "p95_mm": round(float(np.percentile(np.abs(found), 95)), 4),
         "lost_share": round(1.0 - len(found) / len(errors), 4),
-        "close_share": round(float((np.abs(found) <= CLOSE_MM).sum() / len(errors)), 4),
+        "close_share": round(float((np.abs(found) <= CLOSE_MM * scale).sum() / len(errors)), 4),
     }
 
 
@@ -145,7 +149,10 @@ def measure_phantom(phantom: Phantom) -> dict[str, Any]:
         if hu is not None:
             figures[rule] = {**figures.get(rule, {}), **measure_errors(profiles, hu)}
     figures["best"] = max(tried.values(), key=lambda one: one["close_share"])
-    figures["fitted"] = measure_fitted(phantom, volume, profiles)
+    try:
+        figures["fitted"] = measure_fitted(phantom, volume, profiles)
+    except NoSurfaceError as error:
+        figures["fitted"] = {"refused": str(error)}
     if choice is not None:
         tissue, way = choice.tissue_hu, choice.bone_hu - choice.tissue_hu
         figures["shares"] = {f"{share:g}": measure_errors(profiles, round(tissue + share * way)) for share in SHARES}
@@ -184,7 +191,7 @@ def measure_scan(name: str, folder: Path) -> dict[str, Any]:
     for rule, hu in (("preset", PRESETS["bone"].iso_value), ("auto", level)):
         if hu is not None:
             figures[rule] = {**figures.get(rule, {}), "level_hu": hu, **_measure_surface(volume, hu)}
-    if level is not None:
+    if level is not None and "refused" not in figures["preset"]:
         figures["moved_mm"] = _moved(volume, PRESETS["bone"].iso_value, level)
     return figures
 
@@ -210,9 +217,9 @@ def _moved(volume: Volume, one: float, other: float) -> float:
 
 
 def summarise(figures: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return over all phantoms with bone, by rule: means, the worst case, and the spread over one body's scans."""
+    """Return means, the worst case, and the spread over one body's scans, by rule: of all with bone but other kinds."""
     summary = {}
-    with_bone = [one for one in figures if "best" in one]
+    with_bone = [one for one in figures if "best" in one and one["group"] != KINDS_OF_SCAN]
     shares = [f"{100.0 * float(share):.0f} % of the way" for share in with_bone[0]["shares"]]
     flat = [
         {**one, **{f"{hu} HU": row for hu, row in one["fixed"].items()},
@@ -237,11 +244,11 @@ def summarise(figures: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 
 # --- tables ---
-def _cell(figures: dict[str, Any]) -> str:
+def _cell(figures: dict[str, Any], digits: int = 2) -> str:
     if "bias_mm" not in figures:
         return "refused" if figures.get("level_hu") is None else "none"
-    lost = 100.0 * figures["lost_share"]
-    return f"{figures['level_hu']:.0f}: {figures['bias_mm']:+.2f}, {lost:.0f} %, {100.0 * figures['close_share']:.0f} %"
+    lost, close = 100.0 * figures["lost_share"], 100.0 * figures["close_share"]
+    return f"{figures['level_hu']:.0f}: {figures['bias_mm']:+.{digits}f}, {lost:.0f} %, {close:.0f} %"
 
 
 def phantom_table(figures: Sequence[dict[str, Any]]) -> str:
@@ -249,7 +256,8 @@ def phantom_table(figures: Sequence[dict[str, Any]]) -> str:
     head = ("phantom", "preset bone", "auto", "half", "best", "fitted to the cortex")
     rows = []
     for one in figures:
-        cells = [_cell(one[rule]) if rule in one else "" for rule in RULES]
+        digits = 2 if min(one["spacing_mm"]) > 0.2 else 4
+        cells = [_cell(one[rule], digits) if rule in one else "" for rule in RULES]
         rows.append((one["name"], *cells))
     return markdown_table(head, rows)
 
@@ -269,7 +277,7 @@ def summary_table(figures: Sequence[dict[str, Any]]) -> str:
 
 
 def _number(value: Any) -> str:
-    return "refused" if value is None else f"{value:.0f}"
+    return "refused" if value is None else f"{value:.0f}" if value >= 10.0 else f"{value:g}"
 
 
 def scan_table(figures: Sequence[dict[str, Any]]) -> str:
@@ -314,15 +322,21 @@ def write_page() -> None:
 
 
 def _keep(name: str, figures: Sequence[dict[str, Any]]) -> None:
+    """Keep figures in place of those of the same names, those of phantoms in their order."""
     FIGURES.mkdir(parents=True, exist_ok=True)
-    finite = json.loads(json.dumps(figures), parse_constant=lambda _: math.nan)
-    (FIGURES / f"{name}.json").write_text(json.dumps(finite, indent=1) + "\n", "utf-8")
+    path = FIGURES / f"{name}.json"
+    before = json.loads(path.read_text("utf-8")) if path.exists() else []
+    kept = {one["name"]: one for one in [*before, *figures]}
+    order = {phantom.name: place for place, phantom in enumerate(PHANTOMS)}
+    rows = sorted(kept.values(), key=lambda one: order.get(one["name"], 0))
+    finite = json.loads(json.dumps(rows), parse_constant=lambda _: math.nan)
+    path.write_text(json.dumps(finite, indent=1) + "\n", "utf-8")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("phantoms", "scans", "page"))
-    parser.add_argument("scans", nargs="*", metavar="NAME=CT_FOLDER")
+    parser.add_argument("names", nargs="*", metavar="NAME", help="phantoms, else all; of scans NAME=CT_FOLDER")
     parser.add_argument("--seed", type=int, help="of bodies other than those of the tables")
     options = parser.parse_args()
     if options.what == "page":
@@ -331,16 +345,19 @@ def main() -> None:
     figures = []
     if options.what == "phantoms":
         for phantom in PHANTOMS if options.seed is None else with_seed(options.seed):
+            if options.names and phantom.name not in options.names:
+                continue
             figures.append(measure_phantom(phantom))
             print(
                 phantom.name,
                 *(f"{rule} {_cell(figures[-1][rule])};" for rule in RULES if rule in figures[-1]),
                 flush=True,
             )
-    for given in options.scans:
-        name, _, folder = given.partition("=")
-        figures.append(measure_scan(name, Path(folder)))
-        print(json.dumps(figures[-1]), flush=True)
+    else:
+        for given in options.names:
+            name, _, folder = given.partition("=")
+            figures.append(measure_scan(name, Path(folder)))
+            print(json.dumps(figures[-1]), flush=True)
     _keep(options.what if options.seed is None else f"{options.what}_{options.seed}", figures)
 
 

@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
 import clrecon
-from clrecon.anatomy import iso_choice
-from clrecon.anatomy.iso_choice import choose_iso_value, half_iso_value, lies_in_air
+from clrecon.anatomy import materials
+from clrecon.anatomy.iso_choice import choose_iso_value, half_iso_value
+from clrecon.anatomy.materials import lies_in_air
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.proof.phantom import PhantomSettings, make_phantom
@@ -92,8 +93,8 @@ def test_a_specimen_in_air_is_cut_half_way_to_air() -> None:
     ],
 )
 def test_the_range_of_what_bone_lies_in(mode, noise, around) -> None:
-    hu = np.arange(iso_choice.LOWEST_HU, iso_choice.HIGHEST_HU + 1)
-    found = iso_choice._find_background(1e5 * np.exp(-0.5 * ((hu - mode) / noise) ** 2))
+    hu = np.arange(materials.LOWEST_HU, materials.HIGHEST_HU + 1)
+    found = materials.find_background(1e5 * np.exp(-0.5 * ((hu - mode) / noise) ** 2))
     assert found.mode == pytest.approx(mode, abs=1.0) and found.noise == pytest.approx(noise, abs=1.0)
     name, *figures = around
     assert found.name == name
@@ -214,7 +215,7 @@ def test_unsigned_bytes_are_compared_without_wrapping() -> None:
 
 # --- sampling ---
 def test_slices_are_sampled_evenly_and_the_same_each_time(spine, spine_level, monkeypatch) -> None:
-    monkeypatch.setattr(iso_choice, "SAMPLED_VOXELS", 8 * 192 * 192)
+    monkeypatch.setattr(materials, "SAMPLED_VOXELS", 8 * 192 * 192)
     first, second = (choose_iso_value(as_volume(spine)) for _ in range(2))
     assert first == second
     assert (first.slices, first.slice_step) == (8, 5)
@@ -250,7 +251,7 @@ def test_padding_filled_with_air_does_not_hide_the_noise_of_air() -> None:
     assert choose_iso_value(filled).noise_hu < 20
     for share, left in ((0.04, 6.0), (0.1, 0.0), (0.2, 0.0)):
         counts = np.full(3000, 10.0)
-        iso_choice._leave_padding(counts, 100, {"padding_hu": iso_choice.LOWEST_HU + 7, "padding_share": share})
+        materials.leave_padding(counts, 100, {"padding_hu": materials.LOWEST_HU + 7, "padding_share": share})
         assert counts[7] == left and counts.sum() == 29_990 + left
 
 

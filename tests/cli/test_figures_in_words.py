@@ -213,6 +213,15 @@ def test_a_gate_of_the_mesh_decides_the_code(scan: bool, of_mesh: bool, strict: 
     assert mesh_command.finish_with_gates(report, Console(), strict) == code
 
 
+@pytest.mark.parametrize(
+    ("name", "own_units", "code"), [("hu_scale", True, 0), ("hu_scale", False, 7), ("lossless", True, 7)]
+)
+def test_a_level_in_the_values_own_units_leaves_gates_of_hu_warnings(name: str, own_units: bool, code: int) -> None:
+    gate = {"name": name, "ok": False, "text": "t", "measured": 1, "bound": 0, "unit": None}
+    report = {"volume": {"gates": [gate]}, "gates": [], "warnings": []}
+    assert mesh_command.finish_with_gates(report, Console(), True, own_units) == code
+
+
 def test_a_simulator_is_named_as_one() -> None:
     device = {
         "chosen": True, "simulator": True, "type": "cpu", "has_own_memory": False, "memory_bytes": 10**6,

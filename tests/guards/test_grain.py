@@ -11,8 +11,8 @@ from house import ROOT
 from house_figures import count_grain
 
 CEILINGS = {
-    "lines": 92_894,
-    "modules": 416,
+    "lines": 93_025,
+    "modules": 417,
     "small_modules_with_one_reader": 10,
     "docstrings_with_raises": 136,
     "options_in_several_files": 19,

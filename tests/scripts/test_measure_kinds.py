@@ -36,6 +36,10 @@ def measure(shared_folder: Path, tmp_path: Path, device: Any, kind: str, way: st
     return measure_kinds.measure_way(scan, settings, options, tmp_path, str(device.index))
 
 
+def most_off(kind: str, way: str) -> float:
+    return 0.05 if "print" in way or kind == "hip" else 0.03  # metal is swollen
+
+
 ROWS = [(kind, way) for kind, ways in measure_kinds.WAYS.items() for way in ways]
 EVERY_DAY = [("mouse", "default"), ("jaw", "auto"), ("longbone", "auto"), ("hand", "default")]
 
@@ -47,10 +51,9 @@ def test_volumes_are_true_or_the_reason_is_named(
     found = measure(shared_folder, tmp_path, device, kind, way)
     off = abs(measure_kinds.volume_error(found))
     assert off < 0.1 or measure_kinds.said_of(found), (off, found)
-    if way != "default":
-        assert found["closed"] and off < {"print": 0.05}.get(way, 0.03 if kind != "hip" else 0.1)
-        assert found["off_voxels"] < 0.3
-        assert found["code"] == (7 if way == "print" and kind in ("jaw", "longbone") else 0)
+    assert found["code"] == 0
+    if "default" not in way:
+        assert found["closed"] and off < most_off(kind, way) and found["off_voxels"] < 0.3
 
 
 @pytest.mark.parametrize(("kind", "ways"), FIGURES.items())
@@ -59,9 +62,8 @@ def test_the_figures_of_the_page_reach_what_is_promised(kind: str, ways: dict[st
     for way, found in ways.items():
         off = abs(measure_kinds.volume_error(found))
         assert off < 0.1 or measure_kinds.said_of(found)
-        if way != "default":
-            assert found["closed"] and off < (0.05 if way == "print" else 0.03 if kind != "hip" else 0.1)
-            assert found["off_voxels"] < 0.3
+        if "default" not in way:
+            assert found["closed"] and off < most_off(kind, way) and found["off_voxels"] < 0.3
 
 
 def test_the_page_has_the_figures() -> None:

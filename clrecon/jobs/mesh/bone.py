@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.mesh.surfaces import Bones, Part, Surface, warn_of_contrast
+from clrecon.jobs.mesh.surfaces import Bones, Part, Surface, list_failed_values, warn_of_contrast
 from clrecon.jobs.presets import LOWEST_BONE_HU
 from clrecon.system.arguments import name_parameter
 from clrecon.system.text import count_of
@@ -34,10 +34,13 @@ SPINE_MM = 20.0
 
 
 def find_bone(
-    mesh: Mesh, volume: Volume, surface: Surface, labelled: Labelled, *, without_table: bool = False, advice: str
-) -> NDArray[np.bool_]:
-    """Return which components (count,) look like bone or, if none does, the one that holds the spinal canal."""
+    mesh: Mesh, volume: Volume, surface: Surface, labelled: Labelled, *, without_table: bool = False, advice: str,
+    must: bool = True,
+) -> NDArray[np.bool_] | None:  # fmt: skip
+    """Return which components (count,) look like bone or, if none does, the one that holds the spinal canal.
 
+    Not `must`: None, with a warning, where none does and the values of the scan are not known to be HU.
+    """
     from clrecon.mesh.compare.iso_distance import rule_of_report
 
     rule = rule_of_report(mesh.report)
@@ -58,6 +61,11 @@ def find_bone(
     if not bone.any():
         others = [one for one, is_rail in zip(judged, rails, strict=True) if one is not None and not is_rail]
         why = f"{_describe_none(others, count, int(rails.sum()))}{_describe_other_values(volume)}"
+        if not must and list_failed_values(volume):
+            mesh.report.setdefault("warnings", []).append(
+                f"at {surface.describe()}: {why}; nothing was left out for that"
+            )
+            return None
         raise NoSurfaceError(f"at {surface.describe()}: {why} ({advice})")
     mesh.report.setdefault("warnings", []).append(
         f"at {surface.describe()} no component has walls like bone: the one round the spinal canal was kept"
@@ -66,14 +74,16 @@ def find_bone(
 
 
 def _tell_bone(
-    mesh: Mesh, volume: Volume, rule: IsoRule, labelled: Labelled
+    mesh: Mesh, volume: Volume, rule: IsoRule, labelled: Labelled, fewest: int = 0
 ) -> tuple[list[WallLook | None], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Judge the components of a surface; say which are bone, and which would be, but are rails of a table."""
+    """Judge the components of a surface, of `fewest` vertices or more; say which are bone, and which would be, but are
+    rails of a table.
+    """
     import numpy as np
 
-    from clrecon.mesh.compare.walls import find_rails, judge_components, looks_like_bone
+    from clrecon.mesh.compare.walls import FEWEST_VERTICES, find_rails, judge_components, looks_like_bone
 
-    judged = judge_components(mesh, volume, rule, *labelled)
+    judged = judge_components(mesh, volume, rule, *labelled, max(fewest, FEWEST_VERTICES))
     like_bone = np.array([looks_like_bone(one) for one in judged], dtype=bool)
     rails = find_rails(mesh, volume, labelled[1], like_bone)
     return judged, like_bone & ~rails, rails
@@ -93,7 +103,6 @@ def _describe_none(judged: Sequence[dict[str, Any]], count: int, rails: int) -> 
 
 def _describe_other_values(volume: Volume) -> str:
     """Say that values on another scale than HU show no bone; empty where they are HU."""
-    from clrecon.jobs.mesh.surfaces import list_failed_values
     from clrecon.mesh.compare.walls import COMPACT_HU
 
     failed = list_failed_values(volume)
@@ -146,10 +155,12 @@ def _holds_spine(mesh: Mesh, volume: Volume, count: int, labels: NDArray[np.int6
     return found
 
 
-def judge_surfaces(parts: Sequence[Part], volume: Volume, settings: MeshSettings, *, each: bool = False) -> None:
+def judge_surfaces(
+    parts: Sequence[Part], volume: Volume, settings: MeshSettings, label: Callable[[Mesh], Labelled]
+) -> None:
     """Store in the `facts` of each part the judgement of its walls: ``walls``, None for other surfaces than bone.
 
-    each: Components are judged one by one, too, where the surface as a whole looks like bone.
+    label: Numbers the components of a mesh; they are judged one by one where some of it has no wall of compact bone.
     """
     import numpy as np
 
@@ -173,19 +184,23 @@ def judge_surfaces(parts: Sequence[Part], volume: Volume, settings: MeshSettings
         for part, first, end in zip(own, ends[:-1], ends[1:], strict=True):
             own_walls = walls.where(slice(first, end))
             judged = part.facts["walls"] = judge_walls(own_walls)
-            doubtful = each or judged["looks_like"] != "bone" or is_straight(own_walls.points, volume)
-            if doubtful and _means_bone(settings) and not settings.selects:
-                part.bones = _count_bones(part.mesh, volume, rule)
+            if not _means_bone(settings) or settings.selects:
+                continue
+            faint = judged["looks_like"] != "bone" or judged["compact_share"] <= 1.0 - OTHER_SHARE
+            if faint or is_straight(own_walls.points, volume):
+                part.bones = _count_bones(part.mesh, volume, rule, label(part.mesh))
 
 
-def _count_bones(mesh: Mesh, volume: Volume, rule: IsoRule) -> Bones:
-    """Count the components of a surface that look like bone, and judge the largest of the others."""
+def _count_bones(mesh: Mesh, volume: Volume, rule: IsoRule, labelled: Labelled) -> Bones:
+    """Count the components of a surface that look like bone, among the large ones, where one of these does, else among
+    all, and judge the largest of the others.
+    """
     import numpy as np
 
-    from clrecon.mesh.connectivity import label_components
-
-    labelled = label_components(mesh.triangles, mesh.vertex_count)
-    judged, bone, rails = _tell_bone(mesh, volume, rule, labelled)
+    for fewest in (int(OTHER_SHARE * mesh.vertex_count), 0):
+        judged, bone, rails = _tell_bone(mesh, volume, rule, labelled, fewest)
+        if bone.any():
+            break
     sizes = np.bincount(labelled[1][labelled[1] >= 0], minlength=labelled[0])
     sizes[bone | rails | np.array([one is None for one in judged])] = 0
     other = int(sizes.argmax())

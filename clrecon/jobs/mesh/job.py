@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import judge_label_volumes, name_label_files
-from clrecon.jobs.mesh.make import MadeParts, first_names, make_parts, warn_of_crumbs
+from clrecon.jobs.mesh.make import MadeParts, first_names, label_parts, make_parts, warn_of_crumbs
 from clrecon.jobs.mesh.purposes import describe_purposes
 from clrecon.jobs.mesh.refinement import (
     judge_parts,
@@ -68,7 +69,7 @@ def make_mesh(
         if not settings.one_file:
             paths = name_outputs(output, [part.name for part in parts], report_path)
         is_measured = settings.strict or (report_path is not None if measure is None else measure)
-        judge_surfaces(parts, made.volume, settings, each=is_measured)
+        judge_surfaces(parts, made.volume, settings, partial(label_parts, device=made.device, settings=settings))
         run.lap("select")
         gates = _refine_and_measure(run, made, is_measured)
         warnings = [

@@ -329,14 +329,15 @@ def _select_parts(
 
     limits = (settings.keep_largest, settings.min_volume_ml)
     seeds = [(frame_from_lps(settings.space).T @ seed).tolist() for seed in settings.seeds]
-    labelled = _label_components(mesh, device, settings)
+    labelled = label_parts(mesh, device, settings)
     steps.take()
     among = None
     if settings.keep == "bone":
         among = find_bone(
-            mesh, volume, surface, labelled, without_table=settings.remove_table, advice=_advise_without_bone(settings)
-        )
-        if settings.is_for_print:
+            mesh, volume, surface, labelled, without_table=settings.remove_table, advice=_advise_without_bone(settings),
+            must=not settings.is_for_print,
+        )  # fmt: skip
+        if settings.is_for_print and among is not None:
             other = mesh.triangles[~among[labelled[1][mesh.triangles[:, 0]]]]
             no_bone = measure_pieces(mesh.vertices, other)
             mesh.report.update(not_bone=no_bone["pieces"], not_bone_ml=no_bone["pieces_ml"])
@@ -354,7 +355,7 @@ def _select_parts(
     return [Part(surface, _name_piece(surface, place), piece) for place, piece in enumerate(pieces, start=1)]
 
 
-def _label_components(mesh: Mesh, device: Device, settings: MeshSettings) -> Labelled:
+def label_parts(mesh: Mesh, device: Device, settings: MeshSettings) -> Labelled:
     """Number the components on the device, or, where it fails, by the host, which says so."""
     from clrecon.mesh.connectivity import label_components as label_on_host
     from clrecon.operators.primitives.union_find import label_components
@@ -388,7 +389,7 @@ def warn_of_crumbs(parts: Sequence[Part], settings: MeshSettings, device: Device
         if part.quality is None or part.quality.components <= MANY_COMPONENTS or settings.min_volume_ml is not None:
             continue
         mesh = part.mesh
-        labelled = _label_components(mesh, device, settings)
+        labelled = label_parts(mesh, device, settings)
         ml = np.abs(enclosed_mm3(mesh.vertices - local_origin(mesh.vertices), mesh.triangles, *labelled)) / 1000.0
         crumb_ml = float(f"{min(CRUMB_ML, CRUMB_SHARE * float(ml.sum())):.1g}")
         small = ml[ml < crumb_ml]

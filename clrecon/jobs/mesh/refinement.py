@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from clrecon.errors import DeviceMemoryError, NoSurfaceError
+from clrecon.errors import DeviceError, NoSurfaceError
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part
 from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
@@ -59,7 +59,8 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, device: Device, progress:
 def place_on_cortex(
     made: MadeParts, settings: MeshSettings, measure: bool, progress: Progress = ignore_progress
 ) -> None:
-    """Move the meshes onto the bone, if the settings ask for it, or with `measure` say how far they lie from it.
+    """Move the meshes onto the bone, if the settings ask for it, or say how far they lie from it: without `measure` the
+    largest alone, and only where the scan has not given its level.
 
     The constants of the scan are measured once, in its largest mesh.  A mesh that shows no bone stays as it is and gets
     ``{"reason": words}`` in place of figures; where the largest was to be moved, that is an error.
@@ -67,7 +68,9 @@ def place_on_cortex(
     moves = settings.surface == "cortex"
     parts = sorted(made.parts, key=lambda part: -part.mesh.vertex_count)
     if not moves:
-        parts = [part for part in parts if measure and _may_be_bone(part)]
+        parts = [part for part in parts if _may_be_bone(part)]
+        if not measure:
+            parts = [] if settings.half_way == "auto" else parts[:1]
     if not parts:
         return
     from clrecon.operators.resident.device_volume import DeviceVolume
@@ -83,8 +86,8 @@ def place_on_cortex(
                 else:
                     found = measure_outside(part.mesh, resident, constants=constants)
                     part.mesh.report["cortex"], constants = found, found.constants
-            except (NoSurfaceError, DeviceMemoryError) as error:
-                if moves and (constants is None or isinstance(error, DeviceMemoryError)):
+            except (NoSurfaceError, DeviceError) as error:
+                if moves and (constants is None or isinstance(error, DeviceError)):
                     raise
                 part.mesh.report["cortex"] = {"reason": str(error)}
                 if constants is None:
@@ -100,21 +103,22 @@ def _may_be_bone(part: Part) -> bool:
 
 
 def warn_of_shift(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
-    """Return a warning for each measured mesh whose level, unless the scan gave it, lies outside of the bone by so much
+    """Return a warning for each closed mesh whose level, unless the scan gave it, lies outside of the bone by so much
     that its volume is too large.
     """
-    if settings.half_way == "auto":
+    if settings.half_way == "auto" or not settings.closed:
         return []
     warnings = []
     for part in parts:
-        cortex, quality = part.mesh.report.get("cortex"), part.quality
-        if quality is None or not quality.volume_ml or not cortex or not cortex.get("vertices") or cortex["moved"]:
+        cortex = part.mesh.report.get("cortex")
+        if not cortex or not cortex.get("vertices") or cortex["moved"]:
             continue
-        told = cortex["fitted"] / cortex["vertices"]
-        shift = cortex["outside_mm"]["mean"]
-        excess_ml = shift * told * quality.area_mm2 / 1000.0
-        share = excess_ml / max(quality.volume_ml - excess_ml, 0.2 * quality.volume_ml)
-        if told >= FEWEST_TOLD and share >= SHIFT_SHARE:
+        told, shift = cortex["fitted"] / cortex["vertices"], cortex["outside_mm"]["mean"]
+        if told < FEWEST_TOLD:
+            continue
+        area, volume = _measure_size(part)
+        excess = shift * told * area
+        if volume > 0.0 and (share := excess / max(volume - excess, 0.2 * volume)) >= SHIFT_SHARE:
             name = f"{part.name}: " if part.name else ""
             warnings.append(
                 f"{name}the surface {part.surface.phrase} lies {shift:.2g} mm outside of the bone on average, which"
@@ -122,6 +126,15 @@ def warn_of_shift(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
                 " measures the level of this scan"
             )
     return warnings
+
+
+def _measure_size(part: Part) -> tuple[float, float]:
+    """Return area in mm2 and enclosed volume in mm3, as measured already or now."""
+    from clrecon.mesh.quality import measure_triangles
+
+    if part.quality is None:
+        return measure_triangles(part.mesh.vertices, part.mesh.triangles)[:2]
+    return part.quality.area_mm2, 1000.0 * (part.quality.volume_ml or 0.0)
 
 
 def measure_parts(

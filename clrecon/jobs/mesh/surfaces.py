@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from clrecon.errors import RefusedInputError
 from clrecon.jobs.mesh.settings import MeshSettings, name_level
-from clrecon.jobs.presets import find_iso_preset, find_purpose
+from clrecon.jobs.presets import find_iso_preset
 from clrecon.system.arguments import name_parameter
 from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.progress import Progress, ignore_progress
@@ -68,7 +68,7 @@ class Part:
     name: Text between the stem of the output and its extension, for example ``"200hu_001"``; empty if it is alone.
     facts: Further entries of its object in the report.
     pieces: Enclosed volumes of the components of its surface, as extracted and as kept, if the purpose needs them.
-    bones: Counted if it is measured, or does not look like bone as a whole.
+    bones: Counted if some of it does not look like bone.
     """
 
     surface: Surface
@@ -115,10 +115,14 @@ def list_failed_values(volume: Volume) -> list[dict[str, Any]]:
     return [gate for gate in volume.report.get("gates", ()) if gate["name"] in VALUE_GATES and gate["ok"] is False]
 
 
+def names_level(settings: MeshSettings) -> bool:
+    """Tell whether a level, or the two materials beside it, are given as numbers, in whatever units the values have."""
+    return settings.iso_value is not None or settings.half_way not in (None, "auto")
+
+
 def check_known_values(volume: Volume, settings: MeshSettings) -> None:
     """Refuse to choose the level of a print where the values are not HU; one in the values' own units is taken."""
-    named = settings.iso_value is not None or isinstance(settings.half_way, Sequence) and settings.half_way != "auto"
-    if settings.purpose is None or not find_purpose(settings.purpose).is_for_print or named or not settings.follows_hu:
+    if not settings.is_for_print or names_level(settings) or not settings.follows_hu:
         return
     failed = list_failed_values(volume)
     if failed:
@@ -169,7 +173,7 @@ def describe_level(
 
 def _warn_of_specimen(volume: Volume, settings: MeshSettings) -> list[str]:
     """Warn of thin walls of a dry specimen, which are fitted only where the level shows them."""
-    from clrecon.anatomy.iso_choice import lies_in_air
+    from clrecon.anatomy.materials import lies_in_air
 
     level = max((hu for hu in settings.levels if not isinstance(hu, tuple)), default=-math.inf)
     if settings.surface != "cortex" or level <= HIGHEST_DRY_HU or not lies_in_air(volume):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from clrecon.exchange.page import read_facts
 from clrecon.jobs.distance import doubt_frames, read_side
 from clrecon.jobs.inputs import may_be_mesh
 from clrecon.jobs.mesh.bone import judge_surfaces
-from clrecon.jobs.mesh.make import make_parts
+from clrecon.jobs.mesh.make import label_parts, make_parts
 from clrecon.jobs.options import changed_fields
 from clrecon.jobs.outputs import commit_all
 from clrecon.jobs.run import JobReport, Run
@@ -113,7 +114,8 @@ def _read_input(path: str | Path, settings: ViewSettings, run: Run) -> _ShownInp
         run.lap("read")
         return shown
     made = make_parts(path, run)
-    judge_surfaces(made.parts, made.volume, settings.scan)
+    label = partial(label_parts, device=made.device, settings=settings.scan)
+    judge_surfaces(made.parts, made.volume, settings.scan, label)
     run.lap("select")
     meshes = []
     for part in made.parts:

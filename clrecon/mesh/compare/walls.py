@@ -135,13 +135,14 @@ def looks_like_bone(judged: WallLook | None) -> bool:
 
 
 def judge_components(
-    mesh: Mesh, volume: Volume, rule: IsoRule, count: int, label_of_vertex: NDArray[np.int64]
-) -> list[WallLook | None]:
-    """Judge each component of a surface with normals; None for crumbs of less than `FEWEST_VERTICES`."""
+    mesh: Mesh, volume: Volume, rule: IsoRule, count: int, label_of_vertex: NDArray[np.int64],
+    fewest: int = FEWEST_VERTICES,
+) -> list[WallLook | None]:  # fmt: skip
+    """Judge each component of a surface with normals; None for crumbs of less than the `fewest` vertices."""
     order = np.argsort(label_of_vertex, kind="stable")
     ends = np.searchsorted(label_of_vertex[order], np.arange(count + 1))
     sizes = np.diff(ends)
-    told = np.flatnonzero(sizes >= FEWEST_VERTICES)
+    told = np.flatnonzero(sizes >= fewest)
     chosen = [order[ends[one] : ends[one + 1] : -(-sizes[one] // MOST_COMPONENT_SAMPLES)] for one in told]
     judged: list[WallLook | None] = [None] * count
     if len(told) == 0:

@@ -225,6 +225,10 @@ LARGEST_MARROW_MM = 35.0
 """Radius of the smallest ball that fits into no marrow: the head of a femur is 20 to 29 mm in radius, the skull of a
 newborn more than 45."""
 
+SATURATED_HU, METAL_STEPS, METAL_SHARE = 3000.0, 2.0, 0.05
+"""What is filled within so many radii of the ball of values above the first is beside metal, in joints of it and in
+canals round it, and warned of from this share of the solid body on."""
+
 AIR_LIMIT_HU = -200.0
 """A space whose mean is lower holds air: fat is -100, air cells with thin walls are below -400."""
 
@@ -276,14 +280,14 @@ def fill_enclosed(
     Returns
     -------
     Volume or DeviceVolume
-        As ``volume``.  ``report["solid"]``: ``seal_mm``, ``closes_mm`` (width up to which every pore is closed),
-        ``closed_ml`` (what the ball closed, of ``filled_ml``), ``bone_ml``, ``filled_ml``, ``filled_share`` (of both
-        together), ``filled_air_ml`` (cells with air that the ball closed), ``filled_hu`` (the value of what was filled:
-        the mean of the bone), ``spaces`` (number of spaces filled that are wider than the ball), ``at_ends`` (of these,
-        how many the ends of the volume cut), ``largest_ml``, and ``open``: for each kind (``wide``, ``air``)
-        ``spaces``, ``ml``, ``largest_ml`` and ``at_mm``, LPS mm of a place in the largest; ``warnings`` say what stays
-        open, and if more was filled than the bone itself has.  ``report["gates"]`` has ``closed_by_seal``: the ball
-        closed at most half of the solid bone.
+        As ``volume``. ``report["solid"]``: ``seal_mm``, ``closes_mm`` (width up to which every pore is closed),
+        ``closed_ml`` (what the ball closed, of ``filled_ml``), ``metal_ml`` (what lies near metal), ``bone_ml``,
+        ``filled_ml``, ``filled_share`` (of both together), ``filled_air_ml`` (cells with air that the ball closed),
+        ``filled_hu`` (the value of what was filled: the mean of the bone), ``spaces`` (number of spaces filled that are
+        wider than the ball), ``at_ends`` (of these, how many the ends of the volume cut), ``largest_ml``, and ``open``:
+        for each kind (``wide``, ``air``) ``spaces``, ``ml``, ``largest_ml`` and ``at_mm``, LPS mm of a place in the
+        largest; ``warnings`` say what stays open, and if more was filled than the bone itself has. ``report["gates"]``
+        has ``closed_by_seal``: the ball closed at most half of the solid bone.
 
     Raises
     ------
@@ -360,6 +364,7 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
         "filled_ml": filled_ml,
         "filled_share": filled_ml / (filled_ml + bone_ml),
         "closed_ml": closed_ml,
+        "metal_ml": _filled_at_metal(bone, filled, METAL_STEPS * seal_mm, ml),
         "filled_air_ml": float(_count_by_slice(marked & (volume.voxels < AIR_LIMIT_HU)) @ ml),
         "filled_hu": float(value),
         "spaces": int(np.count_nonzero(~left)),
@@ -380,6 +385,14 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
     warnings = [*report.get("warnings", ()), *_warn(facts)]
     made.report = amend(report, solid=facts, warnings=warnings, gates=[*report.get("gates", ()), gate])
     return made
+
+
+def _filled_at_metal(bone: Mask, filled: Mask, reach_mm: float, ml: NDArray[np.float64]) -> float:
+    """Return how much of what was filled lies near metal, ml."""
+    if float(bone.scan.voxels.max()) < SATURATED_HU:
+        return 0.0
+    metal = Mask.from_band(bone.scan, (SATURATED_HU, np.inf), device=bone.device, memory=bone.memory)
+    return float(_count_by_slice((filled & metal.dilate(reach_mm)).to_numpy()) @ ml)
 
 
 def _count_by_slice(marked: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -421,7 +434,13 @@ def _warn(facts: dict[str, Any]) -> list[str]:
             )
     if not facts["filled_ml"]:
         warnings.append("solid: nothing is enclosed at this level, and nothing was filled")
-    elif facts["filled_ml"] > facts["bone_ml"]:
+    if facts["metal_ml"] > METAL_SHARE * (facts["filled_ml"] + facts["bone_ml"]):
+        warnings.append(
+            f"solid: {format_ml(facts['metal_ml'])} of the {format_ml(facts['filled_ml'])} that were filled lie beside"
+            " metal, where joints and canals are narrow: look whether they should be open"
+            f" ({name_parameter('seal_mm', 'MM')}: a smaller ball than {facts['seal_mm']:.3g} mm)"
+        )
+    if facts["filled_ml"] > facts["bone_ml"]:
         warnings.append(
             f"solid: {format_ml(facts['filled_ml'])} were filled, more than the"
             f" {format_ml(facts['bone_ml'])} of the bone"

@@ -144,7 +144,8 @@ TISSUE_HU = (-150, 200)
 """Range of the peaks of fat, water, muscle, organs and blood with contrast medium."""
 
 OFFSET_AIR_HU = (-880, -160)
-"""Range in which the air of an offset scan is looked for; from there on it lies among fat and water."""
+"""Range in which the air of an offset scan is looked for; from there on it lies among fat and water, and above these
+it is told by the step of a CT to soft tissue alone."""
 LUNG_HU, LUNG_WIDTH = -700, 115
 """Lung may be as low as this; its peak is wider than that."""
 STEP_HU, CT_STEP_HU = (450, 1200), (850, 1200)
@@ -264,9 +265,11 @@ def _find_offset(sample: ValueSample, air: Peak, above: Sequence[Peak]) -> _Doub
     """Take the lowest peak for air that lies too high."""
     lower = sample.between(-np.inf, air.at - max(BELOW_AIR_HU, 1.3 * air.width))
     lung = air.at < LUNG_HU and air.width > LUNG_WIDTH
-    if not OFFSET_AIR_HU[0] <= air.at <= OFFSET_AIR_HU[1] or lower >= MOST_BEYOND or lung:
+    no_tissue = air.at > TISSUE_HU[1]
+    if not (OFFSET_AIR_HU[0] <= air.at <= OFFSET_AIR_HU[1] or no_tissue) or lower >= MOST_BEYOND or lung:
         return None
-    fitting = [peak for peak in above if STEP_HU[0] <= peak.at - air.at <= STEP_HU[1]]
+    low, high = CT_STEP_HU if no_tissue else STEP_HU
+    fitting = [peak for peak in above if low <= peak.at - air.at <= high]
     tissue = max(fitting, key=lambda peak: peak.share, default=None)
     if tissue is None or tissue.share < LEAST_OFFSET_TISSUE:
         return None

@@ -12,6 +12,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.jobs.mesh.choices import LabelChoice
 from clrecon.jobs.mesh.job import make_mesh
+from clrecon.jobs.mesh.purposes import settings_for
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.system.records import none_of
 
@@ -105,6 +106,18 @@ def test_values_on_another_scale_are_named_where_nothing_looks_like_bone(
         run(tmp_path, device, iso_value=200.0, keep="bone")
     assert f"; bone is told by walls of 600 HU, and {said.format(shown.voxels.max())}" in str(caught.value)
     assert "rescale=" in str(caught.value) and not list(tmp_path.glob("b.*"))
+
+
+def test_a_print_of_raw_values_at_a_level_of_their_own_keeps_its_largest_piece(
+    read: Any, device: Any, tmp_path: Path
+) -> None:
+    scan = make_scan()
+    voxels = np.rint((scan.voxels + 1000) * 0.3).astype(np.int16)  # no wall reaches 600
+    read(Volume(voxels, AFFINE, {"gates": [none_of("hu_known", 3, "slices")], "warnings": []}))
+    report = run(tmp_path, device, **settings_for("print", {"iso_value": 365.0}))
+    (said,) = [text for text in report["warnings"] if "nothing was left out for that" in text]
+    assert "not known to be HU" in said and "rescale=" in said
+    assert report["volume_ml"] == pytest.approx(HEART_ML, rel=0.1) and report["closed"]
 
 
 def test_pieces_say_which_of_them_are_no_bone(read: Any, device: Any, tmp_path: Path) -> None:

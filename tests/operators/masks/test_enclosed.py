@@ -208,6 +208,20 @@ def test_a_ball_that_closes_more_than_half_of_the_bone_fails_a_gate(device):
     assert [gate["ok"] for gate in fine.report["gates"] if gate["name"] == "closed_by_seal"] == [True]
 
 
+@pytest.mark.parametrize(("hardest", "said"), [(3071, True), (1900, False)])
+def test_what_is_filled_beside_metal_is_said(device, hardest, said):
+    k, j, i = np.indices((24, 30, 30))
+    radius = np.hypot(j - 14.5, i - 14.5)
+    hu = np.where(radius < 12, 800, 50)
+    hu[(radius < 9) & (k > 3) & (k < 20)] = 50  # a canal with a stem in it
+    hu[(radius < 5) & (k < 18)] = hardest
+    filled = clrecon.fill_enclosed(whole(hu), 400, device=device)
+    facts = filled.report["solid"]
+    told = [text for text in filled.report["warnings"] if "lie beside metal" in text]
+    assert (facts["metal_ml"] > 0.9 * facts["filled_ml"] > 0.0, bool(told)) == (said, said)
+    assert not said or "seal_mm=MM: a smaller ball than" in told[0]
+
+
 def test_two_bones_are_not_joined_and_a_groove_of_one_is_only_shallower(device):
     k, j, i = np.indices((30, 30, 40))
     block = (k >= 5) & (k < 25) & (j >= 5) & (j < 25)

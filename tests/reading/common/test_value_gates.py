@@ -45,6 +45,7 @@ def gates_of(report):
         (1, 200, -800, 250, "the rescale intercept seems to be 200 HU too high"),
         (1, 400, -600, 450, "the rescale intercept seems to be 400 HU too high"),
         (1, 800, -200, 850, "the rescale intercept seems to be 800 HU too high"),
+        (1, 1280, 280, 1330, "the rescale intercept seems to be 1280 HU too high"),
         (1, 1024, 24, 1065, "the rescale intercept seems to be missing"),
         (1, -1024, -2024, -983, "the rescale intercept seems to have been applied twice"),
         (0.6, 400, -200, 430, "the rescale slope seems to be wrong, or the scanner has a scale of its own"),
