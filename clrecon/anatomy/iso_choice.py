@@ -22,7 +22,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,7 @@ from clrecon.anatomy.materials import (
 )
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import METAL_HU
+from clrecon.geometry.iso_rule import Level
 from clrecon.geometry.volume import Volume
 from clrecon.system.arguments import explains_arguments
 from clrecon.system.light_dataclass import dataclass
@@ -283,6 +284,18 @@ def choose_iso_value(volume: Volume, *, progress: Progress | None = None) -> Iso
     reason += f"; both are seen at ({', '.join(f'{mm:.4g}' for mm in place)}) mm, in slice {kji[0] + 1}"
     progress("choose", 3, 3)
     return dataclasses.replace(choice, reason=reason, seen_at_lps_mm=place)
+
+
+AutoLevel = Level | Literal["auto"]
+"""An iso value or a range, or the word for the level that `choose_iso_value` measures."""
+
+
+def settle_level(volume: Volume | None, level: Any, progress: Progress | None = None) -> tuple[Any, dict[str, Any]]:
+    """Return a level of HU, measured where it is "auto", and the entries of a report that say so, else none."""
+    if not isinstance(level, str) or level != "auto":
+        return level, {}
+    choice = choose_iso_value(volume, progress=progress)  # type: ignore[arg-type]
+    return choice.iso_value, {"iso_value_reason": choice.reason, "iso_value_choice": choice.measurements()}
 
 
 class _Look(NamedTuple):

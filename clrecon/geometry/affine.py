@@ -71,11 +71,13 @@ def apply_affine(affine: Float64Array, points: ArrayLike) -> Float64Array:
 
 
 def checked_points(points: ArrayLike) -> Float64Array:
-    """Return points (n, 3) as float64 after checking their shape."""
+    """Return points (n, 3), or one point (3,) as an array of one, as float64."""
     try:
         checked = np.asarray(points, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise UsageError(f"points are an array of numbers of shape (n, 3): {error}") from error
+    if checked.shape == (3,):
+        return checked[None]
     if checked.ndim != 2 or checked.shape[1] != 3:
         raise UsageError(f"points have shape (n, 3), these have {checked.shape}")
     return checked
@@ -83,15 +85,8 @@ def checked_points(points: ArrayLike) -> Float64Array:
 
 def map_points(mapping: Callable[[Float64Array], Float64Array], points: ArrayLike) -> Float64Array:
     """Apply what takes points (n, 3) to points, or to one point (3,), whose result then stands alone."""
-    try:
-        is_one = np.ndim(points) == 1  # type: ignore[arg-type]
-    except ValueError:  # rows of several lengths: they are refused below
-        is_one = False
-    placed = mapping(checked_points(np.asarray(points)[None] if is_one else points))
-    if not is_one:
-        return placed
-    alone: Float64Array = placed[0]
-    return alone
+    placed = mapping(checked_points(points))
+    return placed[0] if np.ndim(points) == 1 else placed  # type: ignore[arg-type, no-any-return]
 
 
 def column_spacing(affine: Float64Array) -> tuple[float, float, float]:

@@ -37,8 +37,8 @@ LARGEST_FLOAT = 1e30
 TOPOLOGIES: tuple[str, ...] = get_args(Topology)
 """How inside samples are joined where the corners of a cell leave it open; see `IsoRule.topology`."""
 
-Level = float | Sequence[float]
-"""An iso value, or the two ends of a range, HU."""
+Level = float | Sequence[float | None]
+"""An iso value, or the two ends of a range, HU; one of them may be None, for no end."""
 
 
 @dataclass(frozen=True)
@@ -175,11 +175,12 @@ def choose_iso_rule(
 ) -> IsoRule:
     """Decide what is inside and where the surface lies.
 
-    iso_value: HU.  A sample is inside when its value is >= this; of a range, when it lies within, both ends included.
+    iso_value: HU.  A sample is inside when its value is >= this; of a range, when it lies within, both ends included;
+        an end of None is open.
     below: A sample is inside when its value is < `iso_value`: the same surface, turned round.
     values: Those of this volume; given where several rules for one volume are chosen.
     """
-    iso_value, upper_value = _checked_level(iso_value, below)
+    iso_value, upper_value, below = _checked_level(iso_value, below, volume.voxels.dtype)
     check_topology(topology, ranged=upper_value is not None)
     check_vertex_rule(vertex_rule, topology)
     dtype = volume.voxels.dtype
@@ -258,18 +259,22 @@ def check_topology(topology: str, ranged: bool = False) -> None:
         )
 
 
-def _checked_level(level: Level, below: bool) -> tuple[float, float | None]:
-    """Check the iso value, or the two ends of a range, and return them."""
+def _checked_level(level: Level, below: bool, dtype: np.dtype[Any]) -> tuple[float, float | None, bool]:
+    """Return the iso value, or the two ends of a range, and whether what lies below it is inside."""
     if not isinstance(level, list | tuple | np.ndarray) or np.ndim(level) == 0:
-        return checked_iso_value(level), None  # type: ignore[arg-type]
-    if len(level) != 2:
-        raise UsageError(f"a range of HU has two ends, not {tuple(level)}")
-    low, high = (checked_iso_value(end) for end in level)
-    if low >= high:
-        raise UsageError(f"the range {low:g} to {high:g} HU holds nothing: give its lower end first")
+        return checked_iso_value(level), None, below  # type: ignore[arg-type]
+    if len(level) != 2 or not any(end is not None for end in level):
+        raise UsageError(f"a range of HU has two ends, not {tuple(level)}: None leaves one of them open")
+    low, high = (None if end is None else checked_iso_value(end) for end in level)
     if below:
-        raise UsageError(f"below takes one iso value, not the range {low:g} to {high:g} HU")
-    return low, high
+        raise UsageError(f"below takes one iso value, not the range {level[0]} to {level[1]} HU")
+    if low is None:  # all up to this end is all below the next value
+        assert high is not None
+        beyond = np.nextafter(np.float32(high), np.float32(np.inf)) if dtype.kind == "f" else math.floor(high) + 1
+        return float(beyond), None, True
+    if high is not None and low >= high:
+        raise UsageError(f"the range {low:g} to {high:g} HU holds nothing: give its lower end first")
+    return low, high, False
 
 
 def checked_iso_value(iso_value: float) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -329,13 +329,13 @@ class Volume(BaseVolume, ShownAsHtml):
         return cls._of(*take_nibabel(image))
 
     @explains_arguments
-    def show(self, iso_value: float | None = None, *, device: Any = None) -> None:
+    def show(self, iso_value: float | Literal["auto"] | None = None, *, device: Any = None) -> None:
         """Show the surface at an iso value, which a slider sets, in a window of pyvista; see `clrecon.show`.
 
         Parameters
         ----------
-        iso_value : float, optional
-            HU at the start; 200 by default.
+        iso_value : float or "auto", optional
+            HU at the start, 200 by default.
         device : Device, str or int, optional
             See `clrecon.device`; None is the best of the machine.
 

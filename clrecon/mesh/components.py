@@ -15,7 +15,7 @@ from clrecon.mesh.base import BaseMesh
 from clrecon.mesh.connectivity import label_components
 from clrecon.mesh.quality import measure_components
 from clrecon.mesh.triangles import find_nearest_triangle
-from clrecon.system.arguments import name_parameter
+from clrecon.system.arguments import as_numbers, name_parameter
 from clrecon.system.light_dataclass import dataclass
 from clrecon.system.text import count_of, format_digits
 
@@ -24,6 +24,9 @@ Own = TypeVar("Own", bound=BaseMesh)
 Labelled = tuple[int, NDArray[np.int64]]
 """The result of `label_components`: the number of components, and the component of each vertex."""
 
+
+Seeds = Sequence[Sequence[float]] | Sequence[float]
+"""Points in LPS mm, or one."""
 
 SEED_REACH_MM = 20.0
 """Largest distance of a seed from a surface; the middle of a lumbar vertebral body lies 15 mm from its wall."""
@@ -61,7 +64,7 @@ def select_components(
     keep_largest: int | None = None,
     min_volume_ml: float | None = None,
     *,
-    seeds: Sequence[Sequence[float]] = (),
+    seeds: Seeds = (),
     labelled: Labelled | None = None,
     among: NDArray[np.bool_] | None = None,
 ) -> Own:
@@ -113,7 +116,7 @@ def split_components(
     keep_largest: int | None = None,
     min_volume_ml: float | None = None,
     *,
-    seeds: Sequence[Sequence[float]] = (),
+    seeds: Seeds = (),
     labelled: Labelled | None = None,
     among: NDArray[np.bool_] | None = None,
     most: int | None = None,
@@ -162,7 +165,7 @@ def _choose_components(
     mesh: BaseMesh,
     keep_largest: int | None,
     min_volume_ml: float | None,
-    seeds: Sequence[Sequence[float]],
+    seeds: Seeds,
     labelled: Labelled | None,
     among: NDArray[np.bool_] | None = None,
     *,
@@ -228,15 +231,15 @@ def _rank_areas(areas: NDArray[np.float64], step: float) -> NDArray[np.int64]:
 
 
 def _find_at_seeds(
-    mesh: BaseMesh, label_of_triangle: NDArray[np.int64], keep: NDArray[np.bool_], seeds: Sequence[Sequence[float]]
+    mesh: BaseMesh, label_of_triangle: NDArray[np.int64], keep: NDArray[np.bool_], seeds: Seeds
 ) -> tuple[NDArray[np.bool_], list[float]]:
     """Find the components of `keep` that are nearest to a seed, and the distance of each seed from its component."""
     rows = np.flatnonzero(keep[label_of_triangle])
     triangles = mesh.triangles if len(rows) == mesh.triangle_count else mesh.triangles[rows]
     found = np.zeros_like(keep)
     distances = []
-    for seed in seeds:
-        point = np.asarray(seed, dtype=np.float64)
+    for seed in seeds if np.ndim(seeds[0]) else [seeds]:
+        point = as_numbers("seeds", seed)
         if point.shape != (3,) or not np.isfinite(point).all():
             raise UsageError(f"a seed is a point of three numbers in mm, not {seed}")
         row, distance = find_nearest_triangle(mesh.vertices, triangles, point)

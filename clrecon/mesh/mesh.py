@@ -89,7 +89,7 @@ class Mesh(BaseMesh, ShownAsHtml):
         keep_largest: int | None = None,
         min_volume_ml: float | None = None,
         *,
-        seeds: Sequence[Sequence[float]] = (),
+        seeds: Sequence[Sequence[float]] | Sequence[float] = (),
     ) -> list[Mesh]:
         """Return the parts that share no vertex as meshes, the largest area first, or some of them.
 
@@ -99,7 +99,7 @@ class Mesh(BaseMesh, ShownAsHtml):
             This number of parts, those of largest area.
         min_volume_ml : float, optional
             Parts that enclose at least this volume, regardless of sign: the wall of a cavity is a part of its own.
-        seeds : sequence of (x, y, z)
+        seeds : sequence of (x, y, z), or one
             Parts whose surface lies nearest to one of these points, LPS mm.
 
         Raises

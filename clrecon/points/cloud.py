@@ -45,6 +45,8 @@ def _rows(values: ArrayLike, name: str) -> NDArray[Any]:
     array = _as_array(values, name)
     if array.size == 0 and array.ndim < 2:
         array = array.reshape(0, 3)
+    if array.shape == (3,):  # one point
+        array = array[None]
     if array.ndim != 2 or array.shape[1] != 3:
         raise UsageError(f"{name} have shape (n, 3), these have {array.shape}")
     if array.dtype.kind not in "fiu":
@@ -70,7 +72,7 @@ class PointCloud(Message, ShownAsHtml):
 
     Parameters
     ----------
-    points : array_like, shape (n, 3)
+    points : array_like, shape (n, 3) or (3,)
         LPS mm, finite; kept as float32, without a copy when they are C-contiguous float32.  Others that reach 4096 mm
         from the origin, where float32 would round them by more than 2e-4 mm, are kept as float64.
     normals : array_like, shape (n, 3), optional

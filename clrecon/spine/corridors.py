@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.anatomy.iso_choice import settle_level
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.iso_rule import checked_iso_value
 from clrecon.labels import LabelMap
 from clrecon.labels.resample import resample_labels
 from clrecon.spine.frame import VertebraFrame, find_frame
@@ -378,7 +380,9 @@ def screw_diameter(radius: float, margin: float) -> float:
 
 
 @explains_arguments
-def find_corridors(volume: Volume, labels: LabelMap, label: int | str, iso_value: float) -> VertebraCorridors:
+def find_corridors(
+    volume: Volume, labels: LabelMap, label: int | str, iso_value: float | Literal["auto"]
+) -> VertebraCorridors:
     """Find the widest straight corridors through the pedicles of a labelled vertebra.
 
     It measures one surface at one level of HU and is not for planning an operation; see docs/corridor.md.
@@ -391,8 +395,8 @@ def find_corridors(volume: Volume, labels: LabelMap, label: int | str, iso_value
         On any grid; each label is one vertebra.
     label : int or str
         Number or name, as `LabelMap.find` takes it.
-    iso_value : float
-        HU at which the bone's surface lies.
+    iso_value : float or "auto"
+        HU at which the bone's surface lies; "auto" is that of `choose_iso_value`.
 
     Returns
     -------
@@ -407,8 +411,8 @@ def find_corridors(volume: Volume, labels: LabelMap, label: int | str, iso_value
         The label is not that of a whole vertebra, or it is cut off at the end of the scan.
     """
     number = labels.find(label)
-    taken = resample_labels(labels, volume)
-    return measure_corridors(volume, taken.voxels, number, float(iso_value), labels.name(number))
+    taken, (level, _) = resample_labels(labels, volume), settle_level(volume, iso_value)
+    return measure_corridors(volume, taken.voxels, number, checked_iso_value(level), labels.name(number))
 
 
 def measure_corridors(volume: Volume, labels: NDArray[Any], number: int, level: float, name: str) -> VertebraCorridors:

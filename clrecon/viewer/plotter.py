@@ -7,9 +7,11 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
+from clrecon.anatomy.iso_choice import settle_level
 from clrecon.errors import NoSurfaceError
+from clrecon.geometry import Volume
 from clrecon.jobs.view import ViewSettings
 from clrecon.jobs.view.inputs import check_view_settings
 from clrecon.operators.surface.extract import SurfaceExtractor
@@ -33,7 +35,6 @@ from clrecon.viewer.model.objects import (
 if TYPE_CHECKING:
     import pyvista
 
-    from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.points import PointCloud
@@ -50,7 +51,9 @@ _LISTEN_MS = 100
 """Between two moments in which Python sees a Ctrl-C: VTK's loop is not Python's."""
 
 
-def show(*shown: Volume | Mesh | PointCloud | LabelMap, iso_value: float | None = None, device: Any = None) -> None:
+def show(
+    *shown: Volume | Mesh | PointCloud | LabelMap, iso_value: float | Literal["auto"] | None = None, device: Any = None
+) -> None:
     """Show objects in a window of pyvista, until it is closed.
 
     A plain ``pyvista.Plotter``: drag turns, Shift and drag pans, the wheel zooms.  A slider sets the iso value of
@@ -62,8 +65,8 @@ def show(*shown: Volume | Mesh | PointCloud | LabelMap, iso_value: float | None 
     ----------
     shown : Volume, Mesh, PointCloud or LabelMap
         Together, each in its place.
-    iso_value : float, optional
-        HU at the start; 200 by default.
+    iso_value : float or "auto", optional
+        HU at the start, 200 by default; "auto" is that of `choose_iso_value` of the first volume.
     device : Device, str or int, optional
         For volumes and label maps, see `clrecon.device`; None is the best of the machine.
 
@@ -74,9 +77,10 @@ def show(*shown: Volume | Mesh | PointCloud | LabelMap, iso_value: float | None 
     DeviceError
         The device does not exist.
     """
+    level, _ = settle_level(next((each for each in shown if isinstance(each, Volume)), None), iso_value)
     with DisplayProbe() as probe:
         display = _wait_for_display(probe)
-    with open_plotter(show_objects(shown), iso_value=iso_value, device=device) as plotter:
+    with open_plotter(show_objects(shown), iso_value=level, device=device) as plotter:
         _run(plotter, display)
 
 

@@ -68,7 +68,8 @@ def test_what_is_no_public_name_is_not_there() -> None:
     for name in ("choose_device", "list_devices", "import_module_", "rendr", "_nothing"):
         with pytest.raises(AttributeError, match=name):
             getattr(clrecon, name)
-    assert {"Volume", "device", "__version__"} <= set(dir(clrecon))
+    assert {name for name in dir(clrecon) if not name.startswith("__")} == set(clrecon.__all__) - {"__version__"}
+    assert len(clrecon.__all__) <= 110
 
 
 def test_star_import_takes_the_public_names() -> None:

@@ -5,11 +5,12 @@ Spaces that a mask encloses are measured first: which they are, how large and ho
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.anatomy.iso_choice import settle_level
 from clrecon.anatomy.marrow import find_open_places, holds_ball
 from clrecon.errors import NoSurfaceError
 from clrecon.geometry import Volume, slice_voxel_ml
@@ -236,7 +237,7 @@ AIR_LIMIT_HU = -200.0
 @explains_arguments
 def fill_enclosed(
     volume: Volume | DeviceVolume,
-    iso_value: float,
+    iso_value: float | Literal["auto"],
     *,
     seal_mm: float | None = None,
     largest_mm: float | None = LARGEST_MARROW_MM,
@@ -247,12 +248,11 @@ def fill_enclosed(
 ) -> Any:
     """Return a volume in which what the voxels at a level and above enclose, as marrow, is above the level too.
 
-    The voxels at the level and above are closed by a ball, so that gaps in the cortex are closed.  The ball acts
-    between the centres of voxels: every pore up to twice its radius less one step of the voxels is closed.  A space is
-    enclosed where no way over faces of voxels leads from it to the border of the volume, or only to places of an end
-    of the volume that are enclosed in that end's own slice: the canal of a long bone that the scan cuts.  From outside
-    voxels become free again as deep as the ball's radius, so that grooves, and pores at their mouth, keep their shape.
-    Between two bones nothing is closed: pieces that were apart stay so, with the vessels full of contrast medium.
+    The voxels at the level and above are closed by a ball between the centres of voxels: every pore up to twice its
+    radius less one step of the voxels is closed.  A space is enclosed where no way over faces of voxels leads from it
+    to the border of the volume, or only to places of an end of the volume that are enclosed in that end's own slice:
+    the canal of a long bone that the scan cuts.  From outside voxels become free again as deep as the ball's radius:
+    grooves and mouths of pores keep their shape.  Between two bones nothing is closed: pieces apart stay so.
 
     No other voxel changes: where bone borders on what is outside, an iso surface of the result has the same vertices
     as one of ``volume``, bit for bit.
@@ -261,8 +261,8 @@ def fill_enclosed(
     ----------
     volume : Volume or DeviceVolume
         Not changed.
-    iso_value : float
-        HU; inside is ``>= iso_value``.
+    iso_value : float or "auto"
+        HU; inside is ``>= iso_value``; "auto" is that of `choose_iso_value`, and ``report["solid"]`` says why.
     seal_mm : float, optional
         Radius of the ball, mm.  Below every step of the voxels it closes nothing.  None: 1.25 of the largest step, from
         2.5 to 3 mm, and less where voxels or bones are small: at most 8 steps, and a seventh of the side of a cube as
@@ -272,10 +272,8 @@ def fill_enclosed(
         stays open: no marrow is so thick, but the skull, the chest and the pelvis are.  None fills all.
     keep_air : bool
         True: a space that holds air stays open (sinuses, airways), unless what surrounds the bone is air too.
-    device, memory
-        As for `Mask.from_band`.
-    progress : callable, optional
-        Called as ``progress("solid", steps done, steps)``.
+    device, memory, progress
+        As for `Mask.from_band`; ``progress("solid", steps done, steps)``.
 
     Returns
     -------
@@ -303,16 +301,18 @@ def fill_enclosed(
     steps = Steps(progress, "solid", 5)
     with open_volume(volume, device, memory, "a solid body") as resident:
         own = resident.volume
-        rule = choose_iso_rule(own, iso_value, values=resident.values)
+        level, chosen = settle_level(own, iso_value)
+        rule = choose_iso_rule(own, level, values=resident.values)
         bone = Mask.from_band(resident, (float(rule.lowest_inside), np.inf))
         if not bone.count or bone.count == own.voxels.size:
             what = "no voxel has" if not bone.count else "every voxel has"
             low, high = own.hu_range or (float(own.voxels.min()), float(own.voxels.max()))
             ends = f"the volume runs from {format_hu(low)} to {format_hu(high)} HU"
-            raise NoSurfaceError(f"{what} {iso_value:g} HU or more: {ends}")
+            raise NoSurfaceError(f"{what} {level:g} HU or more: {ends}")
         seal = seal or _default_seal(own, bone)
         steps.take()
         made = _fill(bone, (seal, largest, keep_air), float(rule.lowest_inside), steps)
+        made.report = amend(made.report, solid=made.report["solid"] | chosen)
         return resident.follow(made) if isinstance(volume, DeviceVolume) else made
 
 

@@ -431,8 +431,8 @@ class MaskComponents(MaskShapes):
     def grow(self: ComponentMask, points_mm: ArrayLike) -> ComponentMask:
         """Choose the components that hold a point: chosen voxels joined with it by faces of chosen voxels.
 
-        points_mm: array_like, shape (n, 3). LPS mm; each belongs to the voxel whose centre is nearest along the axes of
-            the volume.
+        points_mm: array_like, shape (n, 3) or (3,). LPS mm; each belongs to the voxel whose centre is nearest along
+            the axes of the volume.
         """
         points = checked_points(points_mm)
         if not len(points) or not np.isfinite(points).all():

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from clrecon.anatomy.head import warn_of_face
+from clrecon.anatomy.iso_choice import settle_level
 from clrecon.errors import DeviceError, DeviceFailedError, DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import data_range
@@ -296,7 +297,7 @@ Band = tuple[float, float]
 @explains_arguments
 def extract_points(
     volume: Volume | DeviceVolume,
-    iso_value: float | None = None,
+    iso_value: float | Literal["auto"] | None = None,
     *,
     kind: PointKind | None = None,
     hu: Sequence[float | None] | None = None,
@@ -319,9 +320,9 @@ def extract_points(
     volume : Volume or DeviceVolume
         A `DeviceVolume` is used directly, with its own device and memory.  Remove a table before, see
         `clrecon.remove_table`.
-    iso_value : float, optional
-        HU; for voxels the lower end of a band without an upper one.  None: that of `clrecon.choose_iso_value`, unless
-        ``hu`` is given.
+    iso_value : float or "auto", optional
+        HU; for voxels the lower end of a band without an upper one.  "auto", and None unless ``hu`` is given: that of
+        `clrecon.choose_iso_value`; the report says why.
     kind : {"surface", "shell", "voxels"}, optional
         None: "voxels" where ``hu`` is given, else "surface".
     hu : (float or None, float or None), optional
@@ -361,17 +362,13 @@ def extract_points(
     progress = progress or ignore_progress
     kind = _check(iso_value, kind, hu, labels, label, paper)
     with open_volume(volume, device, memory, "a cloud of points") as resident:
-        if iso_value is None and hu is None:
-            from clrecon.anatomy.iso_choice import choose_iso_value
-
-            iso_value = choose_iso_value(resident.volume).iso_value
+        level, chosen = settle_level(resident.volume, "auto" if iso_value is None and hu is None else iso_value)
         if kind == "surface":
-            level = iso_value if hu is None else hu
-            cloud = _surface(resident, level, labels, label, progress)
+            cloud = _surface(resident, level if hu is None else hu, labels, label, progress)
         else:
-            band = checked_band((iso_value, None) if hu is None else hu)
+            band = checked_band((level, None) if hu is None else hu)
             cloud = _voxels(resident, band, kind == "shell", labels, label, paper, progress)
-    cloud.report.update(kind=kind, voxels=resident.volume.voxels.size, points=len(cloud))
+    cloud.report.update(chosen, kind=kind, voxels=resident.volume.voxels.size, points=len(cloud))
     return cloud
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from clrecon.anatomy.iso_choice import AutoLevel, settle_level
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, Level, check_topology, choose_iso_rule
@@ -100,7 +101,7 @@ class SurfaceExtractor(Closing):
     @explains_arguments
     def extract(
         self,
-        iso_value: Level,
+        iso_value: AutoLevel,
         *,
         closed: bool = True,
         topology: Topology = "separated",
@@ -110,7 +111,8 @@ class SurfaceExtractor(Closing):
         progress: Progress | None = None,
     ) -> Mesh:
         """Extract the surface at one iso value, or of one range, see `extract_isosurface`."""
-        grid = self._choose_grid(iso_value, closed, topology, below, vertex_rule)
+        level, chosen = settle_level(self.volume, iso_value, progress)
+        grid = self._choose_grid(level, closed, topology, below, vertex_rule)
         seeds = None
         if grow_from is not None:
             if topology != "separated":
@@ -123,13 +125,13 @@ class SurfaceExtractor(Closing):
             with attempt as (_, warnings):
                 run = Extraction(self._resident, grid, self._placement(grid), warnings, seeds=seeds)
                 positions, normals, triangles = run.run(progress or ignore_progress)
-                report = run.describe(len(positions), len(triangles))
+                report = run.describe(len(positions), len(triangles)) | chosen
                 mesh = Mesh(run.placement.to_lps(positions), triangles, normals, report, trusted=True)
         return mesh
 
     @explains_arguments
     def extract_vertices(
-        self, iso_value: Level, *, closed: bool = True, below: bool = False, progress: Progress | None = None
+        self, iso_value: AutoLevel, *, closed: bool = True, below: bool = False, progress: Progress | None = None
     ) -> PointCloud:
         """Extract the vertices and normals of the surface that `extract` makes, without its triangles.
 
@@ -139,12 +141,13 @@ class SurfaceExtractor(Closing):
             In the order of the mesh's vertices, the same bit for bit; the HU of each is the iso value, and those of a
             range have none.
         """
-        grid = self._choose_grid(iso_value, closed, "separated", below)
+        level, chosen = settle_level(self.volume, iso_value, progress)
+        grid = self._choose_grid(level, closed, "separated", below)
         for attempt in self._resident.with_fallback():
             with attempt as (_, warnings):
                 run = Extraction(self._resident, grid, self._placement(grid), warnings, vertices_only=True)
                 positions, normals, _ = run.run(progress or ignore_progress)
-                report = run.describe(len(positions), 0)
+                report = run.describe(len(positions), 0) | chosen
                 level = report["iso_value_hu"]
                 hu = None if level is None else np.full(len(positions), level, np.float32)
                 cloud = PointCloud.of_known(run.placement.to_lps(positions), normals, hu, report=report)
@@ -174,7 +177,7 @@ class SurfaceExtractor(Closing):
 @explains_arguments
 def extract_isosurface(
     volume: Volume | DeviceVolume,
-    iso_value: Level,
+    iso_value: AutoLevel,
     *,
     device: Device | str | int | None = None,
     closed: bool = True,
@@ -190,18 +193,17 @@ def extract_isosurface(
 
     Marching cubes with a derived, face-consistent case table and vertices shared between cells.  A voxel is inside when
     its value is >= ``iso_value``. For integer voxels and an integer ``iso_value`` k the surface lies at k - 0.5,
-    between the integers.  Vertices are mapped once through the volume's affine, shear included.  They are exact to one
-    unit in the last place of float32 at the volume's largest coordinate (6e-5 mm at 1 m), but stay four of these units
-    away from voxel centres.  From 4096 mm on they are given as float64.  A volume that does not fit the device is
-    processed slab by slab; the mesh is the same bit for bit.
+    between the integers.  Vertices go once through the volume's affine, shear included, exact to one unit in the last
+    place of float32 at its largest coordinate (6e-5 mm at 1 m), but stay four of these units away from voxel centres;
+    from 4096 mm on they are float64.  A volume that does not fit the device gives the same mesh bit for bit.
 
     Parameters
     ----------
     volume : Volume or DeviceVolume
         Its voxels may be a memory-mapped file.  A `DeviceVolume` is used directly, with its own device and memory.
-    iso_value : float or (float, float)
-        HU; or the two ends of a range, both included: at 100 to 300 the surface of integer voxels lies at 99.5 and at
-        300.5.  Between two neighbouring voxels, one below and one above the range, there is no surface.
+    iso_value : float, (float, float) or "auto"
+        HU; "auto" is that of `choose_iso_value`, and the report says why.  Or the ends of a range, both included (None:
+        no end): at 100 to 300 the surface of integer voxels lies at 99.5 and at 300.5, none between two neighbours.
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.
     closed : bool
@@ -220,10 +222,8 @@ def extract_isosurface(
         Where on an edge a vertex lies, see ``docs/methods.md``.  "golden" misses the surface by up to 0.6 voxels.
     solid : bool
         True: what is enclosed is filled, see `clrecon.fill_enclosed`; not with ``below`` and ranges.
-    memory : int, optional
-        See `SurfaceExtractor`.
-    progress : callable, optional
-        Called as ``progress("build", done, total)`` and ``progress("slabs", slices done, all slices)``.
+    memory, progress
+        See `SurfaceExtractor`; ``progress("build", done, total)`` and ``progress("slabs", slices done, all slices)``.
 
     Returns
     -------
@@ -239,7 +239,7 @@ def extract_isosurface(
         The iso value crosses nothing; the message gives the range of the data.
     UsageError
         An argument is not what it should be, values or the volume are too large for float32, a row of the volume is
-        too long, or a seed is outside of the volume or not near the surface.
+        too long, or a seed is outside or not near the surface.
     DeviceError
         No device, not even one slice fits its memory, 2^32 vertices or triangles or more, or it fails or errs.
 
@@ -247,11 +247,14 @@ def extract_isosurface(
     ----------
     Lorensen and Cline 1987; Schroeder et al. 2015; "trilinear": Nielson and Hamann 1991, Chernyaev 1995, Grosso 2016.
     """
-    with _open(volume, iso_value, solid, below, device=device, memory=memory, progress=progress) as extractor:
-        return extractor.extract(
-            iso_value, closed=closed, topology=topology, below=below, grow_from=grow_from, vertex_rule=vertex_rule,
+    level, chosen = settle_level(volume, iso_value, progress)  # before anything is filled
+    with _open(volume, level, solid, below, device=device, memory=memory, progress=progress) as extractor:
+        mesh = extractor.extract(
+            level, closed=closed, topology=topology, below=below, grow_from=grow_from, vertex_rule=vertex_rule,
             progress=progress,
         )  # fmt: skip
+    mesh.report.update(chosen)
+    return mesh
 
 
 @contextmanager
@@ -267,7 +270,7 @@ def _open(
     """Yield an extractor for a volume, or with `solid` for one in which what the level encloses is filled."""
     with ExitStack() as opened:
         if solid:
-            if below or np.ndim(iso_value):
+            if below or np.ndim(iso_value):  # type: ignore[arg-type]
                 raise UsageError(f"{name_parameter('solid', True)} goes with one iso value, not with below or a range")
             volume = fill_enclosed(volume, iso_value, progress=progress, **where)  # type: ignore[arg-type]
             if isinstance(volume, DeviceVolume):
@@ -278,7 +281,7 @@ def _open(
 @explains_arguments
 def extract_isosurfaces(
     volume: Volume | DeviceVolume,
-    iso_values: Sequence[Level],
+    iso_values: Sequence[AutoLevel],
     *,
     device: Device | str | int | None = None,
     closed: bool = True,
@@ -291,7 +294,7 @@ def extract_isosurfaces(
 
     Parameters
     ----------
-    iso_values : sequence of float or (float, float)
+    iso_values : sequence of float, (float, float) or "auto"
         HU, at least one.
 
     Returns

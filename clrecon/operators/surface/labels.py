@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike
 
 from clrecon.anatomy.head import SKIN_HU, warn_of_skin
+from clrecon.anatomy.iso_choice import settle_level
 from clrecon.errors import DeviceMemoryError, NoSurfaceError
 from clrecon.geometry import Volume, slice_voxel_ml
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
@@ -353,7 +354,7 @@ def _refuse_label(
 def extract_labels(
     volume: Volume | DeviceVolume,
     labels: LabelMap,
-    iso_value: float,
+    iso_value: float | Literal["auto"],
     *,
     device: Device | str | int | None = None,
     label: Sequence[int | str] | int | str | None = None,
@@ -377,8 +378,8 @@ def extract_labels(
         A `DeviceVolume` is used directly, with its own device and memory.
     labels : LabelMap
         On any grid, see `resample_labels`.
-    iso_value : float
-        HU.
+    iso_value : float or "auto"
+        HU; "auto" is that of `choose_iso_value`, and the reports say why.
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.
     label : int, str or sequence of them, optional
@@ -416,7 +417,8 @@ def extract_labels(
     """
     with open_volume(volume, device, memory, "a surface of a label") as resident:
         taken = resident.bring(labels)
-        rule = choose_iso_rule(resident.volume, iso_value, closed, values=resident.values)
+        level, chosen = settle_level(resident.volume, iso_value)
+        rule = choose_iso_rule(resident.volume, level, closed, values=resident.values)
         marching_cubes.check_row(resident.volume.shape_ijk[0])
         growth = Growth.of(resident.volume, grow_mm)
 
@@ -426,6 +428,8 @@ def extract_labels(
                 meshes = _make_meshes(run, labels, taken, label, progress or ignore_progress)
     if not meshes:
         raise _refuse_all(resident.volume, taken, labels, rule)
+    for mesh in meshes.values():
+        mesh.report.update(chosen)
     return meshes
 
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.anatomy.iso_choice import AutoLevel, settle_level
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.iso_rule import IsoRule, Level, choose_iso_rule
@@ -171,7 +172,7 @@ def check_method(
 @explains_arguments
 def extract_by_method(
     volume: Volume | DeviceVolume,
-    iso_value: Level,
+    iso_value: AutoLevel,
     method: MethodName,
     *,
     grow_from: Any = None,
@@ -187,7 +188,7 @@ def extract_by_method(
     Parameters
     ----------
     volume : Volume or DeviceVolume
-    iso_value : float or (float, float)
+    iso_value : float, (float, float) or "auto"
         HU, see `extract_isosurface`.
     method : {"t-mc", "i-mc", "g-mc", "s-mc", "t-mc-soup", "skimage"}
         See ``METHODS`` and ``docs/methods.md``.
@@ -211,17 +212,17 @@ def extract_by_method(
     NoSurfaceError, DeviceError
         As `extract_isosurface`.
     """
-    chosen = check_method(
-        method, grows=grow_from is not None, vertex_rule=vertex_rule, plain=not np.ndim(iso_value)
-    )  # fmt: skip
+    level, measured = settle_level(volume, iso_value, progress)
+    plain = not np.ndim(level)
+    chosen = check_method(method, grows=grow_from is not None, vertex_rule=vertex_rule, plain=plain)
     if decimate is not None and not chosen.decimates:
         raise UsageError(f"{name_parameter('method', method)} takes no triangles away: leave the share out")
     if not chosen.on_device:
-        mesh = _extract_on_host(volume, iso_value, method, closed)
+        mesh = _extract_on_host(volume, level, method, closed)
     else:
         with SurfaceExtractor(volume, device=device, memory=memory) as extractor:
             mesh = extractor.extract(
-                iso_value, closed=closed, vertex_rule=vertex_rule, progress=progress,
+                level, closed=closed, vertex_rule=vertex_rule, progress=progress,
                 grow_from=(AUTO if grow_from is None else grow_from) if chosen.grows else None,
             )  # fmt: skip
     if chosen.decimates:
@@ -233,7 +234,7 @@ def extract_by_method(
             mesh = collapse_quadric(mesh, share, progress=progress)
         else:  # what may be taken on the device is for the surface
             mesh = decimate_mesh(mesh, share, device=extractor.device if memory is None else None, progress=progress)
-    mesh.report["method"] = method
+    mesh.report.update(measured, method=method)
     return mesh
 
 

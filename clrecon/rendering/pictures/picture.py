@@ -79,6 +79,24 @@ class Rendering(PictureData):
         depth = self.expected_depth if expected else self.depth
         return np.asarray(origins + depth[..., None].astype(np.float64) * directions)
 
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Left, right, lower and upper edge in mm: ``plt.imshow(cut.values, "gray", extent=cut.extent)``.
+
+        Where a side of the picture runs along an axis of the patient these are its LPS coordinates (of an axial slice x
+        and y, of a coronal one x and z), else mm from the middle.  A `UsageError` where pixels have no one size in mm.
+        """
+        if self.camera is None or self.pixel_mm is None:
+            raise UsageError("this picture has no axes in mm: its camera is None or not parallel")
+        found: list[float] = []
+        for way, pixels in zip(self.camera.basis(), self.size, strict=False):
+            axis = int(np.argmax(np.abs(way)))
+            along = abs(abs(way[axis]) - 1.0) < 1e-9
+            middle, sign = (self.camera.focal_point[axis], float(np.sign(way[axis]))) if along else (0.0, 1.0)
+            found += [middle - sign * 0.5 * pixels * self.pixel_mm, middle + sign * 0.5 * pixels * self.pixel_mm]
+        left, right, lower, upper = found
+        return left, right, lower, upper
+
     def show(self) -> None:
         """Open the picture in the system's own viewer, through Pillow; notebooks show it by themselves."""
         load_pillow()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry.affine import Float64Array, checked_points
+from clrecon.geometry.affine import Float64Array, map_points
 from clrecon.geometry.grid import Grid
 from clrecon.geometry.volume import Volume
 from clrecon.rendering.views.camera import box_corners
@@ -105,9 +105,9 @@ class Clip(Message):
         return self._planes
 
     def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Return which points (n, 3), LPS mm, are kept: shape (n,), bool."""
-        heights = checked_points(points) @ self._planes[:, :3].T
-        return np.asarray((heights >= self._planes[:, 3]).all(axis=1))
+        """Return which points (n, 3) or (3,), LPS mm, are kept: shape (n,) or one, bool."""
+        planes = self._planes
+        return map_points(lambda lps: (lps @ planes[:, :3].T >= planes[:, 3]).all(axis=1), points)  # type: ignore
 
     def __and__(self, other: Clip) -> Clip:
         """Keep only points that both keep."""

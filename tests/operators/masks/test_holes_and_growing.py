@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import sample_meshes as samples
 from scipy import ndimage
 from surface_volumes import OBLIQUE
 from uneven_volume import uneven
@@ -110,7 +111,7 @@ def test_points_that_nothing_grows_from_are_refused(device):
         ([[10, 4, 1], [10, 4, 90]], r"\(10.0, 4.0, 90.0\) mm lies outside of the volume: .* is 89.0 mm away"),
         ([[0, 0, np.nan]], "needs points that are numbers"),
         (np.zeros((0, 3)), "needs points that are numbers, these are 0 points"),
-        ([1, 2, 3], "points have shape"),
+        ([1, 2], "points have shape"),
     ):
         with pytest.raises(UsageError, match=words):
             mask.grow(points)
@@ -119,3 +120,16 @@ def test_points_that_nothing_grows_from_are_refused(device):
     small = clrecon.Mask(volume, mask.bits.mask_d, "", device=mask.device, memory=900)
     with pytest.raises(DeviceError, match="are allowed"):
         small.fill_holes()
+
+
+def test_one_point_is_as_good_as_an_array_of_one(device):
+    point, box = (1.0, 1.0, 1.0), clrecon.Mesh(*samples.box())
+    volume = Volume(np.arange(27, dtype=np.int16).reshape(3, 3, 3), np.eye(4))
+    mask = clrecon.Mask.from_band(volume, (0, None), device=device)
+    assert volume.sample(point) == volume.sample([point])[0] and volume.lps_to_ijk(point).tolist() == [1, 1, 1]
+    assert len(clrecon.PointCloud(point)) == 1 and mask.grow(point).count == 27
+    assert mask.count == clrecon.Mask.from_tube(volume, point, 9.0, device=device).count
+    assert [part.vertices.tolist() for part in box.split(seeds=point)] == [box.vertices.tolist()]
+    assert box.closest_points(point)[1].shape == box.ray(point, (0, 0, 1))[:, 0].shape == (1,)
+    kept = clrecon.Clip.box((0, 0, 0), (2, 2, 2)).contains
+    assert kept(point) and not kept((1.0, 1.0, 3.0)) and kept([point]).tolist() == [True]

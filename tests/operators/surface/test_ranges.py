@@ -255,3 +255,16 @@ def test_every_pass_on_a_small_volume(device):
     for shape in [(3, 4, 33), (2, 3, 5)]:
         assert_equals_twin(random_volume(shape), (2, 3), device)
         assert_equals_twin(random_volume(shape), 3, device, below=True)
+
+
+@pytest.mark.parametrize("dtype", ["int16", "float32"])
+def test_an_open_end_of_a_range_is_none(device, dtype):
+    volume = random_volume((5, 6, 37), dtype, high=100)
+    above, up_to = (extract_isosurface(volume, level, device=device) for level in ((40, None), (None, 40)))
+    assert_same(above, extract_isosurface(volume, 40, device=device))
+    beyond = 41 if dtype == "int16" else np.nextafter(np.float32(40), np.float32(np.inf))
+    assert_same(up_to, extract_isosurface(volume, beyond, below=True, device=device))
+    with pytest.raises(UsageError, match="two ends, not .None, None.: None leaves one"):
+        extract_isosurface(volume, (None, None), device=device)
+    with pytest.raises(UsageError, match="below takes one iso value"):
+        extract_isosurface(volume, (None, 40), below=True, device=device)

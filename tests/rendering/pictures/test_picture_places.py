@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -30,6 +32,22 @@ def test_a_picture_is_an_array(shot):
     assert np.asarray(shot) is shot.image or np.shares_memory(np.asarray(shot), shot.image)
     assert np.asarray(shot, dtype=float).max() == shot.image.max()
     assert not np.shares_memory(np.array(shot, copy=True), shot.image)
+
+
+@pytest.mark.parametrize(
+    ("plane", "middle", "ways"),
+    [("axial", (3.5, 2.5), (1, 1)), ("coronal", (3.5, 1.5), (1, -1)), ((30, 20), (0, 0), (1, -1))],
+)
+def test_edges_of_a_plane_are_mm_of_the_axes_that_it_runs_along(device, plane, middle, ways):
+    volume = clrecon.Volume(np.zeros((4, 6, 8), np.int16), np.eye(4))
+    cut = clrecon.cut_slice(volume, plane, (20, 10), pixel_mm=0.5, device=device)
+    (across, down), (right, below) = middle, ways
+    assert cut.extent == pytest.approx((across - 5 * right, across + 5 * right, down + 2.5 * below, down - 2.5 * below))
+
+
+def test_a_perspective_picture_has_no_edges_in_mm(shot):
+    with pytest.raises(UsageError, match="no axes in mm"):
+        _ = replace(shot, camera=replace(shot.camera, parallel_scale=None, view_angle=30.0)).extent
 
 
 def test_a_cut_has_no_places_of_depth(device):
