@@ -185,7 +185,7 @@ PLACES = {
         "", "SliceThickness differs along the stack", SliceThickness=at_one(5, 5, 1.25)
     ),
     "thickness half the gap, numbers in steps": exact(
-        "complete_series", "slices missing according to the numbers", SliceThickness=0.625
+        "complete_series gap_thickness", "slices missing according to the numbers", SliceThickness=0.625
     ),
     "stated gap doubled": exact("stated_gap", "SpacingBetweenSlices says 2.5 mm", SpacingBetweenSlices=2.5),
     "stated gap halved": exact("stated_gap", "SpacingBetweenSlices says 0.625 mm", SpacingBetweenSlices=0.625),

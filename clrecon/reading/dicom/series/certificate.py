@@ -56,8 +56,8 @@ from clrecon.system.text import count_of, hash_uid
 
 LONG_VOXELS = 10.0
 """Gaps of so many pixels want a SliceThickness that says what lies between."""
-GAP_THICKNESSES = 2.0
-"""Largest gap in slice thicknesses.  Beyond it more is left out than measured: 10 in a high-resolution lung scan."""
+GAP_THICKNESSES = 1.95
+"""Largest gap in slice thicknesses: 2 where every second slice of a gapless scan is lost, 10 in a scan of the lung."""
 SLOPES, INTERCEPTS = (1e-3, 100.0), (-40_000.0, 40_000.0)
 """Ranges of slope and intercept.  Scanners write the slope 1, a fraction of 1 or a few; below 0 bone would be dark.
 Stored 16-bit values in the middle of their range need an intercept of 32768."""
