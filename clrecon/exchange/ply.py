@@ -315,7 +315,6 @@ def read_mesh(path: Path) -> RawMesh:
 
 
 def _one_color(columns: Mapping[str, NDArray[Any]]) -> tuple[float, float, float] | None:
-    """Return the colour that all vertices have."""
     own = [columns.get(name) for name in ("red", "green", "blue")]
     values = [
         each[0] / 255.0 for each in own if each is not None and each.dtype == np.uint8 and len(np.unique(each)) == 1

@@ -74,7 +74,7 @@ Features = Literal["paper", "variation"]
 _CHOICES = "Space Topology VertexRule MethodName FilterName PointKind Combination CurvedKind Features Literal".split()
 
 _CLASSES = (
-    "Volume", "DeviceVolume", "Mesh", "LabelMap", "PointCloud", "Mask", "Camera", "Grid", "GridCells", "GhostSlices",
+    "Volume", "DeviceVolume", "Mesh", "LabelMap", "PointCloud", "Mask", "Camera", "GridCells", "GhostSlices",
     "Lighting", "Clip", "TransferFunction", "Rendering", "Style", "PhantomSettings",
 )  # fmt: skip
 _LARGEST = 2**63
@@ -84,6 +84,7 @@ _MAKERS = {
     "a Mesh": "see clrecon.read_mesh and clrecon.Mesh(vertices, triangles)",
     "a LabelMap": "see clrecon.read_labels and clrecon.LabelMap(voxels, affine)",
     "a PointCloud": "see clrecon.read_points and clrecon.PointCloud(points)",
+    "a GhostSlices": "see clrecon.find_ghost_slices",
 }
 
 Given = ParamSpec("Given")
@@ -139,6 +140,7 @@ _KINDS: dict[str, tuple[str, Accepts]] = {
     "Iterable": ("a sequence", _is_iterable),
     "Mapping": ("a mapping", lambda value: isinstance(value, Mapping)),
     **dict.fromkeys(_CHOICES, ("a text", lambda value: isinstance(value, str))),
+    "Grid": ("a Volume", functools.partial(_is_of_class, "Grid")),
     # of `Mask`, whose parts stand in classes of their own
     **dict.fromkeys(("Shapes", "Bits"), ("a Mask", functools.partial(_is_of_class, "Mask"))),
     **{name: (f"a {name}", functools.partial(_is_of_class, name)) for name in _CLASSES},

@@ -205,6 +205,16 @@ def test_the_sweep_finds_a_function_that_checks_nothing(tmp_path: Path) -> None:
     assert any("AttributeError" in each for each in faults(careless, tmp_path))
 
 
-def test_an_array_in_place_of_a_cloud_is_named() -> None:
-    with pytest.raises(UsageError, match="cloud must be a PointCloud"):
-        clrecon.cluster_points(np.zeros((5, 3)))  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("function", "words"),
+    [
+        (clrecon.cluster_points, "cloud must be a PointCloud, a Volume or a DeviceVolume, not ndarray: see clr"),
+        (clrecon.Camera.fit, "volume must be a Volume, not ndarray: see clrecon.read_volume"),
+        (clrecon.fill_ghost_slices, "found must be a GhostSlices, not ndarray: see clrecon.find_ghost_slices"),
+    ],
+)
+def test_what_is_wanted_has_a_public_name_or_a_public_maker(function: Callable[..., Any], words: str) -> None:
+    first = (things()["Volume"],) if function is clrecon.fill_ghost_slices else ()
+    with pytest.raises(UsageError) as refused:
+        function(*first, np.zeros((5, 3)))
+    assert str(refused.value).startswith(words)

@@ -95,7 +95,6 @@ def choose_cell_edge(points: NDArray[np.floating], k: int) -> float:
 
 
 def _edge_of_box(size: NDArray[np.float64], cells: int) -> float:
-    """Return the edge with which a box has so many cells."""
     low, high = 0.0, float(size.max())
     for _ in range(60):
         middle = 0.5 * (low + high)

@@ -383,7 +383,6 @@ class ScenePictures(Closing):
         return taker.render(style, camera=camera, size=size, background="transparent")
 
     def _finish(self, drawn: list[Rendering], shot: Shot, volume: DrawnVolume) -> Rendering:
-        """Draw all layers on a device."""
         device, stopwatch = volume.device, volume.stopwatch
         found = draw_layers(
             device, self._parts, shot.camera, shot.size, still=_join_stills(drawn), volume=volume.sample,

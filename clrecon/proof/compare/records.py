@@ -83,7 +83,6 @@ def make_record(
 
 
 def _work(parts: Mapping[str, float]) -> float:
-    """Return the seconds of a run without drawing."""
     return sum(parts.values()) - parts.get("draw", 0.0)
 
 

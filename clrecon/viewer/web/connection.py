@@ -283,7 +283,6 @@ class Connection:
         self._look_again()
 
     def _look_again(self) -> None:
-        """Find out what is stale, and draw it."""
         keys = {view: self._session.picture_key(view) for view in VIEWS}
         changed = [view for view, key in keys.items() if self._keys.get(view, self) != key]
         if changed:
