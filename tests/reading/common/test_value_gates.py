@@ -37,6 +37,15 @@ def gates_of(report):
 
 
 # --- scale ---
+@pytest.mark.parametrize(("tissue", "told"), [(0.09, False), (0.11, True)])
+def test_a_missing_intercept_is_told_from_a_tenth_of_soft_tissue_on(tissue, told):
+    """Stored values, not known to be HU: air at 24 and soft tissue at 1064."""
+    count = 40_000
+    stored = np.where(np.arange(count) < tissue * count, 1064.0, 24.0).reshape(4, 100, 100)
+    gate = judge(stored + np.random.default_rng(3).normal(0, 8, stored.shape), known=False)
+    assert gate.ok is (False if told else None) and ("intercept seems to be missing" in gate.text) == told
+
+
 @pytest.mark.parametrize(
     ("slope", "offset", "air", "tissue", "reason"),
     [

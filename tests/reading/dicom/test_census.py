@@ -6,6 +6,7 @@ import shutil
 
 import pytest
 from dicom_series import ROOT, Plan, set_values, write_series
+from enhanced_series import write_enhanced
 from variants import daily
 
 from clrecon.reading import list_series, read_volume
@@ -190,6 +191,11 @@ def test_a_series_that_is_numbered_on_from_another(tmp_path):
     assert judge(tmp_path, series=2)["ok"] is True
     (tmp_path / "1" / "slice009.dcm").unlink()
     assert judge(tmp_path, series=2)["measured"] == 10
+
+
+def test_files_with_many_frames_count_once(tmp_path):
+    write_enhanced(tmp_path / "a.dcm", change=lambda ds: setattr(ds, "NumberOfSeriesRelatedInstances", "3"))
+    assert "(NumberOfSeriesRelatedInstances says 3, there is 1): 2, none allowed" in judge(tmp_path)["text"]
 
 
 def test_the_figures_are_in_the_certificate(tmp_path):

@@ -35,6 +35,7 @@ from variants import daily
 
 from clrecon.reading import list_series, read_volume
 from clrecon.reading.dicom.headers.header import read_headers
+from clrecon.reading.dicom.headers.multiframe import DIMENSIONS_OF_PLACE
 from clrecon.reading.dicom.headers.slice_header import OtherImage
 
 SHUFFLED = (4, 0, 6, 2, 5, 1, 3)
@@ -55,6 +56,13 @@ def split_headers(path):
     headers = read_headers(path)
     assert isinstance(headers, list)
     return headers
+
+
+def test_dimensions_that_number_places():
+    assert {pydicom.datadict.keyword_for_tag(tag) for tag in DIMENSIONS_OF_PLACE} == {
+        "ImagePositionPatient", "ImageOrientationPatient", "InStackPositionNumber", "SliceLocation", "InstanceNumber",
+        "PlanePositionSequence", "PlaneOrientationSequence",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)

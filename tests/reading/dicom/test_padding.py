@@ -12,7 +12,7 @@ from dicom_series import Plan, set_values, write_series
 from clrecon.geometry import AIR_HU
 from clrecon.proof.surface.extract import extract_isosurface
 from clrecon.reading import read_volume
-from clrecon.reading.dicom.pixels.padding import PaddingMasks, pack_mask
+from clrecon.reading.dicom.pixels.padding import SAMPLED_SLICES, PaddingMasks, pack_mask
 
 SHAPE = (6, 40, 40)
 CENTRE, RADIUS = 19.5, 18.0
@@ -196,3 +196,19 @@ def test_real_scans_have_no_tube(real_data):
         assert share < 0.15, iso_value
         assert iso_value < AIR_HU or crossed_share(fixed, iso_value, pairs) > 0.85, iso_value
     assert read_volume(real_data / "lumbar_4p25mm").report["padding_hu"] == AIR_HU  # the median of its clipped rim
+
+
+@pytest.mark.parametrize(
+    ("count", "step"), [(1, 1), (SAMPLED_SLICES, 1), (SAMPLED_SLICES + 1, 2), (3 * SAMPLED_SLICES, 3)]
+)
+def test_air_is_sampled_in_slices_along_the_whole_scan(count, step):
+    """Air that is 1 HU denser from slice to slice: the median of that beside the padding of every `step` th slice."""
+    voxels = np.full((count, 3, 3), -1000, np.int16) + np.arange(count, dtype=np.int16)[:, None, None]
+    padding = np.zeros((3, 3), bool)
+    padding[0, 0] = True
+    masks = PaddingMasks(voxels)
+    for k in range(count):
+        masks.add(k, pack_mask(padding))
+    sampled = range(0, count, step)
+    expected = -1000.0 + sampled[(2 * len(sampled) - 1) // 2 // 2]
+    assert masks.fill() == expected and (voxels[:, 0, 0] == expected).all()
