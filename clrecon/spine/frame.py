@@ -226,13 +226,9 @@ def _fit_plates(local: Float64Array, axes: Float64Array, what: str) -> tuple[Flo
 
 
 def _measure(
-    points: Float64Array,
-    middle: Float64Array,
-    axes: Float64Array,
-    canal: tuple[Float64Array, Float64Array, float],
-    height: float,
-    what: str,
-) -> VertebraFrame:
+    points: Float64Array, middle: Float64Array, axes: Float64Array, canal: tuple[Float64Array, Float64Array, float],
+    height: float, what: str,
+) -> VertebraFrame:  # fmt: skip
     """Measure the walls of the body and place the canal's axis in the frame."""
     canal_point, along, radius = canal
     start, lean = (canal_point - middle) @ axes.T, along @ axes.T

@@ -211,15 +211,10 @@ class _Found:
 
 @explains_arguments
 def split_vertebrae(
-    volume: Volume,
-    *,
-    level: float | None = None,
-    seeds: ArrayLike | None = None,
-    name_at: tuple[Sequence[float], str] | None = None,
-    first: str | None = None,
-    keep_unsure: bool = False,
+    volume: Volume, *, level: float | None = None, seeds: ArrayLike | None = None,
+    name_at: tuple[Sequence[float], str] | None = None, first: str | None = None, keep_unsure: bool = False,
     progress: Progress | None = None,
-) -> VertebraSplit:
+) -> VertebraSplit:  # fmt: skip
     """Make a first guess of where each vertebra is, without a label map.
 
     Meant for the spine of an adult from C3 down in CT.  It is a starting point for corrections by hand; a
@@ -368,14 +363,9 @@ def _choose_level(found: _Found) -> float:
 
 
 def _spans(
-    found: _Found,
-    pieces: NDArray[np.uint8],
-    doubtful: Float64Array,
-    rim: Float64Array,
-    arches: Float64Array,
-    voxel_ml: float,
-    level: float,
-) -> tuple[list[tuple[int, Piece]], list[str]]:
+    found: _Found, pieces: NDArray[np.uint8], doubtful: Float64Array, rim: Float64Array, arches: Float64Array,
+    voxel_ml: float, level: float,
+) -> tuple[list[tuple[int, Piece]], list[str]]:  # fmt: skip
     """Return the number and span of each piece that is a vertebra, and what else was seen."""
     from scipy.ndimage import find_objects, label
 

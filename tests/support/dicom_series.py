@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import copy
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from io import BytesIO
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydicom.dataelem import DataElement
 from pydicom.dataset import Dataset, FileMetaDataset
+from pydicom.filebase import DicomBytesIO
+from pydicom.filewriter import write_data_element
 from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
 ROOT = "1.2.826.0.1.3680043.10.1"
@@ -108,9 +114,60 @@ def make_dataset(plan: Plan, k: int) -> Dataset:
     return ds
 
 
+PLAIN = {"AS", "CS", "DA", "DS", "FD", "FL", "IS", "LO", "OB", "OW", "PN", "SH", "SL", "SS", "TM", "UI", "UL", "US"}
+"""Value representations that are written the same in every dataset of a transfer syntax, without a character set."""
+
+REMEMBERED: dict[tuple[Any, ...], bytes] = {}
+"""What pydicom wrote for an element, or for the head of a file."""
+
+
 def save_dataset(ds: Dataset, path: Path) -> None:
+    """Write a dataset as pydicom does, which takes 3 ms, with what it wrote for elements that came before."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    ds.save_as(path, enforce_file_format=True)
+    elements = list(ds.values())
+    meta = getattr(ds, "file_meta", {})
+    if not (
+        set(meta.keys()) == TAGS_OF_A_HEAD
+        and meta.TransferSyntaxUID in (ExplicitVRLittleEndian, ImplicitVRLittleEndian)
+        and meta.MediaStorageSOPInstanceUID == ds.get("SOPInstanceUID")
+        and meta.MediaStorageSOPClassUID == ds.get("SOPClassUID")
+        and all(isinstance(element, DataElement) and element.VR in PLAIN for element in elements)
+        and "SpecificCharacterSet" not in ds
+    ):
+        ds.save_as(path, enforce_file_format=True)
+        return
+    written = [_element_as_written(element, is_implicit(ds)) for element in sorted(elements, key=attrgetter("tag"))]
+    path.write_bytes(_head_as_written(meta) + b"".join(written))
+
+
+TAGS_OF_A_HEAD = {0x00020002, 0x00020003, 0x00020010}
+
+
+def _head_as_written(meta: FileMetaDataset) -> bytes:
+    instance = meta.MediaStorageSOPInstanceUID
+    key = (meta.MediaStorageSOPClassUID, len(instance), meta.TransferSyntaxUID)
+    stand_in = "2." + "7" * (len(instance) - 2)
+    if key not in REMEMBERED:
+        alone = Dataset()
+        alone.file_meta = copy.deepcopy(meta)
+        alone.file_meta.MediaStorageSOPInstanceUID = stand_in
+        file = BytesIO()
+        alone.save_as(file, enforce_file_format=True)
+        REMEMBERED[key] = file.getvalue()
+    return REMEMBERED[key].replace(stand_in.encode(), instance.encode())
+
+
+def _element_as_written(element: DataElement, implicit: bool) -> bytes:
+    is_of_bytes = element.VR in ("OB", "OW")
+    key = (implicit, element.tag, element.VR, type(element.value), str(element.value)) if not is_of_bytes else ()
+    if key not in REMEMBERED:
+        file = DicomBytesIO()
+        file.is_little_endian, file.is_implicit_VR = True, implicit
+        write_data_element(file, element)
+        if is_of_bytes:
+            return file.getvalue()
+        REMEMBERED[key] = file.getvalue()
+    return REMEMBERED[key]
 
 
 def write_series(folder: Path, plan: Plan | None = None, change: Change | None = None) -> Plan:

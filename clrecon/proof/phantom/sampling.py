@@ -221,13 +221,9 @@ def outside_disc(shape: tuple[int, ...], affine: NDArray[np.float64]) -> NDArray
 
 
 def add_streaks(
-    field: Float32Array,
-    metal: NDArray[np.bool_],
-    metal_hu: float,
-    affine: NDArray[np.float64],
-    strength: float,
+    field: Float32Array, metal: NDArray[np.bool_], metal_hu: float, affine: NDArray[np.float64], strength: float,
     seed: int,
-) -> None:
+) -> None:  # fmt: skip
     """Add the streaks of metal of `metal_hu` to the slices that show it, in place."""
     spacing = column_spacing(affine)[:2]
     x, y, radius = _radius(field.shape[1:], spacing)

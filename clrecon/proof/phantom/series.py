@@ -142,51 +142,60 @@ def _make_uid(settings: PhantomSettings, *what: str) -> str:
 
 
 def _make_headers(settings: PhantomSettings, placement: Placement, phase: int) -> Iterator[FileDataset]:
-    """Yield one dataset for each slice of a phase, complete except for the pixels."""
+    """Yield the header of each slice of a phase, complete except for the pixels: one dataset, which changes."""
+    from pydicom.uid import UID
+
+    header = _make_header(settings, placement, phase)
+    for k, position in enumerate(placement.positions):
+        number = phase * settings.slices + k
+        header.SOPInstanceUID = header.file_meta.MediaStorageSOPInstanceUID = UID(
+            _make_uid(settings, "instance", str(number))
+        )
+        header.InstanceNumber, header.ImagePositionPatient = str(number + 1), position
+        yield header
+
+
+def _make_header(settings: PhantomSettings, placement: Placement, phase: int) -> FileDataset:
+    """Make what the slices of a phase have in common."""
     from pydicom.dataset import FileDataset, FileMetaDataset
     from pydicom.uid import PYDICOM_IMPLEMENTATION_UID, UID
 
     study, series, frame = (_make_uid(settings, name) for name in ("study", "series", "frame of reference"))
     columns, rows = settings.size
     scanner = KINDS[settings.kind].scanner
-    for k, position in enumerate(placement.positions):
-        number = phase * settings.slices + k
-        instance = _make_uid(settings, "instance", str(number))
-        meta = FileMetaDataset()
-        meta.MediaStorageSOPClassUID = UID(CT_IMAGE_STORAGE)
-        meta.MediaStorageSOPInstanceUID = UID(instance)
-        meta.TransferSyntaxUID = UID(_TRANSFER_SYNTAXES[settings.transfer_syntax])
-        meta.ImplementationClassUID = PYDICOM_IMPLEMENTATION_UID
-        header = FileDataset(slice_file_name(number), {}, file_meta=meta, preamble=b"\0" * 128)
-        header.ImageType = ["ORIGINAL", "PRIMARY", "AXIAL"]
-        header.SOPClassUID, header.SOPInstanceUID = UID(CT_IMAGE_STORAGE), UID(instance)
-        header.StudyDate = header.SeriesDate = header.AcquisitionDate = header.ContentDate = _DATE
-        header.StudyTime = header.SeriesTime = header.AcquisitionTime = header.ContentTime = _TIME
-        header.AccessionNumber = header.ReferringPhysicianName = ""
-        header.Modality, header.Manufacturer = "CT", "clrecon"
-        header.StudyDescription, header.SeriesDescription = "clrecon phantom", f"phantom {settings.kind}"
-        header.PatientName, header.PatientID = "PHANTOM^CLRECON", "PHANTOM"
-        header.PatientBirthDate = header.PatientSex = ""
-        header.PatientPosition = "HFP" if settings.prone else "HFS"
-        header.KVP, header.SliceThickness = str(scanner.kvp), placement.slice_thickness
-        if float(placement.tilt) != 0.0:
-            header.GantryDetectorTilt = placement.tilt
-        header.StudyInstanceUID, header.SeriesInstanceUID = UID(study), UID(series)
-        header.FrameOfReferenceUID, header.PositionReferenceIndicator = UID(frame), ""
-        header.StudyID, header.SeriesNumber, header.AcquisitionNumber = "1", "1", "1"
-        header.InstanceNumber = str(number + 1)
-        if settings.phases > 1:
-            header.AcquisitionNumber = header.TemporalPositionIdentifier = str(phase + 1)
-            header.NumberOfTemporalPositions = str(settings.phases)
-            header.AcquisitionTime = header.ContentTime = f"1200{_PHASE_SECONDS * phase % 60:02d}"
-        header.ImagePositionPatient, header.ImageOrientationPatient = position, placement.orientation
-        header.SamplesPerPixel, header.PhotometricInterpretation = 1, "MONOCHROME2"
-        header.Rows, header.Columns = rows, columns
-        header.PixelSpacing = placement.pixel_spacing
-        header.BitsAllocated, header.BitsStored, header.HighBit, header.PixelRepresentation = 16, 16, 15, 1
-        header.WindowCenter, header.WindowWidth = "300", "1500"
-        header.RescaleIntercept, header.RescaleSlope, header.RescaleType = str(RESCALE_INTERCEPT), "1", scanner.unit
-        yield header
+    meta = FileMetaDataset()
+    meta.MediaStorageSOPClassUID = UID(CT_IMAGE_STORAGE)
+    meta.TransferSyntaxUID = UID(_TRANSFER_SYNTAXES[settings.transfer_syntax])
+    meta.ImplementationClassUID = PYDICOM_IMPLEMENTATION_UID
+    header = FileDataset("", {}, file_meta=meta, preamble=b"\0" * 128)
+    header.ImageType = ["ORIGINAL", "PRIMARY", "AXIAL"]
+    header.SOPClassUID = UID(CT_IMAGE_STORAGE)
+    header.StudyDate = header.SeriesDate = header.AcquisitionDate = header.ContentDate = _DATE
+    header.StudyTime = header.SeriesTime = header.AcquisitionTime = header.ContentTime = _TIME
+    header.AccessionNumber = header.ReferringPhysicianName = ""
+    header.Modality, header.Manufacturer = "CT", "clrecon"
+    header.StudyDescription, header.SeriesDescription = "clrecon phantom", f"phantom {settings.kind}"
+    header.PatientName, header.PatientID = "PHANTOM^CLRECON", "PHANTOM"
+    header.PatientBirthDate = header.PatientSex = ""
+    header.PatientPosition = "HFP" if settings.prone else "HFS"
+    header.KVP, header.SliceThickness = str(scanner.kvp), placement.slice_thickness
+    if float(placement.tilt) != 0.0:
+        header.GantryDetectorTilt = placement.tilt
+    header.StudyInstanceUID, header.SeriesInstanceUID = UID(study), UID(series)
+    header.FrameOfReferenceUID, header.PositionReferenceIndicator = UID(frame), ""
+    header.StudyID, header.SeriesNumber, header.AcquisitionNumber = "1", "1", "1"
+    if settings.phases > 1:
+        header.AcquisitionNumber = header.TemporalPositionIdentifier = str(phase + 1)
+        header.NumberOfTemporalPositions = str(settings.phases)
+        header.AcquisitionTime = header.ContentTime = f"1200{_PHASE_SECONDS * phase % 60:02d}"
+    header.ImageOrientationPatient = placement.orientation
+    header.SamplesPerPixel, header.PhotometricInterpretation = 1, "MONOCHROME2"
+    header.Rows, header.Columns = rows, columns
+    header.PixelSpacing = placement.pixel_spacing
+    header.BitsAllocated, header.BitsStored, header.HighBit, header.PixelRepresentation = 16, 16, 15, 1
+    header.WindowCenter, header.WindowWidth = "300", "1500"
+    header.RescaleIntercept, header.RescaleSlope, header.RescaleType = str(RESCALE_INTERCEPT), "1", scanner.unit
+    return header
 
 
 def _check_written(path: Path, header: Any, stored: NDArray[np.int16]) -> None:
@@ -207,13 +216,9 @@ def _check_written(path: Path, header: Any, stored: NDArray[np.int16]) -> None:
 
 
 def write_series(
-    folder: Path,
-    voxels: NDArray[np.int16],
-    settings: PhantomSettings,
-    placement: Placement,
-    progress: Progress | None = None,
-    phase: int = 0,
-) -> None:
+    folder: Path, voxels: NDArray[np.int16], settings: PhantomSettings, placement: Placement,
+    progress: Progress | None = None, phase: int = 0,
+) -> None:  # fmt: skip
     """Write one file for each slice that is not missing into an existing folder and read each back.
 
     HU are at most 32767 + `RESCALE_INTERCEPT`; the files of a phase, from 0, follow those of the phase before.

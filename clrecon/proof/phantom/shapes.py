@@ -215,14 +215,9 @@ class Box:
     """
 
     def __init__(
-        self,
-        center: ArrayLike,
-        normal: ArrayLike,
-        thickness: float,
-        width: float,
-        height: float,
+        self, center: ArrayLike, normal: ArrayLike, thickness: float, width: float, height: float,
         edge: ArrayLike | None = None,
-    ):
+    ):  # fmt: skip
         self.center = _vector("center", center)
         self.normal = _unit("normal", normal)
         if edge is None:

@@ -67,16 +67,9 @@ def _draw_wall(
 
 
 def _draw_organs(
-    canvas: Field,
-    anatomy: Anatomy,
-    cavity: Field,
-    x: Field,
-    y: Field,
-    z: Field,
-    ramp: float,
-    seed: int,
+    canvas: Field, anatomy: Anatomy, cavity: Field, x: Field, y: Field, z: Field, ramp: float, seed: int,
     blood_hu: float,
-) -> Field:
+) -> Field:  # fmt: skip
     """Draw abdominal organs in fat and, above the diaphragm, lungs; return the distance into the lungs.
 
     `x` and `y` count from the middle of the trunk.
@@ -130,17 +123,9 @@ _BAND = 24000
 
 
 def draw_tissue(
-    anatomy: Anatomy,
-    x: Field,
-    y: Field,
-    z: Field,
-    ramp: float,
-    seed: int,
-    table: Sequence[Part] | None,
-    prone: bool,
-    *,
-    blood_hu: float = BLOOD_HU,
-) -> Field:
+    anatomy: Anatomy, x: Field, y: Field, z: Field, ramp: float, seed: int, table: Sequence[Part] | None, prone: bool,
+    *, blood_hu: float = BLOOD_HU,
+) -> Field:  # fmt: skip
     """Draw one slice without bone, in bands of rows, HU, (nj, ni), at x, y, z in mm of the plan.
 
     Interfaces are `ramp` mm wide.  Without a table the body lies on a couch of its own, if prone under the front.

@@ -216,14 +216,9 @@ MOST_SLICES = 9999
 
 
 def spine_choice(
-    levels: tuple[str, ...],
-    bend: tuple[float, float],
-    facet_gap_mm: float | None,
-    *,
-    centred: bool,
-    directions: tuple[float, tuple[float, float, float], bool],
-    length_mm: float | None,
-) -> SpineChoice:
+    levels: tuple[str, ...], bend: tuple[float, float], facet_gap_mm: float | None, *, centred: bool,
+    directions: tuple[float, tuple[float, float, float], bool], length_mm: float | None,
+) -> SpineChoice:  # fmt: skip
     """Return a choice, bent by (kyphosis, scoliosis), for slices of directions (tilt, oblique, prone), see
     `slice_directions`, and a volume of a length along their normal.
     """
@@ -237,13 +232,9 @@ def _reach(extent: tuple[float, float]) -> float:
 
 
 def fit_slices(
-    choice: SpineChoice,
-    size: tuple[int, int],
-    spacing: tuple[float, float, float],
-    seed: int,
-    directions: tuple[float, tuple[float, float, float], bool],
-    slices: int | None,
-) -> int:
+    choice: SpineChoice, size: tuple[int, int], spacing: tuple[float, float, float], seed: int,
+    directions: tuple[float, tuple[float, float, float], bool], slices: int | None,
+) -> int:  # fmt: skip
     """Return the number of slices: the given one, if it holds the vertebral bodies, else as many as the bones need."""
     dj, di, dk = spacing
     open_joints = dataclasses.replace(choice, facet_gap_mm=None)
