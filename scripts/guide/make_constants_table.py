@@ -26,27 +26,23 @@ UNITS = re.compile(r"^[A-Z].*_(MM2?|CM2|ML|HU)(_|$)")
 
 ADULTS = "the object: adults; in no other way"
 HU = "values: HU alone"
-WRITERS = "files: how writers round"
 SCALED = (
     "values: where they are not HU, two materials of the scan stand for 40 and 1240 HU, or air and soft tissue for"
     " -1000 and 40"
 )
-FOLLOWS = {
+WRITERS = "files: how writers round"
+LENGTHS = {
     "anatomy/body.py": "the object: adults and their tables; cells are one voxel at least",
-    "anatomy/body_cells.py": "the voxel: cells are one at least; values: HU alone",
-    "anatomy/dense_pieces.py": "the object: adults, their tables and cables; values: HU alone",
-    "anatomy/head.py": "the object: heads of people; values: HU alone",
-    "anatomy/iso_choice.py": SCALED,
+    "anatomy/body_cells.py": "the voxel: cells are one at least",
+    "anatomy/dense_pieces.py": "the object: adults, their tables and cables",
+    "anatomy/head.py": "the object: heads of people",
     "anatomy/marrow.py": "the voxel: blocks are whole ones",
-    "anatomy/materials.py": SCALED,
-    "anatomy/noise.py": HU,
     "anatomy/spine_cells.py": ADULTS,
     "anatomy/spine_line.py": ADULTS,
     "anatomy/surroundings.py": "the object: skin and airways of people",
     "labels/canal.py": ADULTS,
     "labels/contours.py": WRITERS,
     "labels/label_grids.py": WRITERS,
-    "labels/resample.py": HU,
     "labels/segmentation.py": WRITERS,
     "labels/structures.py": WRITERS + ", and the step of the slices",
     "operators/masks/enclosed.py": "the voxel: the ball of `--solid` is 8 steps at most; the object: a share of the"
@@ -57,17 +53,39 @@ FOLLOWS = {
     "operators/points/free_clusters.py": "nothing: range of float32",
     "operators/rays/mesh_pictures.py": "nothing: range of float32",
     "operators/rays/point_pictures.py": "the object: the spacing of the cloud where it has one",
-    "operators/rays/ray_pictures.py": HU,
-    "operators/rays/volume_renderer.py": HU,
     "operators/reformat/cut.py": ADULTS,
-    "operators/surface/cortex.py": "the voxel: lengths are at a voxel of 1 mm3 and scale with it; values: HU alone",
+    "operators/surface/cortex.py": "the voxel: lengths are at a voxel of 1 mm3 and scale with it",
     "operators/surface/cortex_mesh.py": "nothing: float32 in mm",
     "operators/surface/growing.py": "nothing: how far is searched",
     "operators/surface/seeds.py": ADULTS,
-    "operators/vertebrae/inside.py": "the object: vertebrae of adults; values: HU alone",
+    "operators/vertebrae/inside.py": "the object: vertebrae of adults",
     "operators/vertebrae/solid.py": "the object: vertebrae of adults",
 }
-"""What the constants of a module follow; a module without a line is an error."""
+"""What the lengths, areas and volumes of a module follow; a module that has some and no line is an error."""
+
+VALUES = {"anatomy/iso_choice.py": SCALED, "anatomy/materials.py": SCALED}
+"""What the constants in HU of a module follow, where they do not mean HU alone."""
+
+SHOWN_BY = {
+    "anatomy/body.py": "anatomy/test_body_bone.py::test_a_block_of_micro_ct_is_kept_whole",
+    "anatomy/body_cells.py": "anatomy/test_body_cells.py::test_counts_of_cells_hold_every_voxel_of_micro_ct",
+    "anatomy/iso_choice.py": "anatomy/test_iso_choice.py::test_two_materials_are_found_on_any_scale",
+    "anatomy/marrow.py": "anatomy/test_marrow.py::test_a_ball_has_its_radius",
+    "anatomy/materials.py": "anatomy/test_iso_choice.py::test_two_materials_are_found_on_any_scale",
+    "labels/structures.py": "labels/test_structure_sets.py::test_contours_may_be_a_tenth_of_the_step_off",
+    "operators/masks/enclosed.py": "operators/masks/test_enclosed.py::test_the_default_seal_follows_voxels_and_bone",
+    "operators/rays/point_pictures.py": "operators/rays/test_point_pictures.py"
+    "::test_discs_are_as_large_as_points_lie_apart",
+    "operators/surface/cortex.py": "operators/surface/test_cortex.py::test_a_shell_lies_where_it_is",
+}
+"""The test that shows what is said of a module whose constants follow the voxel or the values."""
+
+
+def describe_follows(module: str, names: str) -> str:
+    """Say what constants follow, by the units of their names: lengths by the module, HU by the values."""
+    units = [match[1] for match in map(UNITS.match, names.split(", ")) if match]
+    said = [LENGTHS[module]] if any(unit != "HU" for unit in units) else []
+    return "; ".join(said + [VALUES.get(module, HU)] * ("HU" in units))
 
 
 def find_constants(source: str) -> Iterator[tuple[str, str, str]]:
@@ -93,7 +111,7 @@ def make_table(root: Path = ROOT / "clrecon") -> str:
         for path in sorted((root / room).rglob("*.py")):
             module = path.relative_to(root).as_posix()
             for names, value, said in find_constants(path.read_text(encoding="utf-8")):
-                cells = (module.removesuffix(".py"), names, value, said, FOLLOWS[module])
+                cells = (module.removesuffix(".py"), names, value, said, describe_follows(module, names))
                 rows.append([cell.replace("|", "\\|") for cell in cells])
     return markdown_table(["module", "constant", "value", "made for", "follows"], rows)
 

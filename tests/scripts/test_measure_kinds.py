@@ -10,24 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from made_once import make_once
+from damaged_kinds import SLICES, make_scan
 from variants import daily_rows
 
 import marked_tables  # isort: skip
 import measure_kinds  # isort: skip
 
 from clrecon.cli.main import main
-from clrecon.proof.phantom import PhantomSettings, write_phantom
 
 FIGURES = json.loads(measure_kinds.FIGURES.read_text(encoding="utf-8"))
 PAGE = measure_kinds.PAGE.read_text(encoding="utf-8")
-SLICES = {"jaw": 24, "longbone": 30, "hand": 64, "pair": 30, "hip": 64, "mouse": 40}
-"""Slices in the middle of each kind: a part is as true as the whole; of the hip those without metal are at the ends."""
-
-
-def make_scan(folder: Path, kind: str) -> tuple[Path, PhantomSettings]:
-    settings = PhantomSettings(kind=kind, slices=SLICES[kind])
-    return make_once(folder, f"scan-{kind}", lambda path: write_phantom(path, settings)), settings
 
 
 def measure(shared_folder: Path, tmp_path: Path, device: Any, kind: str, way: str) -> dict[str, Any]:

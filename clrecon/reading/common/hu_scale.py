@@ -144,8 +144,8 @@ TISSUE_HU = (-150, 200)
 """Range of the peaks of fat, water, muscle, organs and blood with contrast medium."""
 
 OFFSET_AIR_HU = (-880, -160)
-"""Range in which the air of an offset scan is looked for; from there on it lies among fat and water, and above these
-it is told by the step of a CT to soft tissue alone."""
+"""Range in which the air of an offset scan is looked for; from there on it lies among fat and water, up to the end of
+`TISSUE_HU`."""
 LUNG_HU, LUNG_WIDTH = -700, 115
 """Lung may be as low as this; its peak is wider than that."""
 STEP_HU, CT_STEP_HU = (450, 1200), (850, 1200)
@@ -199,7 +199,7 @@ def judge_scale(
     if doubt is None:
         measured = sample.without_spikes(LOWEST_AIR_HU, HIGHEST_AIR_HU)
         peaks = find_peaks(measured.values) if measured is not None else []
-        doubt = _find_doubt(sample, peaks, slopes)
+        doubt = _find_doubt(sample, peaks, slopes, facts.disc)
     if doubt is not None:
         text = (
             f"air lies near {doubt.air:.0f} HU and soft tissue near {doubt.tissue:.0f} HU, where a CT has -1000 and 0"
@@ -249,7 +249,9 @@ def _is_padded_specimen(sample: ValueSample) -> bool:
     return padded and sample.between(500, np.inf) >= MOST_BEYOND
 
 
-def _find_doubt(sample: ValueSample, peaks: Sequence[Peak], slopes: Sequence[float]) -> _Doubt | None:
+def _find_doubt(
+    sample: ValueSample, peaks: Sequence[Peak], slopes: Sequence[float], disc: float | None
+) -> _Doubt | None:
     if len(peaks) < 2:
         return None
     lowest, above = peaks[0], peaks[1:]
@@ -258,17 +260,22 @@ def _find_doubt(sample: ValueSample, peaks: Sequence[Peak], slopes: Sequence[flo
         return None if air and tissue else _describe_step(lowest, max(above, key=lambda peak: peak.share))
     if air:
         return None if tissue else _find_wrong_slope(sample, lowest, above, slopes)
-    return _find_offset(sample, lowest, above)
+    return _find_offset(sample, lowest, above, disc)
 
 
-def _find_offset(sample: ValueSample, air: Peak, above: Sequence[Peak]) -> _Doubt | None:
-    """Take the lowest peak for air that lies too high."""
+def _find_offset(sample: ValueSample, air: Peak, above: Sequence[Peak], disc: float | None) -> _Doubt | None:
+    """Take the lowest peak for air that lies too high.
+
+    Among fat and water it is told by a round field of view that is filled with a value far above it, and above these by
+    that or by the step of a CT.
+    """
     lower = sample.between(-np.inf, air.at - max(BELOW_AIR_HU, 1.3 * air.width))
     lung = air.at < LUNG_HU and air.width > LUNG_WIDTH
-    no_tissue = air.at > TISSUE_HU[1]
-    if not (OFFSET_AIR_HU[0] <= air.at <= OFFSET_AIR_HU[1] or no_tissue) or lower >= MOST_BEYOND or lung:
+    padded = disc is not None and disc >= air.at + BELOW_AIR_HU
+    among = OFFSET_AIR_HU[1] < air.at <= TISSUE_HU[1] and not padded
+    if air.at < OFFSET_AIR_HU[0] or among or lower >= MOST_BEYOND or lung:
         return None
-    low, high = CT_STEP_HU if no_tissue else STEP_HU
+    low, high = CT_STEP_HU if air.at > TISSUE_HU[1] and not padded else STEP_HU
     fitting = [peak for peak in above if low <= peak.at - air.at <= high]
     tissue = max(fitting, key=lambda peak: peak.share, default=None)
     if tissue is None or tissue.share < LEAST_OFFSET_TISSUE:

@@ -23,6 +23,7 @@ from clrecon.reading.common.likeness import SHOWN_SAID, judge_shown_places
 from clrecon.reading.common.source_facts import PixelFacts, StoredValues
 from clrecon.system.light_dataclass import dataclass, field
 from clrecon.system.records import Gate, none_of, unmeasured
+from clrecon.system.text import count_of
 
 PADDING_SHARE = 0.75
 """Largest share of padding.  A circle in its square leaves 0.21, a 500 mm circle in a field of 800 mm 0.69; above that
@@ -124,6 +125,7 @@ CEILING_LEVELS, CEILING_SPIKE = 8, 10.0
 that were cut off there and then interpolated, or put beside slices with more bits, exceed it in a few voxels."""
 
 LEAST_PADDING_SHARE = 0.01
+BLANK_SHOWN = 5
 
 
 @dataclass(frozen=True)
@@ -158,6 +160,12 @@ def examine_voxels(
     sample = ValueSample.of(voxels, facts)
     scale, materials = judge_scale(sample, facts, [one.slope for one in slices] or [1.0], known)
     warnings = [facts.padding_text] if facts.padding_text else []
+    if facts.blank:
+        named = ", ".join(str(k + 1) for k in facts.blank[:BLANK_SHOWN]) + ", ..." * (len(facts.blank) > BLANK_SHOWN)
+        warnings.append(
+            f"{count_of(len(facts.blank), 'slice')} of {len(voxels):,} between others show one value alone, no picture"
+            f" ({named}): what is there is cut in two"
+        )
     warnings += _warn_of_saturation(voxels, facts, slices)
     if sample is not None and scale.ok is not False:
         warnings += _warn_of_padding(sample, voxels)

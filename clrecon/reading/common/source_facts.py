@@ -16,6 +16,8 @@ class PixelFacts:
 
     stray: Number of values that lost bits of their own, see `clrecon.reading.dicom.pixels.voxels`.
     padding_text: Of padding that no header declares and that was found by its shape, or that masks tissue.
+    disc: Value that fills the outside of a round field of view without a header that declares it.
+    blank: Slices of one value alone among others, from 0.
     """
 
     padding_share: float
@@ -25,6 +27,8 @@ class PixelFacts:
     stray: int = 0
     stray_text: str = ""
     padding_text: str = ""
+    disc: float | None = None
+    blank: tuple[int, ...] = ()
 
 
 class StoredValues(Protocol):

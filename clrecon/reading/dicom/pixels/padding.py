@@ -118,9 +118,8 @@ def fill_disc_padding(voxels: NDArray[Any]) -> tuple[float, int, float] | None:
     if min(nj, ni) < SMALLEST or value <= AIR_RANGE_HU[1]:
         return None
     distance = _measure_disc(voxels[nk // 2] != value)
-    if distance is None or not all(
-        _is_disc(picture, value, distance) for picture in voxels[:: -(-nk // SAMPLED_SLICES)]
-    ):
+    sampled = [picture for picture in voxels[:: -(-nk // SAMPLED_SLICES)] if picture.min() < picture.max()]
+    if distance is None or not all(_is_disc(picture, value, distance) for picture in sampled):
         return None
     masks = PaddingMasks(voxels)
     for k, picture in enumerate(voxels):

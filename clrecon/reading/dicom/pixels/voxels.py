@@ -161,6 +161,7 @@ def _fill_volume(
 ) -> PixelFacts:
     padding, low, high, tissue = PaddingMasks(voxels), np.inf, -np.inf, 0
     stray: list[StrayBits | None] = [None] * len(slices)
+    blank: list[int] = []
     most = MAX_READERS
     if source.compressed:
         most = min(MAX_DECODERS, 1 + len(slices) * slices[0].pixel_bytes // DECODER_WORTH_BYTES)
@@ -172,6 +173,8 @@ def _fill_volume(
                 padding.add(jobs[job], seen.padding)
                 low, high = min(low, seen.low), max(high, seen.high)
                 stray[jobs[job]] = seen.stray
+                if seen.low >= seen.high:
+                    blank.append(jobs[job])
                 tissue += seen.tissue
                 if progress is not None:
                     progress("read", done, len(slices))
@@ -194,7 +197,16 @@ def _fill_volume(
     if padding_hu is not None:
         low, high = min(low, padding_hu), max(high, padding_hu)
     count, text = describe_stray_bits(stray, slices)
-    return PixelFacts(padded / voxels.size, float(low), float(high), padding_hu, count, text, said)
+    return PixelFacts(
+        padded / voxels.size, float(low), float(high), padding_hu, count, text, said, disc and disc[0],
+        tuple(find_between(sorted(blank), len(slices))),
+    )  # fmt: skip
+
+
+def find_between(blank: Sequence[int], count: int) -> list[int]:
+    """Return the blank slices of `count` that have others before and behind them; at the ends they are padding."""
+    shown = sorted(set(range(count)) - set(blank))
+    return [k for k in blank if shown and shown[0] < k < shown[-1]]
 
 
 def _fill_slice(source: StoredPixels, header: SliceHeader, out: NDArray[Any]) -> _SliceFacts:

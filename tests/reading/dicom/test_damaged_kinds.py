@@ -1,0 +1,55 @@
+"""Damaged series of kinds of scan: cone beam, micro-CT, hand, legs, hip with metal, mouse; what is said of each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from damaged_kinds import (
+    BLANK,
+    DAMAGES,
+    KNOWN,
+    REFUSED,
+    SAID,
+    SCALE,
+    SILENT,
+    SLICES,
+    WARNED,
+    damage,
+    list_damages,
+    make_scan,
+)
+from house import ROOT
+from variants import daily_rows
+
+import clrecon
+from clrecon.errors import RefusedInputError
+
+ROWS = [(name, kind) for name in DAMAGES for kind in SLICES]
+EVERY_DAY = [
+    ("intercept + 400", "jaw"),
+    ("intercept + 1024", "jaw"),
+    (BLANK, "jaw"),
+    (BLANK, "mouse"),
+    ("0.6 of the values + 400", "hand"),
+]
+
+
+@pytest.mark.parametrize(("name", "kind"), daily_rows(5, EVERY_DAY + [row for row in ROWS if row not in EVERY_DAY]))
+def test_what_is_said_of_a_damaged_kind(shared_folder: Path, tmp_path: Path, name: str, kind: str) -> None:
+    scan, _ = make_scan(shared_folder, kind)
+    said = SAID[name][list(SLICES).index(kind)]
+    folder = damage(scan, tmp_path / "ct", name)
+    if said == REFUSED:
+        with pytest.raises(RefusedInputError, match="1 slice missing between"):
+            clrecon.read_volume(folder)
+        return
+    report = clrecon.read_volume(folder).report
+    failed = {gate["name"] for gate in report["gates"] if gate["ok"] is False}
+    assert failed == {gate for gate in (KNOWN, SCALE) if gate in said}
+    assert any("show one value alone, no picture" in text for text in report["warnings"]) == (WARNED in said)
+    assert said != SILENT or kind == "hip" or report["warnings"] == []
+
+
+def test_the_page_has_the_damages() -> None:
+    assert list_damages() in (ROOT / "docs" / "calibration.md").read_text(encoding="utf-8")
