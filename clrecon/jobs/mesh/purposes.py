@@ -12,7 +12,7 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part
 from clrecon.jobs.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU, find_purpose
 from clrecon.system.arguments import name_parameter
-from clrecon.system.text import count_of, format_digits
+from clrecon.system.text import count_of, format_ml
 
 if TYPE_CHECKING:
     import numpy as np
@@ -130,7 +130,7 @@ def warn_of_print(facts: dict[str, Any]) -> list[str]:
     if facts["cavities"]:
         warnings.append(
             f"{count_of(facts['cavities'], 'closed cavity', 'closed cavities')} of"
-            f" {format_digits(facts['cavities_ml'], 2)} ml together are in it: powder or"
+            f" {format_ml(facts['cavities_ml'], 2)} together are in it: powder or"
             f" resin stays in them; {name_parameter('keep_largest', 1)} fills them"
         )
     bone_told = left_out.get("not_bone") is not None
@@ -139,8 +139,8 @@ def warn_of_print(facts: dict[str, Any]) -> list[str]:
         away, seed = name_parameter("remove_table", True), name_parameter("seeds", "X,Y,Z")
         table = "" if bone_told else f" The piece of largest area can be a table ({away});"
         warnings.append(
-            f"{'bone that' if bone_told else 'what'} was left out encloses {format_digits(other_ml)} ml, beside the"
-            f" {format_digits(facts['pieces_ml'])} ml that were kept: is it the right piece?{table}"
+            f"{'bone that' if bone_told else 'what'} was left out encloses {format_ml(other_ml)}, beside the"
+            f" {format_ml(facts['pieces_ml'])} that were kept: is it the right piece?{table}"
             f" {seed} keeps the one at a point, {name_parameter('all_parts', True)} keeps all"
         )
     return warnings
@@ -154,7 +154,7 @@ def warn_of_other_pieces(facts: Sequence[dict[str, Any]]) -> list[str]:
         return []
     all_pieces, all_parts = name_parameter("min_volume_ml", 0.1), name_parameter("all_parts", True)
     return [
-        f"{count_of(left_out['not_bone'], 'piece')} of {format_digits(other_ml)} ml together were left out, crumbs or"
+        f"{count_of(left_out['not_bone'], 'piece')} of {format_ml(other_ml)} together were left out, crumbs or"
         " with walls that do not reach 600 HU like those of bone: coarse voxels blur thin ribs below that."
         f" {all_pieces} in place of {all_parts} keeps pieces of any material"
     ]

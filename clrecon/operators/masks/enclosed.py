@@ -345,17 +345,18 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
     room = body - bone
 
     ml = slice_voxel_ml(volume)
-    bone_ml = float(_count_by_slice(bone.to_numpy()) @ ml)
+    bone_ml = _measure_ml(bone, ml)
     joints = find_joints(bone, seal_mm, min(BONE_ML, BONE_SHARE * bone_ml)) & (sealed - bone)
     # what was closed only at the mouth of a pore, in a groove or in a joint is outside again
     filled = room - (~body | joints).dilate_within(room, seal_mm)
     steps.take()
-    marked = filled.to_numpy()
     value = _mean_inside(volume, bone, lowest_inside)
-    voxels = np.where(marked, value, volume.voxels)
+    voxels, airy_count = np.empty_like(volume.voxels), np.zeros(len(volume.voxels), np.int64)
+    for k, (layer, own) in enumerate(zip(volume.voxels, filled.layers(), strict=True)):
+        voxels[k] = np.where(own, value, layer)
+        airy_count[k] = np.count_nonzero(own & (layer < AIR_LIMIT_HU))
     steps.take()
-    filled_ml = float(_count_by_slice(marked) @ ml)
-    closed_ml = float(_count_by_slice((filled & sealed).to_numpy()) @ ml)
+    filled_ml, closed_ml = _measure_ml(filled, ml), _measure_ml(filled & sealed, ml)
     lattice = Lattice.of(volume)
     facts = {
         "seal_mm": seal_mm,
@@ -365,7 +366,7 @@ def _fill(bone: Mask, how: tuple[float, float, bool], lowest_inside: float, step
         "filled_share": filled_ml / (filled_ml + bone_ml),
         "closed_ml": closed_ml,
         "metal_ml": _filled_at_metal(bone, filled, METAL_STEPS * seal_mm, ml),
-        "filled_air_ml": float(_count_by_slice(marked & (volume.voxels < AIR_LIMIT_HU)) @ ml),
+        "filled_air_ml": float(airy_count @ ml),
         "filled_hu": float(value),
         "spaces": int(np.count_nonzero(~left)),
         "at_ends": int(np.count_nonzero(spaces.at_ends & ~left)),
@@ -392,11 +393,12 @@ def _filled_at_metal(bone: Mask, filled: Mask, reach_mm: float, ml: NDArray[np.f
     if float(bone.scan.voxels.max()) < SATURATED_HU:
         return 0.0
     metal = Mask.from_band(bone.scan, (SATURATED_HU, np.inf), device=bone.device, memory=bone.memory)
-    return float(_count_by_slice((filled & metal.dilate(reach_mm)).to_numpy()) @ ml)
+    return _measure_ml(filled & metal.dilate(reach_mm), ml)
 
 
-def _count_by_slice(marked: NDArray[np.bool_]) -> NDArray[np.int64]:
-    return np.count_nonzero(marked, axis=(1, 2))  # type: ignore[return-value]
+def _measure_ml(mask: Mask, ml: NDArray[np.float64]) -> float:
+    """Return the volume of a mask; `ml` is that of a voxel of each slice."""
+    return float(np.array([np.count_nonzero(layer) for layer in mask.layers()]) @ ml)
 
 
 def _lies_in_air(bone: Mask, sealed: Mask, spaces: Spaces, seal_mm: float) -> bool:
@@ -411,8 +413,8 @@ def _lies_in_air(bone: Mask, sealed: Mask, spaces: Spaces, seal_mm: float) -> bo
 
 def _mean_inside(volume: Volume, bone: Mask, lowest_inside: float) -> Any:
     """Return the mean of the voxels inside, as a scalar of the voxels' type that is inside too."""
-    marked = bone.to_numpy()
-    total = sum(float(layer[own].sum(dtype=np.float64)) for layer, own in zip(volume.voxels, marked, strict=True))
+    pairs = zip(volume.voxels, bone.layers(), strict=True)
+    total = sum(float(layer[own].sum(dtype=np.float64)) for layer, own in pairs)
     mean = max(total / bone.count, lowest_inside + 1.0)
     dtype = volume.voxels.dtype
     if dtype.kind == "f":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, NoReturn, TypeVar
 
@@ -21,6 +22,7 @@ from clrecon.opencl import (
     launch,
     load_program,
     upload,
+    wait,
 )
 from clrecon.operators.masks import voxel_mask
 from clrecon.operators.masks.regions import checked_mm
@@ -236,11 +238,19 @@ class MaskBits:
             self._extents = voxel_mask.find_extents(self.device, self._mask_d, self.shape_ijk)
         return self._extents
 
-    def to_numpy(self) -> NDArray[np.bool_]:
-        """Return the chosen voxels, shape (nk, nj, ni), bool."""
+    def layers(self) -> Iterator[NDArray[np.bool_]]:
+        """Yield the chosen voxels of each slice, shape (nj, ni), bool: an eighth of the memory of `to_numpy`."""
         ni, nj, nk = self.shape_ijk
         words = download(self.device, np.empty((nk, nj, -(-ni // 32)), "<u4"), self._mask_d)
-        return np.unpackbits(words.view(np.uint8), axis=2, count=ni, bitorder="little").view(np.bool_)
+        for layer in words.view(np.uint8):
+            yield np.unpackbits(layer, axis=1, count=ni, bitorder="little").view(np.bool_)
+
+    def to_numpy(self) -> NDArray[np.bool_]:
+        """Return the chosen voxels, shape (nk, nj, ni), bool."""
+        made = np.empty(self.shape_ijk[::-1], np.bool_)
+        for whole, layer in zip(made, self.layers(), strict=True):
+            whole[...] = layer
+        return made
 
     __array_ufunc__ = None  # an array and a mask have no common operators
 
@@ -372,6 +382,7 @@ class MaskShapes(MaskBits):
             cross = _cross_of(self.scan, most > done)
             spread = self._made(spread_bits(self.device, reached.bits, cross), self.name)
             reached = reached | (spread & room)
+            wait(self.device)  # the masks of commands that wait in the queue are all in memory
         return self._made(reached._mask_d, f"({self.name}) dilated by {mm:g} mm within ({room.name})")
 
     def _erode(self, mm: float, by_slice: bool) -> Any:

@@ -266,8 +266,8 @@ def _find_doubt(
 def _find_offset(sample: ValueSample, air: Peak, above: Sequence[Peak], disc: float | None) -> _Doubt | None:
     """Take the lowest peak for air that lies too high.
 
-    Among fat and water it is told by a round field of view that is filled with a value far above it, and above these by
-    that or by the step of a CT.
+    A round field of view that is filled with a value far above it tells it anywhere.  Among fat and water nothing else
+    does, and above these the step of a CT alone.
     """
     lower = sample.between(-np.inf, air.at - max(BELOW_AIR_HU, 1.3 * air.width))
     lung = air.at < LUNG_HU and air.width > LUNG_WIDTH
@@ -282,7 +282,7 @@ def _find_offset(sample: ValueSample, air: Peak, above: Sequence[Peak], disc: fl
         return None
     first, last = max(EMPTY_HU[0], air.at + 1.5 * air.width), EMPTY_HU[1]
     empty = sample.between(first, max(first, last)) < MOST_IN_EMPTY * sample.between(tissue.at - 100, tissue.at + 100)
-    if tissue.at > TISSUE_HU[1] and empty:
+    if padded or (tissue.at > TISSUE_HU[1] and empty):
         return _describe_step(air, tissue)
     steps = [peak.at - air.at for peak in above[:2]]  # fat and muscle together tell that what lies at 100 HU is fat
     pair = len(steps) == 2 and all(

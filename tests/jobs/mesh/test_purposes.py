@@ -91,6 +91,8 @@ def test_warnings_say_what_can_go_wrong() -> None:
     assert warn_of_print({**good, "left_out": told}) == []
     told["not_bone_ml"] = 3.0
     assert "bone that was left out encloses 1.1 ml" in warn_of_print({**good, "left_out": told})[0]
+    mouse = {**good, "pieces_ml": 0.0328, "left_out": {"pieces_ml": 0.0808}}
+    assert "encloses 80.8 mm3, beside the 32.8 mm3 that were kept" in warn_of_print(mouse)[0]
 
 
 def test_all_parts_say_how_much_is_left_out_as_no_bone() -> None:

@@ -25,10 +25,10 @@ from clrecon.reading.common.source_facts import PixelFacts
 NAMES = ("hu_scale", "stored_sign")
 
 
-def judge(hu, known=True):
-    """The gate of the scale of some HU, as they are."""
+def judge(hu, known=True, disc=None):
+    """The gate of the scale of some HU, as they are; `disc` was around a round field of view."""
     hu = np.asarray(hu, np.float32)
-    facts = PixelFacts(0.0, float(hu.min()), float(hu.max()))
+    facts = PixelFacts(0.0, float(hu.min()), float(hu.max()), disc=disc)
     return examine_voxels(hu, facts, (), known=known).gates[0]
 
 
@@ -69,6 +69,15 @@ def test_both_peaks_in_wrong_places_fail(slope, offset, air, tissue, reason, noi
     found = [int(word) for word in gate.text.split() if word.lstrip("-").isdigit()][:2]
     assert found == pytest.approx([air, tissue], abs=12 * max(slope, 1.0))
     assert re.sub(r"\d+ HU", "N HU", reason) in re.sub(r"\d+ HU", "N HU", gate.text)
+
+
+@pytest.mark.parametrize(("slope", "offset"), [(0.8, 140), (0.8, 750), (0.5, 0)])
+def test_a_disc_filled_far_above_the_lowest_peak_tells_air_among_other_materials(slope, offset):
+    hu = make_body() * slope + offset
+    gate = judge(hu, disc=offset)
+    found = [int(word) for word in gate.text.split() if word.lstrip("-").isdigit()][:2]
+    assert gate.ok is False and found == pytest.approx([offset - 1000 * slope, offset + 50 * slope], abs=12)
+    assert judge(hu).ok and judge(make_body(), disc=0).ok
 
 
 @pytest.mark.parametrize("shift", [-100, -60, 60, 100])
